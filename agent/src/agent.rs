@@ -5,8 +5,8 @@
 use std::time::{Duration, Instant};
 
 use protocol::{
-    BevFeatures, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, PointCloud, Pose, PoseEstimate,
-    StageTiming, WireError,
+    BevFeatures, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, PointCloud, Pose,
+    PoseEstimate, StageTiming, WireError,
 };
 use support::stage_times::StageTimes;
 use tch::Tensor;
@@ -91,7 +91,10 @@ impl Agent {
     /// The same with feature maps that keep within `rate`, applied by [`Self::write_map`].
     #[must_use]
     pub fn within(self, rate: RateConfig) -> Self {
-        Self { rate: RateControl::new(rate), ..self }
+        Self {
+            rate: RateControl::new(rate),
+            ..self
+        }
     }
 
     /// The points that the vehicle shares: those that are not on its own body.
@@ -117,14 +120,20 @@ impl Agent {
     pub fn prepare(&mut self, cloud: &PointCloud) {
         let is_needed = self.shares_encoder && self.pose_source.computes_from_sweep();
         // An error comes again, and is returned, when the sweep is perceived.
-        self.encoded = is_needed.then(|| self.detector.encode(cloud).ok()).flatten();
+        self.encoded = is_needed
+            .then(|| self.detector.encode(cloud).ok())
+            .flatten();
     }
 
     /// First step: the pose, which goes out before anything else is computed.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
         self.levels = None;
-        let levels = self.encoded.as_ref().map(|encoded| encoded.levels.as_slice());
-        self.pose_source.estimate(&pose_input(&self.cav, input, levels))
+        let levels = self
+            .encoded
+            .as_ref()
+            .map(|encoded| encoded.levels.as_slice());
+        self.pose_source
+            .estimate(&pose_input(&self.cav, input, levels))
     }
 
     /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. True if the
@@ -132,7 +141,8 @@ impl Agent {
     pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
         self.encoded = None;
         let levels = self.levels.take();
-        self.pose_source.observe(&pose_input(&self.cav, input, levels.as_deref()))
+        self.pose_source
+            .observe(&pose_input(&self.cav, input, levels.as_deref()))
     }
 
     /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live
@@ -147,7 +157,8 @@ impl Agent {
         codec: &CodecConfig,
         capture_nanos: u64,
     ) -> Result<EncodedFeatures, WireError> {
-        self.rate.encode(features, codec, confidence, capture_nanos, None)
+        self.rate
+            .encode(features, codec, confidence, capture_nanos, None)
     }
 
     /// Durations of the stages of the last pose, for pose sources that compute.
@@ -167,11 +178,22 @@ impl Agent {
     /// # Errors
     /// [`DetectorError`] if the tensor library fails.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
-        let encoded = self.encoded.take().map_or_else(|| self.detector.encode(cloud), Ok)?;
-        let Encoded { features, levels, times, .. } = encoded;
+        let encoded = self
+            .encoded
+            .take()
+            .map_or_else(|| self.detector.encode(cloud), Ok)?;
+        let Encoded {
+            features,
+            levels,
+            times,
+            ..
+        } = encoded;
         let perception = self.perceive_map(&features)?;
         self.levels = self.shares_encoder.then_some(levels);
-        Ok(Perception { times: [times, perception.times].concat(), ..perception })
+        Ok(Perception {
+            times: [times, perception.times].concat(),
+            ..perception
+        })
     }
 
     /// The same from a feature map `[1, C, H, W]` that the encoder computed before, as the encoder returned it.
@@ -181,16 +203,32 @@ impl Agent {
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let mut times = StageTimes::start();
         let sent = self.detector.compressed(map)?;
-        let (map, features) = (self.detector.decompressed(&sent)?, self.detector.to_message(&sent)?);
+        let (map, features) = (
+            self.detector.decompressed(&sent)?,
+            self.detector.to_message(&sent)?,
+        );
         times.lap("message");
         let heads = self.detector.heads(&map)?;
         times.lap("head");
-        let boxes = self.detector.boxes(&heads, self.postprocess.score_threshold)?;
-        let own = AgentBoxes { boxes: &boxes, output_from_agent: nalgebra::Isometry3::identity() };
+        let boxes = self
+            .detector
+            .boxes(&heads, self.postprocess.score_threshold)?;
+        let own = AgentBoxes {
+            boxes: &boxes,
+            output_from_agent: nalgebra::Isometry3::identity(),
+        };
         let found = postprocess(&[own], &self.postprocess);
-        let detections = found.iter().map(|candidate| candidate.detection(Some(self.cav.clone()))).collect();
+        let detections = found
+            .iter()
+            .map(|candidate| candidate.detection(Some(self.cav.clone())))
+            .collect();
         times.lap("boxes");
-        Ok(Perception { features, confidence: heads.confidence, detections, times: times.into_timings() })
+        Ok(Perception {
+            features,
+            confidence: heads.confidence,
+            detections,
+            times: times.into_timings(),
+        })
     }
 
     /// All steps.
@@ -204,13 +242,33 @@ impl Agent {
         let pose_time = began.elapsed();
         let perception = self.perceive(input.cloud)?;
         self.observe(input);
-        Ok(AgentOutput { pose, pose_time, perception })
+        Ok(AgentOutput {
+            pose,
+            pose_time,
+            perception,
+        })
     }
 }
 
-fn pose_input<'a>(cav: &'a CavId, input: &AgentInput<'a>, levels: Option<&'a [BackboneLevel]>) -> PoseInput<'a> {
-    let AgentInput { capture_nanos, cloud, measured_pose: measured, motion } = *input;
-    PoseInput { cav, capture_nanos, cloud, levels, measured, motion }
+fn pose_input<'a>(
+    cav: &'a CavId,
+    input: &AgentInput<'a>,
+    levels: Option<&'a [BackboneLevel]>,
+) -> PoseInput<'a> {
+    let AgentInput {
+        capture_nanos,
+        cloud,
+        measured_pose: measured,
+        motion,
+    } = *input;
+    PoseInput {
+        cav,
+        capture_nanos,
+        cloud,
+        levels,
+        measured,
+        motion,
+    }
 }
 
 #[cfg(test)]
@@ -235,40 +293,86 @@ mod tests {
         tch::set_num_threads(1);
         tch::manual_seed(11);
         let lidar_range_m = [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0];
-        let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
+        let config = DetectorConfig {
+            lidar_range_m,
+            compress_ratio,
+            ..DetectorConfig::lean()
+        };
         let network = VarStore::new(Device::Cpu);
         let pillars = PointPillars::new(&network.root(), &config).unwrap();
         // A head with vehicles everywhere gives non-maximum suppression something to do.
-        let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
+        let _ = tch::no_grad(|| {
+            network.variables()["cls_head.bias"]
+                .shallow_clone()
+                .fill_(0.5)
+        });
         (network, config, pillars)
     }
 
     fn agent_with(compress_ratio: Option<i64>) -> Agent {
         let (_network, _, pillars) = small_network(compress_ratio);
-        Agent::new(CavId::new("4279").unwrap(), Box::new(RecordedPose), Detector::from_network(pillars))
+        Agent::new(
+            CavId::new("4279").unwrap(),
+            Box::new(RecordedPose),
+            Detector::from_network(pillars),
+        )
     }
 
     #[test]
     fn a_sweep_becomes_pose_map_and_detections() {
         let mut agent = agent();
-        let points = (0..3000).map(|k| [(k % 83) as f32 * 0.3 - 12.0, (k % 41) as f32 * 0.3 - 6.0, -1.5, 0.2]);
-        let cloud = PointCloud { xyzi: points.collect() };
+        let points = (0..3000).map(|k| {
+            [
+                (k % 83) as f32 * 0.3 - 12.0,
+                (k % 41) as f32 * 0.3 - 6.0,
+                -1.5,
+                0.2,
+            ]
+        });
+        let cloud = PointCloud {
+            xyzi: points.collect(),
+        };
         let pose = Pose::from_xyz_yaw([5.0, 6.0, 0.0], 0.3);
-        let input =
-            AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&pose), motion: EgoMotion::default() };
+        let input = AgentInput {
+            capture_nanos: 0,
+            cloud: &cloud,
+            measured_pose: Some(&pose),
+            motion: EgoMotion::default(),
+        };
         let first = agent.process(&input).unwrap();
         assert_eq!(first.pose.world_from_cav(), Some(&pose));
-        let Perception { features, confidence, detections, times } = &first.perception;
+        let Perception {
+            features,
+            confidence,
+            detections,
+            times,
+        } = &first.perception;
         let [channels, height, width] = agent.detector().map_shape();
         assert_eq!(features.values.len() as i64, channels * height * width);
         assert_eq!(confidence.len(), features.grid.cells());
         assert!(!detections.is_empty() && detections.len() <= 1000);
-        assert!(detections.windows(2).all(|pair| pair[0].score >= pair[1].score));
-        assert!(detections.iter().all(|detection| detection.source.as_ref() == Some(agent.cav())));
+        assert!(
+            detections
+                .windows(2)
+                .all(|pair| pair[0].score >= pair[1].score)
+        );
+        assert!(
+            detections
+                .iter()
+                .all(|detection| detection.source.as_ref() == Some(agent.cav()))
+        );
         let stages: Vec<&str> = times.iter().map(|timing| timing.stage.as_str()).collect();
-        assert_eq!(stages, ["voxelise", "pillars", "backbone", "message", "head", "boxes"]);
+        assert_eq!(
+            stages,
+            [
+                "voxelise", "pillars", "backbone", "message", "head", "boxes"
+            ]
+        );
         let second = agent.process(&input).unwrap();
-        assert_eq!((second.perception.features, second.perception.detections), (features.clone(), detections.clone()));
+        assert_eq!(
+            (second.perception.features, second.perception.detections),
+            (features.clone(), detections.clone())
+        );
     }
 
     /// A pose source that takes levels, and notes the steps in which it gets them.
@@ -304,42 +408,95 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let weights = folder.path().join("detector.safetensors");
         let (network, config, _) = small_network(None);
-        let metadata = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config).unwrap())].into();
+        let metadata = [(
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(&config).unwrap(),
+        )]
+        .into();
         save(&weights, &network, &metadata, Precision::Single).unwrap();
-        let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
-        let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: None, motion: EgoMotion::default() };
+        let cloud = PointCloud {
+            xyzi: (0..500)
+                .map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2])
+                .collect(),
+        };
+        let input = AgentInput {
+            capture_nanos: 0,
+            cloud: &cloud,
+            measured_pose: None,
+            motion: EgoMotion::default(),
+        };
         let load = || Detector::load(&weights, Device::Cpu).unwrap();
         let mut plain = Agent::new(CavId::new("7").unwrap(), Box::new(RecordedPose), load());
         let expected = plain.perceive(&cloud).unwrap();
-        let stages = |times: &[StageTiming]| times.iter().map(|timing| timing.stage.clone()).collect::<Vec<_>>();
-        for (is_own, computes_first, steps) in
-            [(true, true, [true, true]), (true, false, [false, true]), (false, true, [false, false])]
-        {
+        let stages = |times: &[StageTiming]| {
+            times
+                .iter()
+                .map(|timing| timing.stage.clone())
+                .collect::<Vec<_>>()
+        };
+        for (is_own, computes_first, steps) in [
+            (true, true, [true, true]),
+            (true, false, [false, true]),
+            (false, true, [false, false]),
+        ] {
             let detector = load();
-            let encoder = if is_own { detector.encoder_sha256().to_owned() } else { "other".to_owned() };
+            let encoder = if is_own {
+                detector.encoder_sha256().to_owned()
+            } else {
+                "other".to_owned()
+            };
             let given = Arc::<Mutex<Vec<bool>>>::default();
-            let source = TakesLevels { encoder, computes_first, given: Arc::clone(&given) };
+            let source = TakesLevels {
+                encoder,
+                computes_first,
+                given: Arc::clone(&given),
+            };
             let mut agent = Agent::new(CavId::new("7").unwrap(), Box::new(source), detector);
             let seen = agent.process(&input).unwrap().perception;
-            assert_eq!((&seen.features, stages(&seen.times)), (&expected.features, stages(&expected.times)));
+            assert_eq!(
+                (&seen.features, stages(&seen.times)),
+                (&expected.features, stages(&expected.times))
+            );
             // Levels are those of one sweep.
             agent.observe(&input);
-            assert_eq!(*given.lock().unwrap(), [steps.as_slice(), &[false]].concat());
+            assert_eq!(
+                *given.lock().unwrap(),
+                [steps.as_slice(), &[false]].concat()
+            );
         }
     }
 
     #[test]
     fn neighbours_get_the_code_and_the_own_head_gets_what_they_decode() {
         let mut agent = agent_with(Some(4));
-        let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
+        let cloud = PointCloud {
+            xyzi: (0..500)
+                .map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2])
+                .collect(),
+        };
         let encoded = agent.detector.encode(&cloud).unwrap().features;
-        let shared = agent.detector.to_message(&agent.detector.compressed(&encoded).unwrap()).unwrap();
-        let received = agent.detector.received(&DecodedFeatures { features: shared.clone(), sent: None }).unwrap();
+        let shared = agent
+            .detector
+            .to_message(&agent.detector.compressed(&encoded).unwrap())
+            .unwrap();
+        let received = agent
+            .detector
+            .received(&DecodedFeatures {
+                features: shared.clone(),
+                sent: None,
+            })
+            .unwrap();
         let heads = agent.detector.heads(&received).unwrap();
         let seen = agent.perceive(&cloud).unwrap();
-        assert_eq!((&seen.features, &seen.confidence), (&shared, &heads.confidence));
+        assert_eq!(
+            (&seen.features, &seen.confidence),
+            (&shared, &heads.confidence)
+        );
         assert_eq!((shared.channels, shared.code_of), (16, Some(64)));
-        assert_ne!(seen.confidence, agent.detector.heads(&encoded).unwrap().confidence);
+        assert_ne!(
+            seen.confidence,
+            agent.detector.heads(&encoded).unwrap().confidence
+        );
     }
 
     #[test]
@@ -353,6 +510,13 @@ mod tests {
         };
         let output = agent.process(&input).unwrap();
         assert!(output.pose.world_from_cav().is_none());
-        assert!(output.perception.features.values.iter().all(|value| value.is_finite()));
+        assert!(
+            output
+                .perception
+                .features
+                .values
+                .iter()
+                .all(|value| value.is_finite())
+        );
     }
 }

@@ -22,7 +22,9 @@ const GAIN: f32 = 2.0;
 const PATCH_CELLS: i64 = 3;
 
 /// Kind of falsification.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 #[value(rename_all = "snake_case")]
 pub enum Falsification {
@@ -75,7 +77,9 @@ impl AttackConfig {
     /// The attack of the vehicle at `place` of its scenario, the ego being at 0; none if it is honest.
     #[must_use]
     pub fn of(&self, place: usize, cav: &CavId) -> Option<Attack> {
-        (1..=self.attackers).contains(&place).then(|| Attack::new(self.falsification, cav, self.seed))
+        (1..=self.attackers)
+            .contains(&place)
+            .then(|| Attack::new(self.falsification, cav, self.seed))
     }
 }
 
@@ -107,15 +111,25 @@ impl Attack {
     pub fn new(falsification: Falsification, cav: &CavId, seed: u64) -> Self {
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
         let mut random = SplitMix64::derived(seed, &letters);
-        let (distance_m, direction) = (random.between(5.0, 30.0), random.between(0.0, std::f64::consts::TAU));
+        let (distance_m, direction) = (
+            random.between(5.0, 30.0),
+            random.between(0.0, std::f64::consts::TAU),
+        );
         let place = |random: &mut SplitMix64| {
-            let reach = |random: &mut SplitMix64| random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
+            let reach =
+                |random: &mut SplitMix64| random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
             [reach(random), reach(random), random.between(-0.2, 0.2)]
         };
         let places = (0..INVENTED).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
         tracing::warn!(%cav, falsification = falsification.name(), "ATTACK: this vehicle falsifies its messages");
-        Self { falsification, random, offset_m, places, captured: CapturedMessages::default() }
+        Self {
+            falsification,
+            random,
+            offset_m,
+            places,
+            captured: CapturedMessages::default(),
+        }
     }
 
     /// Stores another vehicle's messages, for [`Falsification::Copied`].
@@ -136,10 +150,19 @@ impl Attack {
 impl OutputFilter for Attack {
     /// The pose that is published instead of the vehicle's own.
     fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
-        let (Falsification::ShiftedPose, Some(own)) = (self.falsification, pose.world_from_cav()) else { return pose };
+        let (Falsification::ShiftedPose, Some(own)) = (self.falsification, pose.world_from_cav())
+        else {
+            return pose;
+        };
         let [x, y, z] = own.translation_m;
         let [dx, dy] = self.offset_m;
-        PoseEstimate::new(Pose { translation_m: [x + dx, y + dy, z], ..*own }, 1.0)
+        PoseEstimate::new(
+            Pose {
+                translation_m: [x + dx, y + dy, z],
+                ..*own
+            },
+            1.0,
+        )
     }
 
     /// The perception that is published instead of the true one.
@@ -153,15 +176,28 @@ impl OutputFilter for Attack {
                 falsified.detections = (0..2 * INVENTED).map(|_| self.random_detection()).collect();
             }
             Falsification::Copied => {
-                let features = self.captured.features.get_or_insert_with(|| falsified.features.clone());
+                let features = self
+                    .captured
+                    .features
+                    .get_or_insert_with(|| falsified.features.clone());
                 if features.values.len() == falsified.features.values.len() {
                     falsified.features = features.clone();
                 }
-                falsified.detections = self.captured.detections.get_or_insert(falsified.detections).clone();
+                falsified.detections = self
+                    .captured
+                    .detections
+                    .get_or_insert(falsified.detections)
+                    .clone();
             }
             Falsification::Invented => {
-                invent(&mut falsified.features, &mut falsified.confidence, &self.places);
-                falsified.detections.extend(self.places.iter().map(|&place| vehicle(place, 0.9)));
+                invent(
+                    &mut falsified.features,
+                    &mut falsified.confidence,
+                    &self.places,
+                );
+                falsified
+                    .detections
+                    .extend(self.places.iter().map(|&place| vehicle(place, 0.9)));
             }
         }
         falsified
@@ -177,7 +213,9 @@ impl OutputFilter for Attack {
                     [(40.0, -40.0), (40.0, -40.0), (0.5, -2.5), (1.0, 0.0)]
                         .map(|(high, low)| random.between(low, high) as f32)
                 };
-                PointCloud { xyzi: truth.xyzi.iter().map(any).collect() }
+                PointCloud {
+                    xyzi: truth.xyzi.iter().map(any).collect(),
+                }
             }
             Falsification::Copied => self.captured.points.get_or_insert(truth).clone(),
             Falsification::Invented => {
@@ -193,7 +231,15 @@ impl OutputFilter for Attack {
 
 /// A car on the road at this pose, for a sensor 1.9 m above it.
 fn vehicle([x, y, heading_rad]: [f64; 3], score: f32) -> Detection {
-    Detection { box3d: Box3d { center_m: [x, y, -1.1], size_m: [4.4, 1.9, 1.6], heading_rad }, score, source: None }
+    Detection {
+        box3d: Box3d {
+            center_m: [x, y, -1.1],
+            size_m: [4.4, 1.9, 1.6],
+            heading_rad,
+        },
+        score,
+        source: None,
+    }
 }
 
 /// Points on the sides of such a car.
@@ -201,11 +247,20 @@ fn points_of([x, y, heading]: [f64; 3], random: &mut SplitMix64, points: &mut Ve
     let (sin, cos) = heading.sin_cos();
     for _ in 0..150 {
         let (along, across) = (random.between(-2.2, 2.2), random.between(-0.95, 0.95));
-        let (along, across) =
-            if random.chance(0.7) { (along, 0.95_f64.copysign(across)) } else { (2.2_f64.copysign(along), across) };
+        let (along, across) = if random.chance(0.7) {
+            (along, 0.95_f64.copysign(across))
+        } else {
+            (2.2_f64.copysign(along), across)
+        };
         let height = random.between(-1.8, -0.4);
         points.push(
-            [x + cos * along - sin * across, y + sin * along + cos * across, height, 0.4].map(|value| value as f32),
+            [
+                x + cos * along - sin * across,
+                y + sin * along + cos * across,
+                height,
+                0.4,
+            ]
+            .map(|value| value as f32),
         );
     }
 }
@@ -215,7 +270,11 @@ fn make_noise(features: &mut BevFeatures, random: &mut SplitMix64) {
     let cells = features.grid.cells().max(1);
     for channel in features.values.chunks_mut(cells) {
         let mean = channel.iter().map(|value| f64::from(*value)).sum::<f64>() / cells as f64;
-        let variance = channel.iter().map(|value| (f64::from(*value) - mean).powi(2)).sum::<f64>() / cells as f64;
+        let variance = channel
+            .iter()
+            .map(|value| (f64::from(*value) - mean).powi(2))
+            .sum::<f64>()
+            / cells as f64;
         let spread = variance.sqrt();
         channel.fill_with(|| (mean + spread * random.normal()) as f32);
     }
@@ -226,24 +285,31 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
     let BevGrid { width, height, .. } = features.grid;
     let (width, height) = (i64::from(width), i64::from(height));
     let cells = features.grid.cells();
-    let most_confident =
-        (confidence.iter().enumerate()).max_by(|one, other| one.1.total_cmp(other.1)).map(|(cell, _)| cell as i64);
+    let most_confident = (confidence.iter().enumerate())
+        .max_by(|one, other| one.1.total_cmp(other.1))
+        .map(|(cell, _)| cell as i64);
     let Some(from) = most_confident else { return };
     let (from_row, from_column) = (from / width.max(1), from % width.max(1));
     let (original, original_confidence) = (features.values.clone(), confidence.to_vec());
     let mean = |channel: &[f32]| channel.iter().sum::<f32>() / cells.max(1) as f32;
     let means: Vec<f32> = original.chunks(cells.max(1)).map(mean).collect();
     let index = |row: i64, column: i64| {
-        ((0..height).contains(&row) && (0..width).contains(&column)).then(|| (row * width + column) as usize)
+        ((0..height).contains(&row) && (0..width).contains(&column))
+            .then(|| (row * width + column) as usize)
     };
     for [x, y, _] in places {
         let column = ((x - features.grid.x_min_m) / features.grid.cell_m).floor() as i64;
         let row = ((y - features.grid.y_min_m) / features.grid.cell_m).floor() as i64;
-        for (down, right) in
-            (-PATCH_CELLS..=PATCH_CELLS).flat_map(|down| (-PATCH_CELLS..=PATCH_CELLS).map(move |right| (down, right)))
+        for (down, right) in (-PATCH_CELLS..=PATCH_CELLS)
+            .flat_map(|down| (-PATCH_CELLS..=PATCH_CELLS).map(move |right| (down, right)))
         {
-            let (source, target) = (index(from_row + down, from_column + right), index(row + down, column + right));
-            let (Some(source), Some(target)) = (source, target) else { continue };
+            let (source, target) = (
+                index(from_row + down, from_column + right),
+                index(row + down, column + right),
+            );
+            let (Some(source), Some(target)) = (source, target) else {
+                continue;
+            };
             confidence[target] = original_confidence[source];
             for (channel, mean) in means.iter().enumerate() {
                 let value = original[channel * cells + source];
@@ -262,19 +328,40 @@ mod tests {
     }
 
     fn truth() -> Perception {
-        let grid = BevGrid { x_min_m: -40.0, y_min_m: -40.0, cell_m: 0.8, width: 100, height: 100 };
-        let values = (0..2 * grid.cells()).map(|cell| (cell % 97) as f32 * 0.1).collect();
+        let grid = BevGrid {
+            x_min_m: -40.0,
+            y_min_m: -40.0,
+            cell_m: 0.8,
+            width: 100,
+            height: 100,
+        };
+        let values = (0..2 * grid.cells())
+            .map(|cell| (cell % 97) as f32 * 0.1)
+            .collect();
         let mut confidence = vec![0.0; grid.cells()];
         confidence[5050] = 0.9;
-        let features = BevFeatures { grid, channels: 2, code_of: None, values };
-        Perception { features, confidence, detections: vec![], times: vec![] }
+        let features = BevFeatures {
+            grid,
+            channels: 2,
+            code_of: None,
+            values,
+        };
+        Perception {
+            features,
+            confidence,
+            detections: vec![],
+            times: vec![],
+        }
     }
 
     #[test]
     fn a_shifted_pose_has_a_constant_offset_and_full_confidence() {
         let attack = Attack::new(Falsification::ShiftedPose, &cav("a"), 1);
         let falsified = |x: f64| {
-            let falsified = attack.pose(PoseEstimate::new(Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3), 0.4));
+            let falsified = attack.pose(PoseEstimate::new(
+                Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3),
+                0.4,
+            ));
             assert_eq!(falsified.confidence(), 1.0);
             let pose = *falsified.world_from_cav().unwrap();
             assert!(pose.validate().is_ok());
@@ -291,15 +378,32 @@ mod tests {
     fn falsified_output_has_the_shape_of_the_truth_and_other_values() {
         for falsification in [Falsification::Noise, Falsification::Invented] {
             let falsified = Attack::new(falsification, &cav("a"), 1).perception(truth());
-            assert_eq!(falsified.features.values.len(), truth().features.values.len());
+            assert_eq!(
+                falsified.features.values.len(),
+                truth().features.values.len()
+            );
             assert!(
-                falsified.features.values != truth().features.values && !falsified.detections.is_empty(),
+                falsified.features.values != truth().features.values
+                    && !falsified.detections.is_empty(),
                 "{falsification:?}"
             );
-            assert!(falsified.features.values.iter().all(|value| value.is_finite()));
+            assert!(
+                falsified
+                    .features
+                    .values
+                    .iter()
+                    .all(|value| value.is_finite())
+            );
         }
         let invented = Attack::new(Falsification::Invented, &cav("a"), 1).perception(truth());
-        assert!(invented.confidence.iter().filter(|sure| **sure > 0.8).count() > 5);
+        assert!(
+            invented
+                .confidence
+                .iter()
+                .filter(|sure| **sure > 0.8)
+                .count()
+                > 5
+        );
     }
 
     #[test]
@@ -312,7 +416,10 @@ mod tests {
         };
         assert_eq!(attack.perception(truth()).features, truth().features);
         assert_eq!(attack.perception(later()).features, truth().features);
-        let captured = CapturedMessages { features: Some(later().features), ..CapturedMessages::default() };
+        let captured = CapturedMessages {
+            features: Some(later().features),
+            ..CapturedMessages::default()
+        };
         attack.capture(captured);
         assert_eq!(attack.perception(truth()).features, later().features);
     }

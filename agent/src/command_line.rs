@@ -15,8 +15,14 @@ use crate::command;
 pub(crate) const OFFLINE: Sibling = Sibling {
     program: "agent-offline",
     subcommands: &[
-        ("eval", "Localize recorded sweeps and compare with their true poses"),
-        ("localize", "Localize recorded sweeps and write their poses to a table"),
+        (
+            "eval",
+            "Localize recorded sweeps and compare with their true poses",
+        ),
+        (
+            "localize",
+            "Localize recorded sweeps and write their poses to a table",
+        ),
         ("locate", "Find the pose of single point clouds"),
         ("map", "Make a head for a place from drives through it"),
         ("quantise", "Prepare a scene head for 8-bit inference"),
@@ -44,12 +50,16 @@ enum Command {
 impl Command {
     fn run(self) -> anyhow::Result<()> {
         let Self::Run(args) = self;
-        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again")?;
+        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
+            .context("cannot execute this program again")?;
         command::run::run(*args)
     }
 }
 
 /// Runs a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    exit_code(cli.command.run().map(|()| Outcome::Done), BusError::is_behind)
+    exit_code(
+        cli.command.run().map(|()| Outcome::Done),
+        BusError::is_behind,
+    )
 }

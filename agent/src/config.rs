@@ -99,8 +99,12 @@ impl ModelConfig {
     /// # Errors
     /// [`FieldError`] names what a device needs and this machine lacks.
     pub fn inference(&self) -> Result<Inference, FieldError> {
-        let missing = |missing: NoCuda| FieldError::new("models.device", "cuda", missing.to_string());
-        Ok(Inference::new(self.device.open().map_err(missing)?, self.precision))
+        let missing =
+            |missing: NoCuda| FieldError::new("models.device", "cuda", missing.to_string());
+        Ok(Inference::new(
+            self.device.open().map_err(missing)?,
+            self.precision,
+        ))
     }
 }
 
@@ -124,7 +128,9 @@ pub struct AgentSettings {
 }
 
 /// A message beside the pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum Publish {
     /// BEV feature maps.
@@ -192,7 +198,12 @@ impl AgentSettings {
     /// [`FieldError`] of the first value that is out of range.
     pub fn validate(&self) -> Result<(), FieldError> {
         self.pose.validate()?;
-        within("codec.zstd_level", self.codec.zstd_level.unwrap_or(1), 1, 22)
+        within(
+            "codec.zstd_level",
+            self.codec.zstd_level.unwrap_or(1),
+            1,
+            22,
+        )
     }
 }
 
@@ -211,7 +222,11 @@ impl AgentConfig {
     #[must_use]
     pub fn options(&self) -> NodeOptions {
         NodeOptions {
-            publish: self.publish.iter().map(|publish| publish.stream()).collect(),
+            publish: self
+                .publish
+                .iter()
+                .map(|publish| publish.stream())
+                .collect(),
             codec: self.settings.codec,
             rate: self.settings.rate,
             keeps_running: self.keep_running || self.bus.supervised,

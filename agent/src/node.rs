@@ -9,11 +9,15 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription, unix_nanos};
+use bus::{
+    Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription,
+    unix_nanos,
+};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{
-    CavId, DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role, Stream, Topic, wire,
+    CavId, DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role,
+    Stream, Topic, wire,
 };
 use support::nanos;
 use support::sweep_log::SweepLog;
@@ -53,7 +57,10 @@ impl Default for NodeOptions {
     fn default() -> Self {
         Self {
             publish: vec![Stream::Bev],
-            codec: CodecConfig { dtype: Dtype::F32, ..CodecConfig::default() },
+            codec: CodecConfig {
+                dtype: Dtype::F32,
+                ..CodecConfig::default()
+            },
             rate: RateConfig::default(),
             keeps_running: false,
             limits: Limits::DEFAULT,
@@ -81,7 +88,12 @@ pub struct NodeReport {
 ///
 /// # Errors
 /// [`BusError`] if the bus fails. Errors of single messages are counted and logged.
-pub fn run(bus: &Bus, agent: Agent, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+pub fn run(
+    bus: &Bus,
+    agent: Agent,
+    options: &NodeOptions,
+    stop: &Stop,
+) -> Result<NodeReport, BusError> {
     run_filtered(bus, agent, Box::new(Unfiltered), options, stop)
 }
 
@@ -104,7 +116,9 @@ pub fn run_filtered(
     let mut node = Node::open(bus, agent, filter, options, stop)?;
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
-    let Node { publishers, report, .. } = node;
+    let Node {
+        publishers, report, ..
+    } = node;
     publishers.finish();
     presence.withdraw()?;
     Ok(report)
@@ -135,8 +149,15 @@ impl<'a> Node<'a> {
         options: &'a NodeOptions,
         stop: &Stop,
     ) -> Result<Self, BusError> {
-        let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
-        let (lidar, gnss, imu) = (topic(Stream::Lidar), topic(Stream::Gnss), topic(Stream::Imu));
+        let topic = |stream| Topic::Stream {
+            cav: agent.cav().clone(),
+            stream,
+        };
+        let (lidar, gnss, imu) = (
+            topic(Stream::Lidar),
+            topic(Stream::Gnss),
+            topic(Stream::Imu),
+        );
         // One slot: while a sweep is computed only the newest of those that arrive is kept.
         let inbox = bus.inbox(1, 3 + MAX_EGOS);
         stop.on_request({
@@ -178,10 +199,18 @@ impl<'a> Node<'a> {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
             self.publishers.describe();
-            let deadline = self.pairing.deadline().unwrap_or(self.publishers.next_descriptor);
-            match self.inbox.take(Some(deadline.min(self.publishers.next_descriptor))) {
+            let deadline = self
+                .pairing
+                .deadline()
+                .unwrap_or(self.publishers.next_descriptor);
+            match self
+                .inbox
+                .take(Some(deadline.min(self.publishers.next_descriptor)))
+            {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(arrival),
-                Pop::Item(topic, Event::End { .. }) if topic == self.lidar && !self.options.keeps_running => {
+                Pop::Item(topic, Event::End { .. })
+                    if topic == self.lidar && !self.options.keeps_running =>
+                {
                     // Everything that still waits for a pose has waited for the time-out.
                     self.advance(Instant::now() + POSE_TIMEOUT);
                     return;
@@ -196,25 +225,44 @@ impl<'a> Node<'a> {
 
     fn admit(&mut self, arrival: Arrival) {
         let capture_nanos = arrival.header.stamp.capture_nanos;
-        if let Topic::Stream { cav, stream: Stream::Pace } = &arrival.topic {
+        if let Topic::Stream {
+            cav,
+            stream: Stream::Pace,
+        } = &arrival.topic
+        {
             if let Some(pace) = self.inbox.decode::<Pace>(&arrival, &self.options.limits) {
                 self.follow_pace(cav, pace);
             }
-        } else if arrival.topic == self.lidar && !self.selection.admits(capture_nanos, Instant::now()) {
+        } else if arrival.topic == self.lidar
+            && !self.selection.admits(capture_nanos, Instant::now())
+        {
             self.bus.stats().dropped(&self.lidar, DropReason::Paced);
         } else if arrival.topic == self.lidar {
-            let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
+            let superseded = self
+                .pairing
+                .add_sweep(capture_nanos, arrival, Instant::now());
             if superseded.is_some() {
-                self.bus.stats().dropped(&self.lidar, DropReason::Superseded);
+                self.bus
+                    .stats()
+                    .dropped(&self.lidar, DropReason::Superseded);
             }
         } else if arrival.topic == self.imu {
             if let Some(motion) = self.inbox.decode(&arrival, &self.options.limits) {
                 let motions = self.pairing.add_motion(capture_nanos, motion);
-                self.count_unused(Unused { motions, ..Unused::default() });
+                self.count_unused(Unused {
+                    motions,
+                    ..Unused::default()
+                });
             }
-        } else if let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(&arrival, &self.options.limits) {
+        } else if let Some(Gnss {
+            world_from_lidar, ..
+        }) = self.inbox.decode(&arrival, &self.options.limits)
+        {
             let poses = self.pairing.add_pose(capture_nanos, world_from_lidar);
-            self.count_unused(Unused { poses, ..Unused::default() });
+            self.count_unused(Unused {
+                poses,
+                ..Unused::default()
+            });
         }
     }
 
@@ -230,7 +278,11 @@ impl<'a> Node<'a> {
 
     /// An ego whose stream of paces has ended has left.
     fn forget_pace(&mut self, topic: &Topic) {
-        if let Topic::Stream { cav, stream: Stream::Pace } = topic {
+        if let Topic::Stream {
+            cav,
+            stream: Stream::Pace,
+        } = topic
+        {
             self.selection.forget(cav);
         }
     }
@@ -243,13 +295,26 @@ impl<'a> Node<'a> {
     }
 
     fn advance(&mut self, now: Instant) {
-        while let Some(PairedSweep { capture_nanos, sweep, pose, motion, unused }) = self.pairing.next(now) {
+        while let Some(PairedSweep {
+            capture_nanos,
+            sweep,
+            pose,
+            motion,
+            unused,
+        }) = self.pairing.next(now)
+        {
             self.count_unused(unused);
             let used = [(&self.gnss, pose.is_some()), (&self.imu, motion.is_some())];
-            used.iter().filter(|(_, is_used)| *is_used).for_each(|(topic, _)| self.bus.stats().received(topic));
+            used.iter()
+                .filter(|(_, is_used)| *is_used)
+                .for_each(|(topic, _)| self.bus.stats().received(topic));
             let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
-            let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
-            self.bus.stats().timed("lidar transport", Duration::from_nanos(transport));
+            let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else {
+                continue;
+            };
+            self.bus
+                .stats()
+                .timed("lidar transport", Duration::from_nanos(transport));
             self.bus.stats().received(&self.lidar);
             let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
             self.process(&AgentInput {
@@ -259,7 +324,11 @@ impl<'a> Node<'a> {
                 motion: motion.unwrap_or_default(),
             });
             // Logged after everything is submitted.
-            if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
+            if let Some(Err(error)) = self
+                .sweep_log
+                .as_mut()
+                .map(|log| log.note(capture_nanos, arrived_nanos))
+            {
                 tracing::warn!("arrivals of sweeps are no longer logged: {error}");
                 self.sweep_log = None;
             }
@@ -285,14 +354,22 @@ impl<'a> Node<'a> {
                 stats.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
                 let perception = self.filter.perception(perception);
-                let shared = self.publishers.points.is_some().then(|| self.agent.share_points(input.cloud));
+                let shared = self
+                    .publishers
+                    .points
+                    .is_some()
+                    .then(|| self.agent.share_points(input.cloud));
                 let shared = shared.map(|points| self.filter.points(points));
-                self.publishers.submit(input, pose, perception, shared, stats);
+                self.publishers
+                    .submit(input, pose, perception, shared, stats);
                 self.observe(input);
             }
             Err(error) => {
                 self.report.failed += 1;
-                tracing::error!(capture_nanos = input.capture_nanos, "cannot compute a sweep: {error}");
+                tracing::error!(
+                    capture_nanos = input.capture_nanos,
+                    "cannot compute a sweep: {error}"
+                );
             }
         }
     }
@@ -310,7 +387,9 @@ impl Node<'_> {
 
     fn time_pose_stages(&self) {
         for stage in self.agent.pose_stages() {
-            self.bus.stats().timed(&stage.stage, Duration::from_nanos(stage.nanos));
+            self.bus
+                .stats()
+                .timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
     }
 }
@@ -333,9 +412,21 @@ struct Publishers {
 
 impl Publishers {
     fn open(bus: &Bus, agent: &Agent, options: &NodeOptions) -> Result<Self, BusError> {
-        let publisher = |stream, how| bus.publisher(Topic::Stream { cav: agent.cav().clone(), stream }, how);
+        let publisher = |stream, how| {
+            bus.publisher(
+                Topic::Stream {
+                    cav: agent.cav().clone(),
+                    stream,
+                },
+                how,
+            )
+        };
         let wanted = |stream| {
-            options.publish.contains(&stream).then(|| publisher(stream, PublisherOptions::FEATURES)).transpose()
+            options
+                .publish
+                .contains(&stream)
+                .then(|| publisher(stream, PublisherOptions::FEATURES))
+                .transpose()
         };
         let detector = agent.detector();
         let description = Descriptor {
@@ -343,7 +434,9 @@ impl Publishers {
             grid: detector.grid(),
             channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
             dtype: options.codec.dtype,
-            streams: std::iter::once(Stream::Pose).chain(options.publish.iter().copied()).collect(),
+            streams: std::iter::once(Stream::Pose)
+                .chain(options.publish.iter().copied())
+                .collect(),
         };
         Ok(Self {
             pose: publisher(Stream::Pose, PublisherOptions::POSE)?,
@@ -375,17 +468,33 @@ impl Publishers {
         shared: Option<PointCloud>,
         stats: &MessageStats,
     ) {
-        let Perception { features, confidence, detections, .. } = perception;
+        let Perception {
+            features,
+            confidence,
+            detections,
+            ..
+        } = perception;
         if let Some(bev) = &self.bev {
-            let (codec, rate, stats, topic) = (self.codec, Arc::clone(&self.rate), stats.clone(), bev.topic().clone());
-            let (number, submitted, capture_nanos) = (self.submitted, Instant::now(), input.capture_nanos);
+            let (codec, rate, stats, topic) = (
+                self.codec,
+                Arc::clone(&self.rate),
+                stats.clone(),
+                bev.topic().clone(),
+            );
+            let (number, submitted, capture_nanos) =
+                (self.submitted, Instant::now(), input.capture_nanos);
             self.submitted += 1;
             // The choice of format, selection, quantisation and compression run on the sending thread, at the map's
             // turn.
             bev.submit_encoded(capture_nanos, move |stamp| {
-                let turn = Turn { number, submitted, begun: Instant::now() };
+                let turn = Turn {
+                    number,
+                    submitted,
+                    begun: Instant::now(),
+                };
                 let mut rate = rate.lock().unwrap_or_else(PoisonError::into_inner);
-                let features = rate.encode(features, &codec, &confidence, capture_nanos, Some(&turn))?;
+                let features =
+                    rate.encode(features, &codec, &confidence, capture_nanos, Some(&turn))?;
                 if let Some(choice) = features.rate {
                     stats.adapted(&topic, choice.reason);
                 }
@@ -396,12 +505,25 @@ impl Publishers {
             boxes.submit(input.capture_nanos, Boxes { pose, detections });
         }
         if let (Some(points), Some(shared)) = (&self.points, shared) {
-            points.submit(input.capture_nanos, Points { pose, points: shared });
+            points.submit(
+                input.capture_nanos,
+                Points {
+                    pose,
+                    points: shared,
+                },
+            );
         }
     }
 
     fn finish(self) {
-        let Self { pose, bev, boxes, points, descriptor, .. } = self;
+        let Self {
+            pose,
+            bev,
+            boxes,
+            points,
+            descriptor,
+            ..
+        } = self;
         let streams = [Some(pose), bev, boxes, points, Some(descriptor)];
         streams.into_iter().flatten().for_each(Publisher::finish);
     }

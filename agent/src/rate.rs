@@ -10,7 +10,9 @@
 use std::time::{Duration, Instant};
 
 use protocol::codec::{HEAD_BYTES, encode_within, largest_message, smallest_message};
-use protocol::{BevFeatures, ByteLimit, CodecConfig, EncodedFeatures, LimitedBy, WireError, encode_features};
+use protocol::{
+    BevFeatures, ByteLimit, CodecConfig, EncodedFeatures, LimitedBy, WireError, encode_features,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +30,9 @@ const SMALLEST_SHARE: f64 = 1.0 / 128.0;
 
 /// Limits that feature maps are fitted to: first in a coarser number format, then with fewer cells, the most confident
 /// ones.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args,
+)]
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Rate control of feature maps")]
 pub struct RateConfig {
@@ -67,7 +71,10 @@ impl RateControl {
     /// State before the first map.
     #[must_use]
     pub(crate) fn new(config: RateConfig) -> Self {
-        Self { config, ..Self::default() }
+        Self {
+            config,
+            ..Self::default()
+        }
     }
 
     /// Encodes a feature map as `codec` specifies, or smaller if a limit requires it; the message records format and
@@ -99,26 +106,48 @@ impl RateControl {
         capture_nanos: u64,
         turn: Option<&Turn>,
     ) -> Result<Option<ByteLimit>, WireError> {
-        let RateConfig { message_bytes, bytes_per_second, watch_queue } = self.config;
-        let size = message_bytes.map(|bytes| ByteLimit { bytes, by: LimitedBy::MessageSize });
+        let RateConfig {
+            message_bytes,
+            bytes_per_second,
+            watch_queue,
+        } = self.config;
+        let size = message_bytes.map(|bytes| ByteLimit {
+            bytes,
+            by: LimitedBy::MessageSize,
+        });
         let on_air_nanos = self.nanos_since_last(capture_nanos);
-        let rate =
-            bytes_per_second.map(|rate| ByteLimit { bytes: bytes_within(rate, on_air_nanos), by: LimitedBy::ByteRate });
+        let rate = bytes_per_second.map(|rate| ByteLimit {
+            bytes: bytes_within(rate, on_air_nanos),
+            by: LimitedBy::ByteRate,
+        });
         let queue = match turn.filter(|_| watch_queue) {
             Some(turn) => {
-                let (smallest, largest) = (smallest_message(features)?, largest_message(features, codec)?);
-                Some(ByteLimit { bytes: self.queue.allow(turn, smallest, largest), by: LimitedBy::Queue })
+                let (smallest, largest) = (
+                    smallest_message(features)?,
+                    largest_message(features, codec)?,
+                );
+                Some(ByteLimit {
+                    bytes: self.queue.allow(turn, smallest, largest),
+                    by: LimitedBy::Queue,
+                })
             }
             None => None,
         };
-        Ok([size, rate, queue].into_iter().flatten().min_by_key(|limit| limit.bytes))
+        Ok([size, rate, queue]
+            .into_iter()
+            .flatten()
+            .min_by_key(|limit| limit.bytes))
     }
 
     /// The transmission time that belongs to a map; also where the clock of the scene jumps.
     fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
         let last = self.last_capture_nanos.replace(capture_nanos);
-        let since = last.and_then(|last| capture_nanos.checked_sub(last)).filter(|nanos| *nanos > 0);
-        since.map_or(LONGEST_TRANSMISSION_NANOS, |nanos| nanos.min(LONGEST_TRANSMISSION_NANOS))
+        let since = last
+            .and_then(|last| capture_nanos.checked_sub(last))
+            .filter(|nanos| *nanos > 0);
+        since.map_or(LONGEST_TRANSMISSION_NANOS, |nanos| {
+            nanos.min(LONGEST_TRANSMISSION_NANOS)
+        })
     }
 }
 
@@ -147,7 +176,10 @@ impl QueueWatch {
         let floor = (largest as f64 * SMALLEST_SHARE).max(2.0 * smallest as f64);
         if let Some(last) = self.last.replace(*turn) {
             let submissions = turn.number.saturating_sub(last.number).max(1);
-            let period = turn.submitted.saturating_duration_since(last.submitted).div_f64(submissions as f64);
+            let period = turn
+                .submitted
+                .saturating_duration_since(last.submitted)
+                .div_f64(submissions as f64);
             let waited = turn.begun.saturating_duration_since(turn.submitted);
             self.allowed = if submissions > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
                 let took = turn.begun.saturating_duration_since(last.begun);
@@ -172,20 +204,50 @@ mod tests {
 
     use super::*;
 
-    const GRID: BevGrid = BevGrid { x_min_m: -25.6, y_min_m: -19.2, cell_m: 0.8, width: 64, height: 48 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -25.6,
+        y_min_m: -19.2,
+        cell_m: 0.8,
+        width: 64,
+        height: 48,
+    };
     const CHANNELS: u32 = 16;
     /// Size of a map `[16, 48, 64]` as `f32`.
     const FULL_BYTES: u64 = 4 * 16 * 48 * 64;
 
     fn map() -> (BevFeatures, Vec<f32>) {
-        let values = (0..CHANNELS as usize * GRID.cells()).map(|n| (n as f32 * 0.31).cos()).collect();
-        let confidence = (0..GRID.cells()).map(|cell| (cell * 101 % 997) as f32 / 997.0).collect();
-        (BevFeatures { grid: GRID, channels: CHANNELS, code_of: None, values }, confidence)
+        let values = (0..CHANNELS as usize * GRID.cells())
+            .map(|n| (n as f32 * 0.31).cos())
+            .collect();
+        let confidence = (0..GRID.cells())
+            .map(|cell| (cell * 101 % 997) as f32 / 997.0)
+            .collect();
+        (
+            BevFeatures {
+                grid: GRID,
+                channels: CHANNELS,
+                code_of: None,
+                values,
+            },
+            confidence,
+        )
     }
 
-    fn encode(control: &mut RateControl, capture_nanos: u64, turn: Option<&Turn>) -> EncodedFeatures {
+    fn encode(
+        control: &mut RateControl,
+        capture_nanos: u64,
+        turn: Option<&Turn>,
+    ) -> EncodedFeatures {
         let (features, confidence) = map();
-        control.encode(features, &CodecConfig::default(), &confidence, capture_nanos, turn).unwrap()
+        control
+            .encode(
+                features,
+                &CodecConfig::default(),
+                &confidence,
+                capture_nanos,
+                turn,
+            )
+            .unwrap()
     }
 
     /// Maps at 10 Hz over a sender that takes `bytes_per_second(second)`; each sent one with its waiting time.
@@ -199,9 +261,18 @@ mod tests {
 
     impl SlowLink {
         fn new() -> Self {
-            let control = RateControl::new(RateConfig { watch_queue: true, ..RateConfig::default() });
+            let control = RateControl::new(RateConfig {
+                watch_queue: true,
+                ..RateConfig::default()
+            });
             let start = Instant::now();
-            Self { control, start, free: start, number: 0, waiting: None }
+            Self {
+                control,
+                start,
+                free: start,
+                number: 0,
+                waiting: None,
+            }
         }
 
         /// Runs `frames` more; sizes and waiting times of the maps that were sent, and the number that was superseded.
@@ -222,10 +293,19 @@ mod tests {
         }
 
         fn send(&mut self, bytes_per_second: f64, sent: &mut Vec<(u64, Duration)>) {
-            let Some((number, submitted)) = self.waiting.take() else { return };
+            let Some((number, submitted)) = self.waiting.take() else {
+                return;
+            };
             let begun = self.free.max(submitted);
-            let turn = Turn { number, submitted, begun };
-            let bytes = HEAD_BYTES + encode(&mut self.control, 100_000_000 * number, Some(&turn)).body.len() as u64;
+            let turn = Turn {
+                number,
+                submitted,
+                begun,
+            };
+            let bytes = HEAD_BYTES
+                + encode(&mut self.control, 100_000_000 * number, Some(&turn))
+                    .body
+                    .len() as u64;
             self.free = begun + Duration::from_secs_f64(bytes as f64 / bytes_per_second);
             sent.push((bytes, begun - submitted));
         }
@@ -234,17 +314,35 @@ mod tests {
     #[test]
     fn without_a_limit_maps_are_written_as_they_are() {
         let encoded = encode(&mut RateControl::default(), 0, None);
-        assert_eq!((encoded.codec.selection, encoded.rate), (Selection::Dense, None));
-        let mut watching = RateControl::new(RateConfig { watch_queue: true, ..RateConfig::default() });
-        assert_eq!(encode(&mut watching, 0, None).rate, None, "there is no queue to watch");
+        assert_eq!(
+            (encoded.codec.selection, encoded.rate),
+            (Selection::Dense, None)
+        );
+        let mut watching = RateControl::new(RateConfig {
+            watch_queue: true,
+            ..RateConfig::default()
+        });
+        assert_eq!(
+            encode(&mut watching, 0, None).rate,
+            None,
+            "there is no queue to watch"
+        );
     }
 
     #[test]
     fn a_byte_rate_is_shared_out_by_capture_time() {
-        let config = RateConfig { bytes_per_second: Some(1_000_000), ..RateConfig::default() };
+        let config = RateConfig {
+            bytes_per_second: Some(1_000_000),
+            ..RateConfig::default()
+        };
         let mut control = RateControl::new(config);
         let limits: Vec<u64> = [500, 550, 650, 5000, 100]
-            .map(|ms: u64| encode(&mut control, ms * 1_000_000, None).rate.unwrap().limit_bytes)
+            .map(|ms: u64| {
+                encode(&mut control, ms * 1_000_000, None)
+                    .rate
+                    .unwrap()
+                    .limit_bytes
+            })
             .into();
         // The first has a full period, a later one the time passed, none more than a period; a scene may restart.
         assert_eq!(limits, [100_000, 50_000, 100_000, 100_000, 100_000]);
@@ -252,13 +350,21 @@ mod tests {
 
     #[test]
     fn the_tightest_limit_holds() {
-        let config =
-            RateConfig { message_bytes: Some(60_000), bytes_per_second: Some(1_000_000), ..RateConfig::default() };
+        let config = RateConfig {
+            message_bytes: Some(60_000),
+            bytes_per_second: Some(1_000_000),
+            ..RateConfig::default()
+        };
         let mut control = RateControl::new(config);
         let choice = |encoded: EncodedFeatures| (encoded.codec.dtype, encoded.rate.unwrap().reason);
-        assert_eq!(choice(encode(&mut control, 0, None)), (Dtype::I8, RateReason::SizeCoarser));
+        assert_eq!(
+            choice(encode(&mut control, 0, None)),
+            (Dtype::I8, RateReason::SizeCoarser)
+        );
         let closer = encode(&mut control, 40_000_000, None);
-        assert!(matches!(closer.codec.selection, Selection::TopK { .. }) && closer.body.len() <= 40_000);
+        assert!(
+            matches!(closer.codec.selection, Selection::TopK { .. }) && closer.body.len() <= 40_000
+        );
         assert_eq!(choice(closer), (Dtype::I8, RateReason::RateFewerCells));
     }
 
@@ -266,7 +372,13 @@ mod tests {
     fn a_slow_link_makes_maps_smaller_and_a_fast_one_full_again() {
         let mut link = SlowLink::new();
         let (sent, superseded) = link.drive(20, 20e6);
-        assert!(superseded == 0 && sent.iter().all(|(bytes, _)| *bytes == FULL_BYTES + HEAD_BYTES), "{sent:?}");
+        assert!(
+            superseded == 0
+                && sent
+                    .iter()
+                    .all(|(bytes, _)| *bytes == FULL_BYTES + HEAD_BYTES),
+            "{sent:?}"
+        );
 
         // 200 kB a second: 20 kB a period, a tenth of a full map.
         let (sent, superseded) = link.drive(100, 200e3);
@@ -275,7 +387,12 @@ mod tests {
         let settled = &sent[20..];
         let mean = settled.iter().map(|(bytes, _)| *bytes).sum::<u64>() / settled.len() as u64;
         assert!((14_000..21_000).contains(&mean), "{mean}");
-        assert!(settled.iter().all(|(_, waited)| *waited < Duration::from_millis(80)), "{settled:?}");
+        assert!(
+            settled
+                .iter()
+                .all(|(_, waited)| *waited < Duration::from_millis(80)),
+            "{settled:?}"
+        );
 
         let (sent, superseded) = link.drive(60, 20e6);
         assert_eq!(superseded, 0);
@@ -289,7 +406,10 @@ mod tests {
         let mut link = SlowLink::new();
         let (sent, _) = link.drive(600, 20e3);
         let smallest = sent.iter().map(|(bytes, _)| *bytes).min().unwrap();
-        assert!(smallest > FULL_BYTES / 150 && smallest < FULL_BYTES / 50, "{smallest}");
+        assert!(
+            smallest > FULL_BYTES / 150 && smallest < FULL_BYTES / 50,
+            "{smallest}"
+        );
     }
 
     #[test]

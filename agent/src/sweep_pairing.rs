@@ -78,7 +78,9 @@ impl<S> SweepPairing<S> {
     /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
     pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
-        self.waiting.replace((capture_nanos, sweep, now)).map(|(_, superseded, _)| superseded)
+        self.waiting
+            .replace((capture_nanos, sweep, now))
+            .map(|(_, superseded, _)| superseded)
     }
 
     /// The sweep, if there is nothing left to wait for.
@@ -94,13 +96,21 @@ impl<S> SweepPairing<S> {
         self.expects_pose = pose.is_some() || !self.poses.0.is_empty();
         self.expects_motion = motion.is_some();
         let (_, sweep, _) = self.waiting.take()?;
-        Some(PairedSweep { capture_nanos, sweep, pose, motion, unused: Unused { poses, motions } })
+        Some(PairedSweep {
+            capture_nanos,
+            sweep,
+            pose,
+            motion,
+            unused: Unused { poses, motions },
+        })
     }
 
     /// Time of the next call of [`Self::next`] if nothing arrives.
     #[must_use]
     pub(crate) fn deadline(&self) -> Option<Instant> {
-        self.waiting.as_ref().map(|(_, _, since)| *since + self.timeout)
+        self.waiting
+            .as_ref()
+            .map(|(_, _, since)| *since + self.timeout)
     }
 }
 
@@ -144,7 +154,9 @@ impl<T> CaptureBuffer<T> {
     /// Removes the measurements of later sweeps.
     fn take_later(&mut self, capture_nanos: u64) -> BTreeMap<u64, T> {
         // No capture time is later than the largest one.
-        capture_nanos.checked_add(1).map_or_else(BTreeMap::new, |next| self.0.split_off(&next))
+        capture_nanos
+            .checked_add(1)
+            .map_or_else(BTreeMap::new, |next| self.0.split_off(&next))
     }
 }
 
@@ -155,16 +167,33 @@ mod tests {
     const TIMEOUT: Duration = Duration::from_millis(200);
 
     fn without_motion() -> SweepPairing<char> {
-        SweepPairing { expects_motion: false, ..SweepPairing::new(TIMEOUT) }
+        SweepPairing {
+            expects_motion: false,
+            ..SweepPairing::new(TIMEOUT)
+        }
     }
 
     fn at(x_m: f64) -> Pose {
         Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0)
     }
 
-    fn paired(pairing: &mut SweepPairing<char>, now: Instant) -> Option<(u64, char, Option<f64>, usize)> {
-        let PairedSweep { capture_nanos, sweep, pose, unused, .. } = pairing.next(now)?;
-        Some((capture_nanos, sweep, pose.map(|pose| pose.translation_m[0]), unused.poses))
+    fn paired(
+        pairing: &mut SweepPairing<char>,
+        now: Instant,
+    ) -> Option<(u64, char, Option<f64>, usize)> {
+        let PairedSweep {
+            capture_nanos,
+            sweep,
+            pose,
+            unused,
+            ..
+        } = pairing.next(now)?;
+        Some((
+            capture_nanos,
+            sweep,
+            pose.map(|pose| pose.translation_m[0]),
+            unused.poses,
+        ))
     }
 
     #[test]
@@ -188,28 +217,49 @@ mod tests {
         assert_eq!(pairing.add_sweep(30, 'c', now), None);
         assert_eq!(paired(&mut pairing, now), None);
         assert_eq!(pairing.deadline(), Some(now + TIMEOUT));
-        assert_eq!(paired(&mut pairing, now + TIMEOUT), Some((30, 'c', None, 1)), "the pose of 20 has no sweep");
+        assert_eq!(
+            paired(&mut pairing, now + TIMEOUT),
+            Some((30, 'c', None, 1)),
+            "the pose of 20 has no sweep"
+        );
     }
 
     #[test]
     fn a_restarted_scene_is_not_mistaken_for_one_with_lost_poses() {
         let (mut pairing, now) = (without_motion(), Instant::now());
-        assert_eq!(pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)), 0);
-        assert_eq!(pairing.add_pose(10, at(1.0)), 2, "those of the old scene are dropped and counted");
+        assert_eq!(
+            pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)),
+            0
+        );
+        assert_eq!(
+            pairing.add_pose(10, at(1.0)),
+            2,
+            "those of the old scene are dropped and counted"
+        );
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
         assert_eq!(paired(&mut pairing, now), None, "its own may still arrive");
         assert_eq!(pairing.add_pose(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 1)));
         assert_eq!(pairing.add_pose(30, at(3.0)), 0);
-        assert_eq!(pairing.add_pose(30, at(4.0)), 1, "nor is one of the same time lost silently");
+        assert_eq!(
+            pairing.add_pose(30, at(4.0)),
+            1,
+            "nor is one of the same time lost silently"
+        );
     }
 
     #[test]
     fn the_largest_capture_time_has_no_later_poses() {
         let (mut pairing, now) = (without_motion(), Instant::now());
-        assert_eq!(pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)), 0);
+        assert_eq!(
+            pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)),
+            0
+        );
         assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
-        assert_eq!(paired(&mut pairing, now), Some((u64::MAX, 'z', Some(2.0), 1)));
+        assert_eq!(
+            paired(&mut pairing, now),
+            Some((u64::MAX, 'z', Some(2.0), 1))
+        );
         assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
         assert_eq!(paired(&mut pairing, now), None);
     }
@@ -228,7 +278,10 @@ mod tests {
         let (mut pairing, now) = (without_motion(), Instant::now());
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), None, "there may be a receiver");
-        assert_eq!(paired(&mut pairing, now + TIMEOUT), Some((10, 'a', None, 0)));
+        assert_eq!(
+            paired(&mut pairing, now + TIMEOUT),
+            Some((10, 'a', None, 0))
+        );
         assert_eq!(pairing.add_sweep(20, 'b', now), None);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', None, 0)));
         assert_eq!(pairing.add_pose(30, at(3.0)), 0);
@@ -239,7 +292,10 @@ mod tests {
     #[test]
     fn a_vehicle_with_a_motion_sensor_waits_for_it_and_one_without_does_not() {
         let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
-        let speed = |speed_mps| EgoMotion { speed_mps: Some(speed_mps), yaw_rate_rad_s: None };
+        let speed = |speed_mps| EgoMotion {
+            speed_mps: Some(speed_mps),
+            yaw_rate_rad_s: None,
+        };
         let sweep = |pairing: &mut SweepPairing<char>, capture_nanos| {
             assert_eq!(pairing.add_pose(capture_nanos, at(1.0)), 0);
             assert_eq!(pairing.add_sweep(capture_nanos, 'a', now), None);
@@ -249,10 +305,22 @@ mod tests {
         assert_eq!(pairing.next(now + TIMEOUT).unwrap().motion, None);
         sweep(&mut pairing, 12);
         assert_eq!(pairing.next(now).unwrap().motion, None, "there is none");
-        assert_eq!(pairing.add_motion(15, speed(5.0)) + pairing.add_motion(20, speed(6.0)), 0);
+        assert_eq!(
+            pairing.add_motion(15, speed(5.0)) + pairing.add_motion(20, speed(6.0)),
+            0
+        );
         sweep(&mut pairing, 20);
         let paired = pairing.next(now).unwrap();
-        assert_eq!((paired.motion, paired.unused), (Some(speed(6.0)), Unused { poses: 0, motions: 1 }));
+        assert_eq!(
+            (paired.motion, paired.unused),
+            (
+                Some(speed(6.0)),
+                Unused {
+                    poses: 0,
+                    motions: 1
+                }
+            )
+        );
         sweep(&mut pairing, 30);
         assert_eq!(pairing.next(now), None, "its motion may still arrive");
         assert_eq!(pairing.next(now + TIMEOUT).unwrap().motion, None);

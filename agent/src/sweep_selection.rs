@@ -34,8 +34,17 @@ impl SweepSelection {
             return false;
         }
         // Egos repeat their pace, which does not begin anew.
-        let last = known.filter(|known| known.pace == pace).and_then(|known| known.last);
-        self.paces.insert(ego.clone(), Followed { pace, last, heard: now });
+        let last = known
+            .filter(|known| known.pace == pace)
+            .and_then(|known| known.last);
+        self.paces.insert(
+            ego.clone(),
+            Followed {
+                pace,
+                last,
+                heard: now,
+            },
+        );
         true
     }
 
@@ -70,12 +79,21 @@ impl SweepSelection {
 mod tests {
     use super::*;
 
-    fn computed(selection: &mut SweepSelection, sweeps: std::ops::Range<u64>, now: Instant) -> Vec<u64> {
-        sweeps.filter(|sweep| selection.admits(sweep * 100_000_000, now)).collect()
+    fn computed(
+        selection: &mut SweepSelection,
+        sweeps: std::ops::Range<u64>,
+        now: Instant,
+    ) -> Vec<u64> {
+        sweeps
+            .filter(|sweep| selection.admits(sweep * 100_000_000, now))
+            .collect()
     }
 
     fn every(sweeps: u64) -> Pace {
-        Pace { interval_nanos: sweeps * 100_000_000, phase_nanos: 300_000_000 }
+        Pace {
+            interval_nanos: sweeps * 100_000_000,
+            phase_nanos: 300_000_000,
+        }
     }
 
     #[test]
@@ -87,7 +105,11 @@ mod tests {
         assert_eq!(computed(&mut early, 3..12, now), [3, 6, 9]);
         assert_eq!(computed(&mut late, 0..4, now), [0, 1, 2, 3]);
         assert!(late.follow(&ego, every(3), now));
-        assert_eq!(computed(&mut late, 4..12, now), [4, 6, 9], "from the next interval on");
+        assert_eq!(
+            computed(&mut late, 4..12, now),
+            [4, 6, 9],
+            "from the next interval on"
+        );
         assert!(late.follow(&ego, Pace::EVERY_SWEEP, now));
         assert_eq!(computed(&mut late, 12..15, now), [12, 13, 14]);
     }
@@ -111,11 +133,17 @@ mod tests {
         assert_eq!(computed(&mut selection, 3..7, now), [3, 4, 5, 6]);
         selection.forget(&faster);
         assert_eq!(computed(&mut selection, 7..15, now), [7, 9, 11, 13]);
-        assert!(selection.follow(&slow, every(4), later), "it repeats its pace");
+        assert!(
+            selection.follow(&slow, every(4), later),
+            "it repeats its pace"
+        );
         assert_eq!(computed(&mut selection, 15..19, later), [15, 17]);
         let silent = later + Duration::from_millis(1);
         assert_eq!(computed(&mut selection, 19..27, silent), [19, 23]);
-        assert_eq!(computed(&mut selection, 27..30, silent + MAX_SILENCE), [27, 28, 29]);
+        assert_eq!(
+            computed(&mut selection, 27..30, silent + MAX_SILENCE),
+            [27, 28, 29]
+        );
     }
 
     #[test]
@@ -124,7 +152,10 @@ mod tests {
         let ego = |number: usize| CavId::new(&number.to_string()).unwrap();
         assert!((0..MAX_EGOS).all(|number| selection.follow(&ego(number), every(2), now)));
         assert!(!selection.follow(&ego(MAX_EGOS), every(1), now));
-        assert!(selection.follow(&ego(0), every(3), now), "known ones may change");
+        assert!(
+            selection.follow(&ego(0), every(3), now),
+            "known ones may change"
+        );
         selection.forget(&ego(0));
         assert!(selection.follow(&ego(MAX_EGOS), every(1), now));
     }

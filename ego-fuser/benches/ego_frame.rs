@@ -80,12 +80,20 @@ fn main() -> Result<(), Failure> {
     malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)?;
     tch::set_num_threads(1);
     let arguments = Arguments::parse();
-    let scenario = dataset::open(&arguments.scene)?.scenarios.into_iter().next().ok_or("no scenario")?;
+    let scenario = dataset::open(&arguments.scene)?
+        .scenarios
+        .into_iter()
+        .next()
+        .ok_or("no scenario")?;
     let mut boxes = String::new();
     for &method in &arguments.methods {
         // Boxes and single vehicles have the weights of `none`.
         let named = arguments.weights.join(format!("lean-{method}.safetensors"));
-        let weights = if named.exists() { named } else { arguments.weights.join("lean-none.safetensors") };
+        let weights = if named.exists() {
+            named
+        } else {
+            arguments.weights.join("lean-none.safetensors")
+        };
         for &vehicles in &arguments.vehicles {
             let weights = Weights::load(&weights)?.with_precision(arguments.precision);
             let frames = sent(&scenario, &weights, method, [vehicles, arguments.frames])?;
@@ -109,15 +117,24 @@ fn main() -> Result<(), Failure> {
 }
 
 /// Computes one frame and lowers the fastest time of each stage, milliseconds; returns the boxes as text.
-fn timed(ego: &mut Ego, frame: &[Sent], best: &mut BTreeMap<String, f64>) -> Result<String, Failure> {
+fn timed(
+    ego: &mut Ego,
+    frame: &[Sent],
+    best: &mut BTreeMap<String, f64>,
+) -> Result<String, Failure> {
     let mut times = StageTimes::start();
-    let views = frame.iter().map(Sent::received).collect::<Result<Vec<View>, Failure>>()?;
+    let views = frame
+        .iter()
+        .map(Sent::received)
+        .collect::<Result<Vec<View>, Failure>>()?;
     times.lap("decode");
     let start = Instant::now();
     let output = ego.detect(&views[0], &views[1..])?;
     let whole_ms = start.elapsed().as_secs_f64() * 1e3;
     let stages = times.into_timings().into_iter().chain(output.stages);
-    let mut all: Vec<(String, f64)> = stages.map(|stage| (stage.stage.clone(), stage.nanos as f64 * 1e-6)).collect();
+    let mut all: Vec<(String, f64)> = stages
+        .map(|stage| (stage.stage.clone(), stage.nanos as f64 * 1e-6))
+        .collect();
     let staged_ms: f64 = all.iter().skip(1).map(|(_, ms)| ms).sum();
     all.push(("keep".to_owned(), whole_ms - staged_ms));
     all.push(("whole".to_owned(), whole_ms + all[0].1));
@@ -127,20 +144,38 @@ fn timed(ego: &mut Ego, frame: &[Sent], best: &mut BTreeMap<String, f64>) -> Res
     }
     let text = |found: &protocol::Detection| {
         let [x, y, _] = found.box3d.center_m;
-        format!("{:.4} {x:.3} {y:.3} {:.4}", found.score, found.box3d.heading_rad)
+        format!(
+            "{:.4} {x:.3} {y:.3} {:.4}",
+            found.score, found.box3d.heading_rad
+        )
     };
-    Ok(output.detections.iter().map(text).collect::<Vec<_>>().join("; "))
+    Ok(output
+        .detections
+        .iter()
+        .map(text)
+        .collect::<Vec<_>>()
+        .join("; "))
 }
 
 impl Sent {
     /// As the ego's node hands it to the pipeline.
     fn received(&self) -> Result<View, Failure> {
-        let View { cav, pose, capture_nanos, content } = &self.view;
+        let View {
+            cav,
+            pose,
+            capture_nanos,
+            content,
+        } = &self.view;
         let content = match &self.features {
             Some(features) => Content::Features(features.clone().decode(&Limits::default())?),
             None => content.clone(),
         };
-        Ok(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content })
+        Ok(View {
+            cav: cav.clone(),
+            pose: *pose,
+            capture_nanos: *capture_nanos,
+            content,
+        })
     }
 }
 
@@ -154,7 +189,9 @@ fn sent(
     let mut random = ChaCha8Rng::seed_from_u64(vehicles as u64);
     let mut agents = Vec::new();
     for cav in scenario.agents.iter().take(vehicles) {
-        let source = PoseSourceConfig::Recorded.for_scenario(&scenario.name).build(Inference::default())?;
+        let source = PoseSourceConfig::Recorded
+            .for_scenario(&scenario.name)
+            .build(Inference::default())?;
         agents.push(Agent::new(
             cav.clone(),
             source,
@@ -166,7 +203,13 @@ fn sent(
         let loaded = scenario.load_tick(tick, 0..vehicles, &LoadOptions::default());
         let mut sent = Vec::with_capacity(vehicles);
         for (agent, frame) in &loaded.frames {
-            sent.push(message(&mut agents[*agent], frame, method, *agent == 0, &mut random)?);
+            sent.push(message(
+                &mut agents[*agent],
+                frame,
+                method,
+                *agent == 0,
+                &mut random,
+            )?);
         }
         all.push(sent);
     }
@@ -187,25 +230,47 @@ fn message(
         motion: frame.motion(),
     };
     let mut pose = agent.estimate_pose(&input);
-    if let PoseEstimate::Pose { world_from_cav, confidence, .. } = &mut pose {
+    if let PoseEstimate::Pose {
+        world_from_cav,
+        confidence,
+        ..
+    } = &mut pose
+    {
         let [x, y, z] = world_from_cav.translation_m;
         let mut error = |most: f64| random.random_range(-most..most);
         let place = [x + error(POSE_ERROR_M), y + error(POSE_ERROR_M), z];
-        *world_from_cav = Pose::from_xyz_yaw(place, world_from_cav.yaw_rad() + error(HEADING_ERROR_RAD));
+        *world_from_cav =
+            Pose::from_xyz_yaw(place, world_from_cav.yaw_rad() + error(HEADING_ERROR_RAD));
         *confidence = CONFIDENCE;
     }
     let (content, features) = match method.own_content() {
         Exchange::Points => (Content::Points(agent.share_points(&frame.points)), None),
-        Exchange::Boxes => (Content::Boxes(agent.perceive(&frame.points)?.detections), None),
+        Exchange::Boxes => (
+            Content::Boxes(agent.perceive(&frame.points)?.detections),
+            None,
+        ),
         Exchange::Features | Exchange::Nothing => {
             let perception = agent.perceive(&frame.points)?;
             let gate = method.gate().filter(|_| !is_ego);
-            let codec = CodecConfig { gate, ..CodecConfig::default() };
-            let features = agent.write_map(perception.features, &perception.confidence, &codec, frame.capture_nanos)?;
+            let codec = CodecConfig {
+                gate,
+                ..CodecConfig::default()
+            };
+            let features = agent.write_map(
+                perception.features,
+                &perception.confidence,
+                &codec,
+                frame.capture_nanos,
+            )?;
             (Content::Boxes(Vec::new()), Some(features))
         }
     };
-    let view = View { cav: frame.cav.clone(), pose, capture_nanos: frame.capture_nanos, content };
+    let view = View {
+        cav: frame.cav.clone(),
+        pose,
+        capture_nanos: frame.capture_nanos,
+        content,
+    };
     Ok(Sent { view, features })
 }
 
@@ -213,7 +278,14 @@ fn message(
 fn print(method: Method, vehicles: usize, best: &[BTreeMap<String, f64>]) {
     let full = &best[best.len().min(3) - 1..];
     let stages = full.last().into_iter().flat_map(BTreeMap::keys);
-    let mean = |stage: &String| full.iter().filter_map(|frame| frame.get(stage)).sum::<f64>() / full.len() as f64;
-    let texts: Vec<String> = stages.map(|stage| format!("{stage} {:.2}", mean(stage))).collect();
+    let mean = |stage: &String| {
+        full.iter()
+            .filter_map(|frame| frame.get(stage))
+            .sum::<f64>()
+            / full.len() as f64
+    };
+    let texts: Vec<String> = stages
+        .map(|stage| format!("{stage} {:.2}", mean(stage)))
+        .collect();
     println!("{method}/{vehicles}: {} ms", texts.join(", "));
 }

@@ -27,7 +27,12 @@ pub struct EgoConfig {
     #[serde(default)]
     pub method: Option<Method>,
     /// Neighbours that may take part. None named: all that are discovered.
-    #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "IDS",
+        value_delimiter = ',',
+        allow_hyphen_values = true
+    )]
     #[serde(default)]
     pub neighbours: Vec<CavId>,
     /// Communication range: neighbours farther away are ignored, metres in the plane.
@@ -61,7 +66,13 @@ fn comm_range_m() -> f64 {
 #[serde(default, deny_unknown_fields)]
 pub struct EgoSettings {
     /// The vehicle that fuses. Absent in a scenario: the first of its scene.
-    #[arg(id = "ego", long = "ego", value_name = "ID", required_unless_present = "config", allow_hyphen_values = true)]
+    #[arg(
+        id = "ego",
+        long = "ego",
+        value_name = "ID",
+        required_unless_present = "config",
+        allow_hyphen_values = true
+    )]
     pub id: Option<CavId>,
     /// Longest time that a frame waits for its neighbours, from the arrival of the own agent's message, milliseconds.
     #[arg(long, value_name = "MS")]
@@ -83,7 +94,9 @@ pub struct EgoSettings {
 }
 
 /// Sweeps that the vehicles of a fleet compute.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 #[value(rename_all = "snake_case")]
 pub enum PaceMode {
@@ -139,7 +152,11 @@ impl ProcessConfig for EgoConfig {
         self.models.validate()?;
         self.ego.validate()?;
         if self.ego.id.is_none() {
-            return Err(FieldError::new("ego.id", "absent", "must name the vehicle that fuses (--ego)"));
+            return Err(FieldError::new(
+                "ego.id",
+                "absent",
+                "must name the vehicle that fuses (--ego)",
+            ));
         }
         within("comm_range_m", self.comm_range_m, 0.0, 1e5)?;
         self.bus.validate()

@@ -13,7 +13,9 @@ use perception::boxes::decode::Decoded;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::Detector;
 use perception::weights::{METHOD_KEY, Weights};
-use protocol::{CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
+use protocol::{
+    CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming,
+};
 use support::stage_times::StageTimes;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
@@ -80,7 +82,11 @@ impl Ego {
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn from_weights(weights: &Weights, method: Option<Method>, device: Device) -> Result<Self, EgoError> {
+    pub fn from_weights(
+        weights: &Weights,
+        method: Option<Method>,
+        device: Device,
+    ) -> Result<Self, EgoError> {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
@@ -96,28 +102,45 @@ impl Ego {
     /// # Errors
     /// [`EgoError::Fusion`] when no fusion can be built behind the detector.
     pub fn new(detector: Detector, method: Method) -> Result<Self, EgoError> {
-        let fusion = FusionStage::untrained(method, detector.config(), detector.device()).map_err(StageError::from)?;
+        let fusion = FusionStage::untrained(method, detector.config(), detector.device())
+            .map_err(StageError::from)?;
         Ok(Self::assembled(detector, method, fusion))
     }
 
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
         let history = History::new(fusion.requirements().history.frames);
-        Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
+        Self {
+            method,
+            detector,
+            fusion,
+            history,
+            trust: None,
+            limits,
+            comm_range_m: Self::COMM_RANGE_M,
+        }
     }
 
     /// The same with another communication range: neighbours farther away, metres in the plane, are ignored.
     #[must_use]
     pub fn with_comm_range(self, comm_range_m: f64) -> Self {
-        Self { comm_range_m, ..self }
+        Self {
+            comm_range_m,
+            ..self
+        }
     }
 
     /// The same with misbehaviour detection: leaves out neighbours whose messages contradict the ego's perception.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn with_misbehaviour_detection(mut self, config: Option<MisbehaviourConfig>) -> Result<Self, EgoError> {
-        self.trust = config.map(|config| MisbehaviourDetector::new(config, &mut self.detector)).transpose()?;
+    pub fn with_misbehaviour_detection(
+        mut self,
+        config: Option<MisbehaviourConfig>,
+    ) -> Result<Self, EgoError> {
+        self.trust = config
+            .map(|config| MisbehaviourDetector::new(config, &mut self.detector))
+            .transpose()?;
         Ok(self)
     }
 
@@ -154,12 +177,21 @@ impl Ego {
             Exchange::Points => Content::Points(PointCloud::default()),
             Exchange::Features | Exchange::Nothing => {
                 let [channels, height, width] = self.detector.sent_shape();
-                let map = Tensor::f_zeros([1, channels, height, width], (Kind::Float, Device::Cpu))?;
-                Content::Features(DecodedFeatures { features: self.detector.to_message(&map)?, sent: None })
+                let map =
+                    Tensor::f_zeros([1, channels, height, width], (Kind::Float, Device::Cpu))?;
+                Content::Features(DecodedFeatures {
+                    features: self.detector.to_message(&map)?,
+                    sent: None,
+                })
             }
         };
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
-        let view = |capture_nanos| View { cav: cav.clone(), pose, capture_nanos, content: content.clone() };
+        let view = |capture_nanos| View {
+            cav: cav.clone(),
+            pose,
+            capture_nanos,
+            content: content.clone(),
+        };
         // Twice: methods with a history use the first frame in the second.
         for capture_nanos in [0, 100_000_000] {
             self.detect(&view(capture_nanos), &[view(capture_nanos)])?;
@@ -175,10 +207,17 @@ impl Ego {
     pub fn detect(&mut self, own: &View, neighbours: &[View]) -> Result<EgoOutput, EgoError> {
         let needed = self.method.own_content();
         if own.content.exchange() != needed {
-            return Err(EgoError::OwnContent { method: self.method, needed, found: own.content.exchange() });
+            return Err(EgoError::OwnContent {
+                method: self.method,
+                needed,
+                found: own.content.exchange(),
+            });
         }
         self.history.advance(own.capture_nanos);
-        let mut aligned = vec![Aligned { view: own, ego_from_cav: Pose::IDENTITY }];
+        let mut aligned = vec![Aligned {
+            view: own,
+            ego_from_cav: Pose::IDENTITY,
+        }];
         let mut fused = Vec::new();
         let mut skipped = Vec::new();
         for (index, view) in neighbours.iter().enumerate() {
@@ -196,7 +235,9 @@ impl Ego {
             let found = self.judge(&aligned)?;
             let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
             let left_out = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
-            skipped.extend(left_out.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Misbehaviour))));
+            skipped.extend(
+                left_out.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Misbehaviour))),
+            );
             beliefs = fused.iter().copied().zip(found).collect();
             fused = keep(fused, &is_out);
             let mut others = keep(aligned.split_off(1), &is_out);
@@ -208,14 +249,27 @@ impl Ego {
             Exchange::Points => self.merge_points(&aligned, &mut stages),
             Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
         })?;
-        Ok(EgoOutput { detections, fused, skipped, beliefs, stages: stages.into_timings() })
+        Ok(EgoOutput {
+            detections,
+            fused,
+            skipped,
+            beliefs,
+            stages: stages.into_timings(),
+        })
     }
 
     /// Assessment of each of the neighbours, which follow the ego itself.
     fn judge(&mut self, aligned: &[Aligned<'_>]) -> Result<Vec<Assessment>, EgoError> {
-        let Some(trust) = &mut self.trust else { return Ok(Vec::new()) };
-        let neighbours: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
-        Ok(no_grad(|| trust.judge(aligned[0].view, &neighbours, &mut self.detector))?)
+        let Some(trust) = &mut self.trust else {
+            return Ok(Vec::new());
+        };
+        let neighbours: Vec<(&View, Pose)> = aligned[1..]
+            .iter()
+            .map(|view| (view.view, view.ego_from_cav))
+            .collect();
+        Ok(no_grad(|| {
+            trust.judge(aligned[0].view, &neighbours, &mut self.detector)
+        })?)
     }
 
     /// Pose of a neighbour relative to the ego, or the reason why it is left out.
@@ -226,7 +280,8 @@ impl Ego {
         let no_pose = Skipped::Unusable(DropReason::NoPose);
         let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
-        let [dx, dy] = [0, 1].map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
+        let [dx, dy] = [0, 1]
+            .map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
         if dx.hypot(dy) > self.comm_range_m {
             return Err(Skipped::Unusable(DropReason::OutOfRange));
         }
@@ -252,16 +307,28 @@ impl Ego {
     }
 
     /// Intermediate fusion, and ego-only detection.
-    fn merge_features(&mut self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
-        let (mut maps, mut sent) = (Vec::with_capacity(aligned.len()), Vec::with_capacity(aligned.len()));
+    fn merge_features(
+        &mut self,
+        aligned: &[Aligned<'_>],
+        stages: &mut StageTimes,
+    ) -> Result<Vec<Detection>, EgoError> {
+        let (mut maps, mut sent) = (
+            Vec::with_capacity(aligned.len()),
+            Vec::with_capacity(aligned.len()),
+        );
         for Aligned { view, .. } in aligned {
-            let Content::Features(map) = &view.content else { continue };
+            let Content::Features(map) = &view.content else {
+                continue;
+            };
             let (values, cells) = self.tensors(map, maps.is_empty())?;
             maps.push(values);
             sent.push(cells);
         }
-        let mut metadata: Vec<MapMetadata> =
-            aligned.iter().enumerate().map(|(agent, view)| view.metadata(agent, aligned[0].view)).collect();
+        let mut metadata: Vec<MapMetadata> = aligned
+            .iter()
+            .enumerate()
+            .map(|(agent, view)| view.metadata(agent, aligned[0].view))
+            .collect();
         if let Some(pose_graph) = &self.fusion.requirements().pose_graph {
             box_correction::correct_by_boxes(&mut metadata, &maps, &self.detector, pose_graph)?;
             stages.lap("correct");
@@ -278,7 +345,9 @@ impl Ego {
             });
         }
         let newest = ReceivedMaps::new(one_after_another(&maps)?, Some(one_after_another(&sent)?));
-        let earlier = (!earlier.is_empty()).then(|| ReceivedMaps::together(&earlier)).transpose()?;
+        let earlier = (!earlier.is_empty())
+            .then(|| ReceivedMaps::together(&earlier))
+            .transpose()?;
         let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
         let fused = f64_tensor::as_batch(&self.fusion.fuse(&on_grid)?.map)?;
@@ -306,11 +375,14 @@ impl Ego {
     /// The kept maps of the vehicles that take part, with their poses in the ego's current frame. An ego without a pose
     /// has none.
     fn earlier(&self, aligned: &[Aligned<'_>]) -> Vec<(usize, &KeptMap, Pose)> {
-        let Some(world_from_ego) = aligned[0].view.pose.world_from_cav() else { return Vec::new() };
+        let Some(world_from_ego) = aligned[0].view.pose.world_from_cav() else {
+            return Vec::new();
+        };
         let of_agent = |(agent, Aligned { view, .. }): (usize, &Aligned<'_>)| {
             let place = |kept: &KeptMap| world_from_ego.from_world(&kept.world_from_cav);
             let kept = self.history.before(&view.cav, view.capture_nanos);
-            kept.map(|kept| (agent, kept, place(kept))).collect::<Vec<_>>()
+            kept.map(|kept| (agent, kept, place(kept)))
+                .collect::<Vec<_>>()
         };
         aligned.iter().enumerate().flat_map(of_agent).collect()
     }
@@ -326,22 +398,37 @@ impl Ego {
             return Ok(());
         }
         for ((Aligned { view, .. }, (map, sent)), index) in aligned.iter().zip(maps).zip(0..) {
-            let Some(world_from_cav) = view.pose.world_from_cav().copied() else { continue };
+            let Some(world_from_cav) = view.pose.world_from_cav().copied() else {
+                continue;
+            };
             let confidence = f64::from(view.pose.confidence());
             let turned = on_grid.received.only(index, index + 1)?;
-            let map = self.fusion.kept(&ReceivedMaps::new(map, Some(sent)), &turned)?;
-            let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, map };
+            let map = self
+                .fusion
+                .kept(&ReceivedMaps::new(map, Some(sent)), &turned)?;
+            let kept = KeptMap {
+                capture_nanos: view.capture_nanos,
+                world_from_cav,
+                confidence,
+                map,
+            };
             self.history.keep(&view.cav, kept);
         }
         Ok(())
     }
 
     /// Early fusion: one cloud in the ego frame.
-    fn merge_points(&mut self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
-        let clouds = aligned.iter().filter_map(|Aligned { view, .. }| match &view.content {
-            Content::Points(points) => Some(points),
-            Content::Features(_) | Content::Boxes(_) => None,
-        });
+    fn merge_points(
+        &mut self,
+        aligned: &[Aligned<'_>],
+        stages: &mut StageTimes,
+    ) -> Result<Vec<Detection>, EgoError> {
+        let clouds = aligned
+            .iter()
+            .filter_map(|Aligned { view, .. }| match &view.content {
+                Content::Points(points) => Some(points),
+                Content::Features(_) | Content::Boxes(_) => None,
+            });
         let poses: Vec<Pose> = aligned.iter().map(|view| view.ego_from_cav).collect();
         let merged = merge_points(clouds, &poses);
         stages.lap("align");
@@ -355,28 +442,53 @@ impl Ego {
     fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Vec<Detection> {
         let decoded: Vec<(Vec<Decoded>, Isometry3<f64>)> = (aligned.iter())
             .map(|Aligned { view, ego_from_cav }| {
-                let found = if let Content::Boxes(found) = &view.content { found.as_slice() } else { &[] };
-                let found = found.iter().filter(|found| found.score > self.limits.score_threshold);
-                let boxes = found.map(|found| Decoded { anchor: 0, score: found.score, box3d: found.box3d });
+                let found = if let Content::Boxes(found) = &view.content {
+                    found.as_slice()
+                } else {
+                    &[]
+                };
+                let found = found
+                    .iter()
+                    .filter(|found| found.score > self.limits.score_threshold);
+                let boxes = found.map(|found| Decoded {
+                    anchor: 0,
+                    score: found.score,
+                    box3d: found.box3d,
+                });
                 (boxes.collect(), ego_from_cav.isometry())
             })
             .collect();
         let boxes: Vec<AgentBoxes<'_>> = (decoded.iter())
-            .map(|(boxes, output_from_agent)| AgentBoxes { boxes, output_from_agent: *output_from_agent })
+            .map(|(boxes, output_from_agent)| AgentBoxes {
+                boxes,
+                output_from_agent: *output_from_agent,
+            })
             .collect();
         let merged = postprocess(&boxes, &self.limits);
-        let detections =
-            merged.iter().map(|found| found.detection(Some(aligned[found.agent].view.cav.clone()))).collect();
+        let detections = merged
+            .iter()
+            .map(|found| found.detection(Some(aligned[found.agent].view.cav.clone())))
+            .collect();
         stages.lap("boxes");
         detections
     }
 
-    fn boxes_of(&self, features: &Tensor, stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
+    fn boxes_of(
+        &self,
+        features: &Tensor,
+        stages: &mut StageTimes,
+    ) -> Result<Vec<Detection>, EgoError> {
         let heads = self.detector.heads(features)?;
         stages.lap("head");
         let decoded = self.detector.boxes(&heads, self.limits.score_threshold)?;
-        let boxes = AgentBoxes { boxes: &decoded, output_from_agent: Isometry3::identity() };
-        let detections = postprocess(&[boxes], &self.limits).iter().map(|found| found.detection(None)).collect();
+        let boxes = AgentBoxes {
+            boxes: &decoded,
+            output_from_agent: Isometry3::identity(),
+        };
+        let detections = postprocess(&[boxes], &self.limits)
+            .iter()
+            .map(|found| found.detection(None))
+            .collect();
         stages.lap("boxes");
         Ok(detections)
     }
@@ -392,7 +504,11 @@ fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
 
 /// The items that are not marked.
 fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
-    items.into_iter().zip(is_out).filter_map(|(item, is_out)| (!is_out).then_some(item)).collect()
+    items
+        .into_iter()
+        .zip(is_out)
+        .filter_map(|(item, is_out)| (!is_out).then_some(item))
+        .collect()
 }
 
 /// A view and its pose.
@@ -405,14 +521,25 @@ impl Aligned<'_> {
     fn metadata(&self, agent: usize, ego: &View) -> MapMetadata {
         let confidence = f64::from(self.view.pose.confidence());
         let age_secs = self.view.age_nanos(ego) as f64 * 1e-9;
-        MapMetadata { agent, ego_from_cav: self.ego_from_cav, confidence, age_secs }
+        MapMetadata {
+            agent,
+            ego_from_cav: self.ego_from_cav,
+            confidence,
+            age_secs,
+        }
     }
 }
 
 /// `[1, 1, H, W]`: 1 where the sender sent its cell. The ego has all of its own map.
-fn sent_cells(map: &DecodedFeatures, is_ego: bool, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
+fn sent_cells(
+    map: &DecodedFeatures,
+    is_ego: bool,
+    [height, width]: [i64; 2],
+) -> Result<Tensor, TchError> {
     match &map.sent {
-        Some(sent) if !is_ego => Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width]),
+        Some(sent) if !is_ego => Tensor::f_from_slice(sent)?
+            .f_to_kind(Kind::Float)?
+            .f_view([1, 1, height, width]),
         _ => Tensor::f_ones([1, 1, height, width], (Kind::Float, Device::Cpu)),
     }
 }

@@ -20,5 +20,8 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    exit_code(parse_beside::<CommandLine>(&command::OFFLINE).command.run(), BusError::is_behind)
+    exit_code(
+        parse_beside::<CommandLine>(&command::OFFLINE).command.run(),
+        BusError::is_behind,
+    )
 }

@@ -37,9 +37,16 @@ struct Member {
 /// always received directly.
 pub(crate) fn topic_of(ego: &CavId, cav: &CavId, stream: Stream, over_link: bool) -> Topic {
     if over_link && cav != ego {
-        Topic::Received { ego: ego.clone(), cav: cav.clone(), stream }
+        Topic::Received {
+            ego: ego.clone(),
+            cav: cav.clone(),
+            stream,
+        }
     } else {
-        Topic::Stream { cav: cav.clone(), stream }
+        Topic::Stream {
+            cav: cav.clone(),
+            stream,
+        }
     }
 }
 
@@ -63,7 +70,15 @@ impl Neighbourhood {
     ) -> Result<Self, BusError> {
         let membership = Membership::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
         let (members, queue) = (BTreeMap::new(), Queue::default());
-        Ok(Self { ego: ego.clone(), streams, over_link, allowed, membership, members, queue })
+        Ok(Self {
+            ego: ego.clone(),
+            streams,
+            over_link,
+            allowed,
+            membership,
+            members,
+            queue,
+        })
     }
 
     /// Handles agents that joined and left; returns those that left.
@@ -88,16 +103,30 @@ impl Neighbourhood {
 
     fn subscribe(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
         tracing::info!(%cav, "a neighbour has joined");
-        let topics = self.streams.iter().map(|&stream| topic_of(&self.ego, &cav, stream, self.over_link));
-        let subscriptions = topics.map(|topic| bus.subscribe(topic, inbox)).collect::<Result<_, _>>()?;
-        self.members.insert(cav, Member { silent_frames: 0, _subscriptions: subscriptions });
+        let topics = self
+            .streams
+            .iter()
+            .map(|&stream| topic_of(&self.ego, &cav, stream, self.over_link));
+        let subscriptions = topics
+            .map(|topic| bus.subscribe(topic, inbox))
+            .collect::<Result<_, _>>()?;
+        self.members.insert(
+            cav,
+            Member {
+                silent_frames: 0,
+                _subscriptions: subscriptions,
+            },
+        );
         Ok(())
     }
 
     fn is_wanted(&self, cav: &CavId) -> bool {
         *cav != self.ego
             && !self.members.contains_key(cav)
-            && self.allowed.as_ref().is_none_or(|allowed| allowed.contains(cav))
+            && self
+                .allowed
+                .as_ref()
+                .is_none_or(|allowed| allowed.contains(cav))
     }
 
     /// All current members.
@@ -107,7 +136,10 @@ impl Neighbourhood {
 
     /// Members whose messages a frame waits for.
     pub(crate) fn awaited(&self) -> impl Iterator<Item = &CavId> {
-        self.members.iter().filter(|(_, member)| member.silent_frames < SILENT_AFTER).map(|(cav, _)| cav)
+        self.members
+            .iter()
+            .filter(|(_, member)| member.silent_frames < SILENT_AFTER)
+            .map(|(cav, _)| cav)
     }
 
     /// Records a message from `cav`.
@@ -142,7 +174,11 @@ impl Queue {
 
     /// The vehicle that has waited longest, if there is capacity beside so many members.
     fn next(&mut self, members: usize) -> Option<CavId> {
-        if members < MAX_NEIGHBOURS { self.0.pop_front() } else { None }
+        if members < MAX_NEIGHBOURS {
+            self.0.pop_front()
+        } else {
+            None
+        }
     }
 }
 
@@ -157,7 +193,9 @@ mod tests {
     #[test]
     fn a_vehicle_that_joined_beyond_the_limit_gets_the_next_free_place() {
         let mut queue = Queue::default();
-        [0, 1, 2, 1].into_iter().for_each(|number| queue.add(cav(number)));
+        [0, 1, 2, 1]
+            .into_iter()
+            .for_each(|number| queue.add(cav(number)));
         assert_eq!(queue.next(MAX_NEIGHBOURS), None);
         assert_eq!(queue.next(MAX_NEIGHBOURS - 1), Some(cav(0)));
         queue.remove(&cav(1));

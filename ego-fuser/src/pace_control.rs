@@ -48,15 +48,26 @@ impl PaceControl {
     }
 
     /// Judges a frame of the own agent that waited for another one. Returns the pace if that changes.
-    pub(crate) fn judge(&mut self, capture_nanos: u64, waited: Duration, now: Instant) -> Option<Pace> {
-        let gap_nanos = self.last_nanos.replace(capture_nanos).and_then(|last| capture_nanos.checked_sub(last));
+    pub(crate) fn judge(
+        &mut self,
+        capture_nanos: u64,
+        waited: Duration,
+        now: Instant,
+    ) -> Option<Pace> {
+        let gap_nanos = self
+            .last_nanos
+            .replace(capture_nanos)
+            .and_then(|last| capture_nanos.checked_sub(last));
         // The first frame, or one of a scene that has restarted.
         let gap_nanos = gap_nanos.filter(|gap| *gap > 0)?;
-        let period_nanos = self.period_nanos.map_or(gap_nanos, |period| period.min(gap_nanos));
+        let period_nanos = self
+            .period_nanos
+            .map_or(gap_nanos, |period| period.min(gap_nanos));
         self.period_nanos = Some(period_nanos);
         let interval_nanos = period_nanos.saturating_mul(self.step);
         let has_waited = waited > Duration::from_nanos(period_nanos / 2);
-        let is_overloaded = has_waited || gap_nanos > interval_nanos.saturating_add(period_nanos / 2);
+        let is_overloaded =
+            has_waited || gap_nanos > interval_nanos.saturating_add(period_nanos / 2);
         if is_overloaded {
             self.quiet_since = now;
         }
@@ -68,17 +79,35 @@ impl PaceControl {
         self.overloaded.clear();
         self.quiet_since = now;
         self.step = step;
-        let interval_nanos = if step == 1 { 0 } else { period_nanos.saturating_mul(step) };
-        Some(Pace { interval_nanos, phase_nanos: capture_nanos })
+        let interval_nanos = if step == 1 {
+            0
+        } else {
+            period_nanos.saturating_mul(step)
+        };
+        Some(Pace {
+            interval_nanos,
+            phase_nanos: capture_nanos,
+        })
     }
 
     /// Another number of sweeps per interval, if it is time for one.
     fn next_step(&mut self, period_nanos: u64, now: Instant) -> Option<u64> {
-        let count = self.overloaded.iter().filter(|is_overloaded| **is_overloaded).count();
+        let count = self
+            .overloaded
+            .iter()
+            .filter(|is_overloaded| **is_overloaded)
+            .count();
         let longer = Duration::from_nanos(period_nanos.saturating_mul(self.step + 1));
         if count >= TOO_MANY && longer <= MAX_INTERVAL {
-            let has_failed = self.shortened_at.take().is_some_and(|at| now < at + PATIENCE[0]);
-            self.patience = if has_failed { (2 * self.patience).min(PATIENCE[1]) } else { PATIENCE[0] };
+            let has_failed = self
+                .shortened_at
+                .take()
+                .is_some_and(|at| now < at + PATIENCE[0]);
+            self.patience = if has_failed {
+                (2 * self.patience).min(PATIENCE[1])
+            } else {
+                PATIENCE[0]
+            };
             return Some(self.step + 1);
         }
         let is_quiet = now >= self.quiet_since + self.patience;
@@ -103,7 +132,8 @@ mod tests {
     fn intervals(needed: u64, seconds: u64) -> Vec<u64> {
         let start = Instant::now();
         let mut control = PaceControl::new(start);
-        let (mut pace, mut free_at, mut last, mut changes) = (Pace::EVERY_SWEEP, 0, None, Vec::new());
+        let (mut pace, mut free_at, mut last, mut changes) =
+            (Pace::EVERY_SWEEP, 0, None, Vec::new());
         for sweep in 0..seconds * 10 {
             let capture_nanos = sweep * SWEEP_NANOS;
             let interval = pace.interval_of(capture_nanos);
@@ -134,7 +164,10 @@ mod tests {
         let mut control = PaceControl::new(start);
         for sweep in 0..100u64 {
             let now = start + Duration::from_millis(100 * sweep);
-            assert_eq!(control.judge(sweep * SWEEP_NANOS, waited(sweep % 6 == 0), now), None);
+            assert_eq!(
+                control.judge(sweep * SWEEP_NANOS, waited(sweep % 6 == 0), now),
+                None
+            );
         }
     }
 
@@ -146,7 +179,9 @@ mod tests {
         while sweep < 3000 {
             let now = start + Duration::from_millis(100 * sweep);
             // Every sweep is too much, every second one is not.
-            if let Some(pace) = control.judge(sweep * SWEEP_NANOS, waited(step == 1 && sweep > 0), now) {
+            if let Some(pace) =
+                control.judge(sweep * SWEEP_NANOS, waited(step == 1 && sweep > 0), now)
+            {
                 step = (pace.interval_nanos / SWEEP_NANOS).max(1);
                 if step == 1 {
                     tries.push(sweep);
@@ -156,7 +191,10 @@ mod tests {
             sweep += step;
         }
         let pauses: Vec<u64> = tries.windows(2).map(|pair| pair[1] - pair[0]).collect();
-        assert!(pauses.windows(2).all(|pair| pair[1] >= pair[0]) && pauses[0] >= 50, "{pauses:?}");
+        assert!(
+            pauses.windows(2).all(|pair| pair[1] >= pair[0]) && pauses[0] >= 50,
+            "{pauses:?}"
+        );
         assert!(pauses.last().unwrap() > &400, "{pauses:?}");
     }
 
@@ -165,7 +203,10 @@ mod tests {
         let start = Instant::now();
         let mut control = PaceControl::new(start);
         for sweep in (0..50).rev() {
-            assert_eq!(control.judge(sweep * SWEEP_NANOS, waited(true), start), None);
+            assert_eq!(
+                control.judge(sweep * SWEEP_NANOS, waited(true), start),
+                None
+            );
         }
     }
 }

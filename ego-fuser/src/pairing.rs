@@ -24,7 +24,11 @@ impl PairingConfig {
     /// Messages of at most that age, half a frame of 10 Hz of lead, eight messages.
     #[must_use]
     pub fn with_max_age_nanos(max_age_nanos: u64) -> Self {
-        Self { max_age_nanos, max_lead_nanos: 50_000_000, depth: 8 }
+        Self {
+            max_age_nanos,
+            max_lead_nanos: 50_000_000,
+            depth: 8,
+        }
     }
 }
 
@@ -70,47 +74,84 @@ impl<T> Pairing<T> {
     /// No messages yet.
     #[must_use]
     pub fn new(config: PairingConfig) -> Self {
-        Self { config, waiting: BTreeMap::new() }
+        Self {
+            config,
+            waiting: BTreeMap::new(),
+        }
     }
 
     /// Queues a message. The message that has to be dropped for it is returned: the message itself when it is a
     /// duplicate or older than one that served already, or the oldest of the queue when that is full.
     #[must_use = "what was dropped has to be counted"]
     pub fn insert(&mut self, cav: &CavId, capture_nanos: u64, message: T) -> Option<Dropped> {
-        let dropped = |capture_nanos, reason| Some(Dropped { cav: cav.clone(), capture_nanos, reason });
+        let dropped = |capture_nanos, reason| {
+            Some(Dropped {
+                cav: cav.clone(),
+                capture_nanos,
+                reason,
+            })
+        };
         let queue = self.waiting.entry(cav.clone()).or_default();
         if queue.iter().any(|held| held.capture_nanos == capture_nanos) {
             return dropped(capture_nanos, DropReason::Duplicate);
         }
-        if queue.iter().any(|held| held.is_used && held.capture_nanos > capture_nanos) {
+        if queue
+            .iter()
+            .any(|held| held.is_used && held.capture_nanos > capture_nanos)
+        {
             return dropped(capture_nanos, DropReason::Superseded);
         }
         // Messages may be reordered by the channel.
         let place = queue.partition_point(|held| held.capture_nanos < capture_nanos);
-        queue.insert(place, Waiting { capture_nanos, is_used: false, message });
+        queue.insert(
+            place,
+            Waiting {
+                capture_nanos,
+                is_used: false,
+                message,
+            },
+        );
         if queue.len() <= self.config.depth.max(1) {
             return None;
         }
         let oldest = queue.pop_front()?;
-        if oldest.is_used { None } else { dropped(oldest.capture_nanos, DropReason::Superseded) }
+        if oldest.is_used {
+            None
+        } else {
+            dropped(oldest.capture_nanos, DropReason::Superseded)
+        }
     }
 
     /// The messages that belong to the ego's frame, by CAV, and those that will never be used.
     pub fn pair(&mut self, ego_capture_nanos: u64) -> (Vec<Paired<'_, T>>, Vec<Dropped>) {
-        let PairingConfig { max_age_nanos, max_lead_nanos, .. } = self.config;
+        let PairingConfig {
+            max_age_nanos,
+            max_lead_nanos,
+            ..
+        } = self.config;
         let latest = ego_capture_nanos.saturating_add(max_lead_nanos);
         let earliest = ego_capture_nanos.saturating_sub(max_age_nanos);
         let mut paired = Vec::new();
         let mut dropped = Vec::new();
         for (cav, queue) in &mut self.waiting {
             let due = queue.partition_point(|held| held.capture_nanos <= latest);
-            let newest = due.checked_sub(1).filter(|&newest| queue[newest].capture_nanos >= earliest);
+            let newest = due
+                .checked_sub(1)
+                .filter(|&newest| queue[newest].capture_nanos >= earliest);
             // All before the newest that is due have missed their frame; without one young enough, so have all.
             for held in queue.drain(..newest.unwrap_or(due)) {
                 let is_old = held.capture_nanos < earliest;
-                let reason = if is_old { DropReason::Stale } else { DropReason::Superseded };
+                let reason = if is_old {
+                    DropReason::Stale
+                } else {
+                    DropReason::Superseded
+                };
                 if !held.is_used {
-                    dropped.push(Dropped { cav: cav.clone(), capture_nanos: held.capture_nanos, reason });
+                    dropped.push(Dropped {
+                        cav: cav.clone(),
+                        capture_nanos: held.capture_nanos,
+                        reason,
+                    });
                 }
             }
             if newest.is_some()
@@ -118,7 +159,12 @@ impl<T> Pairing<T> {
             {
                 let is_first_use = !std::mem::replace(&mut held.is_used, true);
                 let age_nanos = ego_capture_nanos as i64 - held.capture_nanos as i64;
-                paired.push(Paired { cav, age_nanos, is_first_use, message: &held.message });
+                paired.push(Paired {
+                    cav,
+                    age_nanos,
+                    is_first_use,
+                    message: &held.message,
+                });
             }
         }
         (paired, dropped)
@@ -126,7 +172,11 @@ impl<T> Pairing<T> {
 
     /// The capture times of messages of a CAV that wait, oldest first.
     pub fn capture_times(&self, cav: &CavId) -> impl Iterator<Item = u64> + '_ {
-        self.waiting.get(cav).into_iter().flatten().map(|held| held.capture_nanos)
+        self.waiting
+            .get(cav)
+            .into_iter()
+            .flatten()
+            .map(|held| held.capture_nanos)
     }
 
     /// All CAVs with waiting messages.
@@ -138,22 +188,33 @@ impl<T> Pairing<T> {
     /// The clock of the scene was set back to `now_nanos`: removes a CAV's messages of later times, except those up to
     /// `ahead_nanos` early. Returns the number of these that were never used.
     pub(crate) fn turn_back(&mut self, cav: &CavId, now_nanos: u64, ahead_nanos: u64) -> usize {
-        let Some(queue) = self.waiting.get_mut(cav) else { return 0 };
+        let Some(queue) = self.waiting.get_mut(cav) else {
+            return 0;
+        };
         let latest = now_nanos.saturating_add(ahead_nanos);
-        let unused = queue.iter().filter(|held| held.capture_nanos > latest && !held.is_used).count();
+        let unused = queue
+            .iter()
+            .filter(|held| held.capture_nanos > latest && !held.is_used)
+            .count();
         queue.retain(|held| held.capture_nanos <= if held.is_used { now_nanos } else { latest });
         unused
     }
 
     /// Removes a CAV that has left; returns the number of its messages that were never used.
     pub fn forget(&mut self, cav: &CavId) -> usize {
-        self.waiting.remove(cav).map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
+        self.waiting
+            .remove(cav)
+            .map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
     }
 
     /// Messages that wait and were never used, at the end of a run: in flight in the message accounting.
     #[must_use]
     pub fn unused(&self) -> usize {
-        self.waiting.values().flatten().filter(|held| !held.is_used).count()
+        self.waiting
+            .values()
+            .flatten()
+            .filter(|held| !held.is_used)
+            .count()
     }
 }
 
@@ -175,7 +236,10 @@ mod tests {
 
     fn ages(pairing: &mut Pairing<u64>, ego: u64) -> (Vec<i64>, Vec<DropReason>) {
         let (paired, dropped) = pairing.pair(ego);
-        (paired.iter().map(|found| found.age_nanos).collect(), dropped.iter().map(|lost| lost.reason).collect())
+        (
+            paired.iter().map(|found| found.age_nanos).collect(),
+            dropped.iter().map(|lost| lost.reason).collect(),
+        )
     }
 
     #[test]
@@ -197,9 +261,19 @@ mod tests {
             assert_eq!(pairing.insert(&cav("a"), frame * FRAME, frame), None);
         }
         let (paired, dropped) = pairing.pair(11 * FRAME);
-        assert_eq!((*paired[0].message, paired[0].age_nanos, paired[0].is_first_use), (11, 0, true));
         assert_eq!(
-            dropped.iter().map(|lost| (lost.capture_nanos / FRAME, lost.reason)).collect::<Vec<_>>(),
+            (
+                *paired[0].message,
+                paired[0].age_nanos,
+                paired[0].is_first_use
+            ),
+            (11, 0, true)
+        );
+        assert_eq!(
+            dropped
+                .iter()
+                .map(|lost| (lost.capture_nanos / FRAME, lost.reason))
+                .collect::<Vec<_>>(),
             [(10, DropReason::Superseded)]
         );
         assert_eq!(ages(&mut pairing, 12 * FRAME), (vec![0], vec![]));
@@ -211,7 +285,10 @@ mod tests {
         assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
         for (frame, first) in [(10, true), (11, false), (13, false)] {
             let (paired, dropped) = pairing.pair(frame * FRAME);
-            assert_eq!((paired[0].age_nanos, paired[0].is_first_use), ((frame as i64 - 10) * FRAME as i64, first));
+            assert_eq!(
+                (paired[0].age_nanos, paired[0].is_first_use),
+                ((frame as i64 - 10) * FRAME as i64, first)
+            );
             assert!(dropped.is_empty());
         }
         // It was received, so its removal is no loss.
@@ -223,7 +300,10 @@ mod tests {
     fn a_message_that_was_never_young_enough_is_stale() {
         let mut pairing = pairing();
         assert_eq!(pairing.insert(&cav("a"), FRAME, 1), None);
-        assert_eq!(ages(&mut pairing, 9 * FRAME), (vec![], vec![DropReason::Stale]));
+        assert_eq!(
+            ages(&mut pairing, 9 * FRAME),
+            (vec![], vec![DropReason::Stale])
+        );
     }
 
     #[test]
@@ -231,23 +311,37 @@ mod tests {
         let mut pairing = pairing();
         assert_eq!(pairing.insert(&cav("a"), 10 * FRAME + FRAME / 4, 1), None);
         assert_eq!(ages(&mut pairing, 9 * FRAME), (vec![], vec![]));
-        assert_eq!(ages(&mut pairing, 10 * FRAME), (vec![-(FRAME as i64) / 4], vec![]));
+        assert_eq!(
+            ages(&mut pairing, 10 * FRAME),
+            (vec![-(FRAME as i64) / 4], vec![])
+        );
     }
 
     #[test]
     fn duplicates_and_reordered_messages_are_distinguished() {
         let mut pairing = pairing();
         assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
-        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason, DropReason::Duplicate);
+        assert_eq!(
+            pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason,
+            DropReason::Duplicate
+        );
         let _ = pairing.pair(10 * FRAME);
-        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason, DropReason::Duplicate);
-        assert_eq!(pairing.insert(&cav("a"), 9 * FRAME, 9).unwrap().reason, DropReason::Superseded);
+        assert_eq!(
+            pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason,
+            DropReason::Duplicate
+        );
+        assert_eq!(
+            pairing.insert(&cav("a"), 9 * FRAME, 9).unwrap().reason,
+            DropReason::Superseded
+        );
     }
 
     #[test]
     fn a_flood_pushes_the_oldest_out() {
         let mut pairing = pairing();
-        let lost: Vec<_> = (0..20).filter_map(|frame| pairing.insert(&cav("a"), frame * FRAME, frame)).collect();
+        let lost: Vec<_> = (0..20)
+            .filter_map(|frame| pairing.insert(&cav("a"), frame * FRAME, frame))
+            .collect();
         assert_eq!(lost.len(), 12);
         assert_eq!(pairing.capture_times(&cav("a")).next(), Some(12 * FRAME));
         assert_eq!(pairing.forget(&cav("a")), 8);

@@ -77,13 +77,28 @@ impl PeerModels {
 
     fn difference(&self, descriptor: &Descriptor) -> Option<OtherModel> {
         // Its streams and numeric type are not part of the network.
-        let Descriptor { model_hash, grid, channels, dtype: _, streams: _ } = descriptor;
+        let Descriptor {
+            model_hash,
+            grid,
+            channels,
+            dtype: _,
+            streams: _,
+        } = descriptor;
         if *grid != self.grid {
-            Some(OtherModel::Grid { found: *grid, own: self.grid })
+            Some(OtherModel::Grid {
+                found: *grid,
+                own: self.grid,
+            })
         } else if *channels != self.channels {
-            Some(OtherModel::Channels { found: *channels, own: self.channels })
+            Some(OtherModel::Channels {
+                found: *channels,
+                own: self.channels,
+            })
         } else if *model_hash != self.model_hash {
-            Some(OtherModel::Hash { found: *model_hash, own: self.model_hash })
+            Some(OtherModel::Hash {
+                found: *model_hash,
+                own: self.model_hash,
+            })
         } else {
             None
         }
@@ -98,23 +113,63 @@ mod tests {
 
     #[test]
     fn another_network_is_reported_once_until_it_is_the_egos() {
-        let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 128, height: 96 };
+        let grid = BevGrid {
+            x_min_m: -51.2,
+            y_min_m: -38.4,
+            cell_m: 0.8,
+            width: 128,
+            height: 96,
+        };
         let own = ModelHash([7; 32]);
-        let mut models = PeerModels { grid, channels: 64, code_of: None, model_hash: own, others: BTreeMap::new() };
+        let mut models = PeerModels {
+            grid,
+            channels: 64,
+            code_of: None,
+            model_hash: own,
+            others: BTreeMap::new(),
+        };
         let cav = CavId::new("20").unwrap();
-        let same = Descriptor { model_hash: own, grid, channels: 64, dtype: Dtype::I8, streams: vec![Stream::Bev] };
+        let same = Descriptor {
+            model_hash: own,
+            grid,
+            channels: 64,
+            dtype: Dtype::I8,
+            streams: vec![Stream::Bev],
+        };
         assert_eq!(models.update(&cav, &same), None);
         assert!(!models.is_other(&cav));
 
-        let hash = Descriptor { model_hash: ModelHash([8; 32]), ..same.clone() };
+        let hash = Descriptor {
+            model_hash: ModelHash([8; 32]),
+            ..same.clone()
+        };
         let text = models.update(&cav, &hash).unwrap().to_string();
-        assert!(text.contains("model_hash") && text.contains(&"07".repeat(32)) && text.contains(&"08".repeat(32)));
+        assert!(
+            text.contains("model_hash")
+                && text.contains(&"07".repeat(32))
+                && text.contains(&"08".repeat(32))
+        );
         assert_eq!(models.update(&cav, &hash), None, "reported once");
         assert!(models.is_other(&cav));
-        let narrow = Descriptor { channels: 32, ..hash };
-        assert_eq!(models.update(&cav, &narrow), Some(OtherModel::Channels { found: 32, own: 64 }));
-        let wide = Descriptor { grid: BevGrid { width: 256, ..grid }, ..narrow };
-        assert!(models.update(&cav, &wide).unwrap().to_string().starts_with("grid is "));
+        let narrow = Descriptor {
+            channels: 32,
+            ..hash
+        };
+        assert_eq!(
+            models.update(&cav, &narrow),
+            Some(OtherModel::Channels { found: 32, own: 64 })
+        );
+        let wide = Descriptor {
+            grid: BevGrid { width: 256, ..grid },
+            ..narrow
+        };
+        assert!(
+            models
+                .update(&cav, &wide)
+                .unwrap()
+                .to_string()
+                .starts_with("grid is ")
+        );
 
         assert_eq!(models.update(&cav, &same), None);
         assert!(!models.is_other(&cav));

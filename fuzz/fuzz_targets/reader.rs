@@ -14,9 +14,18 @@ fn reader() -> &'static Reader {
         let scratch = tempfile::tempdir().expect("a temporary folder");
         // Not as it was compiled: fuzz/run compiles it once and calls it by many names.
         let program = std::env::args_os().next().unwrap_or_default();
-        let name = Path::new(&program).file_name().unwrap_or_default().to_string_lossy().replace('_', " ");
-        let reader = all(scratch.path()).into_iter().find(|reader| reader.name == name);
-        (scratch, reader.expect("every target is called after a format"))
+        let name = Path::new(&program)
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .replace('_', " ");
+        let reader = all(scratch.path())
+            .into_iter()
+            .find(|reader| reader.name == name);
+        (
+            scratch,
+            reader.expect("every target is called after a format"),
+        )
     });
     reader
 }

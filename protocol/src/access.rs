@@ -45,7 +45,9 @@ pub struct Principal {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PrincipalError {
     /// The text begins with no role.
-    #[error("{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer or ros2")]
+    #[error(
+        "{0:?} is no principal: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder, viewer or ros2"
+    )]
     Role(String),
     /// The role is not followed by a vehicle.
     #[error(transparent)]
@@ -56,7 +58,10 @@ impl Principal {
     /// A process of a vehicle.
     #[must_use]
     pub fn new(role: Role, cav: &CavId) -> Self {
-        Self { role, cav: cav.clone() }
+        Self {
+            role,
+            cav: cav.clone(),
+        }
     }
 
     /// A process that belongs to no vehicle.
@@ -65,7 +70,10 @@ impl Principal {
     /// Never: the names of roles are identifiers.
     #[must_use]
     pub fn of_role(role: Role) -> Self {
-        Self { role, cav: CavId::new(role.as_str()).expect("the name of a role is an identifier") }
+        Self {
+            role,
+            cav: CavId::new(role.as_str()).expect("the name of a role is an identifier"),
+        }
     }
 
     /// Its name in ledgers, routes and certificates.
@@ -81,59 +89,107 @@ impl Principal {
     #[must_use]
     pub fn rights(&self, runs: &RunScope) -> Vec<Permission> {
         let keys = |topic: &dyn fmt::Display| KeyExpr::within(runs, topic);
-        let own = |stream| keys(&Topic::Stream { cav: self.cav.clone(), stream });
+        let own = |stream| {
+            keys(&Topic::Stream {
+                cav: self.cav.clone(),
+                stream,
+            })
+        };
         let everyones = |stream: &dyn fmt::Display| keys(&format_args!("*/{stream}"));
-        let over_link = |stream: &dyn fmt::Display| keys(&format_args!("rx/{}/*/{stream}", self.cav));
+        let over_link =
+            |stream: &dyn fmt::Display| keys(&format_args!("rx/{}/*/{stream}", self.cav));
         let control = |verb| keys(&Topic::Control(verb));
         let (publish, subscribe) = match self.role {
             Role::Agent => {
-                let sensors = SENSORS.into_iter().map(own).chain([keys(&format_args!("{}/camera/*", self.cav))]);
-                (SHARED.map(own).into(), sensors.chain([everyones(&Stream::Pace)]).collect())
+                let sensors = SENSORS
+                    .into_iter()
+                    .map(own)
+                    .chain([keys(&format_args!("{}/camera/*", self.cav))]);
+                (
+                    SHARED.map(own).into(),
+                    sensors.chain([everyones(&Stream::Pace)]).collect(),
+                )
             }
             Role::Ego => {
-                let shared = SHARED.iter().flat_map(|stream| [everyones(stream), over_link(stream)]);
+                let shared = SHARED
+                    .iter()
+                    .flat_map(|stream| [everyones(stream), over_link(stream)]);
                 (DETECTIONS.map(own).into(), shared.collect())
             }
             Role::Link => {
-                let shared = SHARED.iter().chain([&Stream::Gnss]).map(|stream| everyones(stream));
-                (SHARED.iter().map(|stream| over_link(stream)).collect(), shared.collect())
+                let shared = SHARED
+                    .iter()
+                    .chain([&Stream::Gnss])
+                    .map(|stream| everyones(stream));
+                (
+                    SHARED.iter().map(|stream| over_link(stream)).collect(),
+                    shared.collect(),
+                )
             }
             Role::Replay => {
                 let sensors = SENSORS.iter().map(|stream| everyones(stream));
                 let previews = everyones(&Stream::Preview);
-                let own = [keys(&"*/camera/*"), previews, keys(&Topic::Truth), control(Verb::End)];
+                let own = [
+                    keys(&"*/camera/*"),
+                    previews,
+                    keys(&Topic::Truth),
+                    control(Verb::End),
+                ];
                 (
                     sensors.chain(own).collect(),
-                    vec![keys(&"control/*"), keys(&"ready/*"), everyones(&Stream::Detections)],
+                    vec![
+                        keys(&"control/*"),
+                        keys(&"ready/*"),
+                        everyones(&Stream::Detections),
+                    ],
                 )
             }
             Role::Scorer => {
                 let subscribed = [everyones(&Stream::Detections), everyones(&Stream::Pose)];
                 let own = [keys(&Topic::Truth), keys(&"stats/*"), keys(&"control/*")];
-                (vec![keys(&"control/*")], own.into_iter().chain(subscribed).collect())
+                (
+                    vec![keys(&"control/*")],
+                    own.into_iter().chain(subscribed).collect(),
+                )
             }
             Role::Recorder => (Vec::new(), vec![keys(&"**")]),
             Role::Viewer => {
                 use Stream::{Bev, Boxes, Descriptor, Detections, Pose, Preview};
                 let shown = [Pose, Boxes, Detections, Preview, Descriptor, Bev];
                 let shown = shown.iter().map(|stream| everyones(stream));
-                let rest = ["*/camera/*", "rx/*/*/pose", "truth", "stats/*", "control/*"].map(|topic| keys(&topic));
+                let rest = ["*/camera/*", "rx/*/*/pose", "truth", "stats/*", "control/*"]
+                    .map(|topic| keys(&topic));
                 (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
             }
             Role::Ros2 => {
                 let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
-                let subscribed = streams.iter().map(|stream| everyones(stream)).chain([keys(&"stats/*")]);
-                ([Stream::Lidar, Stream::Imu].iter().map(|stream| everyones(stream)).collect(), subscribed.collect())
+                let subscribed = streams
+                    .iter()
+                    .map(|stream| everyones(stream))
+                    .chain([keys(&"stats/*")]);
+                (
+                    [Stream::Lidar, Stream::Imu]
+                        .iter()
+                        .map(|stream| everyones(stream))
+                        .collect(),
+                    subscribed.collect(),
+                )
             }
         };
         let right = |act| move |keys: KeyExpr| Permission { act, keys };
-        let mut rights: Vec<Permission> = publish.into_iter().map(right(Operation::Publish)).collect();
+        let mut rights: Vec<Permission> =
+            publish.into_iter().map(right(Operation::Publish)).collect();
         rights.push(right(Operation::Publish)(keys(&Topic::Ready(self.name()))));
         rights.push(right(Operation::Publish)(keys(&Topic::Stats(self.name()))));
         rights.extend(subscribe.into_iter().map(right(Operation::Subscribe)));
-        rights
-            .push(right(Operation::DeclareLiveliness)(keys(&Topic::Alive { role: self.role, cav: self.cav.clone() })));
-        rights.extend(self.watched().map(|topic| right(Operation::SubscribeLiveliness)(keys(&topic))));
+        rights.push(right(Operation::DeclareLiveliness)(keys(&Topic::Alive {
+            role: self.role,
+            cav: self.cav.clone(),
+        })));
+        rights.extend(
+            self.watched()
+                .map(|topic| right(Operation::SubscribeLiveliness)(keys(&topic))),
+        );
         rights.push(right(Operation::Query)(keys(&crate::key::UNDECLARED)));
         rights
     }
@@ -162,17 +218,37 @@ pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
         Stream::Detections,
     ];
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
-    let selectors = |topics: Vec<String>| topics.iter().map(|topics| KeyExpr::within(&RunScope::Any, topics)).collect();
+    let selectors = |topics: Vec<String>| {
+        topics
+            .iter()
+            .map(|topics| KeyExpr::within(&RunScope::Any, topics))
+            .collect()
+    };
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
-    let small_messages = ["control/*", "ready/*", "stats/*"].map(str::to_owned).into();
-    let small_messages = (selectors(small_messages), 2 * Limits::HARD_METADATA_BYTES as usize);
-    small.into_iter().filter_map(limit).chain([small_messages]).collect()
+    let small_messages = ["control/*", "ready/*", "stats/*"]
+        .map(str::to_owned)
+        .into();
+    let small_messages = (
+        selectors(small_messages),
+        2 * Limits::HARD_METADATA_BYTES as usize,
+    );
+    small
+        .into_iter()
+        .filter_map(limit)
+        .chain([small_messages])
+        .collect()
 }
 
 /// Streams that the replay publishes for vehicles, without cameras.
 const SENSORS: [Stream; 4] = [Stream::Lidar, Stream::Gnss, Stream::Imu, Stream::Radar];
 /// Streams of agents.
-const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Descriptor];
+const SHARED: [Stream; 5] = [
+    Stream::Pose,
+    Stream::Bev,
+    Stream::Boxes,
+    Stream::Points,
+    Stream::Descriptor,
+];
 /// Streams of an ego for all principals.
 const DETECTIONS: [Stream; 3] = [Stream::Detections, Stream::DetectionsJson, Stream::Pace];
 
@@ -189,11 +265,19 @@ impl FromStr for Principal {
     type Err = PrincipalError;
 
     fn from_str(text: &str) -> Result<Self, PrincipalError> {
-        let (role, cav) = text.split_once('-').map_or((text, None), |(role, cav)| (role, Some(cav)));
+        let (role, cav) = text
+            .split_once('-')
+            .map_or((text, None), |(role, cav)| (role, Some(cav)));
         let unknown = || PrincipalError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect());
-        let role = Role::ALL.into_iter().find(|known| known.as_str() == role).ok_or_else(unknown)?;
+        let role = Role::ALL
+            .into_iter()
+            .find(|known| known.as_str() == role)
+            .ok_or_else(unknown)?;
         match cav {
-            Some(cav) => Ok(Self { role, cav: CavId::new(cav)? }),
+            Some(cav) => Ok(Self {
+                role,
+                cav: CavId::new(cav)?,
+            }),
             None => Ok(Self::of_role(role)),
         }
     }
@@ -236,8 +320,13 @@ pub enum Operation {
 
 impl Operation {
     /// Every operation, in order.
-    pub const ALL: [Self; 5] =
-        [Self::Publish, Self::Subscribe, Self::DeclareLiveliness, Self::SubscribeLiveliness, Self::Query];
+    pub const ALL: [Self; 5] = [
+        Self::Publish,
+        Self::Subscribe,
+        Self::DeclareLiveliness,
+        Self::SubscribeLiveliness,
+        Self::Query,
+    ];
 }
 
 /// One operation that a principal may carry out.
@@ -256,18 +345,40 @@ mod tests {
     fn rights(principal: &str, act: Operation) -> Vec<String> {
         let runs = RunScope::One(RunId::new("r1").unwrap());
         let rights = principal.parse::<Principal>().unwrap().rights(&runs);
-        rights.iter().filter(|right| right.act == act).map(|right| right.keys.to_string()).collect()
+        rights
+            .iter()
+            .filter(|right| right.act == act)
+            .map(|right| right.keys.to_string())
+            .collect()
     }
 
     #[test]
     fn principals_are_written_and_read_back() {
-        for text in
-            ["agent-4279", "agent--1", "ego-4279", "link-4279", "replay", "scorer", "recorder", "viewer", "ros2"]
-        {
+        for text in [
+            "agent-4279",
+            "agent--1",
+            "ego-4279",
+            "link-4279",
+            "replay",
+            "scorer",
+            "recorder",
+            "viewer",
+            "ros2",
+        ] {
             let principal: Principal = text.parse().unwrap();
-            assert_eq!((principal.to_string().as_str(), principal.name().as_str()), (text, text));
+            assert_eq!(
+                (principal.to_string().as_str(), principal.name().as_str()),
+                (text, text)
+            );
         }
-        for text in ["", "router", "agent-*", "agent-truth", "agent-4279/bev", "driver-1"] {
+        for text in [
+            "",
+            "router",
+            "agent-*",
+            "agent-truth",
+            "agent-4279/bev",
+            "driver-1",
+        ] {
             assert!(text.parse::<Principal>().is_err(), "{text}");
         }
     }
@@ -281,12 +392,20 @@ mod tests {
                     format!("v2v/r1/stats/{principal}"),
                     format!("v2v/r1/ready/{principal}"),
                 ];
-                assert!(own.iter().any(|own| keys.starts_with(own)), "{principal}: {keys}");
+                assert!(
+                    own.iter().any(|own| keys.starts_with(own)),
+                    "{principal}: {keys}"
+                );
                 assert!(!keys.contains('*'), "{principal}: {keys}");
             }
         }
-        assert!(rights("link-4279", Operation::Publish).contains(&"v2v/r1/rx/4279/*/bev".to_owned()));
-        assert_eq!(rights("agent-4279", Operation::DeclareLiveliness), ["v2v/r1/alive/agent/4279"]);
+        assert!(
+            rights("link-4279", Operation::Publish).contains(&"v2v/r1/rx/4279/*/bev".to_owned())
+        );
+        assert_eq!(
+            rights("agent-4279", Operation::DeclareLiveliness),
+            ["v2v/r1/alive/agent/4279"]
+        );
     }
 
     #[test]
@@ -295,15 +414,27 @@ mod tests {
             .into_iter()
             .filter(|keys| !keys.starts_with("v2v/r1/4279/"))
             .collect();
-        assert_eq!(others, ["v2v/r1/*/pace"], "an ego asks every agent for another pace");
+        assert_eq!(
+            others,
+            ["v2v/r1/*/pace"],
+            "an ego asks every agent for another pace"
+        );
         for principal in ["agent-4279", "ego-4279", "link-4279"] {
-            assert!(!rights(principal, Operation::Subscribe).contains(&"v2v/r1/truth".to_owned()), "{principal}");
+            assert!(
+                !rights(principal, Operation::Subscribe).contains(&"v2v/r1/truth".to_owned()),
+                "{principal}"
+            );
         }
     }
 
     #[test]
     fn rights_hold_in_one_run_or_in_any() {
         let agent: Principal = "agent-1".parse().unwrap();
-        assert!(agent.rights(&RunScope::Any).iter().all(|right| right.keys.as_str().starts_with("v2v/*/")));
+        assert!(
+            agent
+                .rights(&RunScope::Any)
+                .iter()
+                .all(|right| right.keys.as_str().starts_with("v2v/*/"))
+        );
     }
 }

@@ -50,7 +50,13 @@ impl BevGrid {
     /// [`WireError::Value`] for an edge that is not a finite number of plausible size, [`WireError::Limit`] for more
     /// cells than permitted, [`WireError::Shape`] for none.
     pub fn check(&self, limits: &Limits) -> Result<(), WireError> {
-        let Self { x_min_m, y_min_m, cell_m, width, height } = *self;
+        let Self {
+            x_min_m,
+            y_min_m,
+            cell_m,
+            width,
+            height,
+        } = *self;
         let (cell_min, cell_max) = CELL_RANGE_M;
         for (what, value, min, max) in [
             ("grid x_min_m", x_min_m, -MAX_EDGE_M, MAX_EDGE_M),
@@ -58,14 +64,28 @@ impl BevGrid {
             ("grid cell_m", cell_m, cell_min, cell_max),
         ] {
             if !(min..=max).contains(&value) {
-                return Err(WireError::Value { what, index: 0, value, min, max });
+                return Err(WireError::Value {
+                    what,
+                    index: 0,
+                    value,
+                    min,
+                    max,
+                });
             }
         }
         let cells = u64::from(width) * u64::from(height);
         let max = limits.max_cells.min(u32::MAX.into());
         match cells {
-            0 => Err(WireError::Shape { what: "grid cells", expected: 1, found: 0 }),
-            _ if cells > max => Err(WireError::Limit { what: "grid cells", max, found: cells }),
+            0 => Err(WireError::Shape {
+                what: "grid cells",
+                expected: 1,
+                found: 0,
+            }),
+            _ if cells > max => Err(WireError::Limit {
+                what: "grid cells",
+                max,
+                found: cells,
+            }),
             _ => Ok(()),
         }
     }
@@ -73,8 +93,17 @@ impl BevGrid {
 
 impl fmt::Display for BevGrid {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { x_min_m, y_min_m, cell_m, width, height } = self;
-        write!(f, "{width} x {height} cells of {cell_m} m from ({x_min_m}, {y_min_m}) m")
+        let Self {
+            x_min_m,
+            y_min_m,
+            cell_m,
+            width,
+            height,
+        } = self;
+        write!(
+            f,
+            "{width} x {height} cells of {cell_m} m from ({x_min_m}, {y_min_m}) m"
+        )
     }
 }
 

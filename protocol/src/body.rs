@@ -6,7 +6,9 @@ use crate::WireError;
 
 // Bodies are cast, not converted.
 #[cfg(target_endian = "big")]
-compile_error!("message bodies are little-endian in memory; a big-endian target would need a converting copy");
+compile_error!(
+    "message bodies are little-endian in memory; a big-endian target would need a converting copy"
+);
 
 /// Bytes copied and checked at a time: a block stays in the first-level cache for every pass over it. Whole values of
 /// every kind.
@@ -90,13 +92,19 @@ impl BodyShape {
             return Ok(());
         }
         let expected = if body_len < min { min } else { max };
-        Err(WireError::Shape { what: "body bytes", expected, found: body_len })
+        Err(WireError::Shape {
+            what: "body bytes",
+            expected,
+            found: body_len,
+        })
     }
 }
 
 /// A count that overflows matches no length.
 fn exactly(count: u64, size: u64) -> (u64, u64) {
-    count.checked_mul(size).map_or((u64::MAX, 0), |bytes| (bytes, bytes))
+    count
+        .checked_mul(size)
+        .map_or((u64::MAX, 0), |bytes| (bytes, bytes))
 }
 
 /// Reads a payload that consists of many pieces, front to back, and updates the checksum.
@@ -109,10 +117,16 @@ pub(crate) struct PayloadReader<'a> {
 impl<'a> PayloadReader<'a> {
     /// Begins after the first `skip` bytes.
     pub(crate) fn new(pieces: Vec<&'a [u8]>, skip: usize) -> Self {
-        let mut reader = Self { pieces: pieces.into_iter(), piece: &[], crc: Hasher::new() };
+        let mut reader = Self {
+            pieces: pieces.into_iter(),
+            piece: &[],
+            crc: Hasher::new(),
+        };
         let mut left = skip;
         while left > 0 {
-            let Some(run) = reader.next_run(left) else { break };
+            let Some(run) = reader.next_run(left) else {
+                break;
+            };
             left -= run.len();
         }
         reader
@@ -132,7 +146,9 @@ impl<'a> PayloadReader<'a> {
     pub(crate) fn read_bytes(&mut self, len: usize) -> Vec<u8> {
         let mut out = Vec::with_capacity(len);
         while out.len() < len {
-            let Some(run) = self.next_run(BLOCK_BYTES.min(len - out.len())) else { break };
+            let Some(run) = self.next_run(BLOCK_BYTES.min(len - out.len())) else {
+                break;
+            };
             self.crc.update(run);
             out.extend_from_slice(run);
         }
@@ -144,11 +160,20 @@ impl<'a> PayloadReader<'a> {
     ///
     /// # Errors
     /// [`WireError::Shape`] when the length does not match the shape.
-    pub(crate) fn read_body(&mut self, len: u64, shape: BodyShape, max_abs: f32) -> Result<(Body, bool), WireError> {
+    pub(crate) fn read_body(
+        &mut self,
+        len: u64,
+        shape: BodyShape,
+        max_abs: f32,
+    ) -> Result<(Body, bool), WireError> {
         shape.check(len)?;
         let len = usize::try_from(len).map_err(|_| {
             let max = usize::MAX as u64;
-            WireError::Limit { what: "body bytes", max, found: len }
+            WireError::Limit {
+                what: "body bytes",
+                max,
+                found: len,
+            }
         })?;
         Ok(match shape {
             BodyShape::Empty => (Body::Empty, true),
@@ -205,9 +230,13 @@ impl<'a> PayloadReader<'a> {
     fn fill(&mut self, bytes: &mut [u8]) -> bool {
         let mut left = bytes;
         while !left.is_empty() {
-            let Some(run) = self.next_run(left.len()) else { return false };
+            let Some(run) = self.next_run(left.len()) else {
+                return false;
+            };
             self.crc.update(run);
-            let Some((filled, rest)) = left.split_at_mut_checked(run.len()) else { return false };
+            let Some((filled, rest)) = left.split_at_mut_checked(run.len()) else {
+                return false;
+            };
             filled.copy_from_slice(run);
             left = rest;
         }
@@ -235,7 +264,10 @@ pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
 /// True if every value is finite and at most `max_abs` in absolute value.
 pub(crate) fn all_bounded(values: &[f32], max_abs: f32) -> bool {
     let headroom = headroom(max_abs);
-    values.iter().fold(0, |excess, value| excess | excess_over(headroom, *value)) >= 0
+    values
+        .iter()
+        .fold(0, |excess, value| excess | excess_over(headroom, *value))
+        >= 0
 }
 
 /// Distance of the bits of `max_abs` from the largest integer.
@@ -255,12 +287,20 @@ fn excess_over(headroom: i32, number: f32) -> i32 {
 }
 
 /// [`all_bounded`] with an error for the first value that is not.
-pub(crate) fn check_values(what: &'static str, values: &[f32], max_abs: f32) -> Result<(), WireError> {
+pub(crate) fn check_values(
+    what: &'static str,
+    values: &[f32],
+    max_abs: f32,
+) -> Result<(), WireError> {
     if all_bounded(values, max_abs) {
         return Ok(());
     }
     let headroom = headroom(max_abs);
-    match values.iter().enumerate().find(|(_, value)| excess_over(headroom, **value) < 0) {
+    match values
+        .iter()
+        .enumerate()
+        .find(|(_, value)| excess_over(headroom, **value) < 0)
+    {
         None => Ok(()),
         Some((index, value)) => Err(WireError::Value {
             what,
@@ -287,10 +327,14 @@ mod tests {
         let bytes = body.as_bytes().to_vec();
         for size in [1, 2, 3, 5, 7, 16, 4095, 16 << 10, 65_535, 1 << 20] {
             let mut reader = split(&bytes, size);
-            let (read, valid) = reader.read_body(40_000, BodyShape::Floats(10_000), 1e6).unwrap();
+            let (read, valid) = reader
+                .read_body(40_000, BodyShape::Floats(10_000), 1e6)
+                .unwrap();
             assert!(valid && read == body, "pieces of {size}");
             assert_eq!(reader.finish(), crc32fast::hash(&bytes));
-            let (read, _) = split(&bytes, size).read_body(40_000, BodyShape::Points(2_500), 1e6).unwrap();
+            let (read, _) = split(&bytes, size)
+                .read_body(40_000, BodyShape::Points(2_500), 1e6)
+                .unwrap();
             assert_eq!(read.as_bytes(), bytes);
         }
     }
@@ -304,17 +348,30 @@ mod tests {
             (BodyShape::Points(1), 15),
             (BodyShape::Bytes { min: 2, max: 3 }, 4),
         ] {
-            assert!(matches!(split(&[0; 64], 64).read_body(len, shape, 1.0), Err(WireError::Shape { .. })));
+            assert!(matches!(
+                split(&[0; 64], 64).read_body(len, shape, 1.0),
+                Err(WireError::Shape { .. })
+            ));
         }
     }
 
     #[test]
     fn values_out_of_bounds_are_named() {
-        for bad in [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30, -1.1e6] {
+        for bad in [
+            f32::NAN,
+            -f32::NAN,
+            f32::INFINITY,
+            f32::NEG_INFINITY,
+            1e30,
+            -1.1e6,
+        ] {
             let values = [0.0, -0.0, 1e6, -1e6, f32::MIN_POSITIVE / 2.0, bad];
             assert!(all_bounded(&values[..5], 1e6) && !all_bounded(&values, 1e6));
             let error = check_values("feature", &values, 1e6).unwrap_err();
-            assert!(matches!(error, WireError::Value { index: 5, .. }), "{error}");
+            assert!(
+                matches!(error, WireError::Value { index: 5, .. }),
+                "{error}"
+            );
         }
     }
 }

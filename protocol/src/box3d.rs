@@ -37,7 +37,11 @@ impl Box3d {
     #[must_use]
     pub fn mirrored_y(&self) -> Self {
         let [x, y, z] = self.center_m;
-        Self { center_m: [x, -y, z], heading_rad: -self.heading_rad, ..*self }
+        Self {
+            center_m: [x, -y, z],
+            heading_rad: -self.heading_rad,
+            ..*self
+        }
     }
 
     /// The box in another frame. Roll and pitch that the transform adds are dropped, as boxes stay upright.
@@ -46,7 +50,11 @@ impl Box3d {
         let center = target_from_source * Point3::from(self.center_m);
         let (sin, cos) = self.heading_rad.sin_cos();
         let forward = target_from_source * Vector3::new(cos, sin, 0.0);
-        Self { center_m: center.into(), heading_rad: forward.y.atan2(forward.x), ..*self }
+        Self {
+            center_m: center.into(),
+            heading_rad: forward.y.atan2(forward.x),
+            ..*self
+        }
     }
 }
 
@@ -54,7 +62,9 @@ impl Box3d {
 #[must_use]
 pub fn corners_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
     let [x_low, y_low, x_high, y_high] = range_m;
-    corners.iter().all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
+    corners
+        .iter()
+        .all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
 }
 
 /// A box that a detector reports.
@@ -75,7 +85,11 @@ mod tests {
 
     use super::*;
 
-    const CAR: Box3d = Box3d { center_m: [10.0, 2.0, 0.5], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 };
+    const CAR: Box3d = Box3d {
+        center_m: [10.0, 2.0, 0.5],
+        size_m: [4.0, 2.0, 1.5],
+        heading_rad: 0.0,
+    };
 
     #[test]
     fn corners_start_at_the_front_right() {
@@ -88,7 +102,9 @@ mod tests {
     fn a_quarter_turn_moves_and_turns_the_box() {
         let turn = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
         let turned = CAR.transformed(&turn);
-        assert!((turned.center_m[0] + 2.0).abs() < 1e-12 && (turned.center_m[1] - 10.0).abs() < 1e-12);
+        assert!(
+            (turned.center_m[0] + 2.0).abs() < 1e-12 && (turned.center_m[1] - 10.0).abs() < 1e-12
+        );
         assert!((turned.heading_rad - FRAC_PI_2).abs() < 1e-12);
         assert_eq!(turned.size_m, CAR.size_m);
     }

@@ -53,6 +53,9 @@ impl DropReason {
     /// rejected.
     #[must_use]
     pub fn is_loss(self) -> bool {
-        !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Misbehaviour)
+        !matches!(
+            self,
+            Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Misbehaviour
+        )
     }
 }

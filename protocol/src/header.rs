@@ -77,8 +77,20 @@ impl Header {
     )]
     pub fn to_bytes(&self) -> [u8; HEADER_LEN] {
         // Destructured in full, so that a new field stops the build here.
-        let Self { kind, stamp, metadata_len, body_len, payload_crc } = self;
-        let Stamp { cav, epoch, sequence, capture_nanos, publish_nanos } = stamp;
+        let Self {
+            kind,
+            stamp,
+            metadata_len,
+            body_len,
+            payload_crc,
+        } = self;
+        let Stamp {
+            cav,
+            epoch,
+            sequence,
+            capture_nanos,
+            publish_nanos,
+        } = stamp;
         let cav = cav.as_str().as_bytes();
         let mut bytes = [0; HEADER_LEN];
         bytes[..4].copy_from_slice(&MAGIC);
@@ -87,8 +99,13 @@ impl Header {
         // An identifier has at most 32 bytes.
         bytes[7] = cav.len() as u8;
         bytes[8..8 + cav.len()].copy_from_slice(cav);
-        for (offset, number) in [(40, epoch), (48, sequence), (56, capture_nanos), (64, publish_nanos), (72, body_len)]
-        {
+        for (offset, number) in [
+            (40, epoch),
+            (48, sequence),
+            (56, capture_nanos),
+            (64, publish_nanos),
+            (72, body_len),
+        ] {
             bytes[offset..offset + 8].copy_from_slice(&number.to_le_bytes());
         }
         bytes[80..84].copy_from_slice(&metadata_len.to_le_bytes());
@@ -141,11 +158,17 @@ impl Header {
         if self.stamp.cav == *expected {
             return Ok(());
         }
-        Err(WireError::Identity { expected: expected.clone(), found: self.stamp.cav.clone() })
+        Err(WireError::Identity {
+            expected: expected.clone(),
+            found: self.stamp.cav.clone(),
+        })
     }
 }
 
-#[expect(clippy::indexing_slicing, reason = "offsets are constants within the header")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "offsets are constants within the header"
+)]
 fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
     std::array::from_fn(|index| bytes[offset + index])
 }
@@ -154,7 +177,11 @@ fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
 fn cav_from_wire(len: u8, field: &[u8; CavId::MAX_LEN]) -> Result<CavId, WireError> {
     let (name, padding) = field.split_at(usize::from(len).min(field.len()));
     let text = String::from_utf8_lossy(name);
-    let malformed = || IdError::Malformed { kind: "CAV id", text: text.clone().into_owned(), max_len: CavId::MAX_LEN };
+    let malformed = || IdError::Malformed {
+        kind: "CAV id",
+        text: text.clone().into_owned(),
+        max_len: CavId::MAX_LEN,
+    };
     if usize::from(len) > field.len() || padding.iter().any(|byte| *byte != 0) {
         return Err(WireError::Cav(malformed()));
     }
@@ -220,14 +247,26 @@ mod tests {
 
     #[test]
     fn errors_state_the_cause() {
-        assert!(matches!(resealed(|b| b[0] = b'X'), Err(WireError::Magic { found: [b'X', ..] })));
-        assert!(matches!(resealed(|b| b[4] = 7), Err(WireError::Version { found: 7 })));
-        assert!(matches!(resealed(|b| b[6] = 99), Err(WireError::UnknownKind { found: 99 })));
+        assert!(matches!(
+            resealed(|b| b[0] = b'X'),
+            Err(WireError::Magic { found: [b'X', ..] })
+        ));
+        assert!(matches!(
+            resealed(|b| b[4] = 7),
+            Err(WireError::Version { found: 7 })
+        ));
+        assert!(matches!(
+            resealed(|b| b[6] = 99),
+            Err(WireError::UnknownKind { found: 99 })
+        ));
         assert!(matches!(resealed(|b| b[7] = 33), Err(WireError::Cav(_))));
         assert!(matches!(resealed(|b| b[7] = 0), Err(WireError::Cav(_))));
         assert!(matches!(resealed(|b| b[8] = b'*'), Err(WireError::Cav(_))));
         assert!(matches!(resealed(|b| b[20] = b'x'), Err(WireError::Cav(_))));
         let other = CavId::new("4288").unwrap();
-        assert!(matches!(header().check_sender(&other), Err(WireError::Identity { .. })));
+        assert!(matches!(
+            header().check_sender(&other),
+            Err(WireError::Identity { .. })
+        ));
     }
 }

@@ -7,13 +7,16 @@ use serde::{Deserialize, Serialize};
 
 /// Reserved chunks at the position of a CAV in a key: a vehicle of that name would publish onto a key of another
 /// process.
-pub(crate) const RESERVED_CAV_IDS: [&str; 6] = ["alive", "control", "ready", "rx", "stats", "truth"];
+pub(crate) const RESERVED_CAV_IDS: [&str; 6] =
+    ["alive", "control", "ready", "rx", "stats", "truth"];
 
 /// Error of a text that is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum IdError {
     /// Empty, too long, or a character outside the alphabet.
-    #[error("{kind} {text:?} is not an identifier: 1 to {max_len} characters of a-z, 0-9, '_' and '-'")]
+    #[error(
+        "{kind} {text:?} is not an identifier: 1 to {max_len} characters of a-z, 0-9, '_' and '-'"
+    )]
     Malformed {
         /// Kind of identifier.
         kind: &'static str,
@@ -32,15 +35,29 @@ pub enum IdError {
     },
 }
 
-fn check(kind: &'static str, text: &str, max_len: usize, reserved: &[&str]) -> Result<Box<str>, IdError> {
-    let allowed = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_' || byte == b'-';
+fn check(
+    kind: &'static str,
+    text: &str,
+    max_len: usize,
+    reserved: &[&str],
+) -> Result<Box<str>, IdError> {
+    let allowed = |byte: u8| {
+        byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_' || byte == b'-'
+    };
     if !(1..=max_len).contains(&text.len()) || !text.bytes().all(allowed) {
         // A hostile name must not fill the log.
         let text = text.chars().take(2 * max_len).collect();
-        return Err(IdError::Malformed { kind, text, max_len });
+        return Err(IdError::Malformed {
+            kind,
+            text,
+            max_len,
+        });
     }
     if reserved.contains(&text) {
-        return Err(IdError::Reserved { kind, text: text.into() });
+        return Err(IdError::Reserved {
+            kind,
+            text: text.into(),
+        });
     }
     Ok(text.into())
 }
@@ -137,7 +154,10 @@ mod tests {
     #[test]
     fn a_vehicle_cannot_take_the_place_of_a_reserved_key() {
         for word in RESERVED_CAV_IDS {
-            assert!(matches!(CavId::new(word), Err(IdError::Reserved { .. })), "{word}");
+            assert!(
+                matches!(CavId::new(word), Err(IdError::Reserved { .. })),
+                "{word}"
+            );
             assert!(ProcessId::new(word).is_ok() && RunId::new(word).is_ok());
         }
     }

@@ -85,13 +85,22 @@ impl Key {
     /// `v2v/<run>/<cav>/<stream>`.
     #[must_use]
     pub fn stream(run: &RunId, cav: &CavId, stream: Stream) -> Self {
-        Topic::Stream { cav: cav.clone(), stream }.in_run(run)
+        Topic::Stream {
+            cav: cav.clone(),
+            stream,
+        }
+        .in_run(run)
     }
 
     /// `v2v/<run>/rx/<ego>/<cav>/<stream>`.
     #[must_use]
     pub fn received(run: &RunId, ego: &CavId, cav: &CavId, stream: Stream) -> Self {
-        Topic::Received { ego: ego.clone(), cav: cav.clone(), stream }.in_run(run)
+        Topic::Received {
+            ego: ego.clone(),
+            cav: cav.clone(),
+            stream,
+        }
+        .in_run(run)
     }
 
     /// `v2v/<run>/truth`.
@@ -121,7 +130,11 @@ impl Key {
     /// `v2v/<run>/alive/<role>/<cav>`.
     #[must_use]
     pub fn alive(run: &RunId, role: Role, cav: &CavId) -> Self {
-        Topic::Alive { role, cav: cav.clone() }.in_run(run)
+        Topic::Alive {
+            role,
+            cav: cav.clone(),
+        }
+        .in_run(run)
     }
 }
 
@@ -136,11 +149,15 @@ impl FromStr for Key {
 
     fn from_str(text: &str) -> Result<Self, KeyError> {
         let mut parts = text.splitn(3, '/');
-        let (Some(KEY_ROOT), Some(run), Some(topic)) = (parts.next(), parts.next(), parts.next()) else {
+        let (Some(KEY_ROOT), Some(run), Some(topic)) = (parts.next(), parts.next(), parts.next())
+        else {
             return Err(KeyError::unknown(text));
         };
         let topic = topic.parse()?;
-        let run = RunId::new(run).map_err(|source| KeyError::Id { text: shown(text), source })?;
+        let run = RunId::new(run).map_err(|source| KeyError::Id {
+            text: shown(text),
+            source,
+        })?;
         Ok(Self { run, topic })
     }
 }
@@ -159,7 +176,10 @@ impl KeyExpr {
     /// `@`.
     #[must_use]
     pub fn all_of(runs: &RunScope) -> [Self; 2] {
-        [Self::within(runs, &"**"), Self::within(runs, &format_args!("*/{}", Stream::Preview))]
+        [
+            Self::within(runs, &"**"),
+            Self::within(runs, &format_args!("*/{}", Stream::Preview)),
+        ]
     }
 
     /// Everything of a run but previews.
@@ -268,22 +288,46 @@ mod tests {
         let (ego, other) = (&cav("4279"), &cav("-1"));
         vec![
             (Key::stream(run, ego, Stream::Lidar), "v2v/r1/4279/lidar"),
-            (Key::stream(run, ego, Stream::Preview), "v2v/r1/4279/@preview"),
+            (
+                Key::stream(run, ego, Stream::Preview),
+                "v2v/r1/4279/@preview",
+            ),
             (Key::stream(run, ego, Stream::Gnss), "v2v/r1/4279/gnss"),
-            (Key::stream(run, ego, Stream::Camera(2)), "v2v/r1/4279/camera/2"),
+            (
+                Key::stream(run, ego, Stream::Camera(2)),
+                "v2v/r1/4279/camera/2",
+            ),
             (Key::stream(run, ego, Stream::Radar), "v2v/r1/4279/radar"),
             (Key::stream(run, ego, Stream::Pose), "v2v/r1/4279/pose"),
             (Key::stream(run, ego, Stream::Bev), "v2v/r1/4279/bev"),
             (Key::stream(run, ego, Stream::Boxes), "v2v/r1/4279/boxes"),
             (Key::stream(run, ego, Stream::Points), "v2v/r1/4279/points"),
-            (Key::stream(run, ego, Stream::Descriptor), "v2v/r1/4279/descriptor"),
-            (Key::stream(run, ego, Stream::Detections), "v2v/r1/4279/detections"),
-            (Key::stream(run, ego, Stream::DetectionsJson), "v2v/r1/4279/detections/json"),
-            (Key::received(run, ego, other, Stream::Bev), "v2v/r1/rx/4279/-1/bev"),
+            (
+                Key::stream(run, ego, Stream::Descriptor),
+                "v2v/r1/4279/descriptor",
+            ),
+            (
+                Key::stream(run, ego, Stream::Detections),
+                "v2v/r1/4279/detections",
+            ),
+            (
+                Key::stream(run, ego, Stream::DetectionsJson),
+                "v2v/r1/4279/detections/json",
+            ),
+            (
+                Key::received(run, ego, other, Stream::Bev),
+                "v2v/r1/rx/4279/-1/bev",
+            ),
             (Key::truth(run), "v2v/r1/truth"),
             (Key::control(run, Verb::Start), "v2v/r1/control/start"),
-            (Key::ready(run, &ProcessId::new("agent-4279").unwrap()), "v2v/r1/ready/agent-4279"),
-            (Key::stats(run, &ProcessId::new("agent-4279").unwrap()), "v2v/r1/stats/agent-4279"),
+            (
+                Key::ready(run, &ProcessId::new("agent-4279").unwrap()),
+                "v2v/r1/ready/agent-4279",
+            ),
+            (
+                Key::stats(run, &ProcessId::new("agent-4279").unwrap()),
+                "v2v/r1/stats/agent-4279",
+            ),
             (Key::alive(run, Role::Agent, other), "v2v/r1/alive/agent/-1"),
         ]
     }
@@ -306,10 +350,19 @@ mod tests {
 
     #[test]
     fn refuses_wildcards() {
-        for text in ["v2v/*/4279/bev", "v2v/r1/*/bev", "v2v/r1/**", "v2v/r1/a$*/bev", "v2v/r1/4279/camera/*"] {
+        for text in [
+            "v2v/*/4279/bev",
+            "v2v/r1/*/bev",
+            "v2v/r1/**",
+            "v2v/r1/a$*/bev",
+            "v2v/r1/4279/camera/*",
+        ] {
             assert!(text.parse::<Key>().is_err(), "{text}");
         }
-        assert!(matches!("v2v/r1/*/bev".parse::<Key>(), Err(KeyError::Wildcard { .. })));
+        assert!(matches!(
+            "v2v/r1/*/bev".parse::<Key>(),
+            Err(KeyError::Wildcard { .. })
+        ));
     }
 
     #[test]
@@ -343,10 +396,19 @@ mod tests {
     fn selectors_name_the_keys_they_are_for() {
         let run = RunId::new("r1").unwrap();
         assert_eq!(KeyExpr::stream(&run, Stream::Bev).as_str(), "v2v/r1/*/bev");
-        assert_eq!(KeyExpr::received(&run, &cav("4279"), Stream::Pose).as_str(), "v2v/r1/rx/4279/*/pose");
-        assert_eq!(KeyExpr::received_by_anyone(&run, Stream::Pose).as_str(), "v2v/r1/rx/*/*/pose");
+        assert_eq!(
+            KeyExpr::received(&run, &cav("4279"), Stream::Pose).as_str(),
+            "v2v/r1/rx/4279/*/pose"
+        );
+        assert_eq!(
+            KeyExpr::received_by_anyone(&run, Stream::Pose).as_str(),
+            "v2v/r1/rx/*/*/pose"
+        );
         assert_eq!(KeyExpr::truth(&run).as_str(), "v2v/r1/truth");
-        assert_eq!(KeyExpr::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
+        assert_eq!(
+            KeyExpr::alive(&run, Role::Agent).as_str(),
+            "v2v/r1/alive/agent/*"
+        );
         assert_eq!(KeyExpr::everyone_alive(&run).as_str(), "v2v/r1/alive/*/*");
         assert_eq!(KeyExpr::control(&run).as_str(), "v2v/r1/control/*");
         assert_eq!(KeyExpr::ready(&run).as_str(), "v2v/r1/ready/*");

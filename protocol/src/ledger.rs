@@ -46,7 +46,10 @@ impl Account {
     /// Account of a receiver, or of the link on the way to it.
     #[must_use]
     pub fn towards(topic: Topic, to: &ProcessId) -> Self {
-        Self { topic, to: Some(to.clone()) }
+        Self {
+            topic,
+            to: Some(to.clone()),
+        }
     }
 }
 
@@ -78,12 +81,20 @@ impl Counts {
     /// Messages lost for any reason.
     #[must_use]
     pub fn dropped_total(&self) -> u64 {
-        self.dropped.values().fold(0, |sum, count| sum.saturating_add(*count))
+        self.dropped
+            .values()
+            .fold(0, |sum, count| sum.saturating_add(*count))
     }
 
     /// Adds another's counters. Numbers from a hostile peer saturate.
     pub fn add(&mut self, other: &Self) {
-        let Self { sent, received, in_flight, dropped, adapted } = other;
+        let Self {
+            sent,
+            received,
+            in_flight,
+            dropped,
+            adapted,
+        } = other;
         self.sent = self.sent.saturating_add(*sent);
         self.received = self.received.saturating_add(*received);
         self.in_flight = self.in_flight.saturating_add(*in_flight);
@@ -93,7 +104,9 @@ impl Counts {
 
     /// Sent minus all messages that are accounted for; 0 if the account is balanced.
     pub(crate) fn missing(&self) -> i128 {
-        let accounted = [self.received, self.in_flight].into_iter().chain(self.dropped.values().copied());
+        let accounted = [self.received, self.in_flight]
+            .into_iter()
+            .chain(self.dropped.values().copied());
         i128::from(self.sent) - accounted.map(i128::from).sum::<i128>()
     }
 }
@@ -129,8 +142,23 @@ struct Line {
 impl From<Vec<Line>> for Ledger {
     fn from(lines: Vec<Line>) -> Self {
         let mut ledger = Self::default();
-        for Line { topic, to, sent, received, in_flight, dropped, adapted } in lines {
-            ledger.counts(&Account { topic, to }).add(&Counts { sent, received, in_flight, dropped, adapted });
+        for Line {
+            topic,
+            to,
+            sent,
+            received,
+            in_flight,
+            dropped,
+            adapted,
+        } in lines
+        {
+            ledger.counts(&Account { topic, to }).add(&Counts {
+                sent,
+                received,
+                in_flight,
+                dropped,
+                adapted,
+            });
         }
         ledger
     }
@@ -139,8 +167,22 @@ impl From<Vec<Line>> for Ledger {
 impl From<Ledger> for Vec<Line> {
     fn from(ledger: Ledger) -> Self {
         let line = |(Account { topic, to }, counts)| {
-            let Counts { sent, received, in_flight, dropped, adapted } = counts;
-            Line { topic, to, sent, received, in_flight, dropped, adapted }
+            let Counts {
+                sent,
+                received,
+                in_flight,
+                dropped,
+                adapted,
+            } = counts;
+            Line {
+                topic,
+                to,
+                sent,
+                received,
+                in_flight,
+                dropped,
+                adapted,
+            }
         };
         ledger.accounts.into_iter().map(line).collect()
     }
@@ -236,14 +278,19 @@ impl Ledger {
     /// accounts have to balance by themselves.
     pub fn exempt(&mut self, is_exempt: impl Fn(&Account) -> bool) -> u64 {
         let mut exempted = 0;
-        for Discrepancy { topic, to, missing, .. } in self.balance().discrepancies {
+        for Discrepancy {
+            topic, to, missing, ..
+        } in self.balance().discrepancies
+        {
             let account = Account { topic, to };
             if !is_exempt(&account) {
                 continue;
             }
             let counts = self.counts(&account);
             match u64::try_from(missing) {
-                Ok(missing) => *counts.dropped.entry(DropReason::PeerOffline).or_default() += missing,
+                Ok(missing) => {
+                    *counts.dropped.entry(DropReason::PeerOffline).or_default() += missing
+                }
                 Err(_) => counts.sent = counts.sent.saturating_add(missing.unsigned_abs()),
             }
             exempted += missing.unsigned_abs();
@@ -308,7 +355,15 @@ mod tests {
         assert_eq!(sum(&ledgers), forward);
         assert_eq!(forward.balance(), Reconciliation::default());
         let total = forward.total();
-        assert_eq!((total.sent, total.received, total.in_flight, total.dropped_total()), (11, 6, 1, 4));
+        assert_eq!(
+            (
+                total.sent,
+                total.received,
+                total.in_flight,
+                total.dropped_total()
+            ),
+            (11, 6, 1, 4)
+        );
     }
 
     #[test]
@@ -344,18 +399,26 @@ mod tests {
         ledger.sent(&published);
         ledger.sent(&published);
         ledger.dropped(&published, DropReason::Superseded);
-        receivers.iter().for_each(|receiver| ledger.received(receiver));
+        receivers
+            .iter()
+            .for_each(|receiver| ledger.received(receiver));
         assert!(ledger.balance().is_exact());
     }
 
     #[test]
     fn only_offline_processes_are_exempt() {
         let mut ledger = sum(&ledgers());
-        let (published, lost) = (Account::published(bev()), Account::towards(bev(), &process("ego-4279")));
+        let (published, lost) = (
+            Account::published(bev()),
+            Account::towards(bev(), &process("ego-4279")),
+        );
         (0..3).for_each(|_| ledger.sent(&published));
         assert_eq!(ledger.exempt(|_| false), 0);
         assert_eq!(ledger.exempt(|account| *account == lost), 3);
-        assert_eq!(ledger.get(&lost).unwrap().dropped[&DropReason::PeerOffline], 3);
+        assert_eq!(
+            ledger.get(&lost).unwrap().dropped[&DropReason::PeerOffline],
+            3
+        );
         assert!(ledger.balance().is_exact());
         (0..2).for_each(|_| ledger.received(&lost));
         assert_eq!(ledger.exempt(|account| *account == lost), 2);
@@ -368,7 +431,13 @@ mod tests {
         ledger.sent(&Account::published(bev()));
         let balance = ledger.balance();
         assert!(balance.is_exact());
-        assert_eq!(balance.unreceived, [UnreceivedTopic { topic: bev(), messages: 1 }]);
+        assert_eq!(
+            balance.unreceived,
+            [UnreceivedTopic {
+                topic: bev(),
+                messages: 1
+            }]
+        );
     }
 
     #[test]

@@ -79,7 +79,14 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::indexing_slicing
+    )
+)]
 
 pub mod access;
 mod bev;
@@ -114,8 +121,9 @@ pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection, corners_within};
 pub use codec::{
-    ByteLimit, Codec, CodecConfig, Compression, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy,
-    RateChoice, RateReason, Selection, Smoothing, encode_features, encode_within,
+    ByteLimit, Codec, CodecConfig, Compression, ConfidenceGate, DecodedFeatures, Dtype,
+    EncodedFeatures, LimitedBy, RateChoice, RateReason, Selection, Smoothing, encode_features,
+    encode_within,
 };
 pub use drop_reason::DropReason;
 pub use error::WireError;
@@ -125,10 +133,11 @@ pub use key::{Key, KeyError, KeyExpr};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
-    AgentTruth, Bev, Boxes, Camera, CameraMetadata, Control, Descriptor, Detections, DetectionsReport, EgoMotion,
-    FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind, Lidar, Message, ModelHash, NeighbourState, NoPoseReason, Pace,
-    Payload, Pinhole, PlanarCovariance, Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary,
-    StageTiming, Stats, TopicCount, TopicTraffic, TrueObject, Truth,
+    AgentTruth, Bev, Boxes, Camera, CameraMetadata, Control, Descriptor, Detections,
+    DetectionsReport, EgoMotion, FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind, Lidar,
+    Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, Pinhole, PlanarCovariance,
+    Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats,
+    TopicCount, TopicTraffic, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

@@ -14,19 +14,32 @@ use crate::text::excerpt;
 
 const HARD_LIMIT: usize = Limits::HARD_METADATA_BYTES as usize;
 
-const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> = bincode::config::standard().with_limit();
+const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> =
+    bincode::config::standard().with_limit();
 
 /// Appends `metadata` to `head`.
 ///
 /// # Errors
 /// [`WireError::Metadata`] when a value cannot be written, [`WireError::Limit`] when it exceeds the limit of every
 /// receiver.
-pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>) -> Result<u32, WireError> {
-    let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG)
-        .map_err(|error| WireError::Metadata { kind, detail: error.to_string() })?;
+pub(crate) fn append<T: Serialize>(
+    kind: Kind,
+    metadata: &T,
+    head: &mut Vec<u8>,
+) -> Result<u32, WireError> {
+    let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG).map_err(|error| {
+        WireError::Metadata {
+            kind,
+            detail: error.to_string(),
+        }
+    })?;
     match u32::try_from(len) {
         Ok(bytes) if len <= HARD_LIMIT => Ok(bytes),
-        _ => Err(WireError::Limit { what: "metadata bytes", max: HARD_LIMIT as u64, found: len as u64 }),
+        _ => Err(WireError::Limit {
+            what: "metadata bytes",
+            max: HARD_LIMIT as u64,
+            found: len as u64,
+        }),
     }
 }
 
@@ -39,10 +52,14 @@ pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>)
 /// [`WireError::Metadata`] when they do not decode or leave bytes over.
 pub(crate) fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<T, WireError> {
     let refuse = |detail: String| WireError::Metadata { kind, detail };
-    let (metadata, used) =
-        bincode::serde::decode_from_slice(bytes, CONFIG).map_err(|error| refuse(excerpt(&error.to_string(), 200)))?;
+    let (metadata, used) = bincode::serde::decode_from_slice(bytes, CONFIG)
+        .map_err(|error| refuse(excerpt(&error.to_string(), 200)))?;
     if used != bytes.len() {
-        return Err(refuse(format!("{} of {} bytes are left over", bytes.len() - used, bytes.len())));
+        return Err(refuse(format!(
+            "{} of {} bytes are left over",
+            bytes.len() - used,
+            bytes.len()
+        )));
     }
     Ok(metadata)
 }
@@ -62,7 +79,12 @@ mod tests {
     #[test]
     fn bytes_are_stable() {
         let (bytes, back) = round_trip(&(7u32, 1.5f64, Some("ab".to_owned()), vec![300u64]));
-        assert_eq!(bytes, [7, 0, 0, 0, 0, 0, 0, 0xf8, 0x3f, 1, 2, b'a', b'b', 1, 251, 44, 1]);
+        assert_eq!(
+            bytes,
+            [
+                7, 0, 0, 0, 0, 0, 0, 0xf8, 0x3f, 1, 2, b'a', b'b', 1, 251, 44, 1
+            ]
+        );
         assert_eq!(back, (7, 1.5, Some("ab".to_owned()), vec![300]));
     }
 
@@ -70,7 +92,10 @@ mod tests {
     fn leftover_bytes_are_refused() {
         let (mut bytes, _) = round_trip(&1u64);
         bytes.push(0);
-        assert!(matches!(decode::<u64>(Kind::Control, &bytes), Err(WireError::Metadata { .. })));
+        assert!(matches!(
+            decode::<u64>(Kind::Control, &bytes),
+            Err(WireError::Metadata { .. })
+        ));
     }
 
     #[test]

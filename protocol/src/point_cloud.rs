@@ -38,6 +38,8 @@ impl PointCloud {
     #[must_use]
     pub fn decimate(&self, most: usize) -> Self {
         let step = self.len().div_ceil(most.max(1)).max(1);
-        Self { xyzi: self.xyzi.iter().step_by(step).copied().collect() }
+        Self {
+            xyzi: self.xyzi.iter().step_by(step).copied().collect(),
+        }
     }
 }

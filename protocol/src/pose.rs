@@ -45,13 +45,19 @@ pub struct Pose {
 
 impl Pose {
     /// The identity transform.
-    pub const IDENTITY: Self = Self { translation_m: [0.0; 3], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+    pub const IDENTITY: Self = Self {
+        translation_m: [0.0; 3],
+        rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+    };
 
     /// A planar pose: position, height and heading.
     #[must_use]
     pub fn from_xyz_yaw(translation_m: [f64; 3], yaw_rad: f64) -> Self {
         let (sin, cos) = (yaw_rad / 2.0).sin_cos();
-        Self { translation_m, rotation_wxyz: [cos, 0.0, 0.0, sin] }
+        Self {
+            translation_m,
+            rotation_wxyz: [cos, 0.0, 0.0, sin],
+        }
     }
 
     /// Reads a row-major 4x4 matrix from outside.
@@ -71,9 +77,13 @@ impl Pose {
         let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
         let determinant = rotation.determinant();
         if deviation > UNIT_TOLERANCE || determinant < 0.0 {
-            return Err(InvalidPose::NotRotation { deviation, determinant });
+            return Err(InvalidPose::NotRotation {
+                deviation,
+                determinant,
+            });
         }
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        let rotation =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
         let translation = Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]);
         Ok(Isometry3::from_parts(translation, rotation).into())
     }
@@ -87,7 +97,11 @@ impl Pose {
             check_bounded(component)?;
         }
         let norm = self.rotation_wxyz.iter().map(|q| q * q).sum::<f64>().sqrt();
-        if (norm - 1.0).abs() > UNIT_TOLERANCE { Err(InvalidPose::NotUnit(norm)) } else { Ok(()) }
+        if (norm - 1.0).abs() > UNIT_TOLERANCE {
+            Err(InvalidPose::NotUnit(norm))
+        } else {
+            Ok(())
+        }
     }
 
     /// Heading: the angle from the target's x axis to the source's, seen from above, in radians.
@@ -102,32 +116,47 @@ impl Pose {
     pub fn isometry(&self) -> Isometry3<f64> {
         let [w, x, y, z] = self.rotation_wxyz;
         let [tx, ty, tz] = self.translation_m;
-        Isometry3::from_parts(Translation3::new(tx, ty, tz), UnitQuaternion::new_normalize(Quaternion::new(w, x, y, z)))
+        Isometry3::from_parts(
+            Translation3::new(tx, ty, tz),
+            UnitQuaternion::new_normalize(Quaternion::new(w, x, y, z)),
+        )
     }
 
     /// The same motion in a world whose y axis points the other way.
     #[must_use]
     pub fn mirrored_y(&self) -> Self {
         let ([x, y, z], [qw, qx, qy, qz]) = (self.translation_m, self.rotation_wxyz);
-        Self { translation_m: [x, -y, z], rotation_wxyz: [qw, -qx, qy, -qz] }
+        Self {
+            translation_m: [x, -y, z],
+            rotation_wxyz: [qw, -qx, qy, -qz],
+        }
     }
 
     /// `target_from_source` from two poses in one world: `self` is `world_from_target`.
     #[must_use]
     pub fn from_world(&self, world_from_source: &Self) -> Self {
-        self.isometry().inv_mul(&world_from_source.isometry()).into()
+        self.isometry()
+            .inv_mul(&world_from_source.isometry())
+            .into()
     }
 }
 
 impl From<Isometry3<f64>> for Pose {
     fn from(isometry: Isometry3<f64>) -> Self {
         let q = isometry.rotation.quaternion();
-        Self { translation_m: isometry.translation.vector.into(), rotation_wxyz: [q.w, q.i, q.j, q.k] }
+        Self {
+            translation_m: isometry.translation.vector.into(),
+            rotation_wxyz: [q.w, q.i, q.j, q.k],
+        }
     }
 }
 
 fn check_bounded(value: f64) -> Result<(), InvalidPose> {
-    if value.abs() <= MAX_ABS_M { Ok(()) } else { Err(InvalidPose::NotFinite(value)) }
+    if value.abs() <= MAX_ABS_M {
+        Ok(())
+    } else {
+        Err(InvalidPose::NotFinite(value))
+    }
 }
 
 #[cfg(test)]
@@ -139,9 +168,19 @@ mod tests {
     use super::*;
 
     fn any_pose() -> impl Strategy<Value = Pose> {
-        (prop::array::uniform3(-1e4..1e4), -PI..PI, -1.5..1.5, -PI..PI).prop_map(|(t, roll, pitch, yaw)| {
-            Isometry3::from_parts(Translation3::from(t), UnitQuaternion::from_euler_angles(roll, pitch, yaw)).into()
-        })
+        (
+            prop::array::uniform3(-1e4..1e4),
+            -PI..PI,
+            -1.5..1.5,
+            -PI..PI,
+        )
+            .prop_map(|(t, roll, pitch, yaw)| {
+                Isometry3::from_parts(
+                    Translation3::from(t),
+                    UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+                )
+                .into()
+            })
     }
 
     proptest! {
@@ -193,6 +232,9 @@ mod tests {
         }
         assert!(matches!(with(3, 0.5), Err(InvalidPose::NotUnit(_))));
         let mirror = Matrix4::from_diagonal(&[1.0, -1.0, 1.0, 1.0].into());
-        assert!(matches!(Pose::from_matrix(&mirror), Err(InvalidPose::NotRotation { .. })));
+        assert!(matches!(
+            Pose::from_matrix(&mirror),
+            Err(InvalidPose::NotRotation { .. })
+        ));
     }
 }

@@ -16,7 +16,10 @@ impl PoseError {
     #[must_use]
     pub fn between(found: &Pose, truth: &Pose) -> Self {
         let difference = truth.isometry().inv_mul(&found.isometry());
-        Self { distance_m: difference.translation.vector.norm(), angle_deg: difference.rotation.angle().to_degrees() }
+        Self {
+            distance_m: difference.translation.vector.norm(),
+            angle_deg: difference.rotation.angle().to_degrees(),
+        }
     }
 }
 

@@ -52,8 +52,10 @@ impl Reconciliation {
 
     pub(crate) fn of(ledger: &Ledger) -> Self {
         let mut balance = Self::default();
-        let received: BTreeSet<&Topic> =
-            ledger.iter().filter_map(|(account, _)| account.to.as_ref().map(|_| &account.topic)).collect();
+        let received: BTreeSet<&Topic> = ledger
+            .iter()
+            .filter_map(|(account, _)| account.to.as_ref().map(|_| &account.topic))
+            .collect();
         for (account, counts) in ledger.iter() {
             let mut counts = counts.clone();
             if account.to.is_some() {
@@ -65,7 +67,10 @@ impl Reconciliation {
             } else if !received.contains(&account.topic) {
                 match u64::try_from(counts.missing()) {
                     Ok(0) => {}
-                    Ok(messages) => balance.unreceived.push(UnreceivedTopic { topic: account.topic.clone(), messages }),
+                    Ok(messages) => balance.unreceived.push(UnreceivedTopic {
+                        topic: account.topic.clone(),
+                        messages,
+                    }),
                     Err(_) => balance.push_difference(account, counts),
                 }
             }
@@ -78,18 +83,35 @@ impl Reconciliation {
         if missing != 0 {
             let Account { topic, to } = account.clone();
             // Counters of real runs are far from the ends of the range; hostile ones may be clamped.
-            let missing = i64::try_from(missing).unwrap_or(if missing < 0 { i64::MIN } else { i64::MAX });
-            self.discrepancies.push(Discrepancy { topic, to, missing, counts });
+            let missing =
+                i64::try_from(missing).unwrap_or(if missing < 0 { i64::MIN } else { i64::MAX });
+            self.discrepancies.push(Discrepancy {
+                topic,
+                to,
+                missing,
+                counts,
+            });
         }
     }
 }
 
 impl fmt::Display for Discrepancy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { topic, to, missing, counts } = self;
-        let to = to.as_ref().map(|to| format!(" to {to}")).unwrap_or_default();
-        let (verb, count) =
-            if *missing > 0 { ("not accounted for", *missing) } else { ("received but never sent", -missing) };
+        let Self {
+            topic,
+            to,
+            missing,
+            counts,
+        } = self;
+        let to = to
+            .as_ref()
+            .map(|to| format!(" to {to}"))
+            .unwrap_or_default();
+        let (verb, count) = if *missing > 0 {
+            ("not accounted for", *missing)
+        } else {
+            ("received but never sent", -missing)
+        };
         write!(
             f,
             "{topic}{to}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",

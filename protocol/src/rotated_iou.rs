@@ -31,9 +31,19 @@ impl Polygon {
             area = -area;
         }
         let bound = |pick: fn(f64, f64) -> f64| {
-            std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).fold(corners[0][axis], pick))
+            std::array::from_fn(|axis| {
+                corners
+                    .iter()
+                    .map(|corner| corner[axis])
+                    .fold(corners[0][axis], pick)
+            })
         };
-        Self { corners, low: bound(f64::min), high: bound(f64::max), area }
+        Self {
+            corners,
+            low: bound(f64::min),
+            high: bound(f64::max),
+            area,
+        }
     }
 
     /// The footprint of a box: its first four corners ([`crate::Box3d::corners`]), seen from above.
@@ -52,7 +62,9 @@ impl Polygon {
     /// Area of overlap of the axis-aligned bounds, square metres: never less than that of the polygons.
     #[must_use]
     pub(crate) fn bounds_overlap(&self, other: &Self) -> f64 {
-        let side = |axis: usize| self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]);
+        let side = |axis: usize| {
+            self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis])
+        };
         side(0).max(0.0) * side(1).max(0.0)
     }
 
@@ -77,7 +89,11 @@ impl Polygon {
     pub fn iou(&self, other: &Self) -> f64 {
         let intersection = self.intersection(other);
         let union = self.area + other.area - intersection;
-        if union > 0.0 { intersection / union } else { 0.0 }
+        if union > 0.0 {
+            intersection / union
+        } else {
+            0.0
+        }
     }
 
     /// True if the IoU is above `threshold`; decided without clipping if bounds and areas suffice.
@@ -103,7 +119,10 @@ struct Clipped {
 
 impl From<&Footprint> for Clipped {
     fn from(corners: &Footprint) -> Self {
-        let mut clipped = Self { corners: [[0.0; 2]; MAX_CORNERS], len: 4 };
+        let mut clipped = Self {
+            corners: [[0.0; 2]; MAX_CORNERS],
+            len: 4,
+        };
         clipped.corners[..4].copy_from_slice(corners);
         clipped
     }
@@ -116,14 +135,19 @@ impl Clipped {
     /// move a corner far away.
     fn keep_left_of(&self, a: [f64; 2], b: [f64; 2]) -> Self {
         let side = |p: [f64; 2]| (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
-        let mut kept = Self { corners: [[0.0; 2]; MAX_CORNERS], len: 0 };
+        let mut kept = Self {
+            corners: [[0.0; 2]; MAX_CORNERS],
+            len: 0,
+        };
         let mut previous = self.corners[self.len - 1];
         let mut previous_side = side(previous);
         for &corner in &self.corners[..self.len] {
             let corner_side = side(corner);
             if (previous_side < 0.0) != (corner_side < 0.0) {
                 let t = previous_side / (previous_side - corner_side);
-                kept.push(std::array::from_fn(|axis| previous[axis] + t * (corner[axis] - previous[axis])));
+                kept.push(std::array::from_fn(|axis| {
+                    previous[axis] + t * (corner[axis] - previous[axis])
+                }));
             }
             if corner_side >= 0.0 {
                 kept.push(corner);
@@ -163,9 +187,15 @@ mod tests {
     use super::*;
 
     fn polygon(x: f64, y: f64, l: f64, w: f64, heading_rad: f64) -> Polygon {
-        let box3d = Box3d { center_m: [x, y, 0.0], size_m: [l, w, 1.0], heading_rad };
+        let box3d = Box3d {
+            center_m: [x, y, 0.0],
+            size_m: [l, w, 1.0],
+            heading_rad,
+        };
         let corners = box3d.corners();
-        Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
+        Polygon::new(std::array::from_fn(|corner| {
+            [corners[corner][0], corners[corner][1]]
+        }))
     }
 
     #[test]
@@ -176,7 +206,8 @@ mod tests {
         let half = polygon(0.0, 0.0, 4.0, 2.0, 0.0).iou(&polygon(2.0, 0.0, 4.0, 2.0, 0.0));
         assert!((half - 4.0 / 12.0).abs() < 1e-12);
         // A square and the same square rotated by 45 degrees intersect in a regular octagon.
-        let octagon = polygon(0.0, 0.0, 2.0, 2.0, 0.0).intersection(&polygon(0.0, 0.0, 2.0, 2.0, FRAC_PI_4));
+        let octagon =
+            polygon(0.0, 0.0, 2.0, 2.0, 0.0).intersection(&polygon(0.0, 0.0, 2.0, 2.0, FRAC_PI_4));
         assert!((octagon - 8.0 * (2.0_f64.sqrt() - 1.0)).abs() < 1e-12);
     }
 
@@ -198,7 +229,8 @@ mod tests {
     }
 
     fn any_polygon() -> impl Strategy<Value = Polygon> {
-        (-5.0..5.0, -5.0..5.0, 0.5..6.0, 0.5..3.0, -PI..PI).prop_map(|(x, y, l, w, yaw)| polygon(x, y, l, w, yaw))
+        (-5.0..5.0, -5.0..5.0, 0.5..6.0, 0.5..3.0, -PI..PI)
+            .prop_map(|(x, y, l, w, yaw)| polygon(x, y, l, w, yaw))
     }
 
     proptest! {

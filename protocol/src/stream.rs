@@ -74,7 +74,12 @@ impl Stream {
             Self::Pose | Self::Gnss | Self::Imu | Self::Pace => Some(16 << 10),
             Self::Preview => Some(64 << 10),
             Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
-            Self::Lidar | Self::Camera(_) | Self::Radar | Self::Bev | Self::Points | Self::DetectionsJson => None,
+            Self::Lidar
+            | Self::Camera(_)
+            | Self::Radar
+            | Self::Bev
+            | Self::Points
+            | Self::DetectionsJson => None,
         }
     }
 

@@ -66,10 +66,14 @@ mod tests {
     #[test]
     fn values_are_written_by_name_and_the_names_differ() {
         fn check<T: serde::Serialize + std::fmt::Display>(all: &[T]) {
-            let names: std::collections::BTreeSet<String> = all.iter().map(ToString::to_string).collect();
+            let names: std::collections::BTreeSet<String> =
+                all.iter().map(ToString::to_string).collect();
             assert_eq!(names.len(), all.len());
             for value in all {
-                assert_eq!(serde_json::to_string(value).unwrap(), format!("\"{value}\""));
+                assert_eq!(
+                    serde_json::to_string(value).unwrap(),
+                    format!("\"{value}\"")
+                );
             }
         }
         check(&MisbehaviourReason::ALL);

@@ -5,11 +5,13 @@ use std::fmt::Write as _;
 /// Two lower-case hexadecimal digits per byte.
 #[must_use]
 pub fn hex(bytes: &[u8]) -> String {
-    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{byte:02x}");
-        text
-    })
+    bytes
+        .iter()
+        .fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
+            // Writing to a string cannot fail.
+            let _ = write!(text, "{byte:02x}");
+            text
+        })
 }
 
 /// At most `max_chars` characters from the beginning: a hostile text inside an error must not fill the log.
@@ -25,6 +27,9 @@ mod tests {
     #[test]
     fn bytes_are_two_digits_each_and_excerpts_end_between_characters() {
         assert_eq!(hex(&[0, 10, 255]), "000aff");
-        assert_eq!((excerpt("äöü", 2), excerpt("a", 2)), ("äö".into(), "a".into()));
+        assert_eq!(
+            (excerpt("äöü", 2), excerpt("a", 2)),
+            ("äö".into(), "a".into())
+        );
     }
 }

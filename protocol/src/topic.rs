@@ -98,7 +98,10 @@ impl Topic {
     /// The key of this topic in `run`.
     #[must_use]
     pub fn in_run(self, run: &RunId) -> Key {
-        Key { run: run.clone(), topic: self }
+        Key {
+            run: run.clone(),
+            topic: self,
+        }
     }
 
     /// True if the ledger covers it: data, but not control messages, not messages that are repeated for late joiners
@@ -119,26 +122,47 @@ impl Topic {
     pub fn is_json(&self) -> bool {
         matches!(
             self,
-            Self::Stream { stream: Stream::DetectionsJson, .. } | Self::Received { stream: Stream::DetectionsJson, .. }
+            Self::Stream {
+                stream: Stream::DetectionsJson,
+                ..
+            } | Self::Received {
+                stream: Stream::DetectionsJson,
+                ..
+            }
         )
     }
 
     fn from_chunks(chunks: &[&str]) -> Result<Option<Self>, IdError> {
         Ok(match chunks {
             ["truth"] => Some(Self::Truth),
-            ["control", verb] => Verb::ALL.into_iter().find(|known| known.as_str() == *verb).map(Self::Control),
+            ["control", verb] => Verb::ALL
+                .into_iter()
+                .find(|known| known.as_str() == *verb)
+                .map(Self::Control),
             ["ready", process] => Some(Self::Ready(ProcessId::new(process)?)),
             ["stats", process] => Some(Self::Stats(ProcessId::new(process)?)),
-            ["alive", role, cav] => match Role::ALL.into_iter().find(|known| known.as_str() == *role) {
-                Some(role) => Some(Self::Alive { role, cav: CavId::new(cav)? }),
-                None => None,
-            },
+            ["alive", role, cav] => {
+                match Role::ALL.into_iter().find(|known| known.as_str() == *role) {
+                    Some(role) => Some(Self::Alive {
+                        role,
+                        cav: CavId::new(cav)?,
+                    }),
+                    None => None,
+                }
+            }
             ["rx", ego, cav, stream @ ..] => match Stream::from_chunks(stream) {
-                Some(stream) => Some(Self::Received { ego: CavId::new(ego)?, cav: CavId::new(cav)?, stream }),
+                Some(stream) => Some(Self::Received {
+                    ego: CavId::new(ego)?,
+                    cav: CavId::new(cav)?,
+                    stream,
+                }),
                 None => None,
             },
             [cav, stream @ ..] => match Stream::from_chunks(stream) {
-                Some(stream) => Some(Self::Stream { cav: CavId::new(cav)?, stream }),
+                Some(stream) => Some(Self::Stream {
+                    cav: CavId::new(cav)?,
+                    stream,
+                }),
                 None => None,
             },
             [] => None,
@@ -173,7 +197,10 @@ impl FromStr for Topic {
         }
         let chunks: Vec<&str> = text.split('/').collect();
         Self::from_chunks(&chunks)
-            .map_err(|source| KeyError::Id { text: shown(text), source })?
+            .map_err(|source| KeyError::Id {
+                text: shown(text),
+                source,
+            })?
             .ok_or_else(|| KeyError::unknown(text))
     }
 }

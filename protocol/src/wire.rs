@@ -102,14 +102,20 @@ pub fn decode_header<'a>(pieces: impl IntoIterator<Item = &'a [u8]>) -> Result<H
     let mut left = bytes.as_mut_slice();
     for piece in pieces {
         let (filled, rest) = left.split_at_mut(piece.len().min(left.len()));
-        filled.iter_mut().zip(piece).for_each(|(byte, from)| *byte = *from);
+        filled
+            .iter_mut()
+            .zip(piece)
+            .for_each(|(byte, from)| *byte = *from);
         left = rest;
         if left.is_empty() {
             return Header::from_bytes(&bytes);
         }
     }
     let found = (HEADER_LEN - left.len()) as u64;
-    Err(WireError::Truncated { expected: HEADER_LEN as u64, found })
+    Err(WireError::Truncated {
+        expected: HEADER_LEN as u64,
+        found,
+    })
 }
 
 /// Decodes a message of a known kind from its pieces.
@@ -123,7 +129,10 @@ pub fn decode<'a, M: Payload>(
 ) -> Result<(Header, M), WireError> {
     let (header, reader) = open(pieces, limits)?;
     if header.kind != M::KIND {
-        return Err(WireError::Kind { expected: M::KIND, found: header.kind });
+        return Err(WireError::Kind {
+            expected: M::KIND,
+            found: header.kind,
+        });
     }
     let message = decode_payload(&header, reader, limits)?;
     Ok((header, message))
@@ -138,7 +147,14 @@ pub fn decode_any<'a>(
     limits: &Limits,
 ) -> Result<(Header, Message), WireError> {
     let (header, reader) = open(pieces, limits)?;
-    let message = Message::read(header.kind, Opened { header: &header, reader, limits })?;
+    let message = Message::read(
+        header.kind,
+        Opened {
+            header: &header,
+            reader,
+            limits,
+        },
+    )?;
     Ok((header, message))
 }
 
@@ -161,15 +177,29 @@ fn open<'a>(
     limits: &Limits,
 ) -> Result<(Header, PayloadReader<'a>), WireError> {
     let pieces: Vec<&[u8]> = pieces.into_iter().collect();
-    let found = pieces.iter().fold(0u64, |sum, piece| sum + piece.len() as u64);
+    let found = pieces
+        .iter()
+        .fold(0u64, |sum, piece| sum + piece.len() as u64);
     let header = decode_header(pieces.iter().copied())?;
-    let Header { metadata_len, body_len, .. } = header;
+    let Header {
+        metadata_len,
+        body_len,
+        ..
+    } = header;
     let max = limits.max_metadata_bytes.min(Limits::HARD_METADATA_BYTES);
     if metadata_len > max {
-        return Err(WireError::Limit { what: "metadata bytes", max: max.into(), found: metadata_len.into() });
+        return Err(WireError::Limit {
+            what: "metadata bytes",
+            max: max.into(),
+            found: metadata_len.into(),
+        });
     }
     if body_len > limits.max_body_bytes {
-        return Err(WireError::Limit { what: "body bytes", max: limits.max_body_bytes, found: body_len });
+        return Err(WireError::Limit {
+            what: "body bytes",
+            max: limits.max_body_bytes,
+            found: body_len,
+        });
     }
     let expected = body_len.saturating_add(HEADER_LEN as u64 + u64::from(metadata_len));
     match found {
@@ -182,11 +212,18 @@ fn open<'a>(
 /// Reads the payload; `reader` holds exactly as many bytes as the header announces.
 ///
 /// The checksum is reported first: all other errors of a corrupted message are consequences.
-fn decode_payload<M: Payload>(header: &Header, mut reader: PayloadReader<'_>, limits: &Limits) -> Result<M, WireError> {
+fn decode_payload<M: Payload>(
+    header: &Header,
+    mut reader: PayloadReader<'_>,
+    limits: &Limits,
+) -> Result<M, WireError> {
     let parts = read_parts::<M>(header, &mut reader, limits);
     let expected = reader.finish();
     if expected != header.payload_crc {
-        return Err(WireError::Checksum { expected, found: header.payload_crc });
+        return Err(WireError::Checksum {
+            expected,
+            found: header.payload_crc,
+        });
     }
     let (metadata, body, valid) = parts?;
     if !valid {
@@ -200,7 +237,8 @@ fn read_parts<M: Payload>(
     reader: &mut PayloadReader<'_>,
     limits: &Limits,
 ) -> Result<(M::Metadata, Body, bool), WireError> {
-    let metadata: M::Metadata = metadata::decode(M::KIND, &reader.read_bytes(header.metadata_len as usize))?;
+    let metadata: M::Metadata =
+        metadata::decode(M::KIND, &reader.read_bytes(header.metadata_len as usize))?;
     let shape = M::check(&metadata, limits)?;
     let (body, valid) = reader.read_body(header.body_len, shape, limits.max_abs_value)?;
     Ok((metadata, body, valid))

@@ -8,13 +8,17 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use protocol::{
-    Bev, BevGrid, Body, Codec, CodecConfig, Compression, DropReason, Dtype, EncodedFeatures, HEADER_LEN, Header, Lidar,
-    Limits, Message, Points, Selection, WireError, wire,
+    Bev, BevGrid, Body, Codec, CodecConfig, Compression, DropReason, Dtype, EncodedFeatures,
+    HEADER_LEN, Header, Lidar, Limits, Message, Points, Selection, WireError, wire,
 };
 use sample::any::any_message;
 
 fn every_message() -> Vec<Vec<u8>> {
-    let encode = |message| wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
+    let encode = |message| {
+        wire::encode_any(&sample::stamp(), message)
+            .unwrap()
+            .to_vec()
+    };
     sample::every_kind().into_iter().map(encode).collect()
 }
 
@@ -28,7 +32,8 @@ fn reseal(bytes: &mut [u8], metadata_len: Option<u32>) {
         return;
     }
     let payload = (bytes.len() - HEADER_LEN) as u64;
-    let metadata_len = metadata_len.unwrap_or_else(|| u32::from_le_bytes(bytes[80..84].try_into().unwrap()));
+    let metadata_len =
+        metadata_len.unwrap_or_else(|| u32::from_le_bytes(bytes[80..84].try_into().unwrap()));
     let metadata_len = metadata_len.min(payload as u32);
     bytes[72..80].copy_from_slice(&(payload - u64::from(metadata_len)).to_le_bytes());
     bytes[80..84].copy_from_slice(&metadata_len.to_le_bytes());
@@ -57,7 +62,10 @@ fn every_truncation_is_refused() {
 fn leftover_bytes_are_refused() {
     for mut bytes in every_message() {
         bytes.push(0);
-        assert!(matches!(decode(&bytes), Err(WireError::TrailingBytes { .. })));
+        assert!(matches!(
+            decode(&bytes),
+            Err(WireError::TrailingBytes { .. })
+        ));
     }
 }
 
@@ -69,7 +77,10 @@ fn every_flipped_bit_is_noticed() {
             bytes[bit / 8] ^= 1 << (bit % 8);
             let error = decode(&bytes).unwrap_err();
             if bit / 8 >= HEADER_LEN {
-                assert!(matches!(error, WireError::Checksum { .. }), "bit {bit}: {error}");
+                assert!(
+                    matches!(error, WireError::Checksum { .. }),
+                    "bit {bit}: {error}"
+                );
             }
         }
     }
@@ -79,7 +90,13 @@ fn every_flipped_bit_is_noticed() {
 fn fifteen_bytes_that_claim_2_to_the_42_are_rejected() {
     let mut bytes = [0; 15];
     bytes[..8].copy_from_slice(&(1u64 << 42).to_le_bytes());
-    assert!(matches!(decode(&bytes), Err(WireError::Truncated { expected: 92, found: 15 })));
+    assert!(matches!(
+        decode(&bytes),
+        Err(WireError::Truncated {
+            expected: 92,
+            found: 15
+        })
+    ));
 }
 
 #[test]
@@ -90,52 +107,132 @@ fn absurd_lengths_in_the_header_are_refused() {
             bytes[offset..offset + 8].copy_from_slice(&len.to_le_bytes());
             reseal_header(&mut bytes);
             let error = decode(&bytes).unwrap_err();
-            assert!(matches!(error, WireError::Limit { what: "body bytes", .. }), "{error}");
+            assert!(
+                matches!(
+                    error,
+                    WireError::Limit {
+                        what: "body bytes",
+                        ..
+                    }
+                ),
+                "{error}"
+            );
         }
         let mut bytes = bytes.clone();
         bytes[80..84].copy_from_slice(&u32::MAX.to_le_bytes());
         reseal_header(&mut bytes);
-        assert!(matches!(decode(&bytes), Err(WireError::Limit { what: "metadata bytes", .. })));
+        assert!(matches!(
+            decode(&bytes),
+            Err(WireError::Limit {
+                what: "metadata bytes",
+                ..
+            })
+        ));
     }
 }
 
-fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, compression: Compression) -> WireError {
-    let codec = Codec { dtype: Dtype::I8, selection, compression };
-    let features = EncodedFeatures { grid, channels, code_of: None, codec, rate: None, body: Body::Bytes(vec![0; 15]) };
+fn absurd_map(
+    grid: BevGrid,
+    channels: u32,
+    selection: Selection,
+    compression: Compression,
+) -> WireError {
+    let codec = Codec {
+        dtype: Dtype::I8,
+        selection,
+        compression,
+    };
+    let features = EncodedFeatures {
+        grid,
+        channels,
+        code_of: None,
+        codec,
+        rate: None,
+        body: Body::Bytes(vec![0; 15]),
+    };
     features.decode(&Limits::DEFAULT).unwrap_err()
 }
 
 #[test]
 fn absurd_shapes_in_the_metadata_are_refused() {
     let (grid, none) = (sample::grid(), Selection::TopK { cells: 0 });
-    let huge = BevGrid { width: u32::MAX, height: u32::MAX, ..grid };
-    let large = BevGrid { width: 1024, height: 1024, ..grid };
+    let huge = BevGrid {
+        width: u32::MAX,
+        height: u32::MAX,
+        ..grid
+    };
+    let large = BevGrid {
+        width: 1024,
+        height: 1024,
+        ..grid
+    };
     for compression in [Compression::Raw, Compression::Zstd] {
-        assert!(matches!(absurd_map(huge, u32::MAX, Selection::Dense, compression), WireError::Limit { .. }));
-        assert!(matches!(absurd_map(huge, 1, none, compression), WireError::Limit { what: "grid cells", .. }));
-        assert!(matches!(absurd_map(grid, u32::MAX, none, compression), WireError::Limit { what: "channels", .. }));
+        assert!(matches!(
+            absurd_map(huge, u32::MAX, Selection::Dense, compression),
+            WireError::Limit { .. }
+        ));
+        assert!(matches!(
+            absurd_map(huge, 1, none, compression),
+            WireError::Limit {
+                what: "grid cells",
+                ..
+            }
+        ));
+        assert!(matches!(
+            absurd_map(grid, u32::MAX, none, compression),
+            WireError::Limit {
+                what: "channels",
+                ..
+            }
+        ));
         // 4 GiB decompressed, from an empty body.
         assert!(matches!(
             absurd_map(large, 1024, none, compression),
-            WireError::Limit { what: "feature map bytes", .. }
+            WireError::Limit {
+                what: "feature map bytes",
+                ..
+            }
         ));
-        let all_and_one = Selection::TopK { cells: grid.cells() as u32 + 1 };
+        let all_and_one = Selection::TopK {
+            cells: grid.cells() as u32 + 1,
+        };
         assert!(matches!(
             absurd_map(grid, 1, all_and_one, compression),
-            WireError::Limit { what: "selected cells", .. }
+            WireError::Limit {
+                what: "selected cells",
+                ..
+            }
         ));
         let empty = BevGrid { height: 0, ..grid };
-        assert!(matches!(absurd_map(empty, 1, Selection::Dense, compression), WireError::Shape { .. }));
+        assert!(matches!(
+            absurd_map(empty, 1, Selection::Dense, compression),
+            WireError::Shape { .. }
+        ));
         for cell_m in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             let error = absurd_map(BevGrid { cell_m, ..grid }, 1, none, compression);
-            assert!(matches!(error, WireError::Value { what: "grid cell_m", .. }), "{error}");
+            assert!(
+                matches!(
+                    error,
+                    WireError::Value {
+                        what: "grid cell_m",
+                        ..
+                    }
+                ),
+                "{error}"
+            );
         }
     }
 }
 
 #[test]
 fn a_code_has_no_more_channels_than_its_map_and_the_map_no_more_than_the_limit() {
-    for (decoded, is_right) in [(2, false), (3, true), (1024, true), (1025, false), (u32::MAX, false)] {
+    for (decoded, is_right) in [
+        (2, false),
+        (3, true),
+        (1024, true),
+        (1025, false),
+        (u32::MAX, false),
+    ] {
         let mut bev = sample::compressed_bev();
         bev.features.code_of = Some(decoded);
         // An attacker can write a message that the encoder rejects.
@@ -143,29 +240,53 @@ fn a_code_has_no_more_channels_than_its_map_and_the_map_no_more_than_the_limit()
         assert_eq!(encoded.is_ok(), decoded > 2, "{decoded}");
         let Ok(encoded) = encoded else { continue };
         match decode(&encoded.to_vec()) {
-            Ok((_, Message::Bev(bev))) => assert!(is_right && bev.features.code_of == Some(decoded), "{decoded}"),
+            Ok((_, Message::Bev(bev))) => assert!(
+                is_right && bev.features.code_of == Some(decoded),
+                "{decoded}"
+            ),
             Ok(other) => panic!("{other:?}"),
-            Err(error) => assert!(!is_right && error.drop_reason() == DropReason::Shape, "{error}"),
+            Err(error) => assert!(
+                !is_right && error.drop_reason() == DropReason::Shape,
+                "{error}"
+            ),
         }
     }
 }
 
 #[test]
 fn smaller_limits_are_kept_too() {
-    let limits = Limits { max_points: 99, max_boxes: 1, max_entries: 0, max_channels: 2, ..Limits::DEFAULT };
+    let limits = Limits {
+        max_points: 99,
+        max_boxes: 1,
+        max_entries: 0,
+        max_channels: 2,
+        ..Limits::DEFAULT
+    };
     for bytes in every_message() {
         let (_, message) = decode(&bytes).unwrap();
         let refused = match &message {
             Message::Lidar(lidar) => lidar.points.len() > 99,
             Message::Radar(_) | Message::Points(_) | Message::Boxes(_) | Message::Bev(_) => true,
-            Message::Descriptor(_) | Message::Detections(_) | Message::Truth(_) | Message::Stats(_) => true,
-            Message::Control(protocol::Control::End { .. } | protocol::Control::Ready { .. }) => true,
+            Message::Descriptor(_)
+            | Message::Detections(_)
+            | Message::Truth(_)
+            | Message::Stats(_) => true,
+            Message::Control(protocol::Control::End { .. } | protocol::Control::Ready { .. }) => {
+                true
+            }
             Message::Camera(_) => false,
-            Message::Control(_) | Message::Gnss(_) | Message::Imu(_) | Message::Pace(_) | Message::Pose(_) => false,
+            Message::Control(_)
+            | Message::Gnss(_)
+            | Message::Imu(_)
+            | Message::Pace(_)
+            | Message::Pose(_) => false,
         };
         match wire::decode_any([&bytes[..]], &limits) {
             Ok(_) => assert!(!refused, "{message:?}"),
-            Err(error) => assert!(refused && error.drop_reason() == DropReason::Shape, "{error}"),
+            Err(error) => assert!(
+                refused && error.drop_reason() == DropReason::Shape,
+                "{error}"
+            ),
         }
     }
 }
@@ -179,14 +300,33 @@ fn numbers_that_are_not_finite_are_never_accepted() {
         let mut points = sample::points();
         points.xyzi[50][2] = bad;
         for message in [
-            Message::Bev(Bev { pose: sample::pose(), features }),
-            Message::Lidar(Lidar { points: points.clone() }),
-            Message::Points(Points { pose: sample::pose(), points }),
+            Message::Bev(Bev {
+                pose: sample::pose(),
+                features,
+            }),
+            Message::Lidar(Lidar {
+                points: points.clone(),
+            }),
+            Message::Points(Points {
+                pose: sample::pose(),
+                points,
+            }),
         ] {
-            let bytes = wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
+            let bytes = wire::encode_any(&sample::stamp(), message)
+                .unwrap()
+                .to_vec();
             for size in [7, 1 << 20] {
                 let error = wire::decode_any(bytes.chunks(size), &Limits::DEFAULT).unwrap_err();
-                assert!(matches!(error, WireError::Value { index: 500 | 202, .. }), "{error}");
+                assert!(
+                    matches!(
+                        error,
+                        WireError::Value {
+                            index: 500 | 202,
+                            ..
+                        }
+                    ),
+                    "{error}"
+                );
                 assert_eq!(error.drop_reason(), DropReason::NotFinite);
             }
         }
@@ -262,14 +402,25 @@ impl Mutation {
 
 /// An accepted message must be valid: it can be used and encoded, and decodes to the same message.
 fn check_accepted(message: Message) -> Result<(), TestCaseError> {
-    let bytes = wire::encode_any(&sample::stamp(), message.clone()).expect("valid").to_vec();
+    let bytes = wire::encode_any(&sample::stamp(), message.clone())
+        .expect("valid")
+        .to_vec();
     prop_assert_eq!(&decode(&bytes).expect("valid").1, &message);
     if let Message::Bev(bev) = message
         && let Ok(decoded) = bev.features.decode(&Limits::DEFAULT)
     {
         let grid = decoded.features.grid;
-        prop_assert_eq!(decoded.features.values.len(), grid.cells() * decoded.features.channels as usize);
-        prop_assert!(decoded.features.values.iter().all(|value| value.is_finite()));
+        prop_assert_eq!(
+            decoded.features.values.len(),
+            grid.cells() * decoded.features.channels as usize
+        );
+        prop_assert!(
+            decoded
+                .features
+                .values
+                .iter()
+                .all(|value| value.is_finite())
+        );
     }
     Ok(())
 }

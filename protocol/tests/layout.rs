@@ -43,7 +43,9 @@ const PINNED: [(&str, usize, u64); 33] = [
 ];
 
 fn fnv1a(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
+    })
 }
 
 fn compressed(message: &Message) -> bool {
@@ -52,19 +54,29 @@ fn compressed(message: &Message) -> bool {
 
 #[test]
 fn bytes_are_stable() {
-    let found = sample::every_kind().into_iter().filter(|message| !compressed(message)).map(|message| {
-        let kind = message.kind().to_string();
-        let bytes = wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
-        (kind, bytes.len(), fnv1a(&bytes))
-    });
+    let found = sample::every_kind()
+        .into_iter()
+        .filter(|message| !compressed(message))
+        .map(|message| {
+            let kind = message.kind().to_string();
+            let bytes = wire::encode_any(&sample::stamp(), message)
+                .unwrap()
+                .to_vec();
+            (kind, bytes.len(), fnv1a(&bytes))
+        });
     let found: Vec<_> = found.collect();
-    let pinned: Vec<_> = PINNED.iter().map(|(kind, len, hash)| ((*kind).to_owned(), *len, *hash)).collect();
+    let pinned: Vec<_> = PINNED
+        .iter()
+        .map(|(kind, len, hash)| ((*kind).to_owned(), *len, *hash))
+        .collect();
     assert_eq!(found, pinned, "found {found:#x?}");
 }
 
 #[test]
 fn a_pose_without_a_covariance_is_sixty_two_bytes_behind_its_header() {
-    let bytes = wire::encode(&sample::stamp(), sample::pose()).unwrap().to_vec();
+    let bytes = wire::encode(&sample::stamp(), sample::pose())
+        .unwrap()
+        .to_vec();
     let mut expected = vec![0];
     for number in [120.5f64, -30.25, 1.75, 0.8, 0.0, 0.0, 0.6] {
         expected.extend(number.to_le_bytes());

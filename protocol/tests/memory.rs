@@ -6,24 +6,56 @@ mod sample;
 use std::io::Write;
 
 use protocol::{
-    BevGrid, Body, Codec, Compression, Dtype, EncodedFeatures, HEADER_LEN, Limits, Message, Selection, WireError, wire,
+    BevGrid, Body, Codec, Compression, Dtype, EncodedFeatures, HEADER_LEN, Limits, Message,
+    Selection, WireError, wire,
 };
 
 const MIB: u64 = 1 << 20;
-const LIMITS: Limits = Limits { max_body_bytes: 8 * MIB, ..Limits::DEFAULT };
+const LIMITS: Limits = Limits {
+    max_body_bytes: 8 * MIB,
+    ..Limits::DEFAULT
+};
 
 /// Resident memory in bytes, now or at its peak.
 fn resident(field: &str) -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find_map(|line| line.strip_prefix(field)).unwrap();
-    line.trim_start_matches(':').trim().trim_end_matches(" kB").parse::<u64>().unwrap() * 1024
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix(field))
+        .unwrap();
+    line.trim_start_matches(':')
+        .trim()
+        .trim_end_matches(" kB")
+        .parse::<u64>()
+        .unwrap()
+        * 1024
 }
 
 /// `[1024, 32, 64]`: 8 MiB as `f32`, the maximum of the limits.
-fn largest_map(dtype: Dtype, selection: Selection, compression: Compression, body: Vec<u8>) -> EncodedFeatures {
-    let grid = BevGrid { width: 64, height: 32, ..sample::grid() };
-    let codec = Codec { dtype, selection, compression };
-    EncodedFeatures { grid, channels: 1024, code_of: None, codec, rate: None, body: Body::Bytes(body) }
+fn largest_map(
+    dtype: Dtype,
+    selection: Selection,
+    compression: Compression,
+    body: Vec<u8>,
+) -> EncodedFeatures {
+    let grid = BevGrid {
+        width: 64,
+        height: 32,
+        ..sample::grid()
+    };
+    let codec = Codec {
+        dtype,
+        selection,
+        compression,
+    };
+    EncodedFeatures {
+        grid,
+        channels: 1024,
+        code_of: None,
+        codec,
+        rate: None,
+        body: Body::Bytes(body),
+    }
 }
 
 /// A zstd frame of zeros, written in small parts so that making it allocates little memory.
@@ -76,7 +108,12 @@ fn claims_allocate_no_memory_and_bombs_at_most_twice_the_limit() {
         for bytes in &claims {
             let error = wire::decode_any([&bytes[..]], &LIMITS).unwrap_err();
             assert!(
-                matches!(error, WireError::Limit { .. } | WireError::Metadata { .. } | WireError::Truncated { .. }),
+                matches!(
+                    error,
+                    WireError::Limit { .. }
+                        | WireError::Metadata { .. }
+                        | WireError::Truncated { .. }
+                ),
                 "{error}"
             );
         }
@@ -84,15 +121,56 @@ fn claims_allocate_no_memory_and_bombs_at_most_twice_the_limit() {
     let after_claims = resident("VmHWM") - before;
     assert!(after_claims < 4 * MIB, "claims took {after_claims} bytes");
 
-    let dense = |bomb: &[u8]| largest_map(Dtype::F32, Selection::Dense, Compression::Zstd, bomb.to_vec());
-    assert!(matches!(dense(&bomb).decode(&LIMITS), Err(WireError::Compression { .. })));
-    assert!(dense(&small_bomb).decode(&LIMITS).unwrap().features.values.iter().all(|value| *value == 0.0));
-    let nothing = largest_map(Dtype::F16, Selection::TopK { cells: 0 }, Compression::Raw, vec![0; 64 * 32 / 8]);
-    let message = Message::Bev(protocol::Bev { pose: sample::pose(), features: nothing });
-    let bytes = wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
+    let dense = |bomb: &[u8]| {
+        largest_map(
+            Dtype::F32,
+            Selection::Dense,
+            Compression::Zstd,
+            bomb.to_vec(),
+        )
+    };
+    assert!(matches!(
+        dense(&bomb).decode(&LIMITS),
+        Err(WireError::Compression { .. })
+    ));
+    assert!(
+        dense(&small_bomb)
+            .decode(&LIMITS)
+            .unwrap()
+            .features
+            .values
+            .iter()
+            .all(|value| *value == 0.0)
+    );
+    let nothing = largest_map(
+        Dtype::F16,
+        Selection::TopK { cells: 0 },
+        Compression::Raw,
+        vec![0; 64 * 32 / 8],
+    );
+    let message = Message::Bev(protocol::Bev {
+        pose: sample::pose(),
+        features: nothing,
+    });
+    let bytes = wire::encode_any(&sample::stamp(), message)
+        .unwrap()
+        .to_vec();
     let (_, message) = wire::decode_any([&bytes[..]], &LIMITS).unwrap();
-    let Message::Bev(bev) = message else { panic!("a map") };
-    assert!(bev.features.decode(&LIMITS).unwrap().sent.unwrap().iter().all(|sent| !sent));
+    let Message::Bev(bev) = message else {
+        panic!("a map")
+    };
+    assert!(
+        bev.features
+            .decode(&LIMITS)
+            .unwrap()
+            .sent
+            .unwrap()
+            .iter()
+            .all(|sent| !sent)
+    );
     let peak = resident("VmHWM") - before;
-    assert!(peak < 2 * LIMITS.max_body_bytes + 4 * MIB, "bombs took {peak} bytes");
+    assert!(
+        peak < 2 * LIMITS.max_body_bytes + 4 * MIB,
+        "bombs took {peak} bytes"
+    );
 }

@@ -5,8 +5,8 @@ mod sample;
 use bytes::Bytes;
 use proptest::prelude::*;
 use protocol::{
-    Bev, BevFeatures, Body, CodecConfig, DecodedFeatures, DetectionsReport, Dtype, Limits, Message, WireError,
-    encode_features, wire,
+    Bev, BevFeatures, Body, CodecConfig, DecodedFeatures, DetectionsReport, Dtype, Limits, Message,
+    WireError, encode_features, wire,
 };
 use sample::any::{any_map, any_message, any_stamp};
 
@@ -29,7 +29,14 @@ fn a_dense_map_is_never_copied_on_its_way_out() {
     let features = sample::features();
     let address = features.values.as_ptr().cast::<u8>();
     let features = encode_features(features, &CodecConfig::default(), None).unwrap();
-    let encoded = wire::encode(&sample::stamp(), Bev { pose: sample::pose(), features }).unwrap();
+    let encoded = wire::encode(
+        &sample::stamp(),
+        Bev {
+            pose: sample::pose(),
+            features,
+        },
+    )
+    .unwrap();
     let payload = Bytes::from_owner(encoded.body);
     assert_eq!(payload.as_ptr(), address);
     assert_eq!(payload.len(), 4 * 3 * 12 * 16);
@@ -37,18 +44,30 @@ fn a_dense_map_is_never_copied_on_its_way_out() {
 
 #[test]
 fn a_dense_map_is_moved_out_of_its_message() {
-    let bytes = wire::encode(&sample::stamp(), sample::bev(&CodecConfig::default())).unwrap().to_vec();
+    let bytes = wire::encode(&sample::stamp(), sample::bev(&CodecConfig::default()))
+        .unwrap()
+        .to_vec();
     let (_, bev) = wire::decode::<Bev>([&bytes[..]], &Limits::DEFAULT).unwrap();
-    let Body::Floats(values) = &bev.features.body else { panic!("a tensor") };
+    let Body::Floats(values) = &bev.features.body else {
+        panic!("a tensor")
+    };
     let address = values.as_ptr();
     let decoded = bev.features.decode(&Limits::DEFAULT).unwrap();
     assert_eq!(decoded.features.values.as_ptr(), address);
-    assert_eq!(decoded, DecodedFeatures { features: sample::features(), sent: None });
+    assert_eq!(
+        decoded,
+        DecodedFeatures {
+            features: sample::features(),
+            sent: None
+        }
+    );
 }
 
 #[test]
 fn a_message_of_another_kind_is_refused() {
-    let bytes = wire::encode(&sample::stamp(), sample::pose()).unwrap().to_vec();
+    let bytes = wire::encode(&sample::stamp(), sample::pose())
+        .unwrap()
+        .to_vec();
     let error = wire::decode::<Bev>([&bytes[..]], &Limits::DEFAULT).unwrap_err();
     assert!(matches!(error, WireError::Kind { .. }), "{error}");
 }
@@ -57,11 +76,17 @@ fn a_message_of_another_kind_is_refused() {
 fn detections_json_is_stable() {
     let json = DetectionsReport::new(&sample::stamp(), Some(7), sample::detections()).to_json();
     let value: serde_json::Value = serde_json::from_str(&json).unwrap();
-    assert_eq!((&value["tick"], &value["agent_frame"]), (&7.into(), &3.into()));
+    assert_eq!(
+        (&value["tick"], &value["agent_frame"]),
+        (&7.into(), &3.into())
+    );
     assert_eq!(value["ego"], "4279");
     assert_eq!(value["capture_nanos"], 1_500_000_000u64);
     assert_eq!(value["detections"][1]["score"], 1.0);
-    assert_eq!(value["detections"][0]["box"]["center_m"], serde_json::json!([10.0, -3.5, 0.4]));
+    assert_eq!(
+        value["detections"][0]["box"]["center_m"],
+        serde_json::json!([10.0, -3.5, 0.4])
+    );
     assert_eq!(value["fused"][0]["cav"], "4288");
     assert_eq!(value["fused"][0]["age_nanos"], -5_000_000);
     assert_eq!(value["skipped"][1]["reason"], "stale");
@@ -79,12 +104,28 @@ fn error_bound(dtype: Dtype, value: f32, largest: f32) -> f32 {
     }
 }
 
-fn check_channel(dtype: Dtype, before: &[f32], after: &[f32], sent: &[bool]) -> Result<(), TestCaseError> {
-    let sent_values = before.iter().zip(sent).filter(|(_, sent)| **sent).map(|(value, _)| value.abs());
+fn check_channel(
+    dtype: Dtype,
+    before: &[f32],
+    after: &[f32],
+    sent: &[bool],
+) -> Result<(), TestCaseError> {
+    let sent_values = before
+        .iter()
+        .zip(sent)
+        .filter(|(_, sent)| **sent)
+        .map(|(value, _)| value.abs());
     let largest = sent_values.fold(0f32, f32::max);
     for ((before, after), sent) in before.iter().zip(after).zip(sent) {
-        let (expected, bound) = if *sent { (*before, error_bound(dtype, *before, largest)) } else { (0.0, 0.0) };
-        prop_assert!((expected - after).abs() <= bound, "{before} came back as {after}, sent: {sent}");
+        let (expected, bound) = if *sent {
+            (*before, error_bound(dtype, *before, largest))
+        } else {
+            (0.0, 0.0)
+        };
+        prop_assert!(
+            (expected - after).abs() <= bound,
+            "{before} came back as {after}, sent: {sent}"
+        );
     }
     Ok(())
 }

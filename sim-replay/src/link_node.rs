@@ -12,7 +12,10 @@ use serde::Serialize;
 
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Arrival, Bus, BusError, Event, Inbox, InboxLimits, Membership, Publisher, PublisherOptions, Subscription};
+use bus::{
+    Arrival, Bus, BusError, Event, Inbox, InboxLimits, Membership, Publisher, PublisherOptions,
+    Subscription,
+};
 use link::{Delivery, LinkEmulator, Outcome, Packet};
 use support::nanos;
 
@@ -46,7 +49,13 @@ impl NodeOptions {
     /// Until all agents of a run have ended, with at most 1 GiB in flight.
     #[must_use]
     pub const fn new(ego: CavId, streams: Vec<Stream>) -> Self {
-        Self { ego, streams, keeps_running: false, max_kept_bytes: 1 << 30, inbox: InboxLimits::PEERS }
+        Self {
+            ego,
+            streams,
+            keeps_running: false,
+            max_kept_bytes: 1 << 30,
+            inbox: InboxLimits::PEERS,
+        }
     }
 }
 
@@ -79,18 +88,35 @@ impl LinkReport {
 ///
 /// # Errors
 /// [`BusError`] if the bus fails. Faults of single messages are counted and logged.
-pub fn run(bus: &Bus, emulator: LinkEmulator, options: &NodeOptions, stop: &Stop) -> Result<LinkReport, BusError> {
+pub fn run(
+    bus: &Bus,
+    emulator: LinkEmulator,
+    options: &NodeOptions,
+    stop: &Stop,
+) -> Result<LinkReport, BusError> {
     let mut node = Node::open(bus, emulator, options, stop)?;
     let presence = bus.announce(Role::Link)?;
     node.carry(stop)?;
-    let Node { vehicles, kept, mut report, .. } = node;
+    let Node {
+        vehicles,
+        kept,
+        mut report,
+        ..
+    } = node;
     report.under_way = kept.len() as u64;
-    let longest = kept.values().map(|arrival| arrival.at.elapsed()).max().unwrap_or_default();
+    let longest = kept
+        .values()
+        .map(|arrival| arrival.at.elapsed())
+        .max()
+        .unwrap_or_default();
     report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
     for topic in kept.values().map(|arrival| &arrival.topic) {
         bus.stats().dropped(topic, DropReason::Stale);
     }
-    vehicles.into_values().flat_map(|vehicle| vehicle.publishers.into_values()).for_each(Publisher::finish);
+    vehicles
+        .into_values()
+        .flat_map(|vehicle| vehicle.publishers.into_values())
+        .for_each(Publisher::finish);
     presence.withdraw()?;
     Ok(report)
 }
@@ -128,8 +154,17 @@ struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    fn open(bus: &'a Bus, emulator: LinkEmulator, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
-        let inbox = bus.limited_inbox(PLACES, MAX_VEHICLES * (options.streams.len() + 1), options.inbox);
+    fn open(
+        bus: &'a Bus,
+        emulator: LinkEmulator,
+        options: &'a NodeOptions,
+        stop: &Stop,
+    ) -> Result<Self, BusError> {
+        let inbox = bus.limited_inbox(
+            PLACES,
+            MAX_VEHICLES * (options.streams.len() + 1),
+            options.inbox,
+        );
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
@@ -157,10 +192,18 @@ impl<'a> Node<'a> {
         while !stop.requested() {
             self.update_membership()?;
             match self.inbox.take(Some(self.next_moment())) {
-                Pop::Item(Topic::Stream { cav, stream: Stream::Gnss }, Event::Message(arrival)) => {
+                Pop::Item(
+                    Topic::Stream {
+                        cav,
+                        stream: Stream::Gnss,
+                    },
+                    Event::Message(arrival),
+                ) => {
                     self.locate(&cav, &arrival);
                 }
-                Pop::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => self.admit(cav, stream, arrival),
+                Pop::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => {
+                    self.admit(cav, stream, arrival)
+                }
                 Pop::Item(Topic::Stream { cav, stream }, Event::End { .. }) => {
                     if let Some(vehicle) = self.vehicles.get_mut(&cav) {
                         vehicle.ended.insert(stream);
@@ -178,10 +221,19 @@ impl<'a> Node<'a> {
     }
 
     fn is_over(&self) -> bool {
-        let mut senders = self.vehicles.iter().filter(|(cav, _)| **cav != self.options.ego).peekable();
+        let mut senders = self
+            .vehicles
+            .iter()
+            .filter(|(cav, _)| **cav != self.options.ego)
+            .peekable();
         !self.options.keeps_running
             && senders.peek().is_some()
-            && senders.all(|(_, vehicle)| self.options.streams.iter().all(|stream| vehicle.ended.contains(stream)))
+            && senders.all(|(_, vehicle)| {
+                self.options
+                    .streams
+                    .iter()
+                    .all(|stream| vehicle.ended.contains(stream))
+            })
             && self.kept.is_empty()
     }
 
@@ -209,8 +261,13 @@ impl<'a> Node<'a> {
     /// Adds a new vehicle; if all slots are taken, it replaces one that has left.
     fn add(&mut self, cav: CavId) -> Result<(), BusError> {
         if self.vehicles.len() >= MAX_VEHICLES {
-            let has_kept = |cav: &CavId| self.kept.values().any(|arrival| arrival.header.stamp.cav == *cav);
-            let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, has_kept).cloned() else {
+            let has_kept = |cav: &CavId| {
+                self.kept
+                    .values()
+                    .any(|arrival| arrival.header.stamp.cav == *cav)
+            };
+            let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, has_kept).cloned()
+            else {
                 self.reject(cav);
                 return Ok(());
             };
@@ -230,25 +287,56 @@ impl<'a> Node<'a> {
     }
 
     fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {
-        let subscribe = |stream| self.bus.subscribe(Topic::Stream { cav: cav.clone(), stream }, &self.inbox);
+        let subscribe = |stream| {
+            self.bus.subscribe(
+                Topic::Stream {
+                    cav: cav.clone(),
+                    stream,
+                },
+                &self.inbox,
+            )
+        };
         let mut subscriptions = vec![subscribe(Stream::Gnss)?];
         let mut publishers = BTreeMap::new();
         // The link does not apply to the ego's own agent.
-        let streams = if *cav == self.options.ego { &[][..] } else { &self.options.streams };
+        let streams = if *cav == self.options.ego {
+            &[][..]
+        } else {
+            &self.options.streams
+        };
         for &stream in streams {
             subscriptions.push(subscribe(stream)?);
-            let topic = Topic::Received { ego: self.options.ego.clone(), cav: cav.clone(), stream };
-            let how = if stream == Stream::Pose { PublisherOptions::POSE } else { PublisherOptions::FEATURES };
+            let topic = Topic::Received {
+                ego: self.options.ego.clone(),
+                cav: cav.clone(),
+                stream,
+            };
+            let how = if stream == Stream::Pose {
+                PublisherOptions::POSE
+            } else {
+                PublisherOptions::FEATURES
+            };
             // The emulator decides the losses; forwarding is lossless.
             publishers.insert(stream, self.bus.publisher(topic, how.waiting(PLACES))?);
         }
         let (ended, position_m, has_left) = (BTreeSet::new(), None, false);
-        Ok(Vehicle { publishers, ended, position_m, has_left, _subscriptions: subscriptions })
+        Ok(Vehicle {
+            publishers,
+            ended,
+            position_m,
+            has_left,
+            _subscriptions: subscriptions,
+        })
     }
 
     /// Records the position of a vehicle: loss may depend on distance.
     fn locate(&mut self, cav: &CavId, arrival: &Arrival) {
-        let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
+        let Some(Gnss {
+            world_from_lidar, ..
+        }) = self.inbox.decode(arrival, &Limits::DEFAULT)
+        else {
+            return;
+        };
         self.bus.stats().received(&arrival.topic);
         if let Some(vehicle) = self.vehicles.get_mut(cav) {
             vehicle.position_m = Some(world_from_lidar.translation_m);
@@ -287,7 +375,11 @@ impl<'a> Node<'a> {
 
     /// Distance between a sender and the ego, metres; 0 while either position is unknown.
     fn distance_m(&self, from: &CavId) -> f64 {
-        let position = |cav: &CavId| self.vehicles.get(cav).and_then(|vehicle| vehicle.position_m);
+        let position = |cav: &CavId| {
+            self.vehicles
+                .get(cav)
+                .and_then(|vehicle| vehicle.position_m)
+        };
         match (position(from), position(&self.options.ego)) {
             (Some(from), Some(to)) => (from[0] - to[0]).hypot(from[1] - to[1]),
             _ => 0.0,
@@ -297,27 +389,41 @@ impl<'a> Node<'a> {
     /// Forwards the messages that have arrived by now.
     fn settle(&mut self) {
         let Some(began) = self.began else { return };
-        for Outcome { packet, delivery, .. } in self.emulator.advance(nanos::between(began, Instant::now())) {
+        for Outcome {
+            packet, delivery, ..
+        } in self.emulator.advance(nanos::between(began, Instant::now()))
+        {
             match delivery {
                 Delivery::Dropped(reason) => {
                     if let Some(lost) = self.release(packet.id) {
                         self.lose(&lost, reason);
                     }
                 }
-                Delivery::Arrived { is_copy, is_repeated } => self.forward(&packet, is_copy, is_repeated),
+                Delivery::Arrived {
+                    is_copy,
+                    is_repeated,
+                } => self.forward(&packet, is_copy, is_repeated),
             }
         }
     }
 
     fn forward(&mut self, packet: &Packet, is_copy: bool, is_repeated: bool) {
-        let publisher = self.vehicles.get(&packet.from).and_then(|vehicle| vehicle.publishers.get(&packet.stream));
-        let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&packet.id)) else { return };
+        let publisher = self
+            .vehicles
+            .get(&packet.from)
+            .and_then(|vehicle| vehicle.publishers.get(&packet.stream));
+        let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&packet.id)) else {
+            return;
+        };
         match arrival.header.stamp.capture_nanos {
             // A message without capture time.
             0 => publisher.relay(arrival),
             scene_nanos => {
                 let began_nanos = *self.began_nanos.get_or_insert(scene_nanos);
-                publisher.relay_as(arrival, self.emulator.clock().shown_since(began_nanos, scene_nanos));
+                publisher.relay_as(
+                    arrival,
+                    self.emulator.clock().shown_since(began_nanos, scene_nanos),
+                );
             }
         }
         if is_copy {
@@ -346,7 +452,10 @@ impl<'a> Node<'a> {
 
     fn next_moment(&self) -> Instant {
         let soon = Instant::now() + MEMBERSHIP_PERIOD;
-        let next = self.began.zip(self.emulator.next_nanos()).map(|(began, nanos)| began + Duration::from_nanos(nanos));
+        let next = self
+            .began
+            .zip(self.emulator.next_nanos())
+            .map(|(began, nanos)| began + Duration::from_nanos(nanos));
         next.map_or(soon, |next| next.min(soon))
     }
 }
@@ -357,7 +466,8 @@ fn place_to_free<'v>(
     ego: &CavId,
     has_kept: impl Fn(&CavId) -> bool,
 ) -> Option<&'v CavId> {
-    let is_free = |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.has_left && *cav != ego && !has_kept(cav);
+    let is_free =
+        |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.has_left && *cav != ego && !has_kept(cav);
     vehicles.iter().find(is_free).map(|(cav, _)| cav)
 }
 
@@ -375,9 +485,12 @@ mod tests {
             has_left,
             _subscriptions: Vec::new(),
         };
-        let mut vehicles: BTreeMap<CavId, Vehicle> = (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();
+        let mut vehicles: BTreeMap<CavId, Vehicle> =
+            (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();
         let [ego, on_its_way] = [cav(0), cav(1)];
-        let free = |vehicles: &BTreeMap<_, _>| place_to_free(vehicles, &ego, |cav| *cav == on_its_way).cloned();
+        let free = |vehicles: &BTreeMap<_, _>| {
+            place_to_free(vehicles, &ego, |cav| *cav == on_its_way).cloned()
+        };
         assert_eq!(free(&vehicles), Some(cav(2)));
         vehicles.remove(&cav(2));
         assert_eq!(free(&vehicles), None);

@@ -60,21 +60,37 @@ impl RecordReport {
     /// True if all received messages are in the file.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.overwritten == 0 && self.undelivered == 0 && self.not_written == 0 && self.failure.is_none()
+        self.overwritten == 0
+            && self.undelivered == 0
+            && self.not_written == 0
+            && self.failure.is_none()
     }
 
     /// Description of the missing messages; `None` if there are none.
     #[must_use]
     pub fn loss_in_words(&self) -> Option<String> {
-        let Self { file, messages, seconds, overwritten, undelivered, not_written, failure, .. } = self;
+        let Self {
+            file,
+            messages,
+            seconds,
+            overwritten,
+            undelivered,
+            not_written,
+            failure,
+            ..
+        } = self;
         let missing = overwritten + undelivered + not_written;
         match failure {
             None if missing == 0 => None,
             None if *undelivered == missing => Some(format!(
                 "recording with gaps: the recorder was too slow for the router, {missing} messages missing"
             )),
-            None => Some(format!("recording with gaps: the disk is too slow, {missing} messages missing")),
-            Some(why) if *messages == 0 => Some(format!("nothing is recorded: {why}, {missing} messages missing")),
+            None => Some(format!(
+                "recording with gaps: the disk is too slow, {missing} messages missing"
+            )),
+            Some(why) if *messages == 0 => Some(format!(
+                "nothing is recorded: {why}, {missing} messages missing"
+            )),
             Some(why) => Some(format!(
                 "recording cut at {seconds:.1} s: {why}, {missing} messages missing; sim-replay recover {} --out {}",
                 file.display(),
@@ -205,16 +221,26 @@ impl Recorder<'_> {
             return;
         }
         self.taken += 1;
-        self.span = Some((self.span.map_or(raw.arrived_nanos, |(first, _)| first), raw.arrived_nanos));
+        self.span = Some((
+            self.span.map_or(raw.arrived_nanos, |(first, _)| first),
+            raw.arrived_nanos,
+        ));
         self.attempt(|writer| writer.write(&raw.key, raw.arrived_nanos, &raw.bytes()));
     }
 
-    fn attempt(&mut self, write: impl FnOnce(&mut RecordingWriter<std::fs::File>) -> Result<(), RecordingError>) {
-        let Some(writer) = &mut self.writer else { return };
+    fn attempt(
+        &mut self,
+        write: impl FnOnce(&mut RecordingWriter<std::fs::File>) -> Result<(), RecordingError>,
+    ) {
+        let Some(writer) = &mut self.writer else {
+            return;
+        };
         let written = write(writer);
         if writer.whole_messages() > self.report.messages {
             self.report.messages = writer.whole_messages();
-            self.report.seconds = self.span.map_or(0.0, |(first, last)| last.saturating_sub(first) as f64 * 1e-9);
+            self.report.seconds = self.span.map_or(0.0, |(first, last)| {
+                last.saturating_sub(first) as f64 * 1e-9
+            });
         }
         if let Err(error) = written {
             tracing::error!("the recording ends here, the run continues: {error}");
@@ -235,7 +261,10 @@ impl Recorder<'_> {
             self.report.bytes = file.len();
         }
         if self.report.overwritten > 0 {
-            tracing::error!(messages = self.report.overwritten, "the disk was too slow for the run");
+            tracing::error!(
+                messages = self.report.overwritten,
+                "the disk was too slow for the run"
+            );
         }
         self.report
     }
@@ -244,7 +273,9 @@ impl Recorder<'_> {
 /// Reason of the failure, without the file, which is in the report.
 fn in_words(error: &RecordingError) -> String {
     match error {
-        RecordingError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => "disk full".into(),
+        RecordingError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => {
+            "disk full".into()
+        }
         RecordingError::Io { source, .. } => source.to_string(),
         other => other.to_string(),
     }

@@ -10,11 +10,16 @@ use tests::mutation::scratch;
 static MEMORY: PeakAlloc = PeakAlloc;
 
 fn main() {
-    let numbers: Vec<u64> = std::env::args().skip(1).filter_map(|argument| argument.parse().ok()).collect();
+    let numbers: Vec<u64> = std::env::args()
+        .skip(1)
+        .filter_map(|argument| argument.parse().ok())
+        .collect();
     let number = |place: usize, usual| numbers.get(place).copied().unwrap_or(usual);
     let (of_messages, of_files, seed) = (number(0, 10_000_000), number(1, 1_000_000), number(2, 7));
     let scratch = scratch();
-    let folder = std::env::args().skip_while(|argument| argument != "--seeds").nth(1);
+    let folder = std::env::args()
+        .skip_while(|argument| argument != "--seeds")
+        .nth(1);
     if let Some(folder) = folder {
         return write_seeds(folder.as_ref(), formats(scratch.path()));
     }

@@ -35,8 +35,8 @@ use perception::model_config::DetectorConfig;
 use perception::weights::{self, Weights};
 use protocol::message::Bev;
 use protocol::{
-    CavId, CodecConfig, Detections, Dtype, EncodedFeatures, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
-    Topic, encode_features, wire,
+    CavId, CodecConfig, Detections, Dtype, EncodedFeatures, Limits, Pose, PoseEstimate, ProcessId,
+    Role, RunId, Stream, Topic, encode_features, wire,
 };
 use support::statistics;
 use tch::Device;
@@ -72,7 +72,9 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
     };
     let mut arguments = arguments.iter().filter(|argument| *argument != "--bench");
     while let Some(name) = arguments.next() {
-        let value = arguments.next().with_context(|| format!("{name} needs a value"))?;
+        let value = arguments
+            .next()
+            .with_context(|| format!("{name} needs a value"))?;
         match name.as_str() {
             // cargo runs benches in the folder of their package.
             "--out" => wanted.out = Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(value),
@@ -84,7 +86,9 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
                     _ => Dtype::F32,
                 }
             }
-            "--agents" => wanted.agents = value.split(',').map(str::parse).collect::<Result<_, _>>()?,
+            "--agents" => {
+                wanted.agents = value.split(',').map(str::parse).collect::<Result<_, _>>()?
+            }
             "--seconds" => wanted.seconds = value.parse()?,
             _ => bail!("{name} is none of --out, --models, --dtype, --agents, --seconds"),
         }
@@ -121,14 +125,23 @@ struct ReceivedResult {
 /// The feature map of a recorded sweep, and weights of the BEV grid.
 fn recorded_map(model: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, EncodedFeatures)> {
     let file = match model {
-        "lean" => Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights/lean-max.safetensors"),
+        "lean" => {
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights/lean-max.safetensors")
+        }
         "small" => {
-            let config =
-                DetectorConfig { lidar_range_m: [-25.6, -19.2, -3.0, 25.6, 19.2, 1.0], ..DetectorConfig::lean() };
+            let config = DetectorConfig {
+                lidar_range_m: [-25.6, -19.2, -3.0, 25.6, 19.2, 1.0],
+                ..DetectorConfig::lean()
+            };
             tch::manual_seed(7);
             let model = CooperativeModel::new(&config, Method::MAX, tch::Device::Cpu)?;
             let file = folder.join("small.safetensors");
-            weights::save(&file, &model.variables, &model.about(), weights::Precision::Single)?;
+            weights::save(
+                &file,
+                &model.variables,
+                &model.about(),
+                weights::Precision::Single,
+            )?;
             file
         }
         _ => bail!("model must be lean or small"),
@@ -146,7 +159,17 @@ fn recorded_map(model: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, En
         motion: frame.motion(),
     };
     let features = agent.process(&input)?.perception.features;
-    Ok((file, encode_features(features, &CodecConfig { dtype, ..CodecConfig::default() }, None)?))
+    Ok((
+        file,
+        encode_features(
+            features,
+            &CodecConfig {
+                dtype,
+                ..CodecConfig::default()
+            },
+            None,
+        )?,
+    ))
 }
 
 fn cav(index: usize) -> CavId {
@@ -154,37 +177,71 @@ fn cav(index: usize) -> CavId {
 }
 
 fn topic(index: usize, stream: Stream) -> Topic {
-    Topic::Stream { cav: cav(index), stream }
+    Topic::Stream {
+        cav: cav(index),
+        stream,
+    }
 }
 
 /// On the ring around the ego.
 fn pose(index: usize, count: usize) -> PoseEstimate {
     let angle = std::f64::consts::TAU * index as f64 / count as f64;
-    let place = if index == 0 { [0.0; 3] } else { [RING_M * angle.cos(), RING_M * angle.sin(), 1.9] };
-    PoseEstimate::new(Pose { translation_m: place, ..Pose::IDENTITY }, 1.0)
+    let place = if index == 0 {
+        [0.0; 3]
+    } else {
+        [RING_M * angle.cos(), RING_M * angle.sin(), 1.9]
+    };
+    PoseEstimate::new(
+        Pose {
+            translation_m: place,
+            ..Pose::IDENTITY
+        },
+        1.0,
+    )
 }
 
-fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Result<(Row, Vec<ReceivedResult>)> {
+fn measure(
+    file: &Path,
+    map: &EncodedFeatures,
+    count: usize,
+    seconds: u32,
+) -> Result<(Row, Vec<ReceivedResult>)> {
     let router = TestRouter::open();
     let session = open(&BusOptions::client(router.endpoint.clone()))?;
     let joined = |index: usize| {
         let process = ProcessId::new(&format!("agent-{index}"))?;
-        anyhow::Ok(Bus::over(session.clone(), Identity { run: RunId::new("test")?, process, cav: cav(index) })?)
+        anyhow::Ok(Bus::over(
+            session.clone(),
+            Identity {
+                run: RunId::new("test")?,
+                process,
+                cav: cav(index),
+            },
+        )?)
     };
     let fleet = (0..=count).map(joined).collect::<Result<Vec<_>>>()?;
     let scorer = router.join("scorer", "scorer");
     let inbox = scorer.inbox(4096, 1);
     let _subscription = scorer.subscribe(topic(0, Stream::Detections), &inbox)?;
-    let presences = fleet.iter().map(|bus| bus.announce(Role::Agent)).collect::<Result<Vec<_>, _>>()?;
+    let presences = fleet
+        .iter()
+        .map(|bus| bus.announce(Role::Agent))
+        .collect::<Result<Vec<_>, _>>()?;
     let publishers = fleet
         .iter()
         .enumerate()
         .map(|(index, bus)| bus.publisher(topic(index, Stream::Bev), PublisherOptions::FEATURES));
     let publishers = publishers.collect::<Result<Vec<_>, _>>()?;
     let mut ego = start_ego(&router, file)?;
-    let mut routes = vec![Route { topic: topic(0, Stream::Detections), receiver: "scorer".parse()? }];
+    let mut routes = vec![Route {
+        topic: topic(0, Stream::Detections),
+        receiver: "scorer".parse()?,
+    }];
     for index in 0..=count {
-        routes.push(Route { topic: topic(index, Stream::Bev), receiver: "ego-0".parse()? });
+        routes.push(Route {
+            topic: topic(index, Stream::Bev),
+            receiver: "ego-0".parse()?,
+        });
     }
     Barrier::new(routes).await_routes(&scorer)?.wait(TIMEOUT)?;
 
@@ -198,39 +255,80 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
         }
         for (index, publisher) in publishers.iter().enumerate() {
             let (features, pose) = (map.clone(), pose(index, count));
-            publisher.submit_encoded(capture_nanos, move |stamp| wire::encode(stamp, Bev { pose, features }));
+            publisher.submit_encoded(capture_nanos, move |stamp| {
+                wire::encode(stamp, Bev { pose, features })
+            });
         }
     }
     thread::sleep(PERIOD * 3);
     let cpu_ms = machine::cpu_ms(ego.id())? - cpu_ms;
     publishers.into_iter().for_each(bus::Publisher::finish);
-    presences.into_iter().try_for_each(bus::LivelinessToken::withdraw)?;
+    presences
+        .into_iter()
+        .try_for_each(bus::LivelinessToken::withdraw)?;
     if !ego.wait()?.success() {
         bail!("the ego failed: see above");
     }
     let mut received = Vec::new();
     while let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now())) {
         let result: Detections = arrival.decode(&Limits::DEFAULT)?;
-        let in_time = result.fused.iter().filter(|fused| fused.age_nanos == 0).count();
-        let (capture_nanos, publish_nanos) = (arrival.header.stamp.capture_nanos, arrival.header.stamp.publish_nanos);
+        let in_time = result
+            .fused
+            .iter()
+            .filter(|fused| fused.age_nanos == 0)
+            .count();
+        let (capture_nanos, publish_nanos) = (
+            arrival.header.stamp.capture_nanos,
+            arrival.header.stamp.publish_nanos,
+        );
         if capture_nanos >= first_nanos {
-            received.push(ReceivedResult { capture_nanos, publish_nanos, in_time });
+            received.push(ReceivedResult {
+                capture_nanos,
+                publish_nanos,
+                in_time,
+            });
         }
     }
-    Ok((row(map, count, (ticks - WARM_UP) as usize, cpu_ms, &received), received))
+    Ok((
+        row(map, count, (ticks - WARM_UP) as usize, cpu_ms, &received),
+        received,
+    ))
 }
 
 fn start_ego(router: &TestRouter, weights: &Path) -> Result<Child> {
     let mut command = Command::new(tests::fleet::programs().join("ego-fuser"));
-    command.args(["run", "--run=test", "--ego=0", "--method=max", "--threads=1"]);
-    command.arg(format!("--connect={}", router.endpoint)).arg(format!("--deadline-ms={DEADLINE_MS}"));
-    Ok(command.arg("--weights").arg(weights).stdout(Stdio::null()).spawn()?)
+    command.args([
+        "run",
+        "--run=test",
+        "--ego=0",
+        "--method=max",
+        "--threads=1",
+    ]);
+    command
+        .arg(format!("--connect={}", router.endpoint))
+        .arg(format!("--deadline-ms={DEADLINE_MS}"));
+    Ok(command
+        .arg("--weights")
+        .arg(weights)
+        .stdout(Stdio::null())
+        .spawn()?)
 }
 
-fn row(map: &EncodedFeatures, count: usize, ticks: usize, cpu_ms: f64, received: &[ReceivedResult]) -> Row {
+fn row(
+    map: &EncodedFeatures,
+    count: usize,
+    ticks: usize,
+    cpu_ms: f64,
+    received: &[ReceivedResult],
+) -> Row {
     let latencies: Vec<f64> = received
         .iter()
-        .map(|received| received.publish_nanos.saturating_sub(received.capture_nanos) as f64 / 1e6)
+        .map(|received| {
+            received
+                .publish_nanos
+                .saturating_sub(received.capture_nanos) as f64
+                / 1e6
+        })
         .collect();
     let latencies = statistics::sorted(&latencies);
     let quantile = |q: f64| statistics::quantile(&latencies, q).unwrap_or(f64::NAN);
@@ -242,7 +340,10 @@ fn row(map: &EncodedFeatures, count: usize, ticks: usize, cpu_ms: f64, received:
         neighbours: count,
         frames: received.len(),
         lost_frames: ticks - received.len().min(ticks),
-        incomplete: received.iter().filter(|received| received.in_time < count).count(),
+        incomplete: received
+            .iter()
+            .filter(|received| received.in_time < count)
+            .count(),
         in_time: fused as f64 / (ticks * count) as f64,
         cpu_per_frame_ms: cpu_ms / received.len().max(1) as f64,
         latency_p50_ms: quantile(0.5),
@@ -262,15 +363,20 @@ fn line(rows: &[&Row]) -> Option<[f64; 3]> {
     let mean = |axis: usize| points.iter().map(|point| point[axis]).sum::<f64>() / count;
     let [x, y] = [mean(0), mean(1)];
     let sum = |of: &dyn Fn(&[f64; 2]) -> f64| points.iter().map(of).sum::<f64>();
-    let (xx, xy, yy) = (sum(&|p| (p[0] - x).powi(2)), sum(&|p| (p[0] - x) * (p[1] - y)), sum(&|p| (p[1] - y).powi(2)));
+    let (xx, xy, yy) = (
+        sum(&|p| (p[0] - x).powi(2)),
+        sum(&|p| (p[0] - x) * (p[1] - y)),
+        sum(&|p| (p[1] - y).powi(2)),
+    );
     (points.len() > 2).then(|| [y - x * xy / xx, xy / xx, xy * xy / (xx * yy)])
 }
 
 fn write(wanted: &Wanted, arguments: &str, rows: &[Row]) -> Result<()> {
     fs::create_dir_all(&wanted.out)?;
-    let mut csv = "model,dtype,map_bytes,neighbours,frames,lost_frames,incomplete_frames,share_in_time,\
+    let mut csv =
+        "model,dtype,map_bytes,neighbours,frames,lost_frames,incomplete_frames,share_in_time,\
         ego_cpu_ms_per_frame,latency_p50_ms,latency_p99_ms\n"
-        .to_owned();
+            .to_owned();
     let mut markdown = format!(
         "`cargo bench -p tests --bench scaling -- {arguments}`\n\n{}\n\n\
         | model | dtype | KB a map | neighbours | frames | lost frames | incomplete | maps in time | ego CPU ms/frame | \
@@ -278,7 +384,17 @@ fn write(wanted: &Wanted, arguments: &str, rows: &[Row]) -> Result<()> {
         machine::describe(),
     );
     for row in rows {
-        let Row { model, dtype, bytes, neighbours, frames, lost_frames, incomplete, in_time, .. } = row;
+        let Row {
+            model,
+            dtype,
+            bytes,
+            neighbours,
+            frames,
+            lost_frames,
+            incomplete,
+            in_time,
+            ..
+        } = row;
         let [cpu, p50, p99] = [row.cpu_per_frame_ms, row.latency_p50_ms, row.latency_p99_ms];
         let dtype = format!("{dtype:?}").to_lowercase();
         writeln!(
@@ -310,7 +426,10 @@ fn write(wanted: &Wanted, arguments: &str, rows: &[Row]) -> Result<()> {
 }
 
 fn main() -> Result<()> {
-    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let arguments: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|argument| argument != "--bench")
+        .collect();
     let wanted = wanted(&arguments)?;
     tch::set_num_threads(1);
     let mut rows = Vec::new();
@@ -325,7 +444,11 @@ fn main() -> Result<()> {
                 100.0 * row.in_time,
                 row.latency_p99_ms
             );
-            rows.push(Row { model: model.clone(), dtype: wanted.dtype, ..row });
+            rows.push(Row {
+                model: model.clone(),
+                dtype: wanted.dtype,
+                ..row
+            });
         }
     }
     write(&wanted, &arguments.join(" "), &rows)

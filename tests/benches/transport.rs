@@ -18,7 +18,9 @@ use std::time::{Duration, Instant};
 
 use bus::{Barrier, Bus, Event, Inbox, Publisher, PublisherOptions, Route, Subscription};
 use protocol::message::Bev;
-use protocol::{BevFeatures, BevGrid, Body, CodecConfig, Limits, Pose, PoseEstimate, Topic, encode_features};
+use protocol::{
+    BevFeatures, BevGrid, Body, CodecConfig, Limits, Pose, PoseEstimate, Topic, encode_features,
+};
 use support::statistics;
 use tests::bus::{TIMEOUT, TestRouter, free_port, next_event, wait_for};
 use zenoh::bytes::ZBytes;
@@ -33,9 +35,22 @@ const AT_MOST: f64 = 1.2;
 fn features(mib: u32) -> BevFeatures {
     let (channels, cells) = (64, mib << 12);
     let width = (f64::from(cells).sqrt() as u32).next_power_of_two();
-    let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width, height: cells / width };
-    let values = (0..channels * cells).map(|index| (index % 1009) as f32 * 0.01).collect();
-    BevFeatures { grid, channels, code_of: None, values }
+    let grid = BevGrid {
+        x_min_m: -51.2,
+        y_min_m: -38.4,
+        cell_m: 0.8,
+        width,
+        height: cells / width,
+    };
+    let values = (0..channels * cells)
+        .map(|index| (index % 1009) as f32 * 0.01)
+        .collect();
+    BevFeatures {
+        grid,
+        channels,
+        code_of: None,
+        values,
+    }
 }
 
 /// Through the bus.
@@ -48,12 +63,27 @@ struct Messages {
 impl Messages {
     fn between(agent: &Bus, ego: &Bus) -> Self {
         let topic: Topic = "1/bev".parse().expect("a topic");
-        let publisher = agent.publisher(topic.clone(), PublisherOptions::FEATURES.lossless(2)).expect("a publisher");
+        let publisher = agent
+            .publisher(topic.clone(), PublisherOptions::FEATURES.lossless(2))
+            .expect("a publisher");
         let inbox = ego.inbox(4, 1);
-        let subscription = ego.subscribe(topic.clone(), &inbox).expect("a subscription");
-        let route = Route { topic, receiver: ego.identity().process.clone() };
-        Barrier::new([route]).await_routes(agent).expect("a bus").wait(TIMEOUT).expect("a route");
-        Self { publisher, inbox, _subscription: subscription }
+        let subscription = ego
+            .subscribe(topic.clone(), &inbox)
+            .expect("a subscription");
+        let route = Route {
+            topic,
+            receiver: ego.identity().process.clone(),
+        };
+        Barrier::new([route])
+            .await_routes(agent)
+            .expect("a bus")
+            .wait(TIMEOUT)
+            .expect("a route");
+        Self {
+            publisher,
+            inbox,
+            _subscription: subscription,
+        }
     }
 
     /// From before encoding to after decoding.
@@ -65,9 +95,14 @@ impl Messages {
             let features = encode_features(sent, &CodecConfig::default(), None)?;
             protocol::wire::encode(stamp, Bev { pose, features })
         });
-        let (_, Event::Message(arrival)) = next_event(&self.inbox) else { panic!("an end") };
+        let (_, Event::Message(arrival)) = next_event(&self.inbox) else {
+            panic!("an end")
+        };
         let bev: Bev = arrival.decode(&Limits::DEFAULT).expect("a sound message");
-        let decoded = bev.features.decode(&Limits::DEFAULT).expect("sound features");
+        let decoded = bev
+            .features
+            .decode(&Limits::DEFAULT)
+            .expect("sound features");
         let took = began.elapsed();
         assert_eq!(decoded.features, *map);
         took
@@ -89,10 +124,22 @@ impl Bare {
             let _ = arrived.send((Instant::now(), sample.payload().len()));
         });
         let subscription = subscriber.wait().expect("a subscription");
-        let publisher = sender.declare_publisher(key).congestion_control(CongestionControl::Block);
+        let publisher = sender
+            .declare_publisher(key)
+            .congestion_control(CongestionControl::Block);
         let publisher = publisher.wait().expect("a publisher");
-        wait_for("a route", || publisher.matching_status().wait().expect("a session").matching());
-        Self { publisher, arrivals, _subscription: subscription }
+        wait_for("a route", || {
+            publisher
+                .matching_status()
+                .wait()
+                .expect("a session")
+                .matching()
+        });
+        Self {
+            publisher,
+            arrivals,
+            _subscription: subscription,
+        }
     }
 
     /// From before the put to the callback, with bytes that were just allocated, as a feature map's are.
@@ -101,7 +148,10 @@ impl Bare {
         let expected = bytes.len();
         let began = Instant::now();
         self.publisher.put(bytes).wait().expect("a session");
-        let (seen, length) = self.arrivals.recv_timeout(TIMEOUT).expect("the raw message");
+        let (seen, length) = self
+            .arrivals
+            .recv_timeout(TIMEOUT)
+            .expect("the raw message");
         assert_eq!(length, expected);
         seen - began
     }
@@ -112,7 +162,11 @@ fn plain_sessions() -> [Session; 3] {
     let endpoint = format!(r#"["tcp/127.0.0.1:{}"]"#, free_port());
     let none = "[]".to_owned();
     ["router", "client", "client"].map(|mode| {
-        let (listen, connect) = if mode == "router" { (&endpoint, &none) } else { (&none, &endpoint) };
+        let (listen, connect) = if mode == "router" {
+            (&endpoint, &none)
+        } else {
+            (&none, &endpoint)
+        };
         let mut config = Config::default();
         for (key, value) in [
             ("mode", &*format!("{mode:?}")),
@@ -121,7 +175,9 @@ fn plain_sessions() -> [Session; 3] {
             ("scouting/multicast/enabled", "false"),
             ("transport/shared_memory/enabled", "false"),
         ] {
-            config.insert_json5(key, value).expect("a setting of zenoh's");
+            config
+                .insert_json5(key, value)
+                .expect("a setting of zenoh's");
         }
         zenoh::open(config).wait().expect("a session")
     })
@@ -145,9 +201,16 @@ fn measure(mib: u32) -> bool {
     let map = features(mib);
     let mut times = [const { Vec::new() }; 3];
     for round in 0..WARM_UP + ROUNDS {
-        let took = [messages.time(round, &map), plain.time(&map), on_the_bus.time(&map)];
+        let took = [
+            messages.time(round, &map),
+            plain.time(&map),
+            on_the_bus.time(&map),
+        ];
         if round >= WARM_UP {
-            times.iter_mut().zip(took).for_each(|(times, took)| times.push(took));
+            times
+                .iter_mut()
+                .zip(took)
+                .for_each(|(times, took)| times.push(took));
         }
     }
     let [[ours, ours_p95], [plain, plain_p95], [bus, bus_p95]] = times.map(|times| summary(&times));
@@ -162,12 +225,20 @@ fn measure(mib: u32) -> bool {
 }
 
 fn main() -> ExitCode {
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|arg| !arg.starts_with('-')).collect();
-    let sizes =
-        [1, 8].into_iter().filter(|mib| wanted.is_empty() || wanted.iter().any(|name| *name == format!("{mib}MiB")));
+    let wanted: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|arg| !arg.starts_with('-'))
+        .collect();
+    let sizes = [1, 8]
+        .into_iter()
+        .filter(|mib| wanted.is_empty() || wanted.iter().any(|name| *name == format!("{mib}MiB")));
     let mut all_good = true;
     for mib in sizes {
         all_good &= measure(mib);
     }
-    if all_good { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    if all_good {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    }
 }

@@ -37,11 +37,19 @@ impl TestRouter {
         let opened = (0..20).find_map(|_| {
             let endpoint = Endpoint::loopback(free_port());
             // A pause of the whole machine must not count as a stalled receiver.
-            let options = BusOptions { stall_limit: TIMEOUT, ..BusOptions::router(endpoint.clone()) };
-            bus::open(&change(options)).ok().map(|session| (endpoint, session))
+            let options = BusOptions {
+                stall_limit: TIMEOUT,
+                ..BusOptions::router(endpoint.clone())
+            };
+            bus::open(&change(options))
+                .ok()
+                .map(|session| (endpoint, session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
-        Self { endpoint, _session: session }
+        Self {
+            endpoint,
+            _session: session,
+        }
     }
 
     /// A client of this router in the run `test`, named `<role>-<cav>` or, for processes without a vehicle, `<cav>`.
@@ -55,7 +63,8 @@ impl TestRouter {
             process: ProcessId::new(process).expect("an identifier"),
             cav: CavId::new(cav).expect("an identifier"),
         };
-        Bus::join(&BusOptions::client(self.endpoint.clone()), identity).expect("the router is there")
+        Bus::join(&BusOptions::client(self.endpoint.clone()), identity)
+            .expect("the router is there")
     }
 }
 
@@ -66,7 +75,10 @@ impl TestRouter {
 #[must_use]
 pub fn free_port() -> u16 {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
-    listener.local_addr().expect("a bound socket has an address").port()
+    listener
+        .local_addr()
+        .expect("a bound socket has an address")
+        .port()
 }
 
 /// The next event.

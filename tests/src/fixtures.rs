@@ -32,12 +32,21 @@ pub struct Golden {
 pub fn golden(name: &str) -> Golden {
     let path = fixture("V2V_GOLDEN", "golden", &format!("{name}.safetensors"));
     let bytes = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    let (_, header) = SafeTensors::read_metadata(&bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    let text = header.metadata().as_ref().and_then(|metadata| metadata.get("config"));
+    let (_, header) = SafeTensors::read_metadata(&bytes)
+        .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let text = header
+        .metadata()
+        .as_ref()
+        .and_then(|metadata| metadata.get("config"));
     let config = text.map_or(Value::Null, |text| {
-        serde_json::from_str(text).unwrap_or_else(|error| panic!("{}: config: {error}", path.display()))
+        serde_json::from_str(text)
+            .unwrap_or_else(|error| panic!("{}: config: {error}", path.display()))
     });
-    Golden { name: name.to_owned(), bytes, config }
+    Golden {
+        name: name.to_owned(),
+        bytes,
+        config,
+    }
 }
 
 /// The sample folder or file `name`, for example `v2xset-scene`.
@@ -51,10 +60,16 @@ pub fn data(name: &str) -> PathBuf {
 
 /// Path of `name` in the folder of the environment variable, else in `default` from the manifest's folder.
 fn fixture(variable: &str, default: &str, name: &str) -> PathBuf {
-    let root =
-        std::env::var_os(variable).map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(default), PathBuf::from);
+    let root = std::env::var_os(variable).map_or_else(
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join(default),
+        PathBuf::from,
+    );
     let path = root.join(name);
-    assert!(path.exists(), "{} does not exist; {variable} names another folder", path.display());
+    assert!(
+        path.exists(),
+        "{} does not exist; {variable} names another folder",
+        path.display()
+    );
     path
 }
 
@@ -69,7 +84,11 @@ impl Golden {
     #[must_use]
     pub fn names(&self) -> Vec<String> {
         let tensors = self.tensors();
-        let mut names: Vec<String> = tensors.names().into_iter().map(ToString::to_string).collect();
+        let mut names: Vec<String> = tensors
+            .names()
+            .into_iter()
+            .map(ToString::to_string)
+            .collect();
         names.sort();
         names
     }
@@ -117,16 +136,32 @@ impl Golden {
     }
 
     fn tensors(&self) -> SafeTensors<'_> {
-        SafeTensors::deserialize(&self.bytes).unwrap_or_else(|error| panic!("{}: {error}", self.name))
+        SafeTensors::deserialize(&self.bytes)
+            .unwrap_or_else(|error| panic!("{}: {error}", self.name))
     }
 
-    fn values<T, const N: usize>(&self, name: &str, dtype: Dtype, from: fn([u8; N]) -> T) -> (Vec<usize>, Vec<T>) {
+    fn values<T, const N: usize>(
+        &self,
+        name: &str,
+        dtype: Dtype,
+        from: fn([u8; N]) -> T,
+    ) -> (Vec<usize>, Vec<T>) {
         let tensors = self.tensors();
-        let tensor = tensors.tensor(name).unwrap_or_else(|error| panic!("{}: {name}: {error}", self.name));
+        let tensor = tensors
+            .tensor(name)
+            .unwrap_or_else(|error| panic!("{}: {name}: {error}", self.name));
         assert_eq!(tensor.dtype(), dtype, "{}: {name}", self.name);
         let (chunks, rest) = tensor.data().as_chunks::<N>();
-        assert!(rest.is_empty(), "{}: {name}: {} stray bytes", self.name, rest.len());
-        (tensor.shape().to_vec(), chunks.iter().map(|&bytes| from(bytes)).collect())
+        assert!(
+            rest.is_empty(),
+            "{}: {name}: {} stray bytes",
+            self.name,
+            rest.len()
+        );
+        (
+            tensor.shape().to_vec(),
+            chunks.iter().map(|&bytes| from(bytes)).collect(),
+        )
     }
 }
 
@@ -134,7 +169,13 @@ impl Golden {
 ///
 /// # Panics
 /// When lengths differ or a value is off.
-pub fn assert_close<T: Into<f64> + Copy>(what: &str, actual: &[T], expected: &[T], atol: f64, rtol: f64) {
+pub fn assert_close<T: Into<f64> + Copy>(
+    what: &str,
+    actual: &[T],
+    expected: &[T],
+    atol: f64,
+    rtol: f64,
+) {
     assert_eq!(actual.len(), expected.len(), "{what}: number of values");
     let differences = actual.iter().zip(expected).map(|(&a, &b)| {
         let (a, b): (f64, f64) = (a.into(), b.into());
@@ -151,7 +192,9 @@ pub fn assert_close<T: Into<f64> + Copy>(what: &str, actual: &[T], expected: &[T
         largest = largest.max(difference);
     }
     if let Some((index, a, b)) = first_off {
-        panic!("{what}[{index}]: {a} is not {b} (atol {atol}, rtol {rtol}); largest difference {largest:.3e}");
+        panic!(
+            "{what}[{index}]: {a} is not {b} (atol {atol}, rtol {rtol}); largest difference {largest:.3e}"
+        );
     }
 }
 

@@ -30,7 +30,10 @@ pub(crate) fn programs_dir() -> &'static Path {
     FOLDER.get_or_init(|| {
         // target/<profile>/deps/<this test>
         let test = std::env::current_exe().expect("a test has a file");
-        test.ancestors().nth(2).expect("a folder of the profile").to_path_buf()
+        test.ancestors()
+            .nth(2)
+            .expect("a folder of the profile")
+            .to_path_buf()
     })
 }
 
@@ -45,19 +48,27 @@ pub fn programs() -> &'static Path {
         // `cargo test` does not always build the programs of other packages: make sure they exist and are fresh.
         if let Some(cargo) = std::env::var_os("CARGO") {
             let mut build = Command::new(cargo);
-            build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+            build
+                .args(["build", "--quiet", "--workspace", "--bins"])
+                .current_dir(env!("CARGO_MANIFEST_DIR"));
             // With cargo's variables for this test, a build script of another crate would take itself as moved, and
             // everything above it would be compiled anew.
             for (name, _) in std::env::vars_os() {
                 let text = name.to_string_lossy();
-                if text == "OUT_DIR" || text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+                if text == "OUT_DIR"
+                    || text.starts_with("CARGO_PKG_")
+                    || text.starts_with("CARGO_MANIFEST_")
+                {
                     build.env_remove(&name);
                 }
             }
             if folder.ends_with("release") {
                 build.arg("--release");
             }
-            assert!(build.status().expect("cargo runs").success(), "the programs cannot be built");
+            assert!(
+                build.status().expect("cargo runs").success(),
+                "the programs cannot be built"
+            );
         }
     });
     folder
@@ -69,7 +80,13 @@ pub fn programs() -> &'static Path {
 /// When a file cannot be written.
 pub fn write_weights(path: &Path) {
     let model = tiny();
-    weights::save(path, &model.variables, &model.about(), weights::Precision::Single).expect("a writable folder");
+    weights::save(
+        path,
+        &model.variables,
+        &model.about(),
+        weights::Precision::Single,
+    )
+    .expect("a writable folder");
 }
 
 /// The same with a head that detects vehicles everywhere: where boxes are compared there have to be some.
@@ -78,8 +95,18 @@ pub fn write_weights(path: &Path) {
 /// When a file cannot be written.
 pub fn write_sighted_weights(path: &Path) {
     let model = tiny();
-    let _ = tch::no_grad(|| model.variables.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
-    weights::save(path, &model.variables, &model.about(), weights::Precision::Single).expect("a writable folder");
+    let _ = tch::no_grad(|| {
+        model.variables.variables()["cls_head.bias"]
+            .shallow_clone()
+            .fill_(0.5)
+    });
+    weights::save(
+        path,
+        &model.variables,
+        &model.about(),
+        weights::Precision::Single,
+    )
+    .expect("a writable folder");
 }
 
 fn tiny() -> CooperativeModel {
@@ -95,7 +122,8 @@ fn tiny() -> CooperativeModel {
         shrink: Some(ShrinkConfig::Pointwise { channels: 8 }),
         ..DetectorConfig::lean()
     };
-    CooperativeModel::new(&config, Method::MAX, tch::Device::Cpu).expect("a configuration that fits")
+    CooperativeModel::new(&config, Method::MAX, tch::Device::Cpu)
+        .expect("a configuration that fits")
 }
 
 /// A folder with a scene of two vehicles, weights and a scenario.
@@ -156,7 +184,12 @@ impl Up {
                 let _ = send.send(line);
             }
         });
-        Self { child, lines, output: Vec::new(), folder: runs.join("test") }
+        Self {
+            child,
+            lines,
+            output: Vec::new(),
+            folder: runs.join("test"),
+        }
     }
 
     /// Waits for an output line that contains `text`, and returns the line.
@@ -167,8 +200,10 @@ impl Up {
         let deadline = Instant::now() + TIMEOUT;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
-            let line =
-                self.lines.recv_timeout(left).unwrap_or_else(|_| panic!("no line with {text:?}: {:?}", self.output));
+            let line = self
+                .lines
+                .recv_timeout(left)
+                .unwrap_or_else(|_| panic!("no line with {text:?}: {:?}", self.output));
             self.output.push(line.clone());
             if line.contains(text) {
                 return line;
@@ -187,8 +222,15 @@ impl Up {
             if condition(&results) {
                 return;
             }
-            assert!(Instant::now() < deadline, "{what}: {} results", results.len());
-            assert!(self.child.try_wait().expect("a child").is_none(), "v2vloc ended before {what}");
+            assert!(
+                Instant::now() < deadline,
+                "{what}: {} results",
+                results.len()
+            );
+            assert!(
+                self.child.try_wait().expect("a child").is_none(),
+                "v2vloc ended before {what}"
+            );
             std::thread::sleep(Duration::from_millis(50));
         }
     }
@@ -238,7 +280,10 @@ impl Drop for Up {
 pub fn results(run: &Path) -> Vec<Value> {
     let text = fs::read_to_string(run.join("detections.jsonl")).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-    whole.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+    whole
+        .lines()
+        .filter_map(|line| serde_json::from_str(line).ok())
+        .collect()
 }
 
 /// Number of neighbours that a result was fused from.
@@ -252,7 +297,11 @@ pub fn fused(result: &Value) -> usize {
 /// # Panics
 /// When there is no `kill`.
 pub fn signal(pid: u32, name: &str) {
-    let status = Command::new("kill").arg(format!("-{name}")).arg(pid.to_string()).status().expect("kill runs");
+    let status = Command::new("kill")
+        .arg(format!("-{name}"))
+        .arg(pid.to_string())
+        .status()
+        .expect("kill runs");
     assert!(status.success(), "kill -{name} {pid}");
 }
 
@@ -260,5 +309,7 @@ pub fn signal(pid: u32, name: &str) {
 #[must_use]
 pub fn is_running(pid: u32) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
-    stat.rsplit(')').next().is_some_and(|rest| !rest.is_empty() && !rest.trim_start().starts_with('Z'))
+    stat.rsplit(')')
+        .next()
+        .is_some_and(|rest| !rest.is_empty() && !rest.trim_start().starts_with('Z'))
 }

@@ -20,7 +20,10 @@ impl Hosts {
         // Names with the id of this process: two tests at once have separate hosts. Names of interfaces have 15
         // characters at most.
         let prefix = format!("v{}", std::process::id());
-        let mut hosts = Self { prefix, names: Vec::new() };
+        let mut hosts = Self {
+            prefix,
+            names: Vec::new(),
+        };
         for name in ["router"].iter().chain(others) {
             ip(&format!("netns add {}", hosts.namespace(name)))?;
             hosts.names.push(name);
@@ -28,9 +31,17 @@ impl Hosts {
         }
         for (index, name) in others.iter().enumerate() {
             let (router, other) = (hosts.namespace("router"), hosts.namespace(name));
-            let (near, far) = (format!("{}r{index}", hosts.prefix), format!("{}h{index}", hosts.prefix));
-            ip(&format!("link add {near} netns {router} type veth peer name {far} netns {other}"))?;
-            for (host, end, address) in [(&router, &near, router_address(index)), (&other, &far, address(index))] {
+            let (near, far) = (
+                format!("{}r{index}", hosts.prefix),
+                format!("{}h{index}", hosts.prefix),
+            );
+            ip(&format!(
+                "link add {near} netns {router} type veth peer name {far} netns {other}"
+            ))?;
+            for (host, end, address) in [
+                (&router, &near, router_address(index)),
+                (&other, &far, address(index)),
+            ] {
                 ip(&format!("-n {host} address add {address}/24 dev {end}"))?;
                 ip(&format!("-n {host} link set {end} up"))?;
             }
@@ -42,7 +53,10 @@ impl Hosts {
     #[must_use]
     pub fn command(&self, host: &str, program: &std::path::Path) -> Command {
         let mut command = Command::new("ip");
-        command.args(["netns", "exec", &self.namespace(host)]).arg(program).stdin(Stdio::null());
+        command
+            .args(["netns", "exec", &self.namespace(host)])
+            .arg(program)
+            .stdin(Stdio::null());
         command
     }
 
@@ -51,7 +65,10 @@ impl Hosts {
     /// # Errors
     /// The error of `ip`.
     pub fn cut(&self, index: usize) -> io::Result<()> {
-        let host = self.names.get(index + 1).map_or_else(String::new, |name| self.namespace(name));
+        let host = self
+            .names
+            .get(index + 1)
+            .map_or_else(String::new, |name| self.namespace(name));
         ip(&format!("-n {host} link set {}h{index} down", self.prefix))
     }
 
@@ -73,7 +90,10 @@ fn address(index: usize) -> Ipv4Addr {
 impl Drop for Hosts {
     fn drop(&mut self) {
         for name in &self.names {
-            let _ = Command::new("ip").args(["netns", "del", &self.namespace(name)]).stderr(Stdio::null()).status();
+            let _ = Command::new("ip")
+                .args(["netns", "del", &self.namespace(name)])
+                .stderr(Stdio::null())
+                .status();
         }
     }
 }
@@ -83,5 +103,8 @@ fn ip(arguments: &str) -> io::Result<()> {
     if output.status.success() {
         return Ok(());
     }
-    Err(io::Error::other(format!("ip {arguments}: {}", String::from_utf8_lossy(&output.stderr).trim())))
+    Err(io::Error::other(format!(
+        "ip {arguments}: {}",
+        String::from_utf8_lossy(&output.stderr).trim()
+    )))
 }

@@ -3,7 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use bus::{self, AccessControl, Bus, BusError, BusOptions, Credentials, Endpoint, Identity, Rejection, RejectionLog};
+use bus::{
+    self, AccessControl, Bus, BusError, BusOptions, Credentials, Endpoint, Identity, Rejection,
+    RejectionLog,
+};
 use deploy::operate::keys::{KeyPlan, make};
 use protocol::{CavId, Principal, RunId, RunScope};
 use zenoh::{Config, Session, Wait};
@@ -16,7 +19,10 @@ use crate::bus::free_port;
 /// When a file cannot be written.
 #[must_use]
 pub fn keys_for(folder: &Path, principals: &[&str]) -> PathBuf {
-    let principals = principals.iter().map(|name| name.parse::<Principal>().expect("a principal")).collect();
+    let principals = principals
+        .iter()
+        .map(|name| name.parse::<Principal>().expect("a principal"))
+        .collect();
     make(&KeyPlan::new(folder, principals, 1)).expect("a writable folder");
     folder.to_path_buf()
 }
@@ -31,7 +37,11 @@ pub const TRIED_FOR: Duration = Duration::from_secs(2);
 ///
 /// # Panics
 /// When zenoh rejects a setting.
-pub fn unauthorised_peer(router: &Endpoint, authority: &Path, own: Option<&Path>) -> Result<Session, String> {
+pub fn unauthorised_peer(
+    router: &Endpoint,
+    authority: &Path,
+    own: Option<&Path>,
+) -> Result<Session, String> {
     let quoted = |path: &Path| format!("{:?}", path.to_str().unwrap());
     let mut settings = vec![
         ("mode", r#""client""#.to_owned()),
@@ -39,16 +49,29 @@ pub fn unauthorised_peer(router: &Endpoint, authority: &Path, own: Option<&Path>
         ("connect/timeout_ms", "0".to_owned()),
         ("connect/exit_on_failure", "true".to_owned()),
         ("scouting/multicast/enabled", "false".to_owned()),
-        ("transport/link/tls/root_ca_certificate", quoted(&authority.join("ca.pem"))),
+        (
+            "transport/link/tls/root_ca_certificate",
+            quoted(&authority.join("ca.pem")),
+        ),
         ("transport/link/tls/enable_mtls", own.is_some().to_string()),
     ];
     if let Some(own) = own {
-        settings.push(("transport/link/tls/connect_certificate", quoted(&own.join("cert.pem"))));
-        settings.push(("transport/link/tls/connect_private_key", quoted(&own.join("key.pem"))));
+        settings.push((
+            "transport/link/tls/connect_certificate",
+            quoted(&own.join("cert.pem")),
+        ));
+        settings.push((
+            "transport/link/tls/connect_private_key",
+            quoted(&own.join("key.pem")),
+        ));
     }
     let mut config = Config::default();
-    settings.iter().for_each(|(key, value)| config.insert_json5(key, value).unwrap());
-    zenoh::open(config).wait().map_err(|cause| cause.to_string())
+    settings
+        .iter()
+        .for_each(|(key, value)| config.insert_json5(key, value).unwrap());
+    zenoh::open(config)
+        .wait()
+        .map_err(|cause| cause.to_string())
 }
 
 /// A router that admits the holders of keys of `folder`, each restricted to its own topics in the run `test`.
@@ -69,15 +92,26 @@ impl GuardedRouter {
     pub fn open(keys: &Path) -> Self {
         let credentials = Credentials::read(&keys.join("router")).expect("keys of a router");
         let runs = RunScope::One(RunId::new("test").expect("an identifier"));
-        let guard = AccessControl { members: credentials.members().expect("a list"), runs };
+        let guard = AccessControl {
+            members: credentials.members().expect("a list"),
+            runs,
+        };
         // Another process may take the port between the two calls.
         let opened = (0..20).find_map(|_| {
             let options = BusOptions::router(Endpoint::loopback(free_port()));
-            let options = options.with_credentials(credentials.clone()).with_access_control(guard.clone());
-            bus::open(&options).ok().map(|session| (options.endpoint().clone(), session))
+            let options = options
+                .with_credentials(credentials.clone())
+                .with_access_control(guard.clone());
+            bus::open(&options)
+                .ok()
+                .map(|session| (options.endpoint().clone(), session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
-        Self { endpoint, session, keys: keys.to_path_buf() }
+        Self {
+            endpoint,
+            session,
+            keys: keys.to_path_buf(),
+        }
     }
 
     /// Options of a client with the keys of `holder`.
@@ -115,7 +149,8 @@ impl GuardedRouter {
     #[must_use]
     pub fn join(&self, principal: &str) -> Bus {
         let known: Principal = principal.parse().expect("a principal");
-        self.join_as(principal, principal, known.cav.as_str()).expect("the router takes those with keys")
+        self.join_as(principal, principal, known.cav.as_str())
+            .expect("the router takes those with keys")
     }
 
     /// Number of messages of one kind that it has refused to a peer so far.
@@ -124,6 +159,11 @@ impl GuardedRouter {
         let mut refusals = RejectionLog::of(&self.endpoint);
         refusals.update(&self.session);
         let is_it = |refusal: &Rejection| refusal.peer == peer && refusal.message == message;
-        refusals.counts().iter().filter(|(refusal, _)| is_it(refusal)).map(|(_, count)| count).sum()
+        refusals
+            .counts()
+            .iter()
+            .filter(|(refusal, _)| is_it(refusal))
+            .map(|(_, count)| count)
+            .sum()
     }
 }

@@ -32,12 +32,20 @@ pub fn small_encoder() -> SceneEncoderConfig {
 pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     let _generator = random_generator_lock();
     tch::manual_seed(seed);
-    let (encoder, head) = (folder.join("encoder.safetensors"), folder.join("head.safetensors"));
+    let (encoder, head) = (
+        folder.join("encoder.safetensors"),
+        folder.join("head.safetensors"),
+    );
     let config = tiny();
     let network = VarStore::new(Device::Cpu);
     SceneEncoder::new(&network.root(), &config).expect("a configuration that fits");
-    let encoder_sha256 =
-        save(&encoder, &network, &metadata(SceneEncoder::KIND, &config), Precision::Single).expect("a writable folder");
+    let encoder_sha256 = save(
+        &encoder,
+        &network,
+        &metadata(SceneEncoder::KIND, &config),
+        Precision::Single,
+    )
+    .expect("a writable folder");
     let config = SceneHeadConfig {
         scene_name: "nowhere".into(),
         encoder_sha256,
@@ -54,7 +62,13 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     };
     let network = VarStore::new(Device::Cpu);
     SceneHead::new(&network.root(), &config).expect("a configuration that fits");
-    save(&head, &network, &metadata(SceneHead::KIND, &config), Precision::Single).expect("a writable folder");
+    save(
+        &head,
+        &network,
+        &metadata(SceneHead::KIND, &config),
+        Precision::Single,
+    )
+    .expect("a writable folder");
     (encoder, head)
 }
 
@@ -63,10 +77,19 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_sgloc(folder: &Path, seed: i64) -> PathBuf {
-    let config = SgLocConfig { scene_name: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
-    write_baseline(&folder.join("sgloc.safetensors"), seed, &metadata(SgLocLocalizer::KIND, &config), |root| {
-        SgLoc::new(root, &config).expect("a configuration that fits");
-    })
+    let config = SgLocConfig {
+        scene_name: "nowhere".into(),
+        origin_m: [0.0; 3],
+        encoder: tiny(),
+    };
+    write_baseline(
+        &folder.join("sgloc.safetensors"),
+        seed,
+        &metadata(SgLocLocalizer::KIND, &config),
+        |root| {
+            SgLoc::new(root, &config).expect("a configuration that fits");
+        },
+    )
 }
 
 /// Writes a HypLiLoc network as if it had been trained, with random parameters, the same for the same seed.
@@ -74,10 +97,19 @@ pub fn write_sgloc(folder: &Path, seed: i64) -> PathBuf {
 /// # Panics
 /// When a file cannot be written.
 pub fn write_hypliloc(folder: &Path, seed: i64) -> PathBuf {
-    let config = HypLiLocConfig { scene_name: "nowhere".into(), origin_m: [0.0; 3], scale_m: [100.0; 3] };
-    write_baseline(&folder.join("hypliloc.safetensors"), seed, &metadata(HypLiLocLocalizer::KIND, &config), |root| {
-        let _ = HypLiLoc::new(root);
-    })
+    let config = HypLiLocConfig {
+        scene_name: "nowhere".into(),
+        origin_m: [0.0; 3],
+        scale_m: [100.0; 3],
+    };
+    write_baseline(
+        &folder.join("hypliloc.safetensors"),
+        seed,
+        &metadata(HypLiLocLocalizer::KIND, &config),
+        |root| {
+            let _ = HypLiLoc::new(root);
+        },
+    )
 }
 
 fn write_baseline(
@@ -95,10 +127,17 @@ fn write_baseline(
 }
 
 fn tiny() -> SceneEncoderConfig {
-    SceneEncoderConfig { widths: vec![4, 8], residual_widths: vec![8], ..small_encoder() }
+    SceneEncoderConfig {
+        widths: vec![4, 8],
+        residual_widths: vec![8],
+        ..small_encoder()
+    }
 }
 
 fn metadata(kind: &str, config: &impl Serialize) -> BTreeMap<String, String> {
     let text = serde_json::to_string(config).expect("plain numbers and texts");
-    BTreeMap::from([(CONFIG_KEY.to_owned(), text), (KIND_KEY.to_owned(), kind.to_owned())])
+    BTreeMap::from([
+        (CONFIG_KEY.to_owned(), text),
+        (KIND_KEY.to_owned(), kind.to_owned()),
+    ])
 }

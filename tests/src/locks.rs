@@ -12,7 +12,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 pub fn exclusive_lock() -> File {
     let path = crate::fleet::programs_dir().join("exclusive-test.lock");
     let file = File::create(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    file.lock().unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    file.lock()
+        .unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     file
 }
 

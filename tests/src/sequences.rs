@@ -40,12 +40,20 @@ impl Benchmark {
     }
 
     fn points(self, points: &[[f32; 4]]) -> Vec<u8> {
-        let turned: Vec<[f32; 4]> = points.iter().map(|&[x, y, z, i]| [x, -y, -z, 255.0 * i]).collect();
+        let turned: Vec<[f32; 4]> = points
+            .iter()
+            .map(|&[x, y, z, i]| [x, -y, -z, 255.0 * i])
+            .collect();
         let numbers: Vec<f32> = match self {
             Self::Nclt => turned.into_flattened(),
-            Self::Oxford => (0..4).flat_map(|part| turned.iter().map(move |point| point[part])).collect(),
+            Self::Oxford => (0..4)
+                .flat_map(|part| turned.iter().map(move |point| point[part]))
+                .collect(),
         };
-        numbers.iter().flat_map(|number| number.to_le_bytes()).collect()
+        numbers
+            .iter()
+            .flat_map(|number| number.to_le_bytes())
+            .collect()
     }
 }
 
@@ -61,13 +69,28 @@ pub fn write(root: &Path, benchmark: Benchmark, drives: &[Scenario]) -> PathBuf 
         fs::create_dir_all(&points_dir).expect("a folder");
         let (mut stamps, mut poses) = (Vec::new(), Vec::new());
         for tick in 0..drive.ticks.len() {
-            let frame = drive.load(0, tick, &LoadOptions::default()).expect("a frame");
+            let frame = drive
+                .load(0, tick, &LoadOptions::default())
+                .expect("a frame");
             let micros = START_MICROS + frame.capture_nanos / 1000;
-            fs::write(points_dir.join(format!("{micros}.bin")), benchmark.points(&frame.points.xyzi)).expect("a file");
+            fs::write(
+                points_dir.join(format!("{micros}.bin")),
+                benchmark.points(&frame.points.xyzi),
+            )
+            .expect("a file");
             stamps.push(micros);
-            poses.push(matrix(&frame.world_from_lidar.expect("a generated drive has its poses").isometry()));
+            poses.push(matrix(
+                &frame
+                    .world_from_lidar
+                    .expect("a generated drive has its poses")
+                    .isometry(),
+            ));
         }
-        fs::write(sequence.join("velodyne_left_False.h5"), hdf5(&stamps, &poses)).expect("a file");
+        fs::write(
+            sequence.join("velodyne_left_False.h5"),
+            hdf5(&stamps, &poses),
+        )
+        .expect("a file");
     }
     folder
 }
@@ -85,13 +108,25 @@ fn matrix(pose: &Isometry3<f64>) -> [f64; 12] {
 pub(crate) fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
     // HDF5's descriptions of little-endian 64-bit integers and IEEE doubles.
     const INTEGER: &[u8] = &[0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
-    const DOUBLE: &[u8] = &[0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];
+    const DOUBLE: &[u8] = &[
+        0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0,
+    ];
     const ROOT_AT: usize = 96;
     let count = stamps.len() as u64;
-    let stamps: Vec<u8> = stamps.iter().flat_map(|stamp| stamp.to_le_bytes()).collect();
-    let poses: Vec<u8> = poses.iter().flatten().flat_map(|number| number.to_le_bytes()).collect();
+    let stamps: Vec<u8> = stamps
+        .iter()
+        .flat_map(|stamp| stamp.to_le_bytes())
+        .collect();
+    let poses: Vec<u8> = poses
+        .iter()
+        .flatten()
+        .flat_map(|number| number.to_le_bytes())
+        .collect();
     let headers = |at: [usize; 4]| {
-        let links = [hdf5_link("valid_timestamps", at[0]), hdf5_link("poses", at[1])];
+        let links = [
+            hdf5_link("valid_timestamps", at[0]),
+            hdf5_link("poses", at[1]),
+        ];
         let no_heaps = hdf5_message(2, &[&[0, 0][..], &[0xff; 16]].concat());
         [
             hdf5_object(&[&[no_heaps][..], &links].concat()),
@@ -102,12 +137,27 @@ pub(crate) fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
     // Lengths do not depend on the places that are written into them.
     let [root, first, second] = headers([0; 4]).map(|header| header.len());
     let data = ROOT_AT + root + first + second;
-    let places = [ROOT_AT + root, ROOT_AT + root + first, data, data + stamps.len()];
+    let places = [
+        ROOT_AT + root,
+        ROOT_AT + root + first,
+        data,
+        data + stamps.len(),
+    ];
     let end = data + stamps.len() + poses.len();
 
     let mut file = b"\x89HDF\r\n\x1a\n".to_vec();
     file.extend([0, 0, 0, 0, 0, 8, 8, 0, 4, 0, 16, 0, 0, 0, 0, 0]);
-    for value in [0, u64::MAX, end as u64, u64::MAX, 0, ROOT_AT as u64, 0, 0, 0] {
+    for value in [
+        0,
+        u64::MAX,
+        end as u64,
+        u64::MAX,
+        0,
+        ROOT_AT as u64,
+        0,
+        0,
+        0,
+    ] {
         file.extend(value.to_le_bytes());
     }
     file.extend(headers(places).concat());
@@ -119,12 +169,29 @@ pub(crate) fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
 fn hdf5_dataset(shape: &[u64], datatype: &[u8], place: usize, bytes: usize) -> Vec<u8> {
     let mut space = vec![1, shape.len() as u8, 0, 0, 0, 0, 0, 0];
     space.extend(shape.iter().flat_map(|size| size.to_le_bytes()));
-    let layout = [&[3, 1][..], &(place as u64).to_le_bytes(), &(bytes as u64).to_le_bytes()].concat();
-    hdf5_object(&[hdf5_message(1, &space), hdf5_message(3, datatype), hdf5_message(8, &layout)])
+    let layout = [
+        &[3, 1][..],
+        &(place as u64).to_le_bytes(),
+        &(bytes as u64).to_le_bytes(),
+    ]
+    .concat();
+    hdf5_object(&[
+        hdf5_message(1, &space),
+        hdf5_message(3, datatype),
+        hdf5_message(8, &layout),
+    ])
 }
 
 fn hdf5_link(name: &str, place: usize) -> Vec<u8> {
-    hdf5_message(6, &[&[1, 0, name.len() as u8][..], name.as_bytes(), &(place as u64).to_le_bytes()].concat())
+    hdf5_message(
+        6,
+        &[
+            &[1, 0, name.len() as u8][..],
+            name.as_bytes(),
+            &(place as u64).to_le_bytes(),
+        ]
+        .concat(),
+    )
 }
 
 fn hdf5_object(messages: &[Vec<u8>]) -> Vec<u8> {

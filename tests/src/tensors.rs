@@ -46,7 +46,11 @@ pub fn pillars(golden: &Golden) -> (Vec<Pillars>, Vec<usize>) {
     let (_, coords) = golden.i32("in.voxel_coords");
     let (_, counts) = golden.i32("in.voxel_num_points");
     let coords = coords.as_chunks::<4>().0;
-    let sweeps = coords.iter().map(|coord| coord[0]).max().map_or(0, |last| last as usize + 1);
+    let sweeps = coords
+        .iter()
+        .map(|coord| coord[0])
+        .max()
+        .map_or(0, |last| last as usize + 1);
     let mut pillars = vec![Pillars::default(); sweeps];
     for (index, &[sweep, z, y, x]) in coords.iter().enumerate() {
         let pillar = &mut pillars[sweep as usize];
@@ -55,7 +59,9 @@ pub fn pillars(golden: &Golden) -> (Vec<Pillars>, Vec<usize>) {
         pillar.counts.push(counts[index] as u32);
         pillar.coords.push([z, y, x]);
     }
-    let mut next: Vec<usize> = (0..sweeps).map(|sweep| pillars[..sweep].iter().map(Pillars::len).sum()).collect();
+    let mut next: Vec<usize> = (0..sweeps)
+        .map(|sweep| pillars[..sweep].iter().map(Pillars::len).sum())
+        .collect();
     let rows = coords.iter().map(|coord| {
         let row = &mut next[coord[0] as usize];
         *row += 1;
@@ -80,7 +86,10 @@ pub fn detector_config(golden: &Golden, backbone: &str) -> DetectorConfig {
         voxel_size_m: array(&config["voxel_size"]),
         max_points_per_pillar: points[1],
         pillar_channels: integer(&config["pillar_vfe"]["num_filters"][0]),
-        layer_nums: integers(&levels["layer_nums"]).iter().map(|&count| count as usize).collect(),
+        layer_nums: integers(&levels["layer_nums"])
+            .iter()
+            .map(|&count| count as usize)
+            .collect(),
         layer_strides: integers(&levels["layer_strides"]),
         num_filters: integers(&levels["num_filters"]),
         upsample_strides: integers(&levels["upsample_strides"]),
@@ -96,7 +105,9 @@ pub fn detector_config(golden: &Golden, backbone: &str) -> DetectorConfig {
 /// When it is no integer.
 #[must_use]
 pub fn integer(value: &Value) -> i64 {
-    value.as_i64().unwrap_or_else(|| panic!("{value} is not an integer"))
+    value
+        .as_i64()
+        .unwrap_or_else(|| panic!("{value} is not an integer"))
 }
 
 /// A number of a configuration.
@@ -105,7 +116,9 @@ pub fn integer(value: &Value) -> i64 {
 /// When it is no number.
 #[must_use]
 pub fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or_else(|| panic!("{value} is not a number"))
+    value
+        .as_f64()
+        .unwrap_or_else(|| panic!("{value} is not a number"))
 }
 
 /// A list of integers of a configuration.
@@ -114,7 +127,12 @@ pub fn number(value: &Value) -> f64 {
 /// When it is no such list.
 #[must_use]
 pub fn integers(value: &Value) -> Vec<i64> {
-    value.as_array().unwrap_or_else(|| panic!("{value} is not a list")).iter().map(integer).collect()
+    value
+        .as_array()
+        .unwrap_or_else(|| panic!("{value} is not a list"))
+        .iter()
+        .map(integer)
+        .collect()
 }
 
 /// `N` numbers of a configuration.
@@ -123,6 +141,13 @@ pub fn integers(value: &Value) -> Vec<i64> {
 /// When there are more or fewer.
 #[must_use]
 pub fn array<const N: usize>(value: &Value) -> [f64; N] {
-    let values: Vec<f64> = value.as_array().expect("a list").iter().filter_map(Value::as_f64).collect();
-    values.try_into().unwrap_or_else(|_| panic!("{value} has not {N} numbers"))
+    let values: Vec<f64> = value
+        .as_array()
+        .expect("a list")
+        .iter()
+        .filter_map(Value::as_f64)
+        .collect();
+    values
+        .try_into()
+        .unwrap_or_else(|_| panic!("{value} has not {N} numbers"))
 }

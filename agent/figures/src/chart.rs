@@ -81,26 +81,44 @@ impl Axis {
     /// Linear axis.
     #[must_use]
     pub fn linear(label: &str, range: [f64; 2]) -> Self {
-        Self { label: label.into(), range, is_logarithmic: false }
+        Self {
+            label: label.into(),
+            range,
+            is_logarithmic: false,
+        }
     }
 
     /// Logarithmic axis.
     #[must_use]
     pub fn logarithmic(label: &str, range: [f64; 2]) -> Self {
-        Self { label: label.into(), range, is_logarithmic: true }
+        Self {
+            label: label.into(),
+            range,
+            is_logarithmic: true,
+        }
     }
 
     /// The range, or a substitute that can be drawn if it is empty or infinite.
     pub(super) fn drawn_range(&self) -> [f64; 2] {
         let [low, high] = self.range;
-        let lowest = if self.is_logarithmic { f64::MIN_POSITIVE } else { f64::MIN };
+        let lowest = if self.is_logarithmic {
+            f64::MIN_POSITIVE
+        } else {
+            f64::MIN
+        };
         let can_be_drawn = low >= lowest && low < high && (high - low).is_finite();
         if can_be_drawn { self.range } else { [0.1, 1.0] }
     }
 
     /// Position of a value: 0 at the lower end, 1 at the upper.
     fn share(&self, value: f64) -> f64 {
-        let scale = |value: f64| if self.is_logarithmic { value.ln() } else { value };
+        let scale = |value: f64| {
+            if self.is_logarithmic {
+                value.ln()
+            } else {
+                value
+            }
+        };
         let [low, high] = self.drawn_range().map(scale);
         (scale(value) - low) / (high - low)
     }
@@ -111,8 +129,15 @@ impl Axis {
 }
 
 impl Series {
-    fn points_on<'a>(&'a self, x: &'a Axis, y: &'a Axis) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
-        self.points.iter().copied().filter(|point| x.contains(point.0) && y.contains(point.1))
+    fn points_on<'a>(
+        &'a self,
+        x: &'a Axis,
+        y: &'a Axis,
+    ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
+        self.points
+            .iter()
+            .copied()
+            .filter(|point| x.contains(point.0) && y.contains(point.1))
     }
 
     fn dot_radius(&self) -> Option<u32> {
@@ -125,7 +150,10 @@ impl Series {
 }
 
 impl Chart {
-    pub(super) fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>) -> Result<(), FigureError> {
+    pub(super) fn draw<DB: DrawingBackend>(
+        &self,
+        area: &DrawingArea<DB, Shift>,
+    ) -> Result<(), FigureError> {
         let mut context = ChartBuilder::on(area)
             .margin(12)
             .margin_right(24)
@@ -166,10 +194,14 @@ impl Chart {
             context.draw_series(LineSeries::new(points(), colour.stroke_width(2)))?;
         }
         let radius = series.dot_radius();
-        let dots =
-            radius.into_iter().flat_map(|radius| points().map(move |at| Circle::new(at, radius, colour.filled())));
+        let dots = radius
+            .into_iter()
+            .flat_map(|radius| points().map(move |at| Circle::new(at, radius, colour.filled())));
         let swatch = move |(x, y)| Rectangle::new([(x, y - 5), (x + 10, y + 5)], colour.filled());
-        context.draw_series(dots)?.label(&series.name).legend(swatch);
+        context
+            .draw_series(dots)?
+            .label(&series.name)
+            .legend(swatch);
         Ok(())
     }
 
@@ -186,10 +218,16 @@ impl Chart {
 
     /// The quarter of the chart with the fewest points.
     fn emptiest_corner(&self) -> SeriesLabelPosition {
-        let points = || self.series.iter().flat_map(|series| series.points_on(&self.x, &self.y));
+        let points = || {
+            self.series
+                .iter()
+                .flat_map(|series| series.points_on(&self.x, &self.y))
+        };
         let count = |is_right: bool, is_upper: bool| {
             points()
-                .filter(|at| (self.x.share(at.0) > 0.5) == is_right && (self.y.share(at.1) > 0.5) == is_upper)
+                .filter(|at| {
+                    (self.x.share(at.0) > 0.5) == is_right && (self.y.share(at.1) > 0.5) == is_upper
+                })
                 .count()
         };
         let corners = [
@@ -198,7 +236,10 @@ impl Chart {
             (count(false, false), SeriesLabelPosition::LowerLeft),
             (count(true, false), SeriesLabelPosition::LowerRight),
         ];
-        corners.into_iter().min_by_key(|corner| corner.0).map_or(SeriesLabelPosition::UpperLeft, |corner| corner.1)
+        corners
+            .into_iter()
+            .min_by_key(|corner| corner.0)
+            .map_or(SeriesLabelPosition::UpperLeft, |corner| corner.1)
     }
 }
 

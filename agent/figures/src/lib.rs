@@ -72,7 +72,10 @@ pub fn save_png(charts: &[Chart], path: &Path) -> Result<(), FigureError> {
 pub fn svg(charts: &[Chart]) -> Result<String, FigureError> {
     load_font()?;
     let mut text = String::new();
-    draw(charts, &SVGBackend::with_string(&mut text, size(charts)).into_drawing_area())?;
+    draw(
+        charts,
+        &SVGBackend::with_string(&mut text, size(charts)).into_drawing_area(),
+    )?;
     Ok(text)
 }
 
@@ -86,7 +89,10 @@ fn draw<DB: DrawingBackend>(
 ) -> Result<(), FigureError> {
     area.fill(&PAPER)?;
     let parts = area.split_evenly((1, charts.len().max(1)));
-    charts.iter().zip(&parts).try_for_each(|(chart, part)| chart.draw(part))?;
+    charts
+        .iter()
+        .zip(&parts)
+        .try_for_each(|(chart, part)| chart.draw(part))?;
     Ok(area.present()?)
 }
 
@@ -101,19 +107,33 @@ mod tests {
     use super::*;
 
     fn chart() -> Chart {
-        let points = vec![(0.0, 0.1), (0.5, 1.0), (1.0, 10.0), (f64::NAN, 1.0), (0.5, f64::INFINITY), (7.0, 1.0)];
+        let points = vec![
+            (0.0, 0.1),
+            (0.5, 1.0),
+            (1.0, 10.0),
+            (f64::NAN, 1.0),
+            (0.5, f64::INFINITY),
+            (7.0, 1.0),
+        ];
         Chart {
             title: "error < 1".into(),
             x: Axis::linear("sigma", [0.0, 1.0]),
             y: Axis::logarithmic("metres", [0.01, 100.0]),
-            series: vec![Series { name: "sweeps".into(), points, mark: Mark::LineAndDots }],
+            series: vec![Series {
+                name: "sweeps".into(),
+                points,
+                mark: Mark::LineAndDots,
+            }],
         }
     }
 
     #[test]
     fn an_svg_shows_finite_points_within_the_axes_and_words() {
         let text = svg(&[chart(), chart()]).unwrap();
-        assert!(text.contains("width=\"1120\" height=\"440\"") && text.contains("error &lt; 1"), "{text}");
+        assert!(
+            text.contains("width=\"1120\" height=\"440\"") && text.contains("error &lt; 1"),
+            "{text}"
+        );
         // One line with three points and three dots for each chart.
         assert_eq!(text.matches("<circle").count(), 2 * 3, "{text}");
         for word in ["sweeps", "sigma", "metres", "0.01", "100"] {
@@ -126,17 +146,29 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("chart.png");
         save_png(&[chart(), chart()], &path).unwrap();
-        let reader = png::Decoder::new(std::io::BufReader::new(std::fs::File::open(&path).unwrap()));
+        let reader =
+            png::Decoder::new(std::io::BufReader::new(std::fs::File::open(&path).unwrap()));
         let reader = reader.read_info().unwrap();
         assert_eq!((reader.info().width, reader.info().height), (1120, 440));
-        let error = save_png(&[], Path::new("/nowhere/chart.png")).unwrap_err().to_string();
+        let error = save_png(&[], Path::new("/nowhere/chart.png"))
+            .unwrap_err()
+            .to_string();
         assert!(error.starts_with("/nowhere/chart.png: "), "{error}");
     }
 
     #[test]
     fn axes_without_extent_are_drawn_all_the_same() {
-        for range in [[0.0, 0.0], [f64::NAN, 1.0], [0.0, f64::INFINITY], [3.0, 1.0]] {
-            let chart = Chart { x: Axis::linear("x", range), y: Axis::logarithmic("y", range), ..chart() };
+        for range in [
+            [0.0, 0.0],
+            [f64::NAN, 1.0],
+            [0.0, f64::INFINITY],
+            [3.0, 1.0],
+        ] {
+            let chart = Chart {
+                x: Axis::linear("x", range),
+                y: Axis::logarithmic("y", range),
+                ..chart()
+            };
             assert!(svg(&[chart]).unwrap().contains("</svg>"), "{range:?}");
         }
     }

@@ -23,7 +23,10 @@ pub fn save_image(
     draw: impl FnOnce(&Image<'_>) -> Result<(), FigureError>,
 ) -> Result<(), FigureError> {
     let rgb = render(size, draw)?;
-    write_png(path, size, &rgb).map_err(|source| FigureError::Write { path: path.to_owned(), source })
+    write_png(path, size, &rgb).map_err(|source| FigureError::Write {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Pixels of a drawn image, row by row from the top, three bytes each.

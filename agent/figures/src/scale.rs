@@ -38,7 +38,9 @@ impl Ranged for Scale {
     fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
         match self {
             Self::Linear(scale) => scale.key_points(hint),
-            Self::Logarithmic(scale) => decades(&scale.range()).unwrap_or_else(|| scale.key_points(hint)),
+            Self::Logarithmic(scale) => {
+                decades(&scale.range()).unwrap_or_else(|| scale.key_points(hint))
+            }
         }
     }
 
@@ -53,8 +55,15 @@ impl Ranged for Scale {
 /// Powers of ten of a range, its ends included; `None` where there are fewer than two.
 fn decades(range: &Range<f64>) -> Option<Vec<f64>> {
     // Logarithms of powers of ten are not exact.
-    let (first, last) = ((range.start.log10() - 1e-9).ceil(), (range.end.log10() + 1e-9).floor());
-    (last > first).then(|| (first as i32..=last as i32).map(|power| 10f64.powi(power)).collect())
+    let (first, last) = (
+        (range.start.log10() - 1e-9).ceil(),
+        (range.end.log10() + 1e-9).floor(),
+    );
+    (last > first).then(|| {
+        (first as i32..=last as i32)
+            .map(|power| 10f64.powi(power))
+            .collect()
+    })
 }
 
 impl ValueFormatter<f64> for Scale {

@@ -21,7 +21,10 @@ fn sweep(world_from_sensor: &Isometry3<f64>, seed: u64) -> Vec<[f32; 4]> {
             0..=4 => Point3::new(within(-60.0, 60.0), within(-9.0, 9.0), 0.0),
             // Houses of 14 m stand at different depths: their gables fix the position along the street.
             5..=8 => {
-                let (x, side) = (within(-60.0, 60.0), if points.len() % 2 == 0 { 1.0 } else { -1.0 });
+                let (x, side) = (
+                    within(-60.0, 60.0),
+                    if points.len() % 2 == 0 { 1.0 } else { -1.0 },
+                );
                 let house = (x / 14.0).floor();
                 match points.len() % 7 {
                     0 => Point3::new(house * 14.0, side * within(10.0, 13.0), within(0.0, 9.0)),
@@ -43,7 +46,8 @@ fn sweep(world_from_sensor: &Isometry3<f64>, seed: u64) -> Vec<[f32; 4]> {
 
 fn icp(criterion: &mut Criterion) {
     let config = IcpConfig::default();
-    let pose = |x: f64, y: f64, yaw: f64| Isometry3::new(Vector3::new(x, y, 2.0), Vector3::z() * yaw);
+    let pose =
+        |x: f64, y: f64, yaw: f64| Isometry3::new(Vector3::new(x, y, 2.0), Vector3::z() * yaw);
     let (here, there) = (pose(0.0, -2.0, 0.0), pose(8.0, 2.0, 0.1));
     let (target, source) = (sweep(&here, 1), sweep(&there, 2));
     let truth = here.inv_mul(&there);
@@ -53,9 +57,18 @@ fn icp(criterion: &mut Criterion) {
     let fit = register(&decimate, &planes, &start, &config).expect("a street constrains a pose");
     let off = truth.inv_mul(&fit.target_from_source);
     assert!(off.translation.vector.norm() < 0.1, "{off}");
-    eprintln!("{} points on {} planes, {} steps", decimate.points_m().len(), planes.planes(), fit.steps);
-    criterion.bench_function("icp/target", |bencher| bencher.iter(|| IcpTarget::of_sweep(black_box(&target), &config)));
-    criterion.bench_function("icp/source", |bencher| bencher.iter(|| IcpSource::of_sweep(black_box(&source), &config)));
+    eprintln!(
+        "{} points on {} planes, {} steps",
+        decimate.points_m().len(),
+        planes.planes(),
+        fit.steps
+    );
+    criterion.bench_function("icp/target", |bencher| {
+        bencher.iter(|| IcpTarget::of_sweep(black_box(&target), &config))
+    });
+    criterion.bench_function("icp/source", |bencher| {
+        bencher.iter(|| IcpSource::of_sweep(black_box(&source), &config))
+    });
     criterion.bench_function("icp/register", |bencher| {
         bencher.iter(|| register(black_box(&decimate), &planes, &start, &config));
     });

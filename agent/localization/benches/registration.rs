@@ -48,7 +48,11 @@ const SCENE: Shape = Shape {
 
 const SHAPES: [Shape; 4] = [
     SCENE,
-    Shape { name: "scene/3000x92", outliers: 0.92, ..SCENE },
+    Shape {
+        name: "scene/3000x92",
+        outliers: 0.92,
+        ..SCENE
+    },
     // The sizes for which reference solutions of SC2-PCR exist.
     Shape {
         name: "indoor/300x60",
@@ -76,7 +80,11 @@ fn problem(shape: &Shape, seed: u64) -> (Isometry3<f64>, Vec<Correspondence>) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let tilt = if shape.upright { 0.05 } else { 1.5 };
     let truth = Isometry3::from_parts(
-        Translation3::new(random.random_range(-100.0..100.0), random.random_range(-100.0..100.0), 2.0),
+        Translation3::new(
+            random.random_range(-100.0..100.0),
+            random.random_range(-100.0..100.0),
+            2.0,
+        ),
         UnitQuaternion::from_euler_angles(
             random.random_range(-tilt..tilt),
             random.random_range(-tilt..tilt),
@@ -84,11 +92,19 @@ fn problem(shape: &Shape, seed: u64) -> (Isometry3<f64>, Vec<Correspondence>) {
         ),
     );
     let pairs = (0..shape.count).map(|_| {
-        let source = Point3::from(shape.reach_m.map(|reach| random.random_range(-reach..reach)));
+        let source = Point3::from(
+            shape
+                .reach_m
+                .map(|reach| random.random_range(-reach..reach)),
+        );
         let log_noise = random.random_range(shape.noise_m[0].ln()..=shape.noise_m[1].ln());
         let target = if random.random_bool(shape.outliers) {
             let mut place = |reach: f64| random.random_range(-reach..reach);
-            Point3::new(place(shape.scene_m), place(shape.scene_m), place(shape.reach_m[2]))
+            Point3::new(
+                place(shape.scene_m),
+                place(shape.scene_m),
+                place(shape.reach_m[2]),
+            )
         } else {
             let mut shaken = truth * source;
             for coordinate in &mut shaken.coords {
@@ -101,29 +117,54 @@ fn problem(shape: &Shape, seed: u64) -> (Isometry3<f64>, Vec<Correspondence>) {
         let error_m = (truth * source - target).norm().min(8.0) * random.random_range(0.5..2.0);
         let weight = (1.0 / (1.0 + error_m * error_m)) as f32;
         let single = |point: Point3<f64>| point.coords.map(|x| x as f32).into();
-        Correspondence { source_m: single(source), target_m: single(target), weight }
+        Correspondence {
+            source_m: single(source),
+            target_m: single(target),
+            weight,
+        }
     });
     let pairs = pairs.collect();
     (truth, pairs)
 }
 
-type Solver<'a> = (&'static str, Box<dyn Fn(&[Correspondence]) -> Result<Registration, NoRegistration> + 'a>);
+type Solver<'a> = (
+    &'static str,
+    Box<dyn Fn(&[Correspondence]) -> Result<Registration, NoRegistration> + 'a>,
+);
 
 fn solvers(shape: &Shape) -> Vec<Solver<'_>> {
     let threshold_m = shape.threshold_m;
     let any = RansacConfig::any_rotation(threshold_m);
-    let upright = RansacConfig { inlier_threshold_m: threshold_m, ..RansacConfig::default() };
-    let three = RansacConfig { minimal: MinimalSolver::ThreePoint, ..upright.clone() };
+    let upright = RansacConfig {
+        inlier_threshold_m: threshold_m,
+        ..RansacConfig::default()
+    };
+    let three = RansacConfig {
+        minimal: MinimalSolver::ThreePoint,
+        ..upright.clone()
+    };
     let second_order = Sc2PcrConfig {
         inlier_threshold_m: threshold_m,
         distance_threshold_m: threshold_m,
-        refinement: Some(Refinement { threshold_m, rounds: 20 }),
+        refinement: Some(Refinement {
+            threshold_m,
+            rounds: 20,
+        }),
         ..Sc2PcrConfig::default()
     };
-    let mut solvers: Vec<Solver<'_>> = vec![("sc2pcr", Box::new(move |pairs| sc2pcr::solve(pairs, &second_order)))];
+    let mut solvers: Vec<Solver<'_>> = vec![(
+        "sc2pcr",
+        Box::new(move |pairs| sc2pcr::solve(pairs, &second_order)),
+    )];
     if shape.upright {
-        solvers.push(("ransac2", Box::new(move |pairs| ransac::solve(pairs, &upright))));
-        solvers.push(("ransac3", Box::new(move |pairs| ransac::solve(pairs, &three))));
+        solvers.push((
+            "ransac2",
+            Box::new(move |pairs| ransac::solve(pairs, &upright)),
+        ));
+        solvers.push((
+            "ransac3",
+            Box::new(move |pairs| ransac::solve(pairs, &three)),
+        ));
     } else {
         solvers.push(("ransac3", Box::new(move |pairs| ransac::solve(pairs, &any))));
     }
@@ -147,7 +188,10 @@ fn accuracy(shape: &Shape, (name, solve): &Solver<'_>) -> usize {
     }
     let quantile = |values: &mut Vec<f64>, share: f64| {
         values.sort_by(f64::total_cmp);
-        values.get((values.len() as f64 * share) as usize).copied().unwrap_or(f64::NAN)
+        values
+            .get((values.len() as f64 * share) as usize)
+            .copied()
+            .unwrap_or(f64::NAN)
     };
     eprintln!(
         "{:14} {name:8} right {good:3}/{PROBLEMS}  p50 {:.3} m {:.3} deg  p95 {:.3} m {:.3} deg  p50 {:.2} ms  p95 {:.2} ms",
@@ -166,7 +210,12 @@ fn registration(criterion: &mut Criterion) {
     for shape in &SHAPES {
         for solver in &solvers(shape) {
             let good = accuracy(shape, solver);
-            assert!(solver.0 == "sc2pcr" || good >= 95, "{} {}: {good}", shape.name, solver.0);
+            assert!(
+                solver.0 == "sc2pcr" || good >= 95,
+                "{} {}: {good}",
+                shape.name,
+                solver.0
+            );
             let (_, pairs) = problem(shape, 1000);
             criterion.bench_function(&format!("{}/{}", shape.name, solver.0), |bencher| {
                 bencher.iter(|| solver.1(black_box(&pairs)));

@@ -8,7 +8,9 @@ use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use dataset::{self, LoadOptions};
-use localization::pgc::{SceneEncoder, SceneEncoderConfig, SceneHead, SceneHeadConfig, SweepVoxels, VoxelBatch};
+use localization::pgc::{
+    SceneEncoder, SceneEncoderConfig, SceneHead, SceneHeadConfig, SweepVoxels, VoxelBatch,
+};
 use simulator::generate::{Subset, SynthOptions, generate};
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -17,11 +19,22 @@ use tch::{Device, Kind, Tensor, no_grad};
 fn sweep() -> Vec<[f32; 3]> {
     let dir = tempfile::tempdir().expect("a folder");
     let folder = dir.path().join("drive");
-    let options = SynthOptions { frames: 1, ..SynthOptions::new(Subset::Town1loc, 3, folder.clone()) };
+    let options = SynthOptions {
+        frames: 1,
+        ..SynthOptions::new(Subset::Town1loc, 3, folder.clone())
+    };
     generate(&options, &|_| {}).expect("a scene");
     let dataset = dataset::open(&folder).expect("a dataset");
-    let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).expect("a frame");
-    frame.points.xyzi.iter().take(50_000).map(|&[x, y, z, _]| [x, y, z]).collect()
+    let frame = dataset.scenarios[0]
+        .load(0, 0, &LoadOptions::default())
+        .expect("a frame");
+    frame
+        .points
+        .xyzi
+        .iter()
+        .take(50_000)
+        .map(|&[x, y, z, _]| [x, y, z])
+        .collect()
 }
 
 fn bench(criterion: &mut Criterion) {
@@ -44,12 +57,22 @@ fn bench(criterion: &mut Criterion) {
         });
         let head_config = head_config(&config);
         let head = SceneHead::new(&(network.root() / "head"), &head_config).expect("a head");
-        let cells =
-            Tensor::randn([head_config.max_cells as i64, head_config.cell_channels], (Kind::Float, Device::Cpu));
-        let logits = Tensor::randn([head_config.max_cells as i64, head_config.classes], (Kind::Float, Device::Cpu));
-        group.bench_function(format!("regress {} cells", head_config.max_cells), |bencher| {
-            bencher.iter(|| no_grad(|| head.regress(&cells, &logits, Kind::Float)).expect("coordinates"));
-        });
+        let cells = Tensor::randn(
+            [head_config.max_cells as i64, head_config.cell_channels],
+            (Kind::Float, Device::Cpu),
+        );
+        let logits = Tensor::randn(
+            [head_config.max_cells as i64, head_config.classes],
+            (Kind::Float, Device::Cpu),
+        );
+        group.bench_function(
+            format!("regress {} cells", head_config.max_cells),
+            |bencher| {
+                bencher.iter(|| {
+                    no_grad(|| head.regress(&cells, &logits, Kind::Float)).expect("coordinates")
+                });
+            },
+        );
     }
 }
 

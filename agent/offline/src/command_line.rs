@@ -38,7 +38,8 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     let kept = match cli.command {
         // Kept memory pays off over many frames; a second start costs as much time as a cloud takes.
         Command::Locate(_) => Ok(()),
-        _ => malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("cannot execute this program again"),
+        _ => malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
+            .context("cannot execute this program again"),
     };
     let outcome = kept.and_then(|()| match cli.command {
         Command::Eval(args) => command::eval::run(&args),

@@ -54,17 +54,23 @@ pub fn head_file(head: &str) -> Result<PathBuf, HeadFileError> {
     }
     let folders = weights_folders();
     let names = [format!("pgc-{head}.{ENDING}"), format!("{head}.{ENDING}")];
-    let mut files = folders.iter().flat_map(|folder| names.iter().map(move |name| folder.join(name)));
+    let mut files = folders
+        .iter()
+        .flat_map(|folder| names.iter().map(move |name| folder.join(name)));
     let released = || {
         let files = folders.iter().flat_map(|folder| files_in(folder));
-        let stems = files.filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix("pgc-")?.to_owned()));
+        let stems = files
+            .filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix("pgc-")?.to_owned()));
         // A folder may be reached by two paths.
         let names: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
         names.into_iter().collect()
     };
     files
         .find(|file| file.is_file())
-        .ok_or_else(|| HeadFileError::NoHead { head: head.to_owned(), released: released() })
+        .ok_or_else(|| HeadFileError::NoHead {
+            head: head.to_owned(),
+            released: released(),
+        })
 }
 
 /// The encoder of a head, scene encoder or detector: the file whose digest its metadata names, of those beside it or
@@ -78,7 +84,10 @@ pub fn encoder_of(head: &Path) -> Result<PathBuf, HeadFileError> {
         (Ok(Ok(found)), _) => Ok(found),
         // The digests are compared, and an unreadable head is reported, when both are opened.
         (_, Some(beside)) => Ok(beside),
-        (Ok(Err(sha256)), None) => Err(HeadFileError::NoEncoder { head: head.to_owned(), sha256 }),
+        (Ok(Err(sha256)), None) => Err(HeadFileError::NoEncoder {
+            head: head.to_owned(),
+            sha256,
+        }),
         (Err(error), None) => Err(error),
     }
 }
@@ -88,31 +97,57 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, HeadFileError> 
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
     let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;
-    let folders = head.parent().map(Path::to_owned).into_iter().chain(weights_folders());
-    let files = folders.flat_map(|folder| files_in(&folder)).filter(|file| file != head);
-    let (encoders, others): (Vec<PathBuf>, Vec<PathBuf>) = files
-        .partition(|file| file.file_stem().and_then(|stem| stem.to_str()).is_some_and(|stem| stem.contains("encoder")));
-    let is_named = |file: &PathBuf| Weights::load(file).is_ok_and(|weights| CellEncoder::sha256_of(&weights) == sha256);
-    Ok(encoders.into_iter().chain(others).find(is_named).ok_or(sha256))
+    let folders = head
+        .parent()
+        .map(Path::to_owned)
+        .into_iter()
+        .chain(weights_folders());
+    let files = folders
+        .flat_map(|folder| files_in(&folder))
+        .filter(|file| file != head);
+    let (encoders, others): (Vec<PathBuf>, Vec<PathBuf>) = files.partition(|file| {
+        file.file_stem()
+            .and_then(|stem| stem.to_str())
+            .is_some_and(|stem| stem.contains("encoder"))
+    });
+    let is_named = |file: &PathBuf| {
+        Weights::load(file).is_ok_and(|weights| CellEncoder::sha256_of(&weights) == sha256)
+    };
+    Ok(encoders
+        .into_iter()
+        .chain(others)
+        .find(is_named)
+        .ok_or(sha256))
 }
 
 /// The released encoder, for a new head.
 #[must_use]
 pub fn released_encoder() -> Option<PathBuf> {
-    weights_folders().into_iter().map(|folder| folder.join(ENCODER_FILE)).find(|file| file.is_file())
+    weights_folders()
+        .into_iter()
+        .map(|folder| folder.join(ENCODER_FILE))
+        .find(|file| file.is_file())
 }
 
 /// Folders of released weights that exist.
 fn weights_folders() -> Vec<PathBuf> {
-    let here = FROM_HERE.into_iter().map(PathBuf::from).filter(|folder| folder.is_dir());
+    let here = FROM_HERE
+        .into_iter()
+        .map(PathBuf::from)
+        .filter(|folder| folder.is_dir());
     here.chain(shared_files::shared("weights")).collect()
 }
 
 /// Weights in a folder, in text order.
 fn files_in(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut files: Vec<PathBuf> =
-        entries.filter(|path| path.extension().is_some_and(|ending| ending == ENDING)).collect();
+    let entries = std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path());
+    let mut files: Vec<PathBuf> = entries
+        .filter(|path| path.extension().is_some_and(|ending| ending == ENDING))
+        .collect();
     files.sort_unstable();
     files
 }
@@ -130,7 +165,10 @@ mod tests {
             assert_eq!(head_file(head.to_str().unwrap()).unwrap(), file);
         }
         let message = head_file("town-that-nobody-drove").unwrap_err().to_string();
-        assert!(message.contains("--head town-that-nobody-drove: no such file or released head"), "{message}");
+        assert!(
+            message.contains("--head town-that-nobody-drove: no such file or released head"),
+            "{message}"
+        );
     }
 
     #[test]

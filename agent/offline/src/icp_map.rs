@@ -31,10 +31,15 @@ impl IcpMapPose {
 impl PoseSource for IcpMapPose {
     /// The confidence is the share of points with a partner.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
-        let Some(start) = input.measured else { return NO_SOURCE };
+        let Some(start) = input.measured else {
+            return NO_SOURCE;
+        };
         let source = IcpSource::of_sweep(&input.cloud.xyzi, &self.config);
         match icp::register(&source, &self.map, &start.isometry(), &self.config) {
-            Ok(fit) => PoseEstimate::new(fit.target_from_source.into(), fit.overlap.clamp(0.0, 1.0) as f32),
+            Ok(fit) => PoseEstimate::new(
+                fit.target_from_source.into(),
+                fit.overlap.clamp(0.0, 1.0) as f32,
+            ),
             Err(NoIcpFit::TooFew { .. }) => no_pose(NoPoseReason::TooFewPoints),
             Err(NoIcpFit::TooLittleOverlap { .. } | NoIcpFit::Unconstrained { .. }) => {
                 no_pose(NoPoseReason::TooFewInliers)
@@ -44,7 +49,10 @@ impl PoseSource for IcpMapPose {
 }
 
 fn no_pose(reason: NoPoseReason) -> PoseEstimate {
-    PoseEstimate::NoPose { reason, inlier_count: 0 }
+    PoseEstimate::NoPose {
+        reason,
+        inlier_count: 0,
+    }
 }
 
 /// Error of building a point-cloud map.
@@ -62,21 +70,42 @@ pub enum MapError {
 ///
 /// # Errors
 /// [`MapError`] names the file.
-pub fn read_map(folders: &[impl AsRef<Path>], spacing_m: f64, config: &IcpConfig) -> Result<IcpTarget, MapError> {
+pub fn read_map(
+    folders: &[impl AsRef<Path>],
+    spacing_m: f64,
+    config: &IcpConfig,
+) -> Result<IcpTarget, MapError> {
     let mut map = IcpTarget::new(config);
     for folder in folders {
         let mut sweeps = 0;
         for scenario in dataset::open(folder.as_ref())?.scenarios {
             for agent in 0..scenario.agents.len() {
                 let mut last: Option<Isometry3<f64>> = None;
-                for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
-                    let without_points = LoadOptions { points: false, ..LoadOptions::default() };
-                    let Some(pose) = scenario.load(agent, tick, &without_points)?.world_from_lidar else { continue };
+                for tick in
+                    (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick))
+                {
+                    let without_points = LoadOptions {
+                        points: false,
+                        ..LoadOptions::default()
+                    };
+                    let Some(pose) = scenario
+                        .load(agent, tick, &without_points)?
+                        .world_from_lidar
+                    else {
+                        continue;
+                    };
                     let pose = pose.isometry();
-                    let way_m =
-                        last.map_or(f64::INFINITY, |last| (last.translation.vector - pose.translation.vector).norm());
+                    let way_m = last.map_or(f64::INFINITY, |last| {
+                        (last.translation.vector - pose.translation.vector).norm()
+                    });
                     if way_m >= spacing_m {
-                        map.add(&scenario.load(agent, tick, &LoadOptions::default())?.points.xyzi, &pose);
+                        map.add(
+                            &scenario
+                                .load(agent, tick, &LoadOptions::default())?
+                                .points
+                                .xyzi,
+                            &pose,
+                        );
                         last = Some(pose);
                         sweeps += 1;
                     }
@@ -99,12 +128,29 @@ mod tests {
 
     /// Ground and two pairs of walls around the origin, as measured from there.
     fn yard() -> PointCloud {
-        let ground = (0..6400).map(|k| [(k % 80) as f32 * 0.5 - 20.0, (k / 80) as f32 * 0.5 - 20.0, -2.0, 0.1]);
-        let wall = (0..4000).map(|k| {
-            let (along, up, side) = ((k % 100) as f32 * 0.35 - 17.5, (k / 100 % 20) as f32 * 0.3 - 2.0, k / 2000);
-            if side == 0 { [along, 12.0, up, 0.1] } else { [-15.0, along, up, 0.1] }
+        let ground = (0..6400).map(|k| {
+            [
+                (k % 80) as f32 * 0.5 - 20.0,
+                (k / 80) as f32 * 0.5 - 20.0,
+                -2.0,
+                0.1,
+            ]
         });
-        PointCloud { xyzi: ground.chain(wall).collect() }
+        let wall = (0..4000).map(|k| {
+            let (along, up, side) = (
+                (k % 100) as f32 * 0.35 - 17.5,
+                (k / 100 % 20) as f32 * 0.3 - 2.0,
+                k / 2000,
+            );
+            if side == 0 {
+                [along, 12.0, up, 0.1]
+            } else {
+                [-15.0, along, up, 0.1]
+            }
+        });
+        PointCloud {
+            xyzi: ground.chain(wall).collect(),
+        }
     }
 
     #[test]
@@ -126,16 +172,28 @@ mod tests {
             motion: protocol::EgoMotion::default(),
         };
         let estimate = source.estimate(&input);
-        let off = truth.from_world(estimate.world_from_cav().unwrap()).isometry();
-        assert!(off.translation.vector.norm() < 0.01 && off.rotation.angle() < 1e-3, "{off}");
+        let off = truth
+            .from_world(estimate.world_from_cav().unwrap())
+            .isometry();
+        assert!(
+            off.translation.vector.norm() < 0.01 && off.rotation.angle() < 1e-3,
+            "{off}"
+        );
         assert!(estimate.confidence() > 0.9);
 
         let empty = PointCloud::default();
         input.cloud = &empty;
         assert_eq!(source.estimate(&input), no_pose(NoPoseReason::TooFewPoints));
         let elsewhere = Pose::from_xyz_yaw([5000.0, 0.0, 0.0], 0.0);
-        input = PoseInput { cloud: &cloud, measured: Some(&elsewhere), ..input };
-        assert_eq!(source.estimate(&input), no_pose(NoPoseReason::TooFewInliers));
+        input = PoseInput {
+            cloud: &cloud,
+            measured: Some(&elsewhere),
+            ..input
+        };
+        assert_eq!(
+            source.estimate(&input),
+            no_pose(NoPoseReason::TooFewInliers)
+        );
         input.measured = None;
         assert_eq!(source.estimate(&input), NO_SOURCE);
     }

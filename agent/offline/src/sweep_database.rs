@@ -31,10 +31,21 @@ pub fn read_database(
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<SweepDatabase, DatabaseError> {
-    let datasets = folders.iter().map(|folder| dataset::open(folder.as_ref())).collect::<Result<Vec<_>, _>>()?;
-    let scenarios: Vec<_> = datasets.iter().flat_map(|dataset| &dataset.scenarios).collect();
-    let total = scenarios.iter().map(|scenario| scenario.ticks.len() * scenario.agents.len()).sum();
-    datasets.iter().for_each(|dataset| left_out.add_files(&dataset.problems));
+    let datasets = folders
+        .iter()
+        .map(|folder| dataset::open(folder.as_ref()))
+        .collect::<Result<Vec<_>, _>>()?;
+    let scenarios: Vec<_> = datasets
+        .iter()
+        .flat_map(|dataset| &dataset.scenarios)
+        .collect();
+    let total = scenarios
+        .iter()
+        .map(|scenario| scenario.ticks.len() * scenario.agents.len())
+        .sum();
+    datasets
+        .iter()
+        .for_each(|dataset| left_out.add_files(&dataset.problems));
     let (mut sweeps, mut done) = (Vec::new(), 0);
     for scenario in scenarios {
         for agent in 0..scenario.agents.len() {
@@ -46,13 +57,20 @@ pub fn read_database(
                 }
                 match described(scenario, agent, tick, localizer) {
                     Ok(sweep) => sweeps.extend(sweep),
-                    Err(DatabaseError::Read(error)) => left_out.add_unreadable(agent, Problem::from(&error)),
+                    Err(DatabaseError::Read(error)) => {
+                        left_out.add_unreadable(agent, Problem::from(&error))
+                    }
                     Err(error) => return Err(error),
                 }
             }
         }
     }
-    let folders = || folders.iter().map(|folder| folder.as_ref().to_owned()).collect();
+    let folders = || {
+        folders
+            .iter()
+            .map(|folder| folder.as_ref().to_owned())
+            .collect()
+    };
     SweepDatabase::new(&sweeps).ok_or_else(|| DatabaseError::NoSweeps(folders()))
 }
 
@@ -69,5 +87,8 @@ fn described(
         return Err(ReadError::malformed(&path, "there is no pose for this sweep").into());
     };
     let features = localizer.sweep_features(&frame.points, &mut LocalizerTimes::default())?;
-    Ok(features.map(|descriptor| DescribedSweep { descriptor, world_from_sensor: pose.isometry() }))
+    Ok(features.map(|descriptor| DescribedSweep {
+        descriptor,
+        world_from_sensor: pose.isometry(),
+    }))
 }

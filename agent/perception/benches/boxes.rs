@@ -16,7 +16,13 @@ use rand_chacha::ChaCha8Rng;
 fn boxes(count: usize, vehicles: usize, seed: u64) -> (Vec<Polygon>, Vec<f32>) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let places: Vec<[f64; 3]> = (0..vehicles)
-        .map(|_| [random.random_range(-100.0..100.0), random.random_range(-40.0..40.0), random.random_range(-3.1..3.1)])
+        .map(|_| {
+            [
+                random.random_range(-100.0..100.0),
+                random.random_range(-40.0..40.0),
+                random.random_range(-3.1..3.1),
+            ]
+        })
         .collect();
     (0..count)
         .map(|index| {
@@ -37,7 +43,11 @@ fn nms(criterion: &mut Criterion) {
     for (name, vehicles) in [("clusters", 40), ("apart", 1000)] {
         let (polygons, scores) = boxes(1000, vehicles, 1000);
         let kept = rotated_nms(&polygons, &scores, 0.15, 1000);
-        assert!(kept.len() >= vehicles.min(40) && kept.len() < 1000, "{}", kept.len());
+        assert!(
+            kept.len() >= vehicles.min(40) && kept.len() < 1000,
+            "{}",
+            kept.len()
+        );
         criterion.bench_function(&format!("nms/{name}/1000"), |bencher| {
             bencher.iter(|| rotated_nms(black_box(&polygons), black_box(&scores), 0.15, 1000));
         });
@@ -46,9 +56,16 @@ fn nms(criterion: &mut Criterion) {
 
 fn decoding(criterion: &mut Criterion) {
     let anchors = Anchors::for_detector(&DetectorConfig::lean());
-    let scores: Vec<f32> = (0..anchors.len()).map(|index| if index % 100 == 0 { 1.0 } else { -4.0 }).collect();
+    let scores: Vec<f32> = (0..anchors.len())
+        .map(|index| if index % 100 == 0 { 1.0 } else { -4.0 })
+        .collect();
     let offsets = vec![0.1; anchors.len() * 7];
-    assert_eq!(decode(&scores, &offsets, &anchors, 0.2).expect("sizes fit").len(), anchors.len().div_ceil(100));
+    assert_eq!(
+        decode(&scores, &offsets, &anchors, 0.2)
+            .expect("sizes fit")
+            .len(),
+        anchors.len().div_ceil(100)
+    );
     criterion.bench_function("decode/lean/246", |bencher| {
         bencher.iter(|| decode(black_box(&scores), black_box(&offsets), &anchors, 0.2));
     });

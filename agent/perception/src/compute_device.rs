@@ -5,7 +5,9 @@ use serde::{Deserialize, Serialize};
 use tch::{Cuda, Device, utils};
 
 /// Device that networks compute on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum ComputeDevice {
     /// The CPU.
@@ -55,7 +57,13 @@ mod tests {
     fn what_is_missing_is_named() {
         assert_eq!(ComputeDevice::default().open(), Ok(Device::Cpu));
         assert_eq!(cuda(true, true), Ok(Device::Cuda(0)));
-        assert_eq!(cuda(false, false).unwrap_err().to_string(), "this libtorch is built without CUDA");
-        assert_eq!(cuda(true, false).unwrap_err().to_string(), "libtorch finds no CUDA device");
+        assert_eq!(
+            cuda(false, false).unwrap_err().to_string(),
+            "this libtorch is built without CUDA"
+        );
+        assert_eq!(
+            cuda(true, false).unwrap_err().to_string(),
+            "libtorch finds no CUDA device"
+        );
     }
 }

@@ -35,7 +35,11 @@ impl Crop {
     /// vehicles. Points that are not finite are removed as well.
     #[must_use]
     pub fn without_own_body(&self, cloud: &PointCloud) -> PointCloud {
-        let anywhere = Self { low_m: [f32::NEG_INFINITY; 3], high_m: [f32::INFINITY; 3], ..*self };
+        let anywhere = Self {
+            low_m: [f32::NEG_INFINITY; 3],
+            high_m: [f32::INFINITY; 3],
+            ..*self
+        };
         let mut kept = PointCloud::default();
         anywhere.keep(&cloud.xyzi, &mut kept.xyzi);
         kept
@@ -44,11 +48,15 @@ impl Crop {
     /// The same area, the own body included.
     #[must_use]
     pub fn range_only(&self) -> Self {
-        Self { own_body_m: None, ..*self }
+        Self {
+            own_body_m: None,
+            ..*self
+        }
     }
 
     fn is_kept(&self, &[x, y, z, intensity]: &[f32; 4]) -> bool {
-        let inside = |axis: usize, value: f32| value > self.low_m[axis] && value < self.high_m[axis];
+        let inside =
+            |axis: usize, value: f32| value > self.low_m[axis] && value < self.high_m[axis];
         let [x_low, y_low, x_high, y_high] = self.own_body_m.unwrap_or([f32::INFINITY; 4]);
         let own = x >= x_low && x <= x_high && y >= y_low && y <= y_high;
         inside(0, x) && inside(1, y) && inside(2, z) && !own && intensity.is_finite()
@@ -71,13 +79,21 @@ mod tests {
             [5.0, 0.0, 0.0, f32::NAN],
         ];
         let mut kept = Vec::new();
-        crop.keep(&[drop[0], keep, drop[1], drop[2], drop[3], drop[4]], &mut kept);
+        crop.keep(
+            &[drop[0], keep, drop[1], drop[2], drop[3], drop[4]],
+            &mut kept,
+        );
         assert_eq!(kept, [keep]);
-        let whole = Crop::for_detector(&DetectorConfig { own_body_m: None, ..DetectorConfig::lean() });
+        let whole = Crop::for_detector(&DetectorConfig {
+            own_body_m: None,
+            ..DetectorConfig::lean()
+        });
         whole.keep(&drop, &mut kept);
         assert_eq!(kept, [keep, drop[0]]);
         assert_eq!(crop.range_only(), whole);
-        let sent = crop.without_own_body(&PointCloud { xyzi: vec![drop[0], keep, drop[1], drop[3], drop[4]] });
+        let sent = crop.without_own_body(&PointCloud {
+            xyzi: vec![drop[0], keep, drop[1], drop[3], drop[4]],
+        });
         assert_eq!(sent.xyzi, [keep, drop[1]]);
     }
 }

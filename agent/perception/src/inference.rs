@@ -15,14 +15,20 @@ pub struct Inference {
 
 impl Inference {
     /// On the CPU in floating point.
-    pub const FLOAT: Self = Self { device: Device::Cpu, precision: InferencePrecision::Float };
+    pub const FLOAT: Self = Self {
+        device: Device::Cpu,
+        precision: InferencePrecision::Float,
+    };
 
     /// On a device, in a number format; integers are for the CPU only.
     #[must_use]
     pub fn new(device: Device, precision: InferencePrecision) -> Self {
         match device {
             Device::Cpu => Self { device, precision },
-            _ => Self { device, precision: InferencePrecision::Float },
+            _ => Self {
+                device,
+                precision: InferencePrecision::Float,
+            },
         }
     }
 }

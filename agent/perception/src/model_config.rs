@@ -97,7 +97,11 @@ pub struct AnchorConfig {
 
 impl Default for AnchorConfig {
     fn default() -> Self {
-        Self { size_lwh_m: [3.9, 1.6, 1.56], center_z_m: -1.0, yaws_deg: vec![0.0, 90.0] }
+        Self {
+            size_lwh_m: [3.9, 1.6, 1.56],
+            center_z_m: -1.0,
+            yaws_deg: vec![0.0, 90.0],
+        }
     }
 }
 
@@ -163,7 +167,10 @@ impl DetectorConfig {
             num_filters: vec![64, 128, 256],
             upsample_strides: vec![1, 2, 4],
             num_upsample_filters: vec![128; 3],
-            shrink: Some(ShrinkConfig::DoubleConv { channels: 256, stride: 2 }),
+            shrink: Some(ShrinkConfig::DoubleConv {
+                channels: 256,
+                stride: 2,
+            }),
             compress_ratio: None,
             anchors: AnchorConfig::default(),
             own_body_m: Some(OWN_BODY_M),
@@ -226,7 +233,9 @@ impl DetectorConfig {
     #[must_use]
     pub fn feature_channels(&self) -> i64 {
         match self.shrink {
-            Some(ShrinkConfig::DoubleConv { channels, .. } | ShrinkConfig::Pointwise { channels }) => channels,
+            Some(
+                ShrinkConfig::DoubleConv { channels, .. } | ShrinkConfig::Pointwise { channels },
+            ) => channels,
             None => self.backbone_channels(),
         }
     }
@@ -234,13 +243,18 @@ impl DetectorConfig {
     /// Channels of the transmitted feature map: of the code, if there is a compressor.
     #[must_use]
     pub fn sent_channels(&self) -> i64 {
-        self.compress_ratio.map_or(self.feature_channels(), |ratio| (self.feature_channels() / ratio).max(1))
+        self.compress_ratio
+            .map_or(self.feature_channels(), |ratio| {
+                (self.feature_channels() / ratio).max(1)
+            })
     }
 
     /// BEV grid of the transmitted feature map.
     #[must_use]
     pub fn feature_grid(&self) -> BevGrid {
-        let [width, height, _] = self.pillar_grid().map(|count| u32::try_from(count).unwrap_or(u32::MAX));
+        let [width, height, _] = self
+            .pillar_grid()
+            .map(|count| u32::try_from(count).unwrap_or(u32::MAX));
         let pillars = BevGrid {
             x_min_m: self.lidar_range_m[0],
             y_min_m: self.lidar_range_m[1],
@@ -259,10 +273,21 @@ impl DetectorConfig {
         self.check_area()?;
         self.check_levels()?;
         let positive = |field, value: i64| {
-            let error = ConfigError::Value { field, value: value.to_string(), must: "1 to 4096" };
-            if (1..=4096).contains(&value) { Ok(()) } else { Err(error) }
+            let error = ConfigError::Value {
+                field,
+                value: value.to_string(),
+                must: "1 to 4096",
+            };
+            if (1..=4096).contains(&value) {
+                Ok(())
+            } else {
+                Err(error)
+            }
         };
-        positive("max_points_per_pillar", i64::try_from(self.max_points_per_pillar).unwrap_or(0))?;
+        positive(
+            "max_points_per_pillar",
+            i64::try_from(self.max_points_per_pillar).unwrap_or(0),
+        )?;
         positive("pillar_channels", self.pillar_channels)?;
         positive("shrink channels", self.feature_channels())?;
         positive("number of anchor yaws", self.anchors.yaws_deg.len() as i64)?;
@@ -271,10 +296,23 @@ impl DetectorConfig {
             positive("shrink stride", stride)?;
         }
         if !(1..=MAX_CELLS).contains(&self.max_pillars) {
-            return Err(value_error("max_pillars", self.max_pillars, "1 to 16777216"));
+            return Err(value_error(
+                "max_pillars",
+                self.max_pillars,
+                "1 to 16777216",
+            ));
         }
-        if self.anchors.size_lwh_m.iter().any(|size| !(size.is_finite() && *size > 0.0)) {
-            return Err(value_error("anchors.size_lwh_m", self.anchors.size_lwh_m, "positive"));
+        if self
+            .anchors
+            .size_lwh_m
+            .iter()
+            .any(|size| !(size.is_finite() && *size > 0.0))
+        {
+            return Err(value_error(
+                "anchors.size_lwh_m",
+                self.anchors.size_lwh_m,
+                "positive",
+            ));
         }
         self.check_sizes()
     }
@@ -284,20 +322,34 @@ impl DetectorConfig {
         let [x, y, _] = self.pillar_grid().map(|count| count as i64);
         let canvas = x * y * self.pillar_channels;
         if canvas > MAX_VALUES {
-            return Err(value_error("pillar grid times pillar_channels", canvas, "268435456 values at most"));
+            return Err(value_error(
+                "pillar grid times pillar_channels",
+                canvas,
+                "268435456 values at most",
+            ));
         }
         let step = self.layer_strides[0] / self.upsample_strides[0];
-        let layers = [self.backbone_channels(), self.feature_channels(), self.head_channels()];
-        let widest = self.num_filters.iter().chain(&layers).copied().max().unwrap_or(0);
+        let layers = [
+            self.backbone_channels(),
+            self.feature_channels(),
+            self.head_channels(),
+        ];
+        let widest = self
+            .num_filters
+            .iter()
+            .chain(&layers)
+            .copied()
+            .max()
+            .unwrap_or(0);
         let map = (x / step) * (y / step) * widest;
         if map > MAX_VALUES {
-            let field =
-                "cells of a feature map times the largest of num_filters, num_upsample_filters, shrink and anchors";
+            let field = "cells of a feature map times the largest of num_filters, num_upsample_filters, shrink and anchors";
             return Err(value_error(field, map, "268435456 values at most"));
         }
         let parameters = self.parameters();
         if parameters > MAX_PARAMETERS {
-            let field = "layer_nums, num_filters, upsample_strides and shrink: number of parameters";
+            let field =
+                "layer_nums, num_filters, upsample_strides and shrink: number of parameters";
             return Err(value_error(field, parameters, "256000000 at most"));
         }
         Ok(())
@@ -314,14 +366,21 @@ impl DetectorConfig {
         let mut count = 0;
         for (level, &filters) in self.num_filters.iter().enumerate() {
             let layers = self.layer_nums[level] as i64;
-            let more = if self.blocks == BlockKind::Residual { 2 * layers - 1 } else { layers };
+            let more = if self.blocks == BlockKind::Residual {
+                2 * layers - 1
+            } else {
+                layers
+            };
             count += 9 * filters * (input + more * filters);
-            count += self.upsample_strides[level].pow(2) * filters * self.num_upsample_filters[level];
+            count +=
+                self.upsample_strides[level].pow(2) * filters * self.num_upsample_filters[level];
             input = filters;
         }
         let channels = self.feature_channels();
         count += match self.shrink {
-            Some(ShrinkConfig::DoubleConv { .. }) => 9 * channels * (self.backbone_channels() + channels),
+            Some(ShrinkConfig::DoubleConv { .. }) => {
+                9 * channels * (self.backbone_channels() + channels)
+            }
             Some(ShrinkConfig::Pointwise { .. }) => channels * self.backbone_channels(),
             None => 0,
         };
@@ -333,17 +392,35 @@ impl DetectorConfig {
 
     fn check_area(&self) -> Result<(), ConfigError> {
         let range = self.lidar_range_m;
-        if range.iter().any(|edge| !edge.is_finite()) || (0..3).any(|axis| range[axis] >= range[axis + 3]) {
-            return Err(value_error("lidar_range_m", range, "finite, lower below upper"));
+        if range.iter().any(|edge| !edge.is_finite())
+            || (0..3).any(|axis| range[axis] >= range[axis + 3])
+        {
+            return Err(value_error(
+                "lidar_range_m",
+                range,
+                "finite, lower below upper",
+            ));
         }
-        if self.voxel_size_m.iter().any(|size| !(size.is_finite() && *size > 0.0)) {
+        if self
+            .voxel_size_m
+            .iter()
+            .any(|size| !(size.is_finite() && *size > 0.0))
+        {
             return Err(value_error("voxel_size_m", self.voxel_size_m, "positive"));
         }
         if (self.voxel_size_m[0] - self.voxel_size_m[1]).abs() > 1e-9 {
-            return Err(value_error("voxel_size_m", self.voxel_size_m, "equal along x and y"));
+            return Err(value_error(
+                "voxel_size_m",
+                self.voxel_size_m,
+                "equal along x and y",
+            ));
         }
         if self.y_axis == YAxis::Right && (range[1] + range[4]).abs() > 1e-9 {
-            return Err(value_error("lidar_range_m", range, "as wide to the left as to the right if y_axis is right"));
+            return Err(value_error(
+                "lidar_range_m",
+                range,
+                "as wide to the left as to the right if y_axis is right",
+            ));
         }
         let [x, y, z] = self.pillar_grid();
         if z != 1 {
@@ -368,15 +445,31 @@ impl DetectorConfig {
         ];
         for (field, list) in lists {
             if list.len() != levels {
-                return Err(ConfigError::Levels { field, got: list.len(), levels });
+                return Err(ConfigError::Levels {
+                    field,
+                    got: list.len(),
+                    levels,
+                });
             }
             if list.iter().any(|value| !(1..=4096).contains(value)) {
                 return Err(value_error(field, list, "1 to 4096 each"));
             }
         }
-        let fewest = if self.blocks == BlockKind::Residual { 1 } else { 0 };
-        if self.layer_nums.iter().any(|layers| !(fewest..=64).contains(layers)) {
-            return Err(value_error("layer_nums", &self.layer_nums, "at most 64 each, residual blocks at least 1"));
+        let fewest = if self.blocks == BlockKind::Residual {
+            1
+        } else {
+            0
+        };
+        if self
+            .layer_nums
+            .iter()
+            .any(|layers| !(fewest..=64).contains(layers))
+        {
+            return Err(value_error(
+                "layer_nums",
+                &self.layer_nums,
+                "at most 64 each, residual blocks at least 1",
+            ));
         }
         self.check_strides()
     }
@@ -397,7 +490,11 @@ impl DetectorConfig {
         let [x, y, _] = self.pillar_grid();
         let down = usize::try_from(down).unwrap_or(usize::MAX);
         if x % down != 0 || y % down != 0 {
-            return Err(value_error("pillar grid", [x, y], "a multiple of the product of layer_strides"));
+            return Err(value_error(
+                "pillar grid",
+                [x, y],
+                "a multiple of the product of layer_strides",
+            ));
         }
         Ok(())
     }
@@ -413,8 +510,16 @@ const MAX_VALUES: i64 = 1 << 28;
 /// Largest number of parameters of a network, for the same reason: nearly 1 GiB.
 const MAX_PARAMETERS: i64 = 256_000_000;
 
-fn value_error(field: &'static str, value: impl std::fmt::Debug, must: &'static str) -> ConfigError {
-    ConfigError::Value { field, value: format!("{value:?}"), must }
+fn value_error(
+    field: &'static str,
+    value: impl std::fmt::Debug,
+    must: &'static str,
+) -> ConfigError {
+    ConfigError::Value {
+        field,
+        value: format!("{value:?}"),
+        must,
+    }
 }
 
 #[cfg(test)]
@@ -426,38 +531,100 @@ mod tests {
         let full = DetectorConfig::full();
         full.validate().unwrap();
         let grid = full.feature_grid();
-        assert_eq!((full.feature_channels(), grid.height, grid.width, grid.cell_m), (256, 48, 176, 1.6));
+        assert_eq!(
+            (
+                full.feature_channels(),
+                grid.height,
+                grid.width,
+                grid.cell_m
+            ),
+            (256, 48, 176, 1.6)
+        );
         let lean = DetectorConfig::lean();
         lean.validate().unwrap();
         let grid = lean.feature_grid();
-        assert_eq!((lean.feature_channels(), grid.height, grid.width, grid.cell_m), (64, 96, 128, 0.8));
-        assert_eq!((lean.pillar_grid(), lean.sent_channels()), ([256, 192, 1], 64));
-        let compressed = |ratio| DetectorConfig { compress_ratio: Some(ratio), ..DetectorConfig::lean() };
-        assert_eq!([1, 32, 100].map(|ratio| compressed(ratio).sent_channels()), [64, 2, 1]);
-        assert_eq!(compressed(32).feature_channels(), 64, "the receiver has the full number of channels");
+        assert_eq!(
+            (
+                lean.feature_channels(),
+                grid.height,
+                grid.width,
+                grid.cell_m
+            ),
+            (64, 96, 128, 0.8)
+        );
+        assert_eq!(
+            (lean.pillar_grid(), lean.sent_channels()),
+            ([256, 192, 1], 64)
+        );
+        let compressed = |ratio| DetectorConfig {
+            compress_ratio: Some(ratio),
+            ..DetectorConfig::lean()
+        };
+        assert_eq!(
+            [1, 32, 100].map(|ratio| compressed(ratio).sent_channels()),
+            [64, 2, 1]
+        );
+        assert_eq!(
+            compressed(32).feature_channels(),
+            64,
+            "the receiver has the full number of channels"
+        );
     }
 
     #[test]
     fn json_round_trip_keeps_everything_and_rejects_misspelt_fields() {
         let full = DetectorConfig::full();
         let mut json = serde_json::to_value(&full).unwrap();
-        assert_eq!(serde_json::from_value::<DetectorConfig>(json.clone()).unwrap(), full);
+        assert_eq!(
+            serde_json::from_value::<DetectorConfig>(json.clone()).unwrap(),
+            full
+        );
         json["max_pilars"] = 7.into();
-        assert!(serde_json::from_value::<DetectorConfig>(json).unwrap_err().to_string().contains("max_pilars"));
+        assert!(
+            serde_json::from_value::<DetectorConfig>(json)
+                .unwrap_err()
+                .to_string()
+                .contains("max_pilars")
+        );
     }
 
     #[test]
     fn sizes_beyond_memory_are_rejected_before_allocation() {
         let refused = |config: DetectorConfig, field: &str, value: &str| {
             let message = config.validate().unwrap_err().to_string();
-            assert!(message.contains(field) && message.contains(value), "{message}");
+            assert!(
+                message.contains(field) && message.contains(value),
+                "{message}"
+            );
         };
         let wide = [-819.2, -819.2, -3.0, 819.2, 819.2, 1.0];
-        let lean = || DetectorConfig { lidar_range_m: wide, pillar_channels: 8, ..DetectorConfig::lean() };
-        refused(DetectorConfig { pillar_channels: 4096, ..lean() }, "pillar_channels", "68719476736");
-        refused(DetectorConfig { num_filters: vec![4096; 3], ..lean() }, "num_filters", "17179869184");
+        let lean = || DetectorConfig {
+            lidar_range_m: wide,
+            pillar_channels: 8,
+            ..DetectorConfig::lean()
+        };
         refused(
-            DetectorConfig { layer_nums: vec![64; 3], num_filters: vec![1024; 3], ..DetectorConfig::lean() },
+            DetectorConfig {
+                pillar_channels: 4096,
+                ..lean()
+            },
+            "pillar_channels",
+            "68719476736",
+        );
+        refused(
+            DetectorConfig {
+                num_filters: vec![4096; 3],
+                ..lean()
+            },
+            "num_filters",
+            "17179869184",
+        );
+        refused(
+            DetectorConfig {
+                layer_nums: vec![64; 3],
+                num_filters: vec![1024; 3],
+                ..DetectorConfig::lean()
+            },
             "layer_nums",
             "256000000",
         );
@@ -474,9 +641,19 @@ mod tests {
         let mut config = DetectorConfig::lean();
         config.upsample_strides = vec![1, 2, 2];
         let message = config.validate().unwrap_err().to_string();
-        assert!(message.contains("upsample_strides") && message.contains("[1, 2, 2]"), "{message}");
+        assert!(
+            message.contains("upsample_strides") && message.contains("[1, 2, 2]"),
+            "{message}"
+        );
         config.upsample_strides.pop();
-        assert_eq!(config.validate(), Err(ConfigError::Levels { field: "upsample_strides", got: 2, levels: 3 }));
+        assert_eq!(
+            config.validate(),
+            Err(ConfigError::Levels {
+                field: "upsample_strides",
+                got: 2,
+                levels: 3
+            })
+        );
         let mut config = DetectorConfig::lean();
         config.lidar_range_m[3] = f64::NAN;
         assert!(config.validate().is_err());

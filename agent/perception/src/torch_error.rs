@@ -5,5 +5,10 @@ use tch::TchError;
 /// First line of the message of an error.
 #[must_use]
 pub fn first_line(error: &TchError) -> String {
-    error.to_string().lines().next().unwrap_or_default().to_owned()
+    error
+        .to_string()
+        .lines()
+        .next()
+        .unwrap_or_default()
+        .to_owned()
 }

@@ -34,7 +34,13 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     let stop = config.bus.stop().context("installing signal handlers")?;
     let bus = config.bus.join(&config.run, Role::Agent, &config.cav)?;
     tracing::info!(cav = %config.cav, weights = %config.models.weights.display(), "ready");
-    let report = node::run_filtered(&bus, agent, output_filter(&config), &config.options(), &stop)?;
+    let report = node::run_filtered(
+        &bus,
+        agent,
+        output_filter(&config),
+        &config.options(),
+        &stop,
+    )?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
@@ -52,9 +58,13 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
     let inference = config.models.inference()?;
     let weights = config.models.load(inference).context("weights")?;
-    let detector =
-        Detector::from_weights(&weights, &weights.detector_config()?, inference.device).context("weights")?;
-    Ok(Agent::new(config.cav.clone(), config.settings.pose.build(inference)?, detector))
+    let detector = Detector::from_weights(&weights, &weights.detector_config()?, inference.device)
+        .context("weights")?;
+    Ok(Agent::new(
+        config.cav.clone(),
+        config.settings.pose.build(inference)?,
+        detector,
+    ))
 }
 
 fn output_filter(config: &AgentConfig) -> Box<dyn OutputFilter> {

@@ -6,10 +6,30 @@ use protocol::CavId;
 
 /// Scores a frame; if compute times are emulated, its stamp is the time of publication.
 pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
-    let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
-    let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
-    let truth: Vec<(CavId, _)> =
-        frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
+    let EvaluatedFrame {
+        tick,
+        stamp,
+        result,
+        frames,
+        poses,
+        objects,
+    } = frame;
+    let poses: Vec<_> = frames
+        .iter()
+        .map(|frame| frame.cav.clone())
+        .zip(poses)
+        .collect();
+    let truth: Vec<(CavId, _)> = frames
+        .iter()
+        .filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?)))
+        .collect();
     let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
-    board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
+    board.judge_whole(
+        (tick as u64, stamp.capture_nanos),
+        latency_ms,
+        result,
+        objects,
+        &poses,
+        truth,
+    );
 }

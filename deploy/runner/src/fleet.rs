@@ -62,7 +62,9 @@ fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
         ("max_agents", protocol.max_agents.is_some()),
     ];
     match options.iter().find(|(_, is_given)| *is_given) {
-        Some((option, _)) => Err(FleetError::Protocol(format!("{option}: choose by scene.agents and ego.id instead"))),
+        Some((option, _)) => Err(FleetError::Protocol(format!(
+            "{option}: choose by scene.agents and ego.id instead"
+        ))),
         None => Ok(()),
     }
 }
@@ -83,56 +85,116 @@ impl Fleet {
         let scene = &mut scenario.scene;
         let dataset = dataset::open_with(&scene.dir, &open_options(scene))?;
         chosen_elsewhere(&scenario.protocol)?;
-        let protocol = scenario.protocol.resolve(dataset.layout).map_err(FleetError::Protocol)?;
+        let protocol = scenario
+            .protocol
+            .resolve(dataset.layout)
+            .map_err(FleetError::Protocol)?;
         let recorded = match &scene.scenario {
-            None => dataset.scenarios.first().ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
-            Some(name) => {
-                dataset.scenarios.iter().find(|known| known.name == *name).ok_or_else(|| FleetError::NoScenario {
+            None => dataset
+                .scenarios
+                .first()
+                .ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
+            Some(name) => dataset
+                .scenarios
+                .iter()
+                .find(|known| known.name == *name)
+                .ok_or_else(|| FleetError::NoScenario {
                     dir: scene.dir.clone(),
                     asked: name.clone(),
-                    found: dataset.scenarios.iter().map(|known| known.name.clone()).collect(),
-                })?
-            }
+                    found: dataset
+                        .scenarios
+                        .iter()
+                        .map(|known| known.name.clone())
+                        .collect(),
+                })?,
         };
         let name = recorded.name.clone();
         if recorded.ticks.is_empty() {
             let agents = recorded.agents.iter().map(ToString::to_string).collect();
-            return Err(FleetError::NoFrames { dir: scene.dir.clone(), name, agents });
+            return Err(FleetError::NoFrames {
+                dir: scene.dir.clone(),
+                name,
+                agents,
+            });
         }
         if scene.seek >= recorded.ticks.len() {
-            return Err(FleetError::Seek { seek: scene.seek, name, ticks: recorded.ticks.len() });
+            return Err(FleetError::Seek {
+                seek: scene.seek,
+                name,
+                ticks: recorded.ticks.len(),
+            });
         }
         let known = |field, cav: &CavId| {
             if recorded.agents.contains(cav) {
                 return Ok(());
             }
             let found = recorded.agents.iter().map(ToString::to_string).collect();
-            Err(FleetError::NoVehicle { field, cav: cav.clone(), name: name.clone(), found })
+            Err(FleetError::NoVehicle {
+                field,
+                cav: cav.clone(),
+                name: name.clone(),
+                found,
+            })
         };
-        scene.agents.iter().try_for_each(|cav| known("scene.agents", cav))?;
-        scenario.ego.id.iter().try_for_each(|cav| known("ego.id", cav))?;
-        scenario.vehicles.keys().try_for_each(|cav| known("vehicles", cav))?;
-        scenario.remote_agents.iter().try_for_each(|cav| known("remote_agents", cav))?;
+        scene
+            .agents
+            .iter()
+            .try_for_each(|cav| known("scene.agents", cav))?;
+        scenario
+            .ego
+            .id
+            .iter()
+            .try_for_each(|cav| known("ego.id", cav))?;
+        scenario
+            .vehicles
+            .keys()
+            .try_for_each(|cav| known("vehicles", cav))?;
+        scenario
+            .remote_agents
+            .iter()
+            .try_for_each(|cav| known("remote_agents", cav))?;
         let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
         let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
         for cav in &agents {
             let pose = scenario.settings_of(cav).pose;
-            let needs_poses = matches!(pose, PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_));
+            let needs_poses = matches!(
+                pose,
+                PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_)
+            );
             let place = recorded.agents.iter().position(|known| known == cav);
-            if needs_poses && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek)) {
-                return Err(FleetError::NoPoses { cav: cav.clone(), source_name: pose.name(), name });
+            if needs_poses
+                && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek))
+            {
+                return Err(FleetError::NoPoses {
+                    cav: cav.clone(),
+                    source_name: pose.name(),
+                    name,
+                });
             }
         }
         let scene = &mut scenario.scene;
         let left = recorded.ticks.len() - scene.seek;
-        let ticks =
-            if scene.repeat { scene.frames } else { Some(scene.frames.map_or(left, |frames| frames.min(left))) };
-        let scene_dir = Some(scene.dir.join(&name)).filter(|folder| folder.is_dir()).unwrap_or(scene.dir.clone());
+        let ticks = if scene.repeat {
+            scene.frames
+        } else {
+            Some(scene.frames.map_or(left, |frames| frames.min(left)))
+        };
+        let scene_dir = Some(scene.dir.join(&name))
+            .filter(|folder| folder.is_dir())
+            .unwrap_or(scene.dir.clone());
         scene.scenario = Some(name);
         scene.agents.clone_from(&agents);
         scenario.ego.id = Some(ego.clone());
-        Ok(Self { scenario, agents, ego, ticks, scene_dir, detector, protocol })
+        Ok(Self {
+            scenario,
+            agents,
+            ego,
+            ticks,
+            scene_dir,
+            detector,
+            protocol,
+        })
     }
 
     /// Rule of the counted objects: those of the protocol inside the area of the model.
@@ -151,17 +213,34 @@ impl Fleet {
     /// Name of the pose source that all vehicles share, or `mixed`.
     #[must_use]
     pub fn pose_source(&self) -> &'static str {
-        let mut names = self.agents.iter().map(|cav| self.scenario.settings_of(cav).pose.name());
+        let mut names = self
+            .agents
+            .iter()
+            .map(|cav| self.scenario.settings_of(cav).pose.name());
         let first = names.next().unwrap_or("recorded");
-        if names.all(|name| name == first) { first } else { "mixed" }
+        if names.all(|name| name == first) {
+            first
+        } else {
+            "mixed"
+        }
     }
 
     /// Principal of every process that the run may have, for its keys.
     #[must_use]
     pub(crate) fn parties(&self) -> Vec<Principal> {
-        let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
+        let agents = self
+            .agents
+            .iter()
+            .map(|cav| Principal::new(Role::Agent, cav));
         let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer, Role::Ros2].map(Principal::of_role);
+        let others = [
+            Role::Replay,
+            Role::Scorer,
+            Role::Recorder,
+            Role::Viewer,
+            Role::Ros2,
+        ]
+        .map(Principal::of_role);
         agents.chain(egos).chain(others).collect()
     }
 
@@ -171,13 +250,18 @@ impl Fleet {
     /// [`KeyError`] when they cannot be made.
     pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyError> {
         let security = self.scenario.security.as_ref();
-        security.map(|security| RunKeys::of(security, self.parties(), folder.path())).transpose()
+        security
+            .map(|security| RunKeys::of(security, self.parties(), folder.path()))
+            .transpose()
     }
 
     /// Executables of a fleet.
     #[must_use]
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
-        ["agent", "ego-fuser", "sim-replay", RUNNER].iter().map(|name| programs.join(name)).collect()
+        ["agent", "ego-fuser", "sim-replay", RUNNER]
+            .iter()
+            .map(|name| programs.join(name))
+            .collect()
     }
 
     fn neighbours(&self) -> impl Iterator<Item = &CavId> {
@@ -201,7 +285,10 @@ fn publish(method: Method) -> Publish {
 
 /// Options with which a scenario's data set is opened.
 pub(crate) fn open_options(scene: &SceneConfig) -> OpenOptions {
-    OpenOptions { intensity_scale: scene.intensity_scale, ..OpenOptions::default() }
+    OpenOptions {
+        intensity_scale: scene.intensity_scale,
+        ..OpenOptions::default()
+    }
 }
 
 /// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.
@@ -214,6 +301,8 @@ fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
         PoseSourceConfig::Baseline(network) => {
             load_baseline(&network.weights, Device::Cpu, PoseSolver::default()).map(drop)
         }
-        PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => Ok(()),
+        PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => {
+            Ok(())
+        }
     }
 }

@@ -32,16 +32,35 @@ impl FrameLines {
     /// Those of the operating system.
     pub(crate) fn create(folder: &Path) -> io::Result<Self> {
         let create = |name: &str| File::create(folder.join(name)).map(BufWriter::new);
-        Ok(Self { detections: create("detections.jsonl")?, truth: create("truth.jsonl")?, written: Ok(()) })
+        Ok(Self {
+            detections: create("detections.jsonl")?,
+            truth: create("truth.jsonl")?,
+            written: Ok(()),
+        })
     }
 
     /// Adds a frame, with the name of its scenario where there are several; false after an error.
     pub(crate) fn add(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> bool {
         if self.written.is_ok() {
-            let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+            let report =
+                DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
             let truth = truth_line(&frame.result.ego, frame);
-            let written = line(&mut self.detections, &OfScenario { scenario, line: report });
-            self.written = written.and_then(|()| line(&mut self.truth, &OfScenario { scenario, line: truth }));
+            let written = line(
+                &mut self.detections,
+                &OfScenario {
+                    scenario,
+                    line: report,
+                },
+            );
+            self.written = written.and_then(|()| {
+                line(
+                    &mut self.truth,
+                    &OfScenario {
+                        scenario,
+                        line: truth,
+                    },
+                )
+            });
         }
         self.written.is_ok()
     }
@@ -51,7 +70,9 @@ impl FrameLines {
     /// # Errors
     /// The first of the operating system.
     pub(crate) fn finish(mut self) -> io::Result<()> {
-        self.written.and_then(|()| self.detections.flush()).and_then(|()| self.truth.flush())
+        self.written
+            .and_then(|()| self.detections.flush())
+            .and_then(|()| self.truth.flush())
     }
 }
 

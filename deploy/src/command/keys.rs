@@ -38,25 +38,47 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Writes the keys and lists the files.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut principals: Vec<Principal> = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav)).collect();
-        principals
-            .extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))));
+        let mut principals: Vec<Principal> = self
+            .agents
+            .iter()
+            .map(|cav| Principal::new(Role::Agent, cav))
+            .collect();
+        principals.extend(
+            self.egos
+                .iter()
+                .flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))),
+        );
         // Vehicles that are added later join a fleet whose other processes have certificates already.
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer, Role::Ros2].map(Principal::of_role);
+        let others = [
+            Role::Replay,
+            Role::Scorer,
+            Role::Recorder,
+            Role::Viewer,
+            Role::Ros2,
+        ]
+        .map(Principal::of_role);
         let has_own = |principal: &Principal| self.out.join(principal.to_string()).exists();
-        principals.extend(others.into_iter().filter(|principal| self.force || !has_own(principal)));
+        principals.extend(
+            others
+                .into_iter()
+                .filter(|principal| self.force || !has_own(principal)),
+        );
         let mut plan = KeyPlan::new(&self.out, principals, self.days);
         plan.hosts.extend(self.hosts);
         plan.lifetime = Duration::from_secs(u64::from(self.days) * 24 * 3600);
         plan.replace = self.force;
         let written = make(&plan).map_err(|error| match error {
-            KeyError::There(_) | KeyError::Unusable { .. } => anyhow::Error::from(BadInput::of(error)),
+            KeyError::There(_) | KeyError::Unusable { .. } => {
+                anyhow::Error::from(BadInput::of(error))
+            }
             KeyError::Io { .. } => anyhow::Error::from(error),
         })?;
         if self.json {
             output::line(serde_json::to_string_pretty(&written)?)?;
         } else {
-            written.iter().try_for_each(|path| output::line(path.display()))?;
+            written
+                .iter()
+                .try_for_each(|path| output::line(path.display()))?;
         }
         Ok(Outcome::Done)
     }

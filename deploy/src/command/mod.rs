@@ -19,10 +19,22 @@ use support::sibling_program::Sibling;
 pub(crate) const RUNNER: Sibling = Sibling {
     program: "v2vloc-runner",
     subcommands: &[
-        ("demo", "Generate a scene if there is none, run a fleet on it and print the result"),
-        ("up", "Start a fleet: processes, scene, models, network; Ctrl-C ends it"),
-        ("eval", "Evaluate methods on recorded scenes without a network: AP, pose errors, bytes"),
-        ("sweep", "Run a grid of experiments in simulation time: one CSV, charts, a report"),
+        (
+            "demo",
+            "Generate a scene if there is none, run a fleet on it and print the result",
+        ),
+        (
+            "up",
+            "Start a fleet: processes, scene, models, network; Ctrl-C ends it",
+        ),
+        (
+            "eval",
+            "Evaluate methods on recorded scenes without a network: AP, pose errors, bytes",
+        ),
+        (
+            "sweep",
+            "Run a grid of experiments in simulation time: one CSV, charts, a report",
+        ),
         (
             "schema",
             "Print the JSON schema of a kind of file, for editors: the files in deploy/scenarios and deploy/experiments \
@@ -59,7 +71,11 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let settings = [malloc_settings::KEPT_MEMORY.as_slice(), &[malloc_settings::ROUTER_THREADS]].concat();
+        let settings = [
+            malloc_settings::KEPT_MEMORY.as_slice(),
+            &[malloc_settings::ROUTER_THREADS],
+        ]
+        .concat();
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Report(arguments) => arguments.run(),
@@ -75,7 +91,11 @@ impl Command {
 /// A connection to the router of a run as a viewer; `keys` where the run has security.
 fn viewer_bus(run: &RunId, router: &Endpoint, keys: Option<&Path>) -> anyhow::Result<Bus> {
     let cav = CavId::new("viewer")?;
-    let identity = Identity { run: run.clone(), process: process_id(Role::Viewer, &cav), cav };
+    let identity = Identity {
+        run: run.clone(),
+        process: process_id(Role::Viewer, &cav),
+        cav,
+    };
     let mut options = BusOptions::client(router.clone());
     if let Some(folder) = keys {
         let credentials = Credentials::read(folder)?;

@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open, process_id};
-use deploy::ros::{AgentTopic, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run};
+use deploy::ros::{
+    AgentTopic, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run,
+};
 use protocol::{CavId, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
@@ -104,7 +106,11 @@ enum Distro {
 
 fn above_zero(text: &str) -> Result<f32, String> {
     let value: f32 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("a number above 0".to_owned()) }
+    if value > 0.0 && value.is_finite() {
+        Ok(value)
+    } else {
+        Err("a number above 0".to_owned())
+    }
 }
 
 impl Arguments {
@@ -118,7 +124,12 @@ impl Arguments {
         let bus = self.join()?;
         let router = self.network.ros_router.as_ref().unwrap_or(&self.connect);
         let session = open(&BusOptions::client(router.clone())).context("the ROS 2 network")?;
-        let session = RosSession::declare(session, domain_id, self.network.namespace.clone(), self.distribution())?;
+        let session = RosSession::declare(
+            session,
+            domain_id,
+            self.network.namespace.clone(),
+            self.distribution(),
+        )?;
         output::note(format_args!(
             "run {} on domain {domain_id} of the ROS 2 network at {router} (Ctrl-C ends it)",
             self.run
@@ -135,16 +146,21 @@ impl Arguments {
     fn check(&self) -> anyhow::Result<()> {
         self.sensors.check()?;
         if self.network.ros_router.is_none() && self.keys.is_some() {
-            return Err(
-                BadInput::new("--ros-router: nodes of ROS 2 have no certificates; name a router for them").into()
-            );
+            return Err(BadInput::new(
+                "--ros-router: nodes of ROS 2 have no certificates; name a router for them",
+            )
+            .into());
         }
         Ok(())
     }
 
     fn join(&self) -> anyhow::Result<Bus> {
         let cav = CavId::new("ros2")?;
-        let identity = Identity { run: self.run.clone(), process: process_id(Role::Ros2, &cav), cav };
+        let identity = Identity {
+            run: self.run.clone(),
+            process: process_id(Role::Ros2, &cav),
+            cav,
+        };
         let mut options = BusOptions::client(self.connect.clone());
         if let Some(folder) = &self.keys {
             let credentials = Credentials::read(folder)?;
@@ -180,21 +196,35 @@ impl Sensors {
     /// Rejects two sensors of one kind for one vehicle, and motions of vehicles without a LiDAR.
     fn check(&self) -> anyhow::Result<()> {
         let speeds: Vec<AgentTopic> = self.odometry.iter().chain(&self.twist).cloned().collect();
-        for (option, what, sources) in
-            [("--lidar", "LiDAR", &self.lidar), ("--odometry, --twist", "speed", &speeds), ("--imu", "IMU", &self.imu)]
-        {
+        for (option, what, sources) in [
+            ("--lidar", "LiDAR", &self.lidar),
+            ("--odometry, --twist", "speed", &speeds),
+            ("--imu", "IMU", &self.imu),
+        ] {
             for (index, source) in sources.iter().enumerate() {
-                if let Some(other) = sources.iter().take(index).find(|other| other.cav == source.cav) {
+                if let Some(other) = sources
+                    .iter()
+                    .take(index)
+                    .find(|other| other.cav == source.cav)
+                {
                     let (first, second, cav) = (&other.topic, &source.topic, &source.cav);
-                    let message = format!("{option}: {first} and {second} are both the {what} of {cav}");
+                    let message =
+                        format!("{option}: {first} and {second} are both the {what} of {cav}");
                     return Err(BadInput::new(message).into());
                 }
             }
         }
         let has_lidar = |cav: &CavId| self.lidar.iter().any(|lidar| lidar.cav == *cav);
-        match self.motions().into_iter().map(|motion| motion.source).find(|source| !has_lidar(&source.cav)) {
+        match self
+            .motions()
+            .into_iter()
+            .map(|motion| motion.source)
+            .find(|source| !has_lidar(&source.cav))
+        {
             Some(AgentTopic { topic, cav }) => {
-                let message = format!("{topic}={cav}: an agent's motion goes with its sweeps; name its --lidar too");
+                let message = format!(
+                    "{topic}={cav}: an agent's motion goes with its sweeps; name its --lidar too"
+                );
                 Err(BadInput::new(message).into())
             }
             None => Ok(()),
@@ -208,7 +238,10 @@ impl Sensors {
             (MotionType::Imu, &self.imu),
         ];
         let of_type = |(motion_type, sources): (MotionType, &Vec<AgentTopic>)| {
-            let source = |source: &AgentTopic| MotionSource { motion_type, source: source.clone() };
+            let source = |source: &AgentTopic| MotionSource {
+                motion_type,
+                source: source.clone(),
+            };
             sources.iter().map(source).collect::<Vec<_>>()
         };
         topics.into_iter().flat_map(of_type).collect()
@@ -217,11 +250,20 @@ impl Sensors {
 
 impl Network {
     fn domain_id(&self) -> anyhow::Result<u32> {
-        let Some(text) = std::env::var_os("ROS_DOMAIN_ID").filter(|_| self.domain_id.is_none()) else {
+        let Some(text) = std::env::var_os("ROS_DOMAIN_ID").filter(|_| self.domain_id.is_none())
+        else {
             return Ok(self.domain_id.unwrap_or(0));
         };
-        let number = text.to_str().and_then(|text| text.parse().ok()).filter(|number| *number <= 232);
-        number.ok_or_else(|| BadInput::new(format!("ROS_DOMAIN_ID is {text:?}, not a number from 0 to 232")).into())
+        let number = text
+            .to_str()
+            .and_then(|text| text.parse().ok())
+            .filter(|number| *number <= 232);
+        number.ok_or_else(|| {
+            BadInput::new(format!(
+                "ROS_DOMAIN_ID is {text:?}, not a number from 0 to 232"
+            ))
+            .into()
+        })
     }
 }
 
@@ -241,18 +283,35 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
         ))?;
     }
     if lidar.sweeps_without_motion > 0 {
-        output::line(format_args!("{} of these without a motion", lidar.sweeps_without_motion))?;
+        output::line(format_args!(
+            "{} of these without a motion",
+            lidar.sweeps_without_motion
+        ))?;
     }
-    for (topic, MotionReport { read, unreadable, out_of_order }) in &report.motion {
+    for (
+        topic,
+        MotionReport {
+            read,
+            unreadable,
+            out_of_order,
+        },
+    ) in &report.motion
+    {
         output::line(format_args!(
             "{read} messages of {topic} read, {unreadable} could not be read, {out_of_order} measurements out of order"
         ))?;
     }
     if lidar.unreadable > 0 {
-        output::line(format_args!("{} messages of LiDARs could not be read", lidar.unreadable))?;
+        output::line(format_args!(
+            "{} messages of LiDARs could not be read",
+            lidar.unreadable
+        ))?;
     }
     if report.left_out > 0 {
-        output::line(format_args!("{} messages of the run were left out", report.left_out))?;
+        output::line(format_args!(
+            "{} messages of the run were left out",
+            report.left_out
+        ))?;
     }
     Ok(())
 }

@@ -6,7 +6,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{AccessControl, BusOptions, Credentials, Endpoint, ROUTER, RejectionLog, STOP_LIMIT, SharedMemory, open};
+use bus::{
+    AccessControl, BusOptions, Credentials, Endpoint, ROUTER, RejectionLog, STOP_LIMIT,
+    SharedMemory, open,
+};
 use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::Wait;
@@ -48,7 +51,11 @@ pub(crate) struct Arguments {
 
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if (0.1..=3600.0).contains(&seconds) { Ok(seconds) } else { Err("0.1 to 3600 s".to_owned()) }
+    if (0.1..=3600.0).contains(&seconds) {
+        Ok(seconds)
+    } else {
+        Err("0.1 to 3600 s".to_owned())
+    }
 }
 
 impl Arguments {
@@ -68,7 +75,10 @@ impl Arguments {
         }
         stop.enforce(STOP_LIMIT);
         let session = open(&options)?;
-        output::note(format_args!("routing at {} (Ctrl-C ends it)", options.endpoint()));
+        output::note(format_args!(
+            "routing at {} (Ctrl-C ends it)",
+            options.endpoint()
+        ));
         let (mut refusals, mut reported) = (RejectionLog::of(options.endpoint()), BTreeMap::new());
         loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
@@ -102,11 +112,18 @@ impl Arguments {
             options.shared_memory = SharedMemory::Attached;
         }
         options.max_message_bytes = self.max_message_mib.max(1) << 20;
-        let Some(folder) = &self.keys else { return Ok(options) };
+        let Some(folder) = &self.keys else {
+            return Ok(options);
+        };
         let credentials = Credentials::read(folder)?;
         credentials.check_name(ROUTER)?;
         let runs = self.run.clone().map_or(RunScope::Any, RunScope::One);
-        let guard = AccessControl { members: credentials.members()?, runs };
-        Ok(options.with_credentials(credentials).with_access_control(guard))
+        let guard = AccessControl {
+            members: credentials.members()?,
+            runs,
+        };
+        Ok(options
+            .with_credentials(credentials)
+            .with_access_control(guard))
     }
 }

@@ -66,6 +66,10 @@ impl Arguments {
 }
 
 fn well(run: &str, troubles: &[String]) -> anyhow::Result<Outcome> {
-    ensure!(troubles.is_empty(), "run {run} is not well: {}", troubles.join("; "));
+    ensure!(
+        troubles.is_empty(),
+        "run {run} is not well: {}",
+        troubles.join("; ")
+    );
     Ok(Outcome::Done)
 }

@@ -76,7 +76,12 @@ impl Arguments {
         }
         let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)?;
         match RunStatus::read(&folder) {
-            Ok(RunStatus { phase: Phase::Running, run, endpoint, .. }) => {
+            Ok(RunStatus {
+                phase: Phase::Running,
+                run,
+                endpoint,
+                ..
+            }) => {
                 output::note(format_args!("run {run} goes on at {endpoint}"));
                 Ok(Shown::Live(run.parse()?, endpoint.parse()?))
             }

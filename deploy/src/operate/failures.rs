@@ -22,21 +22,30 @@ impl Failures {
         let ProcessEvent { name, what } = event;
         let text = match what {
             ProcessEventKind::Logged { line } if name == RECORDER => {
-                serde_json::from_str::<RecordReport>(line).ok()?.loss_in_words()?
+                serde_json::from_str::<RecordReport>(line)
+                    .ok()?
+                    .loss_in_words()?
             }
             ProcessEventKind::Logged { line } => {
                 self.last_line.insert(name.clone(), line.clone());
                 return None;
             }
             // Its report gives the reason.
-            ProcessEventKind::Done { data_lost: true } if self.failed.contains_key(name) => return None,
+            ProcessEventKind::Done { data_lost: true } if self.failed.contains_key(name) => {
+                return None;
+            }
             ProcessEventKind::Done { data_lost: true } => match self.last_line.get(name) {
                 Some(line) => format!("data were lost: {line}"),
                 None => "data were lost; see its log".into(),
             },
-            ProcessEventKind::GaveUp { how, is_optional: true } => format!("{how}; the run went on without it"),
+            ProcessEventKind::GaveUp {
+                how,
+                is_optional: true,
+            } => format!("{how}; the run went on without it"),
             ProcessEventKind::Failed { how } => format!("{how} when it was asked to end"),
-            ProcessEventKind::GaveUp { is_optional: false, .. }
+            ProcessEventKind::GaveUp {
+                is_optional: false, ..
+            }
             | ProcessEventKind::Started { .. }
             | ProcessEventKind::Crashed { .. }
             | ProcessEventKind::Done { data_lost: false } => return None,
@@ -47,7 +56,10 @@ impl Failures {
 
     /// Description of each failure, after the name of its process.
     pub(crate) fn in_words(&self) -> Vec<String> {
-        self.failed.iter().map(|(name, text)| format!("{name}: {text}")).collect()
+        self.failed
+            .iter()
+            .map(|(name, text)| format!("{name}: {text}"))
+            .collect()
     }
 }
 
@@ -58,7 +70,10 @@ mod tests {
     fn noted(events: &[(&str, ProcessEventKind)]) -> Vec<String> {
         let mut failures = Failures::default();
         for (name, what) in events {
-            failures.note(&ProcessEvent { name: (*name).into(), what: what.clone() });
+            failures.note(&ProcessEvent {
+                name: (*name).into(),
+                what: what.clone(),
+            });
         }
         failures.in_words()
     }
@@ -74,7 +89,9 @@ mod tests {
             not_written,
             failure: failure.map(str::to_owned),
         };
-        ProcessEventKind::Logged { line: serde_json::to_string(&report).unwrap() }
+        ProcessEventKind::Logged {
+            line: serde_json::to_string(&report).unwrap(),
+        }
     }
 
     #[test]
@@ -88,8 +105,11 @@ mod tests {
                      sim-replay recover runs/a/recording.mcap --out runs/a/recording.whole.mcap";
         assert_eq!(noted(&events), [text]);
         assert!(
-            noted(&[("recorder", report(None, 0)), ("recorder", ProcessEventKind::Done { data_lost: false })])
-                .is_empty()
+            noted(&[
+                ("recorder", report(None, 0)),
+                ("recorder", ProcessEventKind::Done { data_lost: false })
+            ])
+            .is_empty()
         );
     }
 
@@ -99,11 +119,22 @@ mod tests {
         let events = [
             ("replay", last_line("7 ticks were not answered")),
             ("replay", ProcessEventKind::Done { data_lost: true }),
-            ("link-1", ProcessEventKind::Failed { how: "ended with code 1".into() }),
+            (
+                "link-1",
+                ProcessEventKind::Failed {
+                    how: "ended with code 1".into(),
+                },
+            ),
             ("agent-1", ProcessEventKind::Started { pid: 1 }),
             ("agent-1", last_line("40 sweeps")),
             ("agent-1", ProcessEventKind::Done { data_lost: false }),
-            ("recorder", ProcessEventKind::GaveUp { how: "was ended by signal 9".into(), is_optional: true }),
+            (
+                "recorder",
+                ProcessEventKind::GaveUp {
+                    how: "was ended by signal 9".into(),
+                    is_optional: true,
+                },
+            ),
         ];
         assert_eq!(
             noted(&events),

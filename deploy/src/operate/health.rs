@@ -93,20 +93,28 @@ impl Health {
     /// No process yet. One that is silent for `hang`, or for `start` after it was started, is to be replaced.
     #[must_use]
     pub(crate) fn new(hang: Duration, start: Duration) -> Self {
-        Self { processes: BTreeMap::new(), hang, start, looked: Instant::now() }
+        Self {
+            processes: BTreeMap::new(),
+            hang,
+            start,
+            looked: Instant::now(),
+        }
     }
 
     /// Records an event of a process.
     pub(crate) fn note(&mut self, event: &ProcessEvent, now: Instant) {
-        let noted = self.processes.entry(event.name.clone()).or_insert_with(|| Noted {
-            state: State::Starting,
-            pid: None,
-            started: now,
-            last_report: None,
-            restarts: 0,
-            last_fall: None,
-            failure: None,
-        });
+        let noted = self
+            .processes
+            .entry(event.name.clone())
+            .or_insert_with(|| Noted {
+                state: State::Starting,
+                pid: None,
+                started: now,
+                last_report: None,
+                restarts: 0,
+                last_fall: None,
+                failure: None,
+            });
         match &event.what {
             ProcessEventKind::Started { pid } => {
                 *noted = Noted {
@@ -140,20 +148,29 @@ impl Health {
     }
 
     /// Updates the states from the times of the last reports; returns the hung processes, each with a description.
-    pub(crate) fn look(&mut self, last_reports: &BTreeMap<String, Instant>, now: Instant) -> Vec<(String, String)> {
+    pub(crate) fn look(
+        &mut self,
+        last_reports: &BTreeMap<String, Instant>,
+        now: Instant,
+    ) -> Vec<(String, String)> {
         let was_stopped = now.saturating_duration_since(self.looked) > OWN_PAUSE;
         self.looked = now;
         // The reports of this program come over the same bus. Without any report at all, the network is down, and no
         // process counts as hung.
-        let network_is_up =
-            last_reports.is_empty() || last_reports.values().any(|at| now.saturating_duration_since(*at) <= SILENT);
+        let network_is_up = last_reports.is_empty()
+            || last_reports
+                .values()
+                .any(|at| now.saturating_duration_since(*at) <= SILENT);
         let mut hanging = Vec::new();
         for (name, noted) in &mut self.processes {
             if noted.pid.is_none() {
                 continue;
             }
             // The last reports of the previous process instance may arrive after its end.
-            let last = last_reports.get(name).copied().filter(|at| *at > noted.started + SILENT / 3);
+            let last = last_reports
+                .get(name)
+                .copied()
+                .filter(|at| *at > noted.started + SILENT / 3);
             noted.last_report = noted.last_report.max(last);
             if was_stopped {
                 // Reports of that time were not received.
@@ -171,7 +188,10 @@ impl Health {
                 Some(_) => State::Ready,
             };
             if since > timeout && network_is_up {
-                hanging.push((name.clone(), format!("has not reported for {:.1} s", since.as_secs_f64())));
+                hanging.push((
+                    name.clone(),
+                    format!("has not reported for {:.1} s", since.as_secs_f64()),
+                ));
             }
         }
         hanging
@@ -187,11 +207,18 @@ impl Health {
                 name: name.clone(),
                 state: noted.state,
                 pid: noted.pid,
-                up_s: if noted.pid.is_some() { seconds(noted.started) } else { 0.0 },
+                up_s: if noted.pid.is_some() {
+                    seconds(noted.started)
+                } else {
+                    0.0
+                },
                 restarts: noted.restarts,
                 last_fall: noted.last_fall.clone(),
                 failure: noted.failure.clone(),
-                silent_s: noted.last_report.filter(|_| noted.pid.is_some()).map(seconds),
+                silent_s: noted
+                    .last_report
+                    .filter(|_| noted.pid.is_some())
+                    .map(seconds),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,
@@ -224,7 +251,9 @@ impl Usage {
         Some(Self {
             resident_mib: field("VmRSS:").map(|kib| kib as f64 / 1024.0),
             threads: field("Threads:"),
-            descriptors: fs::read_dir(format!("/proc/{pid}/fd")).ok().map(|entries| entries.count() as u64),
+            descriptors: fs::read_dir(format!("/proc/{pid}/fd"))
+                .ok()
+                .map(|entries| entries.count() as u64),
         })
     }
 }
@@ -234,22 +263,40 @@ mod tests {
     use super::*;
 
     fn event(name: &str, what: ProcessEventKind) -> ProcessEvent {
-        ProcessEvent { name: name.into(), what }
+        ProcessEvent {
+            name: name.into(),
+            what,
+        }
     }
 
     /// Monitor of one process that was started at the returned time.
     fn watch() -> (Health, Instant) {
         let mut health = Health::new(Duration::from_secs(5), Duration::from_secs(60));
         let began = Instant::now();
-        health.note(&event("ego", ProcessEventKind::Started { pid: std::process::id() }), began);
+        health.note(
+            &event(
+                "ego",
+                ProcessEventKind::Started {
+                    pid: std::process::id(),
+                },
+            ),
+            began,
+        );
         (health, began)
     }
 
     /// Updates every 100 ms from `from_ms` to `to_ms`, for a process with its last report at `report_ms`.
-    fn look(health: &mut Health, began: Instant, [from_ms, to_ms, report_ms]: [u64; 3]) -> Vec<(String, String)> {
+    fn look(
+        health: &mut Health,
+        began: Instant,
+        [from_ms, to_ms, report_ms]: [u64; 3],
+    ) -> Vec<(String, String)> {
         let at = |ms| began + Duration::from_millis(ms);
         let look = |ms| {
-            let last_reports = BTreeMap::from([("ego".to_owned(), at(report_ms)), ("scorer".to_owned(), at(ms))]);
+            let last_reports = BTreeMap::from([
+                ("ego".to_owned(), at(report_ms)),
+                ("scorer".to_owned(), at(ms)),
+            ]);
             health.look(&last_reports, at(ms))
         };
         (from_ms..=to_ms).step_by(100).flat_map(look).collect()
@@ -266,13 +313,26 @@ mod tests {
         assert!(look(&mut health, began, [1600, 5900, 1000]).is_empty());
         assert_eq!(state(&health), State::Silent);
         let hanging = look(&mut health, began, [6000, 6100, 1000]);
-        assert_eq!(hanging, [("ego".to_owned(), "has not reported for 5.1 s".to_owned())]);
+        assert_eq!(
+            hanging,
+            [("ego".to_owned(), "has not reported for 5.1 s".to_owned())]
+        );
         health.note(
-            &event("ego", ProcessEventKind::Crashed { how: "hung".into(), again_after: SILENT, restart: 1 }),
+            &event(
+                "ego",
+                ProcessEventKind::Crashed {
+                    how: "hung".into(),
+                    again_after: SILENT,
+                    restart: 1,
+                },
+            ),
             began,
         );
         let status = health.statuses(began).remove(0);
-        assert_eq!((status.state, status.restarts, status.last_fall.as_deref()), (State::Fallen, 1, Some("hung")));
+        assert_eq!(
+            (status.state, status.restarts, status.last_fall.as_deref()),
+            (State::Fallen, 1, Some("hung"))
+        );
     }
 
     #[test]
@@ -288,7 +348,11 @@ mod tests {
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
         // An hour later, before any report.
         assert!(look(&mut health, began, [3_600_000, 3_604_000, 1900]).is_empty());
-        assert_eq!(look(&mut health, began, [3_605_000, 3_605_100, 1900]).len(), 1, "and then silent all the same");
+        assert_eq!(
+            look(&mut health, began, [3_605_000, 3_605_100, 1900]).len(),
+            1,
+            "and then silent all the same"
+        );
     }
 
     #[test]
@@ -296,15 +360,26 @@ mod tests {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 2000, 1900]).is_empty());
         let at = |ms| began + Duration::from_millis(ms);
-        let last_reports = BTreeMap::from([("ego".to_owned(), at(1900)), ("scorer".to_owned(), at(2000))]);
-        assert!((2100..30_000).step_by(100).all(|ms| health.look(&last_reports, at(ms)).is_empty()));
+        let last_reports = BTreeMap::from([
+            ("ego".to_owned(), at(1900)),
+            ("scorer".to_owned(), at(2000)),
+        ]);
+        assert!(
+            (2100..30_000)
+                .step_by(100)
+                .all(|ms| health.look(&last_reports, at(ms)).is_empty())
+        );
         assert_eq!(health.statuses(at(30_000))[0].state, State::Silent);
     }
 
     #[test]
     fn resources_of_a_process_are_read() {
         let usage = Usage::of(std::process::id()).unwrap();
-        assert!(usage.resident_mib.unwrap() > 1.0 && usage.threads.unwrap() >= 1 && usage.descriptors.unwrap() >= 3);
+        assert!(
+            usage.resident_mib.unwrap() > 1.0
+                && usage.threads.unwrap() >= 1
+                && usage.descriptors.unwrap() >= 3
+        );
         assert_eq!(Usage::of(u32::MAX), None);
     }
 }

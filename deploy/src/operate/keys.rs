@@ -20,8 +20,8 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use bus::{AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, MEMBERS_FILE, ROUTER};
 use protocol::Principal;
 use rcgen::{
-    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
-    KeyUsagePurpose, SanType, date_time_ymd,
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
+    Issuer, KeyPair, KeyUsagePurpose, SanType, date_time_ymd,
 };
 
 /// File name of the authority's key.
@@ -51,7 +51,13 @@ impl KeyPlan {
     #[must_use]
     pub fn new(folder: &Path, principals: Vec<Principal>, days: u32) -> Self {
         let hosts = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
-        Self { folder: folder.to_path_buf(), principals, hosts, lifetime: DAY * days, replace: false }
+        Self {
+            folder: folder.to_path_buf(),
+            principals,
+            hosts,
+            lifetime: DAY * days,
+            replace: false,
+        }
     }
 }
 
@@ -84,14 +90,28 @@ pub enum KeyError {
 /// # Errors
 /// [`KeyError`]; files that were written before it stay.
 pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
-    let mut desk = KeyStore { plan, written: Vec::new() };
-    let folders = plan.principals.iter().map(ToString::to_string).chain([ROUTER.to_owned()]);
-    let folders: Vec<(String, PathBuf)> = folders.map(|name| (name.clone(), plan.folder.join(name))).collect();
+    let mut desk = KeyStore {
+        plan,
+        written: Vec::new(),
+    };
+    let folders = plan
+        .principals
+        .iter()
+        .map(ToString::to_string)
+        .chain([ROUTER.to_owned()]);
+    let folders: Vec<(String, PathBuf)> = folders
+        .map(|name| (name.clone(), plan.folder.join(name)))
+        .collect();
     let router_is_there = plan.folder.join(ROUTER).join(CERTIFICATE_FILE).exists();
     let is_wanted = |name: &str| name != ROUTER || !router_is_there || plan.replace;
     if !plan.replace {
-        let taken = folders.iter().map(|(name, folder)| (name, folder.join(CERTIFICATE_FILE)));
-        if let Some((_, taken)) = taken.filter(|(name, _)| *name != ROUTER).find(|(_, file)| file.exists()) {
+        let taken = folders
+            .iter()
+            .map(|(name, folder)| (name, folder.join(CERTIFICATE_FILE)));
+        if let Some((_, taken)) = taken
+            .filter(|(name, _)| *name != ROUTER)
+            .find(|(_, file)| file.exists())
+        {
             return Err(KeyError::There(taken));
         }
     }
@@ -120,34 +140,59 @@ impl KeyStore<'_> {
         let folder = &self.plan.folder;
         make_folder(folder)?;
         let (key_path, pem_path) = (folder.join(AUTHORITY_KEY), folder.join(AUTHORITY_FILE));
-        let unusable = |cause| KeyError::Unusable { what: key_path.display().to_string(), cause };
+        let unusable = |cause| KeyError::Unusable {
+            what: key_path.display().to_string(),
+            cause,
+        };
         // An existing one stays valid for as long as the certificates that it signs.
         let params = authority_params(self.plan.lifetime.max(DAY * 3650))?;
         if key_path.exists() {
             let key = KeyPair::from_pem(&read(&key_path)?).map_err(unusable)?;
-            return Ok(Authority { pem: read(&pem_path)?, issuer: Issuer::new(params, key) });
+            return Ok(Authority {
+                pem: read(&pem_path)?,
+                issuer: Issuer::new(params, key),
+            });
         }
         let key = KeyPair::generate().map_err(unusable)?;
         let pem = params.self_signed(&key).map_err(unusable)?.pem();
         self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
         self.write(pem_path, &pem, 0o644)?;
-        Ok(Authority { pem, issuer: Issuer::new(params, key) })
+        Ok(Authority {
+            pem,
+            issuer: Issuer::new(params, key),
+        })
     }
 
-    fn certify(&mut self, authority: &Authority, name: &str, folder: &Path) -> Result<(), KeyError> {
-        let unusable = |cause| KeyError::Unusable { what: format!("a certificate for {name}"), cause };
+    fn certify(
+        &mut self,
+        authority: &Authority,
+        name: &str,
+        folder: &Path,
+    ) -> Result<(), KeyError> {
+        let unusable = |cause| KeyError::Unusable {
+            what: format!("a certificate for {name}"),
+            cause,
+        };
         let mut params = params(name, self.plan.lifetime)?;
         params.use_authority_key_identifier_extension = true;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         // Any process can be the router of its run (--listen); only the one of that name is addressed by host name.
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         if name == ROUTER {
-            params.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
-            params.subject_alt_names =
-                self.plan.hosts.iter().map(|host| alternative(host)).collect::<Result<_, _>>()?;
+            params
+                .extended_key_usages
+                .push(ExtendedKeyUsagePurpose::ServerAuth);
+            params.subject_alt_names = self
+                .plan
+                .hosts
+                .iter()
+                .map(|host| alternative(host))
+                .collect::<Result<_, _>>()?;
         }
         let key = KeyPair::generate().map_err(unusable)?;
-        let certificate = params.signed_by(&key, &authority.issuer).map_err(unusable)?;
+        let certificate = params
+            .signed_by(&key, &authority.issuer)
+            .map_err(unusable)?;
         make_folder(folder)?;
         self.write(folder.join(AUTHORITY_FILE), &authority.pem, 0o644)?;
         self.write(folder.join(KEY_FILE), &key.serialize_pem(), 0o600)?;
@@ -158,7 +203,10 @@ impl KeyStore<'_> {
     /// Writes the router's list of every process in the folder, including earlier ones.
     fn enlist(&mut self) -> Result<(), KeyError> {
         let folder = &self.plan.folder;
-        let io = |cause| KeyError::Io { path: folder.clone(), cause };
+        let io = |cause| KeyError::Io {
+            path: folder.clone(),
+            cause,
+        };
         let mut members = Vec::new();
         for entry in fs::read_dir(folder).map_err(io)? {
             let entry = entry.map_err(io)?;
@@ -168,16 +216,30 @@ impl KeyStore<'_> {
             }
         }
         members.sort();
-        self.write(folder.join(ROUTER).join(MEMBERS_FILE), &members.concat(), 0o644)
+        self.write(
+            folder.join(ROUTER).join(MEMBERS_FILE),
+            &members.concat(),
+            0o644,
+        )
     }
 
     /// Atomic write: leaves neither half a file nor a moment in which others can read a key.
     fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyError> {
-        let io = |cause| KeyError::Io { path: path.clone(), cause };
+        let io = |cause| KeyError::Io {
+            path: path.clone(),
+            cause,
+        };
         let begun = path.with_extension("new");
         let _ = fs::remove_file(&begun);
-        let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&begun).map_err(io)?;
-        file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).map_err(io)?;
+        let mut file = OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .mode(mode)
+            .open(&begun)
+            .map_err(io)?;
+        file.write_all(text.as_bytes())
+            .and_then(|()| file.sync_all())
+            .map_err(io)?;
         fs::rename(&begun, &path).map_err(io)?;
         self.written.push(path);
         Ok(())
@@ -185,12 +247,21 @@ impl KeyStore<'_> {
 }
 
 fn make_folder(path: &Path) -> Result<(), KeyError> {
-    let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(path);
-    made.map_err(|cause| KeyError::Io { path: path.to_path_buf(), cause })
+    let made = fs::DirBuilder::new()
+        .recursive(true)
+        .mode(0o700)
+        .create(path);
+    made.map_err(|cause| KeyError::Io {
+        path: path.to_path_buf(),
+        cause,
+    })
 }
 
 fn read(path: &Path) -> Result<String, KeyError> {
-    fs::read_to_string(path).map_err(|cause| KeyError::Io { path: path.to_path_buf(), cause })
+    fs::read_to_string(path).map_err(|cause| KeyError::Io {
+        path: path.to_path_buf(),
+        cause,
+    })
 }
 
 fn authority_params(lifetime: Duration) -> Result<CertificateParams, KeyError> {
@@ -201,11 +272,16 @@ fn authority_params(lifetime: Duration) -> Result<CertificateParams, KeyError> {
 }
 
 fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError> {
-    let unusable = |cause| KeyError::Unusable { what: name.to_owned(), cause };
+    let unusable = |cause| KeyError::Unusable {
+        what: name.to_owned(),
+        cause,
+    };
     let mut params = CertificateParams::new(Vec::new()).map_err(unusable)?;
     params.distinguished_name = DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, name);
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let now = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
     let epoch = date_time_ymd(1970, 1, 1);
     params.not_before = epoch + now.saturating_sub(LEEWAY);
     params.not_after = epoch + now + lifetime;
@@ -217,7 +293,10 @@ fn alternative(host: &str) -> Result<SanType, KeyError> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(SanType::IpAddress(address));
     }
-    let unusable = |cause| KeyError::Unusable { what: format!("host {host:?}"), cause };
+    let unusable = |cause| KeyError::Unusable {
+        what: format!("host {host:?}"),
+        cause,
+    };
     host.try_into().map(SanType::DnsName).map_err(unusable)
 }
 
@@ -236,18 +315,35 @@ mod tests {
     #[test]
     fn everybody_gets_a_certificate_and_a_key_of_his_own() {
         let folder = tempfile::tempdir().unwrap();
-        let plan = KeyPlan::new(&folder.path().join("keys"), principals(&["agent-1", "replay"]), 1);
+        let plan = KeyPlan::new(
+            &folder.path().join("keys"),
+            principals(&["agent-1", "replay"]),
+            1,
+        );
         let written = make(&plan).unwrap();
         assert_eq!(written.len(), 2 + 3 * 3 + 1, "{written:?}");
         for name in ["agent-1", "replay", "router"] {
             let credentials = Credentials::read(&plan.folder.join(name)).unwrap();
             assert_eq!(credentials.name(), name);
             assert!(credentials.check_name("agent-2").is_err());
-            let mode = fs::metadata(plan.folder.join(name).join(KEY_FILE)).unwrap().permissions().mode();
+            let mode = fs::metadata(plan.folder.join(name).join(KEY_FILE))
+                .unwrap()
+                .permissions()
+                .mode();
             assert_eq!(mode & 0o777, 0o600, "{name}");
         }
-        assert_eq!(fs::metadata(plan.folder.join(AUTHORITY_KEY)).unwrap().permissions().mode() & 0o777, 0o600);
-        let members = Credentials::read(&plan.folder.join("router")).unwrap().members().unwrap();
+        assert_eq!(
+            fs::metadata(plan.folder.join(AUTHORITY_KEY))
+                .unwrap()
+                .permissions()
+                .mode()
+                & 0o777,
+            0o600
+        );
+        let members = Credentials::read(&plan.folder.join("router"))
+            .unwrap()
+            .members()
+            .unwrap();
         assert_eq!(members, principals(&["agent-1", "replay"]));
     }
 
@@ -260,21 +356,34 @@ mod tests {
         let (agent, router) = (read("agent-1"), read("router"));
         assert!(matches!(make(&plan), Err(KeyError::There(_))));
         // A vehicle that is added later is signed by the same authority.
-        make(&KeyPlan { principals: principals(&["agent-2"]), ..plan.clone() }).unwrap();
+        make(&KeyPlan {
+            principals: principals(&["agent-2"]),
+            ..plan.clone()
+        })
+        .unwrap();
         assert_eq!((read("agent-1"), read("router")), (agent.clone(), router));
         let members = fs::read_to_string(folder.path().join("router/members")).unwrap();
         assert_eq!(members, "agent-1\nagent-2\n");
-        make(&KeyPlan { replace: true, ..plan }).unwrap();
+        make(&KeyPlan {
+            replace: true,
+            ..plan
+        })
+        .unwrap();
         assert_ne!(read("agent-1"), agent);
     }
 
     #[test]
     fn an_expired_certificate_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        let plan = KeyPlan { lifetime: Duration::ZERO, ..KeyPlan::new(folder.path(), principals(&["agent-1"]), 1) };
+        let plan = KeyPlan {
+            lifetime: Duration::ZERO,
+            ..KeyPlan::new(folder.path(), principals(&["agent-1"]), 1)
+        };
         make(&plan).unwrap();
         std::thread::sleep(Duration::from_millis(1100));
-        let error = Credentials::read(&folder.path().join("agent-1")).unwrap_err().to_string();
+        let error = Credentials::read(&folder.path().join("agent-1"))
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("agent-1 expired"), "{error}");
     }
 
@@ -282,7 +391,10 @@ mod tests {
     fn a_host_that_is_none_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let hosts = vec!["router.local".into(), "näher".into()];
-        let plan = KeyPlan { hosts, ..KeyPlan::new(folder.path(), Vec::new(), 1) };
+        let plan = KeyPlan {
+            hosts,
+            ..KeyPlan::new(folder.path(), Vec::new(), 1)
+        };
         assert!(make(&plan).unwrap_err().to_string().contains("näher"));
     }
 }

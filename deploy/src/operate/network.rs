@@ -82,21 +82,34 @@ impl RouterEndpoint {
             }
         }?;
         let session = open(&options)?;
-        Ok(Self { session, endpoint: from_here(options.endpoint())?, is_guarded: options.guard.is_some() })
+        Ok(Self {
+            session,
+            endpoint: from_here(options.endpoint())?,
+            is_guarded: options.guard.is_some(),
+        })
     }
 
     /// Processes to start, and a scorer, that are present already on a shared router.
     ///
     /// # Errors
     /// [`BusError`] when the router does not answer.
-    pub fn present(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<Vec<ProcessId>, BusError> {
+    pub fn present(
+        &self,
+        network: &Network,
+        run: &RunId,
+        specs: &[ProcessSpec],
+    ) -> Result<Vec<ProcessId>, BusError> {
         if network.connect.is_none() {
             return Ok(Vec::new());
         }
         let scorer = process_id(Role::Scorer, &scorer_cav());
-        let is_ours =
-            |process: &ProcessId| *process == scorer || specs.iter().any(|spec| spec.name == process.as_str());
-        Ok(present(&self.session, run)?.into_iter().filter(is_ours).collect())
+        let is_ours = |process: &ProcessId| {
+            *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
+        };
+        Ok(present(&self.session, run)?
+            .into_iter()
+            .filter(is_ours)
+            .collect())
     }
 
     /// Closes the session.
@@ -121,7 +134,9 @@ fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
 
 /// The endpoint with port 0 replaced by a port that is free at this moment.
 fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
-    let Some(place) = listen.strip_suffix(":0") else { return Endpoint::new(listen) };
+    let Some(place) = listen.strip_suffix(":0") else {
+        return Endpoint::new(listen);
+    };
     let host = place.split_once('/').map_or(place, |(_, host)| host);
     // If another program takes the port in between, the router reports the error.
     let bound = if secured {
@@ -129,7 +144,10 @@ fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
     } else {
         TcpListener::bind(format!("{host}:0")).and_then(|listener| listener.local_addr())
     };
-    Endpoint::new(&format!("{place}:{}", bound.as_ref().map_or(0, SocketAddr::port)))
+    Endpoint::new(&format!(
+        "{place}:{}",
+        bound.as_ref().map_or(0, SocketAddr::port)
+    ))
 }
 
 #[cfg(test)]
@@ -138,11 +156,18 @@ mod tests {
 
     #[test]
     fn port_zero_becomes_a_free_one() {
-        for (listen, secured) in [("tcp/127.0.0.1:0", false), ("tcp/127.0.0.1:0", true), ("quic/127.0.0.1:0", true)] {
+        for (listen, secured) in [
+            ("tcp/127.0.0.1:0", false),
+            ("tcp/127.0.0.1:0", true),
+            ("quic/127.0.0.1:0", true),
+        ] {
             let endpoint = with_port(listen, secured).unwrap();
             assert!(!endpoint.as_str().ends_with(":0"), "{}", endpoint.as_str());
         }
-        assert_eq!(with_port("tcp/127.0.0.1:7447", false).unwrap().as_str(), "tcp/127.0.0.1:7447");
+        assert_eq!(
+            with_port("tcp/127.0.0.1:7447", false).unwrap().as_str(),
+            "tcp/127.0.0.1:7447"
+        );
     }
 
     #[test]
@@ -152,7 +177,10 @@ mod tests {
             ("tcp/[::]:7447", "tcp/[::1]:7447"),
             ("tcp/10.0.0.1:7447", "tcp/10.0.0.1:7447"),
         ] {
-            assert_eq!(from_here(&Endpoint::new(listen).unwrap()).unwrap().as_str(), met);
+            assert_eq!(
+                from_here(&Endpoint::new(listen).unwrap()).unwrap().as_str(),
+                met
+            );
         }
     }
 
@@ -160,8 +188,17 @@ mod tests {
     fn a_port_in_use_is_named() {
         let taken = TcpListener::bind("127.0.0.1:0").unwrap();
         let listen = format!("tcp/{}", taken.local_addr().unwrap());
-        let network = Network { listen: listen.clone(), ..Network::default() };
-        let error = RouterEndpoint::open(&network, &"r1".parse().unwrap(), None).err().unwrap().to_string();
-        assert!(error.contains(&listen) && error.contains("in use"), "{error}");
+        let network = Network {
+            listen: listen.clone(),
+            ..Network::default()
+        };
+        let error = RouterEndpoint::open(&network, &"r1".parse().unwrap(), None)
+            .err()
+            .unwrap()
+            .to_string();
+        assert!(
+            error.contains(&listen) && error.contains("in use"),
+            "{error}"
+        );
     }
 }

@@ -23,10 +23,17 @@ impl Display {
     /// A display for `ticks` ticks, or for a run without end.
     #[must_use]
     pub fn new(ticks: Option<usize>) -> Self {
-        let bar = std::io::stderr()
-            .is_terminal()
-            .then(|| ticks.map_or_else(|| progress::spinner("frames"), |ticks| progress::bar(ticks, "frames")));
-        Self { bar, last_line: Instant::now(), shown_frames: 0 }
+        let bar = std::io::stderr().is_terminal().then(|| {
+            ticks.map_or_else(
+                || progress::spinner("frames"),
+                |ticks| progress::bar(ticks, "frames"),
+            )
+        });
+        Self {
+            bar,
+            last_line: Instant::now(),
+            shown_frames: 0,
+        }
     }
 
     /// Updates the live line, or prints a plain line if one is due.
@@ -36,10 +43,17 @@ impl Display {
                 bar.set_position(progress.frames);
                 bar.set_message(summary(progress));
             }
-            None if self.last_line.elapsed() >= LINE_PERIOD && progress.frames != self.shown_frames => {
+            None if self.last_line.elapsed() >= LINE_PERIOD
+                && progress.frames != self.shown_frames =>
+            {
                 self.last_line = Instant::now();
                 self.shown_frames = progress.frames;
-                output::note(format_args!("answered {}/{}  {}", progress.frames, progress.ticks, summary(progress)));
+                output::note(format_args!(
+                    "answered {}/{}  {}",
+                    progress.frames,
+                    progress.ticks,
+                    summary(progress)
+                ));
             }
             None => {}
         }
@@ -63,8 +77,12 @@ impl Display {
 
 /// Rate, latency, neighbours, bytes, drops.
 fn summary(progress: &Progress) -> String {
-    let rate = progress.rate_hz().map_or("-".into(), |rate| format!("{rate:.1}"));
-    let latency = progress.latency_ms.map_or("-".into(), |latency| format!("{latency:.0}"));
+    let rate = progress
+        .rate_hz()
+        .map_or("-".into(), |rate| format!("{rate:.1}"));
+    let latency = progress
+        .latency_ms
+        .map_or("-".into(), |latency| format!("{latency:.0}"));
     format!(
         "{rate} Hz  latency {latency} ms  {} fused  {}  {} dropped",
         progress.fused,
@@ -83,7 +101,11 @@ pub fn bytes(count: f64) -> String {
         value /= 1000.0;
         unit += 1;
     }
-    if unit == 0 { format!("{value:.0} B") } else { format!("{value:.1} {}", UNITS[unit]) }
+    if unit == 0 {
+        format!("{value:.0} B")
+    } else {
+        format!("{value:.1} {}", UNITS[unit])
+    }
 }
 
 #[cfg(test)]
@@ -109,7 +131,13 @@ mod tests {
             dropped: 2,
             ..Progress::default()
         };
-        assert_eq!(summary(&progress), "10.0 Hz  latency 84 ms  1 fused  25.0 kB  2 dropped");
-        assert_eq!(summary(&Progress::default()), "- Hz  latency - ms  0 fused  0 B  0 dropped");
+        assert_eq!(
+            summary(&progress),
+            "10.0 Hz  latency 84 ms  1 fused  25.0 kB  2 dropped"
+        );
+        assert_eq!(
+            summary(&Progress::default()),
+            "- Hz  latency - ms  0 fused  0 B  0 dropped"
+        );
     }
 }

@@ -74,7 +74,11 @@ impl RemoteStatus {
     /// [`BusError`] when the session is closed.
     pub fn observe(bus: &Bus, time: Duration) -> Result<Self, BusError> {
         let run = &bus.identity().run;
-        let selectors = [KeyExpr::stats(run), KeyExpr::stream(run, Stream::Detections), KeyExpr::truth(run)];
+        let selectors = [
+            KeyExpr::stats(run),
+            KeyExpr::stream(run, Stream::Detections),
+            KeyExpr::truth(run),
+        ];
         let tap = bus.tap(&selectors, PLACES)?;
         let mut seen = Seen::default();
         let end = Instant::now() + time;
@@ -84,8 +88,11 @@ impl RemoteStatus {
         // This observer reports, too.
         let own = &bus.identity().process;
         seen.reports.remove(own.as_str());
-        let alive =
-            present(bus.session(), run)?.iter().filter(|process| *process != own).map(ToString::to_string).collect();
+        let alive = present(bus.session(), run)?
+            .iter()
+            .filter(|process| *process != own)
+            .map(ToString::to_string)
+            .collect();
         Ok(seen.status(run.to_string(), time, &alive))
     }
 
@@ -109,8 +116,17 @@ impl RemoteStatus {
         let left = ["process", "state"].map(|name| (name, Side::Left));
         let right = ["cores", "MiB", "sent", "dropped"].map(|name| (name, Side::Right));
         let mut table = TextTable::new(left.into_iter().chain(right));
-        for RemoteProcess { name, state, cores, resident_mib, sent, dropped } in &self.processes {
-            let count = |count: &Option<u64>| count.map_or("-".to_owned(), |count| count.to_string());
+        for RemoteProcess {
+            name,
+            state,
+            cores,
+            resident_mib,
+            sent,
+            dropped,
+        } in &self.processes
+        {
+            let count =
+                |count: &Option<u64>| count.map_or("-".to_owned(), |count| count.to_string());
             let state = match state {
                 RemoteState::Alive => "alive",
                 RemoteState::Silent => "silent",
@@ -126,12 +142,25 @@ impl RemoteStatus {
             ]);
         }
         let results: String = self.egos.iter().map(result_line).collect();
-        format!("{}, observed for {:.1} s\n{results}{table}", self.run, self.observed_s)
+        format!(
+            "{}, observed for {:.1} s\n{results}{table}",
+            self.run, self.observed_s
+        )
     }
 }
 
-fn result_line(RemoteEgo { ego, rate_hz, latency_ms, fused }: &RemoteEgo) -> String {
-    format!("ego {ego}: {rate_hz:.1} results a second, latency {} ms, {fused} fused\n", number(*latency_ms, 0))
+fn result_line(
+    RemoteEgo {
+        ego,
+        rate_hz,
+        latency_ms,
+        fused,
+    }: &RemoteEgo,
+) -> String {
+    format!(
+        "ego {ego}: {rate_hz:.1} results a second, latency {} ms, {fused} fused\n",
+        number(*latency_ms, 0)
+    )
 }
 
 /// Messages seen so far.
@@ -150,7 +179,9 @@ impl Seen {
     fn add(&mut self, topic: &Topic, pieces: &[&[u8]]) {
         match topic {
             Topic::Stats(process) => {
-                let Ok((header, stats)) = wire::decode::<Stats>(pieces.iter().copied(), &Limits::DEFAULT) else {
+                let Ok((header, stats)) =
+                    wire::decode::<Stats>(pieces.iter().copied(), &Limits::DEFAULT)
+                else {
                     return;
                 };
                 let report = (header.stamp.publish_nanos, stats);
@@ -159,18 +190,30 @@ impl Seen {
                     .and_modify(|[_, last]| *last = report.clone())
                     .or_insert_with(|| [report.clone(), report]);
             }
-            Topic::Stream { cav, stream: Stream::Detections } => {
+            Topic::Stream {
+                cav,
+                stream: Stream::Detections,
+            } => {
                 let decoded = wire::decode::<Detections>(pieces.iter().copied(), &Limits::DEFAULT);
-                let Ok((header, result)) = decoded else { return };
+                let Ok((header, result)) = decoded else {
+                    return;
+                };
                 let count = self.results.get(cav).map_or(0, |(count, _)| *count) + 1;
                 let began_nanos = self.ticks.get(&header.stamp.capture_nanos);
-                let latency_ms = began_nanos.map(|began| (header.stamp.publish_nanos as f64 - *began as f64) / 1e6);
-                let ego = RemoteEgo { ego: cav.clone(), rate_hz: 0.0, latency_ms, fused: result.fused.len() };
+                let latency_ms = began_nanos
+                    .map(|began| (header.stamp.publish_nanos as f64 - *began as f64) / 1e6);
+                let ego = RemoteEgo {
+                    ego: cav.clone(),
+                    rate_hz: 0.0,
+                    latency_ms,
+                    fused: result.fused.len(),
+                };
                 self.results.insert(cav.clone(), (count, ego));
             }
             Topic::Truth => {
                 if let Ok(header) = wire::decode_header(pieces.iter().copied()) {
-                    self.ticks.insert(header.stamp.capture_nanos, header.stamp.publish_nanos);
+                    self.ticks
+                        .insert(header.stamp.capture_nanos, header.stamp.publish_nanos);
                 }
             }
             _ => {}
@@ -191,15 +234,23 @@ impl Seen {
                     (false, _) => RemoteState::Gone,
                 },
                 cores: reports.and_then(cores),
-                resident_mib: last.map(|stats| stats.usage.resident_bytes as f64 / f64::from(1 << 20)),
+                resident_mib: last
+                    .map(|stats| stats.usage.resident_bytes as f64 / f64::from(1 << 20)),
                 sent: last.map(|stats| stats.ledger.total().sent),
                 dropped: last.map(|stats| stats.ledger.total().dropped_total()),
             }
         };
         let processes = names.iter().map(process).collect();
-        let egos =
-            self.results.into_values().map(|(count, ego)| RemoteEgo { rate_hz: count as f64 / observed_s, ..ego });
-        RemoteStatus { run, observed_s, processes, egos: egos.collect() }
+        let egos = self.results.into_values().map(|(count, ego)| RemoteEgo {
+            rate_hz: count as f64 / observed_s,
+            ..ego
+        });
+        RemoteStatus {
+            run,
+            observed_s,
+            processes,
+            egos: egos.collect(),
+        }
     }
 }
 
@@ -215,15 +266,32 @@ mod tests {
     use super::*;
 
     fn stamp(capture_nanos: u64, publish_nanos: u64) -> Stamp {
-        Stamp { cav: CavId::new("1000").unwrap(), epoch: 1, sequence: 0, capture_nanos, publish_nanos }
+        Stamp {
+            cav: CavId::new("1000").unwrap(),
+            epoch: 1,
+            sequence: 0,
+            capture_nanos,
+            publish_nanos,
+        }
     }
 
     fn report(seen: &mut Seen, name: &str, at_s: f64, cpu_s: f64) {
         let process: ProcessId = name.parse().unwrap();
-        let usage = ProcessUsage { cpu_s, resident_bytes: 3 << 20, peak_resident_bytes: 3 << 20 };
-        let stats =
-            Stats { process: process.clone(), ledger: Ledger::default(), stages: vec![], usage, traffic: vec![] };
-        let bytes = wire::encode(&stamp(0, (at_s * 1e9) as u64), stats).unwrap().to_vec();
+        let usage = ProcessUsage {
+            cpu_s,
+            resident_bytes: 3 << 20,
+            peak_resident_bytes: 3 << 20,
+        };
+        let stats = Stats {
+            process: process.clone(),
+            ledger: Ledger::default(),
+            stages: vec![],
+            usage,
+            traffic: vec![],
+        };
+        let bytes = wire::encode(&stamp(0, (at_s * 1e9) as u64), stats)
+            .unwrap()
+            .to_vec();
         seen.add(&Topic::Stats(process), &[&bytes]);
     }
 
@@ -235,13 +303,26 @@ mod tests {
         report(&mut seen, "agent-1001", 1.0, 4.0);
         let alive = BTreeSet::from(["agent-1000".to_owned(), "ego-1000".to_owned()]);
         let status = seen.status("test".into(), Duration::from_secs(2), &alive);
-        let states: Vec<_> = status.processes.iter().map(|process| (process.name.as_str(), process.state)).collect();
-        let expected =
-            [("agent-1000", RemoteState::Alive), ("agent-1001", RemoteState::Gone), ("ego-1000", RemoteState::Silent)];
+        let states: Vec<_> = status
+            .processes
+            .iter()
+            .map(|process| (process.name.as_str(), process.state))
+            .collect();
+        let expected = [
+            ("agent-1000", RemoteState::Alive),
+            ("agent-1001", RemoteState::Gone),
+            ("ego-1000", RemoteState::Silent),
+        ];
         assert_eq!(states, expected);
         assert_eq!(status.processes[0].cores, Some(0.5));
-        assert_eq!((status.processes[1].cores, status.processes[1].resident_mib), (None, Some(3.0)));
-        assert_eq!(status.troubles(), ["agent-1001 has left", "ego-1000 is silent"]);
+        assert_eq!(
+            (status.processes[1].cores, status.processes[1].resident_mib),
+            (None, Some(3.0))
+        );
+        assert_eq!(
+            status.troubles(),
+            ["agent-1001 has left", "ego-1000 is silent"]
+        );
         assert!(status.table().contains("0.50"), "{}", status.table());
     }
 

@@ -48,11 +48,19 @@ impl RunFolder {
     pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
-        fs::create_dir_all(&runs).map_err(|source| RunFolderError::Write { path: runs.clone(), source })?;
+        fs::create_dir_all(&runs).map_err(|source| RunFolderError::Write {
+            path: runs.clone(),
+            source,
+        })?;
         // One call that fails if the folder exists, so that two runs never share a folder.
         match fs::create_dir(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Err(RunFolderError::Taken(path)),
-            other => other.map_err(|source| RunFolderError::Write { path: path.clone(), source })?,
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
+                return Err(RunFolderError::Taken(path));
+            }
+            other => other.map_err(|source| RunFolderError::Write {
+                path: path.clone(),
+                source,
+            })?,
         }
         let log = path.join("log");
         fs::create_dir(&log).map_err(|source| RunFolderError::Write { path: log, source })?;
@@ -62,7 +70,10 @@ impl RunFolder {
     /// Removes it with all its files: for a run that was refused before it began, so that its name is free again.
     pub fn remove(self) {
         if let Err(error) = fs::remove_dir_all(&self.path) {
-            tracing::warn!("cannot remove {}, the folder of a run that did not begin: {error}", self.path.display());
+            tracing::warn!(
+                "cannot remove {}, the folder of a run that did not begin: {error}",
+                self.path.display()
+            );
         }
     }
 
@@ -101,12 +112,19 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
-    pub fn write_config(&self, process: &str, config: &impl Serialize) -> Result<PathBuf, RunFolderError> {
+    pub fn write_config(
+        &self,
+        process: &str,
+        config: &impl Serialize,
+    ) -> Result<PathBuf, RunFolderError> {
         let name = format!("config/{process}.yaml");
         let path = self.file(&name);
-        let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
-        let text =
-            serde_saphyr::to_string(config).map_err(|error| unwritable(std::io::Error::other(error.to_string())))?;
+        let unwritable = |source| RunFolderError::Write {
+            path: path.clone(),
+            source,
+        };
+        let text = serde_saphyr::to_string(config)
+            .map_err(|error| unwritable(std::io::Error::other(error.to_string())))?;
         fs::create_dir_all(self.file("config")).map_err(unwritable)?;
         self.write(&name, &text)?;
         Ok(path)
@@ -117,8 +135,10 @@ impl RunFolder {
     /// # Errors
     /// [`RunFolderError::Write`].
     pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunFolderError> {
-        let text = serde_json::to_string_pretty(value)
-            .map_err(|error| RunFolderError::Write { path: self.file(name), source: error.into() })?;
+        let text = serde_json::to_string_pretty(value).map_err(|error| RunFolderError::Write {
+            path: self.file(name),
+            source: error.into(),
+        })?;
         self.write(name, &(text + "\n"))
     }
 
@@ -127,20 +147,32 @@ impl RunFolder {
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
-    pub fn write_frames(&self, records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> Result<(), RunFolderError> {
+    pub fn write_frames(
+        &self,
+        records: &[FrameRecord],
+        swept: &BTreeMap<u64, u64>,
+    ) -> Result<(), RunFolderError> {
         self.write("frames.csv", &frames_csv(records, swept, None))
     }
 }
 
 /// The table of ticks: a header line, then a line per tick, answered or not. With the scenario of each tick, that is the
 /// first column.
-pub fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>, scenarios: Option<&[String]>) -> String {
+pub fn frames_csv(
+    records: &[FrameRecord],
+    swept: &BTreeMap<u64, u64>,
+    scenarios: Option<&[String]>,
+) -> String {
     let header = "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms,answered,tick_unix_nanos,\
          streamed_tick,streamed_age_ms,streamed_detected,streamed_found";
-    let mut text = CsvText::new(&scenarios.map_or_else(|| header.to_owned(), |_| format!("scenario,{header}")));
+    let mut text = CsvText::new(
+        &scenarios.map_or_else(|| header.to_owned(), |_| format!("scenario,{header}")),
+    );
     for (place, record) in records.iter().enumerate() {
-        let scenario = scenarios.and_then(|scenarios| scenarios.get(place)).cloned();
+        let scenario = scenarios
+            .and_then(|scenarios| scenarios.get(place))
+            .cloned();
         text.row(scenario.into_iter().chain(frame_fields(record, swept)));
     }
     text.finish()
@@ -167,24 +199,72 @@ fn frame_fields(record: &FrameRecord, swept: &BTreeMap<u64, u64>) -> Vec<String>
         ego_error_deg,
         streamed,
     } = record;
-    let StageStamps { began_nanos, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } = stamps;
-    let swept_ms = swept.get(capture_nanos).and_then(|swept| stamps.since_began_ms(*swept));
-    let number = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
+    let StageStamps {
+        began_nanos,
+        posed_ms,
+        published_ms,
+        arrived_ms,
+        decided_ms,
+        fused_ms,
+        detected_ms,
+    } = stamps;
+    let swept_ms = swept
+        .get(capture_nanos)
+        .and_then(|swept| stamps.since_began_ms(*swept));
+    let number =
+        |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
     let optional = |number: Option<u64>| number.map_or(String::new(), |number| number.to_string());
-    let mut fields = vec![tick.to_string(), optional(*agent_frame), capture_nanos.to_string(), number(latency_ms)];
+    let mut fields = vec![
+        tick.to_string(),
+        optional(*agent_frame),
+        capture_nanos.to_string(),
+        number(latency_ms),
+    ];
     fields.extend([detected, truth, found, fused, skipped].map(ToString::to_string));
-    fields.extend([number(oldest_ms), stale.to_string(), payload_bytes.to_string(), wire_bytes.to_string()]);
+    fields.extend([
+        number(oldest_ms),
+        stale.to_string(),
+        payload_bytes.to_string(),
+        wire_bytes.to_string(),
+    ]);
     fields.extend([ego_error_m, ego_error_deg].map(number));
-    fields.extend([&swept_ms, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(number));
-    fields.extend([u8::from(record.is_answered()).to_string(), optional(*began_nanos)]);
+    fields.extend(
+        [
+            &swept_ms,
+            posed_ms,
+            published_ms,
+            arrived_ms,
+            decided_ms,
+            fused_ms,
+            detected_ms,
+        ]
+        .map(number),
+    );
+    fields.extend([
+        u8::from(record.is_answered()).to_string(),
+        optional(*began_nanos),
+    ]);
     fields.extend(streamed_fields(streamed.as_ref()));
     fields
 }
 
 fn streamed_fields(streamed: Option<&StreamedResult>) -> [String; 4] {
-    streamed.map_or_else(Default::default, |StreamedResult { tick, age_ms, detected, found }| {
-        [tick.to_string(), format!("{age_ms:.4}"), detected.to_string(), found.to_string()]
-    })
+    streamed.map_or_else(
+        Default::default,
+        |StreamedResult {
+             tick,
+             age_ms,
+             detected,
+             found,
+         }| {
+            [
+                tick.to_string(),
+                format!("{age_ms:.4}"),
+                detected.to_string(),
+                found.to_string(),
+            ]
+        },
+    )
 }
 
 /// Name for an unnamed run: `prefix` and the time, UTC, for example `up-20260131-235959`.
@@ -193,7 +273,9 @@ fn streamed_fields(streamed: Option<&StreamedResult>) -> [String; 4] {
 /// Never with a `prefix` of an identifier's characters, at most 16.
 #[must_use]
 pub fn name_of_now(prefix: &str) -> RunId {
-    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
+    let since_epoch = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or(Duration::ZERO);
     let name = format!("{prefix}-{}", time_stamp(since_epoch.as_secs()));
     RunId::new(&name).expect("a prefix and digits make an identifier")
 }
@@ -205,13 +287,24 @@ fn time_stamp(unix_secs: u64) -> String {
     // lengths of the months are a linear function (Howard Hinnant, "chrono-compatible low-level date algorithms").
     let days = days + 719_468;
     let (cycle, day_of_cycle) = (days / 146_097, days % 146_097);
-    let year_of_cycle = (day_of_cycle - day_of_cycle / 1_460 + day_of_cycle / 36_524 - day_of_cycle / 146_096) / 365;
-    let day_of_year = day_of_cycle - (365 * year_of_cycle + year_of_cycle / 4 - year_of_cycle / 100);
+    let year_of_cycle = (day_of_cycle - day_of_cycle / 1_460 + day_of_cycle / 36_524
+        - day_of_cycle / 146_096)
+        / 365;
+    let day_of_year =
+        day_of_cycle - (365 * year_of_cycle + year_of_cycle / 4 - year_of_cycle / 100);
     let march_month = (5 * day_of_year + 2) / 153;
     let day = day_of_year - (153 * march_month + 2) / 5 + 1;
-    let month = if march_month < 10 { march_month + 3 } else { march_month - 9 };
+    let month = if march_month < 10 {
+        march_month + 3
+    } else {
+        march_month - 9
+    };
     let year = 400 * cycle + year_of_cycle + u64::from(month <= 2);
-    let (hour, minute, second) = (second_of_day / 3_600, second_of_day / 60 % 60, second_of_day % 60);
+    let (hour, minute, second) = (
+        second_of_day / 3_600,
+        second_of_day / 60 % 60,
+        second_of_day % 60,
+    );
     format!("{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}")
 }
 
@@ -225,7 +318,9 @@ mod tests {
         let name = RunId::new("r1").unwrap();
         let folder = RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
         assert!(folder.log_dir().is_dir() && folder.path().is_absolute());
-        let error = RunFolder::create(&runs.path().join("deeper"), &name).unwrap_err().to_string();
+        let error = RunFolder::create(&runs.path().join("deeper"), &name)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("r1 exists already"), "{error}");
         folder.remove();
         RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
@@ -255,18 +350,40 @@ mod tests {
             wire_bytes: 1300,
             ego_error_m: Some(0.25),
             ego_error_deg: None,
-            streamed: Some(StreamedResult { tick: 1, age_ms: 200.5, detected: 15, found: 12 }),
+            streamed: Some(StreamedResult {
+                tick: 1,
+                age_ms: 200.5,
+                detected: 15,
+                found: 12,
+            }),
         };
-        let unanswered = FrameRecord { agent_frame: None, latency_ms: None, streamed: None, ..record.clone() };
-        let text = frames_csv(&[record, unanswered], &BTreeMap::from([(300_000_000, 1_002_500_000)]), None);
+        let unanswered = FrameRecord {
+            agent_frame: None,
+            latency_ms: None,
+            streamed: None,
+            ..record.clone()
+        };
+        let text = frames_csv(
+            &[record, unanswered],
+            &BTreeMap::from([(300_000_000, 1_002_500_000)]),
+            None,
+        );
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[1],
             "3,2,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500,1,\
              1000000000,1,200.5000,15,12"
         );
-        assert!(lines[2].starts_with("3,,300000000,,") && lines[2].ends_with(",0,1000000000,,,,"), "{text}");
-        assert!(lines[1..].iter().all(|line| line.matches(',').count() == lines[0].matches(',').count()), "{text}");
+        assert!(
+            lines[2].starts_with("3,,300000000,,") && lines[2].ends_with(",0,1000000000,,,,"),
+            "{text}"
+        );
+        assert!(
+            lines[1..]
+                .iter()
+                .all(|line| line.matches(',').count() == lines[0].matches(',').count()),
+            "{text}"
+        );
     }
 
     #[test]

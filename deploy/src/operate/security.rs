@@ -40,11 +40,21 @@ impl RunKeys {
     ///
     /// # Errors
     /// [`KeyError`] when they cannot be made.
-    pub fn of(security: &Security, principals: Vec<Principal>, run_folder: &Path) -> Result<Self, KeyError> {
+    pub fn of(
+        security: &Security,
+        principals: Vec<Principal>,
+        run_folder: &Path,
+    ) -> Result<Self, KeyError> {
         if let Some(folder) = &security.keys {
-            return Ok(Self { folder: folder.clone(), is_own: false });
+            return Ok(Self {
+                folder: folder.clone(),
+                is_own: false,
+            });
         }
-        let own = Self { folder: run_folder.join("keys"), is_own: true };
+        let own = Self {
+            folder: run_folder.join("keys"),
+            is_own: true,
+        };
         keys::make(&KeyPlan::new(&own.folder, principals, DAYS_OF_A_RUN))?;
         Ok(own)
     }
@@ -59,17 +69,30 @@ impl RunKeys {
     ///
     /// # Errors
     /// [`BusError::Keys`] names the problem.
-    pub(crate) fn for_router(&self, options: BusOptions, run: &RunId) -> Result<BusOptions, BusError> {
+    pub(crate) fn for_router(
+        &self,
+        options: BusOptions,
+        run: &RunId,
+    ) -> Result<BusOptions, BusError> {
         let credentials = self.read(ROUTER)?;
-        let guard = AccessControl { members: credentials.members()?, runs: RunScope::One(run.clone()) };
-        Ok(options.with_credentials(credentials).with_access_control(guard))
+        let guard = AccessControl {
+            members: credentials.members()?,
+            runs: RunScope::One(run.clone()),
+        };
+        Ok(options
+            .with_credentials(credentials)
+            .with_access_control(guard))
     }
 
     /// A client with the keys of the process of that name.
     ///
     /// # Errors
     /// [`BusError::Keys`] names the problem.
-    pub(crate) fn for_client(&self, options: BusOptions, name: &str) -> Result<BusOptions, BusError> {
+    pub(crate) fn for_client(
+        &self,
+        options: BusOptions,
+        name: &str,
+    ) -> Result<BusOptions, BusError> {
         Ok(options.with_credentials(self.read(name)?))
     }
 
@@ -85,7 +108,10 @@ impl Drop for RunKeys {
         if self.is_own
             && let Err(error) = fs::remove_dir_all(&self.folder)
         {
-            tracing::warn!("{} holds keys that are no longer needed: {error}", self.folder.display());
+            tracing::warn!(
+                "{} holds keys that are no longer needed: {error}",
+                self.folder.display()
+            );
         }
     }
 }
@@ -121,16 +147,33 @@ impl RefusalWatch {
             }
         };
         let thread = thread::Builder::new().name("refusals".into()).spawn(look);
-        let thread = thread.map_err(|cause| BusError::Thread { what: "refusals".into(), cause })?;
-        Ok(Self { stop, thread: Some(thread) })
+        let thread = thread.map_err(|cause| BusError::Thread {
+            what: "refusals".into(),
+            cause,
+        })?;
+        Ok(Self {
+            stop,
+            thread: Some(thread),
+        })
     }
 
     /// All refusals, which are also logged.
     pub fn finish(mut self) -> BTreeMap<Rejection, u64> {
         self.stop.request();
-        let counts =
-            self.thread.take().and_then(|thread| thread.join().ok()).map_or_else(BTreeMap::new, |all| all.counts());
-        for (Rejection { peer, reason, message }, count) in &counts {
+        let counts = self
+            .thread
+            .take()
+            .and_then(|thread| thread.join().ok())
+            .map_or_else(BTreeMap::new, |all| all.counts());
+        for (
+            Rejection {
+                peer,
+                reason,
+                message,
+            },
+            count,
+        ) in &counts
+        {
             tracing::warn!(%peer, %reason, what = %message, count, "refused by the router");
         }
         counts

@@ -102,11 +102,24 @@ impl RunStatus {
     /// [`StatusError`] names the file.
     pub fn read(folder: &Path) -> Result<Self, StatusError> {
         let path = folder.join(FILE);
-        let text = fs::read_to_string(&path).map_err(|source| StatusError::Read { path: path.clone(), source })?;
-        let status: Self = serde_json::from_str(&text)
-            .map_err(|error| StatusError::Syntax { path: path.clone(), problem: error.to_string() })?;
-        let is_lost = status.phase != Phase::Over && (Usage::of(status.pid).is_none() || status.age() > STALE);
-        Ok(if is_lost { Self { phase: Phase::Lost, ..status } } else { status })
+        let text = fs::read_to_string(&path).map_err(|source| StatusError::Read {
+            path: path.clone(),
+            source,
+        })?;
+        let status: Self = serde_json::from_str(&text).map_err(|error| StatusError::Syntax {
+            path: path.clone(),
+            problem: error.to_string(),
+        })?;
+        let is_lost = status.phase != Phase::Over
+            && (Usage::of(status.pid).is_none() || status.age() > STALE);
+        Ok(if is_lost {
+            Self {
+                phase: Phase::Lost,
+                ..status
+            }
+        } else {
+            status
+        })
     }
 
     /// Folder of a run that is named by its path or by its name in `runs`; not named: the newest.
@@ -126,9 +139,19 @@ impl RunStatus {
     /// # Errors
     /// [`StatusError::NoRun`] when no run has one.
     pub fn newest(runs: &Path) -> Result<PathBuf, StatusError> {
-        let folders = fs::read_dir(runs).into_iter().flatten().flatten().map(|entry| entry.path());
-        let written = |folder: &PathBuf| fs::metadata(folder.join(FILE)).and_then(|file| file.modified()).ok();
-        let newest = folders.filter(|folder| written(folder).is_some()).max_by_key(written);
+        let folders = fs::read_dir(runs)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .map(|entry| entry.path());
+        let written = |folder: &PathBuf| {
+            fs::metadata(folder.join(FILE))
+                .and_then(|file| file.modified())
+                .ok()
+        };
+        let newest = folders
+            .filter(|folder| written(folder).is_some())
+            .max_by_key(written);
         newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))
     }
 
@@ -140,11 +163,18 @@ impl RunStatus {
             Phase::Ending | Phase::Over => process.state != State::Down,
             Phase::Lost => true,
         };
-        let sick = self.processes.iter().filter(|process| !is_well(process) || process.failure.is_some());
+        let sick = self
+            .processes
+            .iter()
+            .filter(|process| !is_well(process) || process.failure.is_some());
         let describe = |process: &ProcessStatus| {
             let why = process.failure.as_ref().or(process.last_fall.as_ref());
             let state = name_of(&process.state);
-            format!("{} is {state}{}", process.name, why.map_or(String::new(), |why| format!(" ({why})")))
+            format!(
+                "{} is {state}{}",
+                process.name,
+                why.map_or(String::new(), |why| format!(" ({why})"))
+            )
         };
         let lost = (self.phase == Phase::Lost).then(|| "the supervisor has ended".to_owned());
         lost.into_iter().chain(sick.map(describe)).collect()
@@ -186,8 +216,13 @@ impl RunStatus {
 
     fn processes_table(&self) -> TextTable {
         let left = ["process", "state"].map(|name| (name, Side::Left));
-        let right = ["pid", "up s", "restarts", "silent s", "MiB", "fds"].map(|name| (name, Side::Right));
-        let mut table = TextTable::new(left.into_iter().chain(right).chain([("last crash or failure", Side::Left)]));
+        let right =
+            ["pid", "up s", "restarts", "silent s", "MiB", "fds"].map(|name| (name, Side::Right));
+        let mut table = TextTable::new(
+            left.into_iter()
+                .chain(right)
+                .chain([("last crash or failure", Side::Left)]),
+        );
         for process in &self.processes {
             table.row([
                 process.name.clone(),
@@ -197,8 +232,14 @@ impl RunStatus {
                 process.restarts.to_string(),
                 optional(process.silent_s, 1),
                 optional(process.resident_mib, 0),
-                process.descriptors.map_or("-".into(), |count| count.to_string()),
-                process.failure.clone().or_else(|| process.last_fall.clone()).unwrap_or_default(),
+                process
+                    .descriptors
+                    .map_or("-".into(), |count| count.to_string()),
+                process
+                    .failure
+                    .clone()
+                    .or_else(|| process.last_fall.clone())
+                    .unwrap_or_default(),
             ]);
         }
         table
@@ -207,14 +248,19 @@ impl RunStatus {
     fn neighbours_table(&self) -> TextTable {
         let numbers = ["clock ms", "trust"].map(|name| (name, Side::Right));
         let mut table = TextTable::new(
-            [("neighbour", Side::Left)].into_iter().chain(numbers).chain([("left out because", Side::Left)]),
+            [("neighbour", Side::Left)]
+                .into_iter()
+                .chain(numbers)
+                .chain([("left out because", Side::Left)]),
         );
         for neighbour in &self.neighbours {
             table.row([
                 neighbour.cav.to_string(),
                 optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
                 optional(neighbour.trust, 2),
-                neighbour.misbehaviour.map_or(String::new(), |misbehaviour| misbehaviour.to_string()),
+                neighbour
+                    .misbehaviour
+                    .map_or(String::new(), |misbehaviour| misbehaviour.to_string()),
             ]);
         }
         table
@@ -227,7 +273,10 @@ fn optional(value: Option<f64>, digits: usize) -> String {
 
 /// Name of a value as in the file.
 fn name_of(value: &impl Serialize) -> String {
-    serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
+    serde_json::to_value(value)
+        .ok()
+        .and_then(|value| value.as_str().map(str::to_owned))
+        .unwrap_or_default()
 }
 
 /// Writes the status of a run periodically.
@@ -264,7 +313,11 @@ impl StatusWriter {
         processes: impl FnOnce(Instant) -> Vec<ProcessStatus>,
     ) {
         let now = Instant::now();
-        if phase == Phase::Running && self.written.is_some_and(|written| now.duration_since(written) < PERIOD) {
+        if phase == Phase::Running
+            && self
+                .written
+                .is_some_and(|written| now.duration_since(written) < PERIOD)
+        {
             return;
         }
         self.written = Some(now);
@@ -278,18 +331,26 @@ impl StatusWriter {
             frames: progress.frames,
             ticks: progress.ticks,
             rate_hz: progress.rate_hz(),
-            last_result_s: progress.span.map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
+            last_result_s: progress
+                .span
+                .map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
             latency_ms: progress.latency_ms,
             fused: progress.fused,
             neighbours: progress.neighbours.clone(),
             dropped: progress.dropped,
             processes: processes(now),
         };
-        match atomic_file::write(&self.path, serde_json::to_string_pretty(&status).unwrap_or_default()) {
+        match atomic_file::write(
+            &self.path,
+            serde_json::to_string_pretty(&status).unwrap_or_default(),
+        ) {
             Ok(()) => self.has_warned = false,
             Err(error) if !self.has_warned => {
                 self.has_warned = true;
-                tracing::warn!("{}: {error}; `v2vloc status` will show an old state", self.path.display());
+                tracing::warn!(
+                    "{}: {error}; `v2vloc status` will show an old state",
+                    self.path.display()
+                );
             }
             Err(_) => {}
         }
@@ -297,7 +358,9 @@ impl StatusWriter {
 }
 
 fn unix_ms() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let since = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
@@ -326,8 +389,16 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let run = folder.path().join("test");
         fs::create_dir(&run).unwrap();
-        assert!(matches!(RunStatus::newest(folder.path()), Err(StatusError::NoRun(_))));
-        assert!(RunStatus::read(&run).unwrap_err().to_string().contains("status.json"));
+        assert!(matches!(
+            RunStatus::newest(folder.path()),
+            Err(StatusError::NoRun(_))
+        ));
+        assert!(
+            RunStatus::read(&run)
+                .unwrap_err()
+                .to_string()
+                .contains("status.json")
+        );
         let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447");
         let attacker = NeighbourState {
             cav: protocol::CavId::new("4279").unwrap(),
@@ -335,24 +406,47 @@ mod tests {
             misbehaviour: Some(protocol::MisbehaviourReason::GhostObjects),
             clock_offset_s: Some(0.0125),
         };
-        let progress = Progress { frames: 7, ticks: 9, neighbours: vec![attacker], ..Progress::default() };
+        let progress = Progress {
+            frames: 7,
+            ticks: 9,
+            neighbours: vec![attacker],
+            ..Progress::default()
+        };
         writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
         // Not due yet.
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
         let status = RunStatus::read(&RunStatus::newest(folder.path()).unwrap()).unwrap();
-        assert_eq!((status.phase, status.frames, status.processes.len()), (Phase::Running, 7, 1));
+        assert_eq!(
+            (status.phase, status.frames, status.processes.len()),
+            (Phase::Running, 7, 1)
+        );
         assert!(status.is_well());
         let table = status.table();
-        assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: answered 7/9, - Hz"), "{table}");
-        assert!(table.ends_with("4279           12.5   0.03  ghost_objects\n"), "{table}");
-        assert!(table.contains("agent-4288") && table.contains("was ended by signal 9"), "{table}");
+        assert!(
+            table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: answered 7/9, - Hz"),
+            "{table}"
+        );
+        assert!(
+            table.ends_with("4279           12.5   0.03  ghost_objects\n"),
+            "{table}"
+        );
+        assert!(
+            table.contains("agent-4288") && table.contains("was ended by signal 9"),
+            "{table}"
+        );
 
-        let ended = RunStatus { pid: u32::MAX, ..status.clone() };
+        let ended = RunStatus {
+            pid: u32::MAX,
+            ..status.clone()
+        };
         fs::write(run.join(FILE), serde_json::to_string(&ended).unwrap()).unwrap();
         let found = RunStatus::read(&run).unwrap();
         assert!(found.phase == Phase::Lost && !found.is_well());
         fs::write(run.join(FILE), "{").unwrap();
-        assert!(matches!(RunStatus::read(&run), Err(StatusError::Syntax { .. })));
+        assert!(matches!(
+            RunStatus::read(&run),
+            Err(StatusError::Syntax { .. })
+        ));
     }
 
     #[test]
@@ -368,8 +462,14 @@ mod tests {
             (State::Down, false),
         ] {
             let mut writer = StatusWriter::new(folder.path(), "test", "tcp/127.0.0.1:7447");
-            writer.write(Phase::Running, &Progress::default(), |_| vec![process(state)]);
-            assert_eq!(RunStatus::read(folder.path()).unwrap().is_well(), is_well, "{state:?}");
+            writer.write(Phase::Running, &Progress::default(), |_| {
+                vec![process(state)]
+            });
+            assert_eq!(
+                RunStatus::read(folder.path()).unwrap().is_well(),
+                is_well,
+                "{state:?}"
+            );
         }
     }
 

@@ -46,7 +46,8 @@ impl StatusReporter {
     /// For a run with these timeouts and its router at `endpoint`.
     #[must_use]
     pub fn new(timeouts: &Timeouts, run: &RunId, endpoint: &Endpoint, folder: &RunFolder) -> Self {
-        let [hang, start] = [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
+        let [hang, start] =
+            [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
         Self {
             health: Health::new(hang, start),
             failures: Failures::default(),
@@ -70,13 +71,17 @@ impl StatusReporter {
     /// Processes that crashed at least once.
     pub fn fallen(&self) -> Vec<String> {
         let statuses = self.health.statuses(Instant::now()).into_iter();
-        statuses.filter(|process| process.last_fall.is_some()).map(|process| process.name).collect()
+        statuses
+            .filter(|process| process.last_fall.is_some())
+            .map(|process| process.name)
+            .collect()
     }
 
     /// Writes the status of the run.
     pub fn tell(&mut self, phase: Phase, progress: &Progress) {
         let health = &self.health;
-        self.status.write(phase, progress, |now| health.statuses(now));
+        self.status
+            .write(phase, progress, |now| health.statuses(now));
     }
 
     /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays
@@ -119,12 +124,21 @@ impl StatusReporter {
 /// Displays an event of a process; returns the end of the run where the event ends it.
 fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<Ending> {
     match what {
-        ProcessEventKind::Started { pid } => display.print_line(&format!("{name} runs (pid {pid})")),
-        ProcessEventKind::Crashed { how, again_after, restart } => display.print_line(&format!(
+        ProcessEventKind::Started { pid } => {
+            display.print_line(&format!("{name} runs (pid {pid})"))
+        }
+        ProcessEventKind::Crashed {
+            how,
+            again_after,
+            restart,
+        } => display.print_line(&format!(
             "{name} {how}; starting it again in {:.1} s (restart {restart})",
             again_after.as_secs_f64()
         )),
-        ProcessEventKind::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
+        ProcessEventKind::GaveUp {
+            how,
+            is_optional: false,
+        } => return Some(Ending::Failed { process: name, how }),
         // The replay is the clock of the run; the others follow it.
         ProcessEventKind::Done { .. } if name == REPLAY => return Some(Ending::Over),
         // Reported as failures, where they are some.

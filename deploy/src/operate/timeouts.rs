@@ -22,6 +22,12 @@ pub struct Timeouts {
 
 impl Default for Timeouts {
     fn default() -> Self {
-        Self { ready_s: 60.0, drain_s: 3.0, stop_s: 4.0, restarts: 5, hang_s: 15.0 }
+        Self {
+            ready_s: 60.0,
+            drain_s: 3.0,
+            stop_s: 4.0,
+            restarts: 5,
+            hang_s: 15.0,
+        }
     }
 }

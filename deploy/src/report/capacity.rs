@@ -60,7 +60,17 @@ impl Capacity {
 
 impl fmt::Display for Capacity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { machine: Machine { cores, instructions }, method, vehicles, needed_ms, available_ms, .. } = self;
+        let Self {
+            machine: Machine {
+                cores,
+                instructions,
+            },
+            method,
+            vehicles,
+            needed_ms,
+            available_ms,
+            ..
+        } = self;
         let plural = |count: usize| if count == 1 { "" } else { "s" };
         write!(
             f,

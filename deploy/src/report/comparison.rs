@@ -20,22 +20,42 @@ const ROWS: [Row; 16] = [
     ("method", |report, _| report.method.clone()),
     ("poses", |report, _| report.pose_source.clone()),
     ("clock", |report, _| report.clock.clone()),
-    ("answered", |report, _| format!("{}/{}", report.pace.answered, report.pace.ticks)),
+    ("answered", |report, _| {
+        format!("{}/{}", report.pace.answered, report.pace.ticks)
+    }),
     ("AP@0.3", |_, metrics| number(metrics.ap_global.at_30, 3)),
     ("AP@0.5", |_, metrics| number(metrics.ap_global.at_50, 3)),
     ("AP@0.7", |_, metrics| number(metrics.ap_global.at_70, 3)),
-    ("AP@0.5 all", |_, metrics| number(metrics.ap_unanswered_empty.at_50, 3)),
-    ("sAP@0.5", |_, metrics| number(metrics.ap_streaming.and_then(|ap| ap.at_50), 3)),
-    ("neighbours fused per frame", |_, metrics| number(metrics.contribution.fused_per_frame, 2)),
+    ("AP@0.5 all", |_, metrics| {
+        number(metrics.ap_unanswered_empty.at_50, 3)
+    }),
+    ("sAP@0.5", |_, metrics| {
+        number(metrics.ap_streaming.and_then(|ap| ap.at_50), 3)
+    }),
+    ("neighbours fused per frame", |_, metrics| {
+        number(metrics.contribution.fused_per_frame, 2)
+    }),
     ("pose error, m", |_, metrics| number(metrics.pose.mean_m, 2)),
-    ("latency, median, ms", |report, _| number(report.latency_ms.p50, 0)),
-    ("latency, 95th percentile, ms", |report, _| number(report.latency_ms.p95, 0)),
-    ("between detections, 95th percentile, ms", |report, _| number(report.pace.interval_ms.p95, 0)),
+    ("latency, median, ms", |report, _| {
+        number(report.latency_ms.p50, 0)
+    }),
+    ("latency, 95th percentile, ms", |report, _| {
+        number(report.latency_ms.p95, 0)
+    }),
+    ("between detections, 95th percentile, ms", |report, _| {
+        number(report.pace.interval_ms.p95, 0)
+    }),
     ("CPU per frame, all processes, ms", |report, _| {
-        let of_all: Option<f64> = report.processes.iter().map(|process| process.cpu_ms_per_frame).sum();
+        let of_all: Option<f64> = report
+            .processes
+            .iter()
+            .map(|process| process.cpu_ms_per_frame)
+            .sum();
         number(of_all.filter(|_| !report.processes.is_empty()), 0)
     }),
-    ("bytes of a neighbour per frame", |_, metrics| metrics.comm.wire_bytes_mean.map_or("-".into(), bytes)),
+    ("bytes of a neighbour per frame", |_, metrics| {
+        metrics.comm.wire_bytes_mean.map_or("-".into(), bytes)
+    }),
 ];
 
 impl Comparison {
@@ -44,22 +64,44 @@ impl Comparison {
     /// # Errors
     /// [`ReportError`] names the file.
     pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, ReportError> {
-        let read = |folder: &Path| Ok((RunReport::read(folder)?, read_json(folder.join(metrics::FILE))?));
-        folders.iter().map(|folder| read(folder.as_ref())).collect::<Result<_, _>>().map(Self)
+        let read = |folder: &Path| {
+            Ok((
+                RunReport::read(folder)?,
+                read_json(folder.join(metrics::FILE))?,
+            ))
+        };
+        folders
+            .iter()
+            .map(|folder| read(folder.as_ref()))
+            .collect::<Result<_, _>>()
+            .map(Self)
     }
 }
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let runs = self.0.iter().map(|(report, _)| (report.run.as_str(), Side::Right));
+        let runs = self
+            .0
+            .iter()
+            .map(|(report, _)| (report.run.as_str(), Side::Right));
         let mut table = TextTable::new([("run", Side::Left)].into_iter().chain(runs));
         for (name, value) in ROWS {
-            let values = self.0.iter().map(|(report, metrics)| value(report, metrics));
+            let values = self
+                .0
+                .iter()
+                .map(|(report, metrics)| value(report, metrics));
             table.row([name.to_owned()].into_iter().chain(values));
         }
         write!(f, "{table}")?;
-        if self.0.windows(2).any(|pair| pair[0].1.answered != pair[1].1.answered) {
-            writeln!(f, "\nRuns answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5.")?;
+        if self
+            .0
+            .windows(2)
+            .any(|pair| pair[0].1.answered != pair[1].1.answered)
+        {
+            writeln!(
+                f,
+                "\nRuns answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5."
+            )?;
         }
         Ok(())
     }

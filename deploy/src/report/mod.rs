@@ -67,7 +67,11 @@ impl Spread {
     /// Quantiles of `sample`.
     fn of(sample: &[f64]) -> Self {
         let sorted = sorted(sample);
-        Self { p50: quantile(&sorted, 0.50), p95: quantile(&sorted, 0.95), max: sorted.last().copied() }
+        Self {
+            p50: quantile(&sorted, 0.50),
+            p95: quantile(&sorted, 0.95),
+            max: sorted.last().copied(),
+        }
     }
 }
 
@@ -102,7 +106,10 @@ impl RunReport {
         processes: &[ProcessStats],
         capacity: Option<Capacity>,
     ) -> Self {
-        let latencies: Vec<f64> = records.iter().filter_map(|record| record.latency_ms).collect();
+        let latencies: Vec<f64> = records
+            .iter()
+            .filter_map(|record| record.latency_ms)
+            .collect();
         let pace = Pace::of(metrics, records, processes);
         Self {
             run: run.to_string(),
@@ -129,9 +136,14 @@ impl RunReport {
 
 /// Reads a file of a run.
 fn read_json<T: DeserializeOwned>(path: PathBuf) -> Result<T, ReportError> {
-    let text =
-        bounded_file::read_text(&path, MAX_BYTES).map_err(|source| ReportError::Read { path: path.clone(), source })?;
-    serde_json::from_str(&text).map_err(|error| ReportError::Syntax { path, problem: error.to_string() })
+    let text = bounded_file::read_text(&path, MAX_BYTES).map_err(|source| ReportError::Read {
+        path: path.clone(),
+        source,
+    })?;
+    serde_json::from_str(&text).map_err(|error| ReportError::Syntax {
+        path,
+        problem: error.to_string(),
+    })
 }
 
 #[cfg(test)]

@@ -39,21 +39,37 @@ pub struct AgentPace {
 }
 
 impl Pace {
-    pub(super) fn of(metrics: &Metrics, records: &[FrameRecord], processes: &[ProcessStats]) -> Self {
+    pub(super) fn of(
+        metrics: &Metrics,
+        records: &[FrameRecord],
+        processes: &[ProcessStats],
+    ) -> Self {
         let mut published_s: Vec<f64> = records.iter().filter_map(published_s).collect();
         published_s.sort_by(f64::total_cmp);
-        let intervals_ms: Vec<f64> = published_s.windows(2).map(|pair| (pair[1] - pair[0]) * 1e3).collect();
+        let intervals_ms: Vec<f64> = published_s
+            .windows(2)
+            .map(|pair| (pair[1] - pair[0]) * 1e3)
+            .collect();
         let ticks_s = || records.iter().map(began_s);
         let first_s = ticks_s().reduce(f64::min);
-        let last_s = ticks_s().chain(published_s.iter().copied()).reduce(f64::max);
-        let span_s = published_s.first().zip(published_s.last()).map(|(first, last)| last - first);
+        let last_s = ticks_s()
+            .chain(published_s.iter().copied())
+            .reduce(f64::max);
+        let span_s = published_s
+            .first()
+            .zip(published_s.last())
+            .map(|(first, last)| last - first);
         Self {
             ticks: metrics.ticks,
             answered: metrics.answered,
             agents: agents(processes, metrics.ticks),
             interval_ms: Spread::of(&intervals_ms),
-            rate_hz: span_s.filter(|span| *span > 0.0).map(|span| intervals_ms.len() as f64 / span),
-            seconds: first_s.zip(last_s).map_or(0.0, |(first, last)| last - first),
+            rate_hz: span_s
+                .filter(|span| *span > 0.0)
+                .map(|span| intervals_ms.len() as f64 / span),
+            seconds: first_s
+                .zip(last_s)
+                .map_or(0.0, |(first, last)| last - first),
         }
     }
 
@@ -77,20 +93,33 @@ fn published_s(record: &FrameRecord) -> Option<f64> {
 fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace> {
     let mut agents = BTreeMap::<String, AgentPace>::new();
     for stats in processes {
-        let Some(cav) = vehicle_of(&stats.process) else { continue };
+        let Some(cav) = vehicle_of(&stats.process) else {
+            continue;
+        };
         let pace = agents.entry(cav.to_owned()).or_default();
         pace.computed += sweeps(stats);
-        pace.share = if ticks == 0 { 0.0 } else { pace.computed as f64 / ticks as f64 };
+        pace.share = if ticks == 0 {
+            0.0
+        } else {
+            pace.computed as f64 / ticks as f64
+        };
     }
     agents
 }
 
 /// Vehicle of an agent's process.
 fn vehicle_of(process: &ProcessId) -> Option<&str> {
-    process.as_str().strip_prefix(Role::Agent.as_str())?.strip_prefix('-')
+    process
+        .as_str()
+        .strip_prefix(Role::Agent.as_str())?
+        .strip_prefix('-')
 }
 
 /// Number of sweeps that an agent has computed.
 pub(super) fn sweeps(stats: &ProcessStats) -> u64 {
-    stats.stages.iter().find(|stage| stage.stage == WHOLE_SWEEP).map_or(0, |stage| stage.count)
+    stats
+        .stages
+        .iter()
+        .find(|stage| stage.stage == WHOLE_SWEEP)
+        .map_or(0, |stage| stage.count)
 }

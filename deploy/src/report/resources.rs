@@ -66,15 +66,17 @@ pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
     for stats in processes {
         let (order, kind) = kind_of(stats.process.as_str());
         for stage in &stats.stages {
-            let times = all.entry((order, kind.clone(), stage.stage.clone())).or_insert_with(|| StageTimes {
-                kind: kind.clone(),
-                processes: 0,
-                stage: stage.stage.clone(),
-                count: 0,
-                p50_ms: 0.0,
-                p95_ms: 0.0,
-                max_ms: 0.0,
-            });
+            let times = all
+                .entry((order, kind.clone(), stage.stage.clone()))
+                .or_insert_with(|| StageTimes {
+                    kind: kind.clone(),
+                    processes: 0,
+                    stage: stage.stage.clone(),
+                    count: 0,
+                    p50_ms: 0.0,
+                    p95_ms: 0.0,
+                    max_ms: 0.0,
+                });
             times.processes += 1;
             times.count += stage.count;
             times.p50_ms = times.p50_ms.max(stage.p50_ms);
@@ -87,7 +89,13 @@ pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
 
 /// Kind of a process, and its place in the data flow.
 fn kind_of(process: &str) -> (usize, String) {
-    const ORDER: [Role; 5] = [Role::Replay, Role::Agent, Role::Link, Role::Ego, Role::Scorer];
+    const ORDER: [Role; 5] = [
+        Role::Replay,
+        Role::Agent,
+        Role::Link,
+        Role::Ego,
+        Role::Scorer,
+    ];
     let is_of = |role: Role| process.split('-').next() == Some(role.as_str());
     match ORDER.into_iter().position(is_of) {
         Some(place) => (place, ORDER[place].to_string()),
@@ -101,7 +109,9 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessR
     for stats in processes {
         let name = stats.process.to_string();
         let (order, kind) = kind_of(&name);
-        let (sum, frames) = all.entry((order, name.clone())).or_insert_with(|| (nothing_of(name), 0));
+        let (sum, frames) = all
+            .entry((order, name.clone()))
+            .or_insert_with(|| (nothing_of(name), 0));
         sum.instances += 1;
         sum.cpu_s += stats.usage.cpu_s;
         sum.playing_cpu_s += (stats.usage.cpu_s - stats.cpu_before_s).max(0.0);
@@ -142,9 +152,16 @@ pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
             other => other.to_string(),
         };
         let (messages, bytes) = sums.entry(stream).or_default();
-        (*messages, *bytes) = (*messages + traffic.messages, bytes.saturating_add(traffic.bytes));
+        (*messages, *bytes) = (
+            *messages + traffic.messages,
+            bytes.saturating_add(traffic.bytes),
+        );
     }
-    let of = |(stream, (messages, bytes))| StreamBytes { stream, messages, bytes };
+    let of = |(stream, (messages, bytes))| StreamBytes {
+        stream,
+        messages,
+        bytes,
+    };
     let mut streams: Vec<StreamBytes> = sums.into_iter().map(of).collect();
     streams.sort_by(|a, b| b.bytes.cmp(&a.bytes).then_with(|| a.stream.cmp(&b.stream)));
     streams

@@ -14,7 +14,11 @@ fn record(tick: u64, latency_ms: Option<f64>) -> FrameRecord {
         agent_frame: latency_ms.map(|_| tick),
         capture_nanos: tick * SECOND / 10,
         latency_ms,
-        stamps: StageStamps { began_nanos, detected_ms: latency_ms, ..StageStamps::default() },
+        stamps: StageStamps {
+            began_nanos,
+            detected_ms: latency_ms,
+            ..StageStamps::default()
+        },
         detected: 0,
         truth: 0,
         found: 0,
@@ -31,21 +35,46 @@ fn record(tick: u64, latency_ms: Option<f64>) -> FrameRecord {
 }
 
 /// A process with one stage, its CPU time in total and before the first tick, and one published topic.
-fn process(name: &str, (stage, count, p50_ms): (&str, u64, f64), cpu_s: [f64; 2], topic: &str) -> ProcessStats {
+fn process(
+    name: &str,
+    (stage, count, p50_ms): (&str, u64, f64),
+    cpu_s: [f64; 2],
+    topic: &str,
+) -> ProcessStats {
     let (p95_ms, p99_ms, max_ms) = (2.0 * p50_ms, 2.5 * p50_ms, 3.0 * p50_ms);
     ProcessStats {
         process: name.parse().unwrap(),
         ledger: Ledger::default(),
-        stages: vec![StageSummary { stage: stage.into(), count, p50_ms, p95_ms, p99_ms, max_ms }],
-        usage: ProcessUsage { cpu_s: cpu_s[0], resident_bytes: 1 << 20, peak_resident_bytes: 3 << 20 },
+        stages: vec![StageSummary {
+            stage: stage.into(),
+            count,
+            p50_ms,
+            p95_ms,
+            p99_ms,
+            max_ms,
+        }],
+        usage: ProcessUsage {
+            cpu_s: cpu_s[0],
+            resident_bytes: 1 << 20,
+            peak_resident_bytes: 3 << 20,
+        },
         cpu_before_s: cpu_s[1],
-        traffic: vec![TopicTraffic { topic: topic.parse().unwrap(), messages: count, bytes: 1_000 * count }],
+        traffic: vec![TopicTraffic {
+            topic: topic.parse().unwrap(),
+            messages: count,
+            bytes: 1_000 * count,
+        }],
     }
 }
 
 /// Four ticks, of which the second is unanswered: detections at 1.05, 1.3 and 1.6 s.
 fn report() -> RunReport {
-    let records = [record(0, Some(50.0)), record(1, None), record(2, Some(100.0)), record(3, Some(300.0))];
+    let records = [
+        record(0, Some(50.0)),
+        record(1, None),
+        record(2, Some(100.0)),
+        record(3, Some(300.0)),
+    ];
     let processes = [
         process("scorer", ("decode", 4, 0.1), [0.5, 0.2], "truth"),
         process("ego-1", ("fuse", 3, 30.0), [1.0, 0.4], "1/detections"),
@@ -54,7 +83,11 @@ fn report() -> RunReport {
         // Restarted: it loaded its models while the scene played.
         process("agent-2", ("agent", 1, 50.0), [0.6, 0.0], "2/bev"),
     ];
-    let metrics = Metrics { ticks: 4, answered: 3, ..metrics("pastat") };
+    let metrics = Metrics {
+        ticks: 4,
+        answered: 3,
+        ..metrics("pastat")
+    };
     RunReport::new(&"r1".parse().unwrap(), &metrics, &records, &processes, None)
 }
 
@@ -64,51 +97,107 @@ fn is_near(found: Option<f64>, expected: f64) -> bool {
 
 #[test]
 fn the_pace_counts_computed_and_answered_ticks_and_the_time_between_detections() {
-    let RunReport { pace, latency_ms, .. } = report();
-    assert_eq!((pace.ticks, pace.answered, pace.answered_share()), (4, 3, Some(0.75)));
-    assert_eq!(pace.agents["1"], AgentPace { computed: 4, share: 1.0 });
-    assert_eq!(pace.agents["2"], AgentPace { computed: 3, share: 0.75 }, "both instances");
-    assert!(is_near(pace.interval_ms.p50, 275.0) && is_near(pace.interval_ms.max, 300.0), "{pace:?}");
-    assert!(is_near(pace.rate_hz, 2.0 / 0.55) && is_near(Some(pace.seconds), 0.6), "{pace:?}");
+    let RunReport {
+        pace, latency_ms, ..
+    } = report();
+    assert_eq!(
+        (pace.ticks, pace.answered, pace.answered_share()),
+        (4, 3, Some(0.75))
+    );
+    assert_eq!(
+        pace.agents["1"],
+        AgentPace {
+            computed: 4,
+            share: 1.0
+        }
+    );
+    assert_eq!(
+        pace.agents["2"],
+        AgentPace {
+            computed: 3,
+            share: 0.75
+        },
+        "both instances"
+    );
+    assert!(
+        is_near(pace.interval_ms.p50, 275.0) && is_near(pace.interval_ms.max, 300.0),
+        "{pace:?}"
+    );
+    assert!(
+        is_near(pace.rate_hz, 2.0 / 0.55) && is_near(Some(pace.seconds), 0.6),
+        "{pace:?}"
+    );
     assert!(is_near(latency_ms.p50, 100.0) && is_near(latency_ms.max, 300.0));
 }
 
 #[test]
 fn stages_are_by_kind_and_of_the_slowest_process() {
     let stages = report().stages;
-    let names: Vec<_> = stages.iter().map(|stage| (stage.kind.as_str(), stage.stage.as_str())).collect();
-    assert_eq!(names, [("agent", "agent"), ("ego", "fuse"), ("scorer", "decode")]);
+    let names: Vec<_> = stages
+        .iter()
+        .map(|stage| (stage.kind.as_str(), stage.stage.as_str()))
+        .collect();
+    assert_eq!(
+        names,
+        [("agent", "agent"), ("ego", "fuse"), ("scorer", "decode")]
+    );
     let agent = &stages[0];
-    assert_eq!((agent.processes, agent.count, agent.p50_ms, agent.p95_ms), (3, 7, 60.0, 120.0));
+    assert_eq!(
+        (agent.processes, agent.count, agent.p50_ms, agent.p95_ms),
+        (3, 7, 60.0, 120.0)
+    );
 }
 
 #[test]
 fn cpu_time_is_per_process_and_per_frame() {
     let processes = report().processes;
-    let names: Vec<&str> = processes.iter().map(|process| process.process.as_str()).collect();
+    let names: Vec<&str> = processes
+        .iter()
+        .map(|process| process.process.as_str())
+        .collect();
     assert_eq!(names, ["agent-1", "agent-2", "ego-1", "scorer"]);
-    let [first, second, ego, scorer] = &processes[..] else { panic!("{processes:?}") };
+    let [first, second, ego, scorer] = &processes[..] else {
+        panic!("{processes:?}")
+    };
     assert!(is_near(Some(first.playing_cpu_s), 0.4) && is_near(first.cores, 0.4 / 0.6));
     assert!(is_near(first.cpu_ms_per_frame, 100.0) && first.peak_resident_bytes == 3 << 20);
     assert_eq!(second.instances, 2);
-    assert!(is_near(Some(second.playing_cpu_s), 1.0) && is_near(second.cpu_ms_per_frame, 1000.0 / 3.0));
+    assert!(
+        is_near(Some(second.playing_cpu_s), 1.0) && is_near(second.cpu_ms_per_frame, 1000.0 / 3.0)
+    );
     assert!(is_near(ego.cpu_ms_per_frame, 200.0) && is_near(scorer.cpu_ms_per_frame, 75.0));
 }
 
 #[test]
 fn bytes_are_by_stream() {
     let streams = report().streams;
-    let bev = StreamBytes { stream: "bev".into(), messages: 7, bytes: 7_000 };
+    let bev = StreamBytes {
+        stream: "bev".into(),
+        messages: 7,
+        bytes: 7_000,
+    };
     assert_eq!(streams[0], bev);
-    assert_eq!(streams.iter().map(|stream| stream.stream.as_str()).collect::<Vec<_>>(), ["bev", "truth", "detections"]);
+    assert_eq!(
+        streams
+            .iter()
+            .map(|stream| stream.stream.as_str())
+            .collect::<Vec<_>>(),
+        ["bev", "truth", "detections"]
+    );
 }
 
 #[test]
 fn a_report_reads_back_and_is_a_table_for_people() {
     let folder = tempfile::tempdir().unwrap();
     let missing = RunReport::read(folder.path()).unwrap_err().to_string();
-    assert!(missing.contains("report.json") && missing.contains("has ended"), "{missing}");
-    let machine = Machine { cores: 2, instructions: "AVX2".into() };
+    assert!(
+        missing.contains("report.json") && missing.contains("has ended"),
+        "{missing}"
+    );
+    let machine = Machine {
+        cores: 2,
+        instructions: "AVX2".into(),
+    };
     let capacity = Capacity {
         machine,
         method: "pastat".into(),
@@ -122,8 +211,15 @@ fn a_report_reads_back_and_is_a_table_for_people() {
         available_ms: 200.0,
         expected_share: 0.6,
     };
-    let report = RunReport { capacity: Some(capacity), ..report() };
-    std::fs::write(folder.path().join(FILE), serde_json::to_string(&report).unwrap()).unwrap();
+    let report = RunReport {
+        capacity: Some(capacity),
+        ..report()
+    };
+    std::fs::write(
+        folder.path().join(FILE),
+        serde_json::to_string(&report).unwrap(),
+    )
+    .unwrap();
     let text = report.to_string();
     // Numbers are read back to their last digit but one.
     assert_eq!(RunReport::read(folder.path()).unwrap().to_string(), text);
@@ -140,15 +236,27 @@ fn a_report_reads_back_and_is_a_table_for_people() {
         assert!(text.contains(part), "{part} is not in\n{text}");
     }
     std::fs::write(folder.path().join(FILE), "{").unwrap();
-    assert!(matches!(RunReport::read(folder.path()), Err(ReportError::Syntax { .. })));
+    assert!(matches!(
+        RunReport::read(folder.path()),
+        Err(ReportError::Syntax { .. })
+    ));
 }
 
 #[test]
 fn a_run_without_processes_has_pace_and_latency_only() {
     let records = [record(0, Some(80.0)), record(1, Some(80.0))];
-    let metrics = Metrics { ticks: 2, answered: 2, ..metrics("max") };
+    let metrics = Metrics {
+        ticks: 2,
+        answered: 2,
+        ..metrics("max")
+    };
     let text = RunReport::new(&"r1".parse().unwrap(), &metrics, &records, &[], None).to_string();
-    assert!(text.contains("answered 2/2 (100 %)") && !text.contains("stage") && !text.contains("computed"), "{text}");
+    assert!(
+        text.contains("answered 2/2 (100 %)")
+            && !text.contains("stage")
+            && !text.contains("computed"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -158,17 +266,41 @@ fn runs_are_compared_column_by_column() {
     for (folder, answered) in folders.iter().zip([3, 4]) {
         std::fs::create_dir(folder).unwrap();
         let name = folder.file_name().unwrap().to_string_lossy().into_owned();
-        let report = RunReport { run: name, ..report() };
-        let metrics = Metrics { ticks: 4, answered, ..metrics("pastat") };
+        let report = RunReport {
+            run: name,
+            ..report()
+        };
+        let metrics = Metrics {
+            ticks: 4,
+            answered,
+            ..metrics("pastat")
+        };
         std::fs::write(folder.join(FILE), serde_json::to_string(&report).unwrap()).unwrap();
-        std::fs::write(folder.join(crate::score::metrics::FILE), serde_json::to_string(&metrics).unwrap()).unwrap();
+        std::fs::write(
+            folder.join(crate::score::metrics::FILE),
+            serde_json::to_string(&metrics).unwrap(),
+        )
+        .unwrap();
     }
     let text = Comparison::read(&folders).unwrap().to_string();
     let lines: Vec<&str> = text.lines().collect();
-    assert!(lines[0].starts_with("run") && lines[0].contains("one") && lines[0].ends_with("two"), "{text}");
-    let latency = lines.iter().find(|line| line.starts_with("latency, median, ms")).unwrap();
-    assert_eq!(latency.split_whitespace().rev().take(2).collect::<Vec<_>>(), ["100", "100"], "{text}");
-    assert!(text.contains("Runs answered different numbers of ticks"), "{text}");
+    assert!(
+        lines[0].starts_with("run") && lines[0].contains("one") && lines[0].ends_with("two"),
+        "{text}"
+    );
+    let latency = lines
+        .iter()
+        .find(|line| line.starts_with("latency, median, ms"))
+        .unwrap();
+    assert_eq!(
+        latency.split_whitespace().rev().take(2).collect::<Vec<_>>(),
+        ["100", "100"],
+        "{text}"
+    );
+    assert!(
+        text.contains("Runs answered different numbers of ticks"),
+        "{text}"
+    );
 
     std::fs::remove_file(folders[1].join(crate::score::metrics::FILE)).unwrap();
     let message = Comparison::read(&folders).unwrap_err().to_string();

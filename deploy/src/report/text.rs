@@ -16,7 +16,11 @@ impl fmt::Display for RunReport {
             writeln!(f, "machine   {capacity}")?;
         }
         write!(f, "{}", self.pace)?;
-        writeln!(f, "latency   capture to detection: {}", milliseconds(&self.latency_ms))?;
+        writeln!(
+            f,
+            "latency   capture to detection: {}",
+            milliseconds(&self.latency_ms)
+        )?;
         for (rows, table) in [
             (self.stages.len(), self.stage_table()),
             (self.processes.len(), self.process_table()),
@@ -32,9 +36,18 @@ impl fmt::Display for RunReport {
 
 impl fmt::Display for Pace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { ticks, answered, agents, interval_ms, rate_hz, .. } = self;
+        let Self {
+            ticks,
+            answered,
+            agents,
+            interval_ms,
+            rate_hz,
+            ..
+        } = self;
         let share = self.answered_share().map_or("-".into(), percent);
-        let rate = rate_hz.map_or(String::new(), |rate| format!(", {rate:.1} detections a second"));
+        let rate = rate_hz.map_or(String::new(), |rate| {
+            format!(", {rate:.1} detections a second")
+        });
         writeln!(
             f,
             "pace      answered {answered}/{ticks} ({share}){rate}; between detections {}",
@@ -44,7 +57,11 @@ impl fmt::Display for Pace {
             let of = |(cav, pace): (&String, &super::AgentPace)| {
                 format!("{cav} {}/{ticks} ({})", pace.computed, percent(pace.share))
             };
-            writeln!(f, "computed  {}", agents.iter().map(of).collect::<Vec<_>>().join(", "))?;
+            writeln!(
+                f,
+                "computed  {}",
+                agents.iter().map(of).collect::<Vec<_>>().join(", ")
+            )?;
         }
         Ok(())
     }
@@ -52,7 +69,8 @@ impl fmt::Display for Pace {
 
 impl RunReport {
     fn stage_table(&self) -> TextTable {
-        let numbers = ["frames", "median ms", "95th percentile", "longest"].map(|name| (name, Side::Right));
+        let numbers =
+            ["frames", "median ms", "95th percentile", "longest"].map(|name| (name, Side::Right));
         let names = ["process", "stage"].map(|name| (name, Side::Left));
         let mut table = TextTable::new(names.into_iter().chain(numbers));
         for stage in &self.stages {
@@ -61,13 +79,23 @@ impl RunReport {
                 several => format!("{}, slowest of {several}", stage.kind),
             };
             let times = [stage.p50_ms, stage.p95_ms, stage.max_ms].map(|ms| format!("{ms:.1}"));
-            table.row([kind, stage.stage.clone(), stage.count.to_string()].into_iter().chain(times));
+            table.row(
+                [kind, stage.stage.clone(), stage.count.to_string()]
+                    .into_iter()
+                    .chain(times),
+            );
         }
         table
     }
 
     fn process_table(&self) -> TextTable {
-        let numbers = ["CPU s", "of these playing", "cores", "CPU ms per frame", "peak MiB"];
+        let numbers = [
+            "CPU s",
+            "of these playing",
+            "cores",
+            "CPU ms per frame",
+            "peak MiB",
+        ];
         let numbers = numbers.map(|name| (name, Side::Right));
         let mut table = TextTable::new([("process", Side::Left)].into_iter().chain(numbers));
         for process in &self.processes {
@@ -93,7 +121,12 @@ impl RunReport {
         let mut table = TextTable::new([("stream", Side::Left)].into_iter().chain(numbers));
         for stream in &self.streams {
             let mean = stream.bytes as f64 / stream.messages.max(1) as f64;
-            table.row([stream.stream.clone(), stream.messages.to_string(), bytes(stream.bytes as f64), bytes(mean)]);
+            table.row([
+                stream.stream.clone(),
+                stream.messages.to_string(),
+                bytes(stream.bytes as f64),
+                bytes(mean),
+            ]);
         }
         table
     }

@@ -34,7 +34,10 @@ impl FromStr for AgentTopic {
     fn from_str(text: &str) -> Result<Self, AgentTopicError> {
         let none = || AgentTopicError::NoSeparator(text.chars().take(100).collect());
         let (topic, cav) = text.split_once('=').ok_or_else(none)?;
-        Ok(Self { topic: topic.parse()?, cav: cav.parse()? })
+        Ok(Self {
+            topic: topic.parse()?,
+            cav: cav.parse()?,
+        })
     }
 }
 
@@ -45,9 +48,14 @@ mod tests {
     #[test]
     fn a_source_is_a_topic_and_a_vehicle() {
         let source: AgentTopic = "/velodyne/points=1000".parse().unwrap();
-        assert_eq!((source.topic.as_str(), source.cav.as_str()), ("/velodyne/points", "1000"));
+        assert_eq!(
+            (source.topic.as_str(), source.cav.as_str()),
+            ("/velodyne/points", "1000")
+        );
         let error = |text: &str| text.parse::<AgentTopic>().unwrap_err().to_string();
         assert!(error("/points").contains("TOPIC=AGENT"));
-        assert!(error("points=1000").contains("ROS 2 name") && error("/points=A").contains("CAV id"));
+        assert!(
+            error("points=1000").contains("ROS 2 name") && error("/points=A").contains("CAV id")
+        );
     }
 }

@@ -18,8 +18,10 @@ use super::refusal_log::RefusalLog;
 use super::session::{RosSession, RosSubscription};
 
 /// Limits of a receiver of the run.
-const LIMITS: SweepLimits =
-    SweepLimits { max_points: Limits::DEFAULT.max_points, max_abs_value: Limits::DEFAULT.max_abs_value };
+const LIMITS: SweepLimits = SweepLimits {
+    max_points: Limits::DEFAULT.max_points,
+    max_abs_value: Limits::DEFAULT.max_abs_value,
+};
 
 /// Messages of LiDARs, counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
@@ -85,17 +87,24 @@ impl LidarInputs {
             move || queue.close()
         });
         let open = |AgentTopic { topic, cav }: &AgentTopic| {
-            let lidar = Topic::Stream { cav: cav.clone(), stream: Stream::Lidar };
+            let lidar = Topic::Stream {
+                cav: cav.clone(),
+                stream: Stream::Lidar,
+            };
             let publisher = bus.publisher(lidar, PublisherOptions::SENSOR)?;
-            let (queue, superseded, lane) = (Arc::clone(&queue), Arc::clone(&superseded), cav.clone());
-            let subscription = session.subscribe(topic, RosType::PointCloud2, Qos::SENSOR_DATA, move |sample| {
-                match queue.push(lane.clone(), sample.payload().clone()) {
+            let (queue, superseded, lane) =
+                (Arc::clone(&queue), Arc::clone(&superseded), cav.clone());
+            let subscription = session.subscribe(
+                topic,
+                RosType::PointCloud2,
+                Qos::SENSOR_DATA,
+                move |sample| match queue.push(lane.clone(), sample.payload().clone()) {
                     PushOutcome::Queued | PushOutcome::Closed(_) => {}
                     PushOutcome::Replaced(_) | PushOutcome::NoLane(_) => {
                         superseded.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
                     }
-                }
-            })?;
+                },
+            )?;
             let input = Input {
                 topic: topic.clone(),
                 publisher,
@@ -108,7 +117,13 @@ impl LidarInputs {
             Ok((cav.clone(), input))
         };
         let inputs = sources.iter().map(open).collect::<Result<_, BusError>>()?;
-        Ok(Self { inputs, queue, superseded, max_intensity, report: LidarReport::default() })
+        Ok(Self {
+            inputs,
+            queue,
+            superseded,
+            max_intensity,
+            report: LidarReport::default(),
+        })
     }
 
     /// Passes messages on until the stop is requested. Messages of LiDARs, and of motions by topic.
@@ -124,7 +139,13 @@ impl LidarInputs {
             motions.extend(input.motion.map(MotionInput::finish).unwrap_or_default());
         }
         let superseded = self.superseded.load(std::sync::atomic::Ordering::Relaxed);
-        (LidarReport { superseded, ..self.report }, motions)
+        (
+            LidarReport {
+                superseded,
+                ..self.report
+            },
+            motions,
+        )
     }
 }
 
@@ -133,7 +154,10 @@ impl Input {
         match read_point_cloud(bytes, LIMITS) {
             Ok(sweep) if self.last_nanos == Some(sweep.capture_nanos) => {
                 report.repeated += 1;
-                self.log.warn(&format_args!("header.stamp is {} ns as in the message before", sweep.capture_nanos));
+                self.log.warn(&format_args!(
+                    "header.stamp is {} ns as in the message before",
+                    sweep.capture_nanos
+                ));
             }
             Ok(sweep) => self.pass_on(sweep, max_intensity, report),
             Err(error) => {
@@ -166,6 +190,11 @@ impl Input {
                 self.topic
             );
         }
-        self.publisher.submit(sweep.capture_nanos, Lidar { points: sweep.points });
+        self.publisher.submit(
+            sweep.capture_nanos,
+            Lidar {
+                points: sweep.points,
+            },
+        );
     }
 }

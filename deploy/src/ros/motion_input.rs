@@ -56,31 +56,50 @@ impl MotionInput {
         cav: &CavId,
         sources: &[MotionSource],
     ) -> Result<Option<Self>, BusError> {
-        let own: Vec<&MotionSource> = sources.iter().filter(|source| source.source.cav == *cav).collect();
+        let own: Vec<&MotionSource> = sources
+            .iter()
+            .filter(|source| source.source.cav == *cav)
+            .collect();
         if own.is_empty() {
             return Ok(None);
         }
         // A gyroscope measures turns better than wheels.
-        let has_imu = own.iter().any(|source| source.motion_type == MotionType::Imu);
+        let has_imu = own
+            .iter()
+            .any(|source| source.motion_type == MotionType::Imu);
         let measurements = Arc::<Mutex<Measurements>>::default();
         let subscribe = |source: &&MotionSource| {
-            let MotionSource { motion_type, source: AgentTopic { topic, .. } } = (*source).clone();
+            let MotionSource {
+                motion_type,
+                source: AgentTopic { topic, .. },
+            } = (*source).clone();
             let (measurements, ros_type) = (Arc::clone(&measurements), motion_type.ros_type());
-            lock(&measurements).reports.insert(topic.clone(), MotionReport::default());
+            lock(&measurements)
+                .reports
+                .insert(topic.clone(), MotionReport::default());
             let takes_yaw_rate = motion_type == MotionType::Imu || !has_imu;
             let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
             session.subscribe(&topic.clone(), ros_type, Qos::SENSOR_DATA, move |sample| {
                 let read = motion_type.read(&sample.payload().to_bytes());
                 if let Err(error) = &read {
-                    log.lock().unwrap_or_else(PoisonError::into_inner).warn(error);
+                    log.lock()
+                        .unwrap_or_else(PoisonError::into_inner)
+                        .warn(error);
                 }
                 lock(&measurements).add(&topic, read.ok(), takes_yaw_rate);
             })
         };
         let subscriptions = own.iter().map(subscribe).collect::<Result<_, _>>()?;
-        let imu = Topic::Stream { cav: cav.clone(), stream: Stream::Imu };
+        let imu = Topic::Stream {
+            cav: cav.clone(),
+            stream: Stream::Imu,
+        };
         let publisher = bus.publisher(imu, PublisherOptions::POSE)?;
-        Ok(Some(Self { measurements, publisher, _subscriptions: subscriptions }))
+        Ok(Some(Self {
+            measurements,
+            publisher,
+            _subscriptions: subscriptions,
+        }))
     }
 
     /// Publishes the motion at the capture time of a sweep: speed then, mean yaw rate since the sweep before. True if
@@ -98,14 +117,21 @@ impl MotionInput {
     pub(super) fn finish(self) -> BTreeMap<String, MotionReport> {
         let reports = std::mem::take(&mut lock(&self.measurements).reports);
         self.publisher.finish();
-        reports.into_iter().map(|(topic, report)| (topic.to_string(), report)).collect()
+        reports
+            .into_iter()
+            .map(|(topic, report)| (topic.to_string(), report))
+            .collect()
     }
 }
 
 impl Measurements {
     fn add(&mut self, topic: &RosName, read: Option<TimedMotion>, takes_yaw_rate: bool) {
         let report = self.reports.entry(topic.clone()).or_default();
-        let Some(TimedMotion { capture_nanos, motion }) = read else {
+        let Some(TimedMotion {
+            capture_nanos,
+            motion,
+        }) = read
+        else {
             report.unreadable += 1;
             return;
         };
@@ -121,7 +147,9 @@ impl Measurements {
     fn motion(&self, previous_nanos: Option<u64>, capture_nanos: u64) -> EgoMotion {
         EgoMotion {
             speed_mps: self.speed_mps.at(capture_nanos),
-            yaw_rate_rad_s: self.yaw_rate_rad_s.mean(previous_nanos.unwrap_or(capture_nanos), capture_nanos),
+            yaw_rate_rad_s: self
+                .yaw_rate_rad_s
+                .mean(previous_nanos.unwrap_or(capture_nanos), capture_nanos),
         }
     }
 }

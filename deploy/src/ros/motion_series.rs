@@ -34,16 +34,22 @@ impl MotionSeries {
     /// The value at a time: between two measurements the straight line, else the nearest one that is near enough.
     pub(super) fn at(&self, nanos: u64) -> Option<f64> {
         let next = self.0.partition_point(|(time, _)| *time < nanos);
-        let before = next.checked_sub(1).and_then(|index| self.0.get(index)).copied();
+        let before = next
+            .checked_sub(1)
+            .and_then(|index| self.0.get(index))
+            .copied();
         let after = self.0.get(next).copied();
         match (before, after) {
             (Some((from, first)), Some((to, last))) if to - from <= MAX_GAP_NANOS => {
                 Some(first + (last - first) * seconds(nanos - from) / seconds(to - from))
             }
             _ => {
-                let near =
-                    [before, after].into_iter().flatten().filter(|(time, _)| time.abs_diff(nanos) <= MAX_GAP_NANOS);
-                near.min_by_key(|(time, _)| time.abs_diff(nanos)).map(|(_, value)| value)
+                let near = [before, after]
+                    .into_iter()
+                    .flatten()
+                    .filter(|(time, _)| time.abs_diff(nanos) <= MAX_GAP_NANOS);
+                near.min_by_key(|(time, _)| time.abs_diff(nanos))
+                    .map(|(_, value)| value)
             }
         }
     }
@@ -52,8 +58,14 @@ impl MotionSeries {
     /// or none after it.
     pub(super) fn mean(&self, from: u64, to: u64) -> Option<f64> {
         let last = self.at(to)?;
-        let Some(first) = self.at(from).filter(|_| from < to) else { return Some(last) };
-        let between = self.0.iter().copied().filter(|(time, _)| (from + 1..to).contains(time));
+        let Some(first) = self.at(from).filter(|_| from < to) else {
+            return Some(last);
+        };
+        let between = self
+            .0
+            .iter()
+            .copied()
+            .filter(|(time, _)| (from + 1..to).contains(time));
         let (mut sum, mut previous) = (0.0, (from, first));
         for next in between.chain([(to, last)]) {
             sum += 0.5 * (previous.1 + next.1) * seconds(next.0 - previous.0);
@@ -85,20 +97,34 @@ mod tests {
     fn a_value_is_interpolated_and_held_for_a_short_time() {
         let series = series(&[(1000, 2.0), (1020, 4.0), (1500, 9.0)]);
         let at = |ms: u64| series.at(ms * MS);
-        assert_eq!([at(1000), at(1010), at(1020)], [Some(2.0), Some(3.0), Some(4.0)]);
-        assert_eq!([at(900), at(1100), at(1600)], [Some(2.0), Some(4.0), Some(9.0)]);
+        assert_eq!(
+            [at(1000), at(1010), at(1020)],
+            [Some(2.0), Some(3.0), Some(4.0)]
+        );
+        assert_eq!(
+            [at(900), at(1100), at(1600)],
+            [Some(2.0), Some(4.0), Some(9.0)]
+        );
         assert_eq!([at(700), at(1250), at(1701)], [None; 3]);
         assert_eq!(MotionSeries::default().at(5), None);
     }
 
     #[test]
     fn the_mean_of_a_line_is_its_middle_and_that_of_a_constant_the_constant() {
-        let line = series(&(0..=10).map(|k| (1000 + 20 * k, k as f64)).collect::<Vec<_>>());
+        let line = series(
+            &(0..=10)
+                .map(|k| (1000 + 20 * k, k as f64))
+                .collect::<Vec<_>>(),
+        );
         assert!((line.mean(1000 * MS, 1200 * MS).unwrap() - 5.0).abs() < 1e-9);
         assert!((line.mean(1050 * MS, 1150 * MS).unwrap() - 5.0).abs() < 1e-9);
         let constant = series(&[(1000, 0.5), (1030, 0.5), (1110, 0.5)]);
         assert!((constant.mean(1010 * MS, 1200 * MS).unwrap() - 0.5).abs() < 1e-12);
-        assert_eq!(constant.mean(100 * MS, 1100 * MS), Some(0.5), "nothing is known of the beginning");
+        assert_eq!(
+            constant.mean(100 * MS, 1100 * MS),
+            Some(0.5),
+            "nothing is known of the beginning"
+        );
         assert_eq!(constant.mean(1100 * MS, 1100 * MS), Some(0.5));
         assert_eq!(constant.mean(1000 * MS, 2000 * MS), None);
     }
@@ -107,7 +133,10 @@ mod tests {
     fn a_bag_that_begins_again_leaves_nothing_of_before() {
         let mut series = series(&[(1000, 1.0), (1020, 2.0)]);
         assert_eq!(series.add(500 * MS, 7.0), 2);
-        assert_eq!((series.at(1010 * MS), series.at(500 * MS)), (None, Some(7.0)));
+        assert_eq!(
+            (series.at(1010 * MS), series.at(500 * MS)),
+            (None, Some(7.0))
+        );
         (0..10_000).for_each(|k| assert_eq!(series.add(3_000 * MS + k, 0.0), 0));
         assert_eq!(series.0.len(), MOST);
         assert_eq!(series.add(9_000 * MS, 0.0), 0);

@@ -87,7 +87,12 @@ impl NodeReport {
 ///
 /// # Errors
 /// [`BusError`] when a session fails. Errors of single messages are counted and logged.
-pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+pub fn run(
+    bus: &Bus,
+    session: &RosSession,
+    options: &NodeOptions,
+    stop: &Stop,
+) -> Result<NodeReport, BusError> {
     let streams = [Stream::Imu, Stream::Pose, Stream::Detections];
     let run = &bus.identity().run;
     let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
@@ -102,7 +107,15 @@ pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) 
     });
     let _watched = watched.into_iter().collect::<Result<Vec<_>, _>>()?;
     let inputs = (!options.lidars.is_empty())
-        .then(|| LidarInputs::open(bus, session, (&options.lidars, &options.motions), options.max_intensity, stop))
+        .then(|| {
+            LidarInputs::open(
+                bus,
+                session,
+                (&options.lidars, &options.motions),
+                options.max_intensity,
+                stop,
+            )
+        })
         .transpose()?;
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
@@ -110,8 +123,14 @@ pub fn run(bus: &Bus, session: &RosSession, options: &NodeOptions, stop: &Stop) 
         let followed = follow(scope, (bus, session, options), &tap, &members);
         // After an error the threads of the LiDARs have to end too.
         stop.request();
-        let (lidar, motion) = reading.map(|reading| reading.join().unwrap_or_default()).unwrap_or_default();
-        followed.map(|report| NodeReport { lidar, motion, ..report })
+        let (lidar, motion) = reading
+            .map(|reading| reading.join().unwrap_or_default())
+            .unwrap_or_default();
+        followed.map(|report| NodeReport {
+            lidar,
+            motion,
+            ..report
+        })
     })?;
     presence.withdraw()?;
     Ok(report)
@@ -126,9 +145,15 @@ fn follow<'scope, 'env>(
 ) -> Result<NodeReport, BusError> {
     let mut node = Node::new(scope, bus, session, options)?;
     let followed = node.follow(tap, members);
-    std::mem::take(&mut node.sweeps).into_values().for_each(Forwarding::end);
+    std::mem::take(&mut node.sweeps)
+        .into_values()
+        .for_each(Forwarding::end);
     let left_out = node.left_out + tap.overwritten() + tap.undelivered();
-    followed.map(|()| NodeReport { published: node.published, left_out, ..NodeReport::default() })
+    followed.map(|()| NodeReport {
+        published: node.published,
+        left_out,
+        ..NodeReport::default()
+    })
 }
 
 /// Sweeps of one vehicle, forwarded on a thread of their own.
@@ -161,7 +186,10 @@ impl<'scope, 'env> Node<'scope, 'env> {
         session: &'env RosSession,
         options: &'env NodeOptions,
     ) -> Result<Self, BusError> {
-        let initial_pose = options.initial_pose_of.clone().map(|cav| InitialPose::of(cav, options.mount));
+        let initial_pose = options
+            .initial_pose_of
+            .clone()
+            .map(|cav| InitialPose::of(cav, options.mount));
         let mut node = Self {
             scope,
             bus,
@@ -179,7 +207,10 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let clock = options.with_clock.then_some(RosTopic::Clock);
         let initial_pose = node.initial_pose.is_some().then_some(InitialPose::TOPIC);
         let topics = [RosTopic::Tf, RosTopic::TfStatic, RosTopic::Diagnostics].into_iter();
-        topics.chain(clock).chain(initial_pose).try_for_each(|topic| node.declare(topic))?;
+        topics
+            .chain(clock)
+            .chain(initial_pose)
+            .try_for_each(|topic| node.declare(topic))?;
         Ok(node)
     }
 
@@ -204,7 +235,10 @@ impl<'scope, 'env> Node<'scope, 'env> {
     /// A process of a vehicle has joined or left: its topics appear, or disappear.
     fn note(&mut self, event: LivelinessEvent) -> Result<(), BusError> {
         match event {
-            LivelinessEvent::Joined { role: Role::Agent, cav } => {
+            LivelinessEvent::Joined {
+                role: Role::Agent,
+                cav,
+            } => {
                 self.agents.insert(cav.clone());
                 [VehicleTopic::Pose, VehicleTopic::Odometry]
                     .into_iter()
@@ -214,10 +248,15 @@ impl<'scope, 'env> Node<'scope, 'env> {
                 }
                 self.publish_static_transforms()
             }
-            LivelinessEvent::Joined { cav, .. } => [VehicleTopic::Detections, VehicleTopic::Markers]
-                .into_iter()
-                .try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic))),
-            LivelinessEvent::Left { role: Role::Agent, cav } => {
+            LivelinessEvent::Joined { cav, .. } => {
+                [VehicleTopic::Detections, VehicleTopic::Markers]
+                    .into_iter()
+                    .try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic)))
+            }
+            LivelinessEvent::Left {
+                role: Role::Agent,
+                cav,
+            } => {
                 self.agents.remove(&cav);
                 self.withdraw(&cav, &[VehicleTopic::Pose, VehicleTopic::Odometry]);
                 if let Some(forwarding) = self.sweeps.remove(&cav) {
@@ -234,7 +273,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
 
     fn withdraw(&mut self, cav: &CavId, topics: &[VehicleTopic]) {
         for topic in topics {
-            self.publishers.remove(&RosTopic::Vehicle(cav.clone(), *topic));
+            self.publishers
+                .remove(&RosTopic::Vehicle(cav.clone(), *topic));
         }
     }
 
@@ -247,10 +287,14 @@ impl<'scope, 'env> Node<'scope, 'env> {
 
     fn forward_sweeps(&mut self, cav: &CavId) -> Result<(), BusError> {
         // The LiDAR comes from the ROS 2 network: its own topic is there.
-        if self.sweeps.contains_key(cav) || self.options.lidars.iter().any(|source| source.cav == *cav) {
+        if self.sweeps.contains_key(cav)
+            || self.options.lidars.iter().any(|source| source.cav == *cav)
+        {
             return Ok(());
         }
-        let mut publisher = self.session.publisher(&RosTopic::Vehicle(cav.clone(), VehicleTopic::Points))?;
+        let mut publisher = self
+            .session
+            .publisher(&RosTopic::Vehicle(cav.clone(), VehicleTopic::Points))?;
         let ending = Arc::<AtomicBool>::default();
         let (bus, vehicle, ended) = (self.bus, cav.clone(), Arc::clone(&ending));
         let thread = self.scope.spawn(move || {
@@ -258,7 +302,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
                 tracing::error!("sweeps of {vehicle} are no longer published: {error}");
             }
         });
-        self.sweeps.insert(cav.clone(), Forwarding { ending, thread });
+        self.sweeps
+            .insert(cav.clone(), Forwarding { ending, thread });
         Ok(())
     }
 
@@ -284,17 +329,37 @@ impl<'scope, 'env> Node<'scope, 'env> {
     }
 
     /// The clock before the message: nothing has a stamp in the future.
-    fn tell_time(&mut self, cav: &CavId, stream: Stream, capture_nanos: u64) -> Result<(), BusError> {
-        match self.clock.advance(cav, stream, capture_nanos).filter(|_| self.options.with_clock) {
+    fn tell_time(
+        &mut self,
+        cav: &CavId,
+        stream: Stream,
+        capture_nanos: u64,
+    ) -> Result<(), BusError> {
+        match self
+            .clock
+            .advance(cav, stream, capture_nanos)
+            .filter(|_| self.options.with_clock)
+        {
             Some(nanos) => self.publish(RosTopic::Clock, ros2::clock(nanos)),
             None => Ok(()),
         }
     }
 
-    fn tell_initial_pose(&mut self, cav: &CavId, capture_nanos: u64, message: &Message) -> Result<(), BusError> {
-        let Some(initial) = &mut self.initial_pose else { return Ok(()) };
+    fn tell_initial_pose(
+        &mut self,
+        cav: &CavId,
+        capture_nanos: u64,
+        message: &Message,
+    ) -> Result<(), BusError> {
+        let Some(initial) = &mut self.initial_pose else {
+            return Ok(());
+        };
         let publishers = &self.publishers;
-        let is_wanted = || publishers.get(&InitialPose::TOPIC).is_some_and(RosPublisher::is_wanted);
+        let is_wanted = || {
+            publishers
+                .get(&InitialPose::TOPIC)
+                .is_some_and(RosPublisher::is_wanted)
+        };
         match initial.of_message(cav, capture_nanos, message, is_wanted) {
             Some(cdr) => self.publish(InitialPose::TOPIC, cdr),
             None => Ok(()),
@@ -311,9 +376,13 @@ impl<'scope, 'env> Node<'scope, 'env> {
 
     fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<(), BusError> {
         self.declare(topic.clone())?;
-        let name = topic.name(self.session.node().namespace.as_ref()).to_string();
+        let name = topic
+            .name(self.session.node().namespace.as_ref())
+            .to_string();
         *self.published.entry(name).or_default() += 1;
-        self.publishers.get_mut(&topic).map_or(Ok(()), |publisher| publisher.publish(cdr))
+        self.publishers
+            .get_mut(&topic)
+            .map_or(Ok(()), |publisher| publisher.publish(cdr))
     }
 }
 

@@ -26,7 +26,10 @@ pub(super) struct RosPublisher {
 
 enum Kind {
     /// Volatile.
-    Plain { publisher: zenoh::pubsub::Publisher<'static>, has_subscribers: Arc<AtomicBool> },
+    Plain {
+        publisher: zenoh::pubsub::Publisher<'static>,
+        has_subscribers: Arc<AtomicBool>,
+    },
     /// Transient local: with the cache from which late subscribers get the last messages.
     Latched(AdvancedPublisher<'static>),
 }
@@ -39,26 +42,43 @@ impl RosPublisher {
         qos: Qos,
         (gid, token): (Gid, LivelinessToken),
     ) -> Result<Self, BusError> {
-        let refused = |cause: zenoh::Error| BusError::zenoh(format!("declaring a publisher on {key}"), &cause);
+        let refused = |cause: zenoh::Error| {
+            BusError::zenoh(format!("declaring a publisher on {key}"), &cause)
+        };
         // As in rmw_zenoh: a slow receiver loses messages, nobody waits for it.
-        let builder = session.declare_publisher(key.to_owned()).congestion_control(CongestionControl::Drop);
+        let builder = session
+            .declare_publisher(key.to_owned())
+            .congestion_control(CongestionControl::Drop);
         let kind = if qos.is_latched {
             let cache = CacheConfig::default().max_samples(qos.depth as usize);
             let sequence = MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT);
-            let builder = builder.cache(cache).sample_miss_detection(sequence).publisher_detection();
+            let builder = builder
+                .cache(cache)
+                .sample_miss_detection(sequence)
+                .publisher_detection();
             Kind::Latched(builder.wait().map_err(refused)?)
         } else {
             let publisher = builder.wait().map_err(refused)?;
             let has_subscribers = bus::has_subscribers(&publisher).map_err(refused)?;
-            Kind::Plain { publisher, has_subscribers }
+            Kind::Plain {
+                publisher,
+                has_subscribers,
+            }
         };
-        Ok(Self { kind, gid, published: 0, _token: token })
+        Ok(Self {
+            kind,
+            gid,
+            published: 0,
+            _token: token,
+        })
     }
 
     /// True if a message would reach somebody, now or later.
     pub(super) fn is_wanted(&self) -> bool {
         match &self.kind {
-            Kind::Plain { has_subscribers, .. } => has_subscribers.load(Ordering::Relaxed),
+            Kind::Plain {
+                has_subscribers, ..
+            } => has_subscribers.load(Ordering::Relaxed),
             Kind::Latched(_) => true,
         }
     }
@@ -67,7 +87,12 @@ impl RosPublisher {
     pub(super) fn publish(&mut self, cdr: Vec<u8>) -> Result<(), BusError> {
         self.published = self.published.saturating_add(1);
         let source_nanos = i64::try_from(unix_nanos()).unwrap_or(i64::MAX);
-        let attachment = Attachment { sequence: self.published, source_nanos, gid: self.gid }.to_bytes();
+        let attachment = Attachment {
+            sequence: self.published,
+            source_nanos,
+            gid: self.gid,
+        }
+        .to_bytes();
         let put = match &self.kind {
             Kind::Plain { publisher, .. } => publisher.put(cdr).attachment(attachment).wait(),
             Kind::Latched(publisher) => publisher.put(cdr).attachment(attachment).wait(),

@@ -18,14 +18,22 @@ pub(super) struct RefusalLog {
 
 impl RefusalLog {
     pub(super) fn of(topic: RosName, ros_type: RosType) -> Self {
-        Self { topic, ros_type, logged: None }
+        Self {
+            topic,
+            ros_type,
+            logged: None,
+        }
     }
 
     /// Logs why a message is left out.
     pub(super) fn warn(&mut self, reason: &dyn Display) {
         if self.logged.is_none_or(|logged| logged.elapsed() > PERIOD) {
             self.logged = Some(Instant::now());
-            tracing::warn!("{}: {} left out: {reason}", self.topic, self.ros_type.name());
+            tracing::warn!(
+                "{}: {} left out: {reason}",
+                self.topic,
+                self.ros_type.name()
+            );
         }
     }
 }

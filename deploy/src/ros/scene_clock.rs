@@ -14,9 +14,18 @@ pub(super) struct SceneClock {
 
 impl SceneClock {
     /// The new time, if a message of `stream` changes it.
-    pub(super) fn advance(&mut self, cav: &CavId, stream: Stream, capture_nanos: u64) -> Option<u64> {
+    pub(super) fn advance(
+        &mut self,
+        cav: &CavId,
+        stream: Stream,
+        capture_nanos: u64,
+    ) -> Option<u64> {
         let is_sensor = stream == Stream::Imu;
-        let previous = if is_sensor { self.sensors.insert(cav.clone(), capture_nanos) } else { None };
+        let previous = if is_sensor {
+            self.sensors.insert(cav.clone(), capture_nanos)
+        } else {
+            None
+        };
         if previous.is_some_and(|previous| capture_nanos < previous) {
             self.sensors.retain(|_, nanos| *nanos <= capture_nanos);
             return self.now_nanos.insert(capture_nanos).to_owned().into();
@@ -32,15 +41,34 @@ mod tests {
 
     #[test]
     fn the_clock_follows_the_sensors_forward_and_back_to_the_beginning() {
-        let (mut clock, [a, b]) = (SceneClock::default(), ["1", "2"].map(|id| CavId::new(id).unwrap()));
+        let (mut clock, [a, b]) = (
+            SceneClock::default(),
+            ["1", "2"].map(|id| CavId::new(id).unwrap()),
+        );
         assert_eq!(clock.advance(&a, Stream::Imu, 100), Some(100));
-        assert_eq!(clock.advance(&b, Stream::Imu, 100), None, "it is that time already");
+        assert_eq!(
+            clock.advance(&b, Stream::Imu, 100),
+            None,
+            "it is that time already"
+        );
         assert_eq!(clock.advance(&a, Stream::Imu, 200), Some(200));
-        assert_eq!(clock.advance(&b, Stream::Pose, 100), None, "a result of an earlier time");
+        assert_eq!(
+            clock.advance(&b, Stream::Pose, 100),
+            None,
+            "a result of an earlier time"
+        );
         assert_eq!(clock.advance(&b, Stream::Imu, 200), None);
-        assert_eq!(clock.advance(&a, Stream::Imu, 50), Some(50), "the scene has begun again");
+        assert_eq!(
+            clock.advance(&a, Stream::Imu, 50),
+            Some(50),
+            "the scene has begun again"
+        );
         assert_eq!(clock.advance(&b, Stream::Imu, 50), None);
         assert_eq!(clock.advance(&b, Stream::Imu, 150), Some(150));
-        assert_eq!(clock.advance(&a, Stream::Detections, 300), Some(300), "without sensors results set it");
+        assert_eq!(
+            clock.advance(&a, Stream::Detections, 300),
+            Some(300),
+            "without sensors results set it"
+        );
     }
 }

@@ -40,9 +40,20 @@ impl RosSession {
         namespace: Option<RosName>,
         distribution: Distribution,
     ) -> Result<Self, BusError> {
-        let node = Node { domain_id, zid: session.zid().to_string(), namespace, name: NODE_NAME.into(), distribution };
+        let node = Node {
+            domain_id,
+            zid: session.zid().to_string(),
+            namespace,
+            name: NODE_NAME.into(),
+            distribution,
+        };
         let token = declare_token(&session, &node.token())?;
-        Ok(Self { session, node, endpoints: AtomicU32::new(0), _token: token })
+        Ok(Self {
+            session,
+            node,
+            endpoints: AtomicU32::new(0),
+            _token: token,
+        })
     }
 
     /// The node.
@@ -55,7 +66,8 @@ impl RosSession {
     pub(super) fn publisher(&self, topic: &RosTopic) -> Result<RosPublisher, BusError> {
         let name = topic.name(self.node.namespace.as_ref());
         let key = self.node.key(&name, topic.ros_type());
-        let token = self.endpoint_token(EndpointKind::Publisher, name, topic.ros_type(), topic.qos());
+        let token =
+            self.endpoint_token(EndpointKind::Publisher, name, topic.ros_type(), topic.qos());
         let declared = declare_token(&self.session, &token)?;
         RosPublisher::declare(&self.session, &key, topic.qos(), (gid(&token), declared))
     }
@@ -70,15 +82,35 @@ impl RosSession {
     ) -> Result<RosSubscription, BusError> {
         // Publishers of every distribution are heard, whatever hash they write.
         let keys = self.node.any_hash(topic, ros_type);
-        let subscriber = self.session.declare_subscriber(&keys).callback(receive).wait();
-        let subscriber = subscriber.map_err(|cause| BusError::zenoh(format!("subscribing to {keys}"), &cause))?;
+        let subscriber = self
+            .session
+            .declare_subscriber(&keys)
+            .callback(receive)
+            .wait();
+        let subscriber = subscriber
+            .map_err(|cause| BusError::zenoh(format!("subscribing to {keys}"), &cause))?;
         let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);
-        Ok(RosSubscription { _subscriber: subscriber, _token: declare_token(&self.session, &token)? })
+        Ok(RosSubscription {
+            _subscriber: subscriber,
+            _token: declare_token(&self.session, &token)?,
+        })
     }
 
-    fn endpoint_token(&self, kind: EndpointKind, topic: RosName, ros_type: RosType, qos: Qos) -> String {
+    fn endpoint_token(
+        &self,
+        kind: EndpointKind,
+        topic: RosName,
+        ros_type: RosType,
+        qos: Qos,
+    ) -> String {
         let id = self.endpoints.fetch_add(1, Ordering::Relaxed) + 1;
-        self.node.endpoint_token(&Endpoint { id, kind, topic, ros_type, qos })
+        self.node.endpoint_token(&Endpoint {
+            id,
+            kind,
+            topic,
+            ros_type,
+            qos,
+        })
     }
 }
 

@@ -23,7 +23,10 @@ pub(super) fn forward(
     publisher: &mut RosPublisher,
     ending: &Arc<AtomicBool>,
 ) -> Result<(), BusError> {
-    let topic = Topic::Stream { cav: cav.clone(), stream: Stream::Lidar };
+    let topic = Topic::Stream {
+        cav: cav.clone(),
+        stream: Stream::Lidar,
+    };
     let key = KeyExpr::one(&bus.key(topic.clone()));
     let mut translator = Translator::new(&bus.identity().run);
     let is_ending = || ending.load(Ordering::Relaxed);
@@ -34,7 +37,9 @@ pub(super) fn forward(
         }
         let tap = bus.tap(std::slice::from_ref(&key), 1)?;
         while publisher.is_wanted() && !is_ending() {
-            let Pop::Item(_, raw) = tap.take(Some(Instant::now() + POLL_PERIOD)) else { continue };
+            let Pop::Item(_, raw) = tap.take(Some(Instant::now() + POLL_PERIOD)) else {
+                continue;
+            };
             for message in translated(&mut translator, &topic, &raw) {
                 publisher.publish(message.cdr)?;
             }
@@ -43,7 +48,11 @@ pub(super) fn forward(
     Ok(())
 }
 
-fn translated(translator: &mut Translator, topic: &Topic, raw: &RawMessage) -> Vec<ros2::RosMessage> {
+fn translated(
+    translator: &mut Translator,
+    topic: &Topic,
+    raw: &RawMessage,
+) -> Vec<ros2::RosMessage> {
     match wire::decode_any(raw.pieces(), &Limits::DEFAULT) {
         Ok((header, _)) if header.kind == Kind::Control => Vec::new(),
         Ok((header, message)) => translator.translate(topic, header.stamp.capture_nanos, &message),

@@ -78,7 +78,10 @@ impl FrameRecord {
             agent_frame: None,
             capture_nanos,
             latency_ms: None,
-            stamps: StageStamps { began_nanos: Some(began_nanos), ..StageStamps::default() },
+            stamps: StageStamps {
+                began_nanos: Some(began_nanos),
+                ..StageStamps::default()
+            },
             detected: 0,
             truth,
             found: 0,

@@ -128,7 +128,10 @@ impl FrameScores {
     /// Average precision over the answered ticks, ordered by score over all frames, and ordered by frame.
     #[must_use]
     pub fn average_precision(&self) -> (ByIou, ByIou) {
-        (by_iou(&self.scorer, Ordering::Global), by_iou(&self.scorer, Ordering::Frame))
+        (
+            by_iou(&self.scorer, Ordering::Global),
+            by_iou(&self.scorer, Ordering::Frame),
+        )
     }
 
     /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
@@ -166,8 +169,14 @@ impl FrameScores {
     /// Latencies of all frames.
     #[must_use]
     pub fn latencies(&self) -> Latencies {
-        let sample: Vec<f64> = self.records.iter().filter_map(|record| record.latency_ms).collect();
-        Latencies { capture_to_detection: Percentiles::of(&sample) }
+        let sample: Vec<f64> = self
+            .records
+            .iter()
+            .filter_map(|record| record.latency_ms)
+            .collect();
+        Latencies {
+            capture_to_detection: Percentiles::of(&sample),
+        }
     }
 
     /// Ages of all fused data.
@@ -179,9 +188,15 @@ impl FrameScores {
     /// From the first to the last frame on the scene's clock, seconds; scenarios that follow one another add up.
     #[must_use]
     pub fn seconds(&self) -> f64 {
-        let steps = self.records.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let steps = self
+            .records
+            .windows(2)
+            .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
         // The clock jumps at the start of another scenario, ahead or back.
-        steps.filter(|nanos| *nanos < SCENARIO_GAP_NANOS).map(|nanos| nanos as f64 * 1e-9).sum()
+        steps
+            .filter(|nanos| *nanos < SCENARIO_GAP_NANOS)
+            .map(|nanos| nanos as f64 * 1e-9)
+            .sum()
     }
 
     /// Bytes of all fused messages.
@@ -203,9 +218,14 @@ impl FrameScores {
     }
 
     fn judge(&mut self, capture_nanos: u64, tick: Tick) {
-        let Some((began_nanos, truth)) = tick.truth else { return };
-        let world_from_lidar: Vec<(CavId, Pose)> =
-            truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
+        let Some((began_nanos, truth)) = tick.truth else {
+            return;
+        };
+        let world_from_lidar: Vec<(CavId, Pose)> = truth
+            .agents
+            .iter()
+            .map(|agent| (agent.cav.clone(), agent.world_from_lidar))
+            .collect();
         self.judge_poses(&tick.poses, &world_from_lidar);
         let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
         if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
@@ -213,19 +233,32 @@ impl FrameScores {
             return;
         }
         let boxes = true_boxes(&truth, &self.ego, &self.rule);
-        let answer = tick
-            .result
-            .as_ref()
-            .map(|(done_nanos, result)| Answer { published_nanos: Some(*done_nanos), detections: &result.detections });
-        let streamed = self.judge_live((truth.tick, began_nanos), &world_from_lidar, &boxes, answer);
+        let answer = tick.result.as_ref().map(|(done_nanos, result)| Answer {
+            published_nanos: Some(*done_nanos),
+            detections: &result.detections,
+        });
+        let streamed =
+            self.judge_live((truth.tick, began_nanos), &world_from_lidar, &boxes, answer);
         let Some((done_nanos, result)) = tick.result else {
             let (tick, truth) = (truth.tick, boxes.len());
-            return self.records.push(FrameRecord::unanswered(tick, capture_nanos, began_nanos, truth, streamed));
+            return self.records.push(FrameRecord::unanswered(
+                tick,
+                capture_nanos,
+                began_nanos,
+                truth,
+                streamed,
+            ));
         };
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
-        self.judge_result((truth.tick, capture_nanos), (stamps, streamed), result, boxes, world_from_lidar);
+        self.judge_result(
+            (truth.tick, capture_nanos),
+            (stamps, streamed),
+            result,
+            boxes,
+            world_from_lidar,
+        );
     }
 
     /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
@@ -240,11 +273,29 @@ impl FrameScores {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
-        let stamps = StageStamps { detected_ms: latency_ms, ..StageStamps::default() };
-        let published_nanos = latency_ms.map(|latency_ms| capture_nanos.saturating_add((latency_ms * 1e6) as u64));
-        let answer = Answer { published_nanos, detections: &result.detections };
-        let streamed = self.judge_live((tick, capture_nanos), &world_from_lidar, &boxes, Some(answer));
-        self.judge_result((tick, capture_nanos), (stamps, streamed), result, boxes, world_from_lidar);
+        let stamps = StageStamps {
+            detected_ms: latency_ms,
+            ..StageStamps::default()
+        };
+        let published_nanos =
+            latency_ms.map(|latency_ms| capture_nanos.saturating_add((latency_ms * 1e6) as u64));
+        let answer = Answer {
+            published_nanos,
+            detections: &result.detections,
+        };
+        let streamed = self.judge_live(
+            (tick, capture_nanos),
+            &world_from_lidar,
+            &boxes,
+            Some(answer),
+        );
+        self.judge_result(
+            (tick, capture_nanos),
+            (stamps, streamed),
+            result,
+            boxes,
+            world_from_lidar,
+        );
     }
 
     /// Scores a tick with or without a result; returns the result that was the newest at its publication.
@@ -258,7 +309,16 @@ impl FrameScores {
         let world_from_ego = true_pose(world_from_lidar, &self.ego).copied();
         let ([x_low, x_high], [y_low, y_high]) = (self.rule.x_m, self.rule.y_m);
         let area_m = [x_low, y_low, x_high, y_high];
-        self.live.add(&TickTruth { tick, began_nanos, world_from_ego, boxes, area_m }, answer)
+        self.live.add(
+            &TickTruth {
+                tick,
+                began_nanos,
+                world_from_ego,
+                boxes,
+                area_m,
+            },
+            answer,
+        )
     }
 
     fn judge_result(
@@ -270,10 +330,19 @@ impl FrameScores {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         let found = self.score(&result, &boxes);
-        let bytes: Vec<(u64, u64)> =
-            result.fused.iter().map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes)).collect();
-        let ages_ms = result.fused.iter().map(|neighbour| neighbour.age_nanos as f64 * 1e-6);
-        let ego_error = result.pose.world_from_cav().zip(true_pose(&world_from_lidar, &self.ego));
+        let bytes: Vec<(u64, u64)> = result
+            .fused
+            .iter()
+            .map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes))
+            .collect();
+        let ages_ms = result
+            .fused
+            .iter()
+            .map(|neighbour| neighbour.age_nanos as f64 * 1e-6);
+        let ego_error = result
+            .pose
+            .world_from_cav()
+            .zip(true_pose(&world_from_lidar, &self.ego));
         let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
         self.records.push(FrameRecord {
             tick,
@@ -287,7 +356,11 @@ impl FrameScores {
             fused: result.fused.len(),
             skipped: result.skipped.len(),
             oldest_ms: ages_ms.clone().max_by(f64::total_cmp),
-            stale: result.skipped.iter().filter(|left_out| left_out.reason == Some(DropReason::Stale)).count(),
+            stale: result
+                .skipped
+                .iter()
+                .filter(|left_out| left_out.reason == Some(DropReason::Stale))
+                .count(),
             payload_bytes: bytes.iter().map(|(payload, _)| payload).sum(),
             wire_bytes: bytes.iter().map(|(_, wire)| wire).sum(),
             ego_error_m: ego_error.map(|error| error.distance_m),
@@ -309,7 +382,9 @@ impl FrameScores {
     fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {
         for (cav, estimate) in poses {
             match (estimate.world_from_cav(), true_pose(truth, cav)) {
-                (Some(found), Some(truth)) => self.pose_errors.push(PoseError::between(found, truth)),
+                (Some(found), Some(truth)) => {
+                    self.pose_errors.push(PoseError::between(found, truth))
+                }
                 (None, Some(_)) => self.no_pose += 1,
                 // A vehicle that is not in the scene has no truth.
                 (_, None) => {}
@@ -326,16 +401,25 @@ impl FrameScores {
     ) {
         let worth = |fused: usize, boxes: usize| (fused, boxes);
         let better = self.best.as_ref().is_none_or(|best| {
-            worth(result.fused.len(), boxes.len()) > worth(best.result.fused.len(), best.truth.len())
+            worth(result.fused.len(), boxes.len())
+                > worth(best.result.fused.len(), best.truth.len())
         });
         if better {
-            self.best = Some(JudgedFrame { tick, result, truth: boxes, world_from_lidar });
+            self.best = Some(JudgedFrame {
+                tick,
+                result,
+                truth: boxes,
+                world_from_lidar,
+            });
         }
     }
 }
 
 fn true_pose<'a>(truth: &'a [(CavId, Pose)], cav: &CavId) -> Option<&'a Pose> {
-    truth.iter().find(|(known, _)| known == cav).map(|(_, pose)| pose)
+    truth
+        .iter()
+        .find(|(known, _)| known == cav)
+        .map(|(_, pose)| pose)
 }
 
 #[cfg(test)]

@@ -58,21 +58,45 @@ pub(super) struct Answer<'a> {
 impl LivePrecision {
     /// Adds a tick and its detections, if there are some; returns the detections that were newest at that time, with
     /// their score.
-    pub(super) fn add(&mut self, truth: &TickTruth<'_>, answer: Option<Answer<'_>>) -> Option<StreamedResult> {
+    pub(super) fn add(
+        &mut self,
+        truth: &TickTruth<'_>,
+        answer: Option<Answer<'_>>,
+    ) -> Option<StreamedResult> {
         self.ticks += 1;
         self.answered += u64::from(answer.is_some());
-        self.all_ticks.add(answer.as_ref().map_or(&[], |answer| answer.detections), truth.boxes);
+        self.all_ticks.add(
+            answer.as_ref().map_or(&[], |answer| answer.detections),
+            truth.boxes,
+        );
         let streamed = self.stream(truth);
         match answer {
-            Some(Answer { published_nanos: Some(nanos), detections }) => {
-                let TickTruth { tick, began_nanos, world_from_ego, .. } = *truth;
+            Some(Answer {
+                published_nanos: Some(nanos),
+                detections,
+            }) => {
+                let TickTruth {
+                    tick,
+                    began_nanos,
+                    world_from_ego,
+                    ..
+                } = *truth;
                 let detections = detections.to_vec();
-                self.published.push_back(Published { nanos, tick, began_nanos, world_from_ego, detections });
+                self.published.push_back(Published {
+                    nanos,
+                    tick,
+                    began_nanos,
+                    world_from_ego,
+                    detections,
+                });
                 if self.published.len() > MOST_KEPT {
                     self.published.pop_front();
                 }
             }
-            Some(Answer { published_nanos: None, .. }) => self.is_untimed = true,
+            Some(Answer {
+                published_nanos: None,
+                ..
+            }) => self.is_untimed = true,
             None => {}
         }
         streamed
@@ -104,26 +128,52 @@ impl LivePrecision {
         let detections = known.as_ref().map_or(&[][..], |(_, detections)| detections);
         self.streaming.add(detections, truth.boxes);
         let found = found_by_last(&self.streaming, detections.len());
-        known.map(|(of, detections)| StreamedResult { detected: detections.len(), found, ..of })
+        known.map(|(of, detections)| StreamedResult {
+            detected: detections.len(),
+            found,
+            ..of
+        })
     }
 
     /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick. Older
     /// ones are dropped.
     fn newest(&mut self, truth: &TickTruth<'_>) -> Option<(StreamedResult, Vec<Detection>)> {
-        let index = self.published.iter().rposition(|published| published.nanos <= truth.began_nanos)?;
+        let index = self
+            .published
+            .iter()
+            .rposition(|published| published.nanos <= truth.began_nanos)?;
         self.published.drain(..index);
-        let Published { tick, began_nanos, world_from_ego, detections, .. } = self.published.front()?;
+        let Published {
+            tick,
+            began_nanos,
+            world_from_ego,
+            detections,
+            ..
+        } = self.published.front()?;
         let now_from_then = match (truth.world_from_ego, world_from_ego) {
             (Some(now), Some(then)) => now.from_world(then).isometry(),
             _ => Pose::IDENTITY.isometry(),
         };
         let moved = detections.iter().map(|found| {
             let box3d = found.box3d.transformed(&now_from_then);
-            Detection { box3d, ..found.clone() }
+            Detection {
+                box3d,
+                ..found.clone()
+            }
         });
-        let within = moved.filter(|found| corners_within(&found.box3d.corners(), truth.area_m)).collect();
+        let within = moved
+            .filter(|found| corners_within(&found.box3d.corners(), truth.area_m))
+            .collect();
         let age_ms = (truth.began_nanos.saturating_sub(*began_nanos)) as f64 * 1e-6;
-        Some((StreamedResult { tick: *tick, age_ms, detected: 0, found: 0 }, within))
+        Some((
+            StreamedResult {
+                tick: *tick,
+                age_ms,
+                detected: 0,
+                found: 0,
+            },
+            within,
+        ))
     }
 }
 
@@ -134,7 +184,11 @@ mod tests {
     const AREA_M: [f64; 4] = [-50.0, -40.0, 50.0, 40.0];
 
     fn car(x: f64) -> Box3d {
-        Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 }
+        Box3d {
+            center_m: [x, 0.0, -1.0],
+            size_m: [4.0, 2.0, 1.5],
+            heading_rad: 0.0,
+        }
     }
 
     /// The ego drives 1 m along x from tick to tick, ten a second, towards a car that stands at 20 m in the world; the
@@ -151,17 +205,36 @@ mod tests {
             let ego_x = tick as f64;
             let boxes = [car(20.0 + speed_m * tick as f64 - ego_x)];
             let world_from_ego = Some(Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0));
-            let found = [Detection { box3d: boxes[0], score: 0.9, source: None }];
+            let found = [Detection {
+                box3d: boxes[0],
+                score: 0.9,
+                source: None,
+            }];
             let published_nanos = Some(began_nanos + latency_ms * 1_000_000);
-            let answer = answered.contains(&tick).then_some(Answer { published_nanos, detections: &found });
-            live.add(&TickTruth { tick, began_nanos, world_from_ego, boxes: &boxes, area_m: AREA_M }, answer)
+            let answer = answered.contains(&tick).then_some(Answer {
+                published_nanos,
+                detections: &found,
+            });
+            live.add(
+                &TickTruth {
+                    tick,
+                    began_nanos,
+                    world_from_ego,
+                    boxes: &boxes,
+                    area_m: AREA_M,
+                },
+                answer,
+            )
         });
         let streamed = streamed.collect();
         (live, streamed)
     }
 
     fn streaming(ticks: u64, answered: &[u64], latency_ms: u64, speed_m: f64) -> ByIou {
-        run(ticks, answered, latency_ms, speed_m).0.streaming().unwrap()
+        run(ticks, answered, latency_ms, speed_m)
+            .0
+            .streaming()
+            .unwrap()
     }
 
     #[test]
@@ -182,7 +255,14 @@ mod tests {
     #[test]
     fn each_tick_names_the_result_that_it_was_scored_with() {
         let (_, streamed) = run(4, &[0, 2], 150, 0.0);
-        let of_first = |age_ms| Some(StreamedResult { tick: 0, age_ms, detected: 1, found: 1 });
+        let of_first = |age_ms| {
+            Some(StreamedResult {
+                tick: 0,
+                age_ms,
+                detected: 1,
+                found: 1,
+            })
+        };
         assert_eq!(streamed, [None, None, of_first(200.0), of_first(300.0)]);
     }
 
@@ -192,20 +272,43 @@ mod tests {
         let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
         assert!(is_near(streaming(5, &[0, 1, 2, 3, 4], 100, 0.5).at_70, 0.8));
         let late = streaming(5, &[0, 1, 2, 3, 4], 200, 0.5);
-        assert!(is_near(late.at_50, 0.6) && is_near(late.at_70, 0.0), "{late:?}");
+        assert!(
+            is_near(late.at_50, 0.6) && is_near(late.at_70, 0.0),
+            "{late:?}"
+        );
     }
 
     #[test]
     fn boxes_that_the_ego_has_passed_are_not_judged() {
         let mut live = LivePrecision::default();
-        let found = [Detection { box3d: car(-48.0), score: 0.9, source: None }];
+        let found = [Detection {
+            box3d: car(-48.0),
+            score: 0.9,
+            source: None,
+        }];
         for (tick, boxes) in (0..).zip(&[vec![car(-48.0)], vec![car(10.0)]]) {
             let began_nanos = 1_000 * tick;
             let world_from_ego = Some(Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0));
-            let answer = (tick == 0).then_some(Answer { published_nanos: Some(began_nanos), detections: &found });
-            live.add(&TickTruth { tick, began_nanos, world_from_ego, boxes, area_m: AREA_M }, answer);
+            let answer = (tick == 0).then_some(Answer {
+                published_nanos: Some(began_nanos),
+                detections: &found,
+            });
+            live.add(
+                &TickTruth {
+                    tick,
+                    began_nanos,
+                    world_from_ego,
+                    boxes,
+                    area_m: AREA_M,
+                },
+                answer,
+            );
         }
-        assert_eq!(live.streaming.tallies()[0].matched, [], "it is behind the area at the second tick");
+        assert_eq!(
+            live.streaming.tallies()[0].matched,
+            [],
+            "it is behind the area at the second tick"
+        );
         live.forget();
         assert_eq!((live.published.len(), live.ticks), (0, 2));
         assert!(LivePrecision::default().streaming().is_none());
@@ -214,9 +317,31 @@ mod tests {
     #[test]
     fn results_without_a_time_have_no_streaming_precision() {
         let mut live = LivePrecision::default();
-        let (boxes, found) = ([car(10.0)], [Detection { box3d: car(10.0), score: 0.9, source: None }]);
-        let truth = TickTruth { tick: 0, began_nanos: 0, world_from_ego: None, boxes: &boxes, area_m: AREA_M };
-        live.add(&truth, Some(Answer { published_nanos: None, detections: &found }));
-        assert_eq!((live.streaming(), live.unanswered_empty().at_70), (None, Some(1.0)));
+        let (boxes, found) = (
+            [car(10.0)],
+            [Detection {
+                box3d: car(10.0),
+                score: 0.9,
+                source: None,
+            }],
+        );
+        let truth = TickTruth {
+            tick: 0,
+            began_nanos: 0,
+            world_from_ego: None,
+            boxes: &boxes,
+            area_m: AREA_M,
+        };
+        live.add(
+            &truth,
+            Some(Answer {
+                published_nanos: None,
+                detections: &found,
+            }),
+        );
+        assert_eq!(
+            (live.streaming(), live.unanswered_empty().at_70),
+            (None, Some(1.0))
+        );
     }
 }

@@ -204,7 +204,11 @@ impl Percentiles {
     #[must_use]
     pub fn of(sample: &[f64]) -> Self {
         let sorted = sorted(sample);
-        Self { p50: quantile(&sorted, 0.50), p95: quantile(&sorted, 0.95), p99: quantile(&sorted, 0.99) }
+        Self {
+            p50: quantile(&sorted, 0.50),
+            p95: quantile(&sorted, 0.95),
+            p99: quantile(&sorted, 0.99),
+        }
     }
 }
 
@@ -212,8 +216,19 @@ impl Messages {
     /// Totals of a ledger.
     #[must_use]
     pub fn of(total: &Counts) -> Self {
-        let Counts { sent, received, in_flight, dropped, adapted: _ } = total.clone();
-        Self { sent, received, in_flight, dropped }
+        let Counts {
+            sent,
+            received,
+            in_flight,
+            dropped,
+            adapted: _,
+        } = total.clone();
+        Self {
+            sent,
+            received,
+            in_flight,
+            dropped,
+        }
     }
 
     /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to
@@ -228,9 +243,17 @@ impl PoseErrors {
     /// Summarises the errors of all poses; `no_pose` is the number of frames of vehicles without a pose.
     #[must_use]
     pub fn of(errors: &[PoseError], no_pose: u64) -> Self {
-        let distances = sorted(&errors.iter().map(|error| error.distance_m).collect::<Vec<_>>());
+        let distances = sorted(
+            &errors
+                .iter()
+                .map(|error| error.distance_m)
+                .collect::<Vec<_>>(),
+        );
         let tried = errors.len() as u64 + no_pose;
-        let near = distances.iter().filter(|distance| **distance < SUCCESS_M).count();
+        let near = distances
+            .iter()
+            .filter(|distance| **distance < SUCCESS_M)
+            .count();
         Self {
             mean_m: mean(distances.iter().copied()),
             p50_m: quantile(&distances, 0.50),
@@ -281,7 +304,10 @@ pub(crate) mod tests {
 
     #[test]
     fn the_file_names_the_three_precisions() {
-        let ap = |at_50| ByIou { at_50: Some(at_50), ..ByIou::default() };
+        let ap = |at_50| ByIou {
+            at_50: Some(at_50),
+            ..ByIou::default()
+        };
         let metrics = Metrics {
             answered: 29,
             ap_answered: ap(0.9),
@@ -290,8 +316,12 @@ pub(crate) mod tests {
             ..metrics("pastat")
         };
         let json = serde_json::to_value(&metrics).unwrap();
-        assert_eq!((&json["answered"], &json["ticks"]), (&29.into(), &60.into()));
-        let at_50 = ["ap_answered", "ap_unanswered_empty", "ap_streaming"].map(|name| json[name]["0.5"].as_f64());
+        assert_eq!(
+            (&json["answered"], &json["ticks"]),
+            (&29.into(), &60.into())
+        );
+        let at_50 = ["ap_answered", "ap_unanswered_empty", "ap_streaming"]
+            .map(|name| json[name]["0.5"].as_f64());
         assert_eq!(at_50, [Some(0.9), Some(0.5), Some(0.25)]);
         assert_eq!(serde_json::from_value::<Metrics>(json).unwrap(), metrics);
     }
@@ -307,8 +337,14 @@ pub(crate) mod tests {
 
     #[test]
     fn a_vehicle_without_pose_is_no_success() {
-        let near = PoseError { distance_m: 0.5, angle_deg: 1.0 };
-        let far = PoseError { distance_m: 3.5, angle_deg: 2.0 };
+        let near = PoseError {
+            distance_m: 0.5,
+            angle_deg: 1.0,
+        };
+        let far = PoseError {
+            distance_m: 3.5,
+            angle_deg: 2.0,
+        };
         let errors = PoseErrors::of(&[near, far, near], 1);
         assert_eq!((errors.success_3m, errors.no_pose), (Some(0.5), 1));
         assert_eq!(errors.mean_m, Some(1.5));
@@ -318,7 +354,10 @@ pub(crate) mod tests {
     #[test]
     fn volume_is_the_logarithm_of_the_mean() {
         let comm = Communication::of(&[(1024, 1100), (1024, 1300)], 64 * 96 * 128);
-        assert_eq!((comm.payload_bytes_mean, comm.wire_bytes_mean), (Some(1024.0), Some(1200.0)));
+        assert_eq!(
+            (comm.payload_bytes_mean, comm.wire_bytes_mean),
+            (Some(1024.0), Some(1200.0))
+        );
         assert_eq!(comm.log2_payload, Some(10.0));
         assert!((comm.nominal_fp32_log2 - (4.0 * 64.0 * 96.0 * 128.0_f64).log2()).abs() < 1e-12);
         assert_eq!(Communication::of(&[], 1).log2_payload, None);
@@ -326,7 +365,11 @@ pub(crate) mod tests {
 
     #[test]
     fn thresholds_are_named_by_their_numbers() {
-        let text = serde_json::to_string(&ByIou { at_50: Some(0.5), ..ByIou::default() }).unwrap();
+        let text = serde_json::to_string(&ByIou {
+            at_50: Some(0.5),
+            ..ByIou::default()
+        })
+        .unwrap();
         assert_eq!(text, r#"{"0.3":null,"0.5":0.5,"0.7":null}"#);
     }
 }

@@ -40,7 +40,9 @@ pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &De
     }
     for skipped in &result.skipped {
         if let Some(reason) = skipped.reason {
-            change(&skipped.cav, &|record| *record.left_out.entry(reason).or_default() += 1);
+            change(&skipped.cav, &|record| {
+                *record.left_out.entry(reason).or_default() += 1
+            });
         }
     }
     for neighbour in &result.neighbours {
@@ -51,7 +53,10 @@ pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &De
             record.misbehaviour = neighbour.misbehaviour;
             // One that cannot be fused gets no new trust score.
             record.trust = neighbour.trust.or(record.trust);
-            record.least_trust = [record.least_trust, neighbour.trust].into_iter().flatten().reduce(f64::min);
+            record.least_trust = [record.least_trust, neighbour.trust]
+                .into_iter()
+                .flatten()
+                .reduce(f64::min);
             record.clock_offset_s = neighbour.clock_offset_s.or(record.clock_offset_s);
         });
     }

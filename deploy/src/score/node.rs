@@ -9,12 +9,12 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
 use bus::{
-    Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, MetricsPeer, Subscription, process_id,
-    process_usage,
+    Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, MetricsPeer, Subscription,
+    process_id, process_usage,
 };
 use protocol::{
-    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate, ProcessId,
-    ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
+    CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate,
+    ProcessId, ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
 };
 use zenoh::Session;
 
@@ -143,21 +143,38 @@ impl ScorerNode {
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
-        let bus = Bus::over(session, Identity { run: run.clone(), process, cav })?;
+        let bus = Bus::over(
+            session,
+            Identity {
+                run: run.clone(),
+                process,
+                cav,
+            },
+        )?;
         let inbox = bus.inbox(PLACES, 4 * agents.len() + 64);
-        let detections = Topic::Stream { cav: ego.clone(), stream: Stream::Detections };
+        let detections = Topic::Stream {
+            cav: ego.clone(),
+            stream: Stream::Detections,
+        };
         let mut subscriptions = vec![
             bus.subscribe(Topic::Truth, &inbox)?,
             bus.subscribe(detections, &inbox)?,
             bus.subscribe_all(&KeyExpr::stats(run), &inbox)?,
         ];
         for cav in agents {
-            subscriptions.push(bus.subscribe(Topic::Stream { cav: cav.clone(), stream: Stream::Pose }, &inbox)?);
+            subscriptions.push(bus.subscribe(
+                Topic::Stream {
+                    cav: cav.clone(),
+                    stream: Stream::Pose,
+                },
+                &inbox,
+            )?);
         }
         let presence = bus.announce(Role::Scorer)?;
         let offline = OfflineIntervals::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
-        let lines = |file: &PathBuf| ResultLines::create(file).map_err(io(file.display().to_string()));
+        let lines =
+            |file: &PathBuf| ResultLines::create(file).map_err(io(file.display().to_string()));
         let [detections, truth] = &files;
         let (detections, truth_lines) = (lines(detections)?, lines(truth)?);
         let progress = Arc::<Mutex<Progress>>::default();
@@ -172,16 +189,30 @@ impl ScorerNode {
             numbered: NumberedResults::default(),
             published: BTreeMap::new(),
         };
-        let thread = thread::Builder::new().name(SCORER.into()).spawn(move || worker.run());
+        let thread = thread::Builder::new()
+            .name(SCORER.into())
+            .spawn(move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
-        Ok(Self { bus, inbox, progress, thread, offline, _subscriptions: subscriptions, _presence: presence })
+        Ok(Self {
+            bus,
+            inbox,
+            progress,
+            thread,
+            offline,
+            _subscriptions: subscriptions,
+            _presence: presence,
+        })
     }
 
     /// Serves the counters of the scorer and of the others to Prometheus.
     ///
     /// # Errors
     /// [`ScorerError::Bus`] when the address cannot be listened at.
-    pub fn serve_metrics(&mut self, address: SocketAddr, others: Vec<MetricsPeer>) -> Result<(), ScorerError> {
+    pub fn serve_metrics(
+        &mut self,
+        address: SocketAddr,
+        others: Vec<MetricsPeer>,
+    ) -> Result<(), ScorerError> {
         self.bus.serve_metrics(address, others)?;
         Ok(())
     }
@@ -189,7 +220,10 @@ impl ScorerNode {
     /// Progress so far.
     #[must_use]
     pub fn progress(&self) -> Progress {
-        self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.progress
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
     /// Processes that were offline so far.
@@ -205,10 +239,16 @@ impl ScorerNode {
     #[must_use]
     pub fn finish(self) -> Scored {
         self.inbox.close();
-        let (board, stats, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
+        let (board, stats, unwritten) = self
+            .thread
+            .join()
+            .expect("the scorer's thread has no reason to panic");
         let own_stats = self.bus.stats();
         let process = self.bus.identity().process.clone();
-        let cpu_before_s = stats.values().find(|stats| stats.process == process).map_or(0.0, |own| own.cpu_before_s);
+        let cpu_before_s = stats
+            .values()
+            .find(|stats| stats.process == process)
+            .map_or(0.0, |own| own.cpu_before_s);
         let own = ProcessStats {
             process,
             ledger: own_stats.ledger(),
@@ -217,14 +257,25 @@ impl ScorerNode {
             cpu_before_s,
             traffic: own_stats.traffic(),
         };
-        let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let progress = self
+            .progress
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone();
         drop((self._subscriptions, self._presence, self.offline));
         if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
             tracing::warn!("{overdue}");
         }
         // The scorer receives its own reports like those of others; its current counters are newer.
-        let others = stats.into_values().filter(|stats| stats.process != own.process);
-        Scored { board, stats: others.chain([own.clone()]).collect(), progress, unwritten }
+        let others = stats
+            .into_values()
+            .filter(|stats| stats.process != own.process);
+        Scored {
+            board,
+            stats: others.chain([own.clone()]).collect(),
+            progress,
+            unwritten,
+        }
     }
 }
 
@@ -256,21 +307,33 @@ impl Worker {
         loop {
             match self.inbox.take(None) {
                 Pop::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
-                Pop::Item(Topic::Truth, Event::End { .. }) => self.note(|progress| progress.ended = true),
+                Pop::Item(Topic::Truth, Event::End { .. }) => {
+                    self.note(|progress| progress.ended = true)
+                }
                 Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
                 Pop::Closed => break,
             }
         }
         self.write_results(true);
         self.board.close();
-        (self.board, self.stats, [self.detections.finish(), self.truth_lines.finish()])
+        (
+            self.board,
+            self.stats,
+            [self.detections.finish(), self.truth_lines.finish()],
+        )
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
         let used = match topic {
             Topic::Truth => self.truth(arrival),
-            Topic::Stream { stream: Stream::Detections, .. } => self.result(arrival),
-            Topic::Stream { stream: Stream::Pose, .. } => self.pose(arrival),
+            Topic::Stream {
+                stream: Stream::Detections,
+                ..
+            } => self.result(arrival),
+            Topic::Stream {
+                stream: Stream::Pose,
+                ..
+            } => self.pose(arrival),
             Topic::Stats(sender) => return self.stats(sender, arrival),
             _ => None,
         };
@@ -283,7 +346,8 @@ impl Worker {
     fn truth(&mut self, arrival: &Arrival) -> Option<()> {
         let truth: Truth = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        self.published.insert(stamp.capture_nanos, stamp.publish_nanos);
+        self.published
+            .insert(stamp.capture_nanos, stamp.publish_nanos);
         while self.published.len() > PLACES {
             self.published.pop_first();
         }
@@ -301,13 +365,20 @@ impl Worker {
     fn result(&mut self, arrival: &Arrival) -> Option<()> {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        self.numbered.result(DetectionsReport::new(stamp, None, result.clone()));
+        self.numbered
+            .result(DetectionsReport::new(stamp, None, result.clone()));
         self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
         let neighbours = result.neighbours.clone();
-        let (fused, bytes) =
-            (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
+        let (fused, bytes) = (
+            result.fused.len(),
+            result
+                .fused
+                .iter()
+                .map(|neighbour| neighbour.wire_bytes)
+                .sum::<u64>(),
+        );
         let latency = latency_ms.map(|ms| Duration::from_secs_f64(ms.max(0.0) / 1e3));
         self.bus_stats.answered(latency, fused);
         let at = arrival.at;
@@ -337,7 +408,13 @@ impl Worker {
     }
 
     fn stats(&mut self, sender: &ProcessId, arrival: &Arrival) {
-        let Some(Stats { process, ledger, stages, usage, traffic }) = self.inbox.decode(arrival, &Limits::DEFAULT)
+        let Some(Stats {
+            process,
+            ledger,
+            stages,
+            usage,
+            traffic,
+        }) = self.inbox.decode(arrival, &Limits::DEFAULT)
         else {
             return;
         };
@@ -351,11 +428,25 @@ impl Worker {
         // Until the first tick: the loading of models belongs to no frame.
         let cpu_before_s = match self.published.is_empty() {
             true => usage.cpu_s,
-            false => self.stats.get(&instance).map_or(0.0, |known| known.cpu_before_s),
+            false => self
+                .stats
+                .get(&instance)
+                .map_or(0.0, |known| known.cpu_before_s),
         };
-        let stats = ProcessStats { process, ledger, stages, usage, cpu_before_s, traffic };
+        let stats = ProcessStats {
+            process,
+            ledger,
+            stages,
+            usage,
+            cpu_before_s,
+            traffic,
+        };
         self.stats.insert(instance, stats);
-        let dropped = self.stats.values().map(|stats| stats.ledger.total().dropped_total()).sum();
+        let dropped = self
+            .stats
+            .values()
+            .map(|stats| stats.ledger.total().dropped_total())
+            .sum();
         self.note(|progress| {
             progress.dropped = dropped;
             progress.last_reports.insert(name, at);

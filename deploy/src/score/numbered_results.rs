@@ -34,7 +34,10 @@ impl NumberedResults {
     pub(super) fn next(&mut self, is_over: bool) -> Option<DetectionsReport> {
         let capture_nanos = self.waiting.front()?.capture_nanos;
         let tick = self.ticks.get(&capture_nanos).copied();
-        let is_past = self.ticks.last_key_value().is_some_and(|(newest, _)| *newest > capture_nanos);
+        let is_past = self
+            .ticks
+            .last_key_value()
+            .is_some_and(|(newest, _)| *newest > capture_nanos);
         if tick.is_none() && !is_past && !is_over && self.waiting.len() <= PLACES {
             return None;
         }
@@ -51,16 +54,34 @@ mod tests {
 
     fn report(capture_nanos: u64) -> DetectionsReport {
         let ego = CavId::new("e").unwrap();
-        let stamp = Stamp { cav: ego.clone(), epoch: 1, sequence: 0, capture_nanos, publish_nanos: 0 };
+        let stamp = Stamp {
+            cav: ego.clone(),
+            epoch: 1,
+            sequence: 0,
+            capture_nanos,
+            publish_nanos: 0,
+        };
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
         let (agent_frame, method) = (0, "max".to_owned());
         let (detections, fused, skipped, neighbours, stages) = Default::default();
-        let result = Detections { ego, agent_frame, method, pose, detections, fused, skipped, neighbours, stages };
+        let result = Detections {
+            ego,
+            agent_frame,
+            method,
+            pose,
+            detections,
+            fused,
+            skipped,
+            neighbours,
+            stages,
+        };
         DetectionsReport::new(&stamp, None, result)
     }
 
     fn ticks(results: &mut NumberedResults, is_over: bool) -> Vec<(u64, Option<u64>)> {
-        std::iter::from_fn(|| results.next(is_over)).map(|report| (report.capture_nanos, report.tick)).collect()
+        std::iter::from_fn(|| results.next(is_over))
+            .map(|report| (report.capture_nanos, report.tick))
+            .collect()
     }
 
     #[test]

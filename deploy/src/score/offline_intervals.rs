@@ -50,7 +50,10 @@ impl OfflineIntervals {
                 }
             })
         };
-        Ok(Self { _watches: ROLES.into_iter().map(watch).collect::<Result<_, _>>()?, state })
+        Ok(Self {
+            _watches: ROLES.into_iter().map(watch).collect::<Result<_, _>>()?,
+            state,
+        })
     }
 
     /// Processes that were offline so far. One that does not return counts too, except the replay, which leaves when
@@ -59,7 +62,12 @@ impl OfflineIntervals {
     pub(crate) fn so_far(&self) -> BTreeSet<String> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let replay = Role::Replay.to_string();
-        state.returned.iter().chain(state.gone.iter().filter(|name| **name != replay)).cloned().collect()
+        state
+            .returned
+            .iter()
+            .chain(state.gone.iter().filter(|name| **name != replay))
+            .cloned()
+            .collect()
     }
 }
 
@@ -76,17 +84,26 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
         | Topic::Truth => {
             vec![replay]
         }
-        Topic::Stream { cav, stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace } => {
+        Topic::Stream {
+            cav,
+            stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace,
+        } => {
             vec![process_id(Role::Ego, cav).to_string()]
         }
         Topic::Stream { cav, .. } => vec![agent(cav)],
-        Topic::Received { ego, cav, .. } => vec![agent(cav), process_id(Role::Link, ego).to_string()],
+        Topic::Received { ego, cav, .. } => {
+            vec![agent(cav), process_id(Role::Link, ego).to_string()]
+        }
         Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => Vec::new(),
     };
     if let Some(to) = &account.to {
         concerned.push(to.to_string());
         // An ego receives messages of neighbours through its link.
-        concerned.extend(to.as_str().strip_prefix("ego-").map(|ego| format!("link-{ego}")));
+        concerned.extend(
+            to.as_str()
+                .strip_prefix("ego-")
+                .map(|ego| format!("link-{ego}")),
+        );
     }
     concerned.iter().any(|name| offline.contains(name))
 }

@@ -12,7 +12,11 @@ const FOUND_IOU: f64 = 0.5;
 pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
     let objects = scorer.tallies().first().map_or(0, |tally| tally.objects);
     match scorer.average_precisions(ordering)[..] {
-        [at_30, at_50, at_70] if objects > 0 => ByIou { at_30: Some(at_30), at_50: Some(at_50), at_70: Some(at_70) },
+        [at_30, at_50, at_70] if objects > 0 => ByIou {
+            at_30: Some(at_30),
+            at_50: Some(at_50),
+            at_70: Some(at_70),
+        },
         _ => ByIou::default(),
     }
 }
@@ -27,7 +31,8 @@ pub(super) fn precision_recall_csv(scorer: &Scorer) -> String {
         // The curve has a point more at each end.
         let points = curve.recall.iter().zip(&curve.precision).skip(1);
         for (score, (recall, precision)) in scores.iter().zip(points) {
-            let numbers = [f64::from(*score), *recall, *precision].map(|number| format!("{number:.6}"));
+            let numbers =
+                [f64::from(*score), *recall, *precision].map(|number| format!("{number:.6}"));
             text.row([tally.iou_threshold.to_string()].into_iter().chain(numbers));
         }
     }
@@ -36,8 +41,15 @@ pub(super) fn precision_recall_csv(scorer: &Scorer) -> String {
 
 /// Number of the last `detected` detections of a scorer that overlap a true box by at least [`FOUND_IOU`].
 pub(super) fn found_by_last(scorer: &Scorer, detected: usize) -> usize {
-    scorer.tallies().iter().find(|tally| tally.iou_threshold == FOUND_IOU).map_or(0, |tally| {
-        let first = tally.matched.len().saturating_sub(detected);
-        tally.matched[first..].iter().filter(|matched| matched.is_true).count()
-    })
+    scorer
+        .tallies()
+        .iter()
+        .find(|tally| tally.iou_threshold == FOUND_IOU)
+        .map_or(0, |tally| {
+            let first = tally.matched.len().saturating_sub(detected);
+            tally.matched[first..]
+                .iter()
+                .filter(|matched| matched.is_true)
+                .count()
+        })
 }

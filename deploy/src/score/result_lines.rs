@@ -20,14 +20,24 @@ pub(super) struct ResultLines<W: Write = File> {
 
 impl ResultLines {
     pub(super) fn create(path: &Path) -> io::Result<Self> {
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let name = path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
         File::create(path).map(|file| Self::over(name, file))
     }
 }
 
 impl<W: Write> ResultLines<W> {
     fn over(name: String, out: W) -> Self {
-        Self { name, out: BufWriter::with_capacity(WAITING, out), waiting: 0, lost: 0, has_complained: false }
+        Self {
+            name,
+            out: BufWriter::with_capacity(WAITING, out),
+            waiting: 0,
+            lost: 0,
+            has_complained: false,
+        }
     }
 
     /// Adds a line; another process may be reading the file.
@@ -77,7 +87,9 @@ mod tests {
 
         fn lines(&self) -> Vec<serde_json::Value> {
             let text = String::from_utf8(self.0.lock().unwrap().1.clone()).unwrap();
-            text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+            text.lines()
+                .map(|line| serde_json::from_str(line).unwrap())
+                .collect()
         }
     }
 
@@ -87,7 +99,11 @@ mod tests {
             let count = bytes.len().min(*room);
             *room -= count;
             written.extend_from_slice(&bytes[..count]);
-            if count == 0 { Err(io::ErrorKind::StorageFull.into()) } else { Ok(count) }
+            if count == 0 {
+                Err(io::ErrorKind::StorageFull.into())
+            } else {
+                Ok(count)
+            }
         }
 
         fn flush(&mut self) -> io::Result<()> {
@@ -97,7 +113,13 @@ mod tests {
 
     fn report(tick: u64) -> DetectionsReport {
         let ego = CavId::new("e").unwrap();
-        let stamp = Stamp { cav: ego.clone(), epoch: 1, sequence: tick, capture_nanos: tick, publish_nanos: tick };
+        let stamp = Stamp {
+            cav: ego.clone(),
+            epoch: 1,
+            sequence: tick,
+            capture_nanos: tick,
+            publish_nanos: tick,
+        };
         let result = Detections {
             ego,
             agent_frame: tick,
@@ -134,7 +156,10 @@ mod tests {
         lines.add(report(99).to_json());
         assert_eq!(lines.finish(), 30);
         let written = disk.lines();
-        assert_eq!((written.len(), &written[fitting]["tick"]), (fitting + 1, &99.into()));
+        assert_eq!(
+            (written.len(), &written[fitting]["tick"]),
+            (fitting + 1, &99.into())
+        );
 
         let full = Disk::default();
         let mut lines = ResultLines::over("test.jsonl".into(), full.clone());

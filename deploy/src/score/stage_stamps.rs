@@ -26,10 +26,19 @@ impl StageStamps {
     /// Stamps of a tick with publication times, Unix nanoseconds: of the tick `began_nanos`, of the ego's pose
     /// `posed_nanos`, of its detections `detected_nanos`. `stages` are the durations of the ego's stages.
     #[must_use]
-    pub(crate) fn of(began_nanos: u64, posed_nanos: Option<u64>, detected_nanos: u64, stages: &[StageTiming]) -> Self {
+    pub(crate) fn of(
+        began_nanos: u64,
+        posed_nanos: Option<u64>,
+        detected_nanos: u64,
+        stages: &[StageTiming],
+    ) -> Self {
         let since = |nanos: u64| ms_between(began_nanos, nanos);
-        let took =
-            |name: &str| stages.iter().find(|timing| timing.stage == name).map(|timing| timing.nanos as f64 / 1e6);
+        let took = |name: &str| {
+            stages
+                .iter()
+                .find(|timing| timing.stage == name)
+                .map(|timing| timing.nanos as f64 / 1e6)
+        };
         let fusing: f64 = stages
             .iter()
             .filter(|timing| !["transport", "wait", "send"].contains(&timing.stage.as_str()))
@@ -39,8 +48,12 @@ impl StageStamps {
         // The ego's stages follow each other without a gap: counted back from the end.
         let fused = took("send").map(|send| detected - send);
         let decided = fused.map(|fused| fused - fusing);
-        let arrived = decided.zip(took("wait")).map(|(decided, wait)| decided - wait);
-        let published = arrived.zip(took("transport")).map(|(arrived, transport)| arrived - transport);
+        let arrived = decided
+            .zip(took("wait"))
+            .map(|(decided, wait)| decided - wait);
+        let published = arrived
+            .zip(took("transport"))
+            .map(|(arrived, transport)| arrived - transport);
         Self {
             began_nanos: Some(began_nanos),
             posed_ms: posed_nanos.map(since),
@@ -72,8 +85,13 @@ mod tests {
     #[test]
     fn stages_are_laid_out_from_the_end() {
         let timing = |name, ms| StageTiming::new(name, Duration::from_millis(ms));
-        let stages =
-            [timing("transport", 4), timing("wait", 20), timing("warp", 3), timing("fuse", 7), timing("send", 1)];
+        let stages = [
+            timing("transport", 4),
+            timing("wait", 20),
+            timing("warp", 3),
+            timing("fuse", 7),
+            timing("send", 1),
+        ];
         let stamps = StageStamps::of(1_000_000_000, Some(1_030_000_000), 1_100_000_000, &stages);
         let expected = StageStamps {
             began_nanos: Some(1_000_000_000),
@@ -90,6 +108,13 @@ mod tests {
     #[test]
     fn stages_that_an_ego_does_not_report_are_absent() {
         let stamps = StageStamps::of(0, None, 5_000_000, &[]);
-        assert_eq!(stamps, StageStamps { began_nanos: Some(0), detected_ms: Some(5.0), ..StageStamps::default() });
+        assert_eq!(
+            stamps,
+            StageStamps {
+                began_nanos: Some(0),
+                detected_ms: Some(5.0),
+                ..StageStamps::default()
+            }
+        );
     }
 }

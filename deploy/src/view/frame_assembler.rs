@@ -3,13 +3,15 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::{
-    Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose, PoseEstimate,
-    StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
+    Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload,
+    Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
 };
 
 use super::judgement::{DetectionArea, Judge, Judgement};
 use super::pace_counter::{PaceCounter, ShownPace};
-use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate};
+use super::scene_frame::{
+    Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate,
+};
 
 /// Largest number of incomplete scene frames.
 const MOST_OPEN: usize = 16;
@@ -76,13 +78,22 @@ struct Arrival {
 impl FrameAssembler {
     /// An assembler that knows in which area each vehicle detects.
     pub(crate) fn with_areas(areas: BTreeMap<CavId, DetectionArea>) -> Self {
-        Self { areas, ..Self::default() }
+        Self {
+            areas,
+            ..Self::default()
+        }
     }
 
     /// An assembler of the scene frames of another ego, which knows what this one knows of the run.
     pub(crate) fn for_ego(&self, ego: Option<CavId>) -> Self {
         let (areas, ledgers, egos) = (self.areas.clone(), self.ledgers.clone(), self.egos.clone());
-        Self { areas, ledgers, egos, ego, ..Self::default() }
+        Self {
+            areas,
+            ledgers,
+            egos,
+            ego,
+            ..Self::default()
+        }
     }
 
     /// Adds a message. A result of the ego completes its scene frame, which is returned; so is a scene frame without a
@@ -97,7 +108,11 @@ impl FrameAssembler {
         {
             return None;
         }
-        if let Topic::Stream { cav, stream: Stream::Descriptor } = seen.topic {
+        if let Topic::Stream {
+            cav,
+            stream: Stream::Descriptor,
+        } = seen.topic
+        {
             if let Some(Descriptor { grid, .. }) = decode(seen) {
                 self.areas.insert(cav.clone(), DetectionArea::from(&grid));
             }
@@ -131,18 +146,42 @@ impl FrameAssembler {
         let later = self.open.split_off(&capture_nanos);
         // Older ones will have no result any more.
         let closed = std::mem::replace(&mut self.open, later);
-        let ticks = closed.values().chain([&frame]).filter(|frame| frame.truth.is_some());
-        ticks.for_each(|frame| self.pace.tick(frame.result.as_ref().map(|(published, _)| *published)));
+        let ticks = closed
+            .values()
+            .chain([&frame])
+            .filter(|frame| frame.truth.is_some());
+        ticks.for_each(|frame| {
+            self.pace
+                .tick(frame.result.as_ref().map(|(published, _)| *published))
+        });
         self.shown_until = Some(capture_nanos);
-        let area = frame.result.as_ref().and_then(|(_, result)| self.areas.get(&result.ego)).copied();
+        let area = frame
+            .result
+            .as_ref()
+            .and_then(|(_, result)| self.areas.get(&result.ego))
+            .copied();
         let judgement = frame.judged(area.as_ref(), &mut self.judge);
         let shown = frame.frame(capture_nanos, &self.ledgers, &judgement);
         let (pace, ap_50) = (self.pace.pace(), self.judge.average_precision());
-        Some(SceneFrame { pace, area, ap_50, egos: self.egos.iter().cloned().collect(), ..shown })
+        Some(SceneFrame {
+            pace,
+            area,
+            ap_50,
+            egos: self.egos.iter().cloned().collect(),
+            ..shown
+        })
     }
 
     fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
-        let Some(Stats { process, ledger, stages, .. }) = decode(seen) else { return };
+        let Some(Stats {
+            process,
+            ledger,
+            stages,
+            ..
+        }) = decode(seen)
+        else {
+            return;
+        };
         let process = process.to_string();
         if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
             self.ledgers.insert(process, (ledger, stages));
@@ -151,7 +190,11 @@ impl FrameAssembler {
 
     /// Another replay of the same run begins at its own first tick, which the frames shown so far do not hide.
     fn begin_again_with(&mut self, epoch: u64) {
-        if self.replay_epoch.replace(epoch).is_some_and(|known| known != epoch) {
+        if self
+            .replay_epoch
+            .replace(epoch)
+            .is_some_and(|known| known != epoch)
+        {
             self.open.clear();
             self.shown_until = None;
         }
@@ -166,7 +209,10 @@ impl FrameAssembler {
                     self.frame(at).truth = Some((published, truth));
                 }
             }
-            Topic::Stream { cav, stream: Stream::Detections } => {
+            Topic::Stream {
+                cav,
+                stream: Stream::Detections,
+            } => {
                 self.egos.insert(cav.clone());
                 if self.ego.is_none() {
                     self.ego = Some(cav.clone());
@@ -176,7 +222,10 @@ impl FrameAssembler {
                     return true;
                 }
             }
-            Topic::Stream { cav, stream: Stream::Lidar | Stream::Preview } => {
+            Topic::Stream {
+                cav,
+                stream: Stream::Lidar | Stream::Preview,
+            } => {
                 if let Some(payload) = seen.payload {
                     self.frame(at).sweeps.insert(cav.clone(), payload.to_vec());
                 }
@@ -185,7 +234,9 @@ impl FrameAssembler {
                 match stream {
                     Stream::Pose => {
                         if let Some(estimate) = decode(seen) {
-                            self.frame(at).poses.insert(cav.clone(), (published, estimate));
+                            self.frame(at)
+                                .poses
+                                .insert(cav.clone(), (published, estimate));
                         }
                     }
                     Stream::Boxes => {
@@ -207,7 +258,14 @@ impl FrameAssembler {
         false
     }
 
-    fn arrived(&mut self, at: u64, cav: &CavId, stream: Stream, rank: u8, seen: &ReceivedMessage<'_>) {
+    fn arrived(
+        &mut self,
+        at: u64,
+        cav: &CavId,
+        stream: Stream,
+        rank: u8,
+        seen: &ReceivedMessage<'_>,
+    ) {
         let rank = match stream {
             Stream::Bev | Stream::Boxes | Stream::Points => rank + 1,
             Stream::Pose => rank,
@@ -216,7 +274,14 @@ impl FrameAssembler {
         let latency_ms = (seen.arrived_nanos as f64 - seen.header.stamp.publish_nanos as f64) / 1e6;
         let arrivals = &mut self.frame(at).arrivals;
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
-            arrivals.insert(cav.clone(), Arrival { rank, stream, latency_ms });
+            arrivals.insert(
+                cav.clone(),
+                Arrival {
+                    rank,
+                    stream,
+                    latency_ms,
+                },
+            );
         }
     }
 
@@ -226,7 +291,9 @@ impl FrameAssembler {
 }
 
 fn decode<M: Payload>(seen: &ReceivedMessage<'_>) -> Option<M> {
-    wire::decode([seen.payload?], &Limits::DEFAULT).map(|(_, message)| message).ok()
+    wire::decode([seen.payload?], &Limits::DEFAULT)
+        .map(|(_, message)| message)
+        .ok()
 }
 
 impl OpenFrame {
@@ -248,13 +315,18 @@ impl OpenFrame {
         let (vehicles, points) = self.vehicles();
         let began = self.truth.as_ref().map(|(began, _)| *began);
         let since_began_ms = |nanos: u64| began.map(|began| (nanos as f64 - began as f64) / 1e6);
-        let posed = result.and_then(|result| self.poses.get(&result.ego)).map(|(posed, _)| *posed);
+        let posed = result
+            .and_then(|result| self.poses.get(&result.ego))
+            .map(|(posed, _)| *posed);
         SceneFrame {
             capture_s: capture_nanos as f64 / 1e9,
             tick: self.truth.as_ref().map(|(_, truth)| truth.tick),
             ego: result.map(|result| result.ego.clone()),
             method: result.map(|result| result.method.clone()),
-            latency_ms: self.result.as_ref().and_then(|(done, _)| since_began_ms(*done)),
+            latency_ms: self
+                .result
+                .as_ref()
+                .and_then(|(done, _)| since_began_ms(*done)),
             swept_ms: None,
             posed_ms: posed.and_then(since_began_ms),
             vehicles,
@@ -269,7 +341,10 @@ impl OpenFrame {
             ap_50: None,
             processes: ledgers
                 .iter()
-                .map(|(process, (_, stages))| Process { process: process.clone(), stages: stages.clone() })
+                .map(|(process, (_, stages))| Process {
+                    process: process.clone(),
+                    stages: stages.clone(),
+                })
                 .collect(),
             messages: messages(ledgers.values().map(|(ledger, _)| ledger)),
             points,
@@ -279,39 +354,65 @@ impl OpenFrame {
     /// Every vehicle, the ego first, and their points.
     fn vehicles(&self) -> (Vec<Vehicle>, Vec<u8>) {
         let ego = self.result.as_ref().map(|(_, result)| &result.ego);
-        let in_truth = self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().map(|agent| &agent.cav));
+        let in_truth = self
+            .truth
+            .iter()
+            .flat_map(|(_, truth)| truth.agents.iter().map(|agent| &agent.cav));
         let mut cavs: Vec<&CavId> = Vec::new();
-        for cav in ego.into_iter().chain(in_truth).chain(self.poses.keys()).chain(self.sweeps.keys()) {
+        for cav in ego
+            .into_iter()
+            .chain(in_truth)
+            .chain(self.poses.keys())
+            .chain(self.sweeps.keys())
+        {
             if !cavs.contains(&cav) {
                 cavs.push(cav);
             }
         }
         let mut points = Vec::new();
-        let vehicles = cavs.into_iter().map(|cav| self.vehicle(cav, &mut points)).collect();
+        let vehicles = cavs
+            .into_iter()
+            .map(|cav| self.vehicle(cav, &mut points))
+            .collect();
         (vehicles, points)
     }
 
     fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> Vehicle {
         let agents = self.truth.iter().flat_map(|(_, truth)| &truth.agents);
-        let truth = agents.into_iter().find(|agent| agent.cav == *cav).map(|agent| &agent.world_from_lidar);
-        let estimate = self.poses.get(cav).map(|(_, estimate)| estimate).or_else(|| {
-            self.result
-                .as_ref()
-                .map(|(_, result)| result)
-                .filter(|result| result.ego == *cav)
-                .map(|result| &result.pose)
-        });
+        let truth = agents
+            .into_iter()
+            .find(|agent| agent.cav == *cav)
+            .map(|agent| &agent.world_from_lidar);
+        let estimate = self
+            .poses
+            .get(cav)
+            .map(|(_, estimate)| estimate)
+            .or_else(|| {
+                self.result
+                    .as_ref()
+                    .map(|(_, result)| result)
+                    .filter(|result| result.ego == *cav)
+                    .map(|result| &result.pose)
+            });
         let pose = estimate.and_then(PoseEstimate::world_from_cav);
         let sweep = self.sweep(cav);
         points.extend(&sweep);
         let distance = |found: &Pose, truth: &Pose| {
-            found.translation_m.iter().zip(truth.translation_m).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+            found
+                .translation_m
+                .iter()
+                .zip(truth.translation_m)
+                .map(|(a, b)| (a - b).powi(2))
+                .sum::<f64>()
+                .sqrt()
         };
         Vehicle {
             cav: cav.clone(),
             pose: pose.map(Planar::of),
             confidence: pose.and(estimate).map(PoseEstimate::confidence),
-            covariance_m2: estimate.and_then(PoseEstimate::covariance).map(|of| [of.xx_m2, of.xy_m2, of.yy_m2]),
+            covariance_m2: estimate
+                .and_then(PoseEstimate::covariance)
+                .map(|of| [of.xx_m2, of.xy_m2, of.yy_m2]),
             no_pose: match estimate {
                 Some(PoseEstimate::NoPose { reason, .. }) => Some(*reason),
                 _ => None,
@@ -325,13 +426,18 @@ impl OpenFrame {
 
     fn sweep(&self, cav: &CavId) -> Vec<u8> {
         let payload = self.sweeps.get(cav).map(Vec::as_slice);
-        let decoded = payload.and_then(|payload| wire::decode::<Lidar>([payload], &Limits::DEFAULT).ok());
+        let decoded =
+            payload.and_then(|payload| wire::decode::<Lidar>([payload], &Limits::DEFAULT).ok());
         decoded.map_or(Vec::new(), |(_, Lidar { points })| decimate(&points))
     }
 
     fn true_boxes(&self, judgement: &Judgement) -> Vec<ShownBox> {
         let mut objects: BTreeMap<i64, &TrueObject> = BTreeMap::new();
-        for object in self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().flat_map(|agent| &agent.objects)) {
+        for object in self
+            .truth
+            .iter()
+            .flat_map(|(_, truth)| truth.agents.iter().flat_map(|agent| &agent.objects))
+        {
             objects.entry(object.id).or_insert(object);
         }
         let shown = |object: &TrueObject| ShownBox {
@@ -354,23 +460,44 @@ impl OpenFrame {
 
     /// The ego's detections, placed by its estimated pose.
     fn detections(&self, judgement: &Judgement) -> Vec<ShownBox> {
-        let Some((_, result)) = &self.result else { return Vec::new() };
+        let Some((_, result)) = &self.result else {
+            return Vec::new();
+        };
         let mut shown = self.placed(&result.ego, &result.pose, &result.detections, None);
-        shown.iter_mut().zip(&judgement.hits).for_each(|(shown, is_hit)| shown.is_hit = Some(*is_hit));
+        shown
+            .iter_mut()
+            .zip(&judgement.hits)
+            .for_each(|(shown, is_hit)| shown.is_hit = Some(*is_hit));
         shown
     }
 
     /// Detections that single vehicles sent.
     fn single(&self) -> Vec<ShownBox> {
-        let each = |(cav, boxes): (&CavId, &Boxes)| self.placed(cav, &boxes.pose, &boxes.detections, Some(cav));
+        let each = |(cav, boxes): (&CavId, &Boxes)| {
+            self.placed(cav, &boxes.pose, &boxes.detections, Some(cav))
+        };
         self.own_boxes.iter().flat_map(each).collect()
     }
 
     /// Detections in the frame of a vehicle, placed by its estimated pose, or else by its true one.
-    fn placed(&self, cav: &CavId, pose: &PoseEstimate, found: &[Detection], source: Option<&CavId>) -> Vec<ShownBox> {
-        let truth = self.truth.iter().flat_map(|(_, truth)| &truth.agents).find(|agent| agent.cav == *cav);
-        let pose = pose.world_from_cav().or(truth.map(|agent| &agent.world_from_lidar));
-        let Some(world_from_cav) = pose.map(Pose::isometry) else { return Vec::new() };
+    fn placed(
+        &self,
+        cav: &CavId,
+        pose: &PoseEstimate,
+        found: &[Detection],
+        source: Option<&CavId>,
+    ) -> Vec<ShownBox> {
+        let truth = self
+            .truth
+            .iter()
+            .flat_map(|(_, truth)| &truth.agents)
+            .find(|agent| agent.cav == *cav);
+        let pose = pose
+            .world_from_cav()
+            .or(truth.map(|agent| &agent.world_from_lidar));
+        let Some(world_from_cav) = pose.map(Pose::isometry) else {
+            return Vec::new();
+        };
         let shown = |detection: &Detection| ShownBox {
             box3d: detection.box3d.transformed(&world_from_cav),
             score: Some(detection.score),
@@ -386,16 +513,28 @@ impl OpenFrame {
     }
 
     fn links(&self) -> Vec<Link> {
-        let Some((_, result)) = &self.result else { return Vec::new() };
+        let Some((_, result)) = &self.result else {
+            return Vec::new();
+        };
         let mut links: BTreeMap<String, Link> = BTreeMap::new();
         let to = result.ego.to_string();
         for (cav, arrival) in self.arrivals.iter().filter(|(cav, _)| **cav != result.ego) {
             let (latency_ms, stream) = (Some(arrival.latency_ms), Some(arrival.stream.to_string()));
-            let link = Link { from: cav.to_string(), to: to.clone(), latency_ms, stream, ..Link::default() };
+            let link = Link {
+                from: cav.to_string(),
+                to: to.clone(),
+                latency_ms,
+                stream,
+                ..Link::default()
+            };
             links.insert(link.from.clone(), link);
         }
         let mut link = |cav: &CavId| {
-            let new = || Link { from: cav.to_string(), to: to.clone(), ..Link::default() };
+            let new = || Link {
+                from: cav.to_string(),
+                to: to.clone(),
+                ..Link::default()
+            };
             links.remove(cav.as_str()).unwrap_or_else(new)
         };
         let fused: Vec<Link> = result
@@ -408,11 +547,27 @@ impl OpenFrame {
                 ..link(&neighbour.cav)
             })
             .collect();
-        let skipped: Vec<Link> =
-            result.skipped.iter().map(|neighbour| Link { skipped: neighbour.reason, ..link(&neighbour.cav) }).collect();
-        let mut all: Vec<Link> = fused.into_iter().chain(skipped).chain(links.into_values()).collect();
+        let skipped: Vec<Link> = result
+            .skipped
+            .iter()
+            .map(|neighbour| Link {
+                skipped: neighbour.reason,
+                ..link(&neighbour.cav)
+            })
+            .collect();
+        let mut all: Vec<Link> = fused
+            .into_iter()
+            .chain(skipped)
+            .chain(links.into_values())
+            .collect();
         for link in &mut all {
-            let Some(known) = result.neighbours.iter().find(|state| state.cav.as_str() == link.from) else { continue };
+            let Some(known) = result
+                .neighbours
+                .iter()
+                .find(|state| state.cav.as_str() == link.from)
+            else {
+                continue;
+            };
             (link.trust, link.misbehaviour) = (known.trust, known.misbehaviour);
             link.clock_ms = known.clock_offset_s.map(|seconds| seconds * 1e3);
         }

@@ -22,7 +22,8 @@ pub(super) struct HeatMap {
 impl HeatMap {
     /// The heat map of an encoded message; `None` if it is no valid feature map.
     pub(super) fn of(message: &[u8]) -> Option<Self> {
-        let (header, Bev { features, .. }) = wire::decode::<Bev>([message], &Limits::DEFAULT).ok()?;
+        let (header, Bev { features, .. }) =
+            wire::decode::<Bev>([message], &Limits::DEFAULT).ok()?;
         let features = features.decode(&Limits::DEFAULT).ok()?.features;
         Some(Self {
             capture_s: header.stamp.capture_nanos as f64 / 1e9,
@@ -35,9 +36,19 @@ impl HeatMap {
     /// The map as sent to the page: a JSON document after its length (32 bits, little-endian), then one byte per cell,
     /// row by row.
     pub(super) fn to_bytes(&self) -> Vec<u8> {
-        let Self { capture_s, grid, channels, levels } = self;
+        let Self {
+            capture_s,
+            grid,
+            channels,
+            levels,
+        } = self;
         let json = json!({"capture_s": capture_s, "channels": channels, "grid": grid}).to_string();
-        [(json.len() as u32).to_le_bytes().as_slice(), json.as_bytes(), levels].concat()
+        [
+            (json.len() as u32).to_le_bytes().as_slice(),
+            json.as_bytes(),
+            levels,
+        ]
+        .concat()
     }
 }
 
@@ -46,7 +57,9 @@ fn activations(features: &BevFeatures) -> Vec<f32> {
     let cells = features.grid.cells().max(1);
     let mut sums = vec![0.0_f32; cells];
     for plane in features.values.chunks_exact(cells) {
-        sums.iter_mut().zip(plane).for_each(|(sum, value)| *sum += value.abs());
+        sums.iter_mut()
+            .zip(plane)
+            .for_each(|(sum, value)| *sum += value.abs());
     }
     let channels = features.channels.max(1) as f32;
     sums.iter_mut().for_each(|sum| *sum /= channels);
@@ -55,12 +68,23 @@ fn activations(features: &BevFeatures) -> Vec<f32> {
 
 /// Activations between those of empty ground and the brightest as 0..=255.
 fn levels(activations: &[f32]) -> Vec<u8> {
-    let mut sorted: Vec<f32> = activations.iter().copied().filter(|value| value.is_finite()).collect();
+    let mut sorted: Vec<f32> = activations
+        .iter()
+        .copied()
+        .filter(|value| value.is_finite())
+        .collect();
     sorted.sort_by(f32::total_cmp);
-    let at = |share: f64| sorted.get((share * sorted.len().saturating_sub(1) as f64).round() as usize).copied();
+    let at = |share: f64| {
+        sorted
+            .get((share * sorted.len().saturating_sub(1) as f64).round() as usize)
+            .copied()
+    };
     let (empty, brightest) = (at(EMPTY).unwrap_or(0.0), at(BRIGHTEST).unwrap_or(0.0));
     let range = (brightest - empty).max(f32::MIN_POSITIVE);
-    activations.iter().map(|value| (255.0 * ((value - empty) / range).clamp(0.0, 1.0)) as u8).collect()
+    activations
+        .iter()
+        .map(|value| (255.0 * ((value - empty) / range).clamp(0.0, 1.0)) as u8)
+        .collect()
 }
 
 #[cfg(test)]
@@ -71,10 +95,21 @@ mod tests {
 
     #[test]
     fn the_strongest_cell_is_the_brightest_and_empty_ground_is_dark() {
-        let grid = BevGrid { x_min_m: -2.0, y_min_m: -1.0, cell_m: 1.0, width: 4, height: 2 };
+        let grid = BevGrid {
+            x_min_m: -2.0,
+            y_min_m: -1.0,
+            cell_m: 1.0,
+            width: 4,
+            height: 2,
+        };
         let mut values = vec![0.5; 16];
         (values[3], values[8 + 3], values[5]) = (4.0, -4.0, 1.5);
-        let features = BevFeatures { grid, channels: 2, code_of: None, values };
+        let features = BevFeatures {
+            grid,
+            channels: 2,
+            code_of: None,
+            values,
+        };
         let features = encode_features(features, &CodecConfig::default(), None).unwrap();
         let stamp = Stamp {
             cav: CavId::new("7").unwrap(),
@@ -83,7 +118,10 @@ mod tests {
             capture_nanos: 1_500_000_000,
             publish_nanos: 1,
         };
-        let message = Bev { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), features };
+        let message = Bev {
+            pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
+            features,
+        };
         let message = wire::encode(&stamp, message).unwrap().to_vec();
         let map = HeatMap::of(&message).unwrap();
         assert_eq!((map.capture_s, map.channels, map.grid), (1.5, 2, grid));
@@ -93,13 +131,19 @@ mod tests {
         let (length, rest) = bytes.split_at(4);
         let (json, levels) = rest.split_at(u32::from_le_bytes(length.try_into().unwrap()) as usize);
         let json: serde_json::Value = serde_json::from_slice(json).unwrap();
-        assert_eq!((&json["grid"]["width"], levels), (&4.into(), map.levels.as_slice()));
+        assert_eq!(
+            (&json["grid"]["width"], levels),
+            (&4.into(), map.levels.as_slice())
+        );
         assert_eq!(HeatMap::of(&message[..message.len() - 1]), None);
     }
 
     #[test]
     fn values_that_are_not_finite_are_dark_or_bright_and_nothing_fails() {
-        assert_eq!(levels(&[f32::NAN, f32::INFINITY, 0.0, 0.0, 1.0]), [0, 255, 0, 0, 255]);
+        assert_eq!(
+            levels(&[f32::NAN, f32::INFINITY, 0.0, 0.0, 1.0]),
+            [0, 255, 0, 0, 255]
+        );
         assert_eq!(levels(&[]), [0_u8; 0]);
         assert_eq!(levels(&[2.0, 2.0]), [0, 0]);
     }

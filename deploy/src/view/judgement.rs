@@ -24,7 +24,10 @@ pub struct DetectionArea {
 impl From<&BevGrid> for DetectionArea {
     fn from(grid: &BevGrid) -> Self {
         let edges = |low_m: f64, cells: u32| [low_m, low_m + f64::from(cells) * grid.cell_m];
-        Self { x_m: edges(grid.x_min_m, grid.width), y_m: edges(grid.y_min_m, grid.height) }
+        Self {
+            x_m: edges(grid.x_min_m, grid.width),
+            y_m: edges(grid.y_min_m, grid.height),
+        }
     }
 }
 
@@ -40,9 +43,16 @@ pub(super) struct Judgement {
 impl Judgement {
     /// True and false positives from a score on, and missed objects.
     pub(super) fn counts(&self, result: &Detections, least_score: f32) -> [usize; 3] {
-        let shown = result.detections.iter().zip(&self.hits).filter(|(detection, _)| detection.score >= least_score);
+        let shown = result
+            .detections
+            .iter()
+            .zip(&self.hits)
+            .filter(|(detection, _)| detection.score >= least_score);
         let (hits, false_positives): (Vec<_>, Vec<_>) = shown.partition(|(_, is_hit)| **is_hit);
-        let missed = self.found.values().filter(|score| score.is_none_or(|score| score < least_score));
+        let missed = self
+            .found
+            .values()
+            .filter(|score| score.is_none_or(|score| score < least_score));
         [hits.len(), false_positives.len(), missed.count()]
     }
 }
@@ -54,25 +64,40 @@ pub(super) struct Judge {
 
 impl Default for Judge {
     fn default() -> Self {
-        Self { scorer: Scorer::new(&[IOU]) }
+        Self {
+            scorer: Scorer::new(&[IOU]),
+        }
     }
 }
 
 impl Judge {
     /// Judges a frame and adds it to those before.
-    pub(super) fn judge(&mut self, result: &Detections, truth: &Truth, area: &DetectionArea) -> Judgement {
-        let rule = GroundTruthRule { x_m: area.x_m, y_m: area.y_m, ..GroundTruthRule::OPV2V };
+    pub(super) fn judge(
+        &mut self,
+        result: &Detections,
+        truth: &Truth,
+        area: &DetectionArea,
+    ) -> Judgement {
+        let rule = GroundTruthRule {
+            x_m: area.x_m,
+            y_m: area.y_m,
+            ..GroundTruthRule::OPV2V
+        };
         let objects = true_objects(truth, &result.ego, &rule);
         let boxes: Vec<_> = objects.iter().map(|(_, box3d)| *box3d).collect();
         self.scorer.add(&result.detections, &boxes);
         let matched = matches(&result.detections, &boxes, IOU);
-        let mut found: BTreeMap<i64, Option<f32>> = objects.iter().map(|(id, _)| (*id, None)).collect();
+        let mut found: BTreeMap<i64, Option<f32>> =
+            objects.iter().map(|(id, _)| (*id, None)).collect();
         for (detection, object) in result.detections.iter().zip(&matched) {
             if let Some((id, _)) = object.and_then(|object| objects.get(object)) {
                 found.insert(*id, Some(detection.score));
             }
         }
-        Judgement { hits: matched.iter().map(Option::is_some).collect(), found }
+        Judgement {
+            hits: matched.iter().map(Option::is_some).collect(),
+            found,
+        }
     }
 
     /// Average precision of the frames so far; `None` without an object.
@@ -99,10 +124,21 @@ mod tests {
             speed_mps: None,
         };
         let objects = vec![object(1, 10.0), object(2, 20.0), object(3, 80.0)];
-        let agent = AgentTruth { cav: ego.clone(), world_from_lidar: Pose::IDENTITY, objects };
-        let truth = Truth { tick: 0, agents: vec![agent] };
+        let agent = AgentTruth {
+            cav: ego.clone(),
+            world_from_lidar: Pose::IDENTITY,
+            objects,
+        };
+        let truth = Truth {
+            tick: 0,
+            agents: vec![agent],
+        };
         let detection = |x_m: f64, score: f32| Detection {
-            box3d: Box3d { center_m: [x_m, 0.0, 0.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 },
+            box3d: Box3d {
+                center_m: [x_m, 0.0, 0.0],
+                size_m: [4.0, 2.0, 1.5],
+                heading_rad: 0.0,
+            },
             score,
             source: None,
         };
@@ -111,18 +147,31 @@ mod tests {
             agent_frame: 0,
             method: "max".into(),
             pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
-            detections: vec![detection(10.2, 0.9), detection(40.0, 0.6), detection(20.0, 0.3)],
+            detections: vec![
+                detection(10.2, 0.9),
+                detection(40.0, 0.6),
+                detection(20.0, 0.3),
+            ],
             fused: vec![],
             skipped: vec![],
             neighbours: vec![],
             stages: vec![],
         };
-        let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 128, height: 96 };
+        let grid = BevGrid {
+            x_min_m: -51.2,
+            y_min_m: -38.4,
+            cell_m: 0.8,
+            width: 128,
+            height: 96,
+        };
         let mut judge = Judge::default();
         assert_eq!(judge.average_precision(), None);
         let judgement = judge.judge(&result, &truth, &DetectionArea::from(&grid));
         assert_eq!(judgement.hits, [true, false, true]);
-        assert_eq!(judgement.found, BTreeMap::from([(1, Some(0.9)), (2, Some(0.3))]));
+        assert_eq!(
+            judgement.found,
+            BTreeMap::from([(1, Some(0.9)), (2, Some(0.3))])
+        );
         assert_eq!(judgement.counts(&result, 0.2), [2, 1, 0]);
         assert_eq!(judgement.counts(&result, 0.5), [1, 1, 1]);
         assert!(judge.average_precision().unwrap() > 0.8);

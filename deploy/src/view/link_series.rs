@@ -47,10 +47,17 @@ impl LinkSeries {
         for entry in entries {
             let (cav, stream, is_sent, is_arrived) = match &entry.key.topic {
                 Topic::Stream { cav, stream } if cav != ego => (cav, *stream, true, !is_emulated),
-                Topic::Received { cav, stream, ego: to } if to == ego => (cav, *stream, false, true),
+                Topic::Received {
+                    cav,
+                    stream,
+                    ego: to,
+                } if to == ego => (cav, *stream, false, true),
                 _ => continue,
             };
-            if !matches!(stream, Stream::Pose | Stream::Bev | Stream::Boxes | Stream::Points) {
+            if !matches!(
+                stream,
+                Stream::Pose | Stream::Bev | Stream::Boxes | Stream::Points
+            ) {
                 continue;
             }
             let link = series.links.entry(cav.clone()).or_default();
@@ -60,7 +67,10 @@ impl LinkSeries {
             }
             if is_arrived {
                 let transit_ms = (entry.arrived_nanos as f64 - stamp.publish_nanos as f64) / 1e6;
-                let longest = link.transit_ms.entry(stamp.capture_nanos).or_insert(transit_ms);
+                let longest = link
+                    .transit_ms
+                    .entry(stamp.capture_nanos)
+                    .or_insert(transit_ms);
                 *longest = longest.max(transit_ms);
                 link.published.push((stamp.publish_nanos, bytes));
                 link.arrived.push((entry.arrived_nanos, bytes));
@@ -79,7 +89,8 @@ impl LinkSeries {
             from: from.clone(),
             sent_bytes: link.sent.get(&capture_nanos).copied().unwrap_or(0),
             transit_ms: link.transit_ms.get(&capture_nanos).copied(),
-            waiting_bytes: began_nanos.map(|now| until(&link.published, now).saturating_sub(until(&link.arrived, now))),
+            waiting_bytes: began_nanos
+                .map(|now| until(&link.published, now).saturating_sub(until(&link.arrived, now))),
         };
         self.links.iter().map(traffic).collect()
     }
@@ -102,7 +113,10 @@ fn accumulate(messages: &mut [(u64, u64)]) {
 /// Sum of the bytes until a time, which counts.
 fn until(accumulated: &[(u64, u64)], nanos: u64) -> u64 {
     let count = accumulated.partition_point(|(at, _)| *at <= nanos);
-    count.checked_sub(1).and_then(|last| accumulated.get(last)).map_or(0, |(_, sum)| *sum)
+    count
+        .checked_sub(1)
+        .and_then(|last| accumulated.get(last))
+        .map_or(0, |(_, sum)| *sum)
 }
 
 #[cfg(test)]
@@ -117,8 +131,14 @@ mod tests {
             messages
         };
         // 100 bytes at 10, 200 at 20 and 300 at 30; they arrive in another order.
-        let (published, arrived) = (link(&[(20, 200), (10, 100), (30, 300)]), link(&[(25, 100), (60, 200), (40, 300)]));
+        let (published, arrived) = (
+            link(&[(20, 200), (10, 100), (30, 300)]),
+            link(&[(25, 100), (60, 200), (40, 300)]),
+        );
         let waiting = |now| until(&published, now) - until(&arrived, now);
-        assert_eq!([0, 10, 24, 25, 30, 40, 60].map(waiting), [0, 100, 300, 200, 500, 200, 0]);
+        assert_eq!(
+            [0, 10, 24, 25, 30, 40, 60].map(waiting),
+            [0, 100, 300, 200, 500, 200, 0]
+        );
     }
 }

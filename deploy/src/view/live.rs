@@ -10,7 +10,9 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
 use futures_util::{Stream as Pieces, stream};
-use protocol::{Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, RunId, Stream, Topic, Verb, wire};
+use protocol::{
+    Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, RunId, Stream, Topic, Verb, wire,
+};
 use serde::Serialize;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
@@ -89,7 +91,10 @@ impl LiveRun {
         let newest = Arc::<NewestFrames>::default();
         let ending = Arc::<AtomicBool>::default();
         let activity = Arc::default();
-        let (images, maps) = (Arc::new(OnDemand::new(MOST_IMAGES)), Arc::new(OnDemand::new(MOST_MAPS)));
+        let (images, maps) = (
+            Arc::new(OnDemand::new(MOST_IMAGES)),
+            Arc::new(OnDemand::new(MOST_MAPS)),
+        );
         let listener = Listener {
             bus,
             run: run.clone(),
@@ -104,8 +109,19 @@ impl LiveRun {
         let thread = thread::Builder::new()
             .name("view".into())
             .spawn(move || listener.run())
-            .map_err(|cause| BusError::Thread { what: "the view".into(), cause })?;
-        Ok(Self { newest, run, activity, images, maps, ending, thread: Some(thread) })
+            .map_err(|cause| BusError::Thread {
+                what: "the view".into(),
+                cause,
+            })?;
+        Ok(Self {
+            newest,
+            run,
+            activity,
+            images,
+            maps,
+            ending,
+            thread: Some(thread),
+        })
     }
 
     /// Name of the run.
@@ -138,28 +154,41 @@ impl LiveRun {
     /// Number of open pages.
     #[cfg(test)]
     pub(crate) fn watchers(&self) -> usize {
-        lock(&self.newest).values().map(|newest| newest.receiver_count()).sum()
+        lock(&self.newest)
+            .values()
+            .map(|newest| newest.receiver_count())
+            .sum()
     }
 
     /// Scene frames of an ego (`None`: the first with results) for one page, each after its length (32 bits,
     /// little-endian; 0: nothing new): the newest whenever the page has taken the previous one, until `limit` of them or
     /// the end of the run.
-    pub fn moments(&self, limit: Option<u64>, ego: Option<CavId>) -> impl Pieces<Item = Bytes> + Send + use<> {
+    pub fn moments(
+        &self,
+        limit: Option<u64>,
+        ego: Option<CavId>,
+    ) -> impl Pieces<Item = Bytes> + Send + use<> {
         let newest = self.subscribe(ego);
-        stream::unfold((newest, limit, Duration::ZERO), |(mut newest, left, pause)| async move {
-            if left == Some(0) {
-                return None;
-            }
-            sleep(pause).await;
-            match timeout(HEARTBEAT, newest.changed()).await {
-                Err(_) => Some((Bytes::from_static(&NOTHING_NEW), (newest, left, Duration::ZERO))),
-                Ok(Err(_)) => None,
-                Ok(Ok(())) => {
-                    let moment = newest.borrow_and_update().clone();
-                    Some((moment, (newest, left.map(|left| left - 1), SHORTEST_PERIOD)))
+        stream::unfold(
+            (newest, limit, Duration::ZERO),
+            |(mut newest, left, pause)| async move {
+                if left == Some(0) {
+                    return None;
                 }
-            }
-        })
+                sleep(pause).await;
+                match timeout(HEARTBEAT, newest.changed()).await {
+                    Err(_) => Some((
+                        Bytes::from_static(&NOTHING_NEW),
+                        (newest, left, Duration::ZERO),
+                    )),
+                    Ok(Err(_)) => None,
+                    Ok(Ok(())) => {
+                        let moment = newest.borrow_and_update().clone();
+                        Some((moment, (newest, left.map(|left| left - 1), SHORTEST_PERIOD)))
+                    }
+                }
+            },
+        )
     }
 
     /// Beyond [`MOST_EGOS`], those of the first ego with results.
@@ -209,12 +238,24 @@ struct Subscriptions {
 
 impl Subscriptions {
     fn open(bus: &Bus, run: &RunId) -> Result<Self, BusError> {
-        let streams = [Stream::Pose, Stream::Boxes, Stream::Detections, Stream::Descriptor];
+        let streams = [
+            Stream::Pose,
+            Stream::Boxes,
+            Stream::Detections,
+            Stream::Descriptor,
+        ];
         let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
-        selectors.extend([KeyExpr::received_by_anyone(run, Stream::Pose), KeyExpr::truth(run), KeyExpr::stats(run)]);
+        selectors.extend([
+            KeyExpr::received_by_anyone(run, Stream::Pose),
+            KeyExpr::truth(run),
+            KeyExpr::stats(run),
+        ]);
         selectors.push(KeyExpr::control(run));
         let previews = bus.tap(&[KeyExpr::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
-        Ok(Self { previews, rest: bus.tap(&selectors, PLACES)? })
+        Ok(Self {
+            previews,
+            rest: bus.tap(&selectors, PLACES)?,
+        })
     }
 }
 
@@ -257,7 +298,14 @@ impl Listener {
     }
 
     fn watch_router(&self) {
-        let has_router = self.bus.session().info().routers_zid().wait().next().is_some();
+        let has_router = self
+            .bus
+            .session()
+            .info()
+            .routers_zid()
+            .wait()
+            .next()
+            .is_some();
         lock(&self.activity).has_router = has_router;
     }
 
@@ -275,28 +323,40 @@ impl Listener {
         }
         let Some(cameras) = cameras else { return };
         while let Pop::Item(_, message) = cameras.take(Some(Instant::now())) {
-            let Topic::Stream { cav, stream: Stream::Camera(number) } = &message.key.topic else { continue };
+            let Topic::Stream {
+                cav,
+                stream: Stream::Camera(number),
+            } = &message.key.topic
+            else {
+                continue;
+            };
             let Ok((_, Camera { metadata, image })) =
                 wire::decode::<Camera>([message.bytes().as_ref()], &Limits::DEFAULT)
             else {
                 continue;
             };
-            self.images.keep((cav.clone(), *number), (metadata.format, image.into()));
+            self.images
+                .keep((cav.clone(), *number), (metadata.format, image.into()));
         }
     }
 
     /// Receives the feature maps of the vehicles of which a page shows one.
     fn follow_maps(&self, maps: &mut Option<(BTreeSet<CavId>, PassiveSubscriber)>) {
         let wanted = self.maps.wanted();
-        if maps.as_ref().is_some_and(|(subscribed, _)| *subscribed != wanted) {
+        if maps
+            .as_ref()
+            .is_some_and(|(subscribed, _)| *subscribed != wanted)
+        {
             *maps = None;
         }
         if wanted.is_empty() {
             return;
         }
         if maps.is_none() {
-            let selectors: Vec<KeyExpr> =
-                wanted.iter().map(|cav| KeyExpr::one(&Key::stream(&self.run, cav, Stream::Bev))).collect();
+            let selectors: Vec<KeyExpr> = wanted
+                .iter()
+                .map(|cav| KeyExpr::one(&Key::stream(&self.run, cav, Stream::Bev)))
+                .collect();
             match self.bus.tap(&selectors, PREVIEW_PLACES) {
                 Ok(opened) => *maps = Some((wanted, opened)),
                 Err(error) => tracing::error!("no feature maps are shown: {error}"),
@@ -304,14 +364,21 @@ impl Listener {
         }
         let Some((_, maps)) = maps else { return };
         while let Pop::Item(_, message) = maps.take(Some(Instant::now())) {
-            if let Topic::Stream { cav, stream: Stream::Bev } = &message.key.topic {
-                self.maps.keep(cav.clone(), Bytes::copy_from_slice(&message.bytes()));
+            if let Topic::Stream {
+                cav,
+                stream: Stream::Bev,
+            } = &message.key.topic
+            {
+                self.maps
+                    .keep(cav.clone(), Bytes::copy_from_slice(&message.bytes()));
             }
         }
     }
 
     fn is_watched(&self) -> bool {
-        lock(&self.newest).values().any(|newest| newest.receiver_count() > 0)
+        lock(&self.newest)
+            .values()
+            .any(|newest| newest.receiver_count() > 0)
     }
 
     /// Reports of processes are no activity: a viewer reports too, for as long as its page is open.
@@ -330,21 +397,32 @@ impl Listener {
 
     fn take(&mut self, message: &RawMessage) {
         let bytes = message.bytes();
-        let Ok(header) = wire::decode_header([bytes.as_ref()]) else { return };
+        let Ok(header) = wire::decode_header([bytes.as_ref()]) else {
+            return;
+        };
         let topic = &message.key.topic;
         self.note(topic);
         if header.kind == Kind::Control {
             return;
         }
         let (arrived_nanos, payload) = (message.arrived_nanos, Some(bytes.as_ref()));
-        let seen = ReceivedMessage { topic, header: &header, arrived_nanos, payload };
+        let seen = ReceivedMessage {
+            topic,
+            header: &header,
+            arrived_nanos,
+            payload,
+        };
         let mut newest = lock(&self.newest);
         newest.retain(|ego, frames| ego.is_none() || frames.receiver_count() > 0);
-        self.others.retain(|ego, _| newest.contains_key(&Some(ego.clone())));
+        self.others
+            .retain(|ego, _| newest.contains_key(&Some(ego.clone())));
         for (ego, frames) in newest.iter() {
             let assembly = match ego {
                 None => &mut self.assembly,
-                Some(cav) => self.others.entry(cav.clone()).or_insert_with(|| self.assembly.for_ego(ego.clone())),
+                Some(cav) => self
+                    .others
+                    .entry(cav.clone())
+                    .or_insert_with(|| self.assembly.for_ego(ego.clone())),
             };
             if let Some(frame) = assembly.add(&seen).filter(|_| frames.receiver_count() > 0) {
                 let frame = frame.to_bytes();

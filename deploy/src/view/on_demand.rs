@@ -29,8 +29,15 @@ struct State<K, V> {
 impl<K: Ord + Clone, V: Clone> OnDemand<K, V> {
     /// Keeps the values of up to `most` keys.
     pub(super) fn new(most: usize) -> Self {
-        let state = State { asked: BTreeMap::new(), newest: BTreeMap::new(), left_out: BTreeSet::new() };
-        Self { most, state: Mutex::new(state) }
+        let state = State {
+            asked: BTreeMap::new(),
+            newest: BTreeMap::new(),
+            left_out: BTreeSet::new(),
+        };
+        Self {
+            most,
+            state: Mutex::new(state),
+        }
     }
 
     /// The newest value of a key; from now on values are wanted.

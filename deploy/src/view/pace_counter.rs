@@ -41,9 +41,15 @@ impl PaceCounter {
 
     pub(super) fn pace(&self) -> ShownPace {
         let span = self.published.front().zip(self.published.back());
-        let seconds = span.map_or(0.0, |(first, last)| last.saturating_sub(*first) as f64 * 1e-9);
+        let seconds = span.map_or(0.0, |(first, last)| {
+            last.saturating_sub(*first) as f64 * 1e-9
+        });
         let rate_hz = (seconds > 0.0).then(|| (self.published.len() - 1) as f64 / seconds);
-        ShownPace { ticks: self.ticks, answered: self.answered, rate_hz }
+        ShownPace {
+            ticks: self.ticks,
+            answered: self.answered,
+            rate_hz,
+        }
     }
 }
 

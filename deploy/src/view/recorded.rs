@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
 use protocol::{
-    Camera, CavId, Descriptor, Detections, ImageFormat, Limits, Payload, PoseEstimate, Stream, Topic, Truth, wire,
+    Camera, CavId, Descriptor, Detections, ImageFormat, Limits, Payload, PoseEstimate, Stream,
+    Topic, Truth, wire,
 };
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
@@ -92,7 +93,11 @@ impl RecordedRun {
     /// # Errors
     /// [`ViewError`] when there is none, or it holds nothing to show.
     pub fn open(path: &Path) -> Result<Self, ViewError> {
-        let file = if path.is_dir() { path.join(RECORDING) } else { path.to_path_buf() };
+        let file = if path.is_dir() {
+            path.join(RECORDING)
+        } else {
+            path.to_path_buf()
+        };
         if !file.is_file() {
             return Err(ViewError::NotRecorded(path.into()));
         }
@@ -100,34 +105,66 @@ impl RecordedRun {
         for damage in recording.damage() {
             tracing::warn!("{}: {damage}", file.display());
         }
-        let name = recording.entries().first().map_or(String::new(), |entry| entry.key.run.to_string());
+        let name = recording
+            .entries()
+            .first()
+            .map_or(String::new(), |entry| entry.key.run.to_string());
         let mut moments = BTreeMap::<u64, Vec<usize>>::new();
         let (mut stats, mut areas) = (Vec::new(), BTreeMap::new());
         for (index, entry) in recording.entries().iter().enumerate() {
             match &entry.key.topic {
                 Topic::Stats(_) => stats.push(index),
-                Topic::Stream { cav, stream: Stream::Descriptor } => {
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Descriptor,
+                } => {
                     let bytes = recording.read(entry)?;
-                    if let Ok((_, descriptor)) = wire::decode::<Descriptor>([bytes.as_slice()], &Limits::DEFAULT) {
+                    if let Ok((_, descriptor)) =
+                        wire::decode::<Descriptor>([bytes.as_slice()], &Limits::DEFAULT)
+                    {
                         areas.insert(cav.clone(), DetectionArea::from(&descriptor.grid));
                     }
                 }
-                Topic::Received { stream: Stream::Descriptor, .. } => {}
+                Topic::Received {
+                    stream: Stream::Descriptor,
+                    ..
+                } => {}
                 Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => {
-                    moments.entry(entry.header.stamp.capture_nanos).or_default().push(index);
+                    moments
+                        .entry(entry.header.stamp.capture_nanos)
+                        .or_default()
+                        .push(index);
                 }
                 Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => {}
             }
         }
         let swept = support::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
-        let mut run = Self { recording, name, moments: Vec::new(), timelines: Vec::new(), swept, stats, areas };
-        run.moments = moments.into_iter().filter_map(|(at, entries)| run.moment(at, entries)).collect();
+        let mut run = Self {
+            recording,
+            name,
+            moments: Vec::new(),
+            timelines: Vec::new(),
+            swept,
+            stats,
+            areas,
+        };
+        run.moments = moments
+            .into_iter()
+            .filter_map(|(at, entries)| run.moment(at, entries))
+            .collect();
         if run.moments.is_empty() {
             return Err(ViewError::Empty(file));
         }
         let egos = run.egos();
-        let shown = if egos.is_empty() { vec![None] } else { egos.into_iter().map(Some).collect() };
-        run.timelines = shown.into_iter().map(|ego| run.timeline_of(ego)).collect::<Result<_, _>>()?;
+        let shown = if egos.is_empty() {
+            vec![None]
+        } else {
+            egos.into_iter().map(Some).collect()
+        };
+        run.timelines = shown
+            .into_iter()
+            .map(|ego| run.timeline_of(ego))
+            .collect::<Result<_, _>>()?;
         Ok(run)
     }
 
@@ -158,24 +195,59 @@ impl RecordedRun {
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
-    pub fn frame(&self, index: usize, ego: Option<&CavId>) -> Result<Option<SceneFrame>, RecordingError> {
-        let (Some(moment), Some(timeline)) = (self.moments.get(index), self.shown(ego)) else { return Ok(None) };
-        let mut assembly = FrameAssembler::with_areas(self.areas.clone()).for_ego(timeline.ego.clone());
-        let until = moment.entries.iter().map(|entry| self.entry(*entry).arrived_nanos).max().unwrap_or(0);
+    pub fn frame(
+        &self,
+        index: usize,
+        ego: Option<&CavId>,
+    ) -> Result<Option<SceneFrame>, RecordingError> {
+        let (Some(moment), Some(timeline)) = (self.moments.get(index), self.shown(ego)) else {
+            return Ok(None);
+        };
+        let mut assembly =
+            FrameAssembler::with_areas(self.areas.clone()).for_ego(timeline.ego.clone());
+        let until = moment
+            .entries
+            .iter()
+            .map(|entry| self.entry(*entry).arrived_nanos)
+            .max()
+            .unwrap_or(0);
         // Results come last, and complete the scene frame.
-        let (results, others): (Vec<usize>, Vec<usize>) =
-            moment.entries.iter().partition(|entry| is_result(&self.entry(**entry).key.topic));
-        for number in self.reports_until(until).into_iter().chain(others).chain(results) {
+        let (results, others): (Vec<usize>, Vec<usize>) = moment
+            .entries
+            .iter()
+            .partition(|entry| is_result(&self.entry(**entry).key.topic));
+        for number in self
+            .reports_until(until)
+            .into_iter()
+            .chain(others)
+            .chain(results)
+        {
             let entry = self.entry(number);
-            let payload = if is_wanted(&entry.key.topic) { Some(self.recording.read(entry)?) } else { None };
-            let Entry { key, header, arrived_nanos, .. } = entry;
+            let payload = if is_wanted(&entry.key.topic) {
+                Some(self.recording.read(entry)?)
+            } else {
+                None
+            };
+            let Entry {
+                key,
+                header,
+                arrived_nanos,
+                ..
+            } = entry;
             let (topic, payload) = (&key.topic, payload.as_deref());
-            let shown = assembly.add(&ReceivedMessage { topic, header, arrived_nanos: *arrived_nanos, payload });
+            let shown = assembly.add(&ReceivedMessage {
+                topic,
+                header,
+                arrived_nanos: *arrived_nanos,
+                payload,
+            });
             if shown.is_some() {
                 return Ok(shown.map(|frame| self.complete(frame, index, timeline)));
             }
         }
-        Ok(assembly.show(moment.capture_nanos).map(|frame| self.complete(frame, index, timeline)))
+        Ok(assembly
+            .show(moment.capture_nanos)
+            .map(|frame| self.complete(frame, index, timeline)))
     }
 
     /// The image of a camera at a scene frame; `None` if there is none.
@@ -188,7 +260,9 @@ impl RecordedRun {
         cav: &CavId,
         number: u8,
     ) -> Result<Option<(ImageFormat, Bytes)>, RecordingError> {
-        let Some(bytes) = self.message(index, cav, Stream::Camera(number))? else { return Ok(None) };
+        let Some(bytes) = self.message(index, cav, Stream::Camera(number))? else {
+            return Ok(None);
+        };
         let decoded = wire::decode::<Camera>([bytes.as_slice()], &Limits::DEFAULT).ok();
         Ok(decoded.map(|(_, Camera { metadata, image })| (metadata.format, image.into())))
     }
@@ -197,37 +271,75 @@ impl RecordedRun {
     ///
     /// # Errors
     /// [`RecordingError`] when the file has changed.
-    pub(super) fn heat_map(&self, index: usize, cav: &CavId) -> Result<Option<HeatMap>, RecordingError> {
-        Ok(self.message(index, cav, Stream::Bev)?.and_then(|bytes| HeatMap::of(&bytes)))
+    pub(super) fn heat_map(
+        &self,
+        index: usize,
+        cav: &CavId,
+    ) -> Result<Option<HeatMap>, RecordingError> {
+        Ok(self
+            .message(index, cav, Stream::Bev)?
+            .and_then(|bytes| HeatMap::of(&bytes)))
     }
 
-    fn message(&self, index: usize, cav: &CavId, stream: Stream) -> Result<Option<Vec<u8>>, RecordingError> {
-        let topic = Topic::Stream { cav: cav.clone(), stream };
-        let entries = self.moments.get(index).into_iter().flat_map(|moment| &moment.entries);
-        let entry = entries.map(|entry| self.entry(*entry)).find(|entry| entry.key.topic == topic);
+    fn message(
+        &self,
+        index: usize,
+        cav: &CavId,
+        stream: Stream,
+    ) -> Result<Option<Vec<u8>>, RecordingError> {
+        let topic = Topic::Stream {
+            cav: cav.clone(),
+            stream,
+        };
+        let entries = self
+            .moments
+            .get(index)
+            .into_iter()
+            .flat_map(|moment| &moment.entries);
+        let entry = entries
+            .map(|entry| self.entry(*entry))
+            .find(|entry| entry.key.topic == topic);
         entry.map(|entry| self.recording.read(entry)).transpose()
     }
 
     /// Numbers of the cameras of any vehicle.
     pub(super) fn cameras(&self) -> BTreeSet<u8> {
-        let numbers = self.recording.entries().iter().filter_map(|entry| match entry.key.topic {
-            Topic::Stream { stream: Stream::Camera(number), .. } => Some(number),
-            _ => None,
-        });
+        let numbers = self
+            .recording
+            .entries()
+            .iter()
+            .filter_map(|entry| match entry.key.topic {
+                Topic::Stream {
+                    stream: Stream::Camera(number),
+                    ..
+                } => Some(number),
+                _ => None,
+            });
         numbers.collect()
     }
 
     fn shown(&self, ego: Option<&CavId>) -> Option<&Timeline> {
-        let asked = self.timelines.iter().find(|timeline| ego.is_some() && timeline.ego.as_ref() == ego);
+        let asked = self
+            .timelines
+            .iter()
+            .find(|timeline| ego.is_some() && timeline.ego.as_ref() == ego);
         asked.or(self.timelines.first())
     }
 
     /// All egos, in the order of their first results.
     pub(super) fn egos(&self) -> Vec<CavId> {
         let mut egos = Vec::new();
-        for entry in self.moments.iter().flat_map(|moment| &moment.entries).map(|entry| self.entry(*entry)) {
+        for entry in self
+            .moments
+            .iter()
+            .flat_map(|moment| &moment.entries)
+            .map(|entry| self.entry(*entry))
+        {
             match &entry.key.topic {
-                Topic::Stream { cav, stream: Stream::Detections } if !egos.contains(cav) => egos.push(cav.clone()),
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Detections,
+                } if !egos.contains(cav) => egos.push(cav.clone()),
                 _ => {}
             }
         }
@@ -240,34 +352,70 @@ impl RecordedRun {
         if !topics().any(|topic| *topic == Topic::Truth || is_result(topic)) {
             return None;
         }
-        let truth = entries.iter().map(|index| self.entry(*index)).find(|entry| entry.key.topic == Topic::Truth);
+        let truth = entries
+            .iter()
+            .map(|index| self.entry(*index))
+            .find(|entry| entry.key.topic == Topic::Truth);
         let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
-        Some(Moment { capture_nanos, began_nanos, entries })
+        Some(Moment {
+            capture_nanos,
+            began_nanos,
+            entries,
+        })
     }
 
     fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline, RecordingError> {
-        let links = ego.as_ref().map(|ego| LinkSeries::new(self.recording.entries(), ego)).unwrap_or_default();
+        let links = ego
+            .as_ref()
+            .map(|ego| LinkSeries::new(self.recording.entries(), ego))
+            .unwrap_or_default();
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::default());
         let mut summaries = Vec::with_capacity(self.moments.len());
         for moment in &self.moments {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
             summary.links = links.at(moment.capture_nanos, moment.began_nanos);
             if let Some(began) = moment.began_nanos {
-                pace.tick(summary.latency_ms.map(|latency_ms| began.saturating_add((latency_ms * 1e6) as u64)));
+                pace.tick(
+                    summary
+                        .latency_ms
+                        .map(|latency_ms| began.saturating_add((latency_ms * 1e6) as u64)),
+                );
             }
             summaries.push(summary);
         }
-        Ok(Timeline { ego, summaries, pace })
+        Ok(Timeline {
+            ego,
+            summaries,
+            pace,
+        })
     }
 
     /// Adds what is known of a whole recording.
     fn complete(&self, frame: SceneFrame, index: usize, timeline: &Timeline) -> SceneFrame {
         let moment = self.moments.get(index);
-        let swept = moment.and_then(|moment| self.swept.get(&moment.capture_nanos).copied().zip(moment.began_nanos));
+        let swept = moment.and_then(|moment| {
+            self.swept
+                .get(&moment.capture_nanos)
+                .copied()
+                .zip(moment.began_nanos)
+        });
         let swept_ms = swept.map(|(swept, began)| (swept as f64 - began as f64) / 1e6);
-        let ap_50 = timeline.summaries.get(index).and_then(|summary| summary.ap_50);
-        let egos = self.timelines.iter().filter_map(|timeline| timeline.ego.clone()).collect();
-        SceneFrame { swept_ms, pace: timeline.pace.pace(), ap_50, egos, ..frame }
+        let ap_50 = timeline
+            .summaries
+            .get(index)
+            .and_then(|summary| summary.ap_50);
+        let egos = self
+            .timelines
+            .iter()
+            .filter_map(|timeline| timeline.ego.clone())
+            .collect();
+        SceneFrame {
+            swept_ms,
+            pace: timeline.pace.pace(),
+            ap_50,
+            egos,
+            ..frame
+        }
     }
 
     fn entry(&self, index: usize) -> &Entry {
@@ -277,7 +425,12 @@ impl RecordedRun {
     /// Last report of every process until `nanos`.
     fn reports_until(&self, nanos: u64) -> Vec<usize> {
         let mut last = BTreeMap::new();
-        for index in self.stats.iter().copied().filter(|index| self.entry(*index).arrived_nanos <= nanos) {
+        for index in self
+            .stats
+            .iter()
+            .copied()
+            .filter(|index| self.entry(*index).arrived_nanos <= nanos)
+        {
             last.insert(&self.entry(index).key.topic, index);
         }
         last.into_values().collect()
@@ -290,14 +443,26 @@ impl RecordedRun {
         judge: &mut Judge,
     ) -> Result<MomentSummary, RecordingError> {
         let capture_s = moment.capture_nanos as f64 / 1e9;
-        let mut summary = MomentSummary { capture_s, ..MomentSummary::default() };
+        let mut summary = MomentSummary {
+            capture_s,
+            ..MomentSummary::default()
+        };
         let (mut truth, mut result) = (None, None);
         for entry in moment.entries.iter().map(|index| self.entry(*index)) {
             let published = entry.header.stamp.publish_nanos;
             match &entry.key.topic {
-                Topic::Truth => truth = self.decoded::<Truth>(entry)?.map(|truth| (published, truth)),
-                Topic::Stream { cav, stream: Stream::Detections } if Some(cav) == ego => {
-                    result = self.decoded::<Detections>(entry)?.map(|result| (published, result));
+                Topic::Truth => {
+                    truth = self
+                        .decoded::<Truth>(entry)?
+                        .map(|truth| (published, truth))
+                }
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Detections,
+                } if Some(cav) == ego => {
+                    result = self
+                        .decoded::<Detections>(entry)?
+                        .map(|result| (published, result));
                 }
                 _ => {}
             }
@@ -309,7 +474,8 @@ impl RecordedRun {
                 summary.latency_ms = Some((*done as f64 - *began as f64) / 1e6);
                 summary.ego_error_m = ego_error_m(&result.pose, truth, result);
                 let area = self.areas.get(&result.ego);
-                summary.judged = area.map(|area| judge.judge(result, truth, area).counts(result, SHOWN_SCORE));
+                summary.judged =
+                    area.map(|area| judge.judge(result, truth, area).counts(result, SHOWN_SCORE));
             }
         }
         summary.ap_50 = judge.average_precision();
@@ -319,7 +485,9 @@ impl RecordedRun {
     /// The content of a message; `None` if it is damaged.
     fn decoded<M: Payload>(&self, entry: &Entry) -> Result<Option<M>, RecordingError> {
         let bytes = self.recording.read(entry)?;
-        Ok(wire::decode([bytes.as_slice()], &Limits::DEFAULT).ok().map(|(_, message)| message))
+        Ok(wire::decode([bytes.as_slice()], &Limits::DEFAULT)
+            .ok()
+            .map(|(_, message)| message))
     }
 }
 
@@ -329,12 +497,23 @@ fn ego_error_m(pose: &PoseEstimate, truth: &Truth, result: &Detections) -> Optio
 }
 
 fn is_result(topic: &Topic) -> bool {
-    matches!(topic, Topic::Stream { stream: Stream::Detections, .. })
+    matches!(
+        topic,
+        Topic::Stream {
+            stream: Stream::Detections,
+            ..
+        }
+    )
 }
 
 /// True if a message's content is shown, and not only its arrival.
 fn is_wanted(topic: &Topic) -> bool {
-    const SHOWN: [Stream; 4] = [Stream::Lidar, Stream::Pose, Stream::Boxes, Stream::Detections];
+    const SHOWN: [Stream; 4] = [
+        Stream::Lidar,
+        Stream::Pose,
+        Stream::Boxes,
+        Stream::Detections,
+    ];
     matches!(topic, Topic::Truth | Topic::Stats(_))
         || matches!(topic, Topic::Stream { stream, .. } if SHOWN.contains(stream))
 }

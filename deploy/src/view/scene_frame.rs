@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 
 use protocol::{
-    Box3d, CavId, DropReason, MisbehaviourReason, NoPoseReason, PointCloud, Pose, StageSummary, StageTiming,
+    Box3d, CavId, DropReason, MisbehaviourReason, NoPoseReason, PointCloud, Pose, StageSummary,
+    StageTiming,
 };
 use serde::{Serialize, Serializer};
 
@@ -182,8 +183,17 @@ impl SceneFrame {
             let (points, behind) = rest.split_at((vehicle.points * POINT_BYTES).min(rest.len()));
             rest = behind;
             let metres = |bytes: &[u8]| f32::from(i16::from_le_bytes([bytes[0], bytes[1]])) / 100.0;
-            let point = |bytes: &[u8]| [metres(&bytes[..2]), metres(&bytes[2..4]), metres(&bytes[4..])];
-            (vehicle, points.chunks_exact(POINT_BYTES).map(point).collect())
+            let point = |bytes: &[u8]| {
+                [
+                    metres(&bytes[..2]),
+                    metres(&bytes[2..4]),
+                    metres(&bytes[4..]),
+                ]
+            };
+            (
+                vehicle,
+                points.chunks_exact(POINT_BYTES).map(point).collect(),
+            )
         })
     }
 
@@ -203,7 +213,11 @@ impl SceneFrame {
 
 impl Planar {
     pub(super) fn of(pose: &Pose) -> Self {
-        Self { x_m: pose.translation_m[0], y_m: pose.translation_m[1], yaw_rad: pose.yaw_rad() }
+        Self {
+            x_m: pose.translation_m[0],
+            y_m: pose.translation_m[1],
+            yaw_rad: pose.yaw_rad(),
+        }
     }
 }
 
@@ -211,7 +225,12 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
     let rows = |pose: &Pose| {
         let rotation = pose.isometry().rotation.to_rotation_matrix();
         let row = |index: usize| {
-            [rotation[(index, 0)], rotation[(index, 1)], rotation[(index, 2)], pose.translation_m[index]]
+            [
+                rotation[(index, 0)],
+                rotation[(index, 1)],
+                rotation[(index, 2)],
+                pose.translation_m[index],
+            ]
         };
         let ([a, b, c, d], [e, f, g, h]) = (row(0), row(1));
         [a, b, c, d, e, f, g, h]
@@ -223,5 +242,10 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
 pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
     let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
     let decimate = points.decimate(MAX_POINTS);
-    decimate.xyzi.iter().flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres)).flatten().collect()
+    decimate
+        .xyzi
+        .iter()
+        .flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres))
+        .flatten()
+        .collect()
 }

@@ -42,12 +42,19 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
         "/live" => {
             let frames = run.moments(number_of("frames", &request.query), ego_of(&request.query));
-            Answer::Stream { content_type: BINARY, pieces: frames.boxed() }
+            Answer::Stream {
+                content_type: BINARY,
+                pieces: frames.boxed(),
+            }
         }
         "/status" => document(&json!(run.status())),
         path => match (camera(path), mapped(path)) {
             (Some(camera), _) => image(run.images().get(&camera)),
-            (None, Some(cav)) => heat_map(run.maps().get(&cav).and_then(|message| HeatMap::of(&message))),
+            (None, Some(cav)) => heat_map(
+                run.maps()
+                    .get(&cav)
+                    .and_then(|message| HeatMap::of(&message)),
+            ),
             (None, None) => asset(request),
         },
     })
@@ -68,17 +75,26 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
                 &json!({"mode": "recorded", "run": run, "egos": egos, "timeline": timeline, "cameras": cameras}),
             );
         }
-        let index = number_of("at", &request.query).and_then(|index| usize::try_from(index).ok()).unwrap_or(0);
+        let index = number_of("at", &request.query)
+            .and_then(|index| usize::try_from(index).ok())
+            .unwrap_or(0);
         if let Some((cav, number)) = camera(&request.path) {
             return run.image(index, &cav, number).map_or_else(not_found, image);
         }
         if let Some(cav) = mapped(&request.path) {
             return run.heat_map(index, &cav).map_or_else(not_found, heat_map);
         }
-        let Some(index) = request.path.strip_prefix("/frame/") else { return asset(request) };
+        let Some(index) = request.path.strip_prefix("/frame/") else {
+            return asset(request);
+        };
         match index.parse().map(|index| run.frame(index, ego.as_ref())) {
-            Ok(Ok(Some(frame))) => Answer::Page { content_type: BINARY, body: frame.to_bytes().into() },
-            Ok(Ok(None)) => Answer::NotFound(format!("there are {} moments, counted from 0", run.len())),
+            Ok(Ok(Some(frame))) => Answer::Page {
+                content_type: BINARY,
+                body: frame.to_bytes().into(),
+            },
+            Ok(Ok(None)) => {
+                Answer::NotFound(format!("there are {} moments, counted from 0", run.len()))
+            }
             Ok(Err(error)) => not_found(error),
             Err(error) => Answer::NotFound(format!("{index:?} is no number: {error}")),
         }
@@ -99,7 +115,10 @@ fn mapped(path: &str) -> Option<CavId> {
 /// A heat map; nothing where there is none.
 fn heat_map(found: Option<HeatMap>) -> Answer {
     let body = found.map_or(Bytes::new(), |map| map.to_bytes().into());
-    Answer::Page { content_type: BINARY, body }
+    Answer::Page {
+        content_type: BINARY,
+        body,
+    }
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "the error of a result")]
@@ -109,9 +128,18 @@ fn not_found(error: RecordingError) -> Answer {
 
 fn image(found: Option<(ImageFormat, Bytes)>) -> Answer {
     match found {
-        Some((ImageFormat::Png, body)) => Answer::Page { content_type: "image/png", body },
-        Some((ImageFormat::Jpeg, body)) => Answer::Page { content_type: "image/jpeg", body },
-        None => Answer::Page { content_type: "image/svg+xml", body: Bytes::from_static(NO_IMAGE.as_bytes()) },
+        Some((ImageFormat::Png, body)) => Answer::Page {
+            content_type: "image/png",
+            body,
+        },
+        Some((ImageFormat::Jpeg, body)) => Answer::Page {
+            content_type: "image/jpeg",
+            body,
+        },
+        None => Answer::Page {
+            content_type: "image/svg+xml",
+            body: Bytes::from_static(NO_IMAGE.as_bytes()),
+        },
     }
 }
 
@@ -123,11 +151,17 @@ fn asset(request: &Request) -> Answer {
         (_, Some((_, script))) => ("text/javascript; charset=utf-8", script),
         (other, None) => return Answer::NotFound(format!("there is no {other}")),
     };
-    Answer::Page { content_type, body: Bytes::from_static(text.as_bytes()) }
+    Answer::Page {
+        content_type,
+        body: Bytes::from_static(text.as_bytes()),
+    }
 }
 
 fn document(value: &serde_json::Value) -> Answer {
-    Answer::Page { content_type: "application/json", body: value.to_string().into() }
+    Answer::Page {
+        content_type: "application/json",
+        body: value.to_string().into(),
+    }
 }
 
 /// Number that a query has for `name`.
@@ -141,5 +175,7 @@ fn ego_of(query: &str) -> Option<CavId> {
 }
 
 fn text_of<'a>(name: &str, query: &'a str) -> Option<&'a str> {
-    query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))
+    query
+        .split('&')
+        .find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))
 }

@@ -37,8 +37,12 @@ pub fn until_stopped(
 ) -> anyhow::Result<()> {
     let stop = Stop::new();
     stop.on_signals()?;
-    let server = serve(listen).map_err(|error| BadInput::new(format!("cannot serve at {listen}: {error}")))?;
-    output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
+    let server = serve(listen)
+        .map_err(|error| BadInput::new(format!("cannot serve at {listen}: {error}")))?;
+    output::note(format_args!(
+        "http://{}/ (Ctrl-C ends it)",
+        server.address()
+    ));
     while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
     warn_dropped(&server);
     Ok(())
@@ -47,6 +51,8 @@ pub fn until_stopped(
 fn warn_dropped(server: &WebServer) {
     let dropped = server.readers().dropped();
     if dropped > 0 {
-        output::note(format_args!("{dropped} readers did not read and were dropped"));
+        output::note(format_args!(
+            "{dropped} readers did not read and were dropped"
+        ));
     }
 }

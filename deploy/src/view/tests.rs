@@ -11,8 +11,9 @@ use bus::web::fetch;
 use bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
 use protocol::message::{AgentTruth, FusedNeighbour, NeighbourState, StageTiming};
 use protocol::{
-    Bev, BevFeatures, BevGrid, Box3d, CavId, CodecConfig, Detection, Detections, Key, Lidar, PointCloud, Pose,
-    PoseEstimate, RunId, Stamp, Stream, Topic, TrueObject, Truth, encode_features, wire,
+    Bev, BevFeatures, BevGrid, Box3d, CavId, CodecConfig, Detection, Detections, Key, Lidar,
+    PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic, TrueObject, Truth,
+    encode_features, wire,
 };
 use recording::{RecordingOptions, RecordingWriter};
 use serde_json::Value;
@@ -30,13 +31,23 @@ fn cav(text: &str) -> CavId {
 }
 
 fn pose_of(cav_id: &str, tick: u64) -> Pose {
-    Pose::from_xyz_yaw([tick as f64, if cav_id == EGO { 0.0 } else { 15.0 }, 1.9], 0.2)
+    Pose::from_xyz_yaw(
+        [tick as f64, if cav_id == EGO { 0.0 } else { 15.0 }, 1.9],
+        0.2,
+    )
 }
 
 fn cloud(tick: u64, count: u64) -> PointCloud {
     PointCloud {
         xyzi: (0..count)
-            .map(|k| [(k % 173) as f32 * 0.4 - 34.0, (k / 173) as f32 * 0.4 - 34.0, tick as f32, 0.5])
+            .map(|k| {
+                [
+                    (k % 173) as f32 * 0.4 - 34.0,
+                    (k / 173) as f32 * 0.4 - 34.0,
+                    tick as f32,
+                    0.5,
+                ]
+            })
             .collect(),
     }
 }
@@ -54,17 +65,28 @@ fn truth(tick: u64) -> Truth {
         world_from_lidar: pose_of(cav_id, tick),
         objects: vec![object.clone()],
     };
-    Truth { tick, agents: [EGO, OTHER].map(agent).into() }
+    Truth {
+        tick,
+        agents: [EGO, OTHER].map(agent).into(),
+    }
 }
 
 fn detections_of(ego: &str, tick: u64) -> Detections {
-    let box3d = Box3d { center_m: [10.0, 0.0, -1.0], size_m: [4.0, 1.8, 1.6], heading_rad: 0.0 };
+    let box3d = Box3d {
+        center_m: [10.0, 0.0, -1.0],
+        size_m: [4.0, 1.8, 1.6],
+        heading_rad: 0.0,
+    };
     Detections {
         ego: cav(ego),
         agent_frame: tick,
         method: "max".into(),
         pose: PoseEstimate::new(pose_of(ego, tick), 0.9),
-        detections: vec![Detection { box3d, score: 0.8, source: None }],
+        detections: vec![Detection {
+            box3d,
+            score: 0.8,
+            source: None,
+        }],
         fused: vec![FusedNeighbour {
             cav: cav(other_than(ego)),
             age_nanos: 0,
@@ -92,10 +114,24 @@ fn other_than(ego: &str) -> &'static str {
 
 /// A feature map of 4 by 2 cells.
 fn feature_map(who: &str, tick: u64) -> Bev {
-    let grid = BevGrid { x_min_m: -2.0, y_min_m: -1.0, cell_m: 1.0, width: 4, height: 2 };
-    let features = BevFeatures { grid, channels: 1, code_of: None, values: (0..8).map(|cell| cell as f32).collect() };
+    let grid = BevGrid {
+        x_min_m: -2.0,
+        y_min_m: -1.0,
+        cell_m: 1.0,
+        width: 4,
+        height: 2,
+    };
+    let features = BevFeatures {
+        grid,
+        channels: 1,
+        code_of: None,
+        values: (0..8).map(|cell| cell as f32).collect(),
+    };
     let features = encode_features(features, &CodecConfig::default(), None).unwrap();
-    Bev { pose: PoseEstimate::new(pose_of(who, tick), 0.9), features }
+    Bev {
+        pose: PoseEstimate::new(pose_of(who, tick), 0.9),
+        features,
+    }
 }
 
 /// A feature map of the other vehicle, which reaches the ego over a link, and later a result of the other vehicle.
@@ -107,12 +143,35 @@ fn messages_of_a_second_ego(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
         capture_nanos: 100_000_000 * (tick + 1),
         publish_nanos: now + 1_000_000 * late_ms,
     };
-    let map = wire::encode(&stamp(25), feature_map(OTHER, tick)).unwrap().to_vec();
-    let result = wire::encode(&stamp(30), detections_of(OTHER, tick)).unwrap().to_vec();
+    let map = wire::encode(&stamp(25), feature_map(OTHER, tick))
+        .unwrap()
+        .to_vec();
+    let result = wire::encode(&stamp(30), detections_of(OTHER, tick))
+        .unwrap()
+        .to_vec();
     vec![
-        (Topic::Stream { cav: cav(OTHER), stream: Stream::Bev }, map.clone()),
-        (Topic::Received { ego: cav(EGO), cav: cav(OTHER), stream: Stream::Bev }, map),
-        (Topic::Stream { cav: cav(OTHER), stream: Stream::Detections }, result),
+        (
+            Topic::Stream {
+                cav: cav(OTHER),
+                stream: Stream::Bev,
+            },
+            map.clone(),
+        ),
+        (
+            Topic::Received {
+                ego: cav(EGO),
+                cav: cav(OTHER),
+                stream: Stream::Bev,
+            },
+            map,
+        ),
+        (
+            Topic::Stream {
+                cav: cav(OTHER),
+                stream: Stream::Detections,
+            },
+            result,
+        ),
     ]
 }
 
@@ -125,18 +184,40 @@ fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
         capture_nanos: 100_000_000 * (tick + 1),
         publish_nanos: now + 1_000_000 * late_ms,
     };
-    let stream = |who: &str, stream| Topic::Stream { cav: cav(who), stream };
-    let mut all = vec![(Topic::Truth, wire::encode(&stamp("replay", 0), truth(tick)).unwrap().to_vec())];
+    let stream = |who: &str, stream| Topic::Stream {
+        cav: cav(who),
+        stream,
+    };
+    let mut all = vec![(
+        Topic::Truth,
+        wire::encode(&stamp("replay", 0), truth(tick))
+            .unwrap()
+            .to_vec(),
+    )];
     for who in [EGO, OTHER] {
-        let count = if sweeps == Stream::Preview { 4_000 } else { 30_000 };
-        let lidar = Lidar { points: cloud(tick, count) };
-        all.push((stream(who, sweeps), wire::encode(&stamp(who, 0), lidar).unwrap().to_vec()));
+        let count = if sweeps == Stream::Preview {
+            4_000
+        } else {
+            30_000
+        };
+        let lidar = Lidar {
+            points: cloud(tick, count),
+        };
+        all.push((
+            stream(who, sweeps),
+            wire::encode(&stamp(who, 0), lidar).unwrap().to_vec(),
+        ));
         let estimate = PoseEstimate::new(pose_of(who, tick), 0.9);
-        all.push((stream(who, Stream::Pose), wire::encode(&stamp(who, 20), estimate).unwrap().to_vec()));
+        all.push((
+            stream(who, Stream::Pose),
+            wire::encode(&stamp(who, 20), estimate).unwrap().to_vec(),
+        ));
     }
     all.push((
         stream(EGO, Stream::Detections),
-        wire::encode(&stamp(EGO, 50), detections_of(EGO, tick)).unwrap().to_vec(),
+        wire::encode(&stamp(EGO, 50), detections_of(EGO, tick))
+            .unwrap()
+            .to_vec(),
     ));
     all
 }
@@ -152,12 +233,20 @@ fn record(folder: &Path, has_second_ego: bool) -> RecordedRun {
         }
         for (topic, payload) in all {
             let key: Key = topic.in_run(&run);
-            writer.write(&key, 1_000_000_000 * tick + 60_000_000, &payload).unwrap();
+            writer
+                .write(&key, 1_000_000_000 * tick + 60_000_000, &payload)
+                .unwrap();
         }
     }
     writer.finish().unwrap();
-    let mut sweeps = support::sweep_log::SweepLog::open(&folder.join(crate::operate::run_folder::SWEEP_LOG)).unwrap();
-    (0..TICKS).for_each(|tick| sweeps.note(100_000_000 * (tick + 1), 1_000_000_000 * tick + 3_000_000).unwrap());
+    let mut sweeps =
+        support::sweep_log::SweepLog::open(&folder.join(crate::operate::run_folder::SWEEP_LOG))
+            .unwrap();
+    (0..TICKS).for_each(|tick| {
+        sweeps
+            .note(100_000_000 * (tick + 1), 1_000_000_000 * tick + 3_000_000)
+            .unwrap()
+    });
     RecordedRun::open(folder).unwrap()
 }
 
@@ -169,22 +258,54 @@ fn parsed(bytes: &[u8]) -> (Value, usize) {
 }
 
 fn check(frame: &Value, points: usize) {
-    assert_eq!((&frame["ego"], &frame["method"]), (&EGO.into(), &"max".into()));
-    assert_eq!(frame["truth"].as_array().unwrap().len(), 1, "all vehicles annotate it, and it is shown once");
+    assert_eq!(
+        (&frame["ego"], &frame["method"]),
+        (&EGO.into(), &"max".into())
+    );
+    assert_eq!(
+        frame["truth"].as_array().unwrap().len(),
+        1,
+        "all vehicles annotate it, and it is shown once"
+    );
     // 10 m ahead of an ego at (tick, 0) with a heading of 0.2 rad to the left.
     let tick = frame["tick"].as_u64().unwrap() as f64;
     let x = frame["detections"][0]["center_m"][0].as_f64().unwrap();
     assert!((x - (tick + 10.0 * 0.2_f64.cos())).abs() < 1e-9, "{x}");
-    assert!((frame["latency_ms"].as_f64().unwrap() - 50.0).abs() < 1.0, "{}", frame["latency_ms"]);
-    assert!(frame["posed_ms"].as_f64().is_none_or(|posed| (posed - 20.0).abs() < 1.0), "{}", frame["posed_ms"]);
+    assert!(
+        (frame["latency_ms"].as_f64().unwrap() - 50.0).abs() < 1.0,
+        "{}",
+        frame["latency_ms"]
+    );
+    assert!(
+        frame["posed_ms"]
+            .as_f64()
+            .is_none_or(|posed| (posed - 20.0).abs() < 1.0),
+        "{}",
+        frame["posed_ms"]
+    );
     let vehicles = frame["vehicles"].as_array().unwrap();
     assert_eq!(vehicles.len(), 2);
-    assert!((vehicles[0]["confidence"].as_f64().unwrap() - 0.9).abs() < 1e-6 && vehicles[0]["error_m"] == 0.0);
-    let counted: u64 = vehicles.iter().map(|vehicle| vehicle["points"].as_u64().unwrap()).sum();
-    assert!(counted as usize == points && points <= 24_000, "{counted} and {points}");
+    assert!(
+        (vehicles[0]["confidence"].as_f64().unwrap() - 0.9).abs() < 1e-6
+            && vehicles[0]["error_m"] == 0.0
+    );
+    let counted: u64 = vehicles
+        .iter()
+        .map(|vehicle| vehicle["points"].as_u64().unwrap())
+        .sum();
+    assert!(
+        counted as usize == points && points <= 24_000,
+        "{counted} and {points}"
+    );
     let link = &frame["links"][0];
-    assert_eq!((&link["from"], &link["wire_bytes"], &link["is_fused"]), (&OTHER.into(), &1_250.into(), &true.into()));
-    assert_eq!((&link["trust"], &link["clock_ms"]), (&0.75.into(), &(-250.0).into()));
+    assert_eq!(
+        (&link["from"], &link["wire_bytes"], &link["is_fused"]),
+        (&OTHER.into(), &1_250.into(), &true.into())
+    );
+    assert_eq!(
+        (&link["trust"], &link["clock_ms"]),
+        (&0.75.into(), &(-250.0).into())
+    );
 }
 
 #[test]
@@ -197,48 +318,85 @@ fn a_recorded_run_is_shown_in_any_order() {
         assert_eq!(frame["tick"], index);
         check(&frame, points);
         assert!(points > 10_000, "two sweeps");
-        assert_eq!(frame["pace"], serde_json::json!({"ticks": 5, "answered": 5, "rate_hz": 1.0}));
-        assert_eq!((&frame["swept_ms"], &frame["posed_ms"]), (&3.0.into(), &20.0.into()));
+        assert_eq!(
+            frame["pace"],
+            serde_json::json!({"ticks": 5, "answered": 5, "rate_hz": 1.0})
+        );
+        assert_eq!(
+            (&frame["swept_ms"], &frame["posed_ms"]),
+            (&3.0.into(), &20.0.into())
+        );
     }
     assert!(run.frame(5, None).unwrap().is_none());
     let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
     let about: Value = serde_json::from_slice(&fetch(server.address(), "/run").unwrap().1).unwrap();
-    assert_eq!((&about["mode"], about["timeline"].as_array().unwrap().len()), (&"recorded".into(), 5));
+    assert_eq!(
+        (&about["mode"], about["timeline"].as_array().unwrap().len()),
+        (&"recorded".into(), 5)
+    );
     assert_eq!(about["timeline"][1]["latency_ms"], 50.0);
     let (status, body) = fetch(server.address(), "/frame/2").unwrap();
     assert!(status.contains("200"));
     check(&parsed(&body).0, parsed(&body).1);
     for path in ["/frame/99", "/frame/x", "/nothing"] {
-        assert!(fetch(server.address(), path).unwrap().0.contains("404"), "{path}");
+        assert!(
+            fetch(server.address(), path).unwrap().0.contains("404"),
+            "{path}"
+        );
     }
-    assert!(matches!(RecordedRun::open(&folder.path().join("none")), Err(ViewError::NotRecorded(_))));
+    assert!(matches!(
+        RecordedRun::open(&folder.path().join("none")),
+        Err(ViewError::NotRecorded(_))
+    ));
 }
 
 #[test]
 fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
     let folder = tempfile::tempdir().unwrap();
     let run = record(folder.path(), true);
-    assert_eq!(run.egos(), [cav(EGO), cav(OTHER)], "in the order of their results");
+    assert_eq!(
+        run.egos(),
+        [cav(EGO), cav(OTHER)],
+        "in the order of their results"
+    );
     let latency_ms = |ego: Option<&str>| run.timeline(ego.map(cav).as_ref())[1].latency_ms.unwrap();
-    assert_eq!([None, Some(EGO), Some(OTHER), Some("77")].map(latency_ms), [50.0, 50.0, 30.0, 50.0]);
+    assert_eq!(
+        [None, Some(EGO), Some(OTHER), Some("77")].map(latency_ms),
+        [50.0, 50.0, 30.0, 50.0]
+    );
     for (ego, name) in [(None, EGO), (Some(cav(OTHER)), OTHER)] {
         let (frame, _) = parsed(&run.frame(2, ego.as_ref()).unwrap().unwrap().to_bytes());
-        assert_eq!((&frame["ego"], &frame["egos"]), (&name.into(), &serde_json::json!([EGO, OTHER])));
+        assert_eq!(
+            (&frame["ego"], &frame["egos"]),
+            (&name.into(), &serde_json::json!([EGO, OTHER]))
+        );
         assert_eq!(frame["links"][0]["from"], other_than(name));
     }
     // Published 25 ms after the tick and recorded at 60 ms, long before the next tick.
     let links = &run.timeline(None)[2].links;
-    assert_eq!((links.len(), links[0].from.as_str(), links[0].waiting_bytes), (1, OTHER, Some(0)));
-    assert!(links[0].sent_bytes > 100 && links[0].transit_ms == Some(35.0), "{links:?}");
+    assert_eq!(
+        (links.len(), links[0].from.as_str(), links[0].waiting_bytes),
+        (1, OTHER, Some(0))
+    );
+    assert!(
+        links[0].sent_bytes > 100 && links[0].transit_ms == Some(35.0),
+        "{links:?}"
+    );
 
     let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
     let body = |path: &str| fetch(server.address(), path).unwrap().1;
-    assert_eq!(parsed(&body(&format!("/frame/0?ego={OTHER}"))).0["ego"], OTHER);
+    assert_eq!(
+        parsed(&body(&format!("/frame/0?ego={OTHER}"))).0["ego"],
+        OTHER
+    );
     let about: Value = serde_json::from_slice(&body(&format!("/run?ego={OTHER}"))).unwrap();
     assert_eq!(about["timeline"][0]["latency_ms"], 30.0);
     let map = body(&format!("/map/{OTHER}?at=1"));
     assert_eq!(&map[map.len() - 8..], [0, 0, 0, 0, 0, 85, 170, 255]);
-    assert!(body(&format!("/map/{EGO}?at=1")).is_empty(), "it has published none");
+    assert!(
+        body(&format!("/map/{EGO}?at=1")).is_empty(),
+        "it has published none"
+    );
 }
 
 #[test]
@@ -249,7 +407,12 @@ fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
         for (topic, payload) in messages(tick, 0, Stream::Lidar) {
             let mut header = wire::decode_header([payload.as_slice()]).unwrap();
             header.stamp.epoch = epoch;
-            let seen = ReceivedMessage { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
+            let seen = ReceivedMessage {
+                topic: &topic,
+                header: &header,
+                arrived_nanos: 0,
+                payload: Some(&payload),
+            };
             frames.extend(assembly.add(&seen).and_then(|frame| frame.tick));
         }
         frames
@@ -265,12 +428,29 @@ fn ticks_without_a_result_count_as_unanswered_once_a_later_one_is_shown() {
     let mut assembly = FrameAssembler::default();
     let mut pace = Vec::new();
     for tick in 0..6 {
-        let is_result = |topic: &Topic| matches!(topic, Topic::Stream { stream: Stream::Detections, .. });
+        let is_result = |topic: &Topic| {
+            matches!(
+                topic,
+                Topic::Stream {
+                    stream: Stream::Detections,
+                    ..
+                }
+            )
+        };
         for (topic, payload) in messages(tick, 100_000_000 * tick, Stream::Preview) {
             let header = wire::decode_header([payload.as_slice()]).unwrap();
-            let seen = ReceivedMessage { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
+            let seen = ReceivedMessage {
+                topic: &topic,
+                header: &header,
+                arrived_nanos: 0,
+                payload: Some(&payload),
+            };
             if !is_result(&topic) || tick % 2 == 1 {
-                pace.extend(assembly.add(&seen).map(|frame| (frame.pace.answered, frame.pace.ticks)));
+                pace.extend(
+                    assembly
+                        .add(&seen)
+                        .map(|frame| (frame.pace.answered, frame.pace.ticks)),
+                );
             }
         }
     }
@@ -285,7 +465,13 @@ struct Traffic {
 
 impl Traffic {
     fn start(has_second_ego: bool) -> Self {
-        let endpoint = Endpoint::loopback(TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port());
+        let endpoint = Endpoint::loopback(
+            TcpListener::bind("127.0.0.1:0")
+                .unwrap()
+                .local_addr()
+                .unwrap()
+                .port(),
+        );
         let ending = Arc::<AtomicBool>::default();
         let bus = join(&BusOptions::router(endpoint.clone()), "replay");
         std::thread::spawn({
@@ -303,8 +489,11 @@ impl Drop for Traffic {
 }
 
 fn join(options: &BusOptions, name: &str) -> Bus {
-    let identity =
-        Identity { run: RunId::new("test").unwrap(), process: name.parse().unwrap(), cav: CavId::new(name).unwrap() };
+    let identity = Identity {
+        run: RunId::new("test").unwrap(),
+        process: name.parse().unwrap(),
+        cav: CavId::new(name).unwrap(),
+    };
     Bus::join(options, identity).unwrap()
 }
 
@@ -312,17 +501,47 @@ fn publish(bus: Bus, ending: &AtomicBool, has_second_ego: bool) {
     let mut publishers = std::collections::BTreeMap::new();
     for tick in 0.. {
         let now = bus::unix_nanos();
-        let second = if has_second_ego { messages_of_a_second_ego(tick, now) } else { Vec::new() };
-        for (topic, payload) in messages(tick, now, Stream::Preview).into_iter().chain(second) {
-            if matches!(topic, Topic::Stream { stream: Stream::Detections, .. }) {
+        let second = if has_second_ego {
+            messages_of_a_second_ego(tick, now)
+        } else {
+            Vec::new()
+        };
+        for (topic, payload) in messages(tick, now, Stream::Preview)
+            .into_iter()
+            .chain(second)
+        {
+            if matches!(
+                topic,
+                Topic::Stream {
+                    stream: Stream::Detections,
+                    ..
+                }
+            ) {
                 // As long as perception takes: sweeps are far ahead of their results.
                 std::thread::sleep(Duration::from_millis(50));
             }
-            let is_preview = matches!(topic, Topic::Stream { stream: Stream::Preview, .. });
-            let options = if is_preview { PublisherOptions::PREVIEW } else { PublisherOptions::SENSOR };
-            let publisher = publishers.entry(topic.clone()).or_insert_with(|| bus.publisher(topic, options).unwrap());
+            let is_preview = matches!(
+                topic,
+                Topic::Stream {
+                    stream: Stream::Preview,
+                    ..
+                }
+            );
+            let options = if is_preview {
+                PublisherOptions::PREVIEW
+            } else {
+                PublisherOptions::SENSOR
+            };
+            let publisher = publishers
+                .entry(topic.clone())
+                .or_insert_with(|| bus.publisher(topic, options).unwrap());
             // Unchanged: stamp and all.
-            publisher.submit_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
+            publisher.submit_encoded(0, move |_| {
+                Ok(protocol::Encoded {
+                    head: payload,
+                    body: protocol::Body::Empty,
+                })
+            });
         }
         std::thread::sleep(Duration::from_millis(50));
         if ending.load(Ordering::Relaxed) {
@@ -334,17 +553,36 @@ fn publish(bus: Bus, ending: &AtomicBool, has_second_ego: bool) {
 #[test]
 fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     let traffic = Traffic::start(false);
-    let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
+    let run = Arc::new(
+        LiveRun::start(join(
+            &BusOptions::client(traffic.endpoint.clone()),
+            "viewer",
+        ))
+        .unwrap(),
+    );
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
 
     // The run is subscribed to only once a page is open.
-    let moments: Vec<_> = moments_of(server.address(), "frames=20").iter().map(|bytes| parsed(bytes)).collect();
-    let captures: Vec<f64> = moments.iter().map(|(frame, _)| frame["capture_s"].as_f64().unwrap()).collect();
-    assert!(captures.windows(2).all(|pair| pair[0] < pair[1]), "always a newer one: {captures:?}");
+    let moments: Vec<_> = moments_of(server.address(), "frames=20")
+        .iter()
+        .map(|bytes| parsed(bytes))
+        .collect();
+    let captures: Vec<f64> = moments
+        .iter()
+        .map(|(frame, _)| frame["capture_s"].as_f64().unwrap())
+        .collect();
+    assert!(
+        captures.windows(2).all(|pair| pair[0] < pair[1]),
+        "always a newer one: {captures:?}"
+    );
     // On a busy machine the passive subscriber drops parts of some frames, but hardly ever of all.
-    let whole =
-        |frame: &Value, points: usize| !frame["ego"].is_null() && !frame["truth"][0].is_null() && points == 8_000;
-    let (frame, points) = moments.iter().find(|(frame, points)| whole(frame, *points)).expect("a whole moment");
+    let whole = |frame: &Value, points: usize| {
+        !frame["ego"].is_null() && !frame["truth"][0].is_null() && points == 8_000
+    };
+    let (frame, points) = moments
+        .iter()
+        .find(|(frame, points)| whole(frame, *points))
+        .expect("a whole moment");
     check(frame, *points);
     wait_for("no page is open", || run.watchers() == 0);
 
@@ -360,28 +598,48 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     // Reports of processes, also those of this viewer, do not make a silent run a live one.
     let mut open = TcpStream::connect(server.address()).unwrap();
     open.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
-    wait_for("it is watched", || run.status().silent_s.is_some_and(|silent_s| silent_s < 0.5));
+    wait_for("it is watched", || {
+        run.status().silent_s.is_some_and(|silent_s| silent_s < 0.5)
+    });
     traffic.ending.store(true, Ordering::Relaxed);
-    wait_for("the run is silent", || run.status().silent_s.is_some_and(|silent_s| silent_s > 1.5));
+    wait_for("the run is silent", || {
+        run.status().silent_s.is_some_and(|silent_s| silent_s > 1.5)
+    });
 }
 
 #[test]
 fn another_ego_and_a_feature_map_of_a_live_run_are_shown_on_request() {
     let traffic = Traffic::start(true);
-    let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
+    let run = Arc::new(
+        LiveRun::start(join(
+            &BusOptions::client(traffic.endpoint.clone()),
+            "viewer",
+        ))
+        .unwrap(),
+    );
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
     let mut default_view = TcpStream::connect(server.address()).unwrap();
-    default_view.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
+    default_view
+        .write_all(b"GET /live HTTP/1.1\r\n\r\n")
+        .unwrap();
     wait_for("the default view is watched", || run.watchers() == 1);
     for ego in [EGO, OTHER] {
         let moments = moments_of(server.address(), &format!("frames=10&ego={ego}"));
-        let shown: Vec<Value> = moments.iter().map(|bytes| parsed(bytes).0["ego"].clone()).collect();
-        assert!(shown.iter().all(|shown| shown.is_null() || *shown == ego), "{shown:?}");
+        let shown: Vec<Value> = moments
+            .iter()
+            .map(|bytes| parsed(bytes).0["ego"].clone())
+            .collect();
+        assert!(
+            shown.iter().all(|shown| shown.is_null() || *shown == ego),
+            "{shown:?}"
+        );
         assert!(shown.iter().any(|shown| *shown == ego), "{shown:?}");
     }
     // Received once a page asks for it.
     let path = format!("/map/{OTHER}");
-    wait_for("a feature map", || !fetch(server.address(), &path).unwrap().1.is_empty());
+    wait_for("a feature map", || {
+        !fetch(server.address(), &path).unwrap().1.is_empty()
+    });
 }
 
 /// Moments of a live run, as many as the query says.
@@ -391,7 +649,11 @@ fn moments_of(address: SocketAddr, query: &str) -> Vec<Vec<u8>> {
     write!(connection, "GET /live?{query} HTTP/1.0\r\n\r\n").unwrap();
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer).unwrap();
-    let mut rest = &answer[answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").unwrap() + 4..];
+    let mut rest = &answer[answer
+        .windows(4)
+        .position(|bytes| bytes == b"\r\n\r\n")
+        .unwrap()
+        + 4..];
     let mut moments = Vec::new();
     while let Some((len, behind)) = rest.split_at_checked(4) {
         let (moment, next) = behind.split_at(u32::from_le_bytes(len.try_into().unwrap()) as usize);

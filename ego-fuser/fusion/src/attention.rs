@@ -69,15 +69,29 @@ mod tests {
 
     #[test]
     fn where_a_neighbour_has_seen_nothing_the_ego_attends_to_the_others() {
-        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 7, height: 5 };
+        let grid = BevGrid {
+            x_min_m: 0.0,
+            y_min_m: 0.0,
+            cell_m: 1.0,
+            width: 7,
+            height: 5,
+        };
         let features = Tensor::randn([3, 4, 5, 7], (Kind::Float, Device::Cpu));
         let mask = Tensor::ones([3, 1, 5, 7], (Kind::Float, Device::Cpu));
         let _ = mask.narrow(0, 2, 1).narrow(2, 1, 2).fill_(0.0);
         let facts = [0, 1, 2].map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY));
         let maps = AlignedMaps::newest(&features, &mask, &facts, &grid);
-        let scores = (features.narrow(0, 0, 1) * &features).sum_dim_intlist([1_i64].as_slice(), true, None) / 2.0;
-        let shares = scores.masked_fill(&mask.eq(0.0), f64::NEG_INFINITY).softmax(0, None);
+        let scores =
+            (features.narrow(0, 0, 1) * &features).sum_dim_intlist([1_i64].as_slice(), true, None)
+                / 2.0;
+        let shares = scores
+            .masked_fill(&mask.eq(0.0), f64::NEG_INFINITY)
+            .softmax(0, None);
         let expected = (shares * &features).sum_dim_intlist([0_i64].as_slice(), false, None);
-        assert_eq!(AttentionFusion.fuse(&maps).unwrap().map, expected, "to the bit");
+        assert_eq!(
+            AttentionFusion.fuse(&maps).unwrap().map,
+            expected,
+            "to the bit"
+        );
     }
 }

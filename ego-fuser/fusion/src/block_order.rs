@@ -21,8 +21,8 @@ impl BlockOrder {
         let mut edges = edges.to_vec();
         edges.sort_unstable();
         edges.dedup();
-        let nests =
-            edges.first().is_some_and(|&first| first > 0) && edges.windows(2).all(|pair| pair[1] % pair[0] == 0);
+        let nests = edges.first().is_some_and(|&first| first > 0)
+            && edges.windows(2).all(|pair| pair[1] % pair[0] == 0);
         nests.then_some(Self { edges })
     }
 
@@ -39,10 +39,19 @@ impl BlockOrder {
     pub fn tokens(&self, maps: &Tensor) -> Result<Tensor, TchError> {
         let (count, channels, height, width) = maps.size4()?;
         let levels = self.edges.len() as i64 + 1;
-        let shape = [vec![count], self.split(height), self.split(width), vec![channels]].concat();
+        let shape = [
+            vec![count],
+            self.split(height),
+            self.split(width),
+            vec![channels],
+        ]
+        .concat();
         let order = [vec![0], self.interleaved(), vec![2 * levels + 1]].concat();
         let channels_last = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
-        channels_last.f_view(shape.as_slice())?.f_permute(order)?.f_reshape([count, height * width, channels])
+        channels_last
+            .f_view(shape.as_slice())?
+            .f_permute(order)?
+            .f_reshape([count, height * width, channels])
     }
 
     /// Tokens `[N, H * W, C]` back to `[N, C, H, W]`.
@@ -53,12 +62,23 @@ impl BlockOrder {
         let (count, _, channels) = tokens.size3()?;
         let (rows, columns) = (self.split(height), self.split(width));
         let levels = rows.len();
-        let sizes = rows.iter().zip(&columns).flat_map(|(&row, &column)| [row, column]);
+        let sizes = rows
+            .iter()
+            .zip(&columns)
+            .flat_map(|(&row, &column)| [row, column]);
         let shape: Vec<i64> = [count].into_iter().chain(sizes).chain([channels]).collect();
         let halves = (0..levels).map(|level| 1 + 2 * level as i64);
-        let order = [vec![0], halves.clone().collect(), halves.map(|at| at + 1).collect(), vec![2 * levels as i64 + 1]];
+        let order = [
+            vec![0],
+            halves.clone().collect(),
+            halves.map(|at| at + 1).collect(),
+            vec![2 * levels as i64 + 1],
+        ];
         let channels_last = tokens.f_view(shape.as_slice())?.f_permute(order.concat())?;
-        channels_last.f_reshape([count, height, width, channels])?.f_permute([0, 3, 1, 2])?.f_contiguous()
+        channels_last
+            .f_reshape([count, height, width, channels])?
+            .f_permute([0, 3, 1, 2])?
+            .f_contiguous()
     }
 
     /// Row and column of each token within a window of `edge`, in the order of tokens.
@@ -68,9 +88,14 @@ impl BlockOrder {
         let mut covered = 1;
         for &level in self.edges.iter().filter(|&&level| level <= edge) {
             let steps = level / covered;
-            let corners = (0..steps).flat_map(|row| (0..steps).map(move |column| [row * covered, column * covered]));
+            let corners = (0..steps)
+                .flat_map(|row| (0..steps).map(move |column| [row * covered, column * covered]));
             places = corners
-                .flat_map(|[row, column]| places.iter().map(move |place| [row + place[0], column + place[1]]))
+                .flat_map(|[row, column]| {
+                    places
+                        .iter()
+                        .map(move |place| [row + place[0], column + place[1]])
+                })
                 .collect();
             covered = level;
         }
@@ -88,7 +113,9 @@ impl BlockOrder {
     /// Row and column dimension of each level in turn, in a view `[N, rows by level.., columns by level.., C]`.
     fn interleaved(&self) -> Vec<i64> {
         let levels = self.edges.len() as i64 + 1;
-        (0..levels).flat_map(|level| [1 + level, 1 + levels + level]).collect()
+        (0..levels)
+            .flat_map(|level| [1 + level, 1 + levels + level])
+            .collect()
     }
 }
 
@@ -111,20 +138,31 @@ mod tests {
     fn each_window_is_a_run_of_tokens_in_the_order_of_places() {
         let order = BlockOrder::new(&[2, 4, 12]).unwrap();
         let (height, width) = (24, 36);
-        let map = Tensor::arange(height * width, (Kind::Int64, Device::Cpu)).view([1, 1, height, width]);
+        let map =
+            Tensor::arange(height * width, (Kind::Int64, Device::Cpu)).view([1, 1, height, width]);
         let tokens = order.tokens(&map).unwrap();
         let flat = Vec::<i64>::try_from(tokens.view(-1)).unwrap();
         for edge in [2, 4, 12] {
             let places = order.places(edge);
             for window in flat.chunks((edge * edge) as usize) {
                 let [first_row, first_column] = [window[0] / width, window[0] % width];
-                assert_eq!([first_row % edge, first_column % edge], [0, 0], "a window of {edge}");
-                let found: Vec<_> =
-                    window.iter().map(|cell| [cell / width - first_row, cell % width - first_column]).collect();
+                assert_eq!(
+                    [first_row % edge, first_column % edge],
+                    [0, 0],
+                    "a window of {edge}"
+                );
+                let found: Vec<_> = window
+                    .iter()
+                    .map(|cell| [cell / width - first_row, cell % width - first_column])
+                    .collect();
                 assert_eq!(found, places, "a window of {edge}");
             }
         }
         assert_eq!(order.maps(&tokens, height, width).unwrap(), map);
-        assert!(order.tokens(&Tensor::zeros([1, 1, 24, 35], (Kind::Float, Device::Cpu))).is_err());
+        assert!(
+            order
+                .tokens(&Tensor::zeros([1, 1, 24, 35], (Kind::Float, Device::Cpu)))
+                .is_err()
+        );
     }
 }

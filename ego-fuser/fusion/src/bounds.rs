@@ -8,9 +8,17 @@ use perception::model_config::ConfigError;
 ///
 /// # Errors
 /// [`ConfigError`] names `field` and `value` when that is not in `allowed`.
-pub(super) fn within(field: &'static str, value: i64, allowed: RangeInclusive<i64>) -> Result<(), ConfigError> {
+pub(super) fn within(
+    field: &'static str,
+    value: i64,
+    allowed: RangeInclusive<i64>,
+) -> Result<(), ConfigError> {
     if allowed.contains(&value) {
         return Ok(());
     }
-    Err(ConfigError::Value { field, value: value.to_string(), must: "positive and of a size that a network can have" })
+    Err(ConfigError::Value {
+        field,
+        value: value.to_string(),
+        must: "positive and of a size that a network can have",
+    })
 }

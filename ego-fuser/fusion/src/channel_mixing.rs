@@ -29,7 +29,8 @@ impl ChannelMixing {
     /// Changes nothing before it is trained; its parameter is `steering.weight`, `[5, C, C]`, under `path`.
     #[must_use]
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        let weight = (path / "steering").var("weight", &[BASIS, channels, channels], Init::Const(0.0));
+        let weight =
+            (path / "steering").var("weight", &[BASIS, channels, channels], Init::Const(0.0));
         Self { weight }
     }
 
@@ -38,16 +39,24 @@ impl ChannelMixing {
     ///
     /// # Errors
     /// [`TchError`] when the channels differ from its own, or there is not one pose per feature map.
-    pub(crate) fn turn(&self, features: &Tensor, ego_from_cav: &[Pose], order: Order) -> Result<Tensor, TchError> {
-        let matrices = ego_from_cav.iter().map(|pose| match *pose == Pose::IDENTITY {
-            true => Ok(None),
-            false => self.matrix(pose).map(Some),
-        });
+    pub(crate) fn turn(
+        &self,
+        features: &Tensor,
+        ego_from_cav: &[Pose],
+        order: Order,
+    ) -> Result<Tensor, TchError> {
+        let matrices = ego_from_cav
+            .iter()
+            .map(|pose| match *pose == Pose::IDENTITY {
+                true => Ok(None),
+                false => self.matrix(pose).map(Some),
+            });
         let matrices: Vec<Option<Tensor>> = matrices.collect::<Result<_, TchError>>()?;
         let learns = matrices.iter().flatten().any(Tensor::requires_grad);
         if learns || !are_numbers(features) {
-            let turned =
-                (0..).zip(&matrices).map(|(map, matrix)| turned(&features.f_narrow(0, map, 1)?, matrix.as_ref()));
+            let turned = (0..)
+                .zip(&matrices)
+                .map(|(map, matrix)| turned(&features.f_narrow(0, map, 1)?, matrix.as_ref()));
             return Tensor::f_cat(&turned.collect::<Result<Vec<_>, TchError>>()?, 0);
         }
         let result = with_order(features, order)?;
@@ -68,8 +77,11 @@ impl ChannelMixing {
         let yaw_rad = ego_from_cav.yaw_rad();
         let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
         let basis = [1.0, cos, sin, cos_2, sin_2].map(|value| value as f32);
-        let basis = Tensor::f_from_slice(&basis)?.f_view([BASIS, 1, 1])?.f_to_device(self.weight.device())?;
-        let change = (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)?;
+        let basis = Tensor::f_from_slice(&basis)?
+            .f_view([BASIS, 1, 1])?
+            .f_to_device(self.weight.device())?;
+        let change =
+            (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)?;
         Ok(self.identity()? + change)
     }
 
@@ -81,9 +93,15 @@ impl ChannelMixing {
 
 /// A map `[1, C, H, W]` with its channels mixed; unchanged without a `matrix`.
 fn turned(map: &Tensor, matrix: Option<&Tensor>) -> Result<Tensor, TchError> {
-    let Some(matrix) = matrix else { return Ok(map.shallow_clone()) };
-    let weight = matrix.f_to_kind(map.kind())?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
-    map.f_conv2d(&weight, None::<&Tensor>, [1, 1], [0, 0], [1, 1], 1)?.f_relu()
+    let Some(matrix) = matrix else {
+        return Ok(map.shallow_clone());
+    };
+    let weight = matrix
+        .f_to_kind(map.kind())?
+        .f_unsqueeze(-1)?
+        .f_unsqueeze(-1)?;
+    map.f_conv2d(&weight, None::<&Tensor>, [1, 1], [0, 0], [1, 1], 1)?
+        .f_relu()
 }
 
 #[cfg(test)]
@@ -106,7 +124,12 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let mixing = ChannelMixing::new(&variables.root(), 4);
         let features = Tensor::rand([2, 4, 3, 5], FLOAT);
-        assert_eq!(mixing.turn(&features, &[Pose::IDENTITY, turned(1.0)], Order::Planes).unwrap(), features);
+        assert_eq!(
+            mixing
+                .turn(&features, &[Pose::IDENTITY, turned(1.0)], Order::Planes)
+                .unwrap(),
+            features
+        );
     }
 
     #[test]
@@ -117,24 +140,42 @@ mod tests {
         let mixing = ChannelMixing { weight };
         let features = Tensor::ones([3, 2, 1, 1], FLOAT);
         let poses = [Pose::IDENTITY, turned(FRAC_PI_2), turned(PI)];
-        let out = Vec::<f32>::try_from(mixing.turn(&features, &poses, Order::Planes).unwrap().view(-1)).unwrap();
+        let out = Vec::<f32>::try_from(
+            mixing
+                .turn(&features, &poses, Order::Planes)
+                .unwrap()
+                .view(-1),
+        )
+        .unwrap();
         let expected = [1.0, 1.0, 2.0, 1.0, 1.0, 1.0];
-        assert!(out.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6), "{out:?}");
+        assert!(
+            out.iter()
+                .zip(expected)
+                .all(|(found, expected)| (found - expected).abs() < 1e-6),
+            "{out:?}"
+        );
     }
 
     #[test]
     fn the_order_of_numbers_in_memory_changes_nothing() {
         let weight = Tensor::rand([BASIS, 3, 3], FLOAT) - 0.5;
         let (mixing, planes) = (ChannelMixing { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
-        let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
+        let cells = planes
+            .permute([0, 2, 3, 1])
+            .contiguous()
+            .permute([0, 3, 1, 2]);
         let poses = [turned(0.4)];
         let expected = super::turned(&planes, Some(&mixing.matrix(&poses[0]).unwrap())).unwrap();
-        for (maps, order) in
-            [&planes, &cells].into_iter().flat_map(|maps| [Order::Planes, Order::Cells].map(|to| (maps, to)))
+        for (maps, order) in [&planes, &cells]
+            .into_iter()
+            .flat_map(|maps| [Order::Planes, Order::Cells].map(|to| (maps, to)))
         {
             let found = mixing.turn(maps, &poses, order).unwrap();
             assert!(found.allclose(&expected, 1e-5, 1e-6, false));
-            assert_eq!(found.permute([0, 2, 3, 1]).is_contiguous(), order == Order::Cells);
+            assert_eq!(
+                found.permute([0, 2, 3, 1]).is_contiguous(),
+                order == Order::Cells
+            );
         }
     }
 
@@ -142,6 +183,14 @@ mod tests {
     fn another_number_of_channels_is_refused() {
         let variables = VarStore::new(Device::Cpu);
         let mixing = ChannelMixing::new(&variables.root(), 4);
-        assert!(mixing.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)], Order::Planes).is_err());
+        assert!(
+            mixing
+                .turn(
+                    &Tensor::ones([1, 3, 2, 2], FLOAT),
+                    &[turned(0.5)],
+                    Order::Planes
+                )
+                .is_err()
+        );
     }
 }

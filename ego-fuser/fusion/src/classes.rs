@@ -4,7 +4,10 @@ use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
 /// Initial values before weights are read or trained.
-const RANDOM: Init = Init::Randn { mean: 0.0, stdev: 0.01 };
+const RANDOM: Init = Init::Randn {
+    mean: 0.0,
+    stdev: 0.01,
+};
 
 /// The detector's class head.
 #[derive(Debug)]
@@ -18,20 +21,31 @@ impl Classes {
     /// that is trained with the fusion has created them; otherwise they are created here.
     pub(crate) fn under(path: &nn::Path<'_>, [channels, anchors]: [i64; 2]) -> Self {
         let path = path / "cls_head";
-        let of = |name: &str, size: &[i64]| path.get(name).unwrap_or_else(|| path.var(name, size, RANDOM));
-        Self { weight: of("weight", &[anchors, channels, 1, 1]), bias: of("bias", &[anchors]) }
+        let of = |name: &str, size: &[i64]| {
+            path.get(name)
+                .unwrap_or_else(|| path.var(name, size, RANDOM))
+        };
+        Self {
+            weight: of("weight", &[anchors, channels, 1, 1]),
+            bias: of("bias", &[anchors]),
+        }
     }
 
     /// The same head; nothing is copied.
     pub(crate) fn shallow_clone(&self) -> Self {
-        Self { weight: self.weight.shallow_clone(), bias: self.bias.shallow_clone() }
+        Self {
+            weight: self.weight.shallow_clone(),
+            bias: self.bias.shallow_clone(),
+        }
     }
 
     /// Likelihood of a vehicle around each cell of a feature map `[1, C, H, W]`: `[1, 1, H, W]`, the logit of the best
     /// anchor of a cell. No gradient flows.
     pub(crate) fn likely(&self, map: &Tensor) -> Result<Tensor, TchError> {
         let [map, weight, bias] = [map, &self.weight, &self.bias].map(Tensor::f_detach);
-        let logits = map?.f_permute([0, 2, 3, 1])?.f_linear(&weight?.f_flatten(1, 3)?, Some(&bias?))?;
+        let logits = map?
+            .f_permute([0, 2, 3, 1])?
+            .f_linear(&weight?.f_flatten(1, 3)?, Some(&bias?))?;
         logits.f_amax([3_i64].as_slice(), false)?.f_unsqueeze(1)
     }
 }

@@ -40,7 +40,11 @@ impl Default for CoAlignConfig {
     /// Attention after the correction.
     fn default() -> Self {
         let pose_graph = Some(PoseGraphConfig::default());
-        Self { aggregation: Aggregation::Attention, missing: Missing::Absent, pose_graph }
+        Self {
+            aggregation: Aggregation::Attention,
+            missing: Missing::Absent,
+            pose_graph,
+        }
     }
 }
 
@@ -48,7 +52,10 @@ impl CoAlignConfig {
     /// The fusion, which has no parameters.
     #[must_use]
     pub(crate) fn fusion(&self) -> Where2comm {
-        Where2comm::new(&Where2commConfig { aggregation: self.aggregation, missing: self.missing })
+        Where2comm::new(&Where2commConfig {
+            aggregation: self.aggregation,
+            missing: self.missing,
+        })
     }
 }
 
@@ -64,6 +71,9 @@ impl FusionSettings for CoAlignConfig {
     }
 
     fn requirements(&self) -> Requirements {
-        Requirements { pose_graph: self.pose_graph, ..Requirements::default() }
+        Requirements {
+            pose_graph: self.pose_graph,
+            ..Requirements::default()
+        }
     }
 }

@@ -54,7 +54,11 @@ impl Cobevt {
     pub fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let fusion = SwapFusion::new(path, config, true);
-        Ok(Self { fusion, window: config.window, count_missing: config.count_missing })
+        Ok(Self {
+            fusion,
+            window: config.window,
+            count_missing: config.count_missing,
+        })
     }
 }
 
@@ -62,11 +66,16 @@ impl Fusion for Cobevt {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let agents = maps.count()?;
         let order = nearest_first(&maps.metadata).to_device(maps.warped.features.device());
-        let [features, mask] = [&maps.warped.features, &maps.warped.mask].map(|maps| maps.f_index_select(0, &order));
+        let [features, mask] =
+            [&maps.warped.features, &maps.warped.mask].map(|maps| maps.f_index_select(0, &order));
         let (features, mask) = (features?, mask?);
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let features = if sees_all { features } else { features * &mask };
-        let empty = if self.count_missing { (self.fusion.slots() - agents).max(0) } else { 0 };
+        let empty = if self.count_missing {
+            (self.fusion.slots() - agents).max(0)
+        } else {
+            0
+        };
         let padding = Padding::to_multiples(&features, self.window)?;
         let features = padding.maps(&features, empty)?;
         let reach = if sees_all && empty == 0 && padding.is_empty() {
@@ -74,8 +83,14 @@ impl Fusion for Cobevt {
         } else {
             Some(padding.mask(&mask, empty)?.f_squeeze_dim(1)?)
         };
-        let slots = Slots { asked: agents, reach: reach.as_ref(), count_missing: self.count_missing };
-        Ok(padding.crop(&self.fusion.forward(&features, slots, maps.is_training)?)?.into())
+        let slots = Slots {
+            asked: agents,
+            reach: reach.as_ref(),
+            count_missing: self.count_missing,
+        };
+        Ok(padding
+            .crop(&self.fusion.forward(&features, slots, maps.is_training)?)?
+            .into())
     }
 }
 

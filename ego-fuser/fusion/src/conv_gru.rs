@@ -26,7 +26,17 @@ impl Conv {
     fn of_shape(path: &nn::Path<'_>, shape: &[i64]) -> Self {
         let weight = path.var("weight", shape, nn::init::DEFAULT_KAIMING_UNIFORM);
         let bound = 1.0 / (shape[1..].iter().product::<i64>() as f64).sqrt();
-        Self { weight, bias: path.var("bias", &shape[..1], Init::Uniform { lo: -bound, up: bound }) }
+        Self {
+            weight,
+            bias: path.var(
+                "bias",
+                &shape[..1],
+                Init::Uniform {
+                    lo: -bound,
+                    up: bound,
+                },
+            ),
+        }
     }
 
     /// `[out, in, k, k]`.
@@ -45,13 +55,20 @@ impl Conv {
     /// Contribution of the input channels from `first` on, where `x` holds only those.
     pub(super) fn part(&self, x: &Tensor, first: i64, with_bias: bool) -> Result<Tensor, TchError> {
         let channels = x.size4()?.1;
-        convolve(x, &self.kernel()?.f_narrow(1, first, channels)?, with_bias.then_some(&self.bias))
+        convolve(
+            x,
+            &self.kernel()?.f_narrow(1, first, channels)?,
+            with_bias.then_some(&self.bias),
+        )
     }
 }
 
 fn convolve(x: &Tensor, kernel: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
     let padding = kernel.size()[2] / 2;
-    let (kernel, bias) = (kernel.f_to_kind(x.kind())?, bias.map(|bias| bias.f_to_kind(x.kind())).transpose()?);
+    let (kernel, bias) = (
+        kernel.f_to_kind(x.kind())?,
+        bias.map(|bias| bias.f_to_kind(x.kind())).transpose()?,
+    );
     x.f_conv2d(&kernel, bias, [1, 1], [padding; 2], [1, 1], 1)
 }
 
@@ -72,7 +89,12 @@ struct Cell {
 
 impl ConvGru {
     /// Parameters `cell_list.<layer>.{conv_gates,conv_can}.*` below `path`.
-    pub(super) fn new(path: &nn::Path<'_>, [input, hidden]: [i64; 2], kernel: i64, layers: usize) -> Self {
+    pub(super) fn new(
+        path: &nn::Path<'_>,
+        [input, hidden]: [i64; 2],
+        kernel: i64,
+        layers: usize,
+    ) -> Self {
         let cell = |layer: usize| {
             let path = path / "cell_list" / layer;
             let input = if layer == 0 { input } else { hidden } + hidden;
@@ -81,20 +103,35 @@ impl ConvGru {
                 candidate: Conv::new(&(&path / "conv_can"), [input, hidden], kernel),
             }
         };
-        Self { cells: (0..layers).map(cell).collect(), hidden }
+        Self {
+            cells: (0..layers).map(cell).collect(),
+            hidden,
+        }
     }
 
     /// The state `[N, hidden, H, W]` after an input `x` `[N, in, H, W]` to an empty state: `update * candidate`.
     pub(super) fn first_state(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let hidden = self.hidden;
-        self.cells.iter().try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {
-            let input = x.size4()?.1;
-            // Update gate and candidate in one convolution over the input alone.
-            let kernels = [gates.weight.f_narrow(0, hidden, hidden)?, candidate.weight.shallow_clone()];
-            let kernel = Tensor::f_cat(&kernels, 0)?.f_narrow(1, 0, input)?;
-            let bias = Tensor::f_cat(&[gates.bias.f_narrow(0, hidden, hidden)?, candidate.bias.shallow_clone()], 0)?;
-            let both = convolve(&x, &kernel, Some(&bias))?;
-            Ok(both.f_narrow(1, 0, hidden)?.f_sigmoid()? * both.f_narrow(1, hidden, hidden)?.f_tanh()?)
-        })
+        self.cells
+            .iter()
+            .try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {
+                let input = x.size4()?.1;
+                // Update gate and candidate in one convolution over the input alone.
+                let kernels = [
+                    gates.weight.f_narrow(0, hidden, hidden)?,
+                    candidate.weight.shallow_clone(),
+                ];
+                let kernel = Tensor::f_cat(&kernels, 0)?.f_narrow(1, 0, input)?;
+                let bias = Tensor::f_cat(
+                    &[
+                        gates.bias.f_narrow(0, hidden, hidden)?,
+                        candidate.bias.shallow_clone(),
+                    ],
+                    0,
+                )?;
+                let both = convolve(&x, &kernel, Some(&bias))?;
+                Ok(both.f_narrow(1, 0, hidden)?.f_sigmoid()?
+                    * both.f_narrow(1, hidden, hidden)?.f_tanh()?)
+            })
     }
 }

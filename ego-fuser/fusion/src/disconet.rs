@@ -40,7 +40,10 @@ impl DiscoNetConfig {
     /// The published sizes.
     #[must_use]
     pub fn full(channels: i64) -> Self {
-        Self { channels, hidden: [128, 32, 8] }
+        Self {
+            channels,
+            hidden: [128, 32, 8],
+        }
     }
 
     /// The same: the weighting network is the cheapest part of any network.
@@ -55,7 +58,9 @@ impl DiscoNetConfig {
     /// [`ConfigError`] names the field.
     pub fn validate(&self) -> Result<(), ConfigError> {
         within("fusion channels", self.channels, 1..=4096)?;
-        self.hidden.iter().try_for_each(|&hidden| within("fusion hidden channels", hidden, 1..=4096))
+        self.hidden
+            .iter()
+            .try_for_each(|&hidden| within("fusion hidden channels", hidden, 1..=4096))
     }
 }
 
@@ -94,7 +99,11 @@ impl DiscoNet {
         };
         Ok(Self {
             channels: config.channels,
-            layers: [layer(1, [2 * config.channels, first]), layer(2, [first, second]), layer(3, [second, third])],
+            layers: [
+                layer(1, [2 * config.channels, first]),
+                layer(2, [first, second]),
+                layer(3, [second, third]),
+            ],
             weight: Conv::new(&(&path / "conv1_4"), [third, 1], 1),
         })
     }
@@ -104,7 +113,9 @@ impl DiscoNet {
         let [(first, norm), rest @ ..] = &self.layers;
         // A pair is (agent, ego); the ego's half is the same for all.
         let of_ego = first.part(&maps.f_narrow(0, 0, 1)?, self.channels, true)?;
-        let mut x = norm.forward(&(first.part(maps, 0, false)? + of_ego), train).f_relu()?;
+        let mut x = norm
+            .forward(&(first.part(maps, 0, false)? + of_ego), train)
+            .f_relu()?;
         for (conv, norm) in rest {
             x = norm.forward(&conv.apply(&x)?, train).f_relu()?;
         }
@@ -119,8 +130,12 @@ impl Fusion for DiscoNet {
             return Ok(features.f_get(0)?.into());
         }
         let scores = self.scores(features, maps.is_training)?;
-        let weights = scores.f_masked_fill(&maps.warped.mask.f_eq(0.0)?, f64::NEG_INFINITY)?.f_softmax(0, None)?;
-        Ok((weights * features).f_sum_dim_intlist([0i64].as_slice(), false, None)?.into())
+        let weights = scores
+            .f_masked_fill(&maps.warped.mask.f_eq(0.0)?, f64::NEG_INFINITY)?
+            .f_softmax(0, None)?;
+        Ok((weights * features)
+            .f_sum_dim_intlist([0i64].as_slice(), false, None)?
+            .into())
     }
 }
 
@@ -141,16 +156,37 @@ mod tests {
         let network = DiscoNet::new(&variables.root(), &DiscoNetConfig::lean(8)).unwrap();
         let features = Tensor::rand([3, 8, 6, 10], (Kind::Float, Device::Cpu));
         let mask = Tensor::ones([3, 1, 6, 10], (Kind::Float, Device::Cpu));
-        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 10, height: 6 };
-        let facts: Vec<_> = (0..3).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
-        let maps = AlignedMaps { is_training: true, ..AlignedMaps::newest(&features, &mask, &facts, &grid) };
-        network.fuse(&maps).unwrap().map.square().sum(Kind::Float).backward();
+        let grid = BevGrid {
+            x_min_m: 0.0,
+            y_min_m: 0.0,
+            cell_m: 1.0,
+            width: 10,
+            height: 6,
+        };
+        let facts: Vec<_> = (0..3)
+            .map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY))
+            .collect();
+        let maps = AlignedMaps {
+            is_training: true,
+            ..AlignedMaps::newest(&features, &mask, &facts, &grid)
+        };
+        network
+            .fuse(&maps)
+            .unwrap()
+            .map
+            .square()
+            .sum(Kind::Float)
+            .backward();
         for (name, variable) in variables.variables() {
             if variable.requires_grad() {
                 // A bias before a batch norm has no effect.
-                let must_move = !(name.contains("conv1_") && name.ends_with("bias")) || name.contains("conv1_4");
+                let must_move = !(name.contains("conv1_") && name.ends_with("bias"))
+                    || name.contains("conv1_4");
                 let norm = variable.grad().abs().sum(Kind::Float).double_value(&[]);
-                assert!(norm.is_finite() && (norm > 0.0 || !must_move), "{name}: {norm}");
+                assert!(
+                    norm.is_finite() && (norm > 0.0 || !must_move),
+                    "{name}: {norm}"
+                );
             }
         }
     }

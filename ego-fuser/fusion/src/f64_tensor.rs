@@ -21,7 +21,10 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
 
 /// True if loops over plain floats may replace the tensor library's operations.
 pub(crate) fn are_numbers(tensor: &Tensor) -> bool {
-    tensor.device() == Device::Cpu && tensor.kind() == Kind::Float && tensor.numel() > 0 && !tensor.requires_grad()
+    tensor.device() == Device::Cpu
+        && tensor.kind() == Kind::Float
+        && tensor.numel() > 0
+        && !tensor.requires_grad()
 }
 
 /// Values of a float map `[C, H, W]`, cell by cell: `[H * W, C]`.
@@ -36,7 +39,9 @@ pub(crate) fn cells(map: &Tensor) -> Result<Vec<f32>, TchError> {
     let mut values = vec![0.0; planes.len()];
     for (block, values) in values.chunks_mut(BLOCK * channels).enumerate() {
         for (channel, plane) in planes.chunks(count).enumerate() {
-            let cells = plane[block * BLOCK..].iter().zip(values[channel..].iter_mut().step_by(channels));
+            let cells = plane[block * BLOCK..]
+                .iter()
+                .zip(values[channel..].iter_mut().step_by(channels));
             cells.for_each(|(cell, value)| *value = *cell);
         }
     }
@@ -50,7 +55,9 @@ pub(crate) fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
         return map.f_unsqueeze(0);
     }
     let (channels, height, width) = map.size3()?;
-    Tensor::f_from_slice(&cells(map)?)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
+    Tensor::f_from_slice(&cells(map)?)?
+        .f_view([1, height, width, channels])?
+        .f_permute([0, 3, 1, 2])
 }
 
 /// A 1x1 convolution of maps `[N, C, H, W]` in their memory order: with channels last it is one matrix product.
@@ -60,7 +67,9 @@ pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tenso
     if !cells.is_contiguous() || maps.is_contiguous() {
         return maps.f_conv2d(weight, bias, [1, 1], [0, 0], [1, 1], 1);
     }
-    cells.f_linear(&weight.f_flatten(1, 3)?, bias)?.f_permute([0, 3, 1, 2])
+    cells
+        .f_linear(&weight.f_flatten(1, 3)?, bias)?
+        .f_permute([0, 3, 1, 2])
 }
 
 /// `[C, H * W]` of a map `[C, H, W]`, without a copy in either memory order.
@@ -74,13 +83,17 @@ pub(crate) fn with_order(maps: &Tensor, order: Order) -> Result<Tensor, TchError
     let options = (maps.kind(), maps.device());
     match order {
         Order::Planes => Tensor::f_empty([count, channels, height, width], options),
-        Order::Cells => Tensor::f_empty([count, height, width, channels], options)?.f_permute([0, 3, 1, 2]),
+        Order::Cells => {
+            Tensor::f_empty([count, height, width, channels], options)?.f_permute([0, 3, 1, 2])
+        }
     }
 }
 
 /// `[1, C, H, W]` of a map `[C, H, W]` in its memory order, such that convolutions use that order.
 pub fn as_batch(map: &Tensor) -> Result<Tensor, TchError> {
-    map.f_permute([1, 2, 0])?.f_unsqueeze(0)?.f_permute([0, 3, 1, 2])
+    map.f_permute([1, 2, 0])?
+        .f_unsqueeze(0)?
+        .f_permute([0, 3, 1, 2])
 }
 
 #[cfg(test)]
@@ -96,7 +109,12 @@ mod tests {
         let [planes, cells] = [map.unsqueeze(0), by_cell(&map).unwrap()];
         let [planes, cells] = [planes, cells].map(|maps| pointwise(&convolution, &maps).unwrap());
         assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
-        assert!(cells.allclose(&by_cell(&map).unwrap().apply(&convolution), 1e-5, 1e-5, false));
+        assert!(cells.allclose(
+            &by_cell(&map).unwrap().apply(&convolution),
+            1e-5,
+            1e-5,
+            false
+        ));
     }
 
     #[test]
@@ -105,7 +123,10 @@ mod tests {
         let by_cell = by_cell(&map).unwrap();
         assert_eq!(by_cell, map.unsqueeze(0));
         assert_eq!(by_cell.stride()[1..], [1, 7 * 5, 5]);
-        assert_eq!(as_batch(&by_cell.squeeze_dim(0)).unwrap().stride(), [6 * 7 * 5, 1, 7 * 5, 5]);
+        assert_eq!(
+            as_batch(&by_cell.squeeze_dim(0)).unwrap().stride(),
+            [6 * 7 * 5, 1, 7 * 5, 5]
+        );
         assert_eq!(as_batch(&map).unwrap(), map.unsqueeze(0));
     }
 }

@@ -46,8 +46,14 @@ impl FullResolutionMap {
             None => map.f_narrow(1, 0, 1)?.f_ones_like()?,
         };
         Ok(match are_numbers(map) {
-            true => Self::Numbers { cells: Arc::new(Cells::of(&map.f_squeeze_dim(0)?)?), sent: numbers(&sent)?.into() },
-            false => Self::Tensors { map: map.shallow_clone(), sent },
+            true => Self::Numbers {
+                cells: Arc::new(Cells::of(&map.f_squeeze_dim(0)?)?),
+                sent: numbers(&sent)?.into(),
+            },
+            false => Self::Tensors {
+                map: map.shallow_clone(),
+                sent,
+            },
         })
     }
 
@@ -62,8 +68,14 @@ impl FullResolutionMap {
     /// The same map; nothing is copied.
     pub(crate) fn shallow_clone(&self) -> Self {
         match self {
-            Self::Numbers { cells, sent } => Self::Numbers { cells: Arc::clone(cells), sent: Arc::clone(sent) },
-            Self::Tensors { map, sent } => Self::Tensors { map: map.shallow_clone(), sent: sent.shallow_clone() },
+            Self::Numbers { cells, sent } => Self::Numbers {
+                cells: Arc::clone(cells),
+                sent: Arc::clone(sent),
+            },
+            Self::Tensors { map, sent } => Self::Tensors {
+                map: map.shallow_clone(),
+                sent: sent.shallow_clone(),
+            },
         }
     }
 
@@ -74,15 +86,16 @@ impl FullResolutionMap {
         cells: &[[usize; 2]],
         grid: &BevGrid,
     ) -> Result<BTreeMap<usize, CellSamples>, TchError> {
-        maps.iter().try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
-            let seen = map.at(&places_of(cells, pose, grid))?;
-            let most = match by_step.get(step) {
-                Some(before) => seen.or(before)?,
-                None => seen,
-            };
-            by_step.insert(*step, most);
-            Ok(by_step)
-        })
+        maps.iter()
+            .try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
+                let seen = map.at(&places_of(cells, pose, grid))?;
+                let most = match by_step.get(step) {
+                    Some(before) => seen.or(before)?,
+                    None => seen,
+                };
+                by_step.insert(*step, most);
+                Ok(by_step)
+            })
     }
 
     /// Features at positions in `grid_sampler`'s coordinates, two for each: `[R, C]`, and their validity, `[R, 1]`.
@@ -97,16 +110,24 @@ impl FullResolutionMap {
                     mask[place] = 1.0;
                 });
                 let of = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([count as i64, -1]);
-                Ok(CellSamples { features: of(&features)?, mask: of(&mask)? })
+                Ok(CellSamples {
+                    features: of(&features)?,
+                    mask: of(&mask)?,
+                })
             }
             Self::Tensors { map, sent } => {
-                let sampling_grid = Tensor::f_from_slice(places)?.f_view([1, 1, -1, 2])?.f_to_device(map.device())?;
+                let sampling_grid = Tensor::f_from_slice(places)?
+                    .f_view([1, 1, -1, 2])?
+                    .f_to_device(map.device())?;
                 let read = |map: &Tensor, how| {
                     let read = map.f_grid_sampler(&sampling_grid, how, PADDING_ZEROS, false)?;
                     read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
                 };
                 let mask = read(sent, NEAREST)?.f_ceil()?;
-                Ok(CellSamples { features: read(map, BILINEAR)? * &mask, mask })
+                Ok(CellSamples {
+                    features: read(map, BILINEAR)? * &mask,
+                    mask,
+                })
             }
         }
     }
@@ -115,7 +136,10 @@ impl FullResolutionMap {
 impl CellSamples {
     /// Element-wise maximum of both.
     fn or(&self, other: &Self) -> Result<Self, TchError> {
-        Ok(Self { features: self.features.f_maximum(&other.features)?, mask: self.mask.f_maximum(&other.mask)? })
+        Ok(Self {
+            features: self.features.f_maximum(&other.features)?,
+            mask: self.mask.f_maximum(&other.mask)?,
+        })
     }
 }
 
@@ -125,14 +149,23 @@ mod tests {
     use crate::test_data::uniform;
     use crate::warp::warp_to_ego;
 
-    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -8.0,
+        y_min_m: -4.0,
+        cell_m: 0.5,
+        width: 32,
+        height: 16,
+    };
 
     fn poses() -> [Pose; 3] {
         [0.0, 1.0, 3.0].map(|x_m| Pose::from_xyz_yaw([x_m, 0.5, 0.0], 0.3 * x_m))
     }
 
     fn maps() -> (Tensor, Tensor) {
-        (uniform(3, &[3, 4, 16, 32]), uniform(5, &[3, 1, 16, 32]).gt(0.2).to_kind(Kind::Float))
+        (
+            uniform(3, &[3, 4, 16, 32]),
+            uniform(5, &[3, 1, 16, 32]).gt(0.2).to_kind(Kind::Float),
+        )
     }
 
     fn seen(
@@ -142,11 +175,16 @@ mod tests {
     ) -> BTreeMap<usize, CellSamples> {
         let (maps, sent) = maps();
         let whole = (0..3).map(|entry| {
-            let map = maps.narrow(0, entry, 1).copy().set_requires_grad(with_gradient[entry as usize]);
+            let map = maps
+                .narrow(0, entry, 1)
+                .copy()
+                .set_requires_grad(with_gradient[entry as usize]);
             FullResolutionMap::of(&map, Some(&sent.narrow(0, entry, 1))).unwrap()
         });
         let whole: Vec<FullResolutionMap> = whole.collect();
-        let given = entries.iter().map(|&(step, entry)| (step, poses()[entry], &whole[entry]));
+        let given = entries
+            .iter()
+            .map(|&(step, entry)| (step, poses()[entry], &whole[entry]));
         FullResolutionMap::seen(&given.collect::<Vec<_>>(), cells, &GRID).unwrap()
     }
 
@@ -154,7 +192,10 @@ mod tests {
     fn numbers_and_tensors_agree_with_a_warp_of_the_whole_map() {
         let some: Vec<i64> = (0..16 * 32).filter(|cell| cell % 3 == 0).collect();
         let index = Tensor::from_slice(&some);
-        let cells: Vec<[usize; 2]> = some.iter().map(|&cell| [cell as usize / 32, cell as usize % 32]).collect();
+        let cells: Vec<[usize; 2]> = some
+            .iter()
+            .map(|&cell| [cell as usize / 32, cell as usize % 32])
+            .collect();
         let (maps, sent) = maps();
         let warped = warp_to_ego(&maps, Some(&sent), &poses(), &GRID).unwrap();
         let picked = |maps: &Tensor| maps.flatten(2, 3).index_select(2, &index).transpose(1, 2);
@@ -163,9 +204,13 @@ mod tests {
         for with_gradient in [[false; 3], [true; 3], [false, true, true]] {
             let seen = seen(with_gradient, &[(0, 0), (1, 1), (0, 2)], &cells);
             assert!(seen.keys().eq(&[0, 1]));
-            for ((seen, features), mask) in seen.values().zip(expected(&features)).zip(expected(&mask)) {
+            for ((seen, features), mask) in
+                seen.values().zip(expected(&features)).zip(expected(&mask))
+            {
                 // At a position between two cells either may be the nearest.
-                let apart = |a: &Tensor, b: &Tensor| (a - b).abs().gt(1e-5).sum(Kind::Int64).int64_value(&[]);
+                let apart = |a: &Tensor, b: &Tensor| {
+                    (a - b).abs().gt(1e-5).sum(Kind::Int64).int64_value(&[])
+                };
                 assert!(apart(&seen.features, &features) <= 8 && apart(&seen.mask, &mask) <= 2);
                 assert!(seen.mask.sum(Kind::Float).double_value(&[]) > 50.0);
             }

@@ -37,7 +37,11 @@ pub struct History {
 impl History {
     /// History for a fusion of `frames` time steps; with one, nothing is kept.
     pub fn new(frames: usize) -> Self {
-        Self { frames, kept: BTreeMap::new(), latest_nanos: 0 }
+        Self {
+            frames,
+            kept: BTreeMap::new(),
+            latest_nanos: 0,
+        }
     }
 
     /// Removes everything: another scene begins.
@@ -61,7 +65,13 @@ impl History {
     /// Maps of a vehicle from before the one that is fused now, newest first: at most one per time step.
     pub fn before(&self, cav: &CavId, capture_nanos: u64) -> impl Iterator<Item = &KeptMap> {
         let earlier = move |kept: &&KeptMap| kept.capture_nanos < capture_nanos;
-        self.kept.get(cav).into_iter().flatten().rev().filter(earlier).take(self.frames.saturating_sub(1))
+        self.kept
+            .get(cav)
+            .into_iter()
+            .flatten()
+            .rev()
+            .filter(earlier)
+            .take(self.frames.saturating_sub(1))
     }
 
     /// Keeps a map for later frames. A map that served more than one frame is kept once.
@@ -71,7 +81,10 @@ impl History {
             return;
         }
         let maps = self.kept.entry(cav.clone()).or_default();
-        if maps.back().is_some_and(|last| last.capture_nanos >= kept.capture_nanos) {
+        if maps
+            .back()
+            .is_some_and(|last| last.capture_nanos >= kept.capture_nanos)
+        {
             return;
         }
         maps.push_back(kept);
@@ -99,12 +112,18 @@ mod tests {
             capture_nanos: frame * FRAME,
             world_from_cav: Pose::IDENTITY,
             confidence: 1.0,
-            map: ReceivedMaps::new(Tensor::zeros([1, 1, 1, 1], (Kind::Float, Device::Cpu)), None),
+            map: ReceivedMaps::new(
+                Tensor::zeros([1, 1, 1, 1], (Kind::Float, Device::Cpu)),
+                None,
+            ),
         }
     }
 
     fn frames_before(history: &History, name: &str, frame: u64) -> Vec<u64> {
-        history.before(&cav(name), frame * FRAME).map(|kept| kept.capture_nanos / FRAME).collect()
+        history
+            .before(&cav(name), frame * FRAME)
+            .map(|kept| kept.capture_nanos / FRAME)
+            .collect()
     }
 
     #[test]
@@ -119,7 +138,11 @@ mod tests {
         assert!(frames_before(&history, "b", 6).is_empty());
         history.keep(&cav("a"), map(5));
         history.keep(&cav("a"), map(2));
-        assert_eq!(frames_before(&history, "a", 6), [5, 4], "what served before is not kept twice");
+        assert_eq!(
+            frames_before(&history, "a", 6),
+            [5, 4],
+            "what served before is not kept twice"
+        );
     }
 
     #[test]

@@ -45,6 +45,9 @@ pub struct FusionOutput {
 
 impl From<Tensor> for FusionOutput {
     fn from(map: Tensor) -> Self {
-        Self { map, corrections: None }
+        Self {
+            map,
+            corrections: None,
+        }
     }
 }

@@ -11,7 +11,10 @@ const EPSILON: f64 = 1e-5;
 /// Standard deviation of the weights that lead back to the residual path: small, so that an untrained transformer
 /// passes on the features of a trained encoder, and yet not zero, so that all layers after them get gradients from the
 /// first step.
-const RESIDUAL: Init = Init::Randn { mean: 0.0, stdev: 0.02 };
+const RESIDUAL: Init = Init::Randn {
+    mean: 0.0,
+    stdev: 0.02,
+};
 
 /// `x W^T + b` over the last dimension.
 #[derive(Debug)]
@@ -45,7 +48,10 @@ impl Linear {
 
     fn with_init(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool, init: Init) -> Self {
         let weight = path.var("weight", &[to, from], init);
-        Self { weight, bias: has_bias.then(|| path.var("bias", &[to], Init::Const(0.0))) }
+        Self {
+            weight,
+            bias: has_bias.then(|| path.var("bias", &[to], Init::Const(0.0))),
+        }
     }
 
     /// `[..., from]` to `[..., to]`.
@@ -69,7 +75,10 @@ impl LayerNorm {
     #[must_use]
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let weight = path.var("weight", &[channels], Init::Const(1.0));
-        Self { weight, bias: path.var("bias", &[channels], Init::Const(0.0)) }
+        Self {
+            weight,
+            bias: path.var("bias", &[channels], Init::Const(0.0)),
+        }
     }
 
     /// `[..., channels]` to the same.
@@ -77,7 +86,13 @@ impl LayerNorm {
     /// # Errors
     /// [`TchError`] when the number of channels differs.
     pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        x.f_layer_norm(self.weight.size(), Some(&self.weight), Some(&self.bias), EPSILON, false)
+        x.f_layer_norm(
+            self.weight.size(),
+            Some(&self.weight),
+            Some(&self.bias),
+            EPSILON,
+            false,
+        )
     }
 }
 
@@ -95,7 +110,11 @@ impl FeedForward {
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
         let net = path / "net";
         let wide = Linear::new(&(&net / 0), channels, hidden, true);
-        Self { wide, back: Linear::residual(&(&net / 3), hidden, channels, true), dropout }
+        Self {
+            wide,
+            back: Linear::residual(&(&net / 3), hidden, channels, true),
+            dropout,
+        }
     }
 
     /// `[..., channels]` to the same.
@@ -113,7 +132,11 @@ impl FeedForward {
 /// # Errors
 /// [`TchError`] when `share` is no probability.
 pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
-    if train && share > 0.0 { x.f_dropout(share, true) } else { Ok(x) }
+    if train && share > 0.0 {
+        x.f_dropout(share, true)
+    } else {
+        Ok(x)
+    }
 }
 
 /// Scaled dot-product attention, `softmax(q k^T / sqrt(D) + bias) v`, of `B` groups of tokens with `M` heads at once.
@@ -125,19 +148,36 @@ pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
 ///
 /// # Errors
 /// [`TchError`] when shapes do not fit.
-pub(crate) fn attend(query: &Tensor, key: &Tensor, value: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
+pub(crate) fn attend(
+    query: &Tensor,
+    key: &Tensor,
+    value: &Tensor,
+    bias: Option<&Tensor>,
+) -> Result<Tensor, TchError> {
     let (groups, tokens, heads, channels) = query.size4()?;
-    let [query, key, value] = [query.f_transpose(1, 2)?, key.f_transpose(1, 2)?, value.f_transpose(1, 2)?];
+    let [query, key, value] = [
+        query.f_transpose(1, 2)?,
+        key.f_transpose(1, 2)?,
+        value.f_transpose(1, 2)?,
+    ];
     let seen = match bias {
         Some(bias) if bias.requires_grad() => attend_and_learn_bias(&query, &key, &value, bias)?,
-        _ => Tensor::f_scaled_dot_product_attention(&query, &key, &value, bias, 0.0, false, None, false)?,
+        _ => Tensor::f_scaled_dot_product_attention(
+            &query, &key, &value, bias, 0.0, false, None, false,
+        )?,
     };
-    seen.f_transpose(1, 2)?.f_reshape([groups, tokens, heads * channels])
+    seen.f_transpose(1, 2)?
+        .f_reshape([groups, tokens, heads * channels])
 }
 
 /// The same step by step, on `[B, M, tokens, D]`: the fused kernels have no gradient for the bias, and the library's
 /// fallback scales queries and keys in separate passes.
-fn attend_and_learn_bias(query: &Tensor, key: &Tensor, value: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
+fn attend_and_learn_bias(
+    query: &Tensor,
+    key: &Tensor,
+    value: &Tensor,
+    bias: &Tensor,
+) -> Result<Tensor, TchError> {
     let (groups, heads, asking, channels) = query.size4()?;
     let asked = key.size()[2];
     let flat = |x: &Tensor, tokens: i64| x.f_reshape([groups * heads, tokens, channels]);
@@ -146,11 +186,15 @@ fn attend_and_learn_bias(query: &Tensor, key: &Tensor, value: &Tensor, bias: &Te
     let scores = if bias.dim() == 2 {
         bias.f_baddbmm(&query, &key, 1.0, scale)?
     } else {
-        let scores = (query * scale).f_bmm(&key)?.f_view([groups, heads, asking, asked])?;
+        let scores = (query * scale)
+            .f_bmm(&key)?
+            .f_view([groups, heads, asking, asked])?;
         (scores + bias).f_view([groups * heads, asking, asked])?
     };
     let weights = scores.f_softmax(-1, None::<Kind>)?;
-    weights.f_bmm(&flat(value, asked)?)?.f_view([groups, heads, asking, channels])
+    weights
+        .f_bmm(&flat(value, asked)?)?
+        .f_view([groups, heads, asking, channels])
 }
 
 /// Additive mask of the scores, so that cells with a mask of zero are not attended to: 0 or minus infinity.
@@ -158,7 +202,8 @@ fn attend_and_learn_bias(query: &Tensor, key: &Tensor, value: &Tensor, bias: &Te
 /// # Errors
 /// [`TchError`] of the tensor library.
 pub fn unseen(mask: &Tensor) -> Result<Tensor, TchError> {
-    mask.f_zeros_like()?.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)
+    mask.f_zeros_like()?
+        .f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)
 }
 
 #[cfg(test)]
@@ -173,8 +218,17 @@ mod tests {
         let float = (Kind::Float, Device::Cpu);
         let [query, key, value] = [(); 3].map(|()| Tensor::randn([3, 4, 2, 8], float));
         let mask = Tensor::from_slice(&[0f32, 1.0, 0.0, 0.0]);
-        let out = attend(&query, &key, &value, Some(&unseen(&mask).unwrap().view([1, 1, 1, 4]))).unwrap();
-        let expected = value.narrow(1, 1, 1).expand([3, 4, 2, 8], false).reshape([3, 4, 16]);
+        let out = attend(
+            &query,
+            &key,
+            &value,
+            Some(&unseen(&mask).unwrap().view([1, 1, 1, 4])),
+        )
+        .unwrap();
+        let expected = value
+            .narrow(1, 1, 1)
+            .expand([3, 4, 2, 8], false)
+            .reshape([3, 4, 16]);
         assert!((out - expected).abs().max().double_value(&[]) < 1e-6);
     }
 
@@ -187,7 +241,10 @@ mod tests {
             let fused = attend(&query, &key, &value, Some(&bias)).unwrap();
             let bias = bias.set_requires_grad(true);
             let learnt = attend(&query, &key, &value, Some(&bias)).unwrap();
-            assert!((fused - &learnt).abs().max().double_value(&[]) < 1e-5, "{shape:?}");
+            assert!(
+                (fused - &learnt).abs().max().double_value(&[]) < 1e-5,
+                "{shape:?}"
+            );
             learnt.square().sum(Kind::Float).backward();
             assert_eq!(bias.grad().size(), shape);
         }
@@ -197,8 +254,15 @@ mod tests {
     fn other_channels_are_an_error() {
         let variables = VarStore::new(Device::Cpu);
         let layer = FeedForward::new(&variables.root(), 4, 8, 0.1);
-        assert!(layer.forward(&Tensor::zeros([2, 5], (Kind::Float, Device::Cpu)), false).is_err());
+        assert!(
+            layer
+                .forward(&Tensor::zeros([2, 5], (Kind::Float, Device::Cpu)), false)
+                .is_err()
+        );
         let names: Vec<_> = variables.variables().into_keys().collect();
-        assert!(names.iter().all(|name| name.starts_with("net.")), "{names:?}");
+        assert!(
+            names.iter().all(|name| name.starts_with("net.")),
+            "{names:?}"
+        );
     }
 }

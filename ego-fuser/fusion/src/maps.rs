@@ -25,7 +25,12 @@ impl MapMetadata {
     /// A map without delay whose pose has full confidence.
     #[must_use]
     pub fn fresh(agent: usize, ego_from_cav: Pose) -> Self {
-        Self { agent, ego_from_cav, confidence: 1.0, age_secs: 0.0 }
+        Self {
+            agent,
+            ego_from_cav,
+            confidence: 1.0,
+            age_secs: 0.0,
+        }
     }
 }
 
@@ -44,7 +49,11 @@ impl ReceivedMaps {
     /// Maps `[N, C, H, W]`, of which `sent` `[N, 1, H, W]` is 1 for cells that were sent; absent: all.
     #[must_use]
     pub fn new(maps: Tensor, sent: Option<Tensor>) -> Self {
-        Self { maps, sent, full_resolution: Vec::new() }
+        Self {
+            maps,
+            sent,
+            full_resolution: Vec::new(),
+        }
     }
 
     /// The entries from `first` up to `end`.
@@ -53,9 +62,15 @@ impl ReceivedMaps {
     /// [`TchError`] when there are fewer.
     pub fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
         let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
-        let full_resolution = self.full_resolution.get(first as usize..end as usize).unwrap_or_default();
+        let full_resolution = self
+            .full_resolution
+            .get(first as usize..end as usize)
+            .unwrap_or_default();
         Ok(Self {
-            full_resolution: full_resolution.iter().map(FullResolutionMap::shallow_clone).collect(),
+            full_resolution: full_resolution
+                .iter()
+                .map(FullResolutionMap::shallow_clone)
+                .collect(),
             ..Self::new(of(&self.maps)?, self.sent.as_ref().map(of).transpose()?)
         })
     }
@@ -110,9 +125,17 @@ impl AlignedMaps {
     /// The newest maps of all agents, outside training: `features` `[N, C, H, W]` and `mask` `[N, 1, H, W]` on the
     /// ego's grid; the same tensors stand for the maps as received.
     #[must_use]
-    pub fn newest(features: &Tensor, mask: &Tensor, metadata: &[MapMetadata], grid: &BevGrid) -> Self {
+    pub fn newest(
+        features: &Tensor,
+        mask: &Tensor,
+        metadata: &[MapMetadata],
+        grid: &BevGrid,
+    ) -> Self {
         Self {
-            warped: WarpedMaps { features: features.shallow_clone(), mask: mask.shallow_clone() },
+            warped: WarpedMaps {
+                features: features.shallow_clone(),
+                mask: mask.shallow_clone(),
+            },
             received: ReceivedMaps::new(features.shallow_clone(), None),
             metadata: metadata.to_vec(),
             grid: *grid,
@@ -148,7 +171,14 @@ pub(crate) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError
         return Ok(maps.shallow_clone());
     }
     if height % cells != 0 || width % cells != 0 {
-        return maps.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], true, false, None::<i64>);
+        return maps.f_avg_pool2d(
+            [cells, cells],
+            [cells, cells],
+            [0_i64, 0],
+            true,
+            false,
+            None::<i64>,
+        );
     }
     // The tensor library's pooling takes three times as long.
     let rows = sum_of_every(maps, 2, cells)?;
@@ -165,14 +195,25 @@ fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError>
 pub(crate) fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
     let cells = cells as u32;
     let (width, height) = (grid.width.div_ceil(cells), grid.height.div_ceil(cells));
-    BevGrid { cell_m: grid.cell_m * f64::from(cells), width, height, ..*grid }
+    BevGrid {
+        cell_m: grid.cell_m * f64::from(cells),
+        width,
+        height,
+        ..*grid
+    }
 }
 
 /// Indices of the entries of `mask` `[N, 1, H, W]` that reach any cell, and of the ego's, the first.
 pub(crate) fn present(mask: &Tensor) -> Result<Vec<i64>, TchError> {
-    let most = mask.f_amax([1i64, 2, 3].as_slice(), false)?.f_to_kind(tch::Kind::Float)?;
+    let most = mask
+        .f_amax([1i64, 2, 3].as_slice(), false)?
+        .f_to_kind(tch::Kind::Float)?;
     let most = Vec::<f32>::try_from(most.f_to_device(tch::Device::Cpu)?)?;
-    Ok((0i64..).zip(most).filter(|(entry, most)| *entry == 0 || *most > 0.0).map(|(entry, _)| entry).collect())
+    Ok((0i64..)
+        .zip(most)
+        .filter(|(entry, most)| *entry == 0 || *most > 0.0)
+        .map(|(entry, _)| entry)
+        .collect())
 }
 
 /// Splits agents of all samples into padded samples: `[sum(agents), ...]` to `[B, longest, ...]` and a mask
@@ -180,10 +221,18 @@ pub(crate) fn present(mask: &Tensor) -> Result<Vec<i64>, TchError> {
 ///
 /// # Errors
 /// [`TchError`] when the counts do not add up to the first size, or one is above `longest`.
-pub fn regroup(features: &Tensor, agents: &[i64], longest: i64) -> Result<(Tensor, Tensor), TchError> {
+pub fn regroup(
+    features: &Tensor,
+    agents: &[i64],
+    longest: i64,
+) -> Result<(Tensor, Tensor), TchError> {
     let mut samples = Vec::with_capacity(agents.len());
     let mut masks = Vec::with_capacity(agents.len());
-    for (sample, &count) in features.f_split_with_sizes(agents, 0)?.into_iter().zip(agents) {
+    for (sample, &count) in features
+        .f_split_with_sizes(agents, 0)?
+        .into_iter()
+        .zip(agents)
+    {
         let mut padding = sample.size();
         padding[0] = longest - count;
         let empty = Tensor::f_zeros(padding, (sample.kind(), sample.device()))?;
@@ -209,15 +258,24 @@ mod tests {
         assert_eq!(larger_cells(&maps, 2).unwrap(), pooled(&maps));
         let odd = maps.narrow(3, 0, 5);
         assert_eq!(larger_cells(&odd, 2).unwrap(), pooled(&odd));
-        assert_eq!(larger_cells(&odd, 2).unwrap().double_value(&[0, 0, 0, 2]), 7.0);
+        assert_eq!(
+            larger_cells(&odd, 2).unwrap().double_value(&[0, 0, 0, 2]),
+            7.0
+        );
     }
 
     #[test]
     fn regroup_pads_with_nothing() {
         let features = Tensor::arange(3, FLOAT).view([3, 1]) + 1.0;
         let (groups, mask) = regroup(&features, &[2, 1], 3).unwrap();
-        assert_eq!(Vec::<f32>::try_from(groups.view(-1)).unwrap(), [1.0, 2.0, 0.0, 3.0, 0.0, 0.0]);
-        assert_eq!(Vec::<bool>::try_from(mask.view(-1)).unwrap(), [true, true, false, true, false, false]);
+        assert_eq!(
+            Vec::<f32>::try_from(groups.view(-1)).unwrap(),
+            [1.0, 2.0, 0.0, 3.0, 0.0, 0.0]
+        );
+        assert_eq!(
+            Vec::<bool>::try_from(mask.view(-1)).unwrap(),
+            [true, true, false, true, false, false]
+        );
         assert!(regroup(&features, &[2, 2], 3).is_err());
     }
 }

@@ -53,5 +53,7 @@ pub(super) fn maximum(WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tens
         return features.f_get(0);
     }
     // Zero is an ordinary value for the maximum, so cells out of reach must be below all values.
-    features.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?.f_amax([0i64].as_slice(), false)
+    features
+        .f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?
+        .f_amax([0i64].as_slice(), false)
 }

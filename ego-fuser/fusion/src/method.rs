@@ -15,8 +15,8 @@ use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::{
-    FusionConfig, MethodSpec, attention, coalign, cobevt, disconet, ermvp, max, own, pastat, script, traf_align,
-    v2vnet, v2xvit, where2comm,
+    FusionConfig, MethodSpec, attention, coalign, cobevt, disconet, ermvp, max, own, pastat,
+    script, traf_align, v2vnet, v2xvit, where2comm,
 };
 
 pub use crate::Exchange;
@@ -133,7 +133,9 @@ impl FromStr for Method {
 
     fn from_str(text: &str) -> Result<Self, UnknownMethod> {
         let of_table = Self::ALL.into_iter().find(|method| method.name() == text);
-        of_table.or_else(|| script::spec(text).map(Self)).ok_or_else(|| UnknownMethod(text.to_owned()))
+        of_table
+            .or_else(|| script::spec(text).map(Self))
+            .ok_or_else(|| UnknownMethod(text.to_owned()))
     }
 }
 
@@ -186,7 +188,9 @@ impl Serialize for Method {
 
 impl<'de> Deserialize<'de> for Method {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        Cow::<str>::deserialize(deserializer)?.parse().map_err(D::Error::custom)
+        Cow::<str>::deserialize(deserializer)?
+            .parse()
+            .map_err(D::Error::custom)
     }
 }
 
@@ -206,34 +210,51 @@ pub struct MethodParser;
 impl TypedValueParser for MethodParser {
     type Value = Method;
 
-    fn parse_ref(&self, command: &Command, argument: Option<&Arg>, value: &OsStr) -> Result<Method, clap::Error> {
-        let script = value.to_str().filter(|text| text.starts_with(script::PREFIX));
+    fn parse_ref(
+        &self,
+        command: &Command,
+        argument: Option<&Arg>,
+        value: &OsStr,
+    ) -> Result<Method, clap::Error> {
+        let script = value
+            .to_str()
+            .filter(|text| text.starts_with(script::PREFIX));
         match script.and_then(|text| text.parse().ok()) {
             Some(method) => Ok(method),
             None => {
-                let of_table = PossibleValuesParser::new(of_table()).try_map(|name| name.parse::<Method>());
+                let of_table =
+                    PossibleValuesParser::new(of_table()).try_map(|name| name.parse::<Method>());
                 of_table.parse_ref(command, argument, value)
             }
         }
     }
 
     fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
-        let script = PossibleValue::new("script:FILE.pt").help("feature maps, fused by a TorchScript module");
+        let script = PossibleValue::new("script:FILE.pt")
+            .help("feature maps, fused by a TorchScript module");
         Some(Box::new(of_table().into_iter().chain([script])))
     }
 }
 
 fn of_table() -> Vec<PossibleValue> {
-    Method::ALL.map(|method| PossibleValue::new(method.name()).help(method.summary())).to_vec()
+    Method::ALL
+        .map(|method| PossibleValue::new(method.name()).help(method.summary()))
+        .to_vec()
 }
 
 impl<'de> Deserialize<'de> for FusionConfig {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let mut fields = serde_json::Map::deserialize(deserializer)?;
-        let kind = fields.remove("kind").ok_or_else(|| D::Error::missing_field("kind"))?;
-        let known = Method::ALL.into_iter().map(|method| method.spec().fusion).chain([script::FUSION]);
+        let kind = fields
+            .remove("kind")
+            .ok_or_else(|| D::Error::missing_field("kind"))?;
+        let known = Method::ALL
+            .into_iter()
+            .map(|method| method.spec().fusion)
+            .chain([script::FUSION]);
         let fusion = known.into_iter().find(|fusion| kind == fusion.kind);
-        let fusion = fusion.ok_or_else(|| D::Error::custom(format_args!("unknown kind of fusion {kind}")))?;
+        let fusion = fusion
+            .ok_or_else(|| D::Error::custom(format_args!("unknown kind of fusion {kind}")))?;
         (fusion.parse)(fields.into()).map_err(D::Error::custom)
     }
 }

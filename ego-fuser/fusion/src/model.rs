@@ -24,7 +24,9 @@ use crate::own::OwnConfig;
 use crate::targets::{AnchorGridError, TargetAssigner, TargetRule};
 use crate::warp::WarpError;
 use crate::where2comm::most_confident;
-use crate::{AlignedMaps, FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing};
+use crate::{
+    AlignedMaps, FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing,
+};
 
 use stage::{FUSION_PREFIX, stored_config};
 pub use stage::{FusionStage, StageError};
@@ -86,7 +88,11 @@ impl CooperativeModel {
     ///
     /// # Errors
     /// [`ModelError::Config`] when no network can be built from `config`.
-    pub fn new(config: &DetectorConfig, method: Method, device: Device) -> Result<Self, ModelError> {
+    pub fn new(
+        config: &DetectorConfig,
+        method: Method,
+        device: Device,
+    ) -> Result<Self, ModelError> {
         Self::with_fusion(config, method, &method.default_fusion(config), device)
     }
 
@@ -103,13 +109,24 @@ impl CooperativeModel {
         if config.y_axis == YAxis::Right {
             // Samples and targets are right-handed; a mirrored network cannot be trained.
             let (field, value) = ("y_axis", "right".to_owned());
-            return Err(ConfigError::Value { field, value, must: "left to train" }.into());
+            return Err(ConfigError::Value {
+                field,
+                value,
+                must: "left to train",
+            }
+            .into());
         }
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), config)?;
         let fusion = FusionStage::new(&variables.root(), fusion, method, config)?;
         let anchors = Anchors::for_detector(config);
-        Ok(Self { method, network, variables, anchors, fusion })
+        Ok(Self {
+            method,
+            network,
+            variables,
+            anchors,
+            fusion,
+        })
     }
 
     /// Builds the model of a weights file; `method` overrides the one that the file names.
@@ -142,8 +159,11 @@ impl CooperativeModel {
         };
         let model = Self::with_fusion(&config, method, &fusion, device)?;
         // A single-vehicle network becomes a cooperative one whose fusion is untrained.
-        let is_fusion = |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
-        weights.copy_some_into(&model.variables, |name| !is_fusion(name) || weights.contains(name))?;
+        let is_fusion =
+            |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
+        weights.copy_some_into(&model.variables, |name| {
+            !is_fusion(name) || weights.contains(name)
+        })?;
         Ok(model)
     }
 
@@ -153,9 +173,13 @@ impl CooperativeModel {
         let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
         let fusion = self.fusion.config().to_json();
         let method = self.method.name().to_owned();
-        [(CONFIG_KEY, config), (METHOD_KEY, method), (FUSION_KEY, fusion)]
-            .map(|(key, value)| (key.to_owned(), value))
-            .into()
+        [
+            (CONFIG_KEY, config),
+            (METHOD_KEY, method),
+            (FUSION_KEY, fusion),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into()
     }
 
     /// Configuration of the detector.
@@ -200,7 +224,11 @@ impl CooperativeModel {
         train: bool,
     ) -> Result<CooperativeOutput, ModelError> {
         let features = self.network.features(pillars, train);
-        self.fuse_and_detect(&self.network.through_compressor(&features, train), facts, train)
+        self.fuse_and_detect(
+            &self.network.through_compressor(&features, train),
+            facts,
+            train,
+        )
     }
 
     /// Second half of the forward pass, from the maps of all views `[sum(views), C, H, W]` on, each in its own frame.
@@ -220,21 +248,39 @@ impl CooperativeModel {
         }
         if self.fusion.config().settings::<OwnConfig>().is_some() && described == facts.len() {
             let corrections = facts.iter().map(|_| None).collect();
-            return Ok(CooperativeOutput { head: self.network.heads(features)?, corrections });
+            return Ok(CooperativeOutput {
+                head: self.network.heads(features)?,
+                corrections,
+            });
         }
-        let (mut fused, mut corrections) = (Vec::with_capacity(facts.len()), Vec::with_capacity(facts.len()));
+        let (mut fused, mut corrections) = (
+            Vec::with_capacity(facts.len()),
+            Vec::with_capacity(facts.len()),
+        );
         let mut first = 0;
         for facts in facts {
             let maps = features.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
-            let sent = if train { self.sent_in_training(&maps)? } else { None };
+            let sent = if train {
+                self.sent_in_training(&maps)?
+            } else {
+                None
+            };
             let aligned = self.fusion.align(&ReceivedMaps::new(maps, sent), facts)?;
-            let FusionOutput { map, corrections: shifts } =
-                self.fusion.fuse(&AlignedMaps { is_training: train, ..aligned })?;
+            let FusionOutput {
+                map,
+                corrections: shifts,
+            } = self.fusion.fuse(&AlignedMaps {
+                is_training: train,
+                ..aligned
+            })?;
             fused.push(map);
             corrections.push(shifts);
         }
-        Ok(CooperativeOutput { head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?, corrections })
+        Ok(CooperativeOutput {
+            head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?,
+            corrections,
+        })
     }
 
     /// Mask of the cells of maps `[N, C, H, W]` that agents would have sent, for a method in which they select: in
@@ -267,9 +313,20 @@ impl CooperativeModel {
         (0..samples)
             .map(|sample| {
                 let scores = flat(&output.scores, sample)?;
-                let decoded = decode(&scores, &flat(&output.offsets, sample)?, &self.anchors, limits.score_threshold)?;
-                let boxes = AgentBoxes { boxes: &decoded, output_from_agent: Isometry3::identity() };
-                Ok(postprocess(&[boxes], limits).iter().map(|candidate| candidate.detection(None)).collect())
+                let decoded = decode(
+                    &scores,
+                    &flat(&output.offsets, sample)?,
+                    &self.anchors,
+                    limits.score_threshold,
+                )?;
+                let boxes = AgentBoxes {
+                    boxes: &decoded,
+                    output_from_agent: Isometry3::identity(),
+                };
+                Ok(postprocess(&[boxes], limits)
+                    .iter()
+                    .map(|candidate| candidate.detection(None))
+                    .collect())
             })
             .collect()
     }
@@ -288,7 +345,11 @@ impl CooperativeModel {
         let anchors = &self.anchors;
         let boxes = (0..anchors.len()).map(|index| {
             let [x, y, z, h, w, l, yaw] = anchors.get(index);
-            Box3d { center_m: [x, y, z], size_m: [l, w, h], heading_rad: yaw }
+            Box3d {
+                center_m: [x, y, z],
+                size_m: [l, w, h],
+                heading_rad: yaw,
+            }
         });
         let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
         TargetAssigner::new(boxes.collect(), shape, TargetRule::default())
@@ -297,5 +358,10 @@ impl CooperativeModel {
 
 /// The values of one sample of a map, row-major.
 pub fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(map.f_get(sample)?.f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_reshape([-1])?)
+    Vec::try_from(
+        map.f_get(sample)?
+            .f_to_device(Device::Cpu)?
+            .f_to_kind(Kind::Float)?
+            .f_reshape([-1])?,
+    )
 }

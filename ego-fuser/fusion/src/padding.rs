@@ -16,7 +16,12 @@ impl Padding {
     pub(super) fn to_multiples(maps: &Tensor, edge: i64) -> Result<Self, TchError> {
         let (_, _, height, width) = maps.size4()?;
         let [below, right] = [height, width].map(|length| (edge - length % edge) % edge);
-        Ok(Self { height, width, below, right })
+        Ok(Self {
+            height,
+            width,
+            below,
+            right,
+        })
     }
 
     /// True if no padding is needed.
@@ -34,7 +39,11 @@ impl Padding {
         if self.is_empty() && slots == 0 {
             return Ok(maps.shallow_clone());
         }
-        maps.f_pad([0, self.right, 0, self.below, 0, 0, 0, slots], "constant", 0.0)
+        maps.f_pad(
+            [0, self.right, 0, self.below, 0, 0, 0, slots],
+            "constant",
+            0.0,
+        )
     }
 
     /// `maps` with zeros below and to the right, so that rows and columns are multiples of `cells`.
@@ -49,8 +58,13 @@ impl Padding {
             return Ok(mask.shallow_clone());
         }
         let neighbours = mask.size4()?.0 - 1;
-        let ego = mask.f_narrow(0, 0, 1)?.f_pad([0, self.right, 0, self.below], "constant", 1.0)?;
-        Tensor::f_cat(&[ego, self.maps(&mask.f_narrow(0, 1, neighbours)?, slots)?], 0)
+        let ego = mask
+            .f_narrow(0, 0, 1)?
+            .f_pad([0, self.right, 0, self.below], "constant", 1.0)?;
+        Tensor::f_cat(
+            &[ego, self.maps(&mask.f_narrow(0, 1, neighbours)?, slots)?],
+            0,
+        )
     }
 
     /// `[C, H, W]` of a padded map.
@@ -58,7 +72,9 @@ impl Padding {
         if self.is_empty() {
             return Ok(map.shallow_clone());
         }
-        map.f_narrow(1, 0, self.height)?.f_narrow(2, 0, self.width)?.f_contiguous()
+        map.f_narrow(1, 0, self.height)?
+            .f_narrow(2, 0, self.width)?
+            .f_contiguous()
     }
 }
 
@@ -77,7 +93,9 @@ mod tests {
         assert_eq!(padded.size(), [3, 3, 8, 8]);
         assert_eq!(padding.crop(&padded.get(1)).unwrap(), maps.get(1));
         let mask = padding.mask(&maps.narrow(1, 0, 1), 1).unwrap();
-        let seen: Vec<f64> = (0..3).map(|slot| mask.get(slot).sum(Kind::Float).double_value(&[])).collect();
+        let seen: Vec<f64> = (0..3)
+            .map(|slot| mask.get(slot).sum(Kind::Float).double_value(&[]))
+            .collect();
         assert_eq!(seen, [64.0, 40.0, 0.0]);
         assert!(Padding::to_multiples(&maps, 1).unwrap().is_empty());
     }

@@ -14,23 +14,39 @@ pub(super) enum Partition {
 impl Partition {
     /// `[S, H, W, C]` to `[groups, S, cells of a group, C]`.
     pub(super) fn cut(self, map: &Tensor, window: i64) -> Result<Tensor, TchError> {
-        let &[slots, height, width, channels] = &map.size()[..] else { return Err(shape_error(map)) };
+        let &[slots, height, width, channels] = &map.size()[..] else {
+            return Err(shape_error(map));
+        };
         let (rows, columns) = (height / window, width / window);
         let cut = match self {
-            Self::Window => {
-                map.f_view([slots, rows, window, columns, window, channels])?.f_permute([1, 3, 0, 2, 4, 5])?
-            }
-            Self::Grid => {
-                map.f_view([slots, window, rows, window, columns, channels])?.f_permute([2, 4, 0, 1, 3, 5])?
-            }
+            Self::Window => map
+                .f_view([slots, rows, window, columns, window, channels])?
+                .f_permute([1, 3, 0, 2, 4, 5])?,
+            Self::Grid => map
+                .f_view([slots, window, rows, window, columns, channels])?
+                .f_permute([2, 4, 0, 1, 3, 5])?,
         };
         cut.f_reshape([rows * columns, slots, window * window, channels])
     }
 
     /// Inverse of [`Self::cut`].
-    pub(super) fn map(self, groups: &Tensor, [height, width]: [i64; 2], window: i64) -> Result<Tensor, TchError> {
-        let &[_, slots, _, channels] = &groups.size()[..] else { return Err(shape_error(groups)) };
-        let groups = groups.f_view([height / window, width / window, slots, window, window, channels])?;
+    pub(super) fn map(
+        self,
+        groups: &Tensor,
+        [height, width]: [i64; 2],
+        window: i64,
+    ) -> Result<Tensor, TchError> {
+        let &[_, slots, _, channels] = &groups.size()[..] else {
+            return Err(shape_error(groups));
+        };
+        let groups = groups.f_view([
+            height / window,
+            width / window,
+            slots,
+            window,
+            window,
+            channels,
+        ])?;
         let map = match self {
             Self::Window => groups.f_permute([2, 0, 3, 1, 4, 5])?,
             Self::Grid => groups.f_permute([2, 3, 0, 4, 1, 5])?,
@@ -40,7 +56,10 @@ impl Partition {
 }
 
 pub(super) fn shape_error(found: &Tensor) -> TchError {
-    TchError::Shape(format!("swap fusion does not support maps of shape {:?}", found.size()))
+    TchError::Shape(format!(
+        "swap fusion does not support maps of shape {:?}",
+        found.size()
+    ))
 }
 
 #[cfg(test)]
@@ -55,15 +74,20 @@ mod tests {
         for partition in [Partition::Window, Partition::Grid] {
             let groups = partition.cut(&map, 3).unwrap();
             assert_eq!(groups.size(), [6, 2, 9, 4]);
-            assert_eq!(partition.map(&groups, [6, 9], 3).unwrap(), map, "{partition:?}");
+            assert_eq!(
+                partition.map(&groups, [6, 9], 3).unwrap(),
+                map,
+                "{partition:?}"
+            );
         }
     }
 
     #[test]
     fn windows_are_neighbours_and_grids_are_spread() {
         let map = Tensor::arange(36, (Kind::Int64, Device::Cpu)).view([1, 6, 6, 1]);
-        let first =
-            |partition: Partition| Vec::<i64>::try_from(partition.cut(&map, 2).unwrap().get(0).view(-1)).unwrap();
+        let first = |partition: Partition| {
+            Vec::<i64>::try_from(partition.cut(&map, 2).unwrap().get(0).view(-1)).unwrap()
+        };
         assert_eq!(first(Partition::Window), [0, 1, 6, 7]);
         assert_eq!(first(Partition::Grid), [0, 3, 18, 21]);
     }

@@ -12,8 +12,11 @@ where
     I: Iterator<Item = (Vector3<f64>, Vector3<f64>)> + Clone,
 {
     let count = pairs.clone().count() as f64;
-    let sums =
-        pairs.clone().fold((Vector3::zeros(), Vector3::zeros()), |sums, pair| (sums.0 + pair.0, sums.1 + pair.1));
+    let sums = pairs
+        .clone()
+        .fold((Vector3::zeros(), Vector3::zeros()), |sums, pair| {
+            (sums.0 + pair.0, sums.1 + pair.1)
+        });
     let (from, to): (Vector3<f64>, Vector3<f64>) = (sums.0 / count, sums.1 / count);
     let (mut dot, mut cross, mut spread) = (0.0, 0.0, 0.0);
     for (source, target) in pairs.clone() {
@@ -26,7 +29,10 @@ where
         return None;
     }
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), cross.atan2(dot));
-    Some(Isometry3::from_parts(Translation3::from(to - rotation * from), rotation))
+    Some(Isometry3::from_parts(
+        Translation3::from(to - rotation * from),
+        rotation,
+    ))
 }
 
 #[cfg(test)]
@@ -37,7 +43,9 @@ mod tests {
     fn heading_and_shift_are_found_and_a_single_place_fixes_none() {
         let truth = Isometry3::new(Vector3::new(30.0, -12.0, 0.4), Vector3::z() * -2.8);
         let points = [[0.0, 0.0, 0.0], [10.0, 2.0, 0.3], [-4.0, 7.0, -0.2]].map(Vector3::from);
-        let pairs = points.iter().map(|point| (*point, truth.rotation * point + truth.translation.vector));
+        let pairs = points
+            .iter()
+            .map(|point| (*point, truth.rotation * point + truth.translation.vector));
         let off = truth.inv_mul(&fit(&pairs).unwrap());
         assert!(off.translation.vector.norm() < 1e-9 && off.rotation.angle() < 1e-9);
         assert_eq!(fit(&pairs.clone().take(1)), None);
@@ -47,9 +55,13 @@ mod tests {
     #[test]
     fn a_mirror_image_is_not_fitted_by_mirroring() {
         let points = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [3.0, 8.0, 0.0]].map(Vector3::from);
-        let pairs = points.iter().map(|point| (*point, Vector3::new(point.x, -point.y, 0.0)));
+        let pairs = points
+            .iter()
+            .map(|point| (*point, Vector3::new(point.x, -point.y, 0.0)));
         let found = fit(&pairs).unwrap();
-        let worst = pairs.map(|(a, b)| (found.rotation * a + found.translation.vector - b).norm()).fold(0.0, f64::max);
+        let worst = pairs
+            .map(|(a, b)| (found.rotation * a + found.translation.vector - b).norm())
+            .fold(0.0, f64::max);
         assert!(worst > 2.0, "{worst}");
     }
 }

@@ -5,7 +5,10 @@ use protocol::{PointCloud, Pose};
 
 /// The points of several sweeps in the frame of the ego.
 #[must_use]
-pub fn merge_points<'a>(clouds: impl IntoIterator<Item = &'a PointCloud>, ego_from_cav: &[Pose]) -> PointCloud {
+pub fn merge_points<'a>(
+    clouds: impl IntoIterator<Item = &'a PointCloud>,
+    ego_from_cav: &[Pose],
+) -> PointCloud {
     let mut merged = PointCloud::default();
     for (cloud, pose) in clouds.into_iter().zip(ego_from_cav) {
         if *pose == Pose::IDENTITY {
@@ -13,10 +16,12 @@ pub fn merge_points<'a>(clouds: impl IntoIterator<Item = &'a PointCloud>, ego_fr
             continue;
         }
         let ego_from_cav = pose.isometry().cast::<f32>();
-        merged.xyzi.extend(cloud.xyzi.iter().map(|&[x, y, z, intensity]| {
-            let moved = ego_from_cav * Point3::new(x, y, z);
-            [moved.x, moved.y, moved.z, intensity]
-        }));
+        merged
+            .xyzi
+            .extend(cloud.xyzi.iter().map(|&[x, y, z, intensity]| {
+                let moved = ego_from_cav * Point3::new(x, y, z);
+                [moved.x, moved.y, moved.z, intensity]
+            }));
     }
     merged
 }

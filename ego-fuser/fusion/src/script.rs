@@ -19,7 +19,9 @@ pub(crate) const PREFIX: &str = "script:";
 /// Their fusion.
 pub(crate) const FUSION: FusionSpec = FusionSpec {
     default_config: |spec, _| {
-        FusionConfig::new(ScriptConfig { file: spec.name.strip_prefix(PREFIX).unwrap_or_default().into() })
+        FusionConfig::new(ScriptConfig {
+            file: spec.name.strip_prefix(PREFIX).unwrap_or_default().into(),
+        })
     },
     ..FusionSpec::of::<ScriptConfig>()
 };
@@ -27,7 +29,10 @@ pub(crate) const FUSION: FusionSpec = FusionSpec {
 /// The method of a file, `None` if it names none. The same name gives the same specification; it is never freed.
 pub(crate) fn spec(name: &str) -> Option<&'static MethodSpec> {
     static SPECS: Mutex<BTreeMap<String, &MethodSpec>> = Mutex::new(BTreeMap::new());
-    let stem = Path::new(name.strip_prefix(PREFIX)?).file_stem()?.to_str()?.to_owned();
+    let stem = Path::new(name.strip_prefix(PREFIX)?)
+        .file_stem()?
+        .to_str()?
+        .to_owned();
     let mut specs = SPECS.lock().unwrap_or_else(PoisonError::into_inner);
     Some(specs.entry(name.to_owned()).or_insert_with(|| {
         let name: &'static str = name.to_owned().leak();
@@ -57,14 +62,17 @@ impl FusionSettings for ScriptConfig {
 
     /// No file: the name of the method has it.
     fn for_detector(_detector: &DetectorConfig) -> Self {
-        Self { file: PathBuf::new() }
+        Self {
+            file: PathBuf::new(),
+        }
     }
 
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
         let script = ScriptFusion::load(&self.file, path.device());
-        Ok(Box::new(
-            script.map_err(|source| ConfigError::Script { file: self.file.clone(), reason: first_line(&source) })?,
-        ))
+        Ok(Box::new(script.map_err(|source| ConfigError::Script {
+            file: self.file.clone(),
+            reason: first_line(&source),
+        })?))
     }
 }
 
@@ -90,7 +98,10 @@ impl ScriptFusion {
     pub(crate) fn load(file: &Path, device: Device) -> Result<Self, TchError> {
         let mut module = CModule::load_on_device(file, device)?;
         module.f_set_eval()?;
-        Ok(Self { file: file.to_owned(), module })
+        Ok(Self {
+            file: file.to_owned(),
+            module,
+        })
     }
 }
 
@@ -103,17 +114,28 @@ impl Fusion for ScriptFusion {
             Tensor::f_from_slice(&values)?.f_to_device(device)
         };
         let poses: Vec<f32> = maps.metadata.iter().flat_map(planar).collect();
-        let poses = Tensor::f_from_slice(&poses)?.f_view([-1, 3])?.f_to_device(device)?;
+        let poses = Tensor::f_from_slice(&poses)?
+            .f_view([-1, 3])?
+            .f_to_device(device)?;
         let [confidence, age_s] = [column(|map| map.confidence)?, column(|map| map.age_secs)?];
         let of_file = |text: String| TchError::Torch(format!("{}: {text}", self.file.display()));
         let arguments = [features, &maps.warped.mask, &poses, &confidence, &age_s];
-        let fused = self.module.forward_ts(&arguments).map_err(|error| of_file(first_line(&error)))?;
+        let fused = self
+            .module
+            .forward_ts(&arguments)
+            .map_err(|error| of_file(first_line(&error)))?;
         let (found, expected) = (fused.size(), &features.size()[1..]);
         if found != expected {
-            return Err(of_file(format!("forward returns a map of {found:?}, not of {expected:?}")));
+            return Err(of_file(format!(
+                "forward returns a map of {found:?}, not of {expected:?}"
+            )));
         }
         if fused.kind() != features.kind() {
-            return Err(of_file(format!("forward returns {:?}, not {:?}", fused.kind(), features.kind())));
+            return Err(of_file(format!(
+                "forward returns {:?}, not {:?}",
+                fused.kind(),
+                features.kind()
+            )));
         }
         Ok(fused.into())
     }
@@ -128,7 +150,10 @@ fn planar(map: &MapMetadata) -> [f32; 3] {
 /// The cause without the stack of the interpreter.
 fn first_line(error: &TchError) -> String {
     let text = error.to_string();
-    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with("Traceback"));
+    let lines = text
+        .lines()
+        .map(str::trim)
+        .filter(|line| !line.is_empty() && !line.starts_with("Traceback"));
     // TorchScript lists its call stack first; the last line before the tensor library's own stack is the cause.
     let own = lines.take_while(|line| !line.starts_with("Exception raised from"));
     own.last().unwrap_or("no reason given").to_owned()
@@ -153,22 +178,46 @@ mod tests {
             Tensor::ones([2], FLOAT),
             Tensor::zeros([2], FLOAT),
         ];
-        let inputs: Vec<Tensor> = example.iter_mut().map(|tensor| tensor.shallow_clone()).collect();
+        let inputs: Vec<Tensor> = example
+            .iter_mut()
+            .map(|tensor| tensor.shallow_clone())
+            .collect();
         let mut weighted = |inputs: &[Tensor]| {
-            let [features, mask, poses, confidence, age_s] = inputs else { panic!("{} inputs", inputs.len()) };
-            let weight = confidence + age_s * 10.0 + poses.select(1, 0) * 100.0 + poses.select(1, 2) * 1000.0;
+            let [features, mask, poses, confidence, age_s] = inputs else {
+                panic!("{} inputs", inputs.len())
+            };
+            let weight = confidence
+                + age_s * 10.0
+                + poses.select(1, 0) * 100.0
+                + poses.select(1, 2) * 1000.0;
             let weight = weight.view([-1, 1, 1, 1]) * mask;
             vec![(features * weight).sum_dim_intlist([0_i64].as_slice(), false, None)]
         };
-        let module = CModule::create_by_tracing("Fusion", "forward", &inputs, &mut weighted).unwrap();
+        let module =
+            CModule::create_by_tracing("Fusion", "forward", &inputs, &mut weighted).unwrap();
         module.save(file).unwrap();
     }
 
     fn maps(features: &Tensor, mask: &Tensor) -> AlignedMaps {
-        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 5, height: 4 };
+        let grid = BevGrid {
+            x_min_m: 0.0,
+            y_min_m: 0.0,
+            cell_m: 1.0,
+            width: 5,
+            height: 4,
+        };
         let pose = Pose::from_xyz_yaw([2.0, 0.0, 0.0], 0.5);
-        let other = MapMetadata { confidence: 0.25, age_secs: 0.1, ..MapMetadata::fresh(1, pose) };
-        AlignedMaps::newest(features, mask, &[MapMetadata::fresh(0, Pose::IDENTITY), other], &grid)
+        let other = MapMetadata {
+            confidence: 0.25,
+            age_secs: 0.1,
+            ..MapMetadata::fresh(1, pose)
+        };
+        AlignedMaps::newest(
+            features,
+            mask,
+            &[MapMetadata::fresh(0, Pose::IDENTITY), other],
+            &grid,
+        )
     }
 
     #[test]
@@ -176,22 +225,51 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("weighted.pt");
         write(&file);
-        let (features, mask) = (Tensor::rand([2, 3, 4, 5], FLOAT), Tensor::ones([2, 1, 4, 5], FLOAT));
+        let (features, mask) = (
+            Tensor::rand([2, 3, 4, 5], FLOAT),
+            Tensor::ones([2, 1, 4, 5], FLOAT),
+        );
         let _ = mask.get(1).narrow(1, 0, 1).fill_(0.0);
-        let fused = ScriptFusion::load(&file, Device::Cpu).unwrap().fuse(&maps(&features, &mask)).unwrap().map;
-        let expected = features.get(0) + features.get(1) * mask.get(1) * (0.25 + 1.0 + 200.0 + 500.0);
+        let fused = ScriptFusion::load(&file, Device::Cpu)
+            .unwrap()
+            .fuse(&maps(&features, &mask))
+            .unwrap()
+            .map;
+        let expected =
+            features.get(0) + features.get(1) * mask.get(1) * (0.25 + 1.0 + 200.0 + 500.0);
         assert!(fused.allclose(&expected, 1e-5, 1e-3, false));
     }
 
     #[test]
     fn a_file_is_a_method_by_its_name() {
         let method: Method = "script:runs/mine.pt".parse().unwrap();
-        assert_eq!((method.name(), method), ("script:runs/mine.pt", "script:runs/mine.pt".parse().unwrap()));
-        assert_eq!(method.weights_names(), ["script:runs/mine.pt", "mine", "max"]);
+        assert_eq!(
+            (method.name(), method),
+            (
+                "script:runs/mine.pt",
+                "script:runs/mine.pt".parse().unwrap()
+            )
+        );
+        assert_eq!(
+            method.weights_names(),
+            ["script:runs/mine.pt", "mine", "max"]
+        );
         let config = method.default_fusion(&DetectorConfig::lean());
-        assert_eq!(config.to_json(), r#"{"kind":"script","file":"runs/mine.pt"}"#);
-        assert_eq!(serde_json::from_str::<FusionConfig>(&config.to_json()).unwrap(), config);
-        assert!("script:".parse::<Method>().unwrap_err().to_string().contains("script:FILE.pt"));
+        assert_eq!(
+            config.to_json(),
+            r#"{"kind":"script","file":"runs/mine.pt"}"#
+        );
+        assert_eq!(
+            serde_json::from_str::<FusionConfig>(&config.to_json()).unwrap(),
+            config
+        );
+        assert!(
+            "script:"
+                .parse::<Method>()
+                .unwrap_err()
+                .to_string()
+                .contains("script:FILE.pt")
+        );
     }
 
     #[test]
@@ -199,26 +277,46 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let build = |file: &Path| {
             let variables = nn::VarStore::new(Device::Cpu);
-            ScriptConfig { file: file.to_owned() }.build(&variables.root()).unwrap_err().to_string()
+            ScriptConfig {
+                file: file.to_owned(),
+            }
+            .build(&variables.root())
+            .unwrap_err()
+            .to_string()
         };
         let missing = folder.path().join("missing.pt");
-        assert!(build(&missing).contains("missing.pt"), "{}", build(&missing));
+        assert!(
+            build(&missing).contains("missing.pt"),
+            "{}",
+            build(&missing)
+        );
         let broken = folder.path().join("broken.pt");
         std::fs::write(&broken, b"no archive").unwrap();
         let message = build(&broken);
-        assert!(message.contains("broken.pt") && !message.contains('\n'), "{message}");
+        assert!(
+            message.contains("broken.pt") && !message.contains('\n'),
+            "{message}"
+        );
         let file = folder.path().join("weighted.pt");
         write(&file);
         let script = ScriptFusion::load(&file, Device::Cpu).unwrap();
         let refused = |mask: &[i64]| {
-            let maps = maps(&Tensor::rand([2, 3, 4, 5], FLOAT), &Tensor::ones(mask, FLOAT));
+            let maps = maps(
+                &Tensor::rand([2, 3, 4, 5], FLOAT),
+                &Tensor::ones(mask, FLOAT),
+            );
             script.fuse(&maps).unwrap_err().to_string()
         };
         // The module fails, or returns a map of another shape.
-        for (mask, reason) in [(&[2, 2, 4, 5][..], "must match"), (&[7, 2, 1, 4, 5], "[2, 3, 4, 5], not of [3, 4, 5]")]
-        {
+        for (mask, reason) in [
+            (&[2, 2, 4, 5][..], "must match"),
+            (&[7, 2, 1, 4, 5], "[2, 3, 4, 5], not of [3, 4, 5]"),
+        ] {
             let message = refused(mask);
-            assert!(message.contains("weighted.pt") && message.contains(reason), "{message}");
+            assert!(
+                message.contains("weighted.pt") && message.contains(reason),
+                "{message}"
+            );
             assert!(!message.contains("Traceback"), "{message}");
         }
     }

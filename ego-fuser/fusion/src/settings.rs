@@ -20,7 +20,9 @@ pub const FUSION_KEY: &str = "fusion";
 const LEAN_CHANNELS: i64 = 128;
 
 /// The settings that a method's fusion is built from.
-pub trait FusionSettings: Debug + Clone + PartialEq + Serialize + DeserializeOwned + Send + Sync + 'static {
+pub trait FusionSettings:
+    Debug + Clone + PartialEq + Serialize + DeserializeOwned + Send + Sync + 'static
+{
     /// Tag in weights files.
     const KIND: &'static str;
 
@@ -65,14 +67,22 @@ pub struct HistorySpec {
 impl Default for HistorySpec {
     /// No earlier maps.
     fn default() -> Self {
-        Self { frames: 1, earlier_cells: None, full_resolution: false }
+        Self {
+            frames: 1,
+            earlier_cells: None,
+            full_resolution: false,
+        }
     }
 }
 
 /// Settings of the size that fits maps of a detector: `lean` up to 128 channels, else `full`.
 pub(super) fn of_size<S>(detector: &DetectorConfig, lean: fn(i64) -> S, full: fn(i64) -> S) -> S {
     let channels = detector.feature_channels();
-    if channels <= LEAN_CHANNELS { lean(channels) } else { full(channels) }
+    if channels <= LEAN_CHANNELS {
+        lean(channels)
+    } else {
+        full(channels)
+    }
 }
 
 /// The settings of any method's fusion, stored as JSON beside its weights.
@@ -173,7 +183,10 @@ impl<S: FusionSettings> AnySettings for S {
     }
 
     fn to_json(&self, style: Style) -> String {
-        let tagged = Tagged { kind: S::KIND, settings: self };
+        let tagged = Tagged {
+            kind: S::KIND,
+            settings: self,
+        };
         let text = match style {
             Style::Compact => serde_json::to_string(&tagged),
             Style::Pretty => serde_json::to_string_pretty(&tagged),

@@ -57,7 +57,12 @@ impl SwapFusionConfig {
     /// costs as much as a layer norm and a projection).
     #[must_use]
     pub fn lean(channels: i64) -> Self {
-        Self { depth: 2, head_channels: (channels / 2).max(1), dropout: 0.0, ..Self::full(channels) }
+        Self {
+            depth: 2,
+            head_channels: (channels / 2).max(1),
+            dropout: 0.0,
+            ..Self::full(channels)
+        }
     }
 
     /// Checks that a network can be built.
@@ -73,16 +78,31 @@ impl SwapFusionConfig {
             ("fusion.head_channels", self.head_channels, 4096),
             ("fusion.hidden", self.hidden, 4096),
         ];
-        if let Some((field, size, _)) = sizes.into_iter().find(|(_, size, most)| !(1..=*most).contains(size)) {
-            return Err(ConfigError::Value { field, value: size.to_string(), must: "at least 1 and plausible" });
+        if let Some((field, size, _)) = sizes
+            .into_iter()
+            .find(|(_, size, most)| !(1..=*most).contains(size))
+        {
+            return Err(ConfigError::Value {
+                field,
+                value: size.to_string(),
+                must: "at least 1 and plausible",
+            });
         }
         if self.channels % self.head_channels != 0 {
             let value = self.head_channels.to_string();
-            return Err(ConfigError::Value { field: "fusion.head_channels", value, must: "a divisor of the channels" });
+            return Err(ConfigError::Value {
+                field: "fusion.head_channels",
+                value,
+                must: "a divisor of the channels",
+            });
         }
         if !(0.0..1.0).contains(&self.dropout) {
             let value = self.dropout.to_string();
-            return Err(ConfigError::Value { field: "fusion.dropout", value, must: "a share below 1" });
+            return Err(ConfigError::Value {
+                field: "fusion.dropout",
+                value,
+                must: "a share below 1",
+            });
         }
         Ok(())
     }
@@ -107,7 +127,14 @@ impl OffsetTable {
             slots: config.slots,
             window: config.window,
             heads,
-            table: table.var("weight", &[offsets, heads], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            table: table.var(
+                "weight",
+                &[offsets, heads],
+                Init::Randn {
+                    mean: 0.0,
+                    stdev: 0.02,
+                },
+            ),
         }
     }
 
@@ -116,17 +143,27 @@ impl OffsetTable {
         let (span, last) = (2 * self.window - 1, self.slots - 1);
         let tokens = |slots: i64| {
             let window = self.window;
-            let cells = move |slot| (0..window * window).map(move |cell| [slot, cell / window, cell % window]);
+            let cells = move |slot| {
+                (0..window * window).map(move |cell| [slot, cell / window, cell % window])
+            };
             (0..slots).flat_map(cells)
         };
         let offset = |from: [i64; 3], to: [i64; 3]| {
             let agent = (from[0] - to[0]).clamp(-last, last) + last;
-            (agent * span + from[1] - to[1] + self.window - 1) * span + from[2] - to[2] + self.window - 1
+            (agent * span + from[1] - to[1] + self.window - 1) * span + from[2] - to[2]
+                + self.window
+                - 1
         };
-        let index: Vec<i64> = tokens(asking).flat_map(|from| tokens(asked).map(move |to| offset(from, to))).collect();
+        let index: Vec<i64> = tokens(asking)
+            .flat_map(|from| tokens(asked).map(move |to| offset(from, to)))
+            .collect();
         let cells = self.window * self.window;
         let index = Tensor::f_from_slice(&index)?.f_to_device(self.table.device())?;
-        let bias = self.table.f_index_select(0, &index)?.f_view([asking * cells, asked * cells, self.heads])?;
+        let bias = self.table.f_index_select(0, &index)?.f_view([
+            asking * cells,
+            asked * cells,
+            self.heads,
+        ])?;
         bias.f_permute([2, 0, 1])?.f_contiguous()
     }
 }
@@ -145,16 +182,34 @@ impl GroupAttention {
     fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
         Self {
             heads: config.channels / config.head_channels,
-            to_qkv: Linear::new(&(path / "to_qkv"), config.channels, 3 * config.channels, false),
+            to_qkv: Linear::new(
+                &(path / "to_qkv"),
+                config.channels,
+                3 * config.channels,
+                false,
+            ),
             offsets: OffsetTable::new(path, config),
-            out: Linear::residual(&(path / "to_out" / 0), config.channels, config.channels, false),
+            out: Linear::residual(
+                &(path / "to_out" / 0),
+                config.channels,
+                config.channels,
+                false,
+            ),
             dropout: config.dropout,
         }
     }
 
     /// `[G, S, P, C]` to the same, of which the first `asked` slots are attended to.
-    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        let &[groups, slots, _, channels] = &x.size()[..] else { return Err(shape_error(x)) };
+    fn forward(
+        &self,
+        x: &Tensor,
+        asked: i64,
+        bias: &Tensor,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        let &[groups, slots, _, channels] = &x.size()[..] else {
+            return Err(shape_error(x));
+        };
         let heads = |part: &Tensor| part.f_unflatten(-1, [self.heads, channels / self.heads]);
         let flat = |x: &Tensor| x.f_view([groups, -1, x.size()[3]]);
         let parts = if asked == slots {
@@ -164,10 +219,18 @@ impl GroupAttention {
             let weight = &self.to_qkv.weight;
             let query = flat(&x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?)?;
             let there = x.f_narrow(1, 0, asked)?.f_contiguous()?;
-            let key_value = there.f_linear(&weight.f_narrow(0, channels, 2 * channels)?, None::<Tensor>)?;
-            std::iter::once(query).chain(flat(&key_value)?.f_split(channels, 2)?).collect()
+            let key_value =
+                there.f_linear(&weight.f_narrow(0, channels, 2 * channels)?, None::<Tensor>)?;
+            std::iter::once(query)
+                .chain(flat(&key_value)?.f_split(channels, 2)?)
+                .collect()
         };
-        let seen = attend(&heads(&parts[0])?, &heads(&parts[1])?, &heads(&parts[2])?, Some(bias))?;
+        let seen = attend(
+            &heads(&parts[0])?,
+            &heads(&parts[1])?,
+            &heads(&parts[2])?,
+            Some(bias),
+        )?;
         dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(x)
     }
 }
@@ -194,19 +257,45 @@ impl HalfBlock {
             norm: LayerNorm::new(&(attention / "norm"), config.channels),
             attention: GroupAttention::new(&(attention / "fn"), config),
             feed_norm: LayerNorm::new(&(feed / "norm"), config.channels),
-            feed_forward: FeedForward::new(&(feed / "fn"), config.channels, config.hidden, config.dropout),
+            feed_forward: FeedForward::new(
+                &(feed / "fn"),
+                config.channels,
+                config.hidden,
+                config.dropout,
+            ),
         }
     }
 
-    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        let x = x + self.attention.forward(&self.norm.forward(x)?, asked, bias, train)?;
-        Ok(&x + self.feed_forward.forward(&self.feed_norm.forward(&x)?, train)?)
+    fn forward(
+        &self,
+        x: &Tensor,
+        asked: i64,
+        bias: &Tensor,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        let x = x + self
+            .attention
+            .forward(&self.norm.forward(x)?, asked, bias, train)?;
+        Ok(&x
+            + self
+                .feed_forward
+                .forward(&self.feed_norm.forward(&x)?, train)?)
     }
 
     /// On all groups of a map `[S, H, W, C]` at once, by operations with fast gradients: the groups.
-    pub(super) fn whole(&self, map: &Tensor, slots: Slots<'_>, window: i64, train: bool) -> Result<Tensor, TchError> {
+    pub(super) fn whole(
+        &self,
+        map: &Tensor,
+        slots: Slots<'_>,
+        window: i64,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let x = self.partition.cut(map, window)?;
-        let bias = self.attention.offsets.bias(x.size()[1], slots.asked)?.f_unsqueeze(0)?;
+        let bias = self
+            .attention
+            .offsets
+            .bias(x.size()[1], slots.asked)?
+            .f_unsqueeze(0)?;
         let bias = match slots.unseen(self.partition, window)? {
             Some(unseen) => bias + unseen,
             None => bias,
@@ -228,10 +317,21 @@ pub struct Slots<'a> {
 
 impl Slots<'_> {
     /// `[G, 1, 1, asked * P]`: 0 for valid tokens, minus infinity for invalid ones.
-    pub(super) fn unseen(&self, partition: Partition, window: i64) -> Result<Option<Tensor>, TchError> {
-        let Some(reach) = self.reach else { return Ok(None) };
+    pub(super) fn unseen(
+        &self,
+        partition: Partition,
+        window: i64,
+    ) -> Result<Option<Tensor>, TchError> {
+        let Some(reach) = self.reach else {
+            return Ok(None);
+        };
         let unseen = unseen(&reach.f_narrow(0, 0, self.asked)?.f_unsqueeze(3)?)?;
-        Ok(Some(partition.cut(&unseen, window)?.f_view([-1, 1, 1, self.asked * window * window])?))
+        Ok(Some(partition.cut(&unseen, window)?.f_view([
+            -1,
+            1,
+            1,
+            self.asked * window * window,
+        ])?))
     }
 }
 
@@ -261,7 +361,10 @@ impl MeanHead {
             }
             _ => x.f_mean_dim([0i64].as_slice(), false, None::<Kind>)?,
         };
-        self.linear.forward(&self.norm.forward(&mean)?)?.f_permute([2, 0, 1])?.f_contiguous()
+        self.linear
+            .forward(&self.norm.forward(&mean)?)?
+            .f_permute([2, 0, 1])?
+            .f_contiguous()
     }
 }
 
@@ -284,12 +387,28 @@ impl SwapFusion {
         for layer in 0..config.depth {
             let path = path / "layers" / layer;
             let names = if masked {
-                ["window_attention", "window_ffd", "grid_attention", "grid_ffd"].map(|name| &path / name)
+                [
+                    "window_attention",
+                    "window_ffd",
+                    "grid_attention",
+                    "grid_ffd",
+                ]
+                .map(|name| &path / name)
             } else {
                 [1, 2, 5, 6].map(|index| &path / "block" / index)
             };
-            halves.push(HalfBlock::new(Partition::Window, &names[0], &names[1], config));
-            halves.push(HalfBlock::new(Partition::Grid, &names[2], &names[3], config));
+            halves.push(HalfBlock::new(
+                Partition::Window,
+                &names[0],
+                &names[1],
+                config,
+            ));
+            halves.push(HalfBlock::new(
+                Partition::Grid,
+                &names[2],
+                &names[3],
+                config,
+            ));
         }
         Self {
             halves,
@@ -309,35 +428,60 @@ impl SwapFusion {
     ///
     /// # Errors
     /// [`TchError`] when shapes do not fit.
-    pub fn forward(&self, maps: &Tensor, slots: Slots<'_>, train: bool) -> Result<Tensor, TchError> {
+    pub fn forward(
+        &self,
+        maps: &Tensor,
+        slots: Slots<'_>,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let last = self.halves.len();
-        self.head.forward(&self.through(maps, slots, last, train)?, slots)
+        self.head
+            .forward(&self.through(maps, slots, last, train)?, slots)
     }
 
     /// All slots `[S, C, H, W]` after the first `layers` layers.
     ///
     /// # Errors
     /// [`TchError`] when shapes do not fit.
-    pub fn after_layers(&self, maps: &Tensor, slots: Slots<'_>, layers: usize) -> Result<Tensor, TchError> {
-        self.through(maps, slots, 2 * layers, false)?.f_permute([0, 3, 1, 2])?.f_contiguous()
+    pub fn after_layers(
+        &self,
+        maps: &Tensor,
+        slots: Slots<'_>,
+        layers: usize,
+    ) -> Result<Tensor, TchError> {
+        self.through(maps, slots, 2 * layers, false)?
+            .f_permute([0, 3, 1, 2])?
+            .f_contiguous()
     }
 
     /// All slots after the first `halves` half blocks: `[S, C, H, W]` to `[S, H, W, C]`.
-    fn through(&self, maps: &Tensor, slots: Slots<'_>, halves: usize, train: bool) -> Result<Tensor, TchError> {
+    fn through(
+        &self,
+        maps: &Tensor,
+        slots: Slots<'_>,
+        halves: usize,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let map = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let size = [map.size()[1], map.size()[2]];
         let mut x = map;
         let mut lies_in = None;
         for half in &self.halves[..halves.min(self.halves.len())] {
             x = if train {
-                let map = lies_in.map_or_else(|| Ok(x.shallow_clone()), |p: Partition| p.map(&x, size, self.window))?;
+                let map = lies_in.map_or_else(
+                    || Ok(x.shallow_clone()),
+                    |p: Partition| p.map(&x, size, self.window),
+                )?;
                 half.whole(&map, slots, self.window, true)?
             } else {
                 self.chunked(half, &x, lies_in, slots, size)?
             };
             lies_in = Some(half.partition);
         }
-        lies_in.map_or_else(|| Ok(x.shallow_clone()), |partition| partition.map(&x, size, self.window))
+        lies_in.map_or_else(
+            || Ok(x.shallow_clone()),
+            |partition| partition.map(&x, size, self.window),
+        )
     }
 
     /// The same some groups at a time, gathered from their places in memory.
@@ -356,16 +500,24 @@ impl SwapFusion {
         let count = total / (size[0] * size[1]);
         let order = Tensor::f_arange(total, (Kind::Int64, Device::Cpu))?.f_to_device(x.device())?;
         let order = match lies_in {
-            Some(partition) => partition.map(&order.f_view([-1, count, cells, 1])?, size, self.window)?,
+            Some(partition) => {
+                partition.map(&order.f_view([-1, count, cells, 1])?, size, self.window)?
+            }
             None => order.f_view([count, size[0], size[1], 1])?,
         };
         let order = half.partition.cut(&order, self.window)?.f_view([-1])?;
-        let bias = half.attention.offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
+        let bias = half
+            .attention
+            .offsets
+            .bias(count, slots.asked)?
+            .f_unsqueeze(0)?;
         let unseen = slots.unseen(half.partition, self.window)?;
         let step = (CHUNK / (count * cells)).max(1);
         let mut done = Vec::new();
         for (index, order) in order.f_split(step * count * cells, 0)?.iter().enumerate() {
-            let x = rows.f_index_select(0, order)?.f_view([-1, count, cells, channels])?;
+            let x = rows
+                .f_index_select(0, order)?
+                .f_view([-1, count, cells, channels])?;
             let biased = match &unseen {
                 Some(unseen) => Some(&bias + unseen.f_narrow(0, index as i64 * step, x.size()[0])?),
                 None => None,
@@ -385,7 +537,19 @@ mod tests {
         assert!(SwapFusionConfig::full(256).validate().is_ok());
         assert!(SwapFusionConfig::lean(64).validate().is_ok());
         let message = |config: SwapFusionConfig| config.validate().unwrap_err().to_string();
-        assert!(message(SwapFusionConfig { window: 0, ..SwapFusionConfig::lean(64) }).contains("fusion.window is 0"));
-        assert!(message(SwapFusionConfig { head_channels: 24, ..SwapFusionConfig::lean(64) }).contains("divisor"));
+        assert!(
+            message(SwapFusionConfig {
+                window: 0,
+                ..SwapFusionConfig::lean(64)
+            })
+            .contains("fusion.window is 0")
+        );
+        assert!(
+            message(SwapFusionConfig {
+                head_channels: 24,
+                ..SwapFusionConfig::lean(64)
+            })
+            .contains("divisor")
+        );
     }
 }

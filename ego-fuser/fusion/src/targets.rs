@@ -21,7 +21,10 @@ pub struct TargetRule {
 
 impl Default for TargetRule {
     fn default() -> Self {
-        Self { positive_iou: 0.6, negative_iou: 0.45 }
+        Self {
+            positive_iou: 0.6,
+            negative_iou: 0.45,
+        }
     }
 }
 
@@ -61,7 +64,9 @@ pub enum AnchorGridError {
         per_cell: usize,
     },
     /// Centres do not increase with row and column, so objects cannot be looked up.
-    #[error("anchor {index} breaks the order of the grid: x must increase with the column only, y with the row only")]
+    #[error(
+        "anchor {index} breaks the order of the grid: x must increase with the column only, y with the row only"
+    )]
     NotSeparable {
         /// Flat index of the first anchor that breaks the order.
         index: usize,
@@ -86,26 +91,55 @@ impl TargetAssigner {
     ///
     /// # Errors
     /// [`AnchorGridError`] when the anchors do not fill the shape or are not on a grid.
-    pub fn new(anchors: Vec<Box3d>, shape: [usize; 3], rule: TargetRule) -> Result<Self, AnchorGridError> {
+    pub fn new(
+        anchors: Vec<Box3d>,
+        shape: [usize; 3],
+        rule: TargetRule,
+    ) -> Result<Self, AnchorGridError> {
         let [height, width, per_cell] = shape;
         if anchors.len() != height * width * per_cell || anchors.is_empty() {
-            return Err(AnchorGridError::Count { found: anchors.len(), height, width, per_cell });
+            return Err(AnchorGridError::Count {
+                found: anchors.len(),
+                height,
+                width,
+                per_cell,
+            });
         }
-        let column_x: Vec<f64> = (0..width).map(|column| anchors[column * per_cell].center_m[0]).collect();
-        let row_y: Vec<f64> = (0..height).map(|row| anchors[row * width * per_cell].center_m[1]).collect();
+        let column_x: Vec<f64> = (0..width)
+            .map(|column| anchors[column * per_cell].center_m[0])
+            .collect();
+        let row_y: Vec<f64> = (0..height)
+            .map(|row| anchors[row * width * per_cell].center_m[1])
+            .collect();
         let on_lattice = |(index, anchor): (usize, &Box3d)| {
             let cell = index / per_cell;
-            anchor.center_m[0] == column_x[cell % width] && anchor.center_m[1] == row_y[cell / width]
+            anchor.center_m[0] == column_x[cell % width]
+                && anchor.center_m[1] == row_y[cell / width]
         };
-        if let Some(index) = anchors.iter().enumerate().position(|entry| !on_lattice(entry)) {
+        if let Some(index) = anchors
+            .iter()
+            .enumerate()
+            .position(|entry| !on_lattice(entry))
+        {
             return Err(AnchorGridError::NotSeparable { index });
         }
         if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
             return Err(AnchorGridError::NotSeparable { index: 0 });
         }
         let standing: Vec<Standing> = anchors.iter().map(Standing::of).collect();
-        let reach = anchors.iter().map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0).fold(0.0, f64::max);
-        Ok(Self { rule, anchors, standing, column_x, row_y, per_cell, reach })
+        let reach = anchors
+            .iter()
+            .map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0)
+            .fold(0.0, f64::max);
+        Ok(Self {
+            rule,
+            anchors,
+            standing,
+            column_x,
+            row_y,
+            per_cell,
+            reach,
+        })
     }
 
     /// Targets of the objects of one frame, boxes in the frame of the anchors.
@@ -139,7 +173,10 @@ impl TargetAssigner {
                 owner[index] = owner_id;
             }
         }
-        let mut labels = Labels { anchors: self.anchors.len(), ..Labels::default() };
+        let mut labels = Labels {
+            anchors: self.anchors.len(),
+            ..Labels::default()
+        };
         for (anchor, (&owner, &near)) in owner.iter().zip(&near).enumerate() {
             if owner != FREE {
                 let code = encode(&objects[owner as usize], &self.anchors[anchor]);
@@ -156,7 +193,8 @@ impl TargetAssigner {
         // The added metre, and a margin for the rounding to f32.
         let reach = self.reach + object.size_m[0].hypot(object.size_m[1]) / 2.0 + 1.01;
         let within = |centers: &[f64], middle: f64| {
-            centers.partition_point(|&at| at < middle - reach)..centers.partition_point(|&at| at <= middle + reach)
+            centers.partition_point(|&at| at < middle - reach)
+                ..centers.partition_point(|&at| at <= middle + reach)
         };
         let columns = within(&self.column_x, object.center_m[0]);
         for row in within(&self.row_y, object.center_m[1]) {
@@ -200,21 +238,33 @@ impl Standing {
         let (sin, cos) = (heading.sin() as f32, heading.cos() as f32);
         let [half_l, half_w] = [box3d.size_m[0] as f32 * 0.5, box3d.size_m[1] as f32 * 0.5];
         let [x, y] = [box3d.center_m[0] as f32, box3d.center_m[1] as f32];
-        let mut standing = Self { low: [f32::INFINITY; 2], high: [f32::NEG_INFINITY; 2], area: 0.0 };
-        for (l, w) in [(half_l, -half_w), (half_l, half_w), (-half_l, half_w), (-half_l, -half_w)] {
+        let mut standing = Self {
+            low: [f32::INFINITY; 2],
+            high: [f32::NEG_INFINITY; 2],
+            area: 0.0,
+        };
+        for (l, w) in [
+            (half_l, -half_w),
+            (half_l, half_w),
+            (-half_l, half_w),
+            (-half_l, -half_w),
+        ] {
             let corner = [(l * cos + w * -sin) + x, (l * sin + w * cos) + y];
             for ((low, high), at) in standing.low.iter_mut().zip(&mut standing.high).zip(corner) {
                 *low = low.min(at);
                 *high = high.max(at);
             }
         }
-        standing.area = (standing.high[0] - standing.low[0] + 1.0) * (standing.high[1] - standing.low[1] + 1.0);
+        standing.area =
+            (standing.high[0] - standing.low[0] + 1.0) * (standing.high[1] - standing.low[1] + 1.0);
         standing
     }
 
     /// Intersection over union with one metre added to every side, as if metres were pixels.
     fn overlap(&self, other: &Self) -> f32 {
-        let side = |axis: usize| self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]) + 1.0;
+        let side = |axis: usize| {
+            self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]) + 1.0
+        };
         let (x, y) = (side(0), side(1));
         if x <= 0.0 || y <= 0.0 {
             return 0.0;
@@ -250,17 +300,28 @@ mod tests {
     fn an_object_on_an_anchor_has_nothing_to_regress_there() {
         let anchors = anchor_grid(20, 30);
         let labels = assigner().assign(&[anchors[777]]);
-        let at = labels.positives.iter().find(|positive| positive.anchor == 777).unwrap();
+        let at = labels
+            .positives
+            .iter()
+            .find(|positive| positive.anchor == 777)
+            .unwrap();
         assert!(at.code.iter().all(|value| value.abs() < 1e-12));
         assert!(
-            labels.positives.iter().all(|positive| positive.anchor % 2 == 777 % 2),
+            labels
+                .positives
+                .iter()
+                .all(|positive| positive.anchor % 2 == 777 % 2),
             "the other heading overlaps less"
         );
     }
 
     #[test]
     fn a_truck_that_overlaps_little_still_has_its_best_anchor() {
-        let truck = Box3d { center_m: [12.0, 8.0, 0.0], size_m: [14.0, 3.0, 3.5], heading_rad: 0.4 };
+        let truck = Box3d {
+            center_m: [12.0, 8.0, 0.0],
+            size_m: [14.0, 3.0, 3.5],
+            heading_rad: 0.4,
+        };
         let labels = assigner().assign(&[truck]);
         assert_eq!(labels.positives.len(), 1);
         assert!((labels.positives[0].code[3] - (3.5f64 / 1.56).ln()).abs() < 1e-12);
@@ -269,8 +330,16 @@ mod tests {
     #[test]
     fn restriction_to_near_anchors_changes_nothing() {
         let objects = [
-            Box3d { center_m: [3.3, 4.1, -0.8], size_m: [4.5, 1.9, 1.6], heading_rad: 0.3 },
-            Box3d { center_m: [5.1, 4.9, -0.8], size_m: [4.2, 1.8, 1.6], heading_rad: 1.3 },
+            Box3d {
+                center_m: [3.3, 4.1, -0.8],
+                size_m: [4.5, 1.9, 1.6],
+                heading_rad: 0.3,
+            },
+            Box3d {
+                center_m: [5.1, 4.9, -0.8],
+                size_m: [4.2, 1.8, 1.6],
+                heading_rad: 1.3,
+            },
         ];
         let assigner = assigner();
         let labels = assigner.assign(&objects);
@@ -278,9 +347,15 @@ mod tests {
         for index in 0..labels.anchors {
             let overlap = |object: &Standing| assigner.standing[index].overlap(object);
             let over = standing.iter().map(overlap).fold(0.0, f32::max);
-            let positive = labels.positives.iter().any(|positive| positive.anchor == index);
+            let positive = labels
+                .positives
+                .iter()
+                .any(|positive| positive.anchor == index);
             assert!(positive || over <= 0.6);
-            assert_eq!(labels.unassigned.contains(&index), !positive && over >= 0.45);
+            assert_eq!(
+                labels.unassigned.contains(&index),
+                !positive && over >= 0.45
+            );
         }
     }
 
@@ -288,14 +363,19 @@ mod tests {
     fn no_objects_no_targets() {
         let labels = assigner().assign(&[]);
         assert!(labels.positives.is_empty() && labels.unassigned.is_empty());
-        let far = Box3d { center_m: [1e6, 0.0, 0.0], size_m: CAR, heading_rad: 0.0 };
+        let far = Box3d {
+            center_m: [1e6, 0.0, 0.0],
+            size_m: CAR,
+            heading_rad: 0.0,
+        };
         assert!(assigner().assign(&[far]).positives.is_empty());
     }
 
     #[test]
     fn anchors_off_a_grid_are_rejected() {
         let mut anchors = anchor_grid(4, 5);
-        let error = TargetAssigner::new(anchors.clone(), [4, 4, 2], TargetRule::default()).unwrap_err();
+        let error =
+            TargetAssigner::new(anchors.clone(), [4, 4, 2], TargetRule::default()).unwrap_err();
         assert!(matches!(error, AnchorGridError::Count { found: 40, .. }));
         anchors[13].center_m[0] += 0.1;
         let error = TargetAssigner::new(anchors, [4, 5, 2], TargetRule::default()).unwrap_err();

@@ -8,7 +8,9 @@ use tch::nn::VarStore;
 /// Values from 0 to 1 of this shape.
 pub(crate) fn uniform(seed: u64, shape: &[i64]) -> Tensor {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let values: Vec<f32> = (0..shape.iter().product()).map(|_| random.random()).collect();
+    let values: Vec<f32> = (0..shape.iter().product())
+        .map(|_| random.random())
+        .collect();
     Tensor::from_slice(&values).view(shape)
 }
 
@@ -18,7 +20,9 @@ pub(crate) fn redraw(variables: &VarStore, parts: &[&str], size: f64) {
     named.sort_by(|a, b| a.0.cmp(&b.0));
     for (seed, (name, mut variable)) in named.into_iter().enumerate() {
         if parts.iter().any(|part| name.contains(part)) {
-            tch::no_grad(|| variable.copy_(&((uniform(seed as u64, &variable.size()) * 2.0 - 1.0) * size)));
+            tch::no_grad(|| {
+                variable.copy_(&((uniform(seed as u64, &variable.size()) * 2.0 - 1.0) * size))
+            });
         }
     }
 }

@@ -60,14 +60,23 @@ impl V2vNetConfig {
     /// OpenCOOD's: two rounds, the mean, one layer.
     #[must_use]
     pub fn full(channels: i64) -> Self {
-        Self { channels, rounds: 2, aggregation: Aggregation::Mean, gru_layers: 1, kernel: 3 }
+        Self {
+            channels,
+            rounds: 2,
+            aggregation: Aggregation::Mean,
+            gru_layers: 1,
+            kernel: 3,
+        }
     }
 
     /// One round: with N vehicles the round before the last costs N times as much as the last, for the messages between
     /// neighbours.
     #[must_use]
     pub fn lean(channels: i64) -> Self {
-        Self { rounds: 1, ..Self::full(channels) }
+        Self {
+            rounds: 1,
+            ..Self::full(channels)
+        }
     }
 
     /// Checks that a network can be built.
@@ -78,7 +87,11 @@ impl V2vNetConfig {
         within("fusion channels", self.channels, 1..=4096)?;
         within("fusion rounds", self.rounds as i64, 1..=16)?;
         within("fusion gru_layers", self.gru_layers as i64, 0..=8)?;
-        within("odd fusion kernel", if self.kernel % 2 == 1 { self.kernel } else { 0 }, 1..=15)
+        within(
+            "odd fusion kernel",
+            if self.kernel % 2 == 1 { self.kernel } else { 0 },
+            1..=15,
+        )
     }
 }
 
@@ -125,7 +138,12 @@ impl V2vNet {
         let channels = config.channels;
         Ok(Self {
             message: Conv::new(&(path / "msg_cnn"), [2 * channels, channels], 3),
-            gru: ConvGru::new(&(path / "conv_gru"), [2 * channels, channels], config.kernel, config.gru_layers),
+            gru: ConvGru::new(
+                &(path / "conv_gru"),
+                [2 * channels, channels],
+                config.kernel,
+                config.gru_layers,
+            ),
             mlp: Conv::linear(&(path / "mlp"), [channels, channels]),
             config: config.clone(),
         })
@@ -143,7 +161,11 @@ impl V2vNet {
         let mut nodes = maps.shallow_clone();
         for round in 1..=self.config.rounds {
             // Of the last round only the ego's update is used.
-            let receivers = if round == self.config.rounds { 1 } else { incoming.len() };
+            let receivers = if round == self.config.rounds {
+                1
+            } else {
+                incoming.len()
+            };
             nodes = self.round(&nodes, &incoming[..receivers])?;
         }
         self.mlp.apply(&nodes.f_narrow(0, 0, 1)?)?.f_squeeze_dim(0)
@@ -161,7 +183,9 @@ impl V2vNet {
             let of_receiver = of_receivers.f_narrow(0, index as i64, 1)?;
             let messages = (self.message.part(&arrived, 0, false)? + of_receiver) * &incoming.mask;
             aggregated.push(match self.config.aggregation {
-                Aggregation::Mean => messages.f_mean_dim([0i64].as_slice(), true, messages.kind())?,
+                Aggregation::Mean => {
+                    messages.f_mean_dim([0i64].as_slice(), true, messages.kind())?
+                }
                 Aggregation::Max => messages.f_amax([0i64].as_slice(), true)?,
             });
         }
@@ -169,15 +193,22 @@ impl V2vNet {
         if self.config.gru_layers == 0 {
             return Ok(receivers + aggregated);
         }
-        self.gru.first_state(&Tensor::f_cat(&[receivers, aggregated], 1)?)
+        self.gru
+            .first_state(&Tensor::f_cat(&[receivers, aggregated], 1)?)
     }
 }
 
 impl Incoming {
     fn warp(&self, maps: &Tensor) -> Result<Tensor, TchError> {
         let theta = self.theta.f_to_kind(maps.kind())?;
-        let sampling_grid = Tensor::f_affine_grid_generator(&theta, maps.size(), self.corners_aligned)?;
-        maps.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, self.corners_aligned)
+        let sampling_grid =
+            Tensor::f_affine_grid_generator(&theta, maps.size(), self.corners_aligned)?;
+        maps.f_grid_sampler(
+            &sampling_grid,
+            BILINEAR,
+            PADDING_ZEROS,
+            self.corners_aligned,
+        )
     }
 
     /// Incoming maps of `receiver` from all, by the poses of their maps; `reach` is given for the ego and computed for
@@ -190,20 +221,33 @@ impl Incoming {
         device: Device,
     ) -> Result<Self, TchError> {
         let receiver_from_ego = nodes[receiver].ego_from_cav.isometry().inverse();
-        let relative = |node: &MapMetadata| -> Pose { (receiver_from_ego * node.ego_from_cav.isometry()).into() };
-        let entries = nodes.iter().flat_map(|node| cav_from_ego_normalized(&relative(node), grid));
+        let relative = |node: &MapMetadata| -> Pose {
+            (receiver_from_ego * node.ego_from_cav.isometry()).into()
+        };
+        let entries = nodes
+            .iter()
+            .flat_map(|node| cav_from_ego_normalized(&relative(node), grid));
         let theta = Tensor::f_from_slice(&entries.collect::<Vec<f32>>())?.f_view([-1, 2, 3])?;
         let theta = theta.f_to_device(device)?;
         let mask = match reach {
             Some(reach) => reach.shallow_clone(),
             None => {
-                let size = [nodes.len() as i64, 1, i64::from(grid.height), i64::from(grid.width)];
+                let size = [
+                    nodes.len() as i64,
+                    1,
+                    i64::from(grid.height),
+                    i64::from(grid.width),
+                ];
                 let everywhere = Tensor::f_ones(size, (Kind::Float, theta.device()))?;
                 let sampling_grid = Tensor::f_affine_grid_generator(&theta, size, false)?;
                 everywhere.f_grid_sampler(&sampling_grid, NEAREST, PADDING_ZEROS, false)?
             }
         };
-        Ok(Self { theta, corners_aligned: false, mask })
+        Ok(Self {
+            theta,
+            corners_aligned: false,
+            mask,
+        })
     }
 }
 
@@ -211,18 +255,36 @@ impl Fusion for V2vNet {
     /// Agents whose map does not reach the ego at all are no nodes of the graph. Between two neighbours the complete
     /// map is used, cells that were not sent as zeros.
     fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
-        let AlignedMaps { warped, received, metadata, grid, .. } = aligned;
+        let AlignedMaps {
+            warped,
+            received,
+            metadata,
+            grid,
+            ..
+        } = aligned;
         let entries = present(&warped.mask)?;
-        let nodes: Vec<MapMetadata> = entries.iter().map(|&entry| metadata[entry as usize]).collect();
+        let nodes: Vec<MapMetadata> = entries
+            .iter()
+            .map(|&entry| metadata[entry as usize])
+            .collect();
         let device = warped.features.device();
         let index = Tensor::f_from_slice(&entries)?.f_to_device(device)?;
-        let (maps, mask) = (received.maps.f_index_select(0, &index)?, warped.mask.f_index_select(0, &index)?);
-        let receivers = if self.config.rounds > 1 { nodes.len() } else { 1 };
+        let (maps, mask) = (
+            received.maps.f_index_select(0, &index)?,
+            warped.mask.f_index_select(0, &index)?,
+        );
+        let receivers = if self.config.rounds > 1 {
+            nodes.len()
+        } else {
+            1
+        };
         let incoming = (0..receivers).map(|receiver| {
             let reach = (receiver == 0).then_some(&mask);
             Incoming::between(receiver, &nodes, grid, reach, device)
         });
-        Ok(self.propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)?.into())
+        Ok(self
+            .propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)?
+            .into())
     }
 }
 
@@ -246,8 +308,16 @@ mod tests {
 
     #[test]
     fn a_neighbour_of_a_neighbour_has_an_effect_after_two_rounds_only() {
-        let grid = BevGrid { x_min_m: -12.0, y_min_m: -2.0, cell_m: 1.0, width: 24, height: 4 };
-        let facts: Vec<_> = (0..3).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
+        let grid = BevGrid {
+            x_min_m: -12.0,
+            y_min_m: -2.0,
+            cell_m: 1.0,
+            width: 24,
+            height: 4,
+        };
+        let facts: Vec<_> = (0..3)
+            .map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY))
+            .collect();
         // The third node's map reaches the ego at one cell in a corner, and its features lie elsewhere.
         let mask = Tensor::ones([3, 1, 4, 24], FLOAT);
         let _ = mask.get(2).narrow(2, 1, 23).fill_(0.0);
@@ -259,9 +329,19 @@ mod tests {
             no_grad(|| network.fuse(&maps)).unwrap().map
         };
         for (rounds, has_effect) in [(1, false), (2, true)] {
-            let config = V2vNetConfig { rounds, ..V2vNetConfig::full(4) };
-            let difference = (fused(&config, 0.0) - fused(&config, 3.0)).abs().max().double_value(&[]);
-            assert_eq!(difference > 1e-5, has_effect, "{rounds} rounds: {difference}");
+            let config = V2vNetConfig {
+                rounds,
+                ..V2vNetConfig::full(4)
+            };
+            let difference = (fused(&config, 0.0) - fused(&config, 3.0))
+                .abs()
+                .max()
+                .double_value(&[]);
+            assert_eq!(
+                difference > 1e-5,
+                has_effect,
+                "{rounds} rounds: {difference}"
+            );
         }
     }
 
@@ -269,11 +349,20 @@ mod tests {
     fn invalid_settings_are_rejected() {
         let variables = VarStore::new(Device::Cpu);
         for config in [
-            V2vNetConfig { rounds: 0, ..V2vNetConfig::full(4) },
-            V2vNetConfig { kernel: 2, ..V2vNetConfig::full(4) },
+            V2vNetConfig {
+                rounds: 0,
+                ..V2vNetConfig::full(4)
+            },
+            V2vNetConfig {
+                kernel: 2,
+                ..V2vNetConfig::full(4)
+            },
             V2vNetConfig::full(0),
         ] {
-            assert!(V2vNet::new(&variables.root(), &config).is_err(), "{config:?}");
+            assert!(
+                V2vNet::new(&variables.root(), &config).is_err(),
+                "{config:?}"
+            );
         }
     }
 }

@@ -33,7 +33,13 @@ pub static METHOD: MethodSpec = MethodSpec {
 
 /// Twice the published threshold: `lean` heads score the background just above that one. On validation scenes a fifth
 /// of the bytes is left then, and AP@0.5 is unchanged.
-const GATE: ConfidenceGate = ConfidenceGate { threshold: 0.02, smoothing: Some(Smoothing { kernel: 5, sigma: 1.0 }) };
+const GATE: ConfidenceGate = ConfidenceGate {
+    threshold: 0.02,
+    smoothing: Some(Smoothing {
+        kernel: 5,
+        sigma: 1.0,
+    }),
+};
 
 /// Operation that fuses the features of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -71,7 +77,10 @@ pub struct Where2commConfig {
 impl Default for Where2commConfig {
     /// Attention over the agents that sent the cell.
     fn default() -> Self {
-        Self { aggregation: Aggregation::Attention, missing: Missing::Absent }
+        Self {
+            aggregation: Aggregation::Attention,
+            missing: Missing::Absent,
+        }
     }
 }
 
@@ -87,7 +96,10 @@ impl FusionSettings for Where2commConfig {
     }
 
     fn requirements(&self) -> Requirements {
-        Requirements { partial_maps_in_training: true, ..Requirements::default() }
+        Requirements {
+            partial_maps_in_training: true,
+            ..Requirements::default()
+        }
     }
 }
 
@@ -110,7 +122,10 @@ impl Fusion for Where2comm {
             // Maps are zero wherever their mask is.
             Missing::Zero => warped.mask.f_ones_like()?,
         };
-        let maps = WarpedMaps { features: warped.features.shallow_clone(), mask };
+        let maps = WarpedMaps {
+            features: warped.features.shallow_clone(),
+            mask,
+        };
         Ok(match self.0.aggregation {
             Aggregation::Attention => attended(&maps)?,
             Aggregation::Max => maximum(&maps)?,
@@ -145,12 +160,25 @@ impl Communication {
     pub fn new(path: &nn::Path<'_>, config: &CommunicationConfig) -> Result<Self, ConfigError> {
         let window = config.smoothing.map(|Smoothing { kernel, .. }| {
             let kernel = i64::from(kernel);
-            within("odd kernel of the smoothing", if kernel % 2 == 1 { kernel } else { 0 }, 1..=63)?;
+            within(
+                "odd kernel of the smoothing",
+                if kernel % 2 == 1 { kernel } else { 0 },
+                1..=63,
+            )?;
             let path = path / "gaussian_filter";
-            let weight = path.var("weight", &[1, 1, kernel, kernel], Init::Const(0.0)).set_requires_grad(false);
-            Ok((weight, path.var("bias", &[1], Init::Const(0.0)).set_requires_grad(false)))
+            let weight = path
+                .var("weight", &[1, 1, kernel, kernel], Init::Const(0.0))
+                .set_requires_grad(false);
+            Ok((
+                weight,
+                path.var("bias", &[1], Init::Const(0.0))
+                    .set_requires_grad(false),
+            ))
         });
-        Ok(Self { threshold: config.threshold, window: window.transpose()? })
+        Ok(Self {
+            threshold: config.threshold,
+            window: window.transpose()?,
+        })
     }
 
     /// Mask of the cells that each agent would send: logits `[N, A, H, W]` to `[N, 1, H, W]` of 0 and 1.
@@ -181,7 +209,8 @@ pub fn most_confident(confidence: &Tensor, share: f64) -> Result<Tensor, TchErro
     let flat = confidence.f_reshape([maps, cells])?;
     let (_, best) = flat.f_topk(count, -1, true, false)?;
     let mask = Tensor::f_zeros([maps, cells], (Kind::Float, confidence.device()))?;
-    mask.f_scatter_value(-1, &best, 1.0)?.f_view([maps, 1, height, width])
+    mask.f_scatter_value(-1, &best, 1.0)?
+        .f_view([maps, 1, height, width])
 }
 
 #[cfg(test)]
@@ -199,23 +228,54 @@ mod tests {
         let mask = Tensor::ones([2, 1, 1, 2], FLOAT);
         let _ = mask.get(1).narrow(2, 1, 1).fill_(0.0);
         let features = Tensor::ones([2, 3, 1, 2], FLOAT) * &mask;
-        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 2, height: 1 };
+        let grid = BevGrid {
+            x_min_m: 0.0,
+            y_min_m: 0.0,
+            cell_m: 1.0,
+            width: 2,
+            height: 1,
+        };
         let facts = [0, 1].map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY));
         let maps = AlignedMaps::newest(&features, &mask, &facts, &grid);
-        for (missing, expected) in [(Missing::Absent, 1.0), (Missing::Zero, 1.0 / (1.0 + (-(3f64.sqrt())).exp()))] {
-            let config = Where2commConfig { missing, ..Where2commConfig::default() };
+        for (missing, expected) in [
+            (Missing::Absent, 1.0),
+            (Missing::Zero, 1.0 / (1.0 + (-(3f64.sqrt())).exp())),
+        ] {
+            let config = Where2commConfig {
+                missing,
+                ..Where2commConfig::default()
+            };
             let fused = Where2comm::new(&config).fuse(&maps).unwrap().map;
             assert!((fused.double_value(&[0, 0, 0]) - 1.0).abs() < 1e-6);
-            assert!((fused.double_value(&[0, 0, 1]) - expected).abs() < 1e-6, "{missing:?}");
+            assert!(
+                (fused.double_value(&[0, 0, 1]) - expected).abs() < 1e-6,
+                "{missing:?}"
+            );
         }
     }
 
     #[test]
     fn the_most_confident_share_is_kept() {
-        let confidence = Tensor::from_slice(&[0.1f32, 0.9, 0.5, 0.2, 0.8, 0.3, 0.7, 0.6]).view([2, 1, 2, 2]);
+        let confidence =
+            Tensor::from_slice(&[0.1f32, 0.9, 0.5, 0.2, 0.8, 0.3, 0.7, 0.6]).view([2, 1, 2, 2]);
         let mask = most_confident(&confidence, 0.5).unwrap();
-        assert_eq!(Vec::<f32>::try_from(mask.view(-1)).unwrap(), [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0]);
-        assert_eq!(most_confident(&confidence, 0.0).unwrap().sum(Kind::Float).double_value(&[]), 0.0);
-        assert_eq!(most_confident(&confidence, 1.0).unwrap().sum(Kind::Float).double_value(&[]), 8.0);
+        assert_eq!(
+            Vec::<f32>::try_from(mask.view(-1)).unwrap(),
+            [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0]
+        );
+        assert_eq!(
+            most_confident(&confidence, 0.0)
+                .unwrap()
+                .sum(Kind::Float)
+                .double_value(&[]),
+            0.0
+        );
+        assert_eq!(
+            most_confident(&confidence, 1.0)
+                .unwrap()
+                .sum(Kind::Float)
+                .double_value(&[]),
+            8.0
+        );
     }
 }

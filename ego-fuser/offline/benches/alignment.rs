@@ -16,7 +16,11 @@ fn alignment(criterion: &mut Criterion) {
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let mut boxes = |count: usize| -> Vec<Box3d> {
         let mut car = || Box3d {
-            center_m: [random.random_range(-60.0..60.0), random.random_range(-40.0..40.0), -1.0],
+            center_m: [
+                random.random_range(-60.0..60.0),
+                random.random_range(-40.0..40.0),
+                -1.0,
+            ],
             size_m: [4.5, 1.9, 1.6],
             heading_rad: random.random_range(-3.0..3.0),
         };
@@ -29,12 +33,25 @@ fn alignment(criterion: &mut Criterion) {
     let ego: Vec<_> = common.iter().copied().chain(boxes(10)).collect();
     let config = FreeAlignConfig::default();
     let found = align_boxes(&ego, &neighbour, &config).expect("12 boxes in common");
-    assert!(truth.inv_mul(&found.ego_from_neighbour).translation.vector.norm() < 0.5);
+    assert!(
+        truth
+            .inv_mul(&found.ego_from_neighbour)
+            .translation
+            .vector
+            .norm()
+            < 0.5
+    );
     criterion.bench_function("alignment/free_align/22x22", |bencher| {
         bencher.iter(|| align_boxes(black_box(&ego), black_box(&neighbour), &config));
     });
     criterion.bench_function("alignment/box_icp/22x22", |bencher| {
-        bencher.iter(|| box_icp::align(black_box(&ego), black_box(&neighbour), &Isometry3::identity()));
+        bencher.iter(|| {
+            box_icp::align(
+                black_box(&ego),
+                black_box(&neighbour),
+                &Isometry3::identity(),
+            )
+        });
     });
 }
 

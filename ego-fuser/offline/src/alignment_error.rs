@@ -77,7 +77,10 @@ impl AlignmentMeter {
     /// # Errors
     /// [`EgoError`] names the file and what is wrong with it.
     pub fn load(weights: &Weights) -> Result<Self, EgoError> {
-        let method = weights.metadata(METHOD_KEY).unwrap_or(Method::NONE.name()).parse()?;
+        let method = weights
+            .metadata(METHOD_KEY)
+            .unwrap_or(Method::NONE.name())
+            .parse()?;
         let detector = Detector::from_weights(weights, &weights.detector_config()?, Device::Cpu)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config(), Device::Cpu)?;
         Ok(Self { detector, fusion })
@@ -106,22 +109,35 @@ impl AlignmentMeter {
                 }
             }
         }
-        Ok(offsets.iter().zip(&errors).map(|(offset, errors)| summary(offset, errors)).collect())
+        Ok(offsets
+            .iter()
+            .zip(&errors)
+            .map(|(offset, errors)| summary(offset, errors))
+            .collect())
     }
 
     /// The ego with each of its neighbours in range.
-    fn pairs(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Pair>, AlignmentMeterError> {
+    fn pairs(
+        &mut self,
+        scenario: &Scenario,
+        tick: usize,
+    ) -> Result<Vec<Pair>, AlignmentMeterError> {
         let ego = scenario.load(0, tick, &LoadOptions::default())?;
-        let Some(world_from_ego) = ego.world_from_lidar else { return Ok(Vec::new()) };
+        let Some(world_from_ego) = ego.world_from_lidar else {
+            return Ok(Vec::new());
+        };
         let own = self.map(&ego.points)?;
         let mut pairs = Vec::new();
         for agent in scenario.present_agents(tick).skip(1) {
             let frame = scenario.load(agent, tick, &LoadOptions::default())?;
-            let Some(world_from_cav) = frame.world_from_lidar else { continue };
+            let Some(world_from_cav) = frame.world_from_lidar else {
+                continue;
+            };
             let ego_from_cav = world_from_ego.from_world(&world_from_cav);
             let [x, y, _] = ego_from_cav.translation_m;
             if x.hypot(y) <= Ego::COMM_RANGE_M {
-                let maps = Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0).map_err(EgoError::from)?;
+                let maps =
+                    Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0).map_err(EgoError::from)?;
                 pairs.push(Pair { maps, ego_from_cav });
             }
         }
@@ -135,23 +151,41 @@ impl AlignmentMeter {
     }
 
     /// Errors of a pair with an offset, before and after: metres and degrees.
-    fn around(&self, pair: &Pair, offset: &Offset, rng: &mut impl Rng) -> Result<[[f64; 2]; 2], AlignmentMeterError> {
+    fn around(
+        &self,
+        pair: &Pair,
+        offset: &Offset,
+        rng: &mut impl Rng,
+    ) -> Result<[[f64; 2]; 2], AlignmentMeterError> {
         let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-        let off = moved(&pair.ego_from_cav, [offset.shift_m * cos, offset.shift_m * sin, turn_rad]);
-        let correction = self.correction(&pair.maps, off)?.ok_or(AlignmentMeterError::NoAlignment)?;
+        let off = moved(
+            &pair.ego_from_cav,
+            [offset.shift_m * cos, offset.shift_m * sin, turn_rad],
+        );
+        let correction = self
+            .correction(&pair.maps, off)?
+            .ok_or(AlignmentMeterError::NoAlignment)?;
         let corrected = moved(&off, correction);
-        Ok([error(&pair.ego_from_cav, &off), error(&pair.ego_from_cav, &corrected)])
+        Ok([
+            error(&pair.ego_from_cav, &off),
+            error(&pair.ego_from_cav, &corrected),
+        ])
     }
 
     /// The method's correction of the pose of the second of two maps: x and y, metres, and heading, radians.
     fn correction(&self, maps: &Tensor, reported: Pose) -> Result<Option<[f64; 3]>, EgoError> {
-        let facts = [MapMetadata::fresh(0, Pose::IDENTITY), MapMetadata::fresh(1, reported)];
+        let facts = [
+            MapMetadata::fresh(0, Pose::IDENTITY),
+            MapMetadata::fresh(1, reported),
+        ];
         let fused = no_grad(|| {
             let received = ReceivedMaps::new(maps.shallow_clone(), None);
             self.fusion.fuse(&self.fusion.align(&received, &facts)?)
         })?;
-        let Some(correction) = fused.corrections else { return Ok(None) };
+        let Some(correction) = fused.corrections else {
+            return Ok(None);
+        };
         let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
         Ok(values.first_chunk().copied())
     }
@@ -199,8 +233,18 @@ mod tests {
 
     #[test]
     fn before_and_after_are_summed_up_apart() {
-        let offset = Offset { shift_m: 1.0, turn_deg: 0.0 };
-        let found = summary(&offset, &[[[1.0, 0.0], [0.5, 0.2]], [[1.0, 0.0], [0.1, 0.0]], [[1.0, 0.0], [0.3, 0.1]]]);
+        let offset = Offset {
+            shift_m: 1.0,
+            turn_deg: 0.0,
+        };
+        let found = summary(
+            &offset,
+            &[
+                [[1.0, 0.0], [0.5, 0.2]],
+                [[1.0, 0.0], [0.1, 0.0]],
+                [[1.0, 0.0], [0.3, 0.1]],
+            ],
+        );
         assert_eq!((found.pairs, found.p50_m), (3, [1.0, 0.3]));
         assert!((found.mean_m[1] - 0.3).abs() < 1e-9 && (found.mean_deg[1] - 0.1).abs() < 1e-9);
     }

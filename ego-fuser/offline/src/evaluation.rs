@@ -125,12 +125,15 @@ impl Evaluator {
         let ego = Ego::from_weights(&weights, config.method, Device::Cpu)?;
         let ego = ego.with_misbehaviour_detection(config.trust)?;
         let area = ego.detector().config();
-        let rule = config
-            .protocol
-            .as_ref()
-            .map_or_else(|| rule_for(area), |protocol| protocol.rule_within(area.lidar_range_m));
+        let rule = config.protocol.as_ref().map_or_else(
+            || rule_for(area),
+            |protocol| protocol.rule_within(area.lidar_range_m),
+        );
         let ego = ego.with_comm_range(rule.comm_range_m);
-        let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
+        let codec = CodecConfig {
+            gate: config.codec.gate.or(ego.method().gate()),
+            ..config.codec
+        };
         let config = EvaluateConfig { codec, ..config };
         Ok(Self {
             weights,
@@ -150,7 +153,10 @@ impl Evaluator {
     /// The same with messages that pass through the link emulation, in simulation time.
     #[must_use]
     pub fn with_link(self, stepped: SteppedConfig) -> Self {
-        Self { stepped: Some(stepped), ..self }
+        Self {
+            stepped: Some(stepped),
+            ..self
+        }
     }
 
     /// Runs the vehicles' pipelines in processes of their own from now on, or in this one, where the link is emulated.
@@ -177,7 +183,10 @@ impl Evaluator {
     /// then the same.
     #[must_use]
     pub fn with_maps(self, maps: MapSource) -> Self {
-        Self { maps: Some(maps), ..self }
+        Self {
+            maps: Some(maps),
+            ..self
+        }
     }
 
     /// The ego's pipeline.
@@ -195,7 +204,10 @@ impl Evaluator {
     #[must_use]
     pub fn protocol(&self) -> Option<EvaluationProtocol> {
         let protocol = self.config.protocol.clone()?;
-        Some(EvaluationProtocol { ground_truth: self.rule, ..protocol })
+        Some(EvaluationProtocol {
+            ground_truth: self.rule,
+            ..protocol
+        })
     }
 
     /// Rule for the objects that count.
@@ -220,7 +232,10 @@ impl Evaluator {
             return stepped::run(self, &stepped, scenario, on_frame);
         }
         let points = self.needs_points();
-        let load = LoadOptions { points, ..LoadOptions::default() };
+        let load = LoadOptions {
+            points,
+            ..LoadOptions::default()
+        };
         let mut participants = Vec::with_capacity(scenario.agents.len());
         for cav in &scenario.agents {
             participants.push(self.participant(scenario, cav, participants.is_empty(), None)?);
@@ -253,15 +268,28 @@ impl Evaluator {
             None => all.clone(),
         };
         // Messages of the ego's own vehicle are not transmitted on the link.
-        let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
-        let detector = Detector::from_weights(&self.weights, &self.weights.detector_config()?, Device::Cpu)?;
-        let place = scenario.agents.iter().position(|agent| agent == cav).unwrap_or(0);
+        let rate = if is_ego {
+            RateConfig::default()
+        } else {
+            own.map_or(self.config.rate, |own| own.rate)
+        };
+        let detector =
+            Detector::from_weights(&self.weights, &self.weights.detector_config()?, Device::Cpu)?;
+        let place = scenario
+            .agents
+            .iter()
+            .position(|agent| agent == cav)
+            .unwrap_or(0);
         let attack = match own.and_then(|own| own.falsification) {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => self.config.attack.and_then(|attack| attack.of(place, cav)),
         };
         let inference = Inference::new(Device::Cpu, self.config.precision);
-        let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build(inference)?, detector);
+        let agent = Agent::new(
+            cav.clone(),
+            source.for_scenario(&scenario.name).build(inference)?,
+            detector,
+        );
         Ok(Participant::new(agent.within(rate), attack))
     }
 
@@ -283,24 +311,47 @@ impl Evaluator {
         for Sweep { place, frame, map } in sweeps {
             // Without an exchange, neighbours have nothing to encode; their poses are still needed.
             let is_needed = place == 0 || self.ego.method().exchange() != Exchange::Nothing;
-            let codec = if place == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
+            let codec = if place == 0 {
+                of_the_ego(self.config.codec)
+            } else {
+                self.config.codec
+            };
             let participant = &mut participants[place];
             participant.capture(sent.last());
-            sent.push(view(participant, &frame, map.as_ref(), is_needed.then_some(exchange), &codec)?);
+            sent.push(view(
+                participant,
+                &frame,
+                map.as_ref(),
+                is_needed.then_some(exchange),
+                &codec,
+            )?);
             frames.push(frame);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
         let own = sent.remove(0);
         let own = own.view().expect("the ego is needed by every method");
-        self.under_way.push_back(SentAtOnce { capture_nanos: own.capture_nanos, sent });
-        let (neighbours, bytes): (Vec<View>, Vec<_>) =
-            self.arrived(own.capture_nanos).iter().filter_map(Sent::received).unzip();
+        self.under_way.push_back(SentAtOnce {
+            capture_nanos: own.capture_nanos,
+            sent,
+        });
+        let (neighbours, bytes): (Vec<View>, Vec<_>) = self
+            .arrived(own.capture_nanos)
+            .iter()
+            .filter_map(Sent::received)
+            .unzip();
         let output = self.ego.detect(&own, &neighbours)?;
         let result = self.report(tick, &own, &neighbours, &bytes, output);
         let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.rule);
         let objects = objects.into_iter().map(|(_, object)| object).collect();
         let stamp = stamp(&own.cav, frames[0].capture_nanos);
-        Ok(EvaluatedFrame { tick, stamp, result, frames, poses, objects })
+        Ok(EvaluatedFrame {
+            tick,
+            stamp,
+            result,
+            frames,
+            poses,
+            objects,
+        })
     }
 
     /// The result that the ego would publish as its agent's frame of that number; `bytes` are payload and wire bytes of
@@ -322,13 +373,16 @@ impl Evaluator {
                 wire_bytes: bytes[index].1,
             })
             .collect();
-        let skipped = output.skipped.iter().map(|&(index, reason)| SkippedNeighbour {
-            cav: neighbours[index].cav.clone(),
-            reason: match reason {
-                Skipped::Unusable(reason) => Some(reason),
-                Skipped::NotNeeded => None,
-            },
-        });
+        let skipped = output
+            .skipped
+            .iter()
+            .map(|&(index, reason)| SkippedNeighbour {
+                cav: neighbours[index].cav.clone(),
+                reason: match reason {
+                    Skipped::Unusable(reason) => Some(reason),
+                    Skipped::NotNeeded => None,
+                },
+            });
         Detections {
             ego: own.cav.clone(),
             agent_frame: agent_frame as u64,
@@ -345,11 +399,15 @@ impl Evaluator {
     /// The newest messages of the neighbours that have arrived; empty where all are still in flight.
     fn arrived(&mut self, now_nanos: u64) -> &[Sent] {
         let delay_nanos = self.config.delay_nanos;
-        let has_arrived = |tick: &SentAtOnce| tick.capture_nanos.saturating_add(delay_nanos) <= now_nanos;
+        let has_arrived =
+            |tick: &SentAtOnce| tick.capture_nanos.saturating_add(delay_nanos) <= now_nanos;
         while self.under_way.get(1).is_some_and(has_arrived) {
             self.under_way.pop_front();
         }
-        self.under_way.front().filter(|tick| has_arrived(tick)).map_or(&[], |tick| tick.sent.as_slice())
+        self.under_way
+            .front()
+            .filter(|tick| has_arrived(tick))
+            .map_or(&[], |tick| tick.sent.as_slice())
     }
 }
 
@@ -369,14 +427,20 @@ pub(crate) fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
 
 /// The codec of the ego's own map, which is not restricted by a gate or a budget.
 fn of_the_ego(codec: CodecConfig) -> CodecConfig {
-    CodecConfig { gate: None, budget_bytes: None, ..codec }
+    CodecConfig {
+        gate: None,
+        budget_bytes: None,
+        ..codec
+    }
 }
 
 /// Source of the ego's own poses: one fixed offset does not apply to it, as in the reference code. With the same offset
 /// on all vehicles the relative poses would hardly change.
 fn source_of_ego(all: &PoseSourceConfig) -> PoseSourceConfig {
     match all {
-        PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Fixed => PoseSourceConfig::Recorded,
+        PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Fixed => {
+            PoseSourceConfig::Recorded
+        }
         other => other.clone(),
     }
 }

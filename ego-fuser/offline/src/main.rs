@@ -12,7 +12,12 @@ use support::command_line::parse;
 
 /// Training and evaluation of collaborative detection.
 #[derive(Debug, Parser)]
-#[command(name = "ego-fuser", bin_name = "ego-fuser", version, arg_required_else_help = true)]
+#[command(
+    name = "ego-fuser",
+    bin_name = "ego-fuser",
+    version,
+    arg_required_else_help = true
+)]
 struct CommandLine {
     #[command(subcommand)]
     command: command::Command,

@@ -54,7 +54,8 @@ fn observe_detector(
     let mut detector = Detector::from_weights(&weights, &weights.detector_config()?, Device::Cpu)?;
     for scenario in scenarios {
         for tick in 0..scenario.ticks.len().min(frames) {
-            let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+            let loaded =
+                scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
             left_out.add_tick(&loaded);
             for (_, frame) in loaded.frames {
                 detector.observe(&frame.points, search)?;

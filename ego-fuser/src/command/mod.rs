@@ -12,8 +12,14 @@ use support::sibling_program::Sibling;
 pub(crate) const OFFLINE: Sibling = Sibling {
     program: "ego-fuser-offline",
     subcommands: &[
-        ("align", "Compare alignment methods of two vehicles without GNSS"),
-        ("alignment-error", "Measure the part of pose offsets that a method's own alignment leaves"),
+        (
+            "align",
+            "Compare alignment methods of two vehicles without GNSS",
+        ),
+        (
+            "alignment-error",
+            "Measure the part of pose offsets that a method's own alignment leaves",
+        ),
         ("eval", "Measure AP on recorded scenes"),
         ("quantise", "Prepare weights for 8-bit inference"),
         ("train", "Train a method on scenes"),
@@ -34,7 +40,8 @@ impl Command {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         match self {
             Self::Run(arguments) => {
-                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("restarting with malloc settings")?;
+                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
+                    .context("restarting with malloc settings")?;
                 arguments.run()?;
             }
             Self::Methods(arguments) => arguments.run()?,

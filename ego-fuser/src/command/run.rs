@@ -24,15 +24,30 @@ impl Arguments {
     /// Loads the model, joins the run and works until the own agent ends.
     pub(crate) fn run(self) -> anyhow::Result<()> {
         log_to_stderr();
-        let config = self.config.validated().map_err(|error| BadInput::new(error.to_string()))?;
-        let EgoConfig { run, models, method, ego: settings, bus, .. } = &config;
-        let cav = settings.id.as_ref().context("the configuration names no ego")?;
+        let config = self
+            .config
+            .validated()
+            .map_err(|error| BadInput::new(error.to_string()))?;
+        let EgoConfig {
+            run,
+            models,
+            method,
+            ego: settings,
+            bus,
+            ..
+        } = &config;
+        let cav = settings
+            .id
+            .as_ref()
+            .context("the configuration names no ego")?;
         models.threads.apply();
         let inference = models.inference().map_err(BadInput::of)?;
         let ego = models.load(inference).map_err(EgoError::from);
         let ego = ego.and_then(|weights| Ego::from_weights(&weights, *method, inference.device));
         let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
-        let ego = ego.with_comm_range(config.comm_range_m).with_misbehaviour_detection(settings.trust())?;
+        let ego = ego
+            .with_comm_range(config.comm_range_m)
+            .with_misbehaviour_detection(settings.trust())?;
         let stop = bus.stop().context("installing signal handlers")?;
         let bus = bus.join(run, Role::Ego, cav)?;
         tracing::info!(ego = %cav, method = %ego.method(), weights = %models.weights.display(), "ready");
@@ -43,7 +58,12 @@ impl Arguments {
         if self.json {
             output::line(serde_json::to_string(&report)?)?;
         } else {
-            let node::NodeReport { frames, fused, at_deadline, failed } = report;
+            let node::NodeReport {
+                frames,
+                fused,
+                at_deadline,
+                failed,
+            } = report;
             output::line(format_args!(
                 "{frames} frames, {fused} neighbours' messages fused, {at_deadline} at the deadline, {failed} failed"
             ))?;

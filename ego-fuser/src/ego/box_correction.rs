@@ -26,9 +26,15 @@ pub(super) fn correct_by_boxes(
     if metadata.len() < 2 {
         return Ok(());
     }
-    let boxes = maps.iter().map(|map| boxes_in(map, detector)).collect::<Result<Vec<_>, _>>()?;
+    let boxes = maps
+        .iter()
+        .map(|map| boxes_in(map, detector))
+        .collect::<Result<Vec<_>, _>>()?;
     let observers: Vec<Observer<'_>> = (metadata.iter().zip(&boxes))
-        .map(|(map, boxes)| Observer { ego_from_agent: map.ego_from_cav, boxes })
+        .map(|(map, boxes)| Observer {
+            ego_from_agent: map.ego_from_cav,
+            boxes,
+        })
         .collect();
     for (map, corrected) in metadata.iter_mut().zip(correct(&observers, config)) {
         map.ego_from_cav = corrected.ego_from_agent;
@@ -38,9 +44,17 @@ pub(super) fn correct_by_boxes(
 
 /// Ego-only detections of a vehicle, in its own frame.
 fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, DetectorError> {
-    let limits =
-        PostprocessConfig { score_threshold: LANDMARK_SCORE, ..PostprocessConfig::for_late_fusion(detector.config()) };
+    let limits = PostprocessConfig {
+        score_threshold: LANDMARK_SCORE,
+        ..PostprocessConfig::for_late_fusion(detector.config())
+    };
     let boxes = detector.boxes(&detector.heads(map)?, limits.score_threshold)?;
-    let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
-    Ok(postprocess(&[own], &limits).iter().map(|candidate| candidate.detection(None)).collect())
+    let own = AgentBoxes {
+        boxes: &boxes,
+        output_from_agent: Isometry3::identity(),
+    };
+    Ok(postprocess(&[own], &limits)
+        .iter()
+        .map(|candidate| candidate.detection(None))
+        .collect())
 }

@@ -38,7 +38,9 @@ pub enum EgoError {
         found: Exchange,
     },
     /// The ego's own map is of another network.
-    #[error("the ego's own map is {channels} x {found}, the network's is {expected_channels} x {expected}")]
+    #[error(
+        "the ego's own map is {channels} x {found}, the network's is {expected_channels} x {expected}"
+    )]
     OwnMap {
         /// Channels found.
         channels: u32,

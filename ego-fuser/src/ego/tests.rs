@@ -3,7 +3,8 @@ use localization::pose_source::RecordedPose;
 use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
 use protocol::{
-    CavId, CodecConfig, ConfidenceGate, EgoMotion, Limits, NoPoseReason, PointCloud, PoseEstimate, encode_features,
+    CavId, CodecConfig, ConfidenceGate, EgoMotion, Limits, NoPoseReason, PointCloud, PoseEstimate,
+    encode_features,
 };
 use tch::Device;
 use tch::nn::VarStore;
@@ -14,7 +15,10 @@ use dataset::average_precision::{Ordering, Scorer};
 /// Capture time of all sweeps unless stated otherwise.
 const NOW: u64 = 5_000_000_000;
 
-const HERE: Pose = Pose { translation_m: [100.0, 50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+const HERE: Pose = Pose {
+    translation_m: [100.0, 50.0, 2.0],
+    rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+};
 
 /// The same network every time, with a head that detects vehicles everywhere, so that there is something to suppress.
 fn detector() -> Detector {
@@ -30,20 +34,28 @@ fn detector_with(compress_ratio: Option<i64>) -> Detector {
 fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector {
     tch::set_num_threads(1);
     let lidar_range_m = [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0];
-    let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
+    let config = DetectorConfig {
+        lidar_range_m,
+        compress_ratio,
+        ..DetectorConfig::lean()
+    };
     let network = VarStore::new(Device::Cpu);
     let pillars = PointPillars::new(&network.root(), &config).unwrap();
     for (name, mut variable) in network.variables() {
         // Values from the shape only: tests that run at the same time share torch's generator.
         let count = variable.numel() as i64;
-        let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
+        let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7)
+            .sin()
+            .view(variable.size().as_slice());
         let new = match name.as_str() {
             name if name.contains("running") || name.ends_with("norm.weight") => continue,
             "cls_head.bias" => wave * 0.1 + logit,
             "cls_head.weight" => wave * weight,
             // Boxes are the anchors themselves, which post-processing accepts as vehicles.
             "reg_head.weight" | "reg_head.bias" => wave * 0.0,
-            _ if variable.dim() > 1 => wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt()),
+            _ if variable.dim() > 1 => {
+                wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt())
+            }
             _ => continue,
         };
         no_grad(|| variable.copy_(&new));
@@ -52,16 +64,30 @@ fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector
 }
 
 fn cloud(phase: f32) -> PointCloud {
-    let points = (0..3000)
-        .map(|k| [(k % 83) as f32 * 0.3 - 12.0 + phase, (k % 41) as f32 * 0.3 - 6.0, -1.5 + (k % 7) as f32 * 0.1, 0.2]);
-    PointCloud { xyzi: points.collect() }
+    let points = (0..3000).map(|k| {
+        [
+            (k % 83) as f32 * 0.3 - 12.0 + phase,
+            (k % 41) as f32 * 0.3 - 6.0,
+            -1.5 + (k % 7) as f32 * 0.1,
+            0.2,
+        ]
+    });
+    PointCloud {
+        xyzi: points.collect(),
+    }
 }
 
 fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
     view_by(detector(), name, world_from_cav, method, phase)
 }
 
-fn view_by(detector: Detector, name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
+fn view_by(
+    detector: Detector,
+    name: &str,
+    world_from_cav: Pose,
+    method: Method,
+    phase: f32,
+) -> View {
     let cav = CavId::new(name).unwrap();
     let mut agent = Agent::new(cav.clone(), Box::new(RecordedPose), detector);
     let cloud = cloud(phase);
@@ -75,9 +101,17 @@ fn view_by(detector: Detector, name: &str, world_from_cav: Pose, method: Method,
     let content = match method.own_content() {
         Exchange::Boxes => Content::Boxes(output.perception.detections),
         Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&cloud)),
-        _ => Content::Features(DecodedFeatures { features: output.perception.features, sent: None }),
+        _ => Content::Features(DecodedFeatures {
+            features: output.perception.features,
+            sent: None,
+        }),
     };
-    View { cav, pose: output.pose, capture_nanos: NOW, content }
+    View {
+        cav,
+        pose: output.pose,
+        capture_nanos: NOW,
+        content,
+    }
 }
 
 fn near() -> Pose {
@@ -86,15 +120,30 @@ fn near() -> Pose {
 
 #[test]
 fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
-    for method in [Method::EARLY, Method::MAX, Method::ATTENTION, Method::WHERE2COMM, Method::COALIGN] {
-        let (own, other) = (view("a", HERE, method, 0.0), view("b", near(), method, 0.15));
+    for method in [
+        Method::EARLY,
+        Method::MAX,
+        Method::ATTENTION,
+        Method::WHERE2COMM,
+        Method::COALIGN,
+    ] {
+        let (own, other) = (
+            view("a", HERE, method, 0.0),
+            view("b", near(), method, 0.15),
+        );
         let mut ego = Ego::new(detector(), method).unwrap();
         let ego_only = ego.detect(&own, &[]).unwrap();
         let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
         assert_eq!(together.fused, [0], "{method}");
         assert!(!together.detections.is_empty(), "{method}");
-        assert!(ego_only.detections != together.detections, "{method}: the neighbour changed nothing");
-        let again = Ego::new(detector(), method).unwrap().detect(&own, std::slice::from_ref(&other)).unwrap();
+        assert!(
+            ego_only.detections != together.detections,
+            "{method}: the neighbour changed nothing"
+        );
+        let again = Ego::new(detector(), method)
+            .unwrap()
+            .detect(&own, std::slice::from_ref(&other))
+            .unwrap();
         assert_eq!(again.detections, together.detections, "{method}");
     }
 }
@@ -103,7 +152,11 @@ fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
 fn ego_only_points_give_the_result_of_the_map_with_a_compressor_too() {
     let ego_only = |compress_ratio, method| {
         let own = view_by(detector_with(compress_ratio), "a", HERE, method, 0.0);
-        Ego::new(detector_with(compress_ratio), method).unwrap().detect(&own, &[]).unwrap().detections
+        Ego::new(detector_with(compress_ratio), method)
+            .unwrap()
+            .detect(&own, &[])
+            .unwrap()
+            .detections
     };
     let by_map = ego_only(Some(4), Method::NONE);
     assert!(!by_map.is_empty() && by_map != ego_only(None, Method::NONE));
@@ -113,7 +166,11 @@ fn ego_only_points_give_the_result_of_the_map_with_a_compressor_too() {
 #[test]
 fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
     let found = |x: f64, score: f32| Detection {
-        box3d: protocol::Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 1.8, 1.5], heading_rad: 0.0 },
+        box3d: protocol::Box3d {
+            center_m: [x, 0.0, -1.0],
+            size_m: [4.0, 1.8, 1.5],
+            heading_rad: 0.0,
+        },
         score,
         source: None,
     };
@@ -125,11 +182,26 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
     };
     // The other is 4 m ahead: its box at 1 m is the ego's at 5 m, only it has detected the one at -10 m.
     let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
-    let ahead = Pose { translation_m: [104.0, 50.0, 2.0], ..HERE };
-    let other = boxes("b", ahead, vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)]);
-    let output = Ego::new(detector(), Method::LATE).unwrap().detect(&own, &[other]).unwrap();
+    let ahead = Pose {
+        translation_m: [104.0, 50.0, 2.0],
+        ..HERE
+    };
+    let other = boxes(
+        "b",
+        ahead,
+        vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)],
+    );
+    let output = Ego::new(detector(), Method::LATE)
+        .unwrap()
+        .detect(&own, &[other])
+        .unwrap();
     let seen: Vec<_> = (output.detections.iter())
-        .map(|found| (found.box3d.center_m[0].round(), found.source.as_ref().unwrap().as_str()))
+        .map(|found| {
+            (
+                found.box3d.center_m[0].round(),
+                found.source.as_ref().unwrap().as_str(),
+            )
+        })
         .collect();
     assert_eq!(seen, [(5.0, "b"), (-6.0, "b")]);
 }
@@ -137,22 +209,63 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
 #[test]
 fn with_none_left_the_maps_of_every_method_are_ego_only() {
     let own = view("a", HERE, Method::NONE, 0.0);
-    let ego_only = Ego::new(detector(), Method::NONE).unwrap().detect(&own, &[]).unwrap().detections;
+    let ego_only = Ego::new(detector(), Method::NONE)
+        .unwrap()
+        .detect(&own, &[])
+        .unwrap()
+        .detections;
     assert!(!ego_only.is_empty());
-    let far = view("b", Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0), Method::MAX, 0.0);
-    let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..far.clone() };
-    for method in [Method::MAX, Method::ATTENTION, Method::WHERE2COMM, Method::COALIGN, Method::DISCONET] {
-        let output = Ego::new(detector(), method).unwrap().detect(&own, &[far.clone(), lost.clone()]).unwrap();
+    let far = view(
+        "b",
+        Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0),
+        Method::MAX,
+        0.0,
+    );
+    let lost = View {
+        pose: PoseEstimate::NoPose {
+            reason: NoPoseReason::NoSource,
+            inlier_count: 0,
+        },
+        ..far.clone()
+    };
+    for method in [
+        Method::MAX,
+        Method::ATTENTION,
+        Method::WHERE2COMM,
+        Method::COALIGN,
+        Method::DISCONET,
+    ] {
+        let output = Ego::new(detector(), method)
+            .unwrap()
+            .detect(&own, &[far.clone(), lost.clone()])
+            .unwrap();
         assert_eq!(output.detections, ego_only, "{method}");
-        let reasons = [(0, Skipped::Unusable(DropReason::OutOfRange)), (1, Skipped::Unusable(DropReason::NoPose))];
-        assert_eq!((output.fused, output.skipped), (vec![], reasons.to_vec()), "{method}");
+        let reasons = [
+            (0, Skipped::Unusable(DropReason::OutOfRange)),
+            (1, Skipped::Unusable(DropReason::NoPose)),
+        ];
+        assert_eq!(
+            (output.fused, output.skipped),
+            (vec![], reasons.to_vec()),
+            "{method}"
+        );
     }
 }
 
 /// Methods whose fusion leaves the map of an ego without neighbours unchanged, trained or not; others compute a new
 /// map.
 fn leaves_one_map_as_it_is(method: Method) -> bool {
-    ["none", "late", "early", "max", "attention", "where2comm", "coalign", "disconet"].contains(&method.name())
+    [
+        "none",
+        "late",
+        "early",
+        "max",
+        "attention",
+        "where2comm",
+        "coalign",
+        "disconet",
+    ]
+    .contains(&method.name())
 }
 
 /// AP@0.3, 0.5 and 0.7 of one frame.
@@ -168,30 +281,60 @@ fn ego_only_every_method_is_scored_as_none_down_to_the_same_score() {
     let unsure = || detector_of(None, -1.8, 1e-4);
     let ego_only = |method| {
         let own = view_by(unsure(), "a", HERE, method, 0.0);
-        Ego::new(unsure(), method).unwrap().detect(&own, &[]).unwrap().detections
+        Ego::new(unsure(), method)
+            .unwrap()
+            .detect(&own, &[])
+            .unwrap()
+            .detections
     };
     let expected = ego_only(Method::NONE);
     let scores: Vec<f32> = expected.iter().map(|found| found.score).collect();
-    assert!(scores.iter().any(|score| (0.1..0.2).contains(score)), "{scores:?}");
-    let objects: Vec<_> = expected.iter().step_by(2).map(|found| found.box3d).collect();
-    for method in Method::ALL.into_iter().filter(|method| leaves_one_map_as_it_is(*method)) {
+    assert!(
+        scores.iter().any(|score| (0.1..0.2).contains(score)),
+        "{scores:?}"
+    );
+    let objects: Vec<_> = expected
+        .iter()
+        .step_by(2)
+        .map(|found| found.box3d)
+        .collect();
+    for method in Method::ALL
+        .into_iter()
+        .filter(|method| leaves_one_map_as_it_is(*method))
+    {
         let found = ego_only(method);
         assert_eq!(found.len(), expected.len(), "{method}");
         for (found, expected) in found.iter().zip(&expected) {
             assert_eq!(found.score, expected.score, "{method}");
-            let apart = (0..3).map(|axis| (found.box3d.center_m[axis] - expected.box3d.center_m[axis]).abs());
-            assert!(apart.fold(0.0, f64::max) < 1e-9, "{method}: {found:?} is not {expected:?}");
+            let apart = (0..3)
+                .map(|axis| (found.box3d.center_m[axis] - expected.box3d.center_m[axis]).abs());
+            assert!(
+                apart.fold(0.0, f64::max) < 1e-9,
+                "{method}: {found:?} is not {expected:?}"
+            );
         }
-        assert_eq!(average_precisions(&found, &objects), average_precisions(&expected, &objects), "{method}");
+        assert_eq!(
+            average_precisions(&found, &objects),
+            average_precisions(&expected, &objects),
+            "{method}"
+        );
     }
 }
 
 #[test]
 fn an_ego_without_pose_continues_ego_only() {
     let own = view("a", HERE, Method::MAX, 0.0);
-    let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..own.clone() };
+    let lost = View {
+        pose: PoseEstimate::NoPose {
+            reason: NoPoseReason::NoSource,
+            inlier_count: 0,
+        },
+        ..own.clone()
+    };
     let mut ego = Ego::new(detector(), Method::MAX).unwrap();
-    let output = ego.detect(&lost, &[view("b", near(), Method::MAX, 0.1)]).unwrap();
+    let output = ego
+        .detect(&lost, &[view("b", near(), Method::MAX, 0.1)])
+        .unwrap();
     assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
     assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::NoPose))]);
 }
@@ -201,7 +344,9 @@ fn cells_that_were_not_sent_have_no_part() {
     let own = view("a", HERE, Method::ATTENTION, 0.0);
     let mut other = view("b", near(), Method::ATTENTION, 0.1);
     let mut ego = Ego::new(detector(), Method::ATTENTION).unwrap();
-    let Content::Features(map) = &mut other.content else { panic!("attention exchanges maps") };
+    let Content::Features(map) = &mut other.content else {
+        panic!("attention exchanges maps")
+    };
     map.sent = Some(vec![false; map.features.grid.cells()]);
     let output = ego.detect(&own, &[other]).unwrap();
     assert_eq!(output.fused, [0]);
@@ -212,7 +357,9 @@ fn cells_that_were_not_sent_have_no_part() {
 fn unselected_cells_are_not_sent_and_the_rest_is_fused_unchanged() {
     let own = view("a", HERE, Method::WHERE2COMM, 0.0);
     let mut other = view("b", near(), Method::WHERE2COMM, 0.1);
-    let Content::Features(map) = &mut other.content else { panic!("maps are exchanged") };
+    let Content::Features(map) = &mut other.content else {
+        panic!("maps are exchanged")
+    };
     let detector = detector();
     let [channels, height, width] = detector.map_shape();
     let whole = Tensor::from_slice(&map.features.values).view([1, channels, height, width]);
@@ -220,18 +367,43 @@ fn unselected_cells_are_not_sent_and_the_rest_is_fused_unchanged() {
     let mut distinct = confidence.clone();
     distinct.sort_by(f32::total_cmp);
     distinct.dedup();
-    let gate = ConfidenceGate { threshold: distinct[distinct.len() * 3 / 4], smoothing: None };
+    let gate = ConfidenceGate {
+        threshold: distinct[distinct.len() * 3 / 4],
+        smoothing: None,
+    };
     let encode = |gate| {
-        let codec = CodecConfig { gate, ..CodecConfig::default() };
+        let codec = CodecConfig {
+            gate,
+            ..CodecConfig::default()
+        };
         encode_features(map.features.clone(), &codec, Some(&confidence)).unwrap()
     };
     let (dense, sparse) = (encode(None), encode(Some(gate)));
     let (dense_bytes, sparse_bytes) = (dense.body.len(), sparse.body.len());
     let received = sparse.decode(&Limits::DEFAULT).unwrap();
-    let sent = received.sent.clone().unwrap().iter().filter(|sent| **sent).count();
-    assert_eq!(sent, confidence.iter().filter(|confidence| **confidence > gate.threshold).count());
-    assert!((1..confidence.len()).contains(&sent), "{sent} of {}", confidence.len());
-    assert_eq!(sparse_bytes, confidence.len() / 8 + dense_bytes / confidence.len() * sent);
+    let sent = received
+        .sent
+        .clone()
+        .unwrap()
+        .iter()
+        .filter(|sent| **sent)
+        .count();
+    assert_eq!(
+        sent,
+        confidence
+            .iter()
+            .filter(|confidence| **confidence > gate.threshold)
+            .count()
+    );
+    assert!(
+        (1..confidence.len()).contains(&sent),
+        "{sent} of {}",
+        confidence.len()
+    );
+    assert_eq!(
+        sparse_bytes,
+        confidence.len() / 8 + dense_bytes / confidence.len() * sent
+    );
     *map = received;
     let mut ego = Ego::new(detector, Method::WHERE2COMM).unwrap();
     let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
@@ -243,15 +415,31 @@ fn unselected_cells_are_not_sent_and_the_rest_is_fused_unchanged() {
 fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() {
     let own = view("a", HERE, Method::MAX, 0.0);
     let mut other = view("b", near(), Method::MAX, 0.1);
-    let Content::Features(map) = &mut other.content else { panic!("max exchanges maps") };
+    let Content::Features(map) = &mut other.content else {
+        panic!("max exchanges maps")
+    };
     map.features.channels = 3;
     let mut ego = Ego::new(detector(), Method::MAX).unwrap();
     let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
-    assert!(ego.detect(&other, &[]).unwrap_err().to_string().contains("3 x"));
-    let boxes = View { content: Content::Boxes(vec![]), ..own.clone() };
-    assert!(matches!(ego.detect(&boxes, &[]), Err(EgoError::OwnContent { .. })));
-    assert_eq!(ego.detect(&own, &[boxes]).unwrap().skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+    assert!(
+        ego.detect(&other, &[])
+            .unwrap_err()
+            .to_string()
+            .contains("3 x")
+    );
+    let boxes = View {
+        content: Content::Boxes(vec![]),
+        ..own.clone()
+    };
+    assert!(matches!(
+        ego.detect(&boxes, &[]),
+        Err(EgoError::OwnContent { .. })
+    ));
+    assert_eq!(
+        ego.detect(&own, &[boxes]).unwrap().skipped,
+        [(0, Skipped::Unusable(DropReason::Shape))]
+    );
 }
 
 #[test]
@@ -259,26 +447,56 @@ fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
     let compressed = |ratio| detector_with(Some(ratio));
     let own = view_by(compressed(4), "a", HERE, Method::MAX, 0.0);
     let other = view_by(compressed(4), "b", near(), Method::MAX, 0.1);
-    let Content::Features(map) = &other.content else { panic!("max exchanges maps") };
-    assert_eq!((map.features.channels, map.features.code_of), (16, Some(64)));
+    let Content::Features(map) = &other.content else {
+        panic!("max exchanges maps")
+    };
+    assert_eq!(
+        (map.features.channels, map.features.code_of),
+        (16, Some(64))
+    );
     let mut ego = Ego::new(compressed(4), Method::MAX).unwrap();
     let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(together.fused, [0]);
     // The same network without a compressor is given the decompressed maps.
     let decompressed = |view: &View| {
-        let Content::Features(map) = &view.content else { panic!("max exchanges maps") };
-        let features = detector().to_message(&compressed(4).received(map).unwrap()).unwrap();
-        View { content: Content::Features(DecodedFeatures { features, sent: None }), ..view.clone() }
+        let Content::Features(map) = &view.content else {
+            panic!("max exchanges maps")
+        };
+        let features = detector()
+            .to_message(&compressed(4).received(map).unwrap())
+            .unwrap();
+        View {
+            content: Content::Features(DecodedFeatures {
+                features,
+                sent: None,
+            }),
+            ..view.clone()
+        }
     };
     let mut plain = Ego::new(detector(), Method::MAX).unwrap();
-    assert_eq!(plain.detect(&decompressed(&own), &[decompressed(&other)]).unwrap().detections, together.detections);
+    assert_eq!(
+        plain
+            .detect(&decompressed(&own), &[decompressed(&other)])
+            .unwrap()
+            .detections,
+        together.detections
+    );
     // As many channels, but of another map; and a map where a compressed code is expected.
     let mut of_another = other.clone();
-    let Content::Features(map) = &mut of_another.content else { panic!("max exchanges maps") };
+    let Content::Features(map) = &mut of_another.content else {
+        panic!("max exchanges maps")
+    };
     map.features.code_of = Some(128);
-    let mismatched = [of_another, decompressed(&other), view_by(compressed(8), "b", near(), Method::MAX, 0.1)];
+    let mismatched = [
+        of_another,
+        decompressed(&other),
+        view_by(compressed(8), "b", near(), Method::MAX, 0.1),
+    ];
     let skipped = ego.detect(&own, &mismatched).unwrap().skipped;
-    assert_eq!(skipped, [0, 1, 2].map(|index| (index, Skipped::Unusable(DropReason::Shape))));
+    assert_eq!(
+        skipped,
+        [0, 1, 2].map(|index| (index, Skipped::Unusable(DropReason::Shape)))
+    );
 }
 
 #[test]
@@ -295,20 +513,48 @@ fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
     ego.detect(&first, std::slice::from_ref(&other)).unwrap();
     // The neighbour has no newer message: its message serves again, and is not its own history.
     let aligned = |own, other| {
-        vec![Aligned { view: own, ego_from_cav: Pose::IDENTITY }, Aligned { view: other, ego_from_cav: Pose::IDENTITY }]
+        vec![
+            Aligned {
+                view: own,
+                ego_from_cav: Pose::IDENTITY,
+            },
+            Aligned {
+                view: other,
+                ego_from_cav: Pose::IDENTITY,
+            },
+        ]
     };
-    let earlier = ego.earlier(&aligned(&second, &other)).into_iter().map(|(agent, _, pose)| (agent, pose));
+    let earlier = ego
+        .earlier(&aligned(&second, &other))
+        .into_iter()
+        .map(|(agent, _, pose)| (agent, pose));
     let earlier: Vec<_> = earlier.collect();
     assert_eq!(earlier.len(), 1);
     let (agent, place) = earlier[0];
     assert_eq!(agent, 0);
-    assert!((place.translation_m[0] + 2.0).abs() < 1e-9, "what was here lies 2 m behind now");
+    assert!(
+        (place.translation_m[0] + 2.0).abs() < 1e-9,
+        "what was here lies 2 m behind now"
+    );
     ego.detect(&second, std::slice::from_ref(&other)).unwrap();
-    let later = View { capture_nanos: NOW + 150_000_000, ..view("b", near(), Method::PASTAT, 0.15) };
+    let later = View {
+        capture_nanos: NOW + 150_000_000,
+        ..view("b", near(), Method::PASTAT, 0.15)
+    };
     let third = at(2, 4.0);
-    let agents: Vec<usize> = ego.earlier(&aligned(&third, &later)).into_iter().map(|found| found.0).collect();
+    let agents: Vec<usize> = ego
+        .earlier(&aligned(&third, &later))
+        .into_iter()
+        .map(|found| found.0)
+        .collect();
     assert_eq!(agents, [0, 0, 1]);
-    let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..third.clone() };
+    let lost = View {
+        pose: PoseEstimate::NoPose {
+            reason: NoPoseReason::NoSource,
+            inlier_count: 0,
+        },
+        ..third.clone()
+    };
     assert!(ego.earlier(&aligned(&lost, &later)).is_empty());
     ego.forget();
     assert!(ego.earlier(&aligned(&third, &later)).is_empty());

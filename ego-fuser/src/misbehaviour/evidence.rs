@@ -60,7 +60,12 @@ pub(super) struct Evidence {
 
 impl Evidence {
     /// Compares a neighbour's message with the ego's own; `age_s` is the difference of their ages, seconds.
-    pub(super) fn between(own: &Observation, theirs: &Observation, ego_from_cav: &Isometry2<f64>, age_s: f64) -> Self {
+    pub(super) fn between(
+        own: &Observation,
+        theirs: &Observation,
+        ego_from_cav: &Isometry2<f64>,
+        age_s: f64,
+    ) -> Self {
         let radius_m = SAME_M + DRIVES_MPS * age_s.abs().min(1.0);
         let cav_from_ego = ego_from_cav.inverse();
         let mut evidence = Self {
@@ -74,31 +79,57 @@ impl Evidence {
         let sender = Point2::from(ego_from_cav.translation.vector);
         let is_near = |at: &Point2<f64>| {
             let distances = [at.coords.norm(), (at - sender).norm()];
-            distances.iter().all(|distance| (OWN_BODY_M..NEAR_M).contains(distance))
+            distances
+                .iter()
+                .all(|distance| (OWN_BODY_M..NEAR_M).contains(distance))
         };
-        let theirs_here: Vec<Point2<f64>> = theirs.vehicles.iter().map(|at| ego_from_cav * Point2::from(*at)).collect();
+        let theirs_here: Vec<Point2<f64>> = theirs
+            .vehicles
+            .iter()
+            .map(|at| ego_from_cav * Point2::from(*at))
+            .collect();
         let is_same = |one: &Point2<f64>, other: &Point2<f64>| (one - other).norm() < radius_m;
-        for at in theirs_here.iter().filter(|at| at.coords.norm() >= OWN_BODY_M) {
-            let is_mine = own.vehicles.iter().any(|other| is_same(at, &Point2::from(*other)));
-            let is_empty = own.sure_at([at.x, at.y], radius_m).is_some_and(|sure| sure < EMPTY);
+        for at in theirs_here
+            .iter()
+            .filter(|at| at.coords.norm() >= OWN_BODY_M)
+        {
+            let is_mine = own
+                .vehicles
+                .iter()
+                .any(|other| is_same(at, &Point2::from(*other)));
+            let is_empty = own
+                .sure_at([at.x, at.y], radius_m)
+                .is_some_and(|sure| sure < EMPTY);
             match (is_near(at), is_mine) {
                 (true, true) => evidence.matched += 1,
                 (true, false) => evidence.contradicted += u32::from(is_empty),
                 (false, is_mine) => evidence.strange += u32::from(!is_mine && is_empty),
             }
         }
-        let is_missed = |at: &Point2<f64>| is_near(at) && !theirs_here.iter().any(|other| is_same(at, other));
-        evidence.missed = own.vehicles.iter().filter(|at| is_missed(&Point2::from(**at))).count() as u32;
+        let is_missed =
+            |at: &Point2<f64>| is_near(at) && !theirs_here.iter().any(|other| is_same(at, other));
+        evidence.missed = own
+            .vehicles
+            .iter()
+            .filter(|at| is_missed(&Point2::from(**at)))
+            .count() as u32;
         evidence
     }
 
     /// Log likelihood ratio of an honest neighbour and the most likely type of attacker, and that type; `None` without
     /// anything to compare.
     pub(super) fn judgement(&self) -> Option<(f64, MisbehaviourReason)> {
-        let elsewhere = self.against_elsewhere().map(|odds| (odds, MisbehaviourReason::PositionMismatch));
-        let invention = self.against_invention().map(|odds| (odds, MisbehaviourReason::GhostObjects));
+        let elsewhere = self
+            .against_elsewhere()
+            .map(|odds| (odds, MisbehaviourReason::PositionMismatch));
+        let invention = self
+            .against_invention()
+            .map(|odds| (odds, MisbehaviourReason::GhostObjects));
         let candidates = [elsewhere, invention, self.against_other_attacks()];
-        candidates.into_iter().flatten().min_by(|(one, _), (other, _)| one.total_cmp(other))
+        candidates
+            .into_iter()
+            .flatten()
+            .min_by(|(one, _), (other, _)| one.total_cmp(other))
     }
 
     /// The log likelihood ratio without the type.
@@ -113,11 +144,17 @@ impl Evidence {
         if self.is_blind {
             return Some(BLIND.min(-0.3 * f64::from(self.missed)));
         }
-        if seen.iter().all(|odds| *odds == 0.0) && self.matched + self.contradicted + self.missed == 0 {
+        if seen.iter().all(|odds| *odds == 0.0)
+            && self.matched + self.contradicted + self.missed == 0
+        {
             return None;
         }
         let matched = [0.0, 1.5, 2.2, 2.8][self.matched.min(3) as usize];
-        let unmatched = if self.matched == 0 { -0.5 * f64::from(self.contradicted.min(3)) } else { 0.0 };
+        let unmatched = if self.matched == 0 {
+            -0.5 * f64::from(self.contradicted.min(3))
+        } else {
+            0.0
+        };
         let missed = -0.3 * f64::from(self.missed.saturating_sub(1).min(4));
         Some(matched + seen.iter().sum::<f64>().clamp(-4.0, 2.0) + unmatched + missed)
     }
@@ -137,7 +174,11 @@ impl Evidence {
             (true, true) => 2,
         };
         let is_too_much = self.strange >= enough;
-        let odds = odds[(self.contradicted as usize).min(odds.len() - 1)].min(if is_too_much { -3.6 } else { 0.0 });
+        let odds = odds[(self.contradicted as usize).min(odds.len() - 1)].min(if is_too_much {
+            -3.6
+        } else {
+            0.0
+        });
         (odds < 0.0).then_some(odds)
     }
 
@@ -150,7 +191,8 @@ impl Evidence {
             (self.jumped, -4.0, MisbehaviourReason::ImplausibleMotion),
             (is_torn, -3.0, MisbehaviourReason::Inconsistent),
         ];
-        sure.into_iter().find_map(|(is_so, odds, reason)| is_so.then_some((odds, reason)))
+        sure.into_iter()
+            .find_map(|(is_so, odds, reason)| is_so.then_some((odds, reason)))
     }
 
     /// Evidence from one vehicle's confidence in the other at its reported position: within 35 m an honest neighbour is
@@ -191,36 +233,67 @@ mod tests {
     /// Boxes that a vehicle at a position detects of the vehicles in a world.
     fn boxes(world: &[[f64; 2]], from: [f64; 2]) -> Content {
         let seen = world.iter().map(|[x, y]| Detection {
-            box3d: Box3d { center_m: [x - from[0], y - from[1], -1.0], size_m: [4.4, 1.9, 1.6], heading_rad: 0.0 },
+            box3d: Box3d {
+                center_m: [x - from[0], y - from[1], -1.0],
+                size_m: [4.4, 1.9, 1.6],
+                heading_rad: 0.0,
+            },
             score: 0.7,
             source: None,
         });
-        Content::Boxes(seen.filter(|found| found.box3d.center_m[0].hypot(found.box3d.center_m[1]) > 1.0).collect())
+        Content::Boxes(
+            seen.filter(|found| found.box3d.center_m[0].hypot(found.box3d.center_m[1]) > 1.0)
+                .collect(),
+        )
     }
 
     fn seen(content: &Content) -> Observation {
-        let Content::Boxes(found) = content else { panic!("boxes") };
+        let Content::Boxes(found) = content else {
+            panic!("boxes")
+        };
         let at = |found: &Detection| [found.box3d.center_m[0], found.box3d.center_m[1]];
         Observation::of_boxes(found.iter().map(|found| (at(found), found.score)).collect())
     }
 
-    const WORLD: [[f64; 2]; 6] = [[0.0, 0.0], [20.0, 3.0], [10.0, -6.0], [-8.0, 4.0], [25.0, -9.0], [14.0, 12.0]];
+    const WORLD: [[f64; 2]; 6] = [
+        [0.0, 0.0],
+        [20.0, 3.0],
+        [10.0, -6.0],
+        [-8.0, 4.0],
+        [25.0, -9.0],
+        [14.0, 12.0],
+    ];
 
     #[test]
     fn an_honest_neighbour_is_accepted_and_a_wrong_position_is_not() {
-        let (own, theirs) = (seen(&boxes(&WORLD, WORLD[0])), seen(&boxes(&WORLD, WORLD[1])));
+        let (own, theirs) = (
+            seen(&boxes(&WORLD, WORLD[0])),
+            seen(&boxes(&WORLD, WORLD[1])),
+        );
         let honest = Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
-        assert_eq!((honest.matched, honest.contradicted, honest.missed), (4, 0, 0));
+        assert_eq!(
+            (honest.matched, honest.contradicted, honest.missed),
+            (4, 0, 0)
+        );
         assert!(honest.log_odds().unwrap() > 3.0, "{honest:?}");
         let elsewhere = Evidence::between(&own, &theirs, &Isometry2::translation(12.0, 14.0), 0.0);
-        assert!(elsewhere.matched <= 1 && elsewhere.log_odds().unwrap() < -3.0, "{elsewhere:?}");
+        assert!(
+            elsewhere.matched <= 1 && elsewhere.log_odds().unwrap() < -3.0,
+            "{elsewhere:?}"
+        );
     }
 
     #[test]
     fn vehicles_that_only_the_neighbour_sees_count_against_it() {
         let own = seen(&boxes(&WORLD, WORLD[0]));
         let mut more = WORLD.to_vec();
-        more.extend([[5.0, 12.0], [-4.0, -9.0], [12.0, 5.0], [18.0, -14.0], [3.0, 18.0]]);
+        more.extend([
+            [5.0, 12.0],
+            [-4.0, -9.0],
+            [12.0, 5.0],
+            [18.0, -14.0],
+            [3.0, 18.0],
+        ]);
         let theirs = seen(&boxes(&more, WORLD[1]));
         let evidence = Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
         assert_eq!((evidence.matched, evidence.contradicted), (4, 5));
@@ -230,11 +303,25 @@ mod tests {
 
     #[test]
     fn a_copy_a_jump_and_noise_are_detected() {
-        let fine = Evidence { matched: 3, ego_sees_it: Some(0.6), it_sees_ego: Some(0.6), ..Evidence::default() };
+        let fine = Evidence {
+            matched: 3,
+            ego_sees_it: Some(0.6),
+            it_sees_ego: Some(0.6),
+            ..Evidence::default()
+        };
         assert!(fine.log_odds().unwrap() > 4.0);
-        let copied = Evidence { like_another: 1.0, ..fine.clone() };
-        let jumped = Evidence { jumped: true, ..Evidence::default() };
-        let torn = Evidence { like_before: Some(0.7), ..Evidence::default() };
+        let copied = Evidence {
+            like_another: 1.0,
+            ..fine.clone()
+        };
+        let jumped = Evidence {
+            jumped: true,
+            ..Evidence::default()
+        };
+        let torn = Evidence {
+            like_before: Some(0.7),
+            ..Evidence::default()
+        };
         for (evidence, reason) in [
             (copied, MisbehaviourReason::Duplicated),
             (jumped, MisbehaviourReason::ImplausibleMotion),
@@ -243,8 +330,19 @@ mod tests {
             let (log_odds, found) = evidence.judgement().unwrap();
             assert!(log_odds < -2.0 && found == reason, "{found}");
         }
-        let blind = Evidence { is_blind: true, ego_sees_it: Some(0.6), ..Evidence::default() };
-        assert_eq!(blind.judgement(), Some((BLIND, MisbehaviourReason::PositionMismatch)));
-        assert_eq!(Evidence::default().log_odds(), None, "no content, no evidence");
+        let blind = Evidence {
+            is_blind: true,
+            ego_sees_it: Some(0.6),
+            ..Evidence::default()
+        };
+        assert_eq!(
+            blind.judgement(),
+            Some((BLIND, MisbehaviourReason::PositionMismatch))
+        );
+        assert_eq!(
+            Evidence::default().log_odds(),
+            None,
+            "no content, no evidence"
+        );
     }
 }

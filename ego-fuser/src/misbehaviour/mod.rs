@@ -50,7 +50,10 @@ pub struct MisbehaviourConfig {
 
 impl Default for MisbehaviourConfig {
     fn default() -> Self {
-        Self { leave_out_below: -0.7, take_back_above: 0.7 }
+        Self {
+            leave_out_below: -0.7,
+            take_back_above: 0.7,
+        }
     }
 }
 
@@ -94,9 +97,15 @@ impl Assessment {
 
 /// Report of the assessed neighbours, without clock data; `assessments` are the `beliefs` of an `EgoOutput`.
 #[must_use]
-pub fn neighbour_states(assessments: &[(usize, Assessment)], views: &[View]) -> Vec<NeighbourState> {
+pub fn neighbour_states(
+    assessments: &[(usize, Assessment)],
+    views: &[View],
+) -> Vec<NeighbourState> {
     let of = |(index, view): (usize, &View)| {
-        let assessment = assessments.iter().find(|(known, _)| *known == index).map(|(_, assessment)| assessment);
+        let assessment = assessments
+            .iter()
+            .find(|(known, _)| *known == index)
+            .map(|(_, assessment)| assessment);
         NeighbourState {
             cav: view.cav.clone(),
             trust: assessment.map(|assessment| assessment.trust),
@@ -109,11 +118,18 @@ pub fn neighbour_states(assessments: &[(usize, Assessment)], views: &[View]) -> 
 
 impl MisbehaviourDetector {
     /// Starts with all neighbours trusted.
-    pub(crate) fn new(config: MisbehaviourConfig, detector: &mut Detector) -> Result<Self, DetectorError> {
+    pub(crate) fn new(
+        config: MisbehaviourConfig,
+        detector: &mut Detector,
+    ) -> Result<Self, DetectorError> {
         let encoded = detector.encode(&PointCloud::default())?.features;
         let empty = detector.through_compressor(&encoded)?;
         let empty = Vec::try_from(&empty.f_contiguous()?.f_view([-1])?)?;
-        Ok(Self { config, empty, peers: BTreeMap::new() })
+        Ok(Self {
+            config,
+            empty,
+            peers: BTreeMap::new(),
+        })
     }
 
     /// Removes all neighbours: another scene begins.
@@ -128,14 +144,24 @@ impl MisbehaviourDetector {
         neighbours: &[(&View, Pose)],
         detector: &mut Detector,
     ) -> Result<Vec<Assessment>, DetectorError> {
-        self.forget_absent(own.capture_nanos, neighbours.iter().map(|(view, _)| &view.cav));
+        self.forget_absent(
+            own.capture_nanos,
+            neighbours.iter().map(|(view, _)| &view.cav),
+        );
         let mine = Observation::in_message(&own.content, detector, &self.empty)?;
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
-            all.push(Observation::in_message(&view.content, detector, &self.empty)?);
+            all.push(Observation::in_message(
+                &view.content,
+                detector,
+                &self.empty,
+            )?);
         }
         // A message that serves a second frame is no new evidence.
-        let is_new = |view: &View| self.last_of(&view.cav).is_none_or(|(nanos, ..)| *nanos != view.capture_nanos);
+        let is_new = |view: &View| {
+            self.last_of(&view.cav)
+                .is_none_or(|(nanos, ..)| *nanos != view.capture_nanos)
+        };
         let evidence = neighbours.iter().zip(&all);
         let mut evidence: Vec<Option<Evidence>> = evidence
             .map(|((view, ego_from_cav), seen)| {
@@ -150,7 +176,9 @@ impl MisbehaviourDetector {
             assessments.push(self.add_up(own.capture_nanos, &view.cav, judgement, mine.is_boxes()));
         }
         for ((view, _), seen) in neighbours.iter().zip(all) {
-            if let (Some(reputation), Some(pose)) = (self.peers.get_mut(&view.cav), view.pose.world_from_cav()) {
+            if let (Some(reputation), Some(pose)) =
+                (self.peers.get_mut(&view.cav), view.pose.world_from_cav())
+            {
                 reputation.last = Some((view.capture_nanos, *pose, seen.fingerprint));
             }
         }
@@ -172,17 +200,26 @@ impl MisbehaviourDetector {
     ) -> Evidence {
         let [x, y, _] = ego_from_cav.translation_m;
         let relative = Isometry2::new([x, y].into(), ego_from_cav.yaw_rad());
-        let mut evidence = Evidence::between(mine, seen, &relative, view.age_nanos(own) as f64 * 1e-9);
-        let earlier = self.peers.iter().filter(|(cav, _)| **cav != view.cav).filter_map(|(_, peer)| peer.last.as_ref());
-        let others = earlier.map(|(_, _, fingerprint)| fingerprint).chain([&mine.fingerprint]);
-        evidence.like_another = others.map(|fingerprint| alike(&seen.fingerprint, fingerprint)).fold(0.0, f64::max);
+        let mut evidence =
+            Evidence::between(mine, seen, &relative, view.age_nanos(own) as f64 * 1e-9);
+        let earlier = self
+            .peers
+            .iter()
+            .filter(|(cav, _)| **cav != view.cav)
+            .filter_map(|(_, peer)| peer.last.as_ref());
+        let others = earlier
+            .map(|(_, _, fingerprint)| fingerprint)
+            .chain([&mine.fingerprint]);
+        evidence.like_another = others
+            .map(|fingerprint| alike(&seen.fingerprint, fingerprint))
+            .fold(0.0, f64::max);
         if let (Some((capture_nanos, before, fingerprint)), Some(now)) =
             (self.last_of(&view.cav), view.pose.world_from_cav())
         {
             let elapsed_s = (view.capture_nanos as f64 - *capture_nanos as f64).abs() * 1e-9;
             evidence.jumped = is_jump(before, now, elapsed_s);
-            evidence.like_before =
-                (elapsed_s < SUCCESSIVE_S).then(|| cosine_similarity(&seen.fingerprint, fingerprint));
+            evidence.like_before = (elapsed_s < SUCCESSIVE_S)
+                .then(|| cosine_similarity(&seen.fingerprint, fingerprint));
         }
         evidence
     }
@@ -192,7 +229,8 @@ impl MisbehaviourDetector {
     fn forget_absent<'a>(&mut self, now_nanos: u64, present: impl Iterator<Item = &'a CavId>) {
         let present: BTreeSet<&CavId> = present.collect();
         self.peers.retain(|cav, reputation| {
-            present.contains(cav) || now_nanos.abs_diff(reputation.last_message_nanos) <= FORGOTTEN_NANOS
+            present.contains(cav)
+                || now_nanos.abs_diff(reputation.last_message_nanos) <= FORGOTTEN_NANOS
         });
     }
 
@@ -204,10 +242,16 @@ impl MisbehaviourDetector {
         judgement: Option<(f64, MisbehaviourReason)>,
         probation: bool,
     ) -> Assessment {
-        let MisbehaviourConfig { leave_out_below, take_back_above } = self.config;
+        let MisbehaviourConfig {
+            leave_out_below,
+            take_back_above,
+        } = self.config;
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             // Beyond the limit of neighbours nothing is known.
-            return Assessment { trust: 0.5, misbehaviour: probation.then_some(MisbehaviourReason::Probation) };
+            return Assessment {
+                trust: 0.5,
+                misbehaviour: probation.then_some(MisbehaviourReason::Probation),
+            };
         }
         let reputation = self.peers.entry(cav.clone()).or_insert(Reputation {
             log_odds: 0.0,
@@ -224,11 +268,20 @@ impl MisbehaviourDetector {
             }
         }
         let was_out = reputation.is_out;
-        reputation.is_out = reputation.log_odds < if was_out { take_back_above } else { leave_out_below };
+        reputation.is_out = reputation.log_odds
+            < if was_out {
+                take_back_above
+            } else {
+                leave_out_below
+            };
         let reason = reputation.reason;
         match (was_out, reputation.is_out) {
-            (false, true) => tracing::warn!(%cav, %reason, "its messages contradict the ego's perception: left out"),
-            (true, false) => tracing::info!(%cav, "its messages agree with the ego's perception: readmitted"),
+            (false, true) => {
+                tracing::warn!(%cav, %reason, "its messages contradict the ego's perception: left out")
+            }
+            (true, false) => {
+                tracing::info!(%cav, "its messages agree with the ego's perception: readmitted")
+            }
             _ => {}
         }
         Assessment {
@@ -241,12 +294,21 @@ impl MisbehaviourDetector {
 /// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
 /// neither has any in its favour.
 fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
-    let fits: Vec<f64> =
-        evidence.iter().map(|evidence| evidence.as_ref().and_then(Evidence::log_odds).unwrap_or(0.0)).collect();
+    let fits: Vec<f64> = evidence
+        .iter()
+        .map(|evidence| {
+            evidence
+                .as_ref()
+                .and_then(Evidence::log_odds)
+                .unwrap_or(0.0)
+        })
+        .collect();
     for (index, evidence) in evidence.iter_mut().enumerate() {
         let Some(evidence) = evidence else { continue };
         for other in (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index]) {
-            evidence.like_another = evidence.like_another.max(alike(&all[index].fingerprint, &all[other].fingerprint));
+            evidence.like_another = evidence
+                .like_another
+                .max(alike(&all[index].fingerprint, &all[other].fingerprint));
         }
     }
 }
@@ -254,7 +316,11 @@ fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
 /// Similarity of two messages with enough content to be a copy: two vehicles that detect a single box may well agree.
 fn alike(one: &[f32], other: &[f32]) -> f64 {
     const ENOUGH: usize = 9;
-    if one.len() < ENOUGH { 0.0 } else { cosine_similarity(one, other) }
+    if one.len() < ENOUGH {
+        0.0
+    } else {
+        cosine_similarity(one, other)
+    }
 }
 
 /// True if no vehicle can drive from one pose to the other in that time, with the largest pose errors added.
@@ -262,7 +328,8 @@ fn is_jump(before: &Pose, now: &Pose, elapsed_s: f64) -> bool {
     let moved = before.from_world(now);
     let [x, y, _] = moved.translation_m;
     let (turns, error) = MAX_TURN;
-    x.hypot(y) > MAX_JUMP_M + MAX_SPEED_MPS * elapsed_s || moved.yaw_rad().abs() > error + turns * elapsed_s
+    x.hypot(y) > MAX_JUMP_M + MAX_SPEED_MPS * elapsed_s
+        || moved.yaw_rad().abs() > error + turns * elapsed_s
 }
 
 #[cfg(test)]
@@ -270,7 +337,11 @@ mod tests {
     use super::*;
 
     fn trust() -> MisbehaviourDetector {
-        MisbehaviourDetector { config: MisbehaviourConfig::default(), empty: vec![], peers: BTreeMap::new() }
+        MisbehaviourDetector {
+            config: MisbehaviourConfig::default(),
+            empty: vec![],
+            peers: BTreeMap::new(),
+        }
     }
 
     #[test]
@@ -278,7 +349,12 @@ mod tests {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
         let mut assess = |log_odds: Option<f64>| {
-            trust.add_up(0, &cav, log_odds.map(|odds| (odds, MisbehaviourReason::Duplicated)), false)
+            trust.add_up(
+                0,
+                &cav,
+                log_odds.map(|odds| (odds, MisbehaviourReason::Duplicated)),
+                false,
+            )
         };
         assert!(!assess(None).is_out(), "left out only with evidence");
         assert_eq!(
@@ -289,17 +365,35 @@ mod tests {
         assert!(assess(None).is_out(), "the same message is no new evidence");
         let returns = (0..20).position(|_| !assess(Some(1.5)).is_out()).unwrap();
         assert!((1..6).contains(&returns), "after {returns} frames");
-        assert!(!assess(Some(-1.0)).is_out(), "one frame with weak evidence is tolerated");
+        assert!(
+            !assess(Some(-1.0)).is_out(),
+            "one frame with weak evidence is tolerated"
+        );
         assert!((0..20).map(|_| assess(Some(4.0))).last().unwrap().trust > 0.97);
-        assert!(assess(Some(-8.0)).is_out(), "a clear attack is rejected whatever the trust");
+        assert!(
+            assess(Some(-8.0)).is_out(),
+            "a clear attack is rejected whatever the trust"
+        );
     }
 
     #[test]
     fn boxes_are_accepted_with_evidence_in_their_favour() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        assert_eq!(trust.add_up(0, &cav, None, true).misbehaviour, Some(MisbehaviourReason::Probation));
-        assert!(!trust.add_up(0, &cav, Some((2.0, MisbehaviourReason::PositionMismatch)), true).is_out());
+        assert_eq!(
+            trust.add_up(0, &cav, None, true).misbehaviour,
+            Some(MisbehaviourReason::Probation)
+        );
+        assert!(
+            !trust
+                .add_up(
+                    0,
+                    &cav,
+                    Some((2.0, MisbehaviourReason::PositionMismatch)),
+                    true
+                )
+                .is_out()
+        );
         assert!(!trust.add_up(0, &cav, None, true).is_out());
     }
 
@@ -320,28 +414,58 @@ mod tests {
     #[test]
     fn long_offline_neighbours_are_removed_and_an_attacker_is_known_after_a_short_interval() {
         let mut trust = trust();
-        let names: Vec<CavId> = (0..=MAX_PEERS).map(|number| CavId::new(&format!("v{number}")).unwrap()).collect();
+        let names: Vec<CavId> = (0..=MAX_PEERS)
+            .map(|number| CavId::new(&format!("v{number}")).unwrap())
+            .collect();
         let attack = Some((-9.0, MisbehaviourReason::ImplausibleMotion));
         for cav in &names[..MAX_PEERS] {
             assert!(trust.add_up(0, cav, attack, false).is_out());
         }
         let newcomer = &names[MAX_PEERS];
         trust.forget_absent(FORGOTTEN_NANOS, [newcomer].into_iter());
-        assert!(!trust.add_up(FORGOTTEN_NANOS, newcomer, attack, false).is_out(), "the state is full");
-        assert!(trust.add_up(FORGOTTEN_NANOS, &names[0], None, false).is_out(), "it has not washed itself");
+        assert!(
+            !trust
+                .add_up(FORGOTTEN_NANOS, newcomer, attack, false)
+                .is_out(),
+            "the state is full"
+        );
+        assert!(
+            trust
+                .add_up(FORGOTTEN_NANOS, &names[0], None, false)
+                .is_out(),
+            "it has not washed itself"
+        );
         let later = FORGOTTEN_NANOS + 1;
         trust.forget_absent(later, [newcomer, &names[1]].into_iter());
         let known: Vec<&CavId> = trust.peers.keys().collect();
         assert_eq!(known, [&names[0], &names[1]]);
-        assert!(trust.add_up(later, newcomer, attack, false).is_out(), "a newcomer is judged");
+        assert!(
+            trust.add_up(later, newcomer, attack, false).is_out(),
+            "a newcomer is judged"
+        );
     }
 
     #[test]
     fn an_unreachable_pose_is_detected() {
         let here = Pose::from_xyz_yaw([100.0, 50.0, 2.0], 0.0);
-        assert!(!is_jump(&here, &Pose::from_xyz_yaw([115.0, 50.0, 2.0], 0.5), 0.1), "noise of a poor pose");
-        assert!(is_jump(&here, &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 0.0), 0.1));
-        assert!(is_jump(&here, &Pose::from_xyz_yaw([100.0, 50.0, 2.0], 2.0), 0.1));
-        assert!(!is_jump(&here, &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 2.0), 1.0));
+        assert!(
+            !is_jump(&here, &Pose::from_xyz_yaw([115.0, 50.0, 2.0], 0.5), 0.1),
+            "noise of a poor pose"
+        );
+        assert!(is_jump(
+            &here,
+            &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 0.0),
+            0.1
+        ));
+        assert!(is_jump(
+            &here,
+            &Pose::from_xyz_yaw([100.0, 50.0, 2.0], 2.0),
+            0.1
+        ));
+        assert!(!is_jump(
+            &here,
+            &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 2.0),
+            1.0
+        ));
     }
 }

@@ -40,54 +40,118 @@ enum Sure {
 
 impl Observation {
     /// Evaluates a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
-    pub(super) fn in_message(content: &Content, detector: &mut Detector, empty: &[f32]) -> Result<Self, DetectorError> {
+    pub(super) fn in_message(
+        content: &Content,
+        detector: &mut Detector,
+        empty: &[f32],
+    ) -> Result<Self, DetectorError> {
         match content {
-            Content::Features(map) => Self::in_map(&detector.received(map)?, map.sent.as_deref(), detector, empty),
+            Content::Features(map) => Self::in_map(
+                &detector.received(map)?,
+                map.sent.as_deref(),
+                detector,
+                empty,
+            ),
             Content::Boxes(found) => {
                 let at = |[x, y, _]: [f64; 3]| [x, y];
                 let evident = found.iter().filter(|found| found.score > EVIDENT);
-                Ok(Self::of_boxes(evident.map(|found| (at(found.box3d.center_m), found.score)).collect()))
+                Ok(Self::of_boxes(
+                    evident
+                        .map(|found| (at(found.box3d.center_m), found.score))
+                        .collect(),
+                ))
             }
             Content::Points(points) => {
                 let encoded = detector.encode(points)?.features;
-                let seen = Self::in_map(&detector.through_compressor(&encoded)?, None, detector, empty)?;
-                Ok(Self { is_blind: seen.vehicles.is_empty(), ..seen })
+                let seen = Self::in_map(
+                    &detector.through_compressor(&encoded)?,
+                    None,
+                    detector,
+                    empty,
+                )?;
+                Ok(Self {
+                    is_blind: seen.vehicles.is_empty(),
+                    ..seen
+                })
             }
         }
     }
 
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
-        let vehicles: Vec<_> = all.iter().filter(|(_, score)| *score >= SURE).map(|(at_m, _)| *at_m).collect();
-        let fingerprint = all.iter().flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]).collect();
-        Self { vehicles, sure: Sure::Boxes(all), fingerprint, is_blind: false }
+        let vehicles: Vec<_> = all
+            .iter()
+            .filter(|(_, score)| *score >= SURE)
+            .map(|(at_m, _)| *at_m)
+            .collect();
+        let fingerprint = all
+            .iter()
+            .flat_map(|([x, y], score)| [*x as f32, *y as f32, *score])
+            .collect();
+        Self {
+            vehicles,
+            sure: Sure::Boxes(all),
+            fingerprint,
+            is_blind: false,
+        }
     }
 
     /// From a map `[1, C, H, W]`, of which the `sent` cells were received; all where absent.
-    fn in_map(map: &Tensor, sent: Option<&[bool]>, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
+    fn in_map(
+        map: &Tensor,
+        sent: Option<&[bool]>,
+        detector: &Detector,
+        empty: &[f32],
+    ) -> Result<Self, DetectorError> {
         let grid = detector.grid();
         let heads = detector.heads(map)?;
         // Cells that were not sent have no features that a head can interpret.
         let was_sent = |cell: usize| sent.is_none_or(|sent| sent[cell]);
-        let limits =
-            PostprocessConfig { score_threshold: SURE, ..PostprocessConfig::for_late_fusion(detector.config()) };
+        let limits = PostprocessConfig {
+            score_threshold: SURE,
+            ..PostprocessConfig::for_late_fusion(detector.config())
+        };
         let boxes = detector.boxes(&heads, SURE)?;
-        let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
-        let found = postprocess(&[own], &limits).into_iter().filter_map(|found| {
-            let [x, y, _] = found.detection(None).box3d.center_m;
-            cell_of(&grid, x, y).is_none_or(was_sent).then_some(([x, y], found.score))
-        });
+        let own = AgentBoxes {
+            boxes: &boxes,
+            output_from_agent: Isometry3::identity(),
+        };
+        let found = postprocess(&[own], &limits)
+            .into_iter()
+            .filter_map(|found| {
+                let [x, y, _] = found.detection(None).box3d.center_m;
+                cell_of(&grid, x, y)
+                    .is_none_or(was_sent)
+                    .then_some(([x, y], found.score))
+            });
         let found: Vec<_> = found.collect();
         let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
-        let fingerprint = values.iter().zip(empty).step_by((empty.len() / FINGERPRINT_VALUES).max(1));
-        let fingerprint = fingerprint.map(|(value, nothing)| value - nothing).collect();
+        let fingerprint = values
+            .iter()
+            .zip(empty)
+            .step_by((empty.len() / FINGERPRINT_VALUES).max(1));
+        let fingerprint = fingerprint
+            .map(|(value, nothing)| value - nothing)
+            .collect();
         if detector.config().y_axis == YAxis::Right {
             // The cells of a mirrored network lie elsewhere; its boxes do not.
-            return Ok(Self { fingerprint, ..Self::of_boxes(found) });
+            return Ok(Self {
+                fingerprint,
+                ..Self::of_boxes(found)
+            });
         }
         let mut cells = heads.confidence;
-        cells.iter_mut().enumerate().filter(|(cell, _)| !was_sent(*cell)).for_each(|(_, sure)| *sure = 0.0);
+        cells
+            .iter_mut()
+            .enumerate()
+            .filter(|(cell, _)| !was_sent(*cell))
+            .for_each(|(_, sure)| *sure = 0.0);
         let vehicles = found.into_iter().map(|(at_m, _)| at_m).collect();
-        Ok(Self { vehicles, sure: Sure::Cells(grid, cells), fingerprint, is_blind: false })
+        Ok(Self {
+            vehicles,
+            sure: Sure::Cells(grid, cells),
+            fingerprint,
+            is_blind: false,
+        })
     }
 
     /// True if only boxes are known: a place without one may then be empty or merely uncertain.
@@ -98,10 +162,14 @@ impl Observation {
     /// Confidence of the detector in a vehicle within `radius_m` of a position, 0..1; `None` outside its range.
     pub(super) fn sure_at(&self, at_m: [f64; 2], radius_m: f64) -> Option<f32> {
         match &self.sure {
-            Sure::Cells(grid, cells) => around(grid, at_m, radius_m).map(|cell| cells[cell]).reduce(f32::max),
+            Sure::Cells(grid, cells) => around(grid, at_m, radius_m)
+                .map(|cell| cells[cell])
+                .reduce(f32::max),
             Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
             Sure::Boxes(all) => {
-                let near = all.iter().filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
+                let near = all
+                    .iter()
+                    .filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
                 Some(near.map(|(_, score)| *score).fold(0.0, f32::max))
             }
         }
@@ -112,7 +180,8 @@ impl Observation {
 fn cell_of(grid: &BevGrid, x_m: f64, y_m: f64) -> Option<usize> {
     let column = ((x_m - grid.x_min_m) / grid.cell_m).floor();
     let row = ((y_m - grid.y_min_m) / grid.cell_m).floor();
-    let inside = (0.0..f64::from(grid.width)).contains(&column) && (0.0..f64::from(grid.height)).contains(&row);
+    let inside = (0.0..f64::from(grid.width)).contains(&column)
+        && (0.0..f64::from(grid.height)).contains(&row);
     inside.then(|| row as usize * grid.width as usize + column as usize)
 }
 
@@ -133,7 +202,12 @@ pub(super) fn cosine_similarity(one: &[f32], other: &[f32]) -> f64 {
     if one.len() != other.len() || one.is_empty() {
         return 0.0;
     }
-    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+    let dot = |a: &[f32], b: &[f32]| {
+        a.iter()
+            .zip(b)
+            .map(|(a, b)| f64::from(*a) * f64::from(*b))
+            .sum::<f64>()
+    };
     dot(one, other) / (dot(one, one) * dot(other, other)).sqrt().max(1e-12)
 }
 
@@ -148,15 +222,25 @@ mod tests {
 
     #[test]
     fn cells_around_a_place_are_found_and_none_outside() {
-        let grid = BevGrid { x_min_m: -4.0, y_min_m: -2.0, cell_m: 0.5, width: 16, height: 8 };
+        let grid = BevGrid {
+            x_min_m: -4.0,
+            y_min_m: -2.0,
+            cell_m: 0.5,
+            width: 16,
+            height: 8,
+        };
         assert_eq!(cell_of(&grid, -3.9, -1.9), Some(0));
         assert_eq!(cell_of(&grid, 3.9, 1.9), Some(127));
         assert_eq!(around(&grid, [0.1, 0.1], 0.5).count(), 5);
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
         let mut sure = vec![0.0; 128];
         sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
-        let seen =
-            Observation { vehicles: vec![], sure: Sure::Cells(grid, sure), fingerprint: vec![], is_blind: false };
+        let seen = Observation {
+            vehicles: vec![],
+            sure: Sure::Cells(grid, sure),
+            fingerprint: vec![],
+            is_blind: false,
+        };
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
@@ -165,16 +249,31 @@ mod tests {
     #[test]
     fn boxes_that_are_judged_but_hardly_seen_are_no_evidence() {
         let network = VarStore::new(tch::Device::Cpu);
-        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
-        let mut detector = Detector::from_network(PointPillars::new(&network.root(), &config).unwrap());
+        let config = DetectorConfig {
+            lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
+            ..DetectorConfig::lean()
+        };
+        let mut detector =
+            Detector::from_network(PointPillars::new(&network.root(), &config).unwrap());
         let found = [(4.0, 0.7), (8.0, 0.25), (12.0, 0.15)].map(|(x, score)| Detection {
-            box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.4, 1.9, 1.6], heading_rad: 0.0 },
+            box3d: Box3d {
+                center_m: [x, 0.0, -1.0],
+                size_m: [4.4, 1.9, 1.6],
+                heading_rad: 0.0,
+            },
             score,
             source: None,
         });
-        let seen = Observation::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
+        let seen =
+            Observation::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
         assert_eq!(seen.vehicles, [[4.0, 0.0]]);
-        assert_eq!((seen.sure_at([8.0, 0.0], 1.0), seen.sure_at([12.0, 0.0], 1.0)), (Some(0.25), Some(0.0)));
+        assert_eq!(
+            (
+                seen.sure_at([8.0, 0.0], 1.0),
+                seen.sure_at([12.0, 0.0], 1.0)
+            ),
+            (Some(0.25), Some(0.0))
+        );
         assert_eq!(seen.fingerprint.len(), 2 * 3);
     }
 
@@ -182,7 +281,15 @@ mod tests {
     fn copies_are_alike_and_others_are_not() {
         let one: Vec<f32> = (0..100).map(|step| (step as f32 * 0.37).sin()).collect();
         let other: Vec<f32> = (0..100).map(|step| (step as f32 * 0.91).cos()).collect();
-        assert!(cosine_similarity(&one, &one) > 0.9999 && cosine_similarity(&one, &other).abs() < 0.5);
-        assert_eq!((cosine_similarity(&one, &one[1..]), cosine_similarity(&[], &[])), (0.0, 0.0));
+        assert!(
+            cosine_similarity(&one, &one) > 0.9999 && cosine_similarity(&one, &other).abs() < 0.5
+        );
+        assert_eq!(
+            (
+                cosine_similarity(&one, &one[1..]),
+                cosine_similarity(&[], &[])
+            ),
+            (0.0, 0.0)
+        );
     }
 }

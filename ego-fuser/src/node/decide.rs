@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use bus::unix_nanos;
-use protocol::message::{DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
+use protocol::message::{
+    DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming,
+};
 use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
 
 use super::{Node, OwnFrame};
@@ -34,7 +36,8 @@ impl Node<'_> {
         while let Some(frame) = self.frames.front() {
             let is_complete = self.is_complete(frame.capture_nanos);
             // A frame followed by a newer one has waited too long already.
-            let is_due = frame.begun.elapsed() >= self.options.deadline || self.frames.len() > 1 || must;
+            let is_due =
+                frame.begun.elapsed() >= self.options.deadline || self.frames.len() > 1 || must;
             if !is_complete && !is_due {
                 return;
             }
@@ -47,26 +50,47 @@ impl Node<'_> {
 
     fn is_complete(&self, capture_nanos: u64) -> bool {
         let tolerance = self.options.pairing.max_lead_nanos;
-        self.neighbourhood.iter().flat_map(Neighbourhood::awaited).all(|cav| {
-            // Or a later one: then this frame's own is lost, and waiting is useless.
-            self.ended.contains(cav)
-                || self.models.is_other(cav)
-                || self.pairing.capture_times(cav).any(|time| time.saturating_add(tolerance) >= capture_nanos)
-        })
+        self.neighbourhood
+            .iter()
+            .flat_map(Neighbourhood::awaited)
+            .all(|cav| {
+                // Or a later one: then this frame's own is lost, and waiting is useless.
+                self.ended.contains(cav)
+                    || self.models.is_other(cav)
+                    || self
+                        .pairing
+                        .capture_times(cav)
+                        .any(|time| time.saturating_add(tolerance) >= capture_nanos)
+            })
     }
 
     fn fuse(&mut self, frame: OwnFrame) {
-        let OwnFrame { agent_frame, capture_nanos, transport, begun, view: own } = frame;
+        let OwnFrame {
+            agent_frame,
+            capture_nanos,
+            transport,
+            begun,
+            view: own,
+        } = frame;
         let waited = begun.elapsed();
         let mut choice = self.choose(capture_nanos);
         let own_topic = self.topic(&self.cav);
         match self.ego.detect(&own, &choice.views) {
-            Ok(EgoOutput { detections, fused, skipped, beliefs, stages }) => {
+            Ok(EgoOutput {
+                detections,
+                fused,
+                skipped,
+                beliefs,
+                stages,
+            }) => {
                 let neighbours = self.neighbour_reports(&beliefs, &choice.views);
                 self.bus.stats().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);
-                let before = [StageTiming::new("transport", transport), StageTiming::new("wait", waited)];
+                let before = [
+                    StageTiming::new("transport", transport),
+                    StageTiming::new("wait", waited),
+                ];
                 let stages = before.into_iter().chain(stages).collect();
                 let result = Detections {
                     ego: self.cav.clone(),
@@ -92,7 +116,11 @@ impl Node<'_> {
     }
 
     /// Report of the neighbours received for a frame.
-    fn neighbour_reports(&self, assessments: &[(usize, Assessment)], views: &[View]) -> Vec<NeighbourState> {
+    fn neighbour_reports(
+        &self,
+        assessments: &[(usize, Assessment)],
+        views: &[View],
+    ) -> Vec<NeighbourState> {
         let stats = self.bus.stats();
         for (index, assessment) in assessments {
             stats.trusted(&views[*index].cav, assessment.trust);
@@ -100,29 +128,59 @@ impl Node<'_> {
         let clocks = stats.peers();
         let clock = |cav: &CavId| clocks.iter().find(|peer| peer.cav == *cav)?.clock_offset_s;
         let reports = misbehaviour::neighbour_states(assessments, views).into_iter();
-        reports.map(|neighbour| NeighbourState { clock_offset_s: clock(&neighbour.cav), ..neighbour }).collect()
+        reports
+            .map(|neighbour| NeighbourState {
+                clock_offset_s: clock(&neighbour.cav),
+                ..neighbour
+            })
+            .collect()
     }
 
     /// The neighbours' messages for a frame, and the neighbours without one.
     fn choose(&mut self, capture_nanos: u64) -> Choice {
         let (paired, dropped) = self.pairing.pair(capture_nanos);
         let mut choice = Choice::default();
-        for Paired { is_first_use, message, .. } in paired {
+        for Paired {
+            is_first_use,
+            message,
+            ..
+        } in paired
+        {
             // A copy, as the message may serve the next frame too.
             choice.views.push(message.view.clone());
             let (payload_bytes, wire_bytes) = (message.payload_bytes, message.wire_bytes);
-            choice.messages.push(MessageInfo { is_first_use, payload_bytes, wire_bytes });
+            choice.messages.push(MessageInfo {
+                is_first_use,
+                payload_bytes,
+                wire_bytes,
+            });
         }
         for lost in &dropped {
-            self.bus.stats().dropped(&self.topic(&lost.cav), lost.reason);
+            self.bus
+                .stats()
+                .dropped(&self.topic(&lost.cav), lost.reason);
         }
-        let Some(neighbourhood) = &mut self.neighbourhood else { return choice };
+        let Some(neighbourhood) = &mut self.neighbourhood else {
+            return choice;
+        };
         let has_sent = |cav: &&CavId| choice.views.iter().any(|view| view.cav == **cav);
-        let silent: Vec<CavId> = neighbourhood.members().filter(|cav| !has_sent(cav)).cloned().collect();
+        let silent: Vec<CavId> = neighbourhood
+            .members()
+            .filter(|cav| !has_sent(cav))
+            .cloned()
+            .collect();
         for cav in silent {
             neighbourhood.missed(&cav);
-            let lost = dropped.iter().rev().find(|lost| lost.cav == cav).map(|lost| lost.reason);
-            let reason = if self.models.is_other(&cav) { Some(DropReason::Shape) } else { lost };
+            let lost = dropped
+                .iter()
+                .rev()
+                .find(|lost| lost.cav == cav)
+                .map(|lost| lost.reason);
+            let reason = if self.models.is_other(&cav) {
+                Some(DropReason::Shape)
+            } else {
+                lost
+            };
             choice.skipped.push(SkippedNeighbour { cav, reason });
         }
         choice
@@ -134,10 +192,21 @@ impl Node<'_> {
         let describe = |&index: &usize| {
             let view = &choice.views[index];
             let View { cav, pose, .. } = view;
-            let MessageInfo { is_first_use, payload_bytes, wire_bytes } = choice.messages[index];
+            let MessageInfo {
+                is_first_use,
+                payload_bytes,
+                wire_bytes,
+            } = choice.messages[index];
             self.settle(cav, is_first_use, None);
-            let (cav, age_nanos, confidence) = (cav.clone(), view.age_nanos(own), pose.confidence());
-            FusedNeighbour { cav, age_nanos, confidence, payload_bytes, wire_bytes }
+            let (cav, age_nanos, confidence) =
+                (cav.clone(), view.age_nanos(own), pose.confidence());
+            FusedNeighbour {
+                cav,
+                age_nanos,
+                confidence,
+                payload_bytes,
+                wire_bytes,
+            }
         };
         fused.iter().map(describe).collect()
     }
@@ -170,8 +239,14 @@ impl Node<'_> {
 
     fn publish(&mut self, capture_nanos: u64, result: Detections) {
         // The own message's transport is counted already.
-        for stage in result.stages.iter().filter(|stage| stage.stage != "transport") {
-            self.bus.stats().timed(&stage.stage, Duration::from_nanos(stage.nanos));
+        for stage in result
+            .stages
+            .iter()
+            .filter(|stage| stage.stage != "transport")
+        {
+            self.bus
+                .stats()
+                .timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         self.report.frames += 1;
         // The ego does not know when the sensors of its vehicle measured.
@@ -184,8 +259,13 @@ impl Node<'_> {
             wire::encode(stamp, result)
         });
         self.json.submit_encoded(capture_nanos, move |stamp| {
-            let head = DetectionsReport::new(stamp, None, result).to_json().into_bytes();
-            Ok(Encoded { head, body: Body::Empty })
+            let head = DetectionsReport::new(stamp, None, result)
+                .to_json()
+                .into_bytes();
+            Ok(Encoded {
+                head,
+                body: Body::Empty,
+            })
         });
     }
 }

@@ -110,7 +110,13 @@ pub struct NodeReport {
 ///
 /// # Errors
 /// [`BusError`] of the bus. Errors of single messages are counted and logged.
-pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+pub fn run(
+    bus: &Bus,
+    cav: &CavId,
+    ego: Ego,
+    options: &NodeOptions,
+    stop: &Stop,
+) -> Result<NodeReport, BusError> {
     let mut ego = ego;
     if let Err(error) = ego.warm_up(cav) {
         tracing::warn!("the networks are not warmed up: {error}");
@@ -118,7 +124,13 @@ pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop)
     let mut node = Node::open(bus, cav, ego, options, stop)?;
     let presence = bus.announce(Role::Ego)?;
     node.receive(stop)?;
-    let Node { detections, json, pace, report, .. } = node;
+    let Node {
+        detections,
+        json,
+        pace,
+        report,
+        ..
+    } = node;
     pace.into_iter().for_each(PaceKeeper::finish);
     detections.finish();
     json.finish();
@@ -166,20 +178,44 @@ struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    fn open(bus: &'a Bus, cav: &CavId, ego: Ego, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+    fn open(
+        bus: &'a Bus,
+        cav: &CavId,
+        ego: Ego,
+        options: &'a NodeOptions,
+        stop: &Stop,
+    ) -> Result<Self, BusError> {
         let stream = stream_of(ego.method().own_content());
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
+        let topic = |stream| Topic::Stream {
+            cav: cav.clone(),
+            stream,
+        };
         // Boxes and points belong to no network.
-        let streams = if stream == Stream::Bev { vec![Stream::Descriptor, stream] } else { vec![stream] };
-        let own = streams.iter().map(|&stream| bus.subscribe(topic(stream), &inbox)).collect::<Result<_, _>>()?;
+        let streams = if stream == Stream::Bev {
+            vec![Stream::Descriptor, stream]
+        } else {
+            vec![stream]
+        };
+        let own = streams
+            .iter()
+            .map(|&stream| bus.subscribe(topic(stream), &inbox))
+            .collect::<Result<_, _>>()?;
         // An ego-only method needs no messages of others.
         let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
-            .then(|| Neighbourhood::watch(bus, cav, streams, options.over_link, options.neighbours.clone()))
+            .then(|| {
+                Neighbourhood::watch(
+                    bus,
+                    cav,
+                    streams,
+                    options.over_link,
+                    options.neighbours.clone(),
+                )
+            })
             .transpose()?;
         Ok(Self {
             bus,
@@ -190,10 +226,16 @@ impl<'a> Node<'a> {
             models: PeerModels::new(ego.detector()),
             pairing: Pairing::new(options.pairing),
             frames: VecDeque::new(),
-            pace: options.sets_pace.then(|| PaceKeeper::open(bus, cav)).transpose()?,
+            pace: options
+                .sets_pace
+                .then(|| PaceKeeper::open(bus, cav))
+                .transpose()?,
             own_nanos: None,
             ended: BTreeSet::new(),
-            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.waiting(RESULTS))?,
+            detections: bus.publisher(
+                topic(Stream::Detections),
+                PublisherOptions::DETECTIONS.waiting(RESULTS),
+            )?,
             json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
             report: NodeReport::default(),
             _own: own,
@@ -226,7 +268,10 @@ impl<'a> Node<'a> {
     /// Ends after the own agent: the frames that wait have their usual time, the neighbours' last messages are counted.
     fn finish(&mut self, stop: &Stop) -> Result<(), BusError> {
         let until = Instant::now() + LAST_WORDS.max(self.options.deadline);
-        while !stop.requested() && Instant::now() < until && !(self.frames.is_empty() && self.all_have_ended()) {
+        while !stop.requested()
+            && Instant::now() < until
+            && !(self.frames.is_empty() && self.all_have_ended())
+        {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
@@ -240,7 +285,9 @@ impl<'a> Node<'a> {
         // Messages that wait for a frame that will not come.
         let (_, dropped) = self.pairing.pair(u64::MAX);
         for lost in dropped {
-            self.bus.stats().dropped(&self.topic(&lost.cav), lost.reason);
+            self.bus
+                .stats()
+                .dropped(&self.topic(&lost.cav), lost.reason);
         }
         Ok(())
     }
@@ -255,11 +302,16 @@ impl<'a> Node<'a> {
     }
 
     fn all_have_ended(&self) -> bool {
-        self.neighbourhood.iter().flat_map(Neighbourhood::members).all(|cav| self.ended.contains(cav))
+        self.neighbourhood
+            .iter()
+            .flat_map(Neighbourhood::members)
+            .all(|cav| self.ended.contains(cav))
     }
 
     fn look_round(&mut self) -> Result<(), BusError> {
-        let Some(neighbourhood) = &mut self.neighbourhood else { return Ok(()) };
+        let Some(neighbourhood) = &mut self.neighbourhood else {
+            return Ok(());
+        };
         for cav in neighbourhood.update(self.bus, &self.inbox)? {
             let topic = self.topic(&cav);
             self.models.forget(&cav);
@@ -277,7 +329,9 @@ impl<'a> Node<'a> {
 
     fn next_moment(&self) -> Instant {
         let soon = Instant::now() + LOOK_ROUND;
-        self.frames.front().map_or(soon, |frame| soon.min(frame.begun + self.options.deadline))
+        self.frames
+            .front()
+            .map_or(soon, |frame| soon.min(frame.begun + self.options.deadline))
     }
 }
 

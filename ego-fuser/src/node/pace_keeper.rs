@@ -21,7 +21,10 @@ pub(super) struct PaceKeeper {
 
 impl PaceKeeper {
     pub(super) fn open(bus: &Bus, cav: &CavId) -> Result<Self, BusError> {
-        let topic = Topic::Stream { cav: cav.clone(), stream: Stream::Pace };
+        let topic = Topic::Stream {
+            cav: cav.clone(),
+            stream: Stream::Pace,
+        };
         let now = Instant::now();
         Ok(Self {
             control: PaceControl::new(now),
@@ -33,9 +36,15 @@ impl PaceKeeper {
 
     /// Judges a frame of the own agent that has waited for another one.
     pub(super) fn judge(&mut self, capture_nanos: u64, waited: Duration) {
-        let Some(pace) = self.control.judge(capture_nanos, waited, Instant::now()) else { return };
+        let Some(pace) = self.control.judge(capture_nanos, waited, Instant::now()) else {
+            return;
+        };
         let interval = Duration::from_nanos(pace.interval_nanos);
-        tracing::info!(capture_nanos, ?interval, "the pace of the fleet changes; interval 0: every sweep");
+        tracing::info!(
+            capture_nanos,
+            ?interval,
+            "the pace of the fleet changes; interval 0: every sweep"
+        );
         self.publish(pace);
     }
 

@@ -78,7 +78,9 @@ pub struct KeptMaps {
 /// True if a parameter belongs to the encoder.
 #[must_use]
 pub fn is_encoder(name: &str) -> bool {
-    ["pillar_vfe.", "backbone.", "shrink_conv."].iter().any(|prefix| name.starts_with(prefix))
+    ["pillar_vfe.", "backbone.", "shrink_conv."]
+        .iter()
+        .any(|prefix| name.starts_with(prefix))
 }
 
 /// Maps of the sweeps of some scenarios, one after another in a file.
@@ -110,20 +112,35 @@ impl FeatureStore {
         threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, FeatureStoreError> {
-        let [encoder, data] = [weights.sha256_of(is_encoder), dataset::content_sha256(scenarios)];
+        let [encoder, data] = [
+            weights.sha256_of(is_encoder),
+            dataset::content_sha256(scenarios),
+        ];
         let dtype = format!("{:?}", kept.dtype).to_lowercase();
         let scale = match kept.intensity_scale {
             IntensityScale::AUTO => String::new(),
             scale => format!("-intensity{scale}"),
         };
-        let scales = weights.activation_scales()?.map(|scales| scales.sha256_of(is_encoder));
-        let precision = scales.map_or(String::new(), |scales| format!("-int8-{}", &scales[..HASH_DIGITS]));
+        let scales = weights
+            .activation_scales()?
+            .map(|scales| scales.sha256_of(is_encoder));
+        let precision = scales.map_or(String::new(), |scales| {
+            format!("-int8-{}", &scales[..HASH_DIGITS])
+        });
         let [encoder, data] = [&encoder[..HASH_DIGITS], &data[..HASH_DIGITS]];
         let name = format!("{encoder}-{data}-{dtype}{scale}{precision}-wire{WIRE_VERSION}.maps");
         let path = kept.folder.join(name);
-        let io = |source| FeatureStoreError::Io { path: path.clone(), source };
+        let io = |source| FeatureStoreError::Io {
+            path: path.clone(),
+            source,
+        };
         fs::create_dir_all(&kept.folder).map_err(io)?;
-        let file = OpenOptions::new().create(true).read(true).append(true).open(&path).map_err(io)?;
+        let file = OpenOptions::new()
+            .create(true)
+            .read(true)
+            .append(true)
+            .open(&path)
+            .map_err(io)?;
         // Of two trainings that start together one encodes, the other waits for it.
         file.lock().map_err(io)?;
         let starts = starts(&file).map_err(io)?;
@@ -133,8 +150,14 @@ impl FeatureStore {
         for scenario in scenarios {
             first.push(first[first.len() - 1] + scenario.agents.len() * scenario.ticks.len());
         }
-        let names = scenarios.iter().map(|scenario| scenario.name.clone()).collect();
-        let ticks = scenarios.iter().map(|scenario| scenario.ticks.len()).collect();
+        let names = scenarios
+            .iter()
+            .map(|scenario| scenario.name.clone())
+            .collect();
+        let ticks = scenarios
+            .iter()
+            .map(|scenario| scenario.ticks.len())
+            .collect();
         let encoder = SweepEncoder {
             weights: Arc::clone(weights),
             scenarios: scenarios.into(),
@@ -143,7 +166,14 @@ impl FeatureStore {
             path: path.clone(),
             detector: None,
         };
-        let mut store = Self { path: path.clone(), file, names, first, ticks, starts };
+        let mut store = Self {
+            path: path.clone(),
+            file,
+            names,
+            first,
+            ticks,
+            starts,
+        };
         store.fill(encoder, kept.limit_bytes, threads, on_sweep)?;
         store.file.unlock().map_err(|source| store.io(source))?;
         Ok(store)
@@ -162,12 +192,17 @@ impl FeatureStore {
         }
         let mut encoder = encoder;
         let mut messages =
-            Prefetch::start(threads.min(all - stored), stored as u64, move |sweep| encoder.message(sweep as usize));
+            Prefetch::start(threads.min(all - stored), stored as u64, move |sweep| {
+                encoder.message(sweep as usize)
+            });
         while self.sweeps().0 < all && self.bytes() < limit_bytes {
             let message = messages.next_batch()??;
-            let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
+            let length = u32::try_from(message.len())
+                .map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
             let record = [&length.to_le_bytes()[..], &message].concat();
-            self.file.write_all(&record).map_err(|source| self.io(source))?;
+            self.file
+                .write_all(&record)
+                .map_err(|source| self.io(source))?;
             self.starts.push(self.bytes() + record.len() as u64);
             on_sweep(self.sweeps().0, all);
         }
@@ -179,7 +214,12 @@ impl FeatureStore {
     ///
     /// # Errors
     /// [`FeatureStoreError`] when the file cannot be read or was changed.
-    pub fn map(&self, scenario: usize, agent: usize, tick: usize) -> Result<Option<Tensor>, FeatureStoreError> {
+    pub fn map(
+        &self,
+        scenario: usize,
+        agent: usize,
+        tick: usize,
+    ) -> Result<Option<Tensor>, FeatureStoreError> {
         let place = self.first[scenario] + agent * self.ticks[scenario] + tick;
         let Some(&[start, end]) = self.starts.get(place..place + 2) else {
             return Ok(None);
@@ -189,13 +229,25 @@ impl FeatureStore {
             return Ok(None);
         }
         let mut bytes = vec![0; (end - start) as usize];
-        self.file.read_exact_at(&mut bytes, start).map_err(|source| self.io(source))?;
+        self.file
+            .read_exact_at(&mut bytes, start)
+            .map_err(|source| self.io(source))?;
         let decode = || -> Result<_, WireError> {
             let (_, message): (Header, Bev) = wire::decode([bytes.as_slice()], &Limits::default())?;
             message.features.decode(&Limits::default())
         };
-        let features = decode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })?.features;
-        let size = [1, i64::from(features.channels), i64::from(features.grid.height), i64::from(features.grid.width)];
+        let features = decode()
+            .map_err(|source| FeatureStoreError::Wire {
+                path: self.path.clone(),
+                source,
+            })?
+            .features;
+        let size = [
+            1,
+            i64::from(features.channels),
+            i64::from(features.grid.height),
+            i64::from(features.grid.width),
+        ];
         Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
     }
 
@@ -222,7 +274,10 @@ impl FeatureStore {
     }
 
     fn io(&self, source: io::Error) -> FeatureStoreError {
-        FeatureStoreError::Io { path: self.path.clone(), source }
+        FeatureStoreError::Io {
+            path: self.path.clone(),
+            source,
+        }
     }
 }
 
@@ -259,7 +314,11 @@ pub struct MapSource {
 impl Clone for MapSource {
     /// The encoder is built anew where it is needed: every thread has its own.
     fn clone(&self) -> Self {
-        Self { store: Arc::clone(&self.store), weights: Arc::clone(&self.weights), encoder: None }
+        Self {
+            store: Arc::clone(&self.store),
+            weights: Arc::clone(&self.weights),
+            encoder: None,
+        }
     }
 }
 
@@ -267,7 +326,11 @@ impl MapSource {
     /// Reads from `store`, which was made with `weights`.
     #[must_use]
     pub fn new(store: Arc<FeatureStore>, weights: Arc<Weights>) -> Self {
-        Self { store, weights, encoder: None }
+        Self {
+            store,
+            weights,
+            encoder: None,
+        }
     }
 
     /// The index of a scenario.
@@ -295,7 +358,8 @@ impl MapSource {
             Some(encoder) => encoder,
             None => {
                 let config = self.weights.detector_config()?;
-                self.encoder.insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
+                self.encoder
+                    .insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };
         Ok(encoder.encode(&frame.points)?.features)

@@ -101,7 +101,10 @@ impl LabelTensors {
             let weight = 1.0 / labels.positives.len().max(1) as f32;
             score_weight[first..first + anchors].fill(weight);
             if unassigned == Unassigned::Ignored {
-                labels.unassigned.iter().for_each(|&anchor| score_weight[first + anchor] = 0.0);
+                labels
+                    .unassigned
+                    .iter()
+                    .for_each(|&anchor| score_weight[first + anchor] = 0.0);
             }
             for entry in &labels.positives {
                 positive[first + entry.anchor] = 1.0;
@@ -113,8 +116,12 @@ impl LabelTensors {
         let shape = [samples.len() as i64, anchors as i64];
         Self {
             positive: Tensor::from_slice(&positive).view(shape).to_device(device),
-            score_weight: Tensor::from_slice(&score_weight).view(shape).to_device(device),
-            code: Tensor::from_slice(&code).view([index.len() as i64, BOX_CODE as i64]).to_device(device),
+            score_weight: Tensor::from_slice(&score_weight)
+                .view(shape)
+                .to_device(device),
+            code: Tensor::from_slice(&code)
+                .view([index.len() as i64, BOX_CODE as i64])
+                .to_device(device),
             index: Tensor::from_slice(&index).to_device(device),
             box_weight: Tensor::from_slice(&box_weight).to_device(device),
         }
@@ -136,7 +143,8 @@ pub fn detection_loss(
     config: &LossConfig,
 ) -> Result<Loss, TchError> {
     let batch = scores.size()[0].max(1) as f64;
-    let score = focal_loss(scores, labels, config)?.f_sum(Kind::Float)? * (config.score_weight / batch);
+    let score =
+        focal_loss(scores, labels, config)?.f_sum(Kind::Float)? * (config.score_weight / batch);
     let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)? * (config.box_weight / batch);
     Ok(Loss { score, boxes })
 }
@@ -149,15 +157,24 @@ pub fn detection_loss(
 ///
 /// # Errors
 /// [`TchError`] when a sample has other views than offsets.
-pub(crate) fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -> Result<Tensor, TchError> {
+pub(crate) fn alignment_loss(
+    corrections: &[Option<Tensor>],
+    offsets: &[Vec<Offset>],
+) -> Result<Tensor, TchError> {
     let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
     let mut losses = Vec::new();
     for (moved_by, offsets) in corrections.iter().zip(offsets) {
         let Some(moved_by) = moved_by else { continue };
-        let wanted: Vec<f32> =
-            offsets.iter().skip(1).flat_map(|Offset(offset)| offset.map(|value| value as f32)).collect();
-        let wanted = Tensor::f_from_slice(&wanted)?.f_view([-1, 3])?.f_to_device(moved_by.device())?;
-        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
+        let wanted: Vec<f32> = offsets
+            .iter()
+            .skip(1)
+            .flat_map(|Offset(offset)| offset.map(|value| value as f32))
+            .collect();
+        let wanted = Tensor::f_from_slice(&wanted)?
+            .f_view([-1, 3])?
+            .f_to_device(moved_by.device())?;
+        let off =
+            (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
         let left_m = off.f_abs()?.f_amax([1_i64].as_slice(), true)?;
         let off = off * left_m.f_le(RECOVERABLE_M)?;
         losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
@@ -169,29 +186,50 @@ pub(crate) fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offs
 }
 
 /// Weighted focal loss of every anchor, `[B, H*W*A]`.
-fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor, TchError> {
+fn focal_loss(
+    scores: &Tensor,
+    labels: &LabelTensors,
+    config: &LossConfig,
+) -> Result<Tensor, TchError> {
     let target = &labels.positive;
-    let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?.f_reshape(target.size())?;
+    let logits = scores
+        .f_to_kind(Kind::Float)?
+        .f_permute([0, 2, 3, 1])?
+        .f_reshape(target.size())?;
     let probability = logits.f_sigmoid()?;
     let background: Tensor = 1.0 - target;
     // 1 - p_t of the paper: error of the prediction.
     let wrong: Tensor = target * (1.0 - &probability) + &background * &probability;
     let balance = target * config.alpha + &background * (1.0 - config.alpha);
-    let entropy =
-        logits.f_binary_cross_entropy_with_logits(target, None::<&Tensor>, None::<&Tensor>, tch::Reduction::None)?;
+    let entropy = logits.f_binary_cross_entropy_with_logits(
+        target,
+        None::<&Tensor>,
+        None::<&Tensor>,
+        tch::Reduction::None,
+    )?;
     Ok(balance * wrong.f_pow_tensor_scalar(config.gamma)? * entropy * &labels.score_weight)
 }
 
 /// Weighted smooth L1 of every positive, `[P, 7]`.
-fn box_loss(boxes: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor, TchError> {
+fn box_loss(
+    boxes: &Tensor,
+    labels: &LabelTensors,
+    config: &LossConfig,
+) -> Result<Tensor, TchError> {
     let code = BOX_CODE as i64;
-    let predicted = boxes.f_permute([0, 2, 3, 1])?.f_reshape([-1, code])?.f_index_select(0, &labels.index)?;
+    let predicted = boxes
+        .f_permute([0, 2, 3, 1])?
+        .f_reshape([-1, code])?
+        .f_index_select(0, &labels.index)?;
     let difference = predicted.f_to_kind(Kind::Float)? - &labels.code;
     let linear = difference.f_narrow(1, 0, code - 1)?;
     let turn = difference.f_narrow(1, code - 1, 1)?.f_sin()?;
     let distance = Tensor::f_cat(&[linear, turn], 1)?.f_abs()?;
     let squared = distance.f_square()? * (0.5 / config.beta);
-    let loss = squared.f_where_self(&distance.f_lt(config.beta)?, &(&distance - 0.5 * config.beta))?;
+    let loss = squared.f_where_self(
+        &distance.f_lt(config.beta)?,
+        &(&distance - 0.5 * config.beta),
+    )?;
     Ok(loss * labels.box_weight.f_unsqueeze(1)?)
 }
 
@@ -201,11 +239,23 @@ mod tests {
     use fusion::targets::Positive;
 
     fn labels(positives: Vec<Positive>, unassigned: Vec<usize>) -> Labels {
-        Labels { anchors: 2 * 3 * 2, positives, unassigned }
+        Labels {
+            anchors: 2 * 3 * 2,
+            positives,
+            unassigned,
+        }
     }
 
-    fn loss(scores: &Tensor, boxes: &Tensor, labels: &[Labels], unassigned: Unassigned) -> (f64, f64) {
-        let config = LossConfig { unassigned, ..LossConfig::default() };
+    fn loss(
+        scores: &Tensor,
+        boxes: &Tensor,
+        labels: &[Labels],
+        unassigned: Unassigned,
+    ) -> (f64, f64) {
+        let config = LossConfig {
+            unassigned,
+            ..LossConfig::default()
+        };
         let tensors = LabelTensors::gather(labels, unassigned, Device::Cpu);
         let loss = detection_loss(scores, boxes, &tensors, &config).unwrap();
         (loss.score.double_value(&[]), loss.boxes.double_value(&[]))
@@ -213,13 +263,21 @@ mod tests {
 
     fn maps() -> (Tensor, Tensor) {
         let options = (Kind::Float, Device::Cpu);
-        (Tensor::zeros([1, 2, 2, 3], options), Tensor::zeros([1, 14, 2, 3], options))
+        (
+            Tensor::zeros([1, 2, 2, 3], options),
+            Tensor::zeros([1, 14, 2, 3], options),
+        )
     }
 
     #[test]
     fn an_undecided_map_costs_its_entropy() {
         let (scores, boxes) = maps();
-        let (score, regression) = loss(&scores, &boxes, &[labels(vec![], vec![])], Unassigned::Background);
+        let (score, regression) = loss(
+            &scores,
+            &boxes,
+            &[labels(vec![], vec![])],
+            Unassigned::Background,
+        );
         // Twelve negatives at p = 1/2: 0.75 * (1/2)^2 * ln 2 each.
         assert!((score - 12.0 * 0.75 * 0.25 * 2f64.ln()).abs() < 1e-5);
         assert_eq!(regression, 0.0);
@@ -236,34 +294,73 @@ mod tests {
 
     #[test]
     fn the_alignment_term_is_zero_where_errors_are_undone_and_weighs_turns_by_an_arm() {
-        let offsets = vec![vec![Offset::default(), Offset([1.0, -0.5, 0.02]), Offset([0.0, 2.0, 0.0])]];
+        let offsets = vec![vec![
+            Offset::default(),
+            Offset([1.0, -0.5, 0.02]),
+            Offset([0.0, 2.0, 0.0]),
+        ]];
         let undone = Tensor::from_slice(&[1.0f32, -0.5, 0.02, 0.0, 2.0, 0.0]).view([2, 3]);
         let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]| {
-            alignment_loss(corrections, offsets).unwrap().double_value(&[])
+            alignment_loss(corrections, offsets)
+                .unwrap()
+                .double_value(&[])
         };
         assert!(loss(&[Some(undone.shallow_clone())], &offsets) < 1e-12);
         // No correction: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
         let still = Tensor::zeros([2, 3], (Kind::Float, Device::Cpu)).set_requires_grad(true);
         let expected = (0.5 + 0.125 + 0.08 + 1.5) / 6.0;
         assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
-        alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]]).unwrap().backward();
-        assert!(still.grad().double_value(&[0, 0]) < 0.0, "towards the offset");
-        let lost = vec![vec![Offset::default(), Offset([9.0, 0.0, 0.0]), Offset([0.0, 0.0, 1.0])]];
-        assert_eq!(loss(&[Some(still.detach())], &lost), 0.0, "a lost vehicle has no alignment loss");
-        assert_eq!(loss(&[None], &[vec![Offset::default()]]), 0.0, "ego-only there is nothing to align");
+        alignment_loss(
+            &[Some(still.shallow_clone()), None],
+            &[offsets[0].clone(), vec![]],
+        )
+        .unwrap()
+        .backward();
+        assert!(
+            still.grad().double_value(&[0, 0]) < 0.0,
+            "towards the offset"
+        );
+        let lost = vec![vec![
+            Offset::default(),
+            Offset([9.0, 0.0, 0.0]),
+            Offset([0.0, 0.0, 1.0]),
+        ]];
+        assert_eq!(
+            loss(&[Some(still.detach())], &lost),
+            0.0,
+            "a lost vehicle has no alignment loss"
+        );
+        assert_eq!(
+            loss(&[None], &[vec![Offset::default()]]),
+            0.0,
+            "ego-only there is nothing to align"
+        );
     }
 
     #[test]
     fn the_box_term_reads_the_channels_of_its_anchor() {
         let (scores, mut boxes) = maps();
         // Row 1, column 2, anchor 1.
-        let positive = Positive { anchor: (3 + 2) * 2 + 1, code: [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 3.0] };
+        let positive = Positive {
+            anchor: (3 + 2) * 2 + 1,
+            code: [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 3.0],
+        };
         let _ = boxes.get(0).get(7 + 4).get(1).get(2).fill_(1.0);
         let _ = boxes.get(0).get(7 + 6).get(1).get(2).fill_(3.0);
-        let (_, regression) = loss(&scores, &boxes, &[labels(vec![positive], vec![])], Unassigned::Background);
+        let (_, regression) = loss(
+            &scores,
+            &boxes,
+            &[labels(vec![positive], vec![])],
+            Unassigned::Background,
+        );
         assert!(regression.abs() < 1e-6);
         let _ = boxes.get(0).get(7).get(1).get(2).fill_(1.0);
-        let (_, regression) = loss(&scores, &boxes, &[labels(vec![positive], vec![])], Unassigned::Background);
+        let (_, regression) = loss(
+            &scores,
+            &boxes,
+            &[labels(vec![positive], vec![])],
+            Unassigned::Background,
+        );
         assert!((regression - 2.0 * (1.0 - 0.5 / 9.0)).abs() < 1e-5);
         let _ = boxes.fill_(0.0);
     }

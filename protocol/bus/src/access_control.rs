@@ -33,10 +33,13 @@ impl AccessControl {
         for member in &self.members {
             let name = member.to_string();
             let own = rules_of(&name, &member.rights(&self.runs));
-            let names: Vec<Value> =
-                [json!(SUBSCRIBERS_RULE)].into_iter().chain(own.iter().map(|rule| rule["id"].clone())).collect();
+            let names: Vec<Value> = [json!(SUBSCRIBERS_RULE)]
+                .into_iter()
+                .chain(own.iter().map(|rule| rule["id"].clone()))
+                .collect();
             rules.extend(own);
-            subjects.push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
+            subjects
+                .push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
             policies.push(json!({"id": name, "rules": names, "subjects": [name]}));
         }
         json!({
@@ -51,15 +54,18 @@ impl AccessControl {
 
 /// zenoh's `low_pass_filter`: the router rejects messages above the size limit of their key.
 pub(super) fn size_limits() -> Value {
-    let limits = access::size_limits().into_iter().enumerate().map(|(index, (keys, bytes))| {
-        json!({
-            "id": format!("size-{index}"),
-            "flows": ["ingress"],
-            "messages": ["put"],
-            "key_exprs": keys.iter().map(KeyExpr::as_str).collect::<Vec<_>>(),
-            "size_limit": bytes,
-        })
-    });
+    let limits = access::size_limits()
+        .into_iter()
+        .enumerate()
+        .map(|(index, (keys, bytes))| {
+            json!({
+                "id": format!("size-{index}"),
+                "flows": ["ingress"],
+                "messages": ["put"],
+                "key_exprs": keys.iter().map(KeyExpr::as_str).collect::<Vec<_>>(),
+                "size_limit": bytes,
+            })
+        });
     limits.collect()
 }
 
@@ -86,9 +92,10 @@ fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
             Operation::Publish => (&["put"], &[]),
             Operation::Subscribe => (&["declare_subscriber"], &["put"]),
             Operation::DeclareLiveliness => (&["liveliness_token"], &[]),
-            Operation::SubscribeLiveliness => {
-                (&["declare_liveliness_subscriber", "liveliness_query"], &["liveliness_token"])
-            }
+            Operation::SubscribeLiveliness => (
+                &["declare_liveliness_subscriber", "liveliness_query"],
+                &["liveliness_token"],
+            ),
             Operation::Query => (&["query"], &[]),
         };
         for (flow, messages) in [("ingress", from), ("egress", to)] {
@@ -106,9 +113,13 @@ mod tests {
 
     #[test]
     fn no_principal_may_answer_queries_or_delete() {
-        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"];
-        let access_control =
-            AccessControl { members: members.map(|name| name.parse().unwrap()).into(), runs: RunScope::Any };
+        let members = [
+            "agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2",
+        ];
+        let access_control = AccessControl {
+            members: members.map(|name| name.parse().unwrap()).into(),
+            runs: RunScope::Any,
+        };
         let rules = access_control.rules();
         assert_eq!(rules["default_permission"], "deny");
         let rules = rules["rules"].as_array().unwrap();
@@ -116,9 +127,21 @@ mod tests {
             assert_eq!(rule["permission"], "allow");
             let messages = rule["messages"].as_array().unwrap();
             let never = ["reply", "declare_queryable", "delete"];
-            assert!(messages.iter().all(|message| !never.contains(&message.as_str().unwrap())), "{rule}");
+            assert!(
+                messages
+                    .iter()
+                    .all(|message| !never.contains(&message.as_str().unwrap())),
+                "{rule}"
+            );
         }
-        let ids: std::collections::BTreeSet<&str> = rules.iter().map(|rule| rule["id"].as_str().unwrap()).collect();
-        assert_eq!(ids.len(), rules.len(), "zenoh requires a unique id per rule");
+        let ids: std::collections::BTreeSet<&str> = rules
+            .iter()
+            .map(|rule| rule["id"].as_str().unwrap())
+            .collect();
+        assert_eq!(
+            ids.len(),
+            rules.len(),
+            "zenoh requires a unique id per rule"
+        );
     }
 }

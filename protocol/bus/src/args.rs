@@ -16,7 +16,10 @@ use tracing_subscriber::{EnvFilter, Registry};
 
 use super::handshake_failures::HandshakeCounter;
 use super::shutdown::Stop;
-use super::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, InboxLimits, SharedMemory, process_id};
+use super::{
+    Bus, BusError, BusOptions, Credentials, Endpoint, Identity, InboxLimits, SharedMemory,
+    process_id,
+};
 
 /// Maximum duration of a shutdown after the request: within the 5 s of a whole fleet.
 pub const STOP_LIMIT: Duration = Duration::from_secs(4);
@@ -90,7 +93,8 @@ impl BusConfig {
             Some(listen) => BusOptions::router(listen.clone()),
             None => BusOptions::client(self.connect.clone()),
         };
-        options.connect_timeout = Duration::try_from_secs_f64(self.connect_timeout_s).unwrap_or(Duration::ZERO);
+        options.connect_timeout =
+            Duration::try_from_secs_f64(self.connect_timeout_s).unwrap_or(Duration::ZERO);
         options.shared_memory = self.shared_memory();
         options.max_message_bytes = self.max_message_mib << 20;
         Ok(match &self.keys {
@@ -117,7 +121,11 @@ impl BusConfig {
     /// # Errors
     /// [`BusError`] states the endpoint and the remedy.
     pub fn join(&self, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
-        let identity = Identity { run: run.clone(), process: process_id(role, cav), cav: cav.clone() };
+        let identity = Identity {
+            run: run.clone(),
+            process: process_id(role, cav),
+            cav: cav.clone(),
+        };
         let options = self.options()?;
         if let Some(credentials) = &options.credentials {
             credentials.check_name(identity.process.as_str())?;
@@ -151,13 +159,21 @@ impl BusConfig {
 #[command(next_help_heading = "Limits on received messages")]
 pub struct InboxConfig {
     /// Messages per second of one sender; messages beyond are dropped unread (`rate_limit` in the ledger).
-    #[arg(id = "inbox_messages_per_s", long = "inbox-messages-per-s", value_name = "N")]
+    #[arg(
+        id = "inbox_messages_per_s",
+        long = "inbox-messages-per-s",
+        value_name = "N"
+    )]
     pub messages_per_s: f64,
     /// MiB per second of one sender, on each of its streams.
     #[arg(id = "inbox_mib_per_s", long = "inbox-mib-per-s", value_name = "MIB")]
     pub mib_per_s: f64,
     /// MiB that may wait to be decoded, of all senders together.
-    #[arg(id = "inbox_waiting_mib", long = "inbox-waiting-mib", value_name = "MIB")]
+    #[arg(
+        id = "inbox_waiting_mib",
+        long = "inbox-waiting-mib",
+        value_name = "MIB"
+    )]
     pub waiting_mib: usize,
 }
 
@@ -165,8 +181,16 @@ const MIB: f64 = (1 << 20) as f64;
 
 impl Default for InboxConfig {
     fn default() -> Self {
-        let InboxLimits { messages_per_s, bytes_per_s, waiting_bytes } = InboxLimits::PEERS;
-        Self { messages_per_s, mib_per_s: bytes_per_s / MIB, waiting_mib: waiting_bytes >> 20 }
+        let InboxLimits {
+            messages_per_s,
+            bytes_per_s,
+            waiting_bytes,
+        } = InboxLimits::PEERS;
+        Self {
+            messages_per_s,
+            mib_per_s: bytes_per_s / MIB,
+            waiting_mib: waiting_bytes >> 20,
+        }
     }
 }
 
@@ -202,15 +226,22 @@ pub fn log_to_stderr() {
     };
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(ours));
     // Colours are for terminals: a supervisor redirects the log into a file.
-    let to_stderr =
-        tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
+    let to_stderr = tracing_subscriber::fmt::layer()
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal());
     // A second call, in tests, changes nothing.
-    let _ = Registry::default().with(to_stderr.with_filter(filter)).with(HandshakeCounter).try_init();
+    let _ = Registry::default()
+        .with(to_stderr.with_filter(filter))
+        .with(HandshakeCounter)
+        .try_init();
 }
 
 /// Filter with the project's own crates at a level.
 fn ours_at(level: &str) -> String {
     let crates = ["protocol", "sim_replay", "agent", "ego_fuser", "deploy"];
-    let ours: String = crates.iter().map(|name| format!(",{name}={level}")).collect();
+    let ours: String = crates
+        .iter()
+        .map(|name| format!(",{name}={level}"))
+        .collect();
     format!("warn,zenoh_link_commons::quic=error{ours}")
 }

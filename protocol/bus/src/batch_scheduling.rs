@@ -2,7 +2,8 @@
 
 use rustix::process::{getpriority_process, setpriority_process};
 use thread_priority::{
-    NormalThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
+    NormalThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
 };
 
 /// Sets the batch policy for the calling thread: a woken thread waits for its turn; its share of the processor is
@@ -12,7 +13,9 @@ use thread_priority::{
 /// On a fully loaded machine the clock thread, after handing a feature map to its sending thread, continued 8 to 13 ms
 /// later, when the map was written. Threads of the policy `SCHED_BATCH` never preempt.
 pub(super) fn use_batch_scheduling() {
-    let Ok(niceness) = getpriority_process(None) else { return };
+    let Ok(niceness) = getpriority_process(None) else {
+        return;
+    };
     // The call also sets a niceness, which only root may set. In either case the old niceness is restored.
     let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch);
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Max, policy);
@@ -30,10 +33,17 @@ mod tests {
         let thread = std::thread::spawn(|| {
             let before = getpriority_process(None).unwrap();
             use_batch_scheduling();
-            (before, getpriority_process(None).unwrap(), thread_schedule_policy().unwrap())
+            (
+                before,
+                getpriority_process(None).unwrap(),
+                thread_schedule_policy().unwrap(),
+            )
         });
         let (before, after, policy) = thread.join().unwrap();
         assert_eq!(before, after);
-        assert_eq!(policy, ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch));
+        assert_eq!(
+            policy,
+            ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch)
+        );
     }
 }

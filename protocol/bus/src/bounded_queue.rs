@@ -53,7 +53,11 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     #[must_use]
     pub fn new(lane_capacity: usize, max_lanes: usize) -> Self {
         Self {
-            state: Mutex::new(State { lanes: BTreeMap::new(), next_arrival: 0, closed: false }),
+            state: Mutex::new(State {
+                lanes: BTreeMap::new(),
+                next_arrival: 0,
+                closed: false,
+            }),
             changed: Condvar::new(),
             lane_capacity: lane_capacity.max(1),
             max_lanes: max_lanes.max(1),
@@ -75,7 +79,9 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
             Ok(()) => None,
         };
         self.append(state, key, item);
-        replaced.map_or(PushOutcome::Queued, |(_, older)| PushOutcome::Replaced(older))
+        replaced.map_or(PushOutcome::Queued, |(_, older)| {
+            PushOutcome::Replaced(older)
+        })
     }
 
     /// Appends `item` to its lane, waiting for room without a time limit.
@@ -86,7 +92,12 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
                 Ok(()) => break,
                 Err(Full::Closed) => return PushOutcome::Closed(item),
                 Err(Full::NoLane) => return PushOutcome::NoLane(item),
-                Err(Full::Lane) => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+                Err(Full::Lane) => {
+                    state = self
+                        .changed
+                        .wait(state)
+                        .unwrap_or_else(PoisonError::into_inner)
+                }
             }
         }
         self.append(state, key, item);
@@ -105,13 +116,19 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
                 return Pop::Closed;
             }
             state = match deadline {
-                None => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
+                None => self
+                    .changed
+                    .wait(state)
+                    .unwrap_or_else(PoisonError::into_inner),
                 Some(deadline) => {
                     let left = deadline.saturating_duration_since(Instant::now());
                     if left.is_zero() {
                         return Pop::TimedOut;
                     }
-                    self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0
+                    self.changed
+                        .wait_timeout(state, left)
+                        .unwrap_or_else(PoisonError::into_inner)
+                        .0
                 }
             };
         }
@@ -162,7 +179,11 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     fn append(&self, mut state: MutexGuard<'_, State<K, T>>, key: K, item: T) {
         let arrival = state.next_arrival;
         state.next_arrival += 1;
-        state.lanes.entry(key).or_default().push_back((arrival, item));
+        state
+            .lanes
+            .entry(key)
+            .or_default()
+            .push_back((arrival, item));
         // The woken thread may run at once: the lock must be free then.
         drop(state);
         self.changed.notify_all();
@@ -177,8 +198,10 @@ enum Full {
 
 /// Empty lanes are removed, so that peers that join and leave do not use the lanes up.
 fn pop_oldest<K: Ord + Clone, T>(lanes: &mut BTreeMap<K, VecDeque<(u64, T)>>) -> Option<(K, T)> {
-    let oldest =
-        lanes.iter().filter_map(|(key, lane)| Some((lane.front()?.0, key))).min_by_key(|(arrival, _)| *arrival);
+    let oldest = lanes
+        .iter()
+        .filter_map(|(key, lane)| Some((lane.front()?.0, key)))
+        .min_by_key(|(arrival, _)| *arrival);
     let key = oldest?.1.clone();
     let lane = lanes.get_mut(&key)?;
     let (_, item) = lane.pop_front()?;
@@ -213,7 +236,11 @@ mod tests {
         assert_eq!(queue.push(2, ()), PushOutcome::Queued);
         assert_eq!(queue.push(3, ()), PushOutcome::NoLane(()));
         let _ = queue.take(None);
-        assert_eq!(queue.push(3, ()), PushOutcome::Queued, "an emptied lane is free again");
+        assert_eq!(
+            queue.push(3, ()),
+            PushOutcome::Queued,
+            "an emptied lane is free again"
+        );
     }
 
     #[test]
@@ -229,7 +256,10 @@ mod tests {
     #[test]
     fn an_empty_queue_times_out() {
         let queue = BoundedQueue::<(), ()>::new(1, 1);
-        assert_eq!(queue.take(Some(Instant::now() + Duration::from_millis(5))), Pop::TimedOut);
+        assert_eq!(
+            queue.take(Some(Instant::now() + Duration::from_millis(5))),
+            Pop::TimedOut
+        );
     }
 
     #[test]

@@ -62,7 +62,11 @@ impl Bus {
     /// # Errors
     /// [`BusError::Thread`] when the system cannot start a thread.
     pub fn over(session: Session, identity: Identity) -> Result<Self, BusError> {
-        let (epoch, stats, status) = (new_epoch(), MessageStats::new(identity.process.clone()), StatusPublisher::new());
+        let (epoch, stats, status) = (
+            new_epoch(),
+            MessageStats::new(identity.process.clone()),
+            StatusPublisher::new(),
+        );
         let status_thread = status.start(StatusSender {
             session: session.clone(),
             run: identity.run.clone(),
@@ -71,14 +75,27 @@ impl Bus {
             stats: stats.clone(),
         })?;
         let pool = SharedPool::none();
-        Ok(Self { session, identity, epoch, stats, pool, status, status_thread, metrics: None })
+        Ok(Self {
+            session,
+            identity,
+            epoch,
+            stats,
+            pool,
+            status,
+            status_thread,
+            metrics: None,
+        })
     }
 
     /// Serves the counters, and those of other processes, to Prometheus until this is dropped; returns the address.
     ///
     /// # Errors
     /// [`BusError::Metrics`] when the address cannot be bound.
-    pub fn serve_metrics(&mut self, address: SocketAddr, others: Vec<MetricsPeer>) -> Result<SocketAddr, BusError> {
+    pub fn serve_metrics(
+        &mut self,
+        address: SocketAddr,
+        others: Vec<MetricsPeer>,
+    ) -> Result<SocketAddr, BusError> {
         let server = MetricsServer::start(address, &self.stats, others);
         let server = server.map_err(|cause| BusError::Metrics { address, cause })?;
         Ok(self.metrics.insert(server).address())
@@ -106,14 +123,24 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError`] when zenoh or the system fails.
-    pub fn publisher(&self, topic: Topic, options: PublisherOptions) -> Result<Publisher, BusError> {
+    pub fn publisher(
+        &self,
+        topic: Topic,
+        options: PublisherOptions,
+    ) -> Result<Publisher, BusError> {
         // A sensor message names the vehicle that it belongs to.
         let cav = match &topic {
             Topic::Stream { cav, .. } | Topic::Received { cav, .. } => cav.clone(),
             _ => self.identity.cav.clone(),
         };
         let key = topic.in_run(&self.identity.run);
-        Publisher::new(&self.session, (&key, &cav), self.epoch, (&self.stats, &self.pool), options)
+        Publisher::new(
+            &self.session,
+            (&key, &cav),
+            self.epoch,
+            (&self.stats, &self.pool),
+            options,
+        )
     }
 
     /// An inbox of `places` messages for each of at most `max_topics` topics.
@@ -124,7 +151,12 @@ impl Bus {
 
     /// An inbox with `limits` on each sender.
     #[must_use]
-    pub fn limited_inbox(&self, places: usize, max_topics: usize, limits: InboxLimits) -> Arc<Inbox> {
+    pub fn limited_inbox(
+        &self,
+        places: usize,
+        max_topics: usize,
+        limits: InboxLimits,
+    ) -> Arc<Inbox> {
         Inbox::within(limits, places, max_topics, &self.stats)
     }
 
@@ -140,22 +172,41 @@ impl Bus {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe(&self, topic: Topic, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
-        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, None), &self.status)
+        Subscription::to_key(
+            &self.session,
+            &topic.in_run(&self.identity.run),
+            (inbox, None),
+            &self.status,
+        )
     }
 
     /// [`Self::subscribe`] with another queue length than that of the inbox.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn subscribe_keeping(&self, topic: Topic, places: usize, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
-        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, Some(places)), &self.status)
+    pub fn subscribe_keeping(
+        &self,
+        topic: Topic,
+        places: usize,
+        inbox: &Arc<Inbox>,
+    ) -> Result<Subscription, BusError> {
+        Subscription::to_key(
+            &self.session,
+            &topic.in_run(&self.identity.run),
+            (inbox, Some(places)),
+            &self.status,
+        )
     }
 
     /// Delivers every topic of `selector` into `inbox`.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn subscribe_all(&self, selector: &KeyExpr, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
+    pub fn subscribe_all(
+        &self,
+        selector: &KeyExpr,
+        inbox: &Arc<Inbox>,
+    ) -> Result<Subscription, BusError> {
         Subscription::to_all(&self.session, selector, inbox, &self.status)
     }
 
@@ -191,7 +242,11 @@ impl Bus {
         role: Role,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
     ) -> Result<LivelinessSubscription, BusError> {
-        LivelinessSubscription::begin(&self.session, &KeyExpr::alive(&self.identity.run, role), report)
+        LivelinessSubscription::begin(
+            &self.session,
+            &KeyExpr::alive(&self.identity.run, role),
+            report,
+        )
     }
 
     /// The key of a topic in this run.
@@ -206,7 +261,14 @@ impl Bus {
     /// # Errors
     /// [`Overdue`] when the session does not close in time; the end of the process closes it.
     pub fn leave(self, limit: Duration) -> Result<(), Overdue> {
-        let Self { session, identity, status, status_thread, pool, .. } = self;
+        let Self {
+            session,
+            identity,
+            status,
+            status_thread,
+            pool,
+            ..
+        } = self;
         drop(pool);
         status.close();
         shutdown::within(limit, "the zenoh session", move || {

@@ -21,11 +21,20 @@ pub(super) struct ClockOffset {
 impl ClockOffset {
     /// Estimate after the first message.
     pub(super) fn new(now: Instant) -> Self {
-        Self { begun: now, shortest: [i64::MAX; 2], was_far: false }
+        Self {
+            begun: now,
+            shortest: [i64::MAX; 2],
+            was_far: false,
+        }
     }
 
     /// Adds a message; returns whether the clock is far off if that has changed.
-    pub(super) fn note(&mut self, sent_nanos: u64, arrived_nanos: u64, now: Instant) -> Option<bool> {
+    pub(super) fn note(
+        &mut self,
+        sent_nanos: u64,
+        arrived_nanos: u64,
+        now: Instant,
+    ) -> Option<bool> {
         if now.duration_since(self.begun) > WINDOW {
             self.begun = now;
             self.shortest = [i64::MAX, self.shortest[0]];

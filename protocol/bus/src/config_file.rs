@@ -44,7 +44,8 @@ struct Origin<'a>(Option<&'a Path>);
 
 impl Display for Origin<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.map_or(Ok(()), |path| write!(f, "{}: ", path.display()))
+        self.0
+            .map_or(Ok(()), |path| write!(f, "{}: ", path.display()))
     }
 }
 
@@ -53,10 +54,15 @@ impl Display for Origin<'_> {
 /// # Errors
 /// [`ConfigError`] states the file, and the line if there is one.
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
-    let unreadable = |source| ConfigError::Io { path: path.into(), source };
+    let unreadable = |source| ConfigError::Io {
+        path: path.into(),
+        source,
+    };
     let size = std::fs::metadata(path).map_err(unreadable)?.len();
     if size > MAX_BYTES {
-        return Err(unreadable(std::io::Error::other(format!("{size} bytes, more than {MAX_BYTES}"))));
+        return Err(unreadable(std::io::Error::other(format!(
+            "{size} bytes, more than {MAX_BYTES}"
+        ))));
     }
     parse(&std::fs::read_to_string(path).map_err(unreadable)?, path)
 }
@@ -85,7 +91,9 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, ConfigEr
 fn reason(error: &serde_saphyr::Error) -> String {
     let text = error.without_snippet().to_string();
     let line = text.lines().next().unwrap_or_default().trim();
-    line.rsplit_once(" at line ").map_or(line, |(reason, _)| reason).to_owned()
+    line.rsplit_once(" at line ")
+        .map_or(line, |(reason, _)| reason)
+        .to_owned()
 }
 
 /// Field at which a text stops being a `T`, for example `scene.rate`; `None` for the whole document.
@@ -118,22 +126,33 @@ mod tests {
     }
 
     fn error_of(text: &str) -> String {
-        parse::<Nested>(text, Path::new("a.yaml")).unwrap_err().to_string()
+        parse::<Nested>(text, Path::new("a.yaml"))
+            .unwrap_err()
+            .to_string()
     }
 
     #[test]
     fn a_wrong_field_is_named_with_its_place_once() {
         let message = error_of("scene:\n  rate: fast\n");
-        assert!(message.starts_with("a.yaml:2: scene.rate: ") && !message.contains("at line"), "{message}");
+        assert!(
+            message.starts_with("a.yaml:2: scene.rate: ") && !message.contains("at line"),
+            "{message}"
+        );
         let message = error_of("scene: {rat: 1}\n");
-        assert!(message.starts_with("a.yaml:1: scene.rat: unknown field `rat`, expected"), "{message}");
+        assert!(
+            message.starts_with("a.yaml:1: scene.rat: unknown field `rat`, expected"),
+            "{message}"
+        );
         assert_eq!(error_of("{}"), "a.yaml:1: missing field `scene`");
     }
 
     #[test]
     fn a_file_that_is_no_yaml_says_so_before_its_fields() {
         let message = error_of("scene: {rat: 1}\nthis is: [not yaml\n");
-        assert!(!message.contains("rat") && !message.contains("this is"), "{message}");
+        assert!(
+            !message.contains("rat") && !message.contains("this is"),
+            "{message}"
+        );
         assert_eq!(message, "a.yaml:2: unclosed bracket '['");
     }
 
@@ -145,10 +164,20 @@ mod tests {
         assert!(missing.contains("a.yaml: "), "{missing}");
         std::fs::write(&path, "# first\nrat: 1\n").unwrap();
         let unknown = read::<Small>(&path).unwrap_err().to_string();
-        assert!(unknown.contains("a.yaml:2: ") && unknown.contains("rat"), "{unknown}");
+        assert!(
+            unknown.contains("a.yaml:2: ") && unknown.contains("rat"),
+            "{unknown}"
+        );
         let error = FieldError::new("rate", f64::NAN, "must be 0 to 1");
-        let found = ConfigError::Value { path: Some("a.yaml".into()), error: error.clone() }.to_string();
+        let found = ConfigError::Value {
+            path: Some("a.yaml".into()),
+            error: error.clone(),
+        }
+        .to_string();
         assert_eq!(found, "a.yaml: rate is NaN: must be 0 to 1");
-        assert_eq!(ConfigError::Value { path: None, error }.to_string(), "rate is NaN: must be 0 to 1");
+        assert_eq!(
+            ConfigError::Value { path: None, error }.to_string(),
+            "rate is NaN: must be 0 to 1"
+        );
     }
 }

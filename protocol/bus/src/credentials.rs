@@ -43,9 +43,16 @@ impl Credentials {
             readable(&folder.join(file))?;
         }
         let key = folder.join(KEY_FILE);
-        let mode = fs::metadata(&key).map_err(|cause| bad(&key, &cause))?.permissions().mode();
+        let mode = fs::metadata(&key)
+            .map_err(|cause| bad(&key, &cause))?
+            .permissions()
+            .mode();
         if mode & 0o077 != 0 {
-            tracing::warn!("{}: others on this machine can read this key (mode {:03o})", key.display(), mode & 0o777);
+            tracing::warn!(
+                "{}: others on this machine can read this key (mode {:03o})",
+                key.display(),
+                mode & 0o777
+            );
         }
         let name = name_of(&folder.join(CERTIFICATE_FILE), SystemTime::now())?;
         Ok(Self { folder, name })
@@ -66,7 +73,13 @@ impl Credentials {
             return Ok(());
         }
         let certificate = self.folder.join(CERTIFICATE_FILE);
-        Err(bad(&certificate, &format!("this is the certificate of {}, and {wanted} needs its own", self.name)))
+        Err(bad(
+            &certificate,
+            &format!(
+                "this is the certificate of {}, and {wanted} needs its own",
+                self.name
+            ),
+        ))
     }
 
     /// Path of one of the files, as text for zenoh.
@@ -82,12 +95,20 @@ impl Credentials {
         let path = self.folder.join(MEMBERS_FILE);
         let text = readable(&path)?;
         let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
-        lines.map(|line| line.parse().map_err(|cause: protocol::PrincipalError| bad(&path, &cause))).collect()
+        lines
+            .map(|line| {
+                line.parse()
+                    .map_err(|cause: protocol::PrincipalError| bad(&path, &cause))
+            })
+            .collect()
     }
 }
 
 fn bad(path: &Path, what: &impl ToString) -> BusError {
-    BusError::Keys { path: path.to_path_buf(), what: what.to_string() }
+    BusError::Keys {
+        path: path.to_path_buf(),
+        what: what.to_string(),
+    }
 }
 
 fn readable(path: &Path) -> Result<String, BusError> {
@@ -99,16 +120,29 @@ fn name_of(path: &Path, now: SystemTime) -> Result<String, BusError> {
     let text = readable(path)?;
     let (_, pem) = parse_x509_pem(text.as_bytes()).map_err(|cause| bad(path, &cause))?;
     let certificate = pem.parse_x509().map_err(|cause| bad(path, &cause))?;
-    let name = certificate.subject().iter_common_name().next().and_then(|name| name.as_str().ok());
-    let name = name.ok_or_else(|| bad(path, &"this certificate has no common name"))?.to_owned();
+    let name = certificate
+        .subject()
+        .iter_common_name()
+        .next()
+        .and_then(|name| name.as_str().ok());
+    let name = name
+        .ok_or_else(|| bad(path, &"this certificate has no common name"))?
+        .to_owned();
     let validity = certificate.validity();
-    let now = i64::try_from(now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs()).unwrap_or(i64::MAX);
+    let now = i64::try_from(now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs())
+        .unwrap_or(i64::MAX);
     let (from, until) = (validity.not_before, validity.not_after);
     if now > until.timestamp() {
-        return Err(bad(path, &format!("the certificate of {name} expired on {until}")));
+        return Err(bad(
+            path,
+            &format!("the certificate of {name} expired on {until}"),
+        ));
     }
     if now < from.timestamp() {
-        return Err(bad(path, &format!("the certificate of {name} holds from {from} on only: is the clock right?")));
+        return Err(bad(
+            path,
+            &format!("the certificate of {name} holds from {from} on only: is the clock right?"),
+        ));
     }
     if until.timestamp() - now < SOON.as_secs().cast_signed() {
         tracing::info!("the certificate of {name} expires on {until}");
@@ -139,11 +173,23 @@ mod tests {
     #[test]
     fn members_are_principals() {
         let folder = tempfile::tempdir().unwrap();
-        let credentials = Credentials { folder: folder.path().into(), name: ROUTER.into() };
-        assert!(credentials.members().unwrap_err().to_string().contains("members"));
+        let credentials = Credentials {
+            folder: folder.path().into(),
+            name: ROUTER.into(),
+        };
+        assert!(
+            credentials
+                .members()
+                .unwrap_err()
+                .to_string()
+                .contains("members")
+        );
         fs::write(folder.path().join("members"), "agent-1\n\nreplay\n").unwrap();
         let members = credentials.members().unwrap();
-        assert_eq!(members.iter().map(ToString::to_string).collect::<Vec<_>>(), ["agent-1", "replay"]);
+        assert_eq!(
+            members.iter().map(ToString::to_string).collect::<Vec<_>>(),
+            ["agent-1", "replay"]
+        );
         fs::write(folder.path().join("members"), "agent-*\n").unwrap();
         assert!(credentials.members().is_err());
     }

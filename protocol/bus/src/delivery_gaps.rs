@@ -23,13 +23,22 @@ pub(super) struct DeliveryGaps {
 impl DeliveryGaps {
     /// Adds a message, or with `is_notice` a notification, which has the number of the message after it. Returns the
     /// number of messages skipped before it; 0 for the first of a publisher.
-    pub(super) fn note(&mut self, topic: &Topic, source: Option<&SourceInfo>, is_notice: bool) -> u32 {
+    pub(super) fn note(
+        &mut self,
+        topic: &Topic,
+        source: Option<&SourceInfo>,
+        is_notice: bool,
+    ) -> u32 {
         let Some(source) = source else { return 0 };
         let (publisher, number) = (*source.source_id(), source.source_sn());
         let after = number.wrapping_add(u32::from(!is_notice));
         if let Some((known, next)) = self.next.get_mut(topic) {
             // A restarted publisher begins anew.
-            let skipped = if *known == publisher { number.wrapping_sub(*next) } else { 0 };
+            let skipped = if *known == publisher {
+                number.wrapping_sub(*next)
+            } else {
+                0
+            };
             let is_behind = skipped > u32::MAX / 2;
             if *known != publisher || !is_behind {
                 (*known, *next) = (publisher, after);
@@ -53,10 +62,20 @@ mod tests {
     #[test]
     fn skipped_numbers_are_counted_once() {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
-        let publishers = [(); 2].map(|()| session.declare_publisher("v2v/test/7/bev").wait().unwrap().id());
+        let publishers = [(); 2].map(|()| {
+            session
+                .declare_publisher("v2v/test/7/bev")
+                .wait()
+                .unwrap()
+                .id()
+        });
         let (topic, mut gaps) = ("7/bev".parse::<Topic>().unwrap(), DeliveryGaps::default());
         let mut note = |publisher: usize, number, is_notice| {
-            gaps.note(&topic, Some(&SourceInfo::new(publishers[publisher], number)), is_notice)
+            gaps.note(
+                &topic,
+                Some(&SourceInfo::new(publishers[publisher], number)),
+                is_notice,
+            )
         };
         assert_eq!(note(0, 3, false), 0, "subscribed late");
         assert_eq!(note(0, 4, true), 0, "a notification is no message");

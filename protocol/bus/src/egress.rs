@@ -40,10 +40,17 @@ const LOOPBACK: [&str; 2] = ["lo", "lo0"];
 
 /// Settings of zenoh that a router has in addition.
 pub(super) fn settings() -> Vec<(&'static str, Value)> {
-    let micros = |duration: Duration| json!(u64::try_from(duration.as_micros()).unwrap_or(u64::MAX));
+    let micros =
+        |duration: Duration| json!(u64::try_from(duration.as_micros()).unwrap_or(u64::MAX));
     let mut settings = vec![
-        ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", micros(FIRST_WAIT)),
-        ("transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments", micros(FRAGMENT_WAIT)),
+        (
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop",
+            micros(FIRST_WAIT),
+        ),
+        (
+            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
+            micros(FRAGMENT_WAIT),
+        ),
         ("qos/network", rules()),
     ];
     settings.extend(SMALL_QUEUES.map(|queue| (queue, json!(SMALL_BATCHES))));
@@ -64,12 +71,32 @@ fn rules() -> Value {
     let large = json!({"payload_size": format!("{LARGE_BYTES}..{}", u32::MAX)});
     let tensors = TENSOR_PRIORITIES.map(|priority| {
         let filter = json!({"congestion_control": "block", "priority": priority});
-        rule(&format!("egress-{priority}"), &filter, "block_first", &large)
+        rule(
+            &format!("egress-{priority}"),
+            &filter,
+            "block_first",
+            &large,
+        )
     });
     let others = [
-        rule("egress", &json!({"congestion_control": "block"}), "drop", &json!({})),
-        rule("egress-here", &json!({"congestion_control": "block_first"}), "drop", &json!({"interfaces": LOOPBACK})),
-        rule("egress-lossless", &json!({"priority": "real_time"}), "block", &json!({})),
+        rule(
+            "egress",
+            &json!({"congestion_control": "block"}),
+            "drop",
+            &json!({}),
+        ),
+        rule(
+            "egress-here",
+            &json!({"congestion_control": "block_first"}),
+            "drop",
+            &json!({"interfaces": LOOPBACK}),
+        ),
+        rule(
+            "egress-lossless",
+            &json!({"priority": "real_time"}),
+            "block",
+            &json!({}),
+        ),
     ];
     tensors.into_iter().chain(others).collect()
 }

@@ -37,10 +37,15 @@ impl Endpoint {
     /// [`BusError::Endpoint`] states the text that is not an endpoint.
     pub fn new(text: &str) -> Result<Self, BusError> {
         let bad = || BusError::Endpoint(text.chars().take(100).collect());
-        let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(QUIC)).ok_or_else(bad)?;
+        let address = text
+            .strip_prefix(TCP)
+            .or_else(|| text.strip_prefix(QUIC))
+            .ok_or_else(bad)?;
         let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
         let bracketed = host.starts_with('[') && host.ends_with(']');
-        let clean = |c: char| c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c));
+        let clean = |c: char| {
+            c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c))
+        };
         if host.is_empty() || !host.chars().all(clean) || port.parse::<u16>().is_err() {
             return Err(bad());
         }
@@ -57,7 +62,10 @@ impl Endpoint {
     #[must_use]
     pub fn is_loopback(&self) -> bool {
         let host = self.address().rsplit_once(':').map_or("", |(host, _)| host);
-        let ip = host.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
+        let ip = host
+            .trim_start_matches('[')
+            .trim_end_matches(']')
+            .parse::<IpAddr>();
         host == "localhost" || ip.is_ok_and(|ip| ip.is_loopback())
     }
 
@@ -82,7 +90,11 @@ impl Endpoint {
     /// The endpoint in zenoh's form. Over QUIC all messages use one stream and arrive in the order in which they were
     /// sent, as over TCP: with a stream per priority a flush would not cover messages of other priorities.
     pub(super) fn for_zenoh(&self) -> String {
-        if self.is_secured() { format!("{}?multistream=0", self.0) } else { self.0.clone() }
+        if self.is_secured() {
+            format!("{}?multistream=0", self.0)
+        } else {
+            self.0.clone()
+        }
     }
 
     pub(super) fn address(&self) -> &str {
@@ -111,17 +123,32 @@ mod tests {
 
     #[test]
     fn loopbacks_are_recognised() {
-        for text in ["tcp/127.0.0.1:1", "quic/127.1.2.3:1", "tcp/[::1]:1", "tcp/localhost:1"] {
+        for text in [
+            "tcp/127.0.0.1:1",
+            "quic/127.1.2.3:1",
+            "tcp/[::1]:1",
+            "tcp/localhost:1",
+        ] {
             assert!(Endpoint::new(text).unwrap().is_loopback(), "{text}");
         }
-        for text in ["tcp/0.0.0.0:1", "tcp/10.0.0.1:1", "tcp/[::]:1", "tcp/router.local:1"] {
+        for text in [
+            "tcp/0.0.0.0:1",
+            "tcp/10.0.0.1:1",
+            "tcp/[::]:1",
+            "tcp/router.local:1",
+        ] {
             assert!(!Endpoint::new(text).unwrap().is_loopback(), "{text}");
         }
     }
 
     #[test]
     fn reads_endpoints() {
-        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1", "quic/router.local:1"] {
+        for text in [
+            "tcp/127.0.0.1:7447",
+            "tcp/[::1]:7447",
+            "tcp/router.local:1",
+            "quic/router.local:1",
+        ] {
             assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
         }
         for text in [
@@ -136,7 +163,10 @@ mod tests {
             "tcp/::1:1",
         ] {
             let error = Endpoint::new(text).unwrap_err();
-            assert!(error.to_string().contains("tcp/HOST:PORT"), "{text}: {error}");
+            assert!(
+                error.to_string().contains("tcp/HOST:PORT"),
+                "{text}: {error}"
+            );
         }
     }
 }

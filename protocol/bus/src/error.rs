@@ -10,7 +10,9 @@ use super::endpoint::Endpoint;
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
     /// Not an endpoint.
-    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or quic/HOST:PORT with keys")]
+    #[error(
+        "{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or quic/HOST:PORT with keys"
+    )]
     Endpoint(String),
     /// Keys that are missing or invalid.
     #[error("{}: {what}", path.display())]
@@ -34,7 +36,9 @@ pub enum BusError {
         found: String,
     },
     /// Another process uses the port.
-    #[error("cannot listen at {endpoint}: the port is in use; end the other process or choose another port")]
+    #[error(
+        "cannot listen at {endpoint}: the port is in use; end the other process or choose another port"
+    )]
     PortInUse {
         /// Endpoint of the router.
         endpoint: Endpoint,
@@ -111,6 +115,9 @@ impl BusError {
     /// An error of zenoh during an operation.
     #[must_use]
     pub fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
-        Self::Zenoh { doing: doing.into(), cause: cause.to_string() }
+        Self::Zenoh {
+            doing: doing.into(),
+            cause: cause.to_string(),
+        }
     }
 }

@@ -20,7 +20,11 @@ pub(super) struct FlushBarrier {
 impl FlushBarrier {
     /// A barrier for messages of `priority` and of all higher ones.
     pub(super) fn new(session: &Session, run: &RunId, priority: Priority) -> Self {
-        Self { session: session.clone(), key: KeyExpr::none(run), priority }
+        Self {
+            session: session.clone(),
+            key: KeyExpr::none(run),
+            priority,
+        }
     }
 
     /// Waits for at most `limit`. A query without an answerer is returned by the router at once, and it passes through
@@ -29,7 +33,10 @@ impl FlushBarrier {
         let begun = Instant::now();
         while begun.elapsed() < limit && !self.answered() {}
         if begun.elapsed() >= limit {
-            tracing::warn!(?limit, "the router has not confirmed the flush: the last messages may be lost");
+            tracing::warn!(
+                ?limit,
+                "the router has not confirmed the flush: the last messages may be lost"
+            );
         }
     }
 

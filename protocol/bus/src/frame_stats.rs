@@ -3,8 +3,9 @@
 use std::time::Duration;
 
 /// Upper bounds of the latency histogram's buckets, seconds: finest where live runs are.
-const LATENCY_BUCKETS_S: [f64; 16] =
-    [0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 2.0, 5.0];
+const LATENCY_BUCKETS_S: [f64; 16] = [
+    0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.75, 1.0, 2.0, 5.0,
+];
 
 /// Counters of frames since the process started.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -31,7 +32,11 @@ impl FrameStats {
             self.latency_sum_s += latency_s;
             self.latencies += 1;
             let bucket = LATENCY_BUCKETS_S.partition_point(|end| *end < latency_s);
-            self.buckets.iter_mut().skip(bucket).take(1).for_each(|count| *count += 1);
+            self.buckets
+                .iter_mut()
+                .skip(bucket)
+                .take(1)
+                .for_each(|count| *count += 1);
         }
     }
 
@@ -39,6 +44,10 @@ impl FrameStats {
     /// ([`f64::MAX`]).
     #[must_use]
     pub fn latency_buckets(&self) -> Vec<(f64, u64)> {
-        LATENCY_BUCKETS_S.into_iter().chain([f64::MAX]).zip(self.buckets).collect()
+        LATENCY_BUCKETS_S
+            .into_iter()
+            .chain([f64::MAX])
+            .zip(self.buckets)
+            .collect()
     }
 }

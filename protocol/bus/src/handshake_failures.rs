@@ -53,7 +53,10 @@ fn counts() -> MutexGuard<'static, BTreeMap<&'static str, u64>> {
 }
 
 fn cause(text: &str) -> &'static str {
-    CAUSES.iter().find(|(pattern, _)| text.contains(pattern)).map_or(OTHER, |(_, cause)| cause)
+    CAUSES
+        .iter()
+        .find(|(pattern, _)| text.contains(pattern))
+        .map_or(OTHER, |(_, cause)| cause)
 }
 
 /// The text of an event.
@@ -76,15 +79,28 @@ mod tests {
     #[test]
     fn failed_handshakes_are_counted_by_cause() {
         let before = failed();
-        tracing::subscriber::with_default(tracing_subscriber::registry().with(HandshakeCounter), || {
-            let reason = "invalid peer certificate: UnknownIssuer";
-            tracing::warn!(target: "zenoh_link_commons::quic::unicast", "{FAILED}: TransportError({reason:?}). Hint");
-            tracing::warn!(target: "zenoh_link_commons::quic::unicast", "something else");
-            tracing::warn!(target: "elsewhere", "{FAILED}: TimedOut");
-        });
-        let more = |cause: &str| failed().get(cause).unwrap_or(&0) - before.get(cause).unwrap_or(&0);
-        assert_eq!((more("certificate of another authority"), more("begun and not finished")), (1, 0));
-        assert_eq!(cause("QUIC acceptor failed: TimedOut"), "begun and not finished");
+        tracing::subscriber::with_default(
+            tracing_subscriber::registry().with(HandshakeCounter),
+            || {
+                let reason = "invalid peer certificate: UnknownIssuer";
+                tracing::warn!(target: "zenoh_link_commons::quic::unicast", "{FAILED}: TransportError({reason:?}). Hint");
+                tracing::warn!(target: "zenoh_link_commons::quic::unicast", "something else");
+                tracing::warn!(target: "elsewhere", "{FAILED}: TimedOut");
+            },
+        );
+        let more =
+            |cause: &str| failed().get(cause).unwrap_or(&0) - before.get(cause).unwrap_or(&0);
+        assert_eq!(
+            (
+                more("certificate of another authority"),
+                more("begun and not finished")
+            ),
+            (1, 0)
+        );
+        assert_eq!(
+            cause("QUIC acceptor failed: TimedOut"),
+            "begun and not finished"
+        );
         assert_eq!(cause("QUIC acceptor failed: Reset"), OTHER);
     }
 }

@@ -26,11 +26,17 @@ pub struct InboxLimits {
 
 impl InboxLimits {
     /// No limits: for messages of one's own processes.
-    pub const NONE: Self =
-        Self { messages_per_s: f64::INFINITY, bytes_per_s: f64::INFINITY, waiting_bytes: usize::MAX };
+    pub const NONE: Self = Self {
+        messages_per_s: f64::INFINITY,
+        bytes_per_s: f64::INFINITY,
+        waiting_bytes: usize::MAX,
+    };
     /// Limits for messages of other vehicles: ten times the rate of a 10 Hz sender, with the largest feature maps.
-    pub const PEERS: Self =
-        Self { messages_per_s: 100.0, bytes_per_s: (256_u64 << 20) as f64, waiting_bytes: 512 << 20 };
+    pub const PEERS: Self = Self {
+        messages_per_s: 100.0,
+        bytes_per_s: (256_u64 << 20) as f64,
+        waiting_bytes: 512 << 20,
+    };
 }
 
 /// Token buckets of an inbox, one for each topic.
@@ -48,21 +54,36 @@ struct Meter {
 
 impl RateLimiter {
     pub(super) fn new(limits: InboxLimits) -> Self {
-        Self { limits, meters: Mutex::default() }
+        Self {
+            limits,
+            meters: Mutex::default(),
+        }
     }
 
     /// True if a message of `bytes` bytes keeps within the rates.
     pub(super) fn admit(&self, topic: &Topic, bytes: usize, now: Instant) -> bool {
-        let InboxLimits { messages_per_s, bytes_per_s, .. } = self.limits;
+        let InboxLimits {
+            messages_per_s,
+            bytes_per_s,
+            ..
+        } = self.limits;
         if messages_per_s.is_infinite() && bytes_per_s.is_infinite() {
             return true;
         }
         let mut meters = self.meters.lock().unwrap_or_else(PoisonError::into_inner);
         let own = Some(topic.clone());
-        let key = if meters.len() < MAX_METERS || meters.contains_key(&own) { own } else { None };
+        let key = if meters.len() < MAX_METERS || meters.contains_key(&own) {
+            own
+        } else {
+            None
+        };
         // A rate far below one message per second still admits one from time to time.
         let burst = (messages_per_s * BURST_S).max(1.0);
-        let full = || Meter { messages: burst, bytes: bytes_per_s * BURST_S, at: now };
+        let full = || Meter {
+            messages: burst,
+            bytes: bytes_per_s * BURST_S,
+            at: now,
+        };
         let meter = meters.entry(key).or_insert_with(full);
         let passed = now.saturating_duration_since(meter.at).as_secs_f64();
         meter.messages = (meter.messages + passed * messages_per_s).min(burst);
@@ -86,29 +107,53 @@ mod tests {
     use super::*;
 
     fn meters(messages_per_s: f64, bytes_per_s: f64) -> RateLimiter {
-        RateLimiter::new(InboxLimits { messages_per_s, bytes_per_s, waiting_bytes: usize::MAX })
+        RateLimiter::new(InboxLimits {
+            messages_per_s,
+            bytes_per_s,
+            waiting_bytes: usize::MAX,
+        })
     }
 
     /// Number of `count` messages, arriving in equal steps, that are admitted.
-    fn admitted(meters: &RateLimiter, topic: &str, count: u32, step: Duration, bytes: usize) -> usize {
+    fn admitted(
+        meters: &RateLimiter,
+        topic: &str,
+        count: u32,
+        step: Duration,
+        bytes: usize,
+    ) -> usize {
         let (topic, began) = (topic.parse().unwrap(), Instant::now());
-        (0..count).filter(|index| meters.admit(&topic, bytes, began + step * *index)).count()
+        (0..count)
+            .filter(|index| meters.admit(&topic, bytes, began + step * *index))
+            .count()
     }
 
     #[test]
     fn a_flood_is_limited_to_its_rate_and_others_are_not_affected() {
         let meters = meters(20.0, 1e9);
         let flood = admitted(&meters, "1/bev", 10_000, Duration::from_millis(1), 1 << 10);
-        assert!((230..=241).contains(&flood), "10 s of 20 Hz and the first 2 s' worth: {flood}");
-        assert_eq!(admitted(&meters, "2/bev", 100, Duration::from_millis(100), 1 << 10), 100);
+        assert!(
+            (230..=241).contains(&flood),
+            "10 s of 20 Hz and the first 2 s' worth: {flood}"
+        );
+        assert_eq!(
+            admitted(&meters, "2/bev", 100, Duration::from_millis(100), 1 << 10),
+            100
+        );
     }
 
     #[test]
     fn a_large_message_is_charged_to_the_following_ones() {
         let meters = meters(1e6, 1e6);
-        assert_eq!(admitted(&meters, "1/bev", 10, Duration::from_nanos(1), 3_000_000), 1);
+        assert_eq!(
+            admitted(&meters, "1/bev", 10, Duration::from_nanos(1), 3_000_000),
+            1
+        );
         let paid = Instant::now() + Duration::from_secs(2);
-        assert!(meters.admit(&"1/bev".parse().unwrap(), 1, paid), "after 2 s there is room again");
+        assert!(
+            meters.admit(&"1/bev".parse().unwrap(), 1, paid),
+            "after 2 s there is room again"
+        );
     }
 
     #[test]
@@ -121,7 +166,9 @@ mod tests {
     fn forged_topics_share_a_meter() {
         let meters = meters(1.0, 1e9);
         let now = Instant::now();
-        let admitted = (0..5_000).filter(|id| meters.admit(&format!("{id}/bev").parse().unwrap(), 1, now)).count();
+        let admitted = (0..5_000)
+            .filter(|id| meters.admit(&format!("{id}/bev").parse().unwrap(), 1, now))
+            .count();
         assert_eq!(admitted, MAX_METERS + 2);
         assert!(meters.meters.lock().unwrap().len() <= MAX_METERS + 1);
     }

@@ -25,7 +25,14 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::indexing_slicing
+    )
+)]
 
 mod access_control;
 mod args;
@@ -67,7 +74,9 @@ pub mod web;
 pub use access_control::AccessControl;
 pub use args::{BusConfig, InboxConfig, STOP_LIMIT, log_to_stderr};
 pub use bus::{Bus, Identity};
-pub use credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER};
+pub use credentials::{
+    AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER,
+};
 pub use endpoint::Endpoint;
 pub use error::BusError;
 pub use frame_stats::FrameStats;

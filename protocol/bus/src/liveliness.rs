@@ -24,10 +24,17 @@ impl LivelinessToken {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn announce(session: &Session, run: &RunId, role: Role, cav: &CavId) -> Result<Self, BusError> {
+    pub fn announce(
+        session: &Session,
+        run: &RunId,
+        role: Role,
+        cav: &CavId,
+    ) -> Result<Self, BusError> {
         let key = Key::alive(run, role, cav).to_string();
         let token = session.liveliness().declare_token(&key).wait();
-        token.map(Self).map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
+        token
+            .map(Self)
+            .map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
     }
 
     /// Withdraws the token and waits until the session has processed it.
@@ -35,7 +42,10 @@ impl LivelinessToken {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn withdraw(self) -> Result<(), BusError> {
-        self.0.undeclare().wait().map_err(|cause| BusError::zenoh("withdrawing a liveliness token", &cause))
+        self.0
+            .undeclare()
+            .wait()
+            .map_err(|cause| BusError::zenoh("withdrawing a liveliness token", &cause))
     }
 }
 
@@ -45,13 +55,24 @@ impl LivelinessToken {
 /// [`BusError::Zenoh`] when the session is closed.
 pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, BusError> {
     let selector = KeyExpr::everyone_alive(run);
-    let tokens = session.liveliness().get(selector.as_str()).timeout(QUERY_TIMEOUT).wait();
-    let tokens = tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
-    let process = |reply: zenoh::query::Reply| match reply.result().ok()?.key_expr().as_str().parse() {
-        Ok(Key { topic: Topic::Alive { role, cav }, .. }) => Some(process_id(role, &cav)),
-        _ => None,
-    };
-    Ok(std::iter::from_fn(|| tokens.recv().ok()).filter_map(process).collect())
+    let tokens = session
+        .liveliness()
+        .get(selector.as_str())
+        .timeout(QUERY_TIMEOUT)
+        .wait();
+    let tokens =
+        tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
+    let process =
+        |reply: zenoh::query::Reply| match reply.result().ok()?.key_expr().as_str().parse() {
+            Ok(Key {
+                topic: Topic::Alive { role, cav },
+                ..
+            }) => Some(process_id(role, &cav)),
+            _ => None,
+        };
+    Ok(std::iter::from_fn(|| tokens.recv().ok())
+        .filter_map(process)
+        .collect())
 }
 
 /// A process joined or left.
@@ -91,16 +112,26 @@ impl LivelinessSubscription {
         selector: &KeyExpr,
         report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
     ) -> Result<Self, BusError> {
-        let subscriber =
-            session.liveliness().declare_subscriber(selector.as_str()).history(true).callback(move |sample| {
+        let subscriber = session
+            .liveliness()
+            .declare_subscriber(selector.as_str())
+            .history(true)
+            .callback(move |sample| {
                 // Tokens outside this key grammar are ignored.
-                if let Ok(Key { topic: Topic::Alive { role, cav }, .. }) = sample.key_expr().as_str().parse() {
+                if let Ok(Key {
+                    topic: Topic::Alive { role, cav },
+                    ..
+                }) = sample.key_expr().as_str().parse()
+                {
                     report(match sample.kind() {
                         SampleKind::Put => LivelinessEvent::Joined { role, cav },
                         SampleKind::Delete => LivelinessEvent::Left { role, cav },
                     });
                 }
             });
-        subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
+        subscriber
+            .wait()
+            .map(Self)
+            .map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
     }
 }

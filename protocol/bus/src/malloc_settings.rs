@@ -22,7 +22,10 @@ pub const KEPT_MEMORY: [Setting; 4] = [
 /// matrices and keep 1024 of them, megabytes each. No two batches of sparse sweeps have the same shape: a training
 /// would grow by gigabytes of products that are never used again. The steps of a head, which all have the same shape,
 /// are not slower with it.
-pub const FEW_PRODUCTS: [Setting; 2] = [("LRU_CACHE_CAPACITY", "16"), ("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16")];
+pub const FEW_PRODUCTS: [Setting; 2] = [
+    ("LRU_CACHE_CAPACITY", "16"),
+    ("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16"),
+];
 
 /// Threads of a router. zenoh's two threads for incoming messages are not enough: one that closes the connection of a
 /// receiver that took nothing waits up to 10 s in the system (`SO_LINGER` on a socket with unsent data), and with two
@@ -48,7 +51,11 @@ pub fn ensure(settings: &[Setting]) -> io::Result<()> {
 }
 
 fn missing(settings: &[Setting], is_set: impl Fn(&str) -> bool) -> Vec<Setting> {
-    settings.iter().filter(|(name, _)| !is_set(name)).copied().collect()
+    settings
+        .iter()
+        .filter(|(name, _)| !is_set(name))
+        .copied()
+        .collect()
 }
 
 #[cfg(test)]

@@ -35,7 +35,10 @@ impl Membership {
                 }
             }
         })?;
-        Ok(Self { events, _watch: subscription })
+        Ok(Self {
+            events,
+            _watch: subscription,
+        })
     }
 
     /// The next vehicle that joined (`true`) or left since the last call; `None` if there is none.

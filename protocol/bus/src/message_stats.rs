@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use protocol::{
-    Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, TopicTraffic, WireError,
+    Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic,
+    TopicTraffic, WireError,
 };
 
 use support::statistics::{quantile, sorted};
@@ -87,8 +88,9 @@ pub struct PeerSummary {
 }
 
 /// Upper bounds of the histogram's buckets, seconds.
-const BUCKETS_S: [f64; 14] =
-    [0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5];
+const BUCKETS_S: [f64; 14] = [
+    0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5,
+];
 
 /// Durations of a stage, over all frames so far.
 #[derive(Debug, Clone, PartialEq)]
@@ -116,7 +118,10 @@ impl MessageStats {
     /// Counters of `process`, all zero.
     #[must_use]
     pub fn new(process: ProcessId) -> Self {
-        Self { process, state: Arc::default() }
+        Self {
+            process,
+            state: Arc::default(),
+        }
     }
 
     /// Process of these counters.
@@ -127,7 +132,9 @@ impl MessageStats {
 
     /// Counts one more message submitted on `topic`.
     pub fn submitted(&self, topic: &Topic) {
-        self.note(topic, |state| state.ledger.sent(&Account::published(topic.clone())));
+        self.note(topic, |state| {
+            state.ledger.sent(&Account::published(topic.clone()))
+        });
     }
 
     /// Counts a submitted message as taken by the network.
@@ -137,12 +144,20 @@ impl MessageStats {
 
     /// Counts a submitted message as suppressed.
     pub fn suppressed(&self, topic: &Topic, reason: DropReason) {
-        self.note(topic, |state| state.ledger.dropped(&Account::published(topic.clone()), reason));
+        self.note(topic, |state| {
+            state
+                .ledger
+                .dropped(&Account::published(topic.clone()), reason)
+        });
     }
 
     /// Counts a submitted feature map as written to keep within a limit.
     pub fn adapted(&self, topic: &Topic, reason: RateReason) {
-        self.note(topic, |state| state.ledger.adapted(&Account::published(topic.clone()), reason));
+        self.note(topic, |state| {
+            state
+                .ledger
+                .adapted(&Account::published(topic.clone()), reason)
+        });
     }
 
     /// Opens the account of a subscription to `topic`.
@@ -162,14 +177,20 @@ impl MessageStats {
 
     /// Counts an arrived message as not used.
     pub fn dropped(&self, topic: &Topic, reason: DropReason) {
-        self.note(topic, |state| state.ledger.dropped(&self.here(topic), reason));
+        self.note(topic, |state| {
+            state.ledger.dropped(&self.here(topic), reason)
+        });
     }
 
     /// Counts messages that the router has taken and not handed on to this process.
     pub(super) fn undelivered(&self, topic: &Topic, messages: u32) {
         self.note(topic, |state| {
             state.pass_many(self.here(topic), u64::from(messages));
-            state.ledger.dropped_many(&self.here(topic), DropReason::Undelivered, u64::from(messages));
+            state.ledger.dropped_many(
+                &self.here(topic),
+                DropReason::Undelivered,
+                u64::from(messages),
+            );
         });
     }
 
@@ -182,7 +203,10 @@ impl MessageStats {
             *count == 1
         };
         if is_first && way != SharedMemoryUse::Carried {
-            tracing::warn!(reason = way.as_str(), "a large message takes the socket instead of shared memory");
+            tracing::warn!(
+                reason = way.as_str(),
+                "a large message takes the socket instead of shared memory"
+            );
         }
     }
 
@@ -220,8 +244,16 @@ impl MessageStats {
     fn warn_once(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         let times = {
             let mut state = self.lock();
-            let has_room = state.rejections.len() < MAX_ACCOUNTS || state.rejections.contains_key(topic);
-            let times = state.rejections.entry(if has_room { topic.clone() } else { Topic::Truth }).or_default();
+            let has_room =
+                state.rejections.len() < MAX_ACCOUNTS || state.rejections.contains_key(topic);
+            let times = state
+                .rejections
+                .entry(if has_room {
+                    topic.clone()
+                } else {
+                    Topic::Truth
+                })
+                .or_default();
             *times += 1;
             *times
         };
@@ -231,14 +263,24 @@ impl MessageStats {
     }
 
     /// Updates the clock offset of `cav` from a message. Logged when it gets large, and when it is small again.
-    pub(super) fn observe_clock(&self, cav: &CavId, sent_nanos: u64, arrived_nanos: u64, at: Instant) {
+    pub(super) fn observe_clock(
+        &self,
+        cav: &CavId,
+        sent_nanos: u64,
+        arrived_nanos: u64,
+        at: Instant,
+    ) {
         let change = self.lock().peer(cav).and_then(|peer| {
             let clock = peer.clock.get_or_insert_with(|| ClockOffset::new(at));
             Some((clock.note(sent_nanos, arrived_nanos, at)?, clock.seconds()))
         });
         match change {
-            Some((true, offset_s)) => tracing::warn!(%cav, offset_s, "clock offset of the vehicle is large"),
-            Some((false, offset_s)) => tracing::info!(%cav, offset_s, "clock offset of the vehicle is small again"),
+            Some((true, offset_s)) => {
+                tracing::warn!(%cav, offset_s, "clock offset of the vehicle is large")
+            }
+            Some((false, offset_s)) => {
+                tracing::info!(%cav, offset_s, "clock offset of the vehicle is small again")
+            }
             None => {}
         }
     }
@@ -267,7 +309,9 @@ impl MessageStats {
         if !state.stages.contains_key(stage) {
             state.stages.insert(stage.to_owned(), Timings::default());
         }
-        let Some(timings) = state.stages.get_mut(stage) else { return };
+        let Some(timings) = state.stages.get_mut(stage) else {
+            return;
+        };
         timings.count += 1;
         timings.sum = timings.sum.saturating_add(time);
         let bucket = BUCKETS_S.partition_point(|end| *end < time.as_secs_f64());
@@ -293,8 +337,11 @@ impl MessageStats {
     /// Published messages and bytes so far, by topic.
     #[must_use]
     pub fn traffic(&self) -> Vec<TopicTraffic> {
-        let of =
-            |(topic, &(messages, bytes)): (&Topic, &(u64, u64))| TopicTraffic { topic: topic.clone(), messages, bytes };
+        let of = |(topic, &(messages, bytes)): (&Topic, &(u64, u64))| TopicTraffic {
+            topic: topic.clone(),
+            messages,
+            bytes,
+        };
         self.lock().traffic.iter().map(of).collect()
     }
 
@@ -335,7 +382,11 @@ impl MessageStats {
     #[must_use]
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
-        state.stages.iter().map(|(stage, timings)| timings.summary(stage)).collect()
+        state
+            .stages
+            .iter()
+            .map(|(stage, timings)| timings.summary(stage))
+            .collect()
     }
 
     /// Histogram of every stage over all its frames.
@@ -365,7 +416,9 @@ impl MessageStats {
     }
 
     fn has_account(&self, state: &State, topic: &Topic) -> bool {
-        [self.here(topic), Account::published(topic.clone())].iter().any(|account| state.ledger.get(account).is_some())
+        [self.here(topic), Account::published(topic.clone())]
+            .iter()
+            .any(|account| state.ledger.get(account).is_some())
     }
 
     fn here(&self, topic: &Topic) -> Account {
@@ -397,7 +450,11 @@ impl State {
 
 impl Timings {
     fn summary(&self, stage: &str) -> StageSummary {
-        let ms: Vec<f64> = self.last.iter().map(|time| time.as_secs_f64() * 1e3).collect();
+        let ms: Vec<f64> = self
+            .last
+            .iter()
+            .map(|time| time.as_secs_f64() * 1e3)
+            .collect();
         let ms = sorted(&ms);
         let quantile_ms = |q: f64| quantile(&ms, q).unwrap_or(0.0);
         StageSummary {
@@ -442,7 +499,13 @@ mod tests {
         ledger.merge(&ego.ledger());
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
         ego.dropped(&topic(), DropReason::Stale);
-        assert_eq!(ego.ledger().get(&Account::towards(topic(), ego.process())).unwrap().in_flight, 0);
+        assert_eq!(
+            ego.ledger()
+                .get(&Account::towards(topic(), ego.process()))
+                .unwrap()
+                .in_flight,
+            0
+        );
     }
 
     #[test]
@@ -451,7 +514,13 @@ mod tests {
         let topic: Topic = "4279/descriptor".parse().unwrap();
         agent.submitted(&topic);
         agent.delivered(&topic);
-        agent.rejected(&topic, &WireError::Kind { expected: protocol::Kind::Descriptor, found: protocol::Kind::Bev });
+        agent.rejected(
+            &topic,
+            &WireError::Kind {
+                expected: protocol::Kind::Descriptor,
+                found: protocol::Kind::Bev,
+            },
+        );
         assert!(agent.ledger().is_empty());
     }
 
@@ -467,7 +536,11 @@ mod tests {
         assert_eq!(stats.ledger().len(), MAX_ACCOUNTS);
         stats.received(&topic(0));
         let account = Account::towards(topic(0), stats.process());
-        assert_eq!(stats.ledger().get(&account).unwrap().received, 1, "existing accounts continue");
+        assert_eq!(
+            stats.ledger().get(&account).unwrap().received,
+            1,
+            "existing accounts continue"
+        );
         let state = stats.lock();
         assert!(state.rejections.len() <= MAX_ACCOUNTS + 1 && state.passed.len() <= MAX_ACCOUNTS);
     }
@@ -480,6 +553,9 @@ mod tests {
         }
         let stage = &stats.stages()[0];
         assert_eq!((stage.stage.as_str(), stage.count), ("fuse", 100));
-        assert_eq!((stage.p50_ms, stage.p95_ms, stage.p99_ms, stage.max_ms), (50.5, 95.05, 99.01, 100.0));
+        assert_eq!(
+            (stage.p50_ms, stage.p95_ms, stage.p99_ms, stage.max_ms),
+            (50.5, 95.05, 99.01, 100.0)
+        );
     }
 }

@@ -26,13 +26,24 @@ impl MetricsServer {
     ///
     /// # Errors
     /// When the address cannot be bound.
-    pub(crate) fn start(address: SocketAddr, stats: &MessageStats, others: Vec<MetricsPeer>) -> std::io::Result<Self> {
+    pub(crate) fn start(
+        address: SocketAddr,
+        stats: &MessageStats,
+        others: Vec<MetricsPeer>,
+    ) -> std::io::Result<Self> {
         let stats = stats.clone();
         let server = WebServer::start(address, move |request| match request.path.as_str() {
             "/metrics" => {
                 let own = exposition(&stats);
-                let body = if others.is_empty() { own } else { fleet::fleet_exposition(&own, &others) };
-                Answer::Page { content_type: CONTENT_TYPE, body: body.into() }
+                let body = if others.is_empty() {
+                    own
+                } else {
+                    fleet::fleet_exposition(&own, &others)
+                };
+                Answer::Page {
+                    content_type: CONTENT_TYPE,
+                    body: body.into(),
+                }
             }
             other => Answer::NotFound(format!("{other} not found; see /metrics")),
         })?;
@@ -77,8 +88,16 @@ impl Collector for ProcessCollector {
         ConstCounter::new(usage.cpu_s).encode(cpu)?;
         let bytes = Some(&Unit::Bytes);
         for (name, help, value) in [
-            ("process_resident_memory", "Resident memory", usage.resident_bytes),
-            ("process_peak_resident_memory", "Largest resident memory so far", usage.peak_resident_bytes),
+            (
+                "process_resident_memory",
+                "Resident memory",
+                usage.resident_bytes,
+            ),
+            (
+                "process_peak_resident_memory",
+                "Largest resident memory so far",
+                usage.peak_resident_bytes,
+            ),
         ] {
             let memory = encoder.encode_descriptor(name, help, bytes, MetricType::Gauge)?;
             ConstGauge::new(i64::try_from(value).unwrap_or(i64::MAX)).encode(memory)?;
@@ -90,7 +109,8 @@ impl Collector for ProcessCollector {
 /// Encodes ticks, answers, fused neighbours and latency of a process that has frames.
 fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fmt::Result {
     if frames.ticks > 0 {
-        let ticks = encoder.encode_descriptor("ticks", "Ticks of the scene", None, MetricType::Counter)?;
+        let ticks =
+            encoder.encode_descriptor("ticks", "Ticks of the scene", None, MetricType::Counter)?;
         ConstCounter::new(frames.ticks).encode(ticks)?;
     }
     if frames.ticks + frames.answered == 0 {
@@ -98,7 +118,11 @@ fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fm
     }
     let counters = [
         ("answered_ticks", "Ticks with detections", frames.answered),
-        ("fused_neighbours", "Neighbours whose data were fused, over all frames", frames.fused_neighbours),
+        (
+            "fused_neighbours",
+            "Neighbours whose data were fused, over all frames",
+            frames.fused_neighbours,
+        ),
     ];
     for (name, help, value) in counters {
         let counter = encoder.encode_descriptor(name, help, None, MetricType::Counter)?;
@@ -108,10 +132,19 @@ fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fm
         return Ok(());
     }
     let help = "From the publication of a tick to that of its detections";
-    let mut latency =
-        encoder.encode_descriptor("capture_to_detection", help, Some(&Unit::Seconds), MetricType::Histogram)?;
+    let mut latency = encoder.encode_descriptor(
+        "capture_to_detection",
+        help,
+        Some(&Unit::Seconds),
+        MetricType::Histogram,
+    )?;
     let buckets = frames.latency_buckets();
-    latency.encode_histogram::<[(&str, &str); 0]>(frames.latency_sum_s, frames.latencies, &buckets, None)
+    latency.encode_histogram::<[(&str, &str); 0]>(
+        frames.latency_sum_s,
+        frames.latencies,
+        &buckets,
+        None,
+    )
 }
 
 struct StatsCollector(MessageStats);
@@ -129,26 +162,49 @@ impl Collector for StatsCollector {
             .iter()
             .map(|(account, counts)| (account.topic.to_string(), (account.to.is_some(), counts)))
             .collect();
-        let mut sent = encoder.encode_descriptor("messages_sent", "Messages published", None, MetricType::Counter)?;
+        let mut sent = encoder.encode_descriptor(
+            "messages_sent",
+            "Messages published",
+            None,
+            MetricType::Counter,
+        )?;
         for (topic, (_, counts)) in topics.iter().filter(|(_, (is_received, _))| !is_received) {
-            ConstCounter::new(counts.sent).encode(sent.encode_family(&[("topic", topic.as_str())])?)?;
+            ConstCounter::new(counts.sent)
+                .encode(sent.encode_family(&[("topic", topic.as_str())])?)?;
         }
-        let mut received =
-            encoder.encode_descriptor("messages_received", "Messages accepted and used", None, MetricType::Counter)?;
+        let mut received = encoder.encode_descriptor(
+            "messages_received",
+            "Messages accepted and used",
+            None,
+            MetricType::Counter,
+        )?;
         for (topic, (_, counts)) in topics.iter().filter(|(_, (is_received, _))| *is_received) {
-            ConstCounter::new(counts.received).encode(received.encode_family(&[("topic", topic.as_str())])?)?;
+            ConstCounter::new(counts.received)
+                .encode(received.encode_family(&[("topic", topic.as_str())])?)?;
         }
-        let mut dropped =
-            encoder.encode_descriptor("messages_dropped", "Messages lost, by reason", None, MetricType::Counter)?;
+        let mut dropped = encoder.encode_descriptor(
+            "messages_dropped",
+            "Messages lost, by reason",
+            None,
+            MetricType::Counter,
+        )?;
         for (topic, (is_received, counts)) in &topics {
             let side = if *is_received { "receiver" } else { "sender" };
             for (reason, count) in &counts.dropped {
-                let labels = [("topic", topic.as_str()), ("side", side), ("reason", reason.as_str())];
+                let labels = [
+                    ("topic", topic.as_str()),
+                    ("side", side),
+                    ("reason", reason.as_str()),
+                ];
                 ConstCounter::new(*count).encode(dropped.encode_family(&labels)?)?;
             }
         }
-        let mut in_flight =
-            encoder.encode_descriptor("messages_in_flight", "Messages in flight", None, MetricType::Gauge)?;
+        let mut in_flight = encoder.encode_descriptor(
+            "messages_in_flight",
+            "Messages in flight",
+            None,
+            MetricType::Gauge,
+        )?;
         for (topic, (is_received, counts)) in &topics {
             let side = if *is_received { "receiver" } else { "sender" };
             let count = i64::try_from(counts.in_flight).unwrap_or(i64::MAX);
@@ -165,10 +221,16 @@ impl Collector for StatsCollector {
             ConstCounter::new(count).encode(shared.encode_family(&[("way", way.as_str())])?)?;
         }
         let help = "Bytes of published messages, each counted once for all its receivers";
-        let mut bytes = encoder.encode_descriptor("published", help, Some(&Unit::Bytes), MetricType::Counter)?;
+        let mut bytes = encoder.encode_descriptor(
+            "published",
+            help,
+            Some(&Unit::Bytes),
+            MetricType::Counter,
+        )?;
         for traffic in self.0.traffic() {
             let topic = traffic.topic.to_string();
-            ConstCounter::new(traffic.bytes).encode(bytes.encode_family(&[("topic", topic.as_str())])?)?;
+            ConstCounter::new(traffic.bytes)
+                .encode(bytes.encode_family(&[("topic", topic.as_str())])?)?;
         }
         encode_frames(&self.0.frames(), &mut encoder)?;
         let seconds = Unit::Seconds;
@@ -179,12 +241,23 @@ impl Collector for StatsCollector {
             Some(&seconds),
             MetricType::Gauge,
         )?;
-        for (cav, offset_s) in peers.iter().filter_map(|peer| Some((&peer.cav, peer.clock_offset_s?))) {
-            ConstGauge::new(offset_s).encode(clocks.encode_family(&[("vehicle", cav.as_str())])?)?;
+        for (cav, offset_s) in peers
+            .iter()
+            .filter_map(|peer| Some((&peer.cav, peer.clock_offset_s?)))
+        {
+            ConstGauge::new(offset_s)
+                .encode(clocks.encode_family(&[("vehicle", cav.as_str())])?)?;
         }
-        let mut trust =
-            encoder.encode_descriptor("trust", "Trust score of a vehicle, 0 to 1", None, MetricType::Gauge)?;
-        for (cav, value) in peers.iter().filter_map(|peer| Some((&peer.cav, peer.trust?))) {
+        let mut trust = encoder.encode_descriptor(
+            "trust",
+            "Trust score of a vehicle, 0 to 1",
+            None,
+            MetricType::Gauge,
+        )?;
+        for (cav, value) in peers
+            .iter()
+            .filter_map(|peer| Some((&peer.cav, peer.trust?)))
+        {
             ConstGauge::new(value).encode(trust.encode_family(&[("vehicle", cav.as_str())])?)?;
         }
         let mut stages = encoder.encode_descriptor(
@@ -196,7 +269,12 @@ impl Collector for StatsCollector {
         for histogram in self.0.histograms() {
             let labels = [("stage", histogram.stage.as_str())];
             let mut family = stages.encode_family(&labels)?;
-            family.encode_histogram::<[(&str, &str); 0]>(histogram.sum_s, histogram.count, &histogram.buckets, None)?;
+            family.encode_histogram::<[(&str, &str); 0]>(
+                histogram.sum_s,
+                histogram.count,
+                &histogram.buckets,
+                None,
+            )?;
         }
         Ok(())
     }
@@ -213,7 +291,10 @@ mod tests {
     fn sample() -> MessageStats {
         let stats = MessageStats::new(ProcessId::new("agent-4279").unwrap());
         let cav = CavId::new("4279").unwrap();
-        let [lidar, bev] = [Stream::Lidar, Stream::Bev].map(|stream| Topic::Stream { cav: cav.clone(), stream });
+        let [lidar, bev] = [Stream::Lidar, Stream::Bev].map(|stream| Topic::Stream {
+            cav: cav.clone(),
+            stream,
+        });
         stats.subscribed(&lidar);
         for _ in 0..5 {
             stats.arrived(&lidar);
@@ -244,7 +325,9 @@ mod tests {
             format!(
                 "v2vloc_messages_dropped_total{{{process},topic=\"4279/lidar\",side=\"receiver\",reason=\"superseded\"}} 1"
             ),
-            format!("v2vloc_messages_in_flight{{{process},topic=\"4279/lidar\",side=\"receiver\"}} 2"),
+            format!(
+                "v2vloc_messages_in_flight{{{process},topic=\"4279/lidar\",side=\"receiver\"}} 2"
+            ),
             format!("v2vloc_trust{{{process},vehicle=\"4279\"}} 0.25"),
             format!("v2vloc_published_bytes_total{{{process},topic=\"4279/bev\"}} 2000"),
             format!("v2vloc_ticks_total{{{process}}} 3"),
@@ -258,33 +341,55 @@ mod tests {
             "# TYPE v2vloc_stage_seconds histogram".into(),
             "# EOF".into(),
         ] {
-            assert!(text.lines().any(|found| found == line), "{line}\nis not in\n{text}");
+            assert!(
+                text.lines().any(|found| found == line),
+                "{line}\nis not in\n{text}"
+            );
         }
         for name in ["process_cpu_seconds_total", "process_resident_memory_bytes"] {
-            let line = text.lines().find(|line| line.starts_with(&format!("{name}{{{process}}}")));
-            let value = line.and_then(|line| line.rsplit(' ').next()).and_then(|value| value.parse::<f64>().ok());
+            let line = text
+                .lines()
+                .find(|line| line.starts_with(&format!("{name}{{{process}}}")));
+            let value = line
+                .and_then(|line| line.rsplit(' ').next())
+                .and_then(|value| value.parse::<f64>().ok());
             assert!(value.is_some_and(|value| value > 0.0), "{name} in\n{text}");
         }
         assert_eq!(text.matches("# EOF").count(), 1);
         let bucket = |le: &str| {
-            let line = text
-                .lines()
-                .find(|line| line.contains("stage_seconds_bucket") && line.contains(&format!("le=\"{le}\"")));
-            line.and_then(|line| line.rsplit(' ').next()).and_then(|count| count.parse::<u64>().ok())
+            let line = text.lines().find(|line| {
+                line.contains("stage_seconds_bucket") && line.contains(&format!("le=\"{le}\""))
+            });
+            line.and_then(|line| line.rsplit(' ').next())
+                .and_then(|count| count.parse::<u64>().ok())
         };
         assert_eq!(
-            [bucket("0.0025"), bucket("0.005"), bucket("0.05"), bucket("+Inf")],
+            [
+                bucket("0.0025"),
+                bucket("0.005"),
+                bucket("0.05"),
+                bucket("+Inf")
+            ],
             [Some(1), Some(3), Some(4), Some(5)]
         );
     }
 
     #[test]
     fn metrics_can_be_fetched() {
-        let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample(), Vec::new()).unwrap();
+        let server =
+            MetricsServer::start("127.0.0.1:0".parse().unwrap(), &sample(), Vec::new()).unwrap();
         let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
         assert_eq!(status, "HTTP/1.0 200 OK");
         let text = String::from_utf8(body).unwrap();
-        assert!(text.contains("v2vloc_ticks_total") && text.ends_with("# EOF\n"), "{text}");
-        assert!(crate::web::fetch(server.address(), "/").unwrap().0.contains("404"));
+        assert!(
+            text.contains("v2vloc_ticks_total") && text.ends_with("# EOF\n"),
+            "{text}"
+        );
+        assert!(
+            crate::web::fetch(server.address(), "/")
+                .unwrap()
+                .0
+                .contains("404")
+        );
     }
 }

@@ -92,18 +92,27 @@ impl PassiveSubscriber {
         let subscribe = |selector: &KeyExpr| {
             let (shared, status) = (Arc::clone(&shared), status.clone());
             let subscriber = session.declare_subscriber(selector.as_str());
-            let subscriber = subscriber.callback(move |sample| shared.admit(&sample, &status)).wait();
-            subscriber.map_err(|cause| BusError::zenoh(format!("subscribing to {}", selector.as_str()), &cause))
+            let subscriber = subscriber
+                .callback(move |sample| shared.admit(&sample, &status))
+                .wait();
+            subscriber.map_err(|cause| {
+                BusError::zenoh(format!("subscribing to {}", selector.as_str()), &cause)
+            })
         };
         let subscribers = selectors.iter().map(subscribe).collect::<Result<_, _>>()?;
-        Ok(Self { shared, _subscribers: subscribers })
+        Ok(Self {
+            shared,
+            _subscribers: subscribers,
+        })
     }
 
     /// The oldest message, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, RawMessage> {
         let taken = self.shared.queue.take(deadline);
         if let Pop::Item(_, raw_message) = &taken {
-            self.shared.waiting_bytes.fetch_sub(raw_message.len(), Ordering::Relaxed);
+            self.shared
+                .waiting_bytes
+                .fetch_sub(raw_message.len(), Ordering::Relaxed);
         }
         taken
     }
@@ -130,14 +139,19 @@ impl PassiveSubscriber {
 impl Shared {
     /// Runs on zenoh's receive thread: reads headers only and waits for nothing.
     fn admit(&self, sample: &Sample, status: &StatusPublisher) {
-        let Ok(key) = sample.key_expr().as_str().parse::<Key>() else { return };
+        let Ok(key) = sample.key_expr().as_str().parse::<Key>() else {
+            return;
+        };
         if has_notifications(&key.topic) && !key.topic.is_json() {
             let header = wire::decode_header(sample.payload().slices());
-            let is_notice = header.as_ref().is_ok_and(|header| header.kind == Kind::Control);
+            let is_notice = header
+                .as_ref()
+                .is_ok_and(|header| header.kind == Kind::Control);
             let mut gaps = self.gaps.lock().unwrap_or_else(PoisonError::into_inner);
             let skipped = gaps.note(&key.topic, sample.source_info(), is_notice);
             drop(gaps);
-            self.undelivered.fetch_add(u64::from(skipped), Ordering::Relaxed);
+            self.undelivered
+                .fetch_add(u64::from(skipped), Ordering::Relaxed);
             match header {
                 Ok(_) if is_notice => return note(&key.topic, sample, status),
                 Ok(_) => status.confirm_route(&key.topic),
@@ -145,7 +159,11 @@ impl Shared {
                 Err(_) => {}
             }
         }
-        self.keep(RawMessage { key, arrived_nanos: unix_nanos(), payload: sample.payload().clone() });
+        self.keep(RawMessage {
+            key,
+            arrived_nanos: unix_nanos(),
+            payload: sample.payload().clone(),
+        });
     }
 
     fn keep(&self, raw_message: RawMessage) {
@@ -162,7 +180,8 @@ impl Shared {
             }
         };
         self.waiting_bytes.fetch_sub(left_out, Ordering::Relaxed);
-        self.overwritten.fetch_add(u64::from(is_lost), Ordering::Relaxed);
+        self.overwritten
+            .fetch_add(u64::from(is_lost), Ordering::Relaxed);
     }
 }
 
@@ -185,12 +204,19 @@ mod tests {
             gaps: Mutex::default(),
             undelivered: AtomicU64::new(0),
         };
-        PassiveSubscriber { shared: Arc::new(shared), _subscribers: Vec::new() }
+        PassiveSubscriber {
+            shared: Arc::new(shared),
+            _subscribers: Vec::new(),
+        }
     }
 
     fn raw_message(vehicle: usize, payload: &ZBytes) -> RawMessage {
         let key = format!("v2v/test/{vehicle}/lidar").parse().unwrap();
-        RawMessage { key, arrived_nanos: 0, payload: payload.clone() }
+        RawMessage {
+            key,
+            arrived_nanos: 0,
+            payload: payload.clone(),
+        }
     }
 
     #[test]
@@ -202,7 +228,12 @@ mod tests {
         (1..10).for_each(|vehicle| passive.shared.keep(raw_message(vehicle, &payload)));
         assert_eq!(passive.overwritten(), 1 + 3, "eight of them fill the queue");
         let at_once = Some(Instant::now());
-        assert_eq!((0..9).filter(|_| matches!(passive.take(at_once), Pop::Item(..))).count(), 8);
+        assert_eq!(
+            (0..9)
+                .filter(|_| matches!(passive.take(at_once), Pop::Item(..)))
+                .count(),
+            8
+        );
         assert_eq!(passive.shared.waiting_bytes.load(Ordering::Relaxed), 0);
         passive.shared.keep(raw_message(9, &payload));
         assert_eq!(passive.overwritten(), 4, "there is room again");

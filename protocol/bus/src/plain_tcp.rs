@@ -24,7 +24,10 @@ impl PlainTcp {
         let bound = TcpListener::bind(router.address());
         let listener = bound.and_then(|listener| listener.set_nonblocking(true).map(|()| listener));
         match listener {
-            Ok(listener) => Some(Self { listener, turned_away: 0 }),
+            Ok(listener) => Some(Self {
+                listener,
+                turned_away: 0,
+            }),
             Err(error) => {
                 tracing::info!("plain-TCP clients of {router} are not counted: {error}");
                 None
@@ -36,7 +39,9 @@ impl PlainTcp {
     pub(super) fn reject(&mut self) -> u64 {
         for _ in 0..MAX_PER_CALL {
             // Whatever the error, the other connections can wait until the next call.
-            let Ok((client, _)) = self.listener.accept() else { break };
+            let Ok((client, _)) = self.listener.accept() else {
+                break;
+            };
             let _ = client.shutdown(Shutdown::Both);
             self.turned_away += 1;
         }
@@ -53,7 +58,10 @@ mod tests {
 
     #[test]
     fn tcp_clients_are_disconnected_and_counted() {
-        let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+        let free = TcpListener::bind("127.0.0.1:0")
+            .unwrap()
+            .local_addr()
+            .unwrap();
         let router = Endpoint::loopback(free.port());
         assert!(PlainTcp::beside(&router).is_none(), "it takes TCP itself");
         let mut listener = PlainTcp::beside(&router.secured()).unwrap();
@@ -63,6 +71,9 @@ mod tests {
         for client in &mut clients {
             assert_eq!(client.read(&mut [0; 1]).unwrap(), 0, "nothing is sent");
         }
-        assert!(PlainTcp::beside(&router.secured()).is_none(), "the port is taken");
+        assert!(
+            PlainTcp::beside(&router.secured()).is_none(),
+            "the port is taken"
+        );
     }
 }

@@ -31,10 +31,14 @@ pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
 ///
 /// # Errors
 /// A value that its field does not accept.
-pub fn minimal<C: ProcessConfig>(value_of: impl Fn(&str) -> String) -> Result<C, serde_json::Error> {
+pub fn minimal<C: ProcessConfig>(
+    value_of: impl Fn(&str) -> String,
+) -> Result<C, serde_json::Error> {
     let mut root = Map::new();
     for field in C::REQUIRED {
-        let (section, name) = field.split_once('.').map_or((None, *field), |(section, name)| (Some(section), name));
+        let (section, name) = field
+            .split_once('.')
+            .map_or((None, *field), |(section, name)| (Some(section), name));
         let value = Value::String(value_of(name));
         match section {
             None => root.insert(name.into(), value),
@@ -62,7 +66,9 @@ impl<C: ProcessConfig> Configured<C> {
     /// [`ConfigError::Value`] states file, field and value.
     pub fn validated(self) -> Result<C, ConfigError> {
         let Self { file, config } = self;
-        config.validate().map_err(|error| ConfigError::Value { path: file, error })?;
+        config
+            .validate()
+            .map_err(|error| ConfigError::Value { path: file, error })?;
         Ok(config)
     }
 }
@@ -74,7 +80,10 @@ impl<C: ProcessConfig> FromArgMatches for Configured<C> {
 
     fn from_arg_matches_mut(matches: &mut ArgMatches) -> Result<Self, clap::Error> {
         let refused = |error: &dyn std::fmt::Display| {
-            clap::Error::raw(clap::error::ErrorKind::ValueValidation, format!("{error}\n"))
+            clap::Error::raw(
+                clap::error::ErrorKind::ValueValidation,
+                format!("{error}\n"),
+            )
         };
         let file = matches.remove_one::<PathBuf>("config");
         let mut config: C = match &file {
@@ -104,12 +113,22 @@ impl<C: ProcessConfig> Args for Configured<C> {
             .value_parser(clap::value_parser!(PathBuf))
             .help("Configuration of this process, YAML; given options override it");
         // A word that is valid as an id, a path and a name.
-        let defaults = minimal::<C>(|_| "x".into()).and_then(serde_json::to_value).unwrap_or_default();
-        let required = C::REQUIRED.iter().map(|field| field.rsplit('.').next().unwrap_or(field));
+        let defaults = minimal::<C>(|_| "x".into())
+            .and_then(serde_json::to_value)
+            .unwrap_or_default();
+        let required = C::REQUIRED
+            .iter()
+            .map(|field| field.rsplit('.').next().unwrap_or(field));
         let required: Vec<&str> = required.collect();
-        let options = options_of::<C>().filter(|option| !required.contains(&option.get_id().as_str()));
+        let options =
+            options_of::<C>().filter(|option| !required.contains(&option.get_id().as_str()));
         let heading = None::<&str>;
-        document(C::augment_args_for_update(command.arg(config)), options, &defaults).next_help_heading(heading)
+        document(
+            C::augment_args_for_update(command.arg(config)),
+            options,
+            &defaults,
+        )
+        .next_help_heading(heading)
     }
 
     fn augment_args_for_update(command: Command) -> Command {
@@ -137,7 +156,10 @@ mod tests {
 
     impl Default for Section {
         fn default() -> Self {
-            Self { seconds: 2.5, goes_on: false }
+            Self {
+                seconds: 2.5,
+                goes_on: false,
+            }
         }
     }
 
@@ -167,7 +189,8 @@ mod tests {
     }
 
     fn parsed(arguments: &[&str]) -> Result<Config, String> {
-        let cli = Cli::try_parse_from([&["program"], arguments].concat()).map_err(|error| error.to_string())?;
+        let cli = Cli::try_parse_from([&["program"], arguments].concat())
+            .map_err(|error| error.to_string())?;
         cli.config.validated().map_err(|error| error.to_string())
     }
 
@@ -177,23 +200,43 @@ mod tests {
         let path = folder.path().join("c.yaml");
         std::fs::write(&path, "name: a\nsection: {seconds: 4, goes_on: true}\n").unwrap();
         let file = path.to_str().unwrap();
-        let config = |name: &str, seconds, goes_on| Config { name: name.into(), section: Section { seconds, goes_on } };
+        let config = |name: &str, seconds, goes_on| Config {
+            name: name.into(),
+            section: Section { seconds, goes_on },
+        };
         assert_eq!(parsed(&["--name", "b"]).unwrap(), config("b", 2.5, false));
         assert_eq!(parsed(&["--config", file]).unwrap(), config("a", 4.0, true));
-        assert_eq!(parsed(&["--config", file, "--name=b", "--goes-on=false"]).unwrap(), config("b", 4.0, false));
-        assert_eq!(parsed(&["--name=b", "--goes-on", "--section-seconds=1"]).unwrap(), config("b", 1.0, true));
+        assert_eq!(
+            parsed(&["--config", file, "--name=b", "--goes-on=false"]).unwrap(),
+            config("b", 4.0, false)
+        );
+        assert_eq!(
+            parsed(&["--name=b", "--goes-on", "--section-seconds=1"]).unwrap(),
+            config("b", 1.0, true)
+        );
         assert!(parsed(&[]).unwrap_err().contains("--name"));
         let message = parsed(&["--config", file, "--section-seconds=0"]).unwrap_err();
-        assert!(message.contains("c.yaml: section.seconds is 0"), "{message}");
+        assert!(
+            message.contains("c.yaml: section.seconds is 0"),
+            "{message}"
+        );
         std::fs::write(&path, "nam: a\n").unwrap();
         let message = parsed(&["--config", file]).unwrap_err();
-        assert!(message.contains("c.yaml:1: ") && message.contains("nam"), "{message}");
+        assert!(
+            message.contains("c.yaml:1: ") && message.contains("nam"),
+            "{message}"
+        );
     }
 
     #[test]
     fn the_help_quotes_the_defaults() {
-        let help = <Cli as clap::CommandFactory>::command().render_help().to_string();
+        let help = <Cli as clap::CommandFactory>::command()
+            .render_help()
+            .to_string();
         assert!(help.contains("Waits so long [default: 2.5]"), "{help}");
-        assert!(help.contains("--goes-on[=<true|false>]") && !help.contains("Name [default"), "{help}");
+        assert!(
+            help.contains("--goes-on[=<true|false>]") && !help.contains("Name [default"),
+            "{help}"
+        );
     }
 }

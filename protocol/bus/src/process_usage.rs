@@ -26,7 +26,11 @@ pub fn process_cpu_s() -> f64 {
 /// A field of `/proc/PID/status` in kB, in bytes.
 fn memory_bytes(status: &str, field: &str) -> Option<u64> {
     let line = status.lines().find_map(|line| line.strip_prefix(field))?;
-    line.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
+    line.split_whitespace()
+        .next()?
+        .parse::<u64>()
+        .ok()?
+        .checked_mul(1024)
 }
 
 #[cfg(test)]
@@ -39,11 +43,16 @@ mod tests {
         let block = vec![1_u8; 32 << 20];
         let mut sum = 0_u64;
         while process_cpu_s() < before.cpu_s + 0.01 {
-            sum = block.iter().fold(sum, |sum, byte| sum.wrapping_mul(31).wrapping_add(u64::from(*byte)));
+            sum = block.iter().fold(sum, |sum, byte| {
+                sum.wrapping_mul(31).wrapping_add(u64::from(*byte))
+            });
         }
         let after = process_usage();
         assert!(after.cpu_s > before.cpu_s, "{sum}");
-        assert!(after.resident_bytes > 16 << 20 && after.peak_resident_bytes >= 32 << 20, "{after:?}");
+        assert!(
+            after.resident_bytes > 16 << 20 && after.peak_resident_bytes >= 32 << 20,
+            "{after:?}"
+        );
     }
 
     #[test]
@@ -51,6 +60,12 @@ mod tests {
         let status = "Name:\tagent\nVmHWM:\t    2048 kB\nVmRSS:\t    1024 kB\n";
         assert_eq!(memory_bytes(status, "VmRSS:"), Some(1 << 20));
         assert_eq!(memory_bytes(status, "VmHWM:"), Some(2 << 20));
-        assert_eq!((memory_bytes(status, "VmSwap:"), memory_bytes("VmRSS: much", "VmRSS:")), (None, None));
+        assert_eq!(
+            (
+                memory_bytes(status, "VmSwap:"),
+                memory_bytes("VmRSS: much", "VmRSS:")
+            ),
+            (None, None)
+        );
     }
 }

@@ -6,7 +6,9 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::wire::{self, Encoded};
-use protocol::{CavId, Control, DropReason, HEADER_LEN, Key, Payload, Stamp, Topic, TopicCount, WireError};
+use protocol::{
+    CavId, Control, DropReason, HEADER_LEN, Key, Payload, Stamp, Topic, TopicCount, WireError,
+};
 use zenoh::Wait;
 use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
@@ -66,23 +68,37 @@ impl PublisherOptions {
     pub const CAMERA: Self = Self::new(Priority::Background, false);
 
     /// Previews for people, not used in any computation.
-    pub const PREVIEW: Self = Self { is_for_onlookers: true, ..Self::new(Priority::Background, false) };
+    pub const PREVIEW: Self = Self {
+        is_for_onlookers: true,
+        ..Self::new(Priority::Background, false)
+    };
 
     const fn new(priority: Priority, express: bool) -> Self {
-        Self { overflow: Overflow::KeepLast(1), priority, express, is_for_onlookers: false }
+        Self {
+            overflow: Overflow::KeepLast(1),
+            priority,
+            express,
+            is_for_onlookers: false,
+        }
     }
 
     /// The same, but the producer waits for a place among `places` instead of replacing a message.
     #[must_use]
     pub const fn waiting(self, places: usize) -> Self {
-        Self { overflow: Overflow::Wait(places), ..self }
+        Self {
+            overflow: Overflow::Wait(places),
+            ..self
+        }
     }
 
     /// The same, and the router waits for every receiver: no message is dropped, and a receiver that takes nothing
     /// stops the publisher until its connection is closed. For paced runs.
     #[must_use]
     pub const fn lossless(self, places: usize) -> Self {
-        Self { priority: Priority::RealTime, ..self.waiting(places) }
+        Self {
+            priority: Priority::RealTime,
+            ..self.waiting(places)
+        }
     }
 }
 
@@ -121,12 +137,25 @@ impl Publisher {
         (stats, pool): (&MessageStats, &SharedPool),
         options: PublisherOptions,
     ) -> Result<Self, BusError> {
-        let PublisherOptions { overflow, priority, express, is_for_onlookers } = options;
+        let PublisherOptions {
+            overflow,
+            priority,
+            express,
+            is_for_onlookers,
+        } = options;
         let topic = key.topic.clone();
         // JSON is read by programs outside this project, which do not expect probes.
         let is_json = matches!(&topic, Topic::Stream { stream, .. } if stream.kind().is_none());
-        let encoding = if is_json { Encoding::APPLICATION_JSON } else { Encoding::APPLICATION_OCTET_STREAM };
-        let congestion = if is_for_onlookers { CongestionControl::Drop } else { CongestionControl::Block };
+        let encoding = if is_json {
+            Encoding::APPLICATION_JSON
+        } else {
+            Encoding::APPLICATION_OCTET_STREAM
+        };
+        let congestion = if is_for_onlookers {
+            CongestionControl::Drop
+        } else {
+            CongestionControl::Block
+        };
         let publisher = session
             .declare_publisher(key.to_string())
             .encoding(encoding)
@@ -138,9 +167,11 @@ impl Publisher {
         let places = match overflow {
             Overflow::KeepLast(places) | Overflow::Wait(places) => places,
         };
-        let has_subscribers = is_for_onlookers.then(|| has_subscribers(&publisher)).transpose();
-        let has_subscribers =
-            has_subscribers.map_err(|cause| BusError::zenoh(format!("asking for subscribers of {key}"), &cause))?;
+        let has_subscribers = is_for_onlookers
+            .then(|| has_subscribers(&publisher))
+            .transpose();
+        let has_subscribers = has_subscribers
+            .map_err(|cause| BusError::zenoh(format!("asking for subscribers of {key}"), &cause))?;
         let queue = Arc::new(BoundedQueue::new(places, 1));
         let sender = Sender {
             topic: topic.clone(),
@@ -159,14 +190,26 @@ impl Publisher {
         let thread = thread::Builder::new()
             .name(format!("send {topic}"))
             .spawn(move || sender.run())
-            .map_err(|cause| BusError::Thread { what: format!("sending {key}"), cause })?;
-        Ok(Self { topic, overflow, queue, stats: stats.clone(), has_subscribers, thread: Some(thread) })
+            .map_err(|cause| BusError::Thread {
+                what: format!("sending {key}"),
+                cause,
+            })?;
+        Ok(Self {
+            topic,
+            overflow,
+            queue,
+            stats: stats.clone(),
+            has_subscribers,
+            thread: Some(thread),
+        })
     }
 
     /// True if messages should be submitted: always, except for viewer topics without subscribers.
     #[must_use]
     pub fn is_wanted(&self) -> bool {
-        self.has_subscribers.as_ref().is_none_or(|has_subscribers| has_subscribers.load(Ordering::Relaxed))
+        self.has_subscribers
+            .as_ref()
+            .is_none_or(|has_subscribers| has_subscribers.load(Ordering::Relaxed))
     }
 
     /// Topic of the publisher.
@@ -187,13 +230,19 @@ impl Publisher {
         capture_nanos: u64,
         encode: impl FnOnce(&Stamp) -> Result<Encoded, WireError> + Send + 'static,
     ) {
-        self.push(Submission { capture_nanos, encode: Box::new(|stamp, pool| Ok(pool.payload(encode(stamp)?))) });
+        self.push(Submission {
+            capture_nanos,
+            encode: Box::new(|stamp, pool| Ok(pool.payload(encode(stamp)?))),
+        });
     }
 
     /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload().clone();
-        self.push(Submission { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_, _| Ok(bytes)) });
+        self.push(Submission {
+            capture_nanos: arrival.header.stamp.capture_nanos,
+            encode: Box::new(|_, _| Ok(bytes)),
+        });
     }
 
     /// The same with another capture time, that of an erroneous clock.
@@ -203,12 +252,20 @@ impl Publisher {
         }
         let mut header = arrival.header.clone();
         header.stamp.capture_nanos = capture_nanos;
-        let rest = arrival.payload().to_bytes().get(HEADER_LEN..).unwrap_or_default().to_vec();
+        let rest = arrival
+            .payload()
+            .to_bytes()
+            .get(HEADER_LEN..)
+            .unwrap_or_default()
+            .to_vec();
         let mut writer = ZBytes::writer();
         writer.append(header.to_bytes().to_vec().into());
         writer.append(rest.into());
         let bytes = writer.finish();
-        self.push(Submission { capture_nanos, encode: Box::new(|_, _| Ok(bytes)) });
+        self.push(Submission {
+            capture_nanos,
+            encode: Box::new(|_, _| Ok(bytes)),
+        });
     }
 
     fn push(&self, submission: Submission) {
@@ -269,19 +326,34 @@ impl Sender {
         }
         loop {
             let probing = self.has_notifications && self.sequence == 0;
-            match self.queue.take(probing.then(|| Instant::now() + PROBE_PERIOD)) {
+            match self
+                .queue
+                .take(probing.then(|| Instant::now() + PROBE_PERIOD))
+            {
                 Pop::Item((), submission) => self.send(submission),
                 Pop::TimedOut => self.notify(Control::Probe),
                 Pop::Closed => break,
             }
         }
         if self.has_notifications {
-            let sent = vec![TopicCount { topic: self.topic.clone(), messages: self.sequence }];
-            self.notify(Control::End { ticks: self.sequence, sent });
+            let sent = vec![TopicCount {
+                topic: self.topic.clone(),
+                messages: self.sequence,
+            }];
+            self.notify(Control::End {
+                ticks: self.sequence,
+                sent,
+            });
         }
     }
 
-    fn send(&mut self, Submission { capture_nanos, encode }: Submission) {
+    fn send(
+        &mut self,
+        Submission {
+            capture_nanos,
+            encode,
+        }: Submission,
+    ) {
         let began = Instant::now();
         match encode(&self.stamp(capture_nanos), &self.pool) {
             Ok(bytes) => {
@@ -314,7 +386,9 @@ impl Sender {
             Ok(encoded) => {
                 self.put(payload(encoded));
             }
-            Err(error) => tracing::error!(topic = %self.topic, "notification cannot be sent: {error}"),
+            Err(error) => {
+                tracing::error!(topic = %self.topic, "notification cannot be sent: {error}")
+            }
         }
     }
 
@@ -346,7 +420,10 @@ pub fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Resul
     let has_subscribers = Arc::<AtomicBool>::default();
     let noted = Arc::clone(&has_subscribers);
     let listener = publisher.matching_listener();
-    listener.callback(move |status| noted.store(status.matching(), Ordering::Relaxed)).background().wait()?;
+    listener
+        .callback(move |status| noted.store(status.matching(), Ordering::Relaxed))
+        .background()
+        .wait()?;
     if publisher.matching_status().wait()?.matching() {
         has_subscribers.store(true, Ordering::Relaxed);
     }
@@ -366,7 +443,9 @@ pub(super) fn payload(encoded: Encoded) -> ZBytes {
 /// Current time on the Unix clock, nanoseconds.
 #[must_use]
 pub fn unix_nanos() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let since = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default();
     nanos::of(since)
 }
 
@@ -380,16 +459,37 @@ mod tests {
     #[test]
     fn messages_rejected_by_zenoh_are_not_in_flight() {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
-        let (key, stats): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), MessageStats::new("replay".parse().unwrap()));
+        let (key, stats): (Key, _) = (
+            "v2v/test/7/gnss".parse().unwrap(),
+            MessageStats::new("replay".parse().unwrap()),
+        );
         let cav = CavId::new("7").unwrap();
-        let publisher =
-            Publisher::new(&session, (&key, &cav), 1, (&stats, &SharedPool::none()), PublisherOptions::POSE).unwrap();
+        let publisher = Publisher::new(
+            &session,
+            (&key, &cav),
+            1,
+            (&stats, &SharedPool::none()),
+            PublisherOptions::POSE,
+        )
+        .unwrap();
         session.close().wait().unwrap();
         let source = GnssSource::Recorded;
-        let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };
+        let gnss = Gnss {
+            world_from_lidar: Pose::IDENTITY,
+            position_std_m: 0.0,
+            heading_std_rad: 0.0,
+            source,
+        };
         publisher.submit(5, gnss);
         publisher.finish();
-        let lost = Counts { sent: 1, dropped: [(DropReason::PeerOffline, 1)].into(), ..Counts::default() };
-        assert_eq!(stats.ledger().get(&Account::published(key.topic)), Some(&lost));
+        let lost = Counts {
+            sent: 1,
+            dropped: [(DropReason::PeerOffline, 1)].into(),
+            ..Counts::default()
+        };
+        assert_eq!(
+            stats.ledger().get(&Account::published(key.topic)),
+            Some(&lost)
+        );
     }
 }

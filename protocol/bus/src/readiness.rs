@@ -30,7 +30,9 @@ const POLL_PERIOD: Duration = Duration::from_millis(100);
 const MAX_LISTED: usize = 20;
 
 /// From the publisher of a topic to one subscribing process, written `4279/lidar>agent-4279`.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(
+    Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema,
+)]
 #[serde(try_from = "String", into = "String")]
 pub struct Route {
     /// Topic of the publisher.
@@ -64,11 +66,20 @@ impl FromStr for Route {
     type Err = RouteError;
 
     fn from_str(text: &str) -> Result<Self, RouteError> {
-        let error = |detail: String| RouteError { text: text.chars().take(100).collect(), detail };
-        let (topic, receiver) = text.split_once('>').ok_or_else(|| error("there is no '>'".into()))?;
+        let error = |detail: String| RouteError {
+            text: text.chars().take(100).collect(),
+            detail,
+        };
+        let (topic, receiver) = text
+            .split_once('>')
+            .ok_or_else(|| error("there is no '>'".into()))?;
         Ok(Self {
-            topic: topic.parse().map_err(|cause: protocol::KeyError| error(cause.to_string()))?,
-            receiver: receiver.parse().map_err(|cause: protocol::IdError| error(cause.to_string()))?,
+            topic: topic
+                .parse()
+                .map_err(|cause: protocol::KeyError| error(cause.to_string()))?,
+            receiver: receiver
+                .parse()
+                .map_err(|cause: protocol::IdError| error(cause.to_string()))?,
         })
     }
 }
@@ -110,7 +121,10 @@ impl Barrier {
     /// A barrier that opens when all of `expected` are confirmed; at once if there are none.
     #[must_use]
     pub fn new(expected: impl IntoIterator<Item = Route>) -> Self {
-        Self { missing: Mutex::new(expected.into_iter().collect()), changed: Condvar::new() }
+        Self {
+            missing: Mutex::new(expected.into_iter().collect()),
+            changed: Condvar::new(),
+        }
     }
 
     /// Subscribes on `bus` to the answers to probes.
@@ -124,18 +138,33 @@ impl Barrier {
         thread::Builder::new()
             .name("readiness".into())
             .spawn(move || attending.0.listen(&attending.1))
-            .map_err(|cause| BusError::Thread { what: "readiness".into(), cause })?;
-        Ok(RoutesReady { barrier, inbox, _subscription: subscription })
+            .map_err(|cause| BusError::Thread {
+                what: "readiness".into(),
+                cause,
+            })?;
+        Ok(RoutesReady {
+            barrier,
+            inbox,
+            _subscription: subscription,
+        })
     }
 
     fn listen(&self, inbox: &Inbox) {
         while let Pop::Item(topic, event) = inbox.take(None) {
-            let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else { continue };
+            let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else {
+                continue;
+            };
             match inbox.decode(&arrival, &Limits::DEFAULT) {
                 // A process may confirm its own routes only.
-                Some(Control::Ready { process, subscribed }) if process == *sender => {
+                Some(Control::Ready {
+                    process,
+                    subscribed,
+                }) if process == *sender => {
                     for topic in subscribed {
-                        self.confirm(&Route { topic, receiver: sender.clone() });
+                        self.confirm(&Route {
+                            topic,
+                            receiver: sender.clone(),
+                        });
                     }
                 }
                 Some(_) => inbox.reject_invalid(&topic, "not the sender's own readiness"),
@@ -169,17 +198,28 @@ impl Barrier {
     ///
     /// # Errors
     /// [`NotReady`] lists the missing routes.
-    pub fn wait_unless(&self, timeout: Duration, given_up: impl Fn() -> bool) -> Result<(), NotReady> {
+    pub fn wait_unless(
+        &self,
+        timeout: Duration,
+        given_up: impl Fn() -> bool,
+    ) -> Result<(), NotReady> {
         let began = Instant::now();
         let mut missing = self.lock();
         while !missing.is_empty() {
             let left = timeout.saturating_sub(began.elapsed());
             if left.is_zero() || given_up() {
                 let waited = began.elapsed();
-                return Err(NotReady { missing: missing.iter().cloned().collect(), waited });
+                return Err(NotReady {
+                    missing: missing.iter().cloned().collect(),
+                    waited,
+                });
             }
             let pause = left.min(POLL_PERIOD);
-            missing = self.changed.wait_timeout(missing, pause).unwrap_or_else(PoisonError::into_inner).0;
+            missing = self
+                .changed
+                .wait_timeout(missing, pause)
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
         }
         Ok(())
     }
@@ -220,10 +260,18 @@ mod tests {
 
     #[test]
     fn routes_are_written_and_read_back() {
-        for text in ["4279/lidar>agent-4279", "truth>scorer", "rx/4279/4288/bev>ego-4279"] {
+        for text in [
+            "4279/lidar>agent-4279",
+            "truth>scorer",
+            "rx/4279/4288/bev>ego-4279",
+        ] {
             assert_eq!(route(text).to_string(), text);
         }
-        for (text, expected) in [("4279/lidar", "'>'"), ("4279/nothing>a", "key"), ("truth>A", "process name")] {
+        for (text, expected) in [
+            ("4279/lidar", "'>'"),
+            ("4279/nothing>a", "key"),
+            ("truth>A", "process name"),
+        ] {
             let error = text.parse::<Route>().unwrap_err().to_string();
             assert!(error.contains(expected), "{error}");
         }
@@ -231,9 +279,20 @@ mod tests {
 
     #[test]
     fn processes_are_named_by_role_and_vehicle() {
-        assert_eq!(process_id(Role::Agent, &CavId::new("-1").unwrap()).as_str(), "agent--1");
-        assert_eq!(process_id(Role::Replay, &CavId::new("replay").unwrap()).as_str(), "replay");
-        assert_eq!(process_id(Role::Replay, &CavId::new(&"z".repeat(32)).unwrap()).as_str().len(), 39);
+        assert_eq!(
+            process_id(Role::Agent, &CavId::new("-1").unwrap()).as_str(),
+            "agent--1"
+        );
+        assert_eq!(
+            process_id(Role::Replay, &CavId::new("replay").unwrap()).as_str(),
+            "replay"
+        );
+        assert_eq!(
+            process_id(Role::Replay, &CavId::new(&"z".repeat(32)).unwrap())
+                .as_str()
+                .len(),
+            39
+        );
     }
 
     #[test]

@@ -46,7 +46,11 @@ impl RejectionLog {
     /// [`Self::update`] closes connections over plain TCP.
     #[must_use]
     pub fn of(router: &Endpoint) -> Self {
-        Self { seen: BTreeMap::new(), failed_handshakes: BTreeMap::new(), plain_tcp: PlainTcp::beside(router) }
+        Self {
+            seen: BTreeMap::new(),
+            failed_handshakes: BTreeMap::new(),
+            plain_tcp: PlainTcp::beside(router),
+        }
     }
 
     /// Queries the router of this process. Counts that cannot be queried stay as they were.
@@ -57,14 +61,24 @@ impl RejectionLog {
             self.failed_handshakes.insert(PLAIN_TCP, plain);
         }
         let key = format!("@/{}/router/metrics", router.zid());
-        let query =
-            router.get(format!("{key}?descriptors=false;compression=false;per_key=false")).timeout(QUERY_TIMEOUT);
+        let query = router
+            .get(format!(
+                "{key}?descriptors=false;compression=false;per_key=false"
+            ))
+            .timeout(QUERY_TIMEOUT);
         let Ok(answers) = query.wait() else { return };
         while let Ok(answer) = answers.recv() {
-            let Ok(sample) = answer.result() else { continue };
-            let Ok(text) = sample.payload().try_to_string() else { continue };
+            let Ok(sample) = answer.result() else {
+                continue;
+            };
+            let Ok(text) = sample.payload().try_to_string() else {
+                continue;
+            };
             for ((rejection, connection), count) in text.lines().filter_map(rejected) {
-                if self.seen.len() < MAX_REJECTIONS || self.seen.contains_key(&(rejection.clone(), connection.clone()))
+                if self.seen.len() < MAX_REJECTIONS
+                    || self
+                        .seen
+                        .contains_key(&(rejection.clone(), connection.clone()))
                 {
                     self.seen.insert((rejection, connection), count);
                 }
@@ -81,7 +95,14 @@ impl RejectionLog {
         }
         counts.extend(self.failed_handshakes.iter().map(|(cause, count)| {
             let [peer, reason, message] = [UNAUTHORISED, "handshake", *cause].map(str::to_owned);
-            (Rejection { peer, reason, message }, *count)
+            (
+                Rejection {
+                    peer,
+                    reason,
+                    message,
+                },
+                *count,
+            )
         }));
         counts
     }
@@ -100,15 +121,26 @@ fn rejected(line: &str) -> Option<((Rejection, String), u64)> {
     }
     let (labels, count) = rest.rsplit_once('}')?;
     let label = |wanted: &str| {
-        let mut known = labels.split("\",").filter_map(|label| label.split_once("=\""));
-        known.find(|(name, _)| *name == wanted).map(|(_, value)| value.trim_end_matches('"').to_owned())
+        let mut known = labels
+            .split("\",")
+            .filter_map(|label| label.split_once("=\""));
+        known
+            .find(|(name, _)| *name == wanted)
+            .map(|(_, value)| value.trim_end_matches('"').to_owned())
     };
-    let reason = label("reason").filter(|reason| reason == "access-control" || reason == "low-pass")?;
+    let reason =
+        label("reason").filter(|reason| reason == "access-control" || reason == "low-pass")?;
     let zid = label("remote_zid").unwrap_or_default();
-    let peer = label("remote_cn").filter(|name| !name.is_empty()).unwrap_or_else(|| zid.clone());
+    let peer = label("remote_cn")
+        .filter(|name| !name.is_empty())
+        .unwrap_or_else(|| zid.clone());
     // Each priority has a count of its own.
     let connection = format!("{zid} {}", label("priority")?);
-    let rejection = Rejection { peer, reason, message: label("message")? };
+    let rejection = Rejection {
+        peer,
+        reason,
+        message: label("message")?,
+    };
     Some(((rejection, connection), count.trim().parse().ok()?))
 }
 
@@ -125,15 +157,27 @@ mod tests {
                  disconnected=\"false\"}} 28"
             )
         };
-        let ((rejection, connection), count) = rejected(&line(DROPPED, "access-control", "agent-1")).unwrap();
+        let ((rejection, connection), count) =
+            rejected(&line(DROPPED, "access-control", "agent-1")).unwrap();
         assert_eq!(
-            (rejection.peer.as_str(), rejection.message.as_str(), connection.as_str()),
+            (
+                rejection.peer.as_str(),
+                rejection.message.as_str(),
+                connection.as_str()
+            ),
             ("agent-1", "put", "fb data")
         );
         assert_eq!(count, 28);
-        assert_eq!(rejected(&line(DROPPED, "low-pass", "")).unwrap().0.0.peer, "fb", "without a certificate");
+        assert_eq!(
+            rejected(&line(DROPPED, "low-pass", "")).unwrap().0.0.peer,
+            "fb",
+            "without a certificate"
+        );
         assert_eq!(rejected(&line(DROPPED, "congestion", "agent-1")), None);
-        assert_eq!(rejected(&line("zenoh_rx_bytes_total", "access-control", "agent-1")), None);
+        assert_eq!(
+            rejected(&line("zenoh_rx_bytes_total", "access-control", "agent-1")),
+            None
+        );
         assert_eq!(rejected("# EOF"), None);
     }
 }

@@ -61,20 +61,37 @@ struct SequenceWindow {
 
 impl ReplayWindow {
     /// Adds a message and decides whether it is accepted.
-    pub(super) fn admit(&mut self, topic: &Topic, epoch: u64, sequence: u64, now: Instant) -> Admission {
+    pub(super) fn admit(
+        &mut self,
+        topic: &Topic,
+        epoch: u64,
+        sequence: u64,
+        now: Instant,
+    ) -> Admission {
         if let Some(senders) = self.topics.get_mut(topic) {
             return senders.admit(epoch, sequence, now);
         }
         if self.topics.len() >= TOPICS {
-            let oldest = self.topics.iter().min_by_key(|(_, senders)| senders.current.last_seen);
+            let oldest = self
+                .topics
+                .iter()
+                .min_by_key(|(_, senders)| senders.current.last_seen);
             if let Some(oldest) = oldest.map(|(topic, _)| topic.clone()) {
                 self.topics.remove(&oldest);
             }
         }
         let current = Sender::new(epoch, sequence, now);
-        let senders = Senders { current, former: VecDeque::new(), starts: VecDeque::new(), quarantined_until: None };
+        let senders = Senders {
+            current,
+            former: VecDeque::new(),
+            starts: VecDeque::new(),
+            quarantined_until: None,
+        };
         self.topics.insert(topic.clone(), senders);
-        Admission { dropped: None, quarantine: None }
+        Admission {
+            dropped: None,
+            quarantine: None,
+        }
     }
 }
 
@@ -85,7 +102,10 @@ impl Senders {
         let dropped = self.judge(epoch, sequence, now);
         let is_quarantined = self.quarantined_until.is_some();
         let dropped = dropped.or(is_quarantined.then_some(DropReason::Identity));
-        Admission { dropped, quarantine: (was_quarantined != is_quarantined).then_some(is_quarantined) }
+        Admission {
+            dropped,
+            quarantine: (was_quarantined != is_quarantined).then_some(is_quarantined),
+        }
     }
 
     fn judge(&mut self, epoch: u64, sequence: u64, now: Instant) -> Option<DropReason> {
@@ -100,7 +120,11 @@ impl Senders {
             return self.admit_previous_epoch(place, sequence, now);
         }
         // A restarted sender is accepted at once.
-        while self.starts.front().is_some_and(|start| now.duration_since(*start) > QUIET) {
+        while self
+            .starts
+            .front()
+            .is_some_and(|start| now.duration_since(*start) > QUIET)
+        {
             self.starts.pop_front();
         }
         self.starts.push_back(now);
@@ -113,7 +137,12 @@ impl Senders {
     }
 
     /// A message of a previous epoch: a replay, a message in transit at the restart, or a second sender.
-    fn admit_previous_epoch(&mut self, place: usize, sequence: u64, now: Instant) -> Option<DropReason> {
+    fn admit_previous_epoch(
+        &mut self,
+        place: usize,
+        sequence: u64,
+        now: Instant,
+    ) -> Option<DropReason> {
         let sender = self.former.get_mut(place)?;
         if let Some(repeated) = sender.numbers.note(sequence) {
             return Some(repeated);
@@ -146,7 +175,15 @@ impl Senders {
 
 impl Sender {
     fn new(epoch: u64, sequence: u64, now: Instant) -> Self {
-        Self { epoch, numbers: SequenceWindow { highest: sequence, came: 1 }, last_seen: now, replaced: now }
+        Self {
+            epoch,
+            numbers: SequenceWindow {
+                highest: sequence,
+                came: 1,
+            },
+            last_seen: now,
+            replaced: now,
+        }
     }
 }
 
@@ -155,7 +192,11 @@ impl SequenceWindow {
     fn note(&mut self, sequence: u64) -> Option<DropReason> {
         if sequence > self.highest {
             let ahead = sequence - self.highest;
-            self.came = if ahead < 64 { self.came << ahead | 1 } else { 1 };
+            self.came = if ahead < 64 {
+                self.came << ahead | 1
+            } else {
+                1
+            };
             self.highest = sequence;
             return None;
         }
@@ -180,11 +221,20 @@ mod tests {
 
     impl Receiver {
         fn new() -> Self {
-            Self { replay_window: ReplayWindow::default(), topic: "4279/bev".parse().unwrap(), begun: Instant::now() }
+            Self {
+                replay_window: ReplayWindow::default(),
+                topic: "4279/bev".parse().unwrap(),
+                begun: Instant::now(),
+            }
         }
 
         fn receive(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Admission {
-            self.replay_window.admit(&self.topic, epoch, sequence, self.begun + Duration::from_millis(at_ms))
+            self.replay_window.admit(
+                &self.topic,
+                epoch,
+                sequence,
+                self.begun + Duration::from_millis(at_ms),
+            )
         }
 
         fn dropped(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Option<DropReason> {
@@ -195,12 +245,19 @@ mod tests {
     #[test]
     fn a_repeated_number_is_a_duplicate_and_an_overtaken_one_is_stale() {
         let mut receiver = Receiver::new();
-        assert_eq!([10, 11, 14].map(|number| receiver.dropped(1, number, 0)), [None; 3]);
+        assert_eq!(
+            [10, 11, 14].map(|number| receiver.dropped(1, number, 0)),
+            [None; 3]
+        );
         assert_eq!(receiver.dropped(1, 14, 0), Some(DropReason::Duplicate));
         assert_eq!(receiver.dropped(1, 12, 0), Some(DropReason::Superseded));
         assert_eq!(receiver.dropped(1, 12, 0), Some(DropReason::Duplicate));
         assert_eq!(receiver.dropped(1, 1_000_000, 0), None);
-        assert_eq!(receiver.dropped(1, 15, 0), Some(DropReason::Duplicate), "outside of the window");
+        assert_eq!(
+            receiver.dropped(1, 15, 0),
+            Some(DropReason::Duplicate),
+            "outside of the window"
+        );
     }
 
     #[test]
@@ -208,7 +265,13 @@ mod tests {
         let mut receiver = Receiver::new();
         assert_eq!(receiver.dropped(1, 100, 0), None);
         let again = receiver.receive(2, 0, 100);
-        assert_eq!(again, Admission { dropped: None, quarantine: None });
+        assert_eq!(
+            again,
+            Admission {
+                dropped: None,
+                quarantine: None
+            }
+        );
         // A replay of old messages, and the last of them in transit.
         assert_eq!(receiver.dropped(1, 100, 5_000), Some(DropReason::Duplicate));
         assert_eq!(receiver.dropped(2, 1, 5_000), None);
@@ -235,16 +298,30 @@ mod tests {
                 accepted_from = Some(step * 100);
             }
         }
-        assert!((6_900..=7_300).contains(&accepted_from.unwrap()), "{accepted_from:?}");
-        assert_eq!(changes, [false], "its start was reported with a message of the other sender");
+        assert!(
+            (6_900..=7_300).contains(&accepted_from.unwrap()),
+            "{accepted_from:?}"
+        );
+        assert_eq!(
+            changes,
+            [false],
+            "its start was reported with a message of the other sender"
+        );
     }
 
     #[test]
     fn a_sender_with_many_epochs_is_quarantined() {
         let mut receiver = Receiver::new();
-        let verdicts: Vec<_> = (0..20).map(|epoch| receiver.dropped(epoch, 0, epoch * 100)).collect();
+        let verdicts: Vec<_> = (0..20)
+            .map(|epoch| receiver.dropped(epoch, 0, epoch * 100))
+            .collect();
         assert!(verdicts[..4].iter().all(Option::is_none));
-        assert!(verdicts[6..].iter().all(|dropped| *dropped == Some(DropReason::Identity)), "{verdicts:?}");
+        assert!(
+            verdicts[6..]
+                .iter()
+                .all(|dropped| *dropped == Some(DropReason::Identity)),
+            "{verdicts:?}"
+        );
     }
 
     #[test]
@@ -253,7 +330,12 @@ mod tests {
         let begun = Instant::now();
         for vehicle in 0..2 * TOPICS as u64 {
             let topic: Topic = format!("{vehicle}/bev").parse().unwrap();
-            assert_eq!(replay_window.admit(&topic, 1, 1, begun + Duration::from_millis(vehicle)).dropped, None);
+            assert_eq!(
+                replay_window
+                    .admit(&topic, 1, 1, begun + Duration::from_millis(vehicle))
+                    .dropped,
+                None
+            );
         }
         assert_eq!(replay_window.topics.len(), TOPICS);
     }

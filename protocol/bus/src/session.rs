@@ -122,7 +122,8 @@ impl BusOptions {
     /// The same with keys: the endpoint becomes a QUIC endpoint.
     #[must_use]
     pub fn with_credentials(mut self, credentials: Credentials) -> Self {
-        let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &mut self.role;
+        let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) =
+            &mut self.role;
         *endpoint = endpoint.secured();
         self.stall_limit = self.stall_limit.min(LONGEST_SECURED);
         self.credentials = Some(credentials);
@@ -132,7 +133,10 @@ impl BusOptions {
     /// The same as a router with access control.
     #[must_use]
     pub fn with_access_control(self, guard: AccessControl) -> Self {
-        Self { guard: Some(guard), ..self }
+        Self {
+            guard: Some(guard),
+            ..self
+        }
     }
 
     /// Endpoint at which this end listens or to which it connects.
@@ -194,10 +198,26 @@ impl BusOptions {
             // Tensors: with zenoh's two batches the writing and the sending thread wait for each other after every 64
             // KiB, which costs a fifth of the time of 8 MiB.
             ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),
-            ("transport/link/tx/queue/size/data_low", json!(TENSOR_BATCHES)),
-            ("transport/link/tx/queue/size/real_time", json!(TENSOR_BATCHES)),
-            ("transport/link/rx/max_message_size", json!(self.max_message_bytes)),
-            ("transport/link/protocols", json!([if self.credentials.is_some() { "quic" } else { "tcp" }])),
+            (
+                "transport/link/tx/queue/size/data_low",
+                json!(TENSOR_BATCHES),
+            ),
+            (
+                "transport/link/tx/queue/size/real_time",
+                json!(TENSOR_BATCHES),
+            ),
+            (
+                "transport/link/rx/max_message_size",
+                json!(self.max_message_bytes),
+            ),
+            (
+                "transport/link/protocols",
+                json!([if self.credentials.is_some() {
+                    "quic"
+                } else {
+                    "tcp"
+                }]),
+            ),
             ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
             ("transport/unicast/max_links", json!(1)),
             ("transport/unicast/accept_pending", json!(MAX_PENDING)),
@@ -205,9 +225,15 @@ impl BusOptions {
                 "transport/link/tx/queue/congestion_control/block/wait_before_close",
                 json!(u64::try_from(self.stall_limit.as_micros()).unwrap_or(u64::MAX)),
             ),
-            ("transport/shared_memory/enabled", json!(self.shared_memory != SharedMemory::Off)),
+            (
+                "transport/shared_memory/enabled",
+                json!(self.shared_memory != SharedMemory::Off),
+            ),
             // Publishers put their messages there themselves, and count those for which there is no room.
-            ("transport/shared_memory/transport_optimization/enabled", json!(false)),
+            (
+                "transport/shared_memory/transport_optimization/enabled",
+                json!(false),
+            ),
         ];
         if matches!(self.role, Role::Router { .. }) {
             settings.push(("low_pass_filter", access_control::size_limits()));
@@ -217,7 +243,10 @@ impl BusOptions {
         if let Some(guard) = &self.guard {
             settings.push(("access_control", guard.rules()));
             // Metrics of rejections; access control keeps other processes from reading them.
-            settings.push(("adminspace", json!({"enabled": true, "permissions": {"read": true, "write": false}})));
+            settings.push((
+                "adminspace",
+                json!({"enabled": true, "permissions": {"read": true, "write": false}}),
+            ));
         }
         settings
     }
@@ -227,11 +256,20 @@ impl BusOptions {
 fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
     let path = |file| json!(credentials.path(file));
     vec![
-        ("transport/link/tls/root_ca_certificate", path(AUTHORITY_FILE)),
+        (
+            "transport/link/tls/root_ca_certificate",
+            path(AUTHORITY_FILE),
+        ),
         ("transport/link/tls/enable_mtls", json!(true)),
-        ("transport/link/tls/listen_certificate", path(CERTIFICATE_FILE)),
+        (
+            "transport/link/tls/listen_certificate",
+            path(CERTIFICATE_FILE),
+        ),
         ("transport/link/tls/listen_private_key", path(KEY_FILE)),
-        ("transport/link/tls/connect_certificate", path(CERTIFICATE_FILE)),
+        (
+            "transport/link/tls/connect_certificate",
+            path(CERTIFICATE_FILE),
+        ),
         ("transport/link/tls/connect_private_key", path(KEY_FILE)),
         ("transport/link/tls/verify_name_on_connect", json!(true)),
         // An expired certificate ends the connections that it opened.
@@ -256,32 +294,44 @@ pub fn open(options: &BusOptions) -> Result<Session, BusError> {
     if let Role::Router { listen } = &options.role
         && port_in_use(listen)
     {
-        return Err(BusError::PortInUse { endpoint: listen.clone() });
+        return Err(BusError::PortInUse {
+            endpoint: listen.clone(),
+        });
     }
-    zenoh::open(config).wait().map_err(|cause| match &options.role {
-        Role::Router { listen } if port_in_use(listen) => BusError::PortInUse { endpoint: listen.clone() },
-        Role::Router { listen } => BusError::zenoh(format!("listening at {listen}"), &cause),
-        Role::Client { connect } => {
-            BusError::Unreachable { endpoint: connect.clone(), waited_s: began.elapsed().as_secs_f64() }
-        }
-    })
+    zenoh::open(config)
+        .wait()
+        .map_err(|cause| match &options.role {
+            Role::Router { listen } if port_in_use(listen) => BusError::PortInUse {
+                endpoint: listen.clone(),
+            },
+            Role::Router { listen } => BusError::zenoh(format!("listening at {listen}"), &cause),
+            Role::Client { connect } => BusError::Unreachable {
+                endpoint: connect.clone(),
+                waited_s: began.elapsed().as_secs_f64(),
+            },
+        })
 }
 
 fn port_in_use(endpoint: &Endpoint) -> bool {
     let address = endpoint.address();
-    let bound =
-        if endpoint.is_secured() { UdpSocket::bind(address).map(drop) } else { TcpListener::bind(address).map(drop) };
+    let bound = if endpoint.is_secured() {
+        UdpSocket::bind(address).map(drop)
+    } else {
+        TcpListener::bind(address).map(drop)
+    };
     bound.is_err_and(|error| error.kind() == std::io::ErrorKind::AddrInUse)
 }
 
 fn config(options: &BusOptions) -> Result<Config, BusError> {
     let mut config = Config::default();
     for (key, wanted) in options.settings() {
-        config.insert_json5(key, &wanted.to_string()).map_err(|cause| BusError::Setting {
-            key,
-            wanted: wanted.clone(),
-            found: format!("rejected: {cause}"),
-        })?;
+        config
+            .insert_json5(key, &wanted.to_string())
+            .map_err(|cause| BusError::Setting {
+                key,
+                wanted: wanted.clone(),
+                found: format!("rejected: {cause}"),
+            })?;
     }
     // zenoh accepts some keys and ignores them: the values are read back.
     for (key, wanted) in options.settings() {
@@ -291,7 +341,11 @@ fn config(options: &BusOptions) -> Result<Config, BusError> {
             found: format!("cannot be read back: {cause}"),
         })?;
         if !serde_json::from_str::<Value>(&found).is_ok_and(|found| same(&found, &wanted)) {
-            return Err(BusError::Setting { key, wanted, found: format!("reads back as {found}") });
+            return Err(BusError::Setting {
+                key,
+                wanted,
+                found: format!("reads back as {found}"),
+            });
         }
     }
     Ok(config)
@@ -301,11 +355,15 @@ fn config(options: &BusOptions) -> Result<Config, BusError> {
 fn same(found: &Value, wanted: &Value) -> bool {
     match (found, wanted) {
         (Value::Number(found), Value::Number(wanted)) => found.as_f64() == wanted.as_f64(),
-        (Value::Object(found), Value::Object(wanted)) => {
-            wanted.iter().all(|(key, value)| found.get(key).is_some_and(|found| same(found, value)))
-        }
+        (Value::Object(found), Value::Object(wanted)) => wanted
+            .iter()
+            .all(|(key, value)| found.get(key).is_some_and(|found| same(found, value))),
         (Value::Array(found), Value::Array(wanted)) => {
-            found.len() == wanted.len() && found.iter().zip(wanted).all(|(found, wanted)| same(found, wanted))
+            found.len() == wanted.len()
+                && found
+                    .iter()
+                    .zip(wanted)
+                    .all(|(found, wanted)| same(found, wanted))
         }
         _ => found == wanted,
     }
@@ -328,17 +386,28 @@ mod tests {
     fn a_secured_endpoint_requires_keys() {
         let endpoint = Endpoint::loopback(7447).secured();
         assert_eq!(endpoint.as_str(), "quic/127.0.0.1:7447");
-        assert!(matches!(open(&BusOptions::client(endpoint)), Err(BusError::NoKeys(_))));
+        assert!(matches!(
+            open(&BusOptions::client(endpoint)),
+            Err(BusError::NoKeys(_))
+        ));
     }
 
     #[test]
     fn every_rule_reads_back() {
-        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"];
+        let members = [
+            "agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2",
+        ];
         let members = members.map(|name| name.parse().unwrap()).into();
-        let guard = AccessControl { members, runs: protocol::RunScope::Any };
+        let guard = AccessControl {
+            members,
+            runs: protocol::RunScope::Any,
+        };
         let options = BusOptions::router(Endpoint::loopback(7447)).with_access_control(guard);
         config(&options).unwrap();
-        assert_eq!(options.for_zenohd()["transport"]["link"]["protocols"], json!(["tcp"]));
+        assert_eq!(
+            options.for_zenohd()["transport"]["link"]["protocols"],
+            json!(["tcp"])
+        );
     }
 
     #[test]

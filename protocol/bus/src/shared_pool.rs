@@ -9,7 +9,9 @@ use std::sync::Arc;
 use bytes::Bytes;
 use protocol::wire::Encoded;
 use zenoh::bytes::ZBytes;
-use zenoh::shm::{Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut};
+use zenoh::shm::{
+    Defragment, GarbageCollect, PosixShmProviderBackend, ShmProvider, ShmProviderBuilder, ZShmMut,
+};
 use zenoh::{Session, Wait};
 
 use super::message_stats::SharedMemoryUse;
@@ -40,14 +42,23 @@ impl SharedPool {
     ///
     /// # Errors
     /// [`BusError::SharedMemory`] when the system has too little; [`BusError::Zenoh`] when it gives none.
-    pub(super) fn open(session: &Session, bytes: usize, stats: &MessageStats) -> Result<Self, BusError> {
+    pub(super) fn open(
+        session: &Session,
+        bytes: usize,
+        stats: &MessageStats,
+    ) -> Result<Self, BusError> {
         if bytes == 0 {
             return Ok(Self::none());
         }
         check_room(bytes)?;
         let provider = ShmProviderBuilder::default_backend(bytes).wait();
-        let provider = provider.map_err(|cause| BusError::zenoh("making a pool of shared memory", &cause))?;
-        Ok(Self(Some(Arc::new(Pool { provider, session: session.clone(), stats: stats.clone() }))))
+        let provider =
+            provider.map_err(|cause| BusError::zenoh("making a pool of shared memory", &cause))?;
+        Ok(Self(Some(Arc::new(Pool {
+            provider,
+            session: session.clone(),
+            stats: stats.clone(),
+        }))))
     }
 
     /// Head and body concatenated; a large body is copied into the pool, others are not copied.
@@ -66,13 +77,20 @@ impl SharedPool {
 
     /// A copy of a large body in the pool.
     fn shared(&self, body: &[u8]) -> Option<ZShmMut> {
-        let Pool { provider, session, stats } = self.0.as_deref().filter(|_| body.len() >= SMALL_BYTES)?;
+        let Pool {
+            provider,
+            session,
+            stats,
+        } = self.0.as_deref().filter(|_| body.len() >= SMALL_BYTES)?;
         if !is_router_attached(session) {
             stats.shared(SharedMemoryUse::RouterNotAttached);
             return None;
         }
         // Without waiting: a receiver that holds many messages must not delay the others.
-        let place = provider.alloc(body.len()).with_policy::<Defragment<GarbageCollect>>().wait();
+        let place = provider
+            .alloc(body.len())
+            .with_policy::<Defragment<GarbageCollect>>()
+            .wait();
         let Ok(mut place) = place else {
             stats.shared(SharedMemoryUse::PoolFull);
             return None;
@@ -84,18 +102,27 @@ impl SharedPool {
 }
 
 fn is_router_attached(session: &Session) -> bool {
-    session.info().transports().wait().any(|transport| transport.is_shm())
+    session
+        .info()
+        .transports()
+        .wait()
+        .any(|transport| transport.is_shm())
 }
 
 /// A segment is made without its memory, and a process is killed when it writes where there is none.
 fn check_room(bytes: usize) -> Result<(), BusError> {
     // Elsewhere shared memory is not in a folder.
-    let Ok(room) = rustix::fs::statvfs(FOLDER) else { return Ok(()) };
+    let Ok(room) = rustix::fs::statvfs(FOLDER) else {
+        return Ok(());
+    };
     let free = room.f_bavail.saturating_mul(room.f_frsize);
     if u64::try_from(bytes).is_ok_and(|bytes| bytes <= free) {
         return Ok(());
     }
-    Err(BusError::SharedMemory { wanted_mib: bytes >> 20, free_mib: free >> 20 })
+    Err(BusError::SharedMemory {
+        wanted_mib: bytes >> 20,
+        free_mib: free >> 20,
+    })
 }
 
 #[cfg(test)]
@@ -105,7 +132,10 @@ mod tests {
     #[test]
     fn a_pool_larger_than_the_memory_is_refused() {
         let error = check_room(usize::MAX).unwrap_err().to_string();
-        assert!(error.contains("shared memory") && error.contains("MiB"), "{error}");
+        assert!(
+            error.contains("shared memory") && error.contains("MiB"),
+            "{error}"
+        );
         check_room(1 << 20).unwrap();
     }
 }

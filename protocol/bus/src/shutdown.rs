@@ -64,7 +64,12 @@ impl Stop {
             if left.is_zero() {
                 return false;
             }
-            state = self.0.1.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            state = self
+                .0
+                .1
+                .wait_timeout(state, left)
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
         }
         true
     }
@@ -74,27 +79,35 @@ impl Stop {
     /// # Errors
     /// When the signal handlers cannot be installed.
     pub fn on_signals(&self) -> std::io::Result<()> {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()?;
         let (mut interrupt, mut terminate) = {
             use tokio::signal::unix::{SignalKind, signal};
             let _inside = runtime.enter();
-            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
+            (
+                signal(SignalKind::interrupt())?,
+                signal(SignalKind::terminate())?,
+            )
         };
         let stop = self.clone();
-        thread::Builder::new().name("signals".into()).spawn(move || {
-            runtime.block_on(async {
-                loop {
-                    tokio::select! {
-                        _ = interrupt.recv() => {}
-                        _ = terminate.recv() => {}
+        thread::Builder::new()
+            .name("signals".into())
+            .spawn(move || {
+                runtime.block_on(async {
+                    loop {
+                        tokio::select! {
+                            _ = interrupt.recv() => {}
+                            _ = terminate.recv() => {}
+                        }
+                        if stop.requested() {
+                            std::process::exit(130);
+                        }
+                        stop.request();
                     }
-                    if stop.requested() {
-                        std::process::exit(130);
-                    }
-                    stop.request();
-                }
-            });
-        })?;
+                });
+            })?;
         Ok(())
     }
 
@@ -105,11 +118,13 @@ impl Stop {
     /// When the thread that waits for it cannot be started.
     pub fn on_end_of_input(&self) -> std::io::Result<()> {
         let stop = self.clone();
-        thread::Builder::new().name("parent-death".into()).spawn(move || {
-            // A broken pipe is an end of input too.
-            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
-            stop.request();
-        })?;
+        thread::Builder::new()
+            .name("parent-death".into())
+            .spawn(move || {
+                // A broken pipe is an end of input too.
+                let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+                stop.request();
+            })?;
         Ok(())
     }
 
@@ -118,11 +133,13 @@ impl Stop {
     pub fn enforce(&self, limit: Duration) {
         self.on_request(move || {
             // Without a thread for it, the operator can still press Ctrl-C a second time.
-            let _ = thread::Builder::new().name("enforcer".into()).spawn(move || {
-                thread::sleep(limit);
-                tracing::error!("not ended {limit:?} after the request: exit without cleanup");
-                std::process::exit(1);
-            });
+            let _ = thread::Builder::new()
+                .name("enforcer".into())
+                .spawn(move || {
+                    thread::sleep(limit);
+                    tracing::error!("not ended {limit:?} after the request: exit without cleanup");
+                    std::process::exit(1);
+                });
         });
     }
 
@@ -154,10 +171,12 @@ pub fn within<T: Send + 'static>(
     teardown: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, Overdue> {
     let (done, wait) = mpsc::sync_channel(1);
-    let helper = thread::Builder::new().name(format!("end-{what}")).spawn(move || {
-        // The receiver is gone only after the timeout.
-        let _ = done.send(teardown());
-    });
+    let helper = thread::Builder::new()
+        .name(format!("end-{what}"))
+        .spawn(move || {
+            // The receiver is gone only after the timeout.
+            let _ = done.send(teardown());
+        });
     let overdue = Overdue { what, limit };
     helper.map_err(|_| overdue)?;
     wait.recv_timeout(limit).map_err(|_| overdue)
@@ -202,7 +221,10 @@ mod tests {
     #[test]
     fn a_teardown_that_hangs_is_abandoned() {
         let (release, hang) = mpsc::channel::<()>();
-        let overdue = within(Duration::from_millis(20), "a dead link", move || hang.recv()).unwrap_err();
+        let overdue = within(Duration::from_millis(20), "a dead link", move || {
+            hang.recv()
+        })
+        .unwrap_err();
         assert_eq!(overdue.to_string(), "a dead link did not end within 20ms");
         drop(release);
         assert_eq!(within(Duration::from_secs(60), "a live one", || 7), Ok(7));

@@ -27,7 +27,10 @@ const MAX_CONFIRMED: usize = 512;
 
 enum Request {
     Ready,
-    Control { control: Control, capture_nanos: u64 },
+    Control {
+        control: Control,
+        capture_nanos: u64,
+    },
 }
 
 /// A handle to the status thread of this process.
@@ -56,7 +59,11 @@ impl StatusPublisher {
 
     /// Marks the route of `topic` as confirmed.
     pub(super) fn confirm_route(&self, topic: &Topic) {
-        let mut confirmed = self.0.confirmed.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut confirmed = self
+            .0
+            .confirmed
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         if confirmed.len() < MAX_CONFIRMED && !confirmed.contains(topic) {
             confirmed.insert(topic.clone());
         }
@@ -72,12 +79,19 @@ impl StatusPublisher {
 
     /// Publishes `control`.
     pub(super) fn publish(&self, control: Control, capture_nanos: u64) {
-        self.push(Request::Control { control, capture_nanos });
+        self.push(Request::Control {
+            control,
+            capture_nanos,
+        });
     }
 
     /// Heartbeats are published only while this thread works; `None`: always.
     pub(super) fn watch(&self, watchdog: Option<Arc<Watchdog>>) {
-        *self.0.watchdog.lock().unwrap_or_else(PoisonError::into_inner) = watchdog;
+        *self
+            .0
+            .watchdog
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = watchdog;
     }
 
     /// Ends the thread after it has published the queued messages and the final ledger.
@@ -102,7 +116,10 @@ impl StatusPublisher {
         thread::Builder::new()
             .name("status".into())
             .spawn(move || sender.run(&shared))
-            .map_err(|cause| BusError::Thread { what: "status".into(), cause })
+            .map_err(|cause| BusError::Thread {
+                what: "status".into(),
+                cause,
+            })
     }
 }
 
@@ -122,13 +139,23 @@ impl StatusSender {
         loop {
             match shared.queue.take(Some(next)) {
                 Pop::Item((), Request::Ready) => self.ready(shared, &mut sequence),
-                Pop::Item((), Request::Control { control, capture_nanos }) => {
+                Pop::Item(
+                    (),
+                    Request::Control {
+                        control,
+                        capture_nanos,
+                    },
+                ) => {
                     self.control(control, capture_nanos, &mut sequence);
                 }
                 Pop::TimedOut => {
                     next = Instant::now() + PERIOD;
                     self.ready(shared, &mut sequence);
-                    let watchdog = shared.watchdog.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                    let watchdog = shared
+                        .watchdog
+                        .lock()
+                        .unwrap_or_else(PoisonError::into_inner)
+                        .clone();
                     if watchdog.is_none_or(|watchdog| watchdog.is_alive(&mut beats)) {
                         self.stats(&mut sequence);
                     }
@@ -141,18 +168,38 @@ impl StatusSender {
     fn ready(&self, shared: &Shared, sequence: &mut u64) {
         // Cleared first: a probe that arrives from here on requests a new answer.
         shared.answer_due.store(false, Ordering::Release);
-        let subscribed: Vec<Topic> =
-            shared.confirmed.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
+        let subscribed: Vec<Topic> = shared
+            .confirmed
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .iter()
+            .cloned()
+            .collect();
         if !subscribed.is_empty() {
             let process = self.stats.process().clone();
             let key = Key::ready(&self.run, &process);
-            self.put(&key, Priority::InteractiveHigh, 0, Control::Ready { process, subscribed }, sequence);
+            self.put(
+                &key,
+                Priority::InteractiveHigh,
+                0,
+                Control::Ready {
+                    process,
+                    subscribed,
+                },
+                sequence,
+            );
         }
     }
 
     fn control(&self, control: Control, capture_nanos: u64, sequence: &mut u64) {
         if let Some(verb) = control.verb() {
-            self.put(&Key::control(&self.run, verb), Priority::InteractiveHigh, capture_nanos, control, sequence);
+            self.put(
+                &Key::control(&self.run, verb),
+                Priority::InteractiveHigh,
+                capture_nanos,
+                control,
+                sequence,
+            );
         }
     }
 
@@ -169,7 +216,14 @@ impl StatusSender {
         self.put(&key, Priority::Background, 0, stats, sequence);
     }
 
-    fn put<M: Payload>(&self, key: &Key, priority: Priority, capture_nanos: u64, message: M, sequence: &mut u64) {
+    fn put<M: Payload>(
+        &self,
+        key: &Key,
+        priority: Priority,
+        capture_nanos: u64,
+        message: M,
+        sequence: &mut u64,
+    ) {
         let stamp = Stamp {
             cav: self.cav.clone(),
             epoch: self.epoch,
@@ -183,7 +237,10 @@ impl StatusSender {
             Err(error) => return tracing::error!(%key, "status cannot be sent: {error}"),
         };
         let put = self.session.put(key.to_string(), payload(encoded));
-        let put = put.congestion_control(CongestionControl::Block).priority(priority).express(true);
+        let put = put
+            .congestion_control(CongestionControl::Block)
+            .priority(priority)
+            .express(true);
         if let Err(cause) = put.wait() {
             tracing::error!(%key, "zenoh rejected a status: {cause}");
         }

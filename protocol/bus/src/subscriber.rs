@@ -4,7 +4,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use protocol::{Control, DropReason, Header, Key, KeyExpr, Kind, Limits, Payload, Stream, Topic, WireError, wire};
+use protocol::{
+    Control, DropReason, Header, Key, KeyExpr, Kind, Limits, Payload, Stream, Topic, WireError,
+    wire,
+};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SourceInfo};
@@ -103,7 +106,12 @@ impl Inbox {
         Self::within(InboxLimits::NONE, places, max_topics, stats)
     }
 
-    pub(super) fn within(limits: InboxLimits, places: usize, max_topics: usize, stats: &MessageStats) -> Arc<Self> {
+    pub(super) fn within(
+        limits: InboxLimits,
+        places: usize,
+        max_topics: usize,
+        stats: &MessageStats,
+    ) -> Arc<Self> {
         Arc::new(Self {
             // Two lanes per topic: data and notifications.
             queue: BoundedQueue::new(places, max_topics.saturating_mul(2)),
@@ -127,7 +135,8 @@ impl Inbox {
     pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, Event> {
         match self.watchdog.wait(|| self.queue.take(deadline)) {
             Pop::Item(lane, event) => {
-                self.waiting_bytes.fetch_sub(event.bytes(), Ordering::Relaxed);
+                self.waiting_bytes
+                    .fetch_sub(event.bytes(), Ordering::Relaxed);
                 Pop::Item(lane.topic, event)
             }
             Pop::TimedOut => Pop::TimedOut,
@@ -147,7 +156,10 @@ impl Inbox {
 
     /// Decodes `arrival`; `None` for a malformed message, which is counted and logged.
     pub fn decode<M: Payload>(&self, arrival: &Arrival, limits: &Limits) -> Option<M> {
-        arrival.decode(limits).map_err(|error| self.stats.rejected(&arrival.topic, &error)).ok()
+        arrival
+            .decode(limits)
+            .map_err(|error| self.stats.rejected(&arrival.topic, &error))
+            .ok()
     }
 
     /// Counts and logs a message on `topic` whose content its sender may not publish.
@@ -157,13 +169,21 @@ impl Inbox {
 
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let is_notice = matches!(event, Event::End { .. });
-        let lane = Lane { topic: topic.clone(), is_notice };
+        let lane = Lane {
+            topic: topic.clone(),
+            is_notice,
+        };
         // Limit on the bytes of all topics together; a message beyond it is lost.
         let bytes = event.bytes();
-        let waiting = self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes);
+        let waiting = self
+            .waiting_bytes
+            .fetch_add(bytes, Ordering::Relaxed)
+            .saturating_add(bytes);
         if waiting > self.max_waiting && !is_notice {
             self.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
-            return self.stats.limited(topic, "the limit of queued bytes is reached");
+            return self
+                .stats
+                .limited(topic, "the limit of queued bytes is reached");
         }
         let pushed = match places {
             Some(places) => self.queue.push_within(places, lane, event),
@@ -171,9 +191,12 @@ impl Inbox {
         };
         let lost = match pushed {
             PushOutcome::Queued => return,
-            PushOutcome::Replaced(event) | PushOutcome::NoLane(event) | PushOutcome::Closed(event) => event,
+            PushOutcome::Replaced(event)
+            | PushOutcome::NoLane(event)
+            | PushOutcome::Closed(event) => event,
         };
-        self.waiting_bytes.fetch_sub(lost.bytes(), Ordering::Relaxed);
+        self.waiting_bytes
+            .fetch_sub(lost.bytes(), Ordering::Relaxed);
         if let Event::Message(arrival) = lost {
             self.stats.dropped(&arrival.topic, DropReason::Superseded);
         }
@@ -182,7 +205,9 @@ impl Inbox {
 
 /// A subscription; ends when dropped.
 #[must_use = "the subscription ends when this is dropped"]
-pub struct Subscription(#[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>);
+pub struct Subscription(
+    #[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>,
+);
 
 impl Subscription {
     pub(super) fn to_key(
@@ -193,9 +218,12 @@ impl Subscription {
     ) -> Result<Self, BusError> {
         inbox.stats.subscribed(&key.topic);
         let topic = key.topic.clone();
-        Self::declare(session, &key.to_string(), IngressFilter::new(inbox, places, status), move |_| {
-            Some(topic.clone())
-        })
+        Self::declare(
+            session,
+            &key.to_string(),
+            IngressFilter::new(inbox, places, status),
+            move |_| Some(topic.clone()),
+        )
     }
 
     pub(super) fn to_all(
@@ -205,8 +233,20 @@ impl Subscription {
         status: &StatusPublisher,
     ) -> Result<Self, BusError> {
         // Keys outside this grammar carry none of our messages.
-        let topic = |sample: &Sample| sample.key_expr().as_str().parse::<Key>().ok().map(|key| key.topic);
-        Self::declare(session, selector.as_str(), IngressFilter::new(inbox, None, status), topic)
+        let topic = |sample: &Sample| {
+            sample
+                .key_expr()
+                .as_str()
+                .parse::<Key>()
+                .ok()
+                .map(|key| key.topic)
+        };
+        Self::declare(
+            session,
+            selector.as_str(),
+            IngressFilter::new(inbox, None, status),
+            topic,
+        )
     }
 
     fn declare(
@@ -220,7 +260,10 @@ impl Subscription {
                 filter.admit(topic, sample.payload(), sample.source_info());
             }
         });
-        subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
+        subscriber
+            .wait()
+            .map(Self)
+            .map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
     }
 }
 
@@ -228,7 +271,10 @@ impl Subscription {
 /// only.
 pub(super) fn has_notifications(topic: &Topic) -> bool {
     match topic {
-        Topic::Stream { stream: Stream::Preview, .. } => false,
+        Topic::Stream {
+            stream: Stream::Preview,
+            ..
+        } => false,
         Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
         Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
     }
@@ -243,13 +289,21 @@ struct IngressFilter {
 
 impl IngressFilter {
     fn new(inbox: &Arc<Inbox>, places: Option<usize>, status: &StatusPublisher) -> Self {
-        Self { inbox: Arc::clone(inbox), places, status: status.clone() }
+        Self {
+            inbox: Arc::clone(inbox),
+            places,
+            status: status.clone(),
+        }
     }
 
     fn admit(&self, topic: Topic, payload: &ZBytes, source: Option<&SourceInfo>) {
         self.count_gap(&topic, payload, source);
         // Before the message is read: a flood must cost next to nothing.
-        if !self.inbox.meters.admit(&topic, payload.len(), Instant::now()) {
+        if !self
+            .inbox
+            .meters
+            .admit(&topic, payload.len(), Instant::now())
+        {
             return self.reject(&topic, payload);
         }
         let header = match header_of(&topic, payload) {
@@ -267,8 +321,14 @@ impl IngressFilter {
                 return self.inbox.stats.dropped(&topic, reason);
             }
         }
-        let arrival = Arrival { topic: topic.clone(), header, at, payload: payload.clone() };
-        self.inbox.deliver(&topic, Event::Message(arrival), self.places);
+        let arrival = Arrival {
+            topic: topic.clone(),
+            header,
+            at,
+            payload: payload.clone(),
+        };
+        self.inbox
+            .deliver(&topic, Event::Message(arrival), self.places);
     }
 
     /// Counts the messages that the router has dropped before this one.
@@ -278,7 +338,11 @@ impl IngressFilter {
         }
         let is_notice = payload.len() <= MAX_NOTICE_BYTES
             && header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header));
-        let mut gaps = self.inbox.gaps.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut gaps = self
+            .inbox
+            .gaps
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
         let skipped = gaps.note(topic, source, is_notice);
         if skipped > 0 {
             self.inbox.stats.undelivered(topic, skipped);
@@ -304,7 +368,11 @@ impl IngressFilter {
         match wire::decode(payload.slices(), &Limits::DEFAULT) {
             Ok((_, Control::Probe)) => self.status.probed(&topic),
             Ok((_, Control::End { ticks: sent, .. })) => {
-                let end = Event::End { topic: topic.clone(), epoch: header.stamp.epoch, sent };
+                let end = Event::End {
+                    topic: topic.clone(),
+                    epoch: header.stamp.epoch,
+                    sent,
+                };
                 self.inbox.deliver(&topic, end, None);
             }
             Ok(_) => {}
@@ -315,19 +383,30 @@ impl IngressFilter {
     /// Drop reason of a duplicate or stale message, or of one under quarantine.
     fn reject_stale(&self, topic: &Topic, header: &Header, at: Instant) -> Option<DropReason> {
         let stamp = &header.stamp;
-        let Admission { dropped, quarantine } = {
-            let mut replay_window = self.inbox.replay_window.lock().unwrap_or_else(PoisonError::into_inner);
+        let Admission {
+            dropped,
+            quarantine,
+        } = {
+            let mut replay_window = self
+                .inbox
+                .replay_window
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner);
             replay_window.admit(topic, stamp.epoch, stamp.sequence, at)
         };
         match quarantine {
             Some(true) => {
                 tracing::warn!(%topic, "two senders use one id: both are rejected until one is silent")
             }
-            Some(false) => tracing::info!(%topic, "one sender of this id is left: its messages are accepted again"),
+            Some(false) => {
+                tracing::info!(%topic, "one sender of this id is left: its messages are accepted again")
+            }
             None => {}
         }
         if dropped.is_none() {
-            self.inbox.stats.observe_clock(&stamp.cav, stamp.publish_nanos, unix_nanos(), at);
+            self.inbox
+                .stats
+                .observe_clock(&stamp.cav, stamp.publish_nanos, unix_nanos(), at);
         }
         dropped
     }
@@ -357,7 +436,10 @@ fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
     };
     match expected {
         Some(expected) if header.kind != expected && header.kind != Kind::Control => {
-            Err(WireError::Kind { expected, found: header.kind })
+            Err(WireError::Kind {
+                expected,
+                found: header.kind,
+            })
         }
         _ => Ok(header),
     }
@@ -372,29 +454,67 @@ mod tests {
 
     fn bytes<M: Payload>(sequence: u64, message: M) -> ZBytes {
         let cav = CavId::new("7").unwrap();
-        let stamp = Stamp { cav, epoch: 1, sequence, capture_nanos: sequence, publish_nanos: 5 };
+        let stamp = Stamp {
+            cav,
+            epoch: 1,
+            sequence,
+            capture_nanos: sequence,
+            publish_nanos: 5,
+        };
         payload(wire::encode(&stamp, message).unwrap())
     }
 
     fn gnss() -> Gnss {
         let source = GnssSource::Recorded;
-        Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source }
+        Gnss {
+            world_from_lidar: Pose::IDENTITY,
+            position_std_m: 0.0,
+            heading_std_rad: 0.0,
+            source,
+        }
     }
 
     #[test]
     fn only_data_beyond_the_limit_are_counted() {
         let stats = MessageStats::new("ego-9".parse().unwrap());
-        let limits = InboxLimits { messages_per_s: 1e-3, ..InboxLimits::PEERS };
-        let (inbox, topic) = (Inbox::within(limits, 4, 4, &stats), "7/gnss".parse::<Topic>().unwrap());
+        let limits = InboxLimits {
+            messages_per_s: 1e-3,
+            ..InboxLimits::PEERS
+        };
+        let (inbox, topic) = (
+            Inbox::within(limits, 4, 4, &stats),
+            "7/gnss".parse::<Topic>().unwrap(),
+        );
         let filter = IngressFilter::new(&inbox, None, &StatusPublisher::new());
-        let counts = || stats.ledger().get(&Account::towards(topic.clone(), stats.process())).cloned();
+        let counts = || {
+            stats
+                .ledger()
+                .get(&Account::towards(topic.clone(), stats.process()))
+                .cloned()
+        };
         stats.subscribed(&topic);
         for _ in 0..3 {
             filter.admit(topic.clone(), &bytes(0, Control::Probe), None);
-            filter.admit(topic.clone(), &bytes(0, Control::End { ticks: 0, sent: Vec::new() }), None);
+            filter.admit(
+                topic.clone(),
+                &bytes(
+                    0,
+                    Control::End {
+                        ticks: 0,
+                        sent: Vec::new(),
+                    },
+                ),
+                None,
+            );
         }
         assert_eq!(counts(), Some(Counts::default()));
         filter.admit(topic.clone(), &bytes(0, gnss()), None);
-        assert_eq!(counts(), Some(Counts { dropped: [(DropReason::RateLimit, 1)].into(), ..Counts::default() }));
+        assert_eq!(
+            counts(),
+            Some(Counts {
+                dropped: [(DropReason::RateLimit, 1)].into(),
+                ..Counts::default()
+            })
+        );
     }
 }

@@ -46,7 +46,10 @@ pub struct Heartbeat {
 impl Heartbeat {
     pub(super) fn begin(status: &StatusPublisher, watchdog: &Arc<Watchdog>) -> Self {
         status.watch(Some(Arc::clone(watchdog)));
-        Self { status: status.clone(), watchdog: Arc::clone(watchdog) }
+        Self {
+            status: status.clone(),
+            watchdog: Arc::clone(watchdog),
+        }
     }
 
     /// Records activity of the thread without taking from the inbox.
@@ -74,7 +77,10 @@ mod tests {
             assert!(watchdog.is_alive(&mut beats), "however long it waits");
         });
         assert!(watchdog.is_alive(&mut beats), "it came back");
-        assert!(!watchdog.is_alive(&mut beats), "and has not been here since");
+        assert!(
+            !watchdog.is_alive(&mut beats),
+            "and has not been here since"
+        );
         watchdog.beat();
         assert!(watchdog.is_alive(&mut beats));
     }

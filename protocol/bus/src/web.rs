@@ -20,7 +20,10 @@ use futures_util::stream::BoxStream;
 use http_body_util::combinators::UnsyncBoxBody;
 use http_body_util::{BodyExt, Full, StreamBody};
 use hyper::body::{Frame, Incoming};
-use hyper::header::{ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderValue, X_CONTENT_TYPE_OPTIONS};
+use hyper::header::{
+    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderValue,
+    X_CONTENT_TYPE_OPTIONS,
+};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Response, StatusCode};
@@ -118,14 +121,24 @@ impl WebServer {
         handler: impl Fn(&Request) -> Answer + Send + Sync + 'static,
     ) -> io::Result<Self> {
         let mut builder = runtime::Builder::new_multi_thread();
-        let runtime =
-            builder.worker_threads(1).max_blocking_threads(MAX_HANDLERS).thread_name("web").enable_all().build()?;
+        let runtime = builder
+            .worker_threads(1)
+            .max_blocking_threads(MAX_HANDLERS)
+            .thread_name("web")
+            .enable_all()
+            .build()?;
         let listener = runtime.block_on(TcpListener::bind(address))?;
         let address = listener.local_addr()?;
-        let readers =
-            Arc::new(Readers { places: Arc::new(Semaphore::new(MAX_CONNECTIONS)), dropped: AtomicU64::new(0) });
+        let readers = Arc::new(Readers {
+            places: Arc::new(Semaphore::new(MAX_CONNECTIONS)),
+            dropped: AtomicU64::new(0),
+        });
         runtime.spawn(accept(listener, Arc::new(handler), Arc::clone(&readers)));
-        Ok(Self { address, readers, runtime: Some(runtime) })
+        Ok(Self {
+            address,
+            readers,
+            runtime: Some(runtime),
+        })
     }
 
     /// Address of the server.
@@ -180,7 +193,9 @@ async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()
     let local = connection.local_addr();
     let mut connection = TimeoutStream::new(connection);
     connection.set_write_timeout(Some(WRITE_LIMIT));
-    let service = service_fn(move |request| answer(Arc::clone(&handler), local.as_ref().ok().copied(), request));
+    let service = service_fn(move |request| {
+        answer(Arc::clone(&handler), local.as_ref().ok().copied(), request)
+    });
     http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(READ_LIMIT)
@@ -192,7 +207,9 @@ async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()
 
 /// A missing request ends a connection too, but is not counted as a reader: browsers open spare connections.
 fn was_not_read(error: &hyper::Error) -> bool {
-    let cause = error.source().and_then(|cause| cause.downcast_ref::<io::Error>());
+    let cause = error
+        .source()
+        .and_then(|cause| cause.downcast_ref::<io::Error>());
     cause.is_some_and(|cause| cause.kind() == io::ErrorKind::TimedOut)
 }
 
@@ -203,8 +220,14 @@ async fn answer(
     request: hyper::Request<Incoming>,
 ) -> Result<Response<Body>, Infallible> {
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
-        let mut refusal = respond(StatusCode::METHOD_NOT_ALLOWED, TEXT, whole("GET and HEAD only".into()));
-        refusal.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
+        let mut refusal = respond(
+            StatusCode::METHOD_NOT_ALLOWED,
+            TEXT,
+            whole("GET and HEAD only".into()),
+        );
+        refusal
+            .headers_mut()
+            .insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
         return Ok(refusal);
     }
     if let Some(local) = local
@@ -213,16 +236,30 @@ async fn answer(
         let message = format!("this server is called localhost, not {name:?}");
         return Ok(respond(StatusCode::FORBIDDEN, TEXT, whole(message.into())));
     }
-    let (path, query) = (request.uri().path().to_owned(), request.uri().query().unwrap_or_default().to_owned());
+    let (path, query) = (
+        request.uri().path().to_owned(),
+        request.uri().query().unwrap_or_default().to_owned(),
+    );
     let answer = tokio::task::spawn_blocking(move || handler(&Request { path, query })).await;
     Ok(match answer {
-        Ok(Answer::Page { content_type, body }) => respond(StatusCode::OK, content_type, whole(body)),
-        Ok(Answer::Stream { content_type, pieces }) => {
+        Ok(Answer::Page { content_type, body }) => {
+            respond(StatusCode::OK, content_type, whole(body))
+        }
+        Ok(Answer::Stream {
+            content_type,
+            pieces,
+        }) => {
             let body = StreamBody::new(pieces.map(|piece| Ok(Frame::data(piece))));
             respond(StatusCode::OK, content_type, body.boxed_unsync())
         }
-        Ok(Answer::NotFound(message)) => respond(StatusCode::NOT_FOUND, TEXT, whole(message.into())),
-        Err(panicked) => respond(StatusCode::INTERNAL_SERVER_ERROR, TEXT, whole(panicked.to_string().into())),
+        Ok(Answer::NotFound(message)) => {
+            respond(StatusCode::NOT_FOUND, TEXT, whole(message.into()))
+        }
+        Err(panicked) => respond(
+            StatusCode::INTERNAL_SERVER_ERROR,
+            TEXT,
+            whole(panicked.to_string().into()),
+        ),
     })
 }
 
@@ -240,7 +277,9 @@ fn respond(status: StatusCode, content_type: &'static str, body: Body) -> Respon
         (X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (CONTENT_SECURITY_POLICY, POLICY),
     ];
-    response.headers_mut().extend(headers.map(|(name, value)| (name, HeaderValue::from_static(value))));
+    response
+        .headers_mut()
+        .extend(headers.map(|(name, value)| (name, HeaderValue::from_static(value))));
     response
 }
 
@@ -253,16 +292,26 @@ pub fn fetch(address: SocketAddr, path: &str) -> io::Result<(String, Vec<u8>)> {
 }
 
 /// [`fetch`] with a limit of each wait.
-pub(crate) fn fetch_within(address: SocketAddr, path: &str, limit: Duration) -> io::Result<(String, Vec<u8>)> {
+pub(crate) fn fetch_within(
+    address: SocketAddr,
+    path: &str,
+    limit: Duration,
+) -> io::Result<(String, Vec<u8>)> {
     let mut connection = std::net::TcpStream::connect_timeout(&address, limit)?;
     connection.set_read_timeout(Some(limit))?;
     // HTTP/1.0 gives a body in one piece that ends with the connection.
     write!(connection, "GET {path} HTTP/1.0\r\n\r\n")?;
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer)?;
-    let end = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").ok_or(io::ErrorKind::InvalidData)?;
-    let status =
-        String::from_utf8_lossy(answer.get(..end).unwrap_or_default()).lines().next().unwrap_or_default().to_owned();
+    let end = answer
+        .windows(4)
+        .position(|bytes| bytes == b"\r\n\r\n")
+        .ok_or(io::ErrorKind::InvalidData)?;
+    let status = String::from_utf8_lossy(answer.get(..end).unwrap_or_default())
+        .lines()
+        .next()
+        .unwrap_or_default()
+        .to_owned();
     Ok((status, answer.get(end + 4..).unwrap_or_default().to_vec()))
 }
 
@@ -289,12 +338,21 @@ mod tests {
     #[test]
     fn a_document_is_what_the_handler_answers() {
         let server = server(|request| match request.path.as_str() {
-            "/a" => Answer::Page { content_type: "text/plain", body: request.query.clone().into() },
+            "/a" => Answer::Page {
+                content_type: "text/plain",
+                body: request.query.clone().into(),
+            },
             other => Answer::NotFound(format!("no {other}")),
         });
-        assert_eq!(fetch(server.address(), "/a?b=1").unwrap(), ("HTTP/1.0 200 OK".into(), b"b=1".to_vec()));
+        assert_eq!(
+            fetch(server.address(), "/a?b=1").unwrap(),
+            ("HTTP/1.0 200 OK".into(), b"b=1".to_vec())
+        );
         let (status, body) = fetch(server.address(), "/../etc").unwrap();
-        assert_eq!((status.as_str(), body.as_slice()), ("HTTP/1.0 404 Not Found", b"no /../etc".as_slice()));
+        assert_eq!(
+            (status.as_str(), body.as_slice()),
+            ("HTTP/1.0 404 Not Found", b"no /../etc".as_slice())
+        );
     }
 
     /// The answer to a request without a body.
@@ -310,34 +368,70 @@ mod tests {
     fn anything_but_get_and_head_is_refused() {
         let server = server(|_| Answer::NotFound(String::new()));
         let answer = response_to(&server, "POST / HTTP/1.1\r\nHost: localhost");
-        assert!(answer.starts_with("HTTP/1.1 405") && answer.contains("allow: GET, HEAD"), "{answer}");
+        assert!(
+            answer.starts_with("HTTP/1.1 405") && answer.contains("allow: GET, HEAD"),
+            "{answer}"
+        );
     }
 
     #[test]
     fn head_is_answered_as_get_without_the_body() {
         let server = server(|request| match request.path.as_str() {
-            "/page" => Answer::Page { content_type: TEXT, body: "twelve bytes".into() },
+            "/page" => Answer::Page {
+                content_type: TEXT,
+                body: "twelve bytes".into(),
+            },
             "/stream" => {
-                let pieces = futures_util::stream::repeat(Bytes::from_static(&[0; 1 << 16])).boxed();
-                Answer::Stream { content_type: TEXT, pieces }
+                let pieces =
+                    futures_util::stream::repeat(Bytes::from_static(&[0; 1 << 16])).boxed();
+                Answer::Stream {
+                    content_type: TEXT,
+                    pieces,
+                }
             }
             other => Answer::NotFound(other.to_owned()),
         });
         let head = response_to(&server, "HEAD /page HTTP/1.1\r\nHost: localhost");
-        assert!(head.starts_with("HTTP/1.1 200") && head.contains("content-length: 12\r\n"), "{head}");
+        assert!(
+            head.starts_with("HTTP/1.1 200") && head.contains("content-length: 12\r\n"),
+            "{head}"
+        );
         assert!(head.ends_with("\r\n\r\n"), "{head}");
-        assert!(response_to(&server, "HEAD /stream HTTP/1.1\r\nHost: localhost").ends_with("\r\n\r\n"));
-        assert!(response_to(&server, "HEAD /none HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
+        assert!(
+            response_to(&server, "HEAD /stream HTTP/1.1\r\nHost: localhost").ends_with("\r\n\r\n")
+        );
+        assert!(
+            response_to(&server, "HEAD /none HTTP/1.1\r\nHost: localhost")
+                .starts_with("HTTP/1.1 404")
+        );
     }
 
     #[test]
     fn a_request_under_another_name_is_rejected() {
-        let server = server(|_| Answer::Page { content_type: TEXT, body: "secret".into() });
-        let answer = response_to(&server, &format!("GET / HTTP/1.1\r\nHost: evil.example:{}", server.address().port()));
-        assert!(answer.starts_with("HTTP/1.1 403") && !answer.contains("secret"), "{answer}");
+        let server = server(|_| Answer::Page {
+            content_type: TEXT,
+            body: "secret".into(),
+        });
+        let answer = response_to(
+            &server,
+            &format!(
+                "GET / HTTP/1.1\r\nHost: evil.example:{}",
+                server.address().port()
+            ),
+        );
+        assert!(
+            answer.starts_with("HTTP/1.1 403") && !answer.contains("secret"),
+            "{answer}"
+        );
         assert!(answer.contains("evil.example"), "{answer}");
-        let answer = response_to(&server, &format!("GET / HTTP/1.1\r\nHost: {}", server.address()));
-        assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("secret"), "{answer}");
+        let answer = response_to(
+            &server,
+            &format!("GET / HTTP/1.1\r\nHost: {}", server.address()),
+        );
+        assert!(
+            answer.starts_with("HTTP/1.1 200") && answer.contains("secret"),
+            "{answer}"
+        );
     }
 
     #[test]
@@ -355,10 +449,13 @@ mod tests {
     #[test]
     fn connections_beyond_the_maximum_are_refused() {
         let server = server(|_| Answer::NotFound(String::new()));
-        let connections: Vec<_> =
-            (0..MAX_CONNECTIONS + 3).map(|_| TcpStream::connect(server.address()).unwrap()).collect();
+        let connections: Vec<_> = (0..MAX_CONNECTIONS + 3)
+            .map(|_| TcpStream::connect(server.address()).unwrap())
+            .collect();
         wait_for("three are refused", || server.readers().dropped() == 3);
-        wait_for("idle connections are closed", || server.readers().open() == 0);
+        wait_for("idle connections are closed", || {
+            server.readers().open() == 0
+        });
         assert_eq!(server.readers().dropped(), 3, "and are no readers");
         drop(connections);
         assert!(fetch(server.address(), "/").is_ok());
@@ -372,7 +469,10 @@ mod tests {
                 thread::sleep(Duration::from_secs(600));
                 Answer::NotFound(String::new())
             }
-            _ => Answer::Page { content_type: TEXT, body: Bytes::new() },
+            _ => Answer::Page {
+                content_type: TEXT,
+                body: Bytes::new(),
+            },
         });
         let address = server.address();
         assert!(fetch(address, "/panic").unwrap().0.contains("500"));
@@ -384,6 +484,9 @@ mod tests {
         drop(server);
         // With an answer that never arrives, or with none.
         let _ = waiting.read_to_end(&mut Vec::new());
-        assert!(began.elapsed() < Duration::from_secs(60), "the connection ends with the server");
+        assert!(
+            began.elapsed() < Duration::from_secs(60),
+            "the connection ends with the server"
+        );
     }
 }

@@ -13,7 +13,9 @@ pub(crate) fn rows<T: numpy::Element, const COLUMNS: usize>(
     rows: Vec<[T; COLUMNS]>,
 ) -> PyResult<Py<PyArray2<T>>> {
     let shape = [rows.len(), COLUMNS];
-    Ok(PyArray1::from_vec(py, rows.into_flattened()).reshape(shape)?.unbind())
+    Ok(PyArray1::from_vec(py, rows.into_flattened())
+        .reshape(shape)?
+        .unbind())
 }
 
 /// A transform as `[4, 4]`.
@@ -24,7 +26,9 @@ pub(crate) fn pose(py: Python<'_>, pose: &Pose) -> PyResult<Matrix> {
 /// Transforms as `[N, 4, 4]`.
 pub(crate) fn poses(py: Python<'_>, poses: &[Pose]) -> PyResult<Py<PyArray3<f64>>> {
     let values: Vec<[f64; 4]> = poses.iter().flat_map(matrix_rows).collect();
-    Ok(PyArray1::from_vec(py, values.into_flattened()).reshape([poses.len(), 4, 4])?.unbind())
+    Ok(PyArray1::from_vec(py, values.into_flattened())
+        .reshape([poses.len(), 4, 4])?
+        .unbind())
 }
 
 fn matrix_rows(pose: &Pose) -> [[f64; 4]; 4] {
@@ -33,7 +37,10 @@ fn matrix_rows(pose: &Pose) -> [[f64; 4]; 4] {
 }
 
 /// Boxes as `[N, 7]`: centre, full sizes, heading.
-pub(crate) fn boxes<'a>(py: Python<'_>, boxes: impl Iterator<Item = &'a Box3d>) -> PyResult<Matrix> {
+pub(crate) fn boxes<'a>(
+    py: Python<'_>,
+    boxes: impl Iterator<Item = &'a Box3d>,
+) -> PyResult<Matrix> {
     let row = |box3d: &Box3d| {
         let ([x, y, z], [dx, dy, dz]) = (box3d.center_m, box3d.size_m);
         [x, y, z, dx, dy, dz, box3d.heading_rad]
@@ -43,7 +50,12 @@ pub(crate) fn boxes<'a>(py: Python<'_>, boxes: impl Iterator<Item = &'a Box3d>) 
 
 /// Covariance of x, y (square metres) and yaw (square radians) as `[3, 3]`.
 pub(crate) fn covariance(py: Python<'_>, covariance: &PlanarCovariance) -> PyResult<Matrix> {
-    let PlanarCovariance { xx_m2, xy_m2, yy_m2, yaw_rad2 } = *covariance;
+    let PlanarCovariance {
+        xx_m2,
+        xy_m2,
+        yy_m2,
+        yaw_rad2,
+    } = *covariance;
     let [xx, xy, yy, yaw] = [xx_m2, xy_m2, yy_m2, yaw_rad2].map(f64::from);
     rows(py, vec![[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, yaw]])
 }

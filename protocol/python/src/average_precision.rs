@@ -22,7 +22,11 @@ pub(crate) fn average_precision<'py>(
     let ordering = match ordering {
         "global" => Ordering::Global,
         "frame" => Ordering::Frame,
-        other => return Err(error(format!("ordering: {other:?}, expected \"global\" or \"frame\""))),
+        other => {
+            return Err(error(format!(
+                "ordering: {other:?}, expected \"global\" or \"frame\""
+            )));
+        }
     };
     let frames = frames(detections, truth)?;
     let single = match iou {
@@ -31,14 +35,21 @@ pub(crate) fn average_precision<'py>(
     };
     let thresholds = match (single, iou) {
         (Some(iou), _) => vec![iou],
-        (None, iou) => iou.map(PyAnyMethods::extract).transpose()?.unwrap_or_default(),
+        (None, iou) => iou
+            .map(PyAnyMethods::extract)
+            .transpose()?
+            .unwrap_or_default(),
     };
     if let Some(bad) = thresholds.iter().find(|iou| !(**iou > 0.0 && **iou <= 1.0)) {
-        return Err(error(format!("iou: {bad}, expected more than 0, at most 1")));
+        return Err(error(format!(
+            "iou: {bad}, expected more than 0, at most 1"
+        )));
     }
     let found = py.detach(|| {
         let mut scorer = Scorer::new(&thresholds);
-        frames.iter().for_each(|(detections, objects)| scorer.add(detections, objects));
+        frames
+            .iter()
+            .for_each(|(detections, objects)| scorer.add(detections, objects));
         scorer.average_precisions(ordering)
     });
     match (single, found.first()) {
@@ -60,16 +71,25 @@ fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<V
     let (detections, truth) = (entries("detections", detections)?, entries("truth", truth)?);
     if detections.len() != truth.len() {
         let (found, expected) = (detections.len(), truth.len());
-        return Err(error(format!("detections of {found} frames, truth of {expected}")));
+        return Err(error(format!(
+            "detections of {found} frames, truth of {expected}"
+        )));
     }
     let frame = |(index, (found, objects)): (usize, (&Bound<'_, PyAny>, &Bound<'_, PyAny>))| {
         Ok((scored_boxes(index, found)?, true_boxes(index, objects)?))
     };
-    detections.iter().zip(&truth).enumerate().map(frame).collect()
+    detections
+        .iter()
+        .zip(&truth)
+        .enumerate()
+        .map(frame)
+        .collect()
 }
 
 fn entries<'py>(name: &str, frames: &Bound<'py, PyAny>) -> PyResult<Vec<Bound<'py, PyAny>>> {
-    let frames = frames.try_iter().map_err(|_| error(format!("{name}: expected one entry per frame")))?;
+    let frames = frames
+        .try_iter()
+        .map_err(|_| error(format!("{name}: expected one entry per frame")))?;
     frames.collect()
 }
 
@@ -78,11 +98,16 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
     let (boxes, scores) = match found.cast::<Detections>() {
         Ok(found) => {
             let (boxes, scores) = found.get().scored();
-            (boxes.bind(py).clone().into_any(), scores.bind(py).clone().into_any())
+            (
+                boxes.bind(py).clone().into_any(),
+                scores.bind(py).clone().into_any(),
+            )
         }
         Err(_) => found.extract().map_err(|_| {
             let kind = found.get_type();
-            error(format!("detections of frame {frame}: {kind}, expected Detections or (boxes, scores)"))
+            error(format!(
+                "detections of frame {frame}: {kind}, expected Detections or (boxes, scores)"
+            ))
         })?,
     };
     let boxes = boxes_of("detections", frame, &boxes)?;
@@ -90,20 +115,40 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
     let scores: Vec<f32> = scores.as_array().iter().copied().collect();
     if scores.len() != boxes.len() {
         let (found, expected) = (scores.len(), boxes.len());
-        return Err(error(format!("detections of frame {frame}: {found} scores for {expected} boxes")));
+        return Err(error(format!(
+            "detections of frame {frame}: {found} scores for {expected} boxes"
+        )));
     }
     if let Some(bad) = scores.iter().find(|score| !score.is_finite()) {
         return Err(error(format!("detections of frame {frame}: score {bad}")));
     }
-    let detection = |(box3d, score)| Detection { box3d, score, source: None };
+    let detection = |(box3d, score)| Detection {
+        box3d,
+        score,
+        source: None,
+    };
     Ok(boxes.into_iter().zip(scores).map(detection).collect())
 }
 
 fn true_boxes(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<Vec<Box3d>> {
-    let Ok(objects) = objects.cast::<Objects>() else { return boxes_of("truth", frame, objects) };
-    let no_pose =
-        || error(format!("truth of frame {frame}: objects without boxes, as the pose of the LiDAR is unknown"));
-    boxes_of("truth", frame, objects.get().boxes().ok_or_else(no_pose)?.bind(objects.py()).as_any())
+    let Ok(objects) = objects.cast::<Objects>() else {
+        return boxes_of("truth", frame, objects);
+    };
+    let no_pose = || {
+        error(format!(
+            "truth of frame {frame}: objects without boxes, as the pose of the LiDAR is unknown"
+        ))
+    };
+    boxes_of(
+        "truth",
+        frame,
+        objects
+            .get()
+            .boxes()
+            .ok_or_else(no_pose)?
+            .bind(objects.py())
+            .as_any(),
+    )
 }
 
 /// Rows of an array `[N, 7]`; an empty list is none.
@@ -111,7 +156,9 @@ fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<
     let boxes = as_array::<f64>(boxes)?;
     let shape = boxes.shape().to_vec();
     if shape != [boxes.len() / 7, 7] && !boxes.is_empty() {
-        return Err(error(format!("{what} of frame {frame}: boxes of shape {shape:?}, expected (N, 7)")));
+        return Err(error(format!(
+            "{what} of frame {frame}: boxes of shape {shape:?}, expected (N, 7)"
+        )));
     }
     let values: Vec<f64> = boxes.as_array().iter().copied().collect();
     if let Some(bad) = values.iter().find(|value| !value.is_finite()) {
@@ -126,9 +173,15 @@ fn boxes_of(what: &str, frame: usize, boxes: &Bound<'_, PyAny>) -> PyResult<Vec<
 }
 
 /// The array that NumPy makes of a list, or of an array of another type.
-fn as_array<'py, T: numpy::Element>(value: &Bound<'py, PyAny>) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
+fn as_array<'py, T: numpy::Element>(
+    value: &Bound<'py, PyAny>,
+) -> PyResult<PyReadonlyArrayDyn<'py, T>> {
     let py = value.py();
-    let made = py.import("numpy")?.call_method1("asarray", (value, T::get_dtype(py)))?;
-    let array = made.cast_into::<PyArrayDyn<T>>().map_err(|cause| error(cause.to_string()))?;
+    let made = py
+        .import("numpy")?
+        .call_method1("asarray", (value, T::get_dtype(py)))?;
+    let array = made
+        .cast_into::<PyArrayDyn<T>>()
+        .map_err(|cause| error(cause.to_string()))?;
     Ok(numpy::PyArrayMethods::readonly(&array))
 }

@@ -29,7 +29,11 @@ enum Source {
 impl DataSet {
     fn count(&self) -> usize {
         match &self.source {
-            Source::Folder(dataset) => dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum(),
+            Source::Folder(dataset) => dataset
+                .scenarios
+                .iter()
+                .map(|scenario| scenario.ticks.len())
+                .sum(),
             Source::Recording(recording) => recording.len(),
         }
     }
@@ -48,10 +52,19 @@ impl DataSet {
             let loaded = scenario.load_tick(tick, scenario.present_agents(tick), &self.options);
             let mut parts = FrameParts::empty(&scenario.name, at.capture_nanos, &self.protocol);
             parts.tick = Some(tick as u64);
-            parts.problems.extend(loaded.unreadable.into_iter().map(|(_, problem)| problem.message));
+            parts.problems.extend(
+                loaded
+                    .unreadable
+                    .into_iter()
+                    .map(|(_, problem)| problem.message),
+            );
             for (_, frame) in loaded.frames {
-                parts.problems.extend(frame.problems.iter().map(|problem| problem.message.clone()));
-                parts.agents.push(AgentParts::recorded(frame, self.options.points));
+                parts
+                    .problems
+                    .extend(frame.problems.iter().map(|problem| problem.message.clone()));
+                parts
+                    .agents
+                    .push(AgentParts::recorded(frame, self.options.points));
             }
             return Some(parts);
         }
@@ -59,7 +72,9 @@ impl DataSet {
     }
 
     fn frame(&self, py: Python<'_>, index: usize) -> PyResult<Option<Frame>> {
-        py.detach(|| self.load(index)).map(|parts| Frame::new(py, parts)).transpose()
+        py.detach(|| self.load(index))
+            .map(|parts| Frame::new(py, parts))
+            .transpose()
     }
 }
 
@@ -71,20 +86,41 @@ impl DataSet {
 
     fn __getitem__(&self, py: Python<'_>, index: isize) -> PyResult<Frame> {
         let count = self.count();
-        let wanted = if index < 0 { count.checked_add_signed(index) } else { usize::try_from(index).ok() };
-        let frame = wanted.map(|index| self.frame(py, index)).transpose()?.flatten();
+        let wanted = if index < 0 {
+            count.checked_add_signed(index)
+        } else {
+            usize::try_from(index).ok()
+        };
+        let frame = wanted
+            .map(|index| self.frame(py, index))
+            .transpose()?
+            .flatten();
         frame.ok_or_else(|| PyIndexError::new_err(format!("frame {index} of {count}")))
     }
 
     fn __iter__(slf: Py<Self>) -> DataSetIterator {
-        DataSetIterator { data_set: slf, next: 0 }
+        DataSetIterator {
+            data_set: slf,
+            next: 0,
+        }
     }
 
     /// Copies open the data set again: worker processes of a data loader.
-    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<(pyo3::Bound<'py, pyo3::PyAny>, ReadArguments)> {
+    fn __reduce__<'py>(
+        &self,
+        py: Python<'py>,
+    ) -> PyResult<(pyo3::Bound<'py, pyo3::PyAny>, ReadArguments)> {
         use pyo3::types::PyAnyMethods;
-        let LoadOptions { points, radar, cameras, .. } = self.options;
-        Ok((py.import("v2vloc")?.getattr("read")?, (self.path.clone(), points, radar, cameras)))
+        let LoadOptions {
+            points,
+            radar,
+            cameras,
+            ..
+        } = self.options;
+        Ok((
+            py.import("v2vloc")?.getattr("read")?,
+            (self.path.clone(), points, radar, cameras),
+        ))
     }
 
     #[getter]
@@ -103,7 +139,11 @@ impl DataSet {
     #[getter]
     fn scenarios(&self) -> Vec<String> {
         match &self.source {
-            Source::Folder(dataset) => dataset.scenarios.iter().map(|scenario| scenario.name.clone()).collect(),
+            Source::Folder(dataset) => dataset
+                .scenarios
+                .iter()
+                .map(|scenario| scenario.name.clone())
+                .collect(),
             Source::Recording(recording) => vec![recording.run().to_owned()],
         }
     }
@@ -117,7 +157,12 @@ impl DataSet {
     }
 
     fn __repr__(&self) -> String {
-        format!("DataSet({:?}, {}, {} frames)", self.path, self.layout(), self.count())
+        format!(
+            "DataSet({:?}, {}, {} frames)",
+            self.path,
+            self.layout(),
+            self.count()
+        )
     }
 }
 
@@ -145,13 +190,25 @@ impl DataSetIterator {
 /// Opens a data set, or a recording of a run.
 #[pyfunction]
 #[pyo3(signature = (path, points=true, radar=false, cameras=false))]
-pub(crate) fn read(py: Python<'_>, path: PathBuf, points: bool, radar: bool, cameras: bool) -> PyResult<DataSet> {
-    let options = LoadOptions { points, radar, cameras, ..LoadOptions::default() };
+pub(crate) fn read(
+    py: Python<'_>,
+    path: PathBuf,
+    points: bool,
+    radar: bool,
+    cameras: bool,
+) -> PyResult<DataSet> {
+    let options = LoadOptions {
+        points,
+        radar,
+        cameras,
+        ..LoadOptions::default()
+    };
     let protocol = |layout: Layout| ProtocolConfig::default().resolve(layout).map_err(error);
     let opened: Result<_, PyErr> = py.detach(|| match dataset::recording_of(&path) {
         Some(file) => {
             let protocol = protocol(Layout::RECORDING)?;
-            let recording = RecordingFrames::open(&file, &options, protocol.clone()).map_err(error)?;
+            let recording =
+                RecordingFrames::open(&file, &options, protocol.clone()).map_err(error)?;
             Ok((Source::Recording(Box::new(recording)), protocol))
         }
         None => {
@@ -161,5 +218,10 @@ pub(crate) fn read(py: Python<'_>, path: PathBuf, points: bool, radar: bool, cam
         }
     });
     let (source, protocol) = opened?;
-    Ok(DataSet { path, options, protocol, source })
+    Ok(DataSet {
+        path,
+        options,
+        protocol,
+        source,
+    })
 }

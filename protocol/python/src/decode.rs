@@ -44,7 +44,10 @@ impl Decoded {
         let header = wire::decode_header([bytes])?;
         match kind {
             Some(expected) if expected != header.kind => {
-                return Err(protocol::WireError::Kind { expected, found: header.kind });
+                return Err(protocol::WireError::Kind {
+                    expected,
+                    found: header.kind,
+                });
             }
             _ => {}
         }
@@ -67,18 +70,30 @@ impl Decoded {
         Self::of_kind(Some(kind), bytes)
     }
 
-    fn new(header: Header, message: WireMessage, wire_bytes: usize) -> Result<Self, protocol::WireError> {
+    fn new(
+        header: Header,
+        message: WireMessage,
+        wire_bytes: usize,
+    ) -> Result<Self, protocol::WireError> {
         let content = match message {
             WireMessage::Bev(bev) => Content::Bev(DecodedBev::decode(bev)?),
             message => Content::Other(message),
         };
-        Ok(Self { header, content, wire_bytes })
+        Ok(Self {
+            header,
+            content,
+            wire_bytes,
+        })
     }
 }
 
 impl Message {
     pub(crate) fn new(py: Python<'_>, key: Option<String>, decoded: Decoded) -> PyResult<Self> {
-        let Decoded { header: Header { kind, stamp, .. }, content, wire_bytes } = decoded;
+        let Decoded {
+            header: Header { kind, stamp, .. },
+            content,
+            wire_bytes,
+        } = decoded;
         let payload = match content {
             Content::Bev(bev) => Bev::new(py, bev)?.into_any(),
             Content::Other(message) => payload(py, &stamp.cav, message)?,
@@ -105,7 +120,9 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
         WireMessage::Boxes(boxes) => Detections::of_agent(py, cav.as_str(), &boxes)?.into_any(),
         WireMessage::Detections(found) => Detections::of_ego(py, &found)?.into_any(),
         WireMessage::Camera(camera) => Camera::new(py, &camera)?.into_any(),
-        WireMessage::Points(sent) => Agent::new(py, AgentParts::of_points(cav, sent))?.0.into_any(),
+        WireMessage::Points(sent) => Agent::new(py, AgentParts::of_points(cav, sent))?
+            .0
+            .into_any(),
         WireMessage::Truth(truth) => {
             let agents = PyDict::new(py);
             for parts in AgentParts::of_truth(&truth) {
@@ -119,7 +136,10 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
         }
         WireMessage::Gnss(gnss) => {
             let made = json::to_python(py, &gnss)?;
-            made.set_item("world_from_lidar", arrays::pose(py, &gnss.world_from_lidar)?)?;
+            made.set_item(
+                "world_from_lidar",
+                arrays::pose(py, &gnss.world_from_lidar)?,
+            )?;
             made.unbind()
         }
         WireMessage::Imu(motion) => json::to_python(py, &motion)?.unbind(),
@@ -135,8 +155,14 @@ fn payload(py: Python<'_>, cav: &CavId, message: WireMessage) -> PyResult<Py<PyA
 #[pymethods]
 impl Message {
     fn __repr__(&self) -> String {
-        let (seconds, place) = (self.capture_time_ns as f64 * 1e-9, self.key.as_deref().unwrap_or(&self.cav));
-        format!("Message({}, {place:?}, t={seconds:.3} s, {} bytes)", self.kind, self.wire_bytes)
+        let (seconds, place) = (
+            self.capture_time_ns as f64 * 1e-9,
+            self.key.as_deref().unwrap_or(&self.cav),
+        );
+        format!(
+            "Message({}, {place:?}, t={seconds:.3} s, {} bytes)",
+            self.kind, self.wire_bytes
+        )
     }
 }
 
@@ -145,17 +171,27 @@ impl Message {
 pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult<Message> {
     let named = |cause: &dyn std::fmt::Display| error(format!("{kind_or_key}: {cause}"));
     if !kind_or_key.contains('/') {
-        let kind = Kind::ALL.into_iter().find(|kind| kind.to_string() == kind_or_key);
+        let kind = Kind::ALL
+            .into_iter()
+            .find(|kind| kind.to_string() == kind_or_key);
         let known = || Kind::ALL.map(|kind| kind.to_string()).join(", ");
-        let kind =
-            kind.ok_or_else(|| error(format!("{kind_or_key:?} is no kind of message; there are {}", known())))?;
+        let kind = kind.ok_or_else(|| {
+            error(format!(
+                "{kind_or_key:?} is no kind of message; there are {}",
+                known()
+            ))
+        })?;
         let decoded = py.detach(|| Decoded::of_kind(Some(kind), data));
         return Message::new(py, None, decoded.map_err(|cause| named(&cause))?);
     }
-    let key: Key = kind_or_key.parse().map_err(|cause: protocol::KeyError| named(&cause))?;
+    let key: Key = kind_or_key
+        .parse()
+        .map_err(|cause: protocol::KeyError| named(&cause))?;
     if key.topic.is_json() {
         return Err(named(&"messages of this key are JSON: use json.loads"));
     }
-    let decoded = py.detach(|| Decoded::of_key(&key, data)).map_err(|cause| named(&cause))?;
+    let decoded = py
+        .detach(|| Decoded::of_key(&key, data))
+        .map_err(|cause| named(&cause))?;
     Message::new(py, Some(kind_or_key.to_owned()), decoded)
 }

@@ -33,7 +33,14 @@ pub(crate) struct Agent {
 impl Agent {
     /// Converts all parts but the ground truth, which stays in the frame as well.
     pub(crate) fn new(py: Python<'_>, parts: AgentParts) -> PyResult<(Py<Self>, frame::Frame)> {
-        let AgentParts { mut recorded, has_points, gnss_world_from_lidar, pose, bev, boxes } = parts;
+        let AgentParts {
+            mut recorded,
+            has_points,
+            gnss_world_from_lidar,
+            pose,
+            bev,
+            boxes,
+        } = parts;
         let matrix = |pose: Option<&Pose>| pose.map(|pose| arrays::pose(py, pose)).transpose();
         let cameras = PyDict::new(py);
         for (number, camera) in std::mem::take(&mut recorded.cameras) {
@@ -44,7 +51,9 @@ impl Agent {
         let radar = recorded.radar.take();
         let made = Self {
             points: has_points.then(|| arrays::rows(py, points)).transpose()?,
-            radar: radar.map(|sweep| arrays::rows(py, sweep.xyzi)).transpose()?,
+            radar: radar
+                .map(|sweep| arrays::rows(py, sweep.xyzi))
+                .transpose()?,
             cameras: cameras.unbind(),
             world_from_lidar: matrix(recorded.world_from_lidar.as_ref())?,
             gnss_world_from_lidar: matrix(gnss_world_from_lidar.as_ref())?,
@@ -53,7 +62,9 @@ impl Agent {
             objects: Objects::annotated(py, &recorded)?,
             pose: pose.map(|pose| PoseEstimate::new(py, &pose)).transpose()?,
             bev: bev.map(|bev| Bev::new(py, bev)).transpose()?,
-            boxes: boxes.map(|boxes| Detections::of_agent(py, &cav, &boxes)).transpose()?,
+            boxes: boxes
+                .map(|boxes| Detections::of_agent(py, &cav, &boxes))
+                .transpose()?,
             cav,
         };
         Ok((Py::new(py, made)?, recorded))
@@ -64,9 +75,18 @@ impl Agent {
 impl Agent {
     fn __repr__(&self, py: Python<'_>) -> String {
         let mut parts = vec![format!("{:?}", self.cav)];
-        let count = |points: &Py<PyArray2<f32>>| points.bind(py).shape().first().copied().unwrap_or(0);
-        parts.extend(self.points.as_ref().map(|points| format!("{} points", count(points))));
-        parts.extend(self.radar.as_ref().map(|points| format!("{} radar points", count(points))));
+        let count =
+            |points: &Py<PyArray2<f32>>| points.bind(py).shape().first().copied().unwrap_or(0);
+        parts.extend(
+            self.points
+                .as_ref()
+                .map(|points| format!("{} points", count(points))),
+        );
+        parts.extend(
+            self.radar
+                .as_ref()
+                .map(|points| format!("{} radar points", count(points))),
+        );
         let here: [(&str, bool); 5] = [
             ("true pose", self.world_from_lidar.is_some()),
             ("pose", self.pose.is_some()),
@@ -74,7 +94,11 @@ impl Agent {
             ("boxes", self.boxes.is_some()),
             ("cameras", !self.cameras.bind(py).is_empty()),
         ];
-        parts.extend(here.iter().filter(|(_, is_here)| *is_here).map(|(name, _)| (*name).to_owned()));
+        parts.extend(
+            here.iter()
+                .filter(|(_, is_here)| *is_here)
+                .map(|(name, _)| (*name).to_owned()),
+        );
         format!("Agent({})", parts.join(", "))
     }
 }
@@ -102,7 +126,15 @@ pub(crate) struct Frame {
 
 impl Frame {
     pub(crate) fn new(py: Python<'_>, parts: FrameParts) -> PyResult<Self> {
-        let FrameParts { source, tick, capture_nanos, agents: parts, detections: results, problems, protocol } = parts;
+        let FrameParts {
+            source,
+            tick,
+            capture_nanos,
+            agents: parts,
+            detections: results,
+            problems,
+            protocol,
+        } = parts;
         let (agents, detections) = (PyDict::new(py), PyDict::new(py));
         let mut truth = Vec::with_capacity(parts.len());
         for agent in parts {
@@ -113,7 +145,10 @@ impl Frame {
         for result in &results {
             detections.set_item(result.ego.as_str(), Detections::of_ego(py, result)?)?;
         }
-        let ego = results.first().map(|result| &result.ego).or(truth.first().map(|agent| &agent.cav));
+        let ego = results
+            .first()
+            .map(|result| &result.ego)
+            .or(truth.first().map(|agent| &agent.cav));
         Ok(Self {
             source,
             tick,
@@ -128,8 +163,14 @@ impl Frame {
     }
 
     fn rule(&self, protocol: Option<&str>) -> PyResult<EvaluationProtocol> {
-        let Some(name) = protocol else { return Ok(self.protocol.clone()) };
-        let known = || dataset::evaluation_protocol::PRESETS.map(|(name, _)| name).join(", ");
+        let Some(name) = protocol else {
+            return Ok(self.protocol.clone());
+        };
+        let known = || {
+            dataset::evaluation_protocol::PRESETS
+                .map(|(name, _)| name)
+                .join(", ")
+        };
         EvaluationProtocol::preset(name)
             .ok_or_else(|| error(format!("unknown protocol {name:?}; there are {}", known())))
     }
@@ -149,23 +190,40 @@ impl Frame {
         let protocol = self.rule(protocol)?;
         let rule = area_m.map_or(protocol.ground_truth, |area_m| protocol.rule_within(area_m));
         let ego = ego.or_else(|| self.ego.clone()).unwrap_or_default();
-        let index = self.truth.iter().position(|agent| agent.cav.as_str() == ego);
-        let no_pose = || error(format!("no true pose of agent {ego:?} in {}", self.__repr__(py)));
-        let index = index.filter(|&index| self.truth[index].world_from_lidar.is_some()).ok_or_else(no_pose)?;
+        let index = self
+            .truth
+            .iter()
+            .position(|agent| agent.cav.as_str() == ego);
+        let no_pose = || {
+            error(format!(
+                "no true pose of agent {ego:?} in {}",
+                self.__repr__(py)
+            ))
+        };
+        let index = index
+            .filter(|&index| self.truth[index].world_from_lidar.is_some())
+            .ok_or_else(no_pose)?;
         let frames: Vec<&frame::Frame> = self.truth.iter().collect();
         let (objects, boxes): (Vec<&frame::Object>, Vec<Box3d>) =
-            ground_truth::merged_objects(&frames, index, &rule).into_iter().unzip();
+            ground_truth::merged_objects(&frames, index, &rule)
+                .into_iter()
+                .unzip();
         Objects::new(py, &objects, Some(&boxes))
     }
 
     fn __repr__(&self, py: Python<'_>) -> String {
         let agents = self.agents.bind(py).keys();
-        let tick = self.tick.map_or(String::new(), |tick| format!(", tick={tick}"));
+        let tick = self
+            .tick
+            .map_or(String::new(), |tick| format!(", tick={tick}"));
         let detections = match self.detections.bind(py).len() {
             0 => String::new(),
             count => format!(", detections of {count}"),
         };
         let seconds = self.capture_time_ns as f64 * 1e-9;
-        format!("Frame({:?}{tick}, t={seconds:.3} s, agents={agents}{detections})", self.source)
+        format!(
+            "Frame({:?}{tick}, t={seconds:.3} s, agents={agents}{detections})",
+            self.source
+        )
     }
 }

@@ -3,7 +3,8 @@
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use protocol::{
-    Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream, Topic, Truth, WireError, wire,
+    Boxes, CavId, Detections, Handedness, Limits, Message, Pose, PoseEstimate, Stream, Topic,
+    Truth, WireError, wire,
 };
 
 use crate::payload::DecodedBev;
@@ -63,7 +64,9 @@ impl FrameParts {
                 self.add_truth(&truth);
             }
             Topic::Stream { cav, stream } => match decode_stream(cav, *stream, pieces)? {
-                Message::Detections(found) if !self.detections.iter().any(|known| known.ego == found.ego) => {
+                Message::Detections(found)
+                    if !self.detections.iter().any(|known| known.ego == found.ego) =>
+                {
                     self.detections.push(found);
                 }
                 message => self.agent(cav).take(*stream, message)?,
@@ -80,9 +83,18 @@ impl FrameParts {
         }
         let mut others = std::mem::take(&mut self.agents);
         for agent in &truth.agents {
-            let Frame { world_from_lidar, objects, .. } = Frame::of_truth(agent);
-            let known = others.iter().position(|other| other.recorded.cav == agent.cav);
-            let mut parts = known.map_or_else(|| AgentParts::empty(&agent.cav), |index| others.swap_remove(index));
+            let Frame {
+                world_from_lidar,
+                objects,
+                ..
+            } = Frame::of_truth(agent);
+            let known = others
+                .iter()
+                .position(|other| other.recorded.cav == agent.cav);
+            let mut parts = known.map_or_else(
+                || AgentParts::empty(&agent.cav),
+                |index| others.swap_remove(index),
+            );
             (parts.recorded.world_from_lidar, parts.recorded.objects) = (world_from_lidar, objects);
             self.agents.push(parts);
         }
@@ -90,7 +102,10 @@ impl FrameParts {
     }
 
     fn agent(&mut self, cav: &CavId) -> &mut AgentParts {
-        let known = self.agents.iter().position(|agent| agent.recorded.cav == *cav);
+        let known = self
+            .agents
+            .iter()
+            .position(|agent| agent.recorded.cav == *cav);
         let index = known.unwrap_or_else(|| {
             self.agents.push(AgentParts::empty(cav));
             self.agents.len() - 1
@@ -107,39 +122,58 @@ impl AgentParts {
     /// An agent of a data set.
     pub(crate) fn recorded(recorded: Frame, has_points: bool) -> Self {
         let gnss_world_from_lidar = recorded.gnss_world_from_lidar();
-        Self { recorded, has_points, gnss_world_from_lidar, pose: None, bev: None, boxes: None }
+        Self {
+            recorded,
+            has_points,
+            gnss_world_from_lidar,
+            pose: None,
+            bev: None,
+            boxes: None,
+        }
     }
 
     /// The agents of a message of the ground truth.
     pub(crate) fn of_truth(truth: &Truth) -> Vec<Self> {
-        truth.agents.iter().map(|agent| Self::recorded(Frame::of_truth(agent), false)).collect()
+        truth
+            .agents
+            .iter()
+            .map(|agent| Self::recorded(Frame::of_truth(agent), false))
+            .collect()
     }
 
     /// An agent with points that it shares.
     pub(crate) fn of_points(cav: &CavId, sent: protocol::Points) -> Self {
         let mut parts = Self::empty(cav);
-        (parts.recorded.points, parts.has_points, parts.pose) = (sent.points, true, Some(sent.pose));
+        (parts.recorded.points, parts.has_points, parts.pose) =
+            (sent.points, true, Some(sent.pose));
         parts
     }
 
     fn take(&mut self, stream: Stream, message: Message) -> Result<(), WireError> {
         let frame = &mut self.recorded;
         match (message, stream) {
-            (Message::Lidar(protocol::Lidar { points }) | Message::Points(protocol::Points { points, .. }), _)
-                if !self.has_points =>
-            {
+            (
+                Message::Lidar(protocol::Lidar { points })
+                | Message::Points(protocol::Points { points, .. }),
+                _,
+            ) if !self.has_points => {
                 (frame.points, self.has_points) = (points, true);
             }
             (Message::Radar(sweep), _) => frame.radar = frame.radar.take().or(Some(sweep.points)),
             (Message::Gnss(gnss), _) => {
-                self.gnss_world_from_lidar = self.gnss_world_from_lidar.or(Some(gnss.world_from_lidar));
+                self.gnss_world_from_lidar =
+                    self.gnss_world_from_lidar.or(Some(gnss.world_from_lidar));
             }
             (Message::Imu(motion), _) => {
                 (frame.speed_mps, frame.yaw_rate_rad_s) = (motion.speed_mps, motion.yaw_rate_rad_s);
             }
-            (Message::Camera(camera), Stream::Camera(number)) => frame.cameras.push((number, camera)),
+            (Message::Camera(camera), Stream::Camera(number)) => {
+                frame.cameras.push((number, camera))
+            }
             (Message::Pose(pose), _) => self.pose = self.pose.or(Some(pose)),
-            (Message::Bev(bev), _) if self.bev.is_none() => self.bev = Some(DecodedBev::decode(bev)?),
+            (Message::Bev(bev), _) if self.bev.is_none() => {
+                self.bev = Some(DecodedBev::decode(bev)?)
+            }
             (Message::Boxes(boxes), _) => self.boxes = self.boxes.take().or(Some(boxes)),
             _ => {}
         }
@@ -152,9 +186,10 @@ impl AgentParts {
 pub(crate) fn is_part_of_frames(topic: &Topic) -> bool {
     match topic {
         Topic::Truth => true,
-        Topic::Stream { stream, .. } => {
-            !matches!(stream, Stream::Preview | Stream::Descriptor | Stream::Pace | Stream::DetectionsJson)
-        }
+        Topic::Stream { stream, .. } => !matches!(
+            stream,
+            Stream::Preview | Stream::Descriptor | Stream::Pace | Stream::DetectionsJson
+        ),
         _ => false,
     }
 }
@@ -168,7 +203,10 @@ pub(crate) fn decode_stream<'a>(
     let (header, message) = wire::decode_any(pieces, &Limits::DEFAULT)?;
     header.check_sender(cav)?;
     match stream.kind() {
-        Some(expected) if expected != header.kind => Err(WireError::Kind { expected, found: header.kind }),
+        Some(expected) if expected != header.kind => Err(WireError::Kind {
+            expected,
+            found: header.kind,
+        }),
         _ => Ok(message),
     }
 }

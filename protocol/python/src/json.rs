@@ -8,14 +8,19 @@ use serde_json::Value;
 use crate::error::error;
 
 /// The value as Python's `json` would read its JSON.
-pub(crate) fn to_python<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
+pub(crate) fn to_python<'py>(
+    py: Python<'py>,
+    value: &impl Serialize,
+) -> PyResult<Bound<'py, PyAny>> {
     of_value(py, &serde_json::to_value(value).map_err(error)?)
 }
 
 /// The name that a variant has in JSON.
 pub(crate) fn name(variant: &impl Serialize) -> PyResult<String> {
     let value = serde_json::to_value(variant).map_err(error)?;
-    Ok(value.as_str().map_or_else(|| value.to_string(), str::to_owned))
+    Ok(value
+        .as_str()
+        .map_or_else(|| value.to_string(), str::to_owned))
 }
 
 fn of_value<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
@@ -29,7 +34,10 @@ fn of_value<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> 
         },
         Value::String(text) => text.into_pyobject(py)?.into_any(),
         Value::Array(values) => {
-            let values: Vec<_> = values.iter().map(|value| of_value(py, value)).collect::<PyResult<_>>()?;
+            let values: Vec<_> = values
+                .iter()
+                .map(|value| of_value(py, value))
+                .collect::<PyResult<_>>()?;
             PyList::new(py, values)?.into_any()
         }
         Value::Object(fields) => {

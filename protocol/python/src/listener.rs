@@ -66,12 +66,16 @@ impl Listener {
     /// The next message, waiting for one so long: without Python's lock, and such that Ctrl-C interrupts.
     fn step(&mut self, py: Python<'_>, wait: Duration) -> PyResult<Step> {
         py.check_signals()?;
-        let Some(Connection { bus, subscriber }) = &self.connection else { return Ok(Step::End) };
+        let Some(Connection { bus, subscriber }) = &self.connection else {
+            return Ok(Step::End);
+        };
         let has_ended = self.is_over && self.last_data.elapsed() >= self.settle;
         let wait = if has_ended { Duration::ZERO } else { wait };
         match py.detach(|| subscriber.take(Some(Instant::now() + wait))) {
             // Its own status is no sign that the run is there.
-            Pop::Item(Topic::Stats(process), _) if process == *bus.stats().process() => self.silence(),
+            Pop::Item(Topic::Stats(process), _) if process == *bus.stats().process() => {
+                self.silence()
+            }
             Pop::Item(topic, message) => {
                 self.note(&topic);
                 Ok(Step::Message(message))
@@ -124,7 +128,9 @@ impl Listener {
                 Step::End => return Ok(None),
             };
             match py.detach(|| Decoded::of_key(&message.key, &message.bytes())) {
-                Ok(decoded) => return Message::new(py, Some(message.key.to_string()), decoded).map(Some),
+                Ok(decoded) => {
+                    return Message::new(py, Some(message.key.to_string()), decoded).map(Some);
+                }
                 Err(cause) => self.reject(&message.key, &cause),
             }
         }
@@ -169,7 +175,11 @@ impl Listener {
                 Step::Message(_) | Step::Waiting => {}
                 Step::End => {
                     self.frames.finish();
-                    return self.frames.next().map(|parts| Frame::new(py, parts)).transpose();
+                    return self
+                        .frames
+                        .next()
+                        .map(|parts| Frame::new(py, parts))
+                        .transpose();
                 }
             }
         }
@@ -206,14 +216,23 @@ impl Listener {
 
     #[getter]
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let subscriber = self.connection.as_ref().map(|connection| &connection.subscriber);
+        let subscriber = self
+            .connection
+            .as_ref()
+            .map(|connection| &connection.subscriber);
         let counts = PyDict::new(py);
         for (name, count) in [
             ("messages", self.messages),
             ("undecodable", self.undecodable),
             ("late", self.frames.late),
-            ("overwritten", subscriber.map_or(0, PassiveSubscriber::overwritten)),
-            ("undelivered", subscriber.map_or(0, PassiveSubscriber::undelivered)),
+            (
+                "overwritten",
+                subscriber.map_or(0, PassiveSubscriber::overwritten),
+            ),
+            (
+                "undelivered",
+                subscriber.map_or(0, PassiveSubscriber::undelivered),
+            ),
         ] {
             counts.set_item(name, count)?;
         }
@@ -221,8 +240,16 @@ impl Listener {
     }
 
     fn __repr__(&self) -> String {
-        let state = if self.connection.is_some() { "" } else { ", closed" };
-        format!("Listener(run={:?}, {} messages{state})", self.run.as_str(), self.messages)
+        let state = if self.connection.is_some() {
+            ""
+        } else {
+            ", closed"
+        };
+        format!(
+            "Listener(run={:?}, {} messages{state})",
+            self.run.as_str(),
+            self.messages
+        )
     }
 }
 
@@ -256,11 +283,14 @@ pub(crate) fn listen(
     streams: Option<Vec<String>>,
     settle_s: f64,
 ) -> PyResult<Listener> {
-    let run =
-        run.ok_or_else(|| error("run: give the name of the run; `v2vloc up` prints it, `v2vloc status` lists runs"))?;
+    let run = run.ok_or_else(|| {
+        error("run: give the name of the run; `v2vloc up` prints it, `v2vloc status` lists runs")
+    })?;
     let run = RunId::new(run).map_err(error)?;
     let endpoint = Endpoint::new(endpoint).map_err(error)?;
-    let timeout = timeout_s.map(|seconds| seconds_of("timeout_s", seconds)).transpose()?;
+    let timeout = timeout_s
+        .map(|seconds| seconds_of("timeout_s", seconds))
+        .transpose()?;
     let settle = seconds_of("settle_s", settle_s)?;
     let mut options = BusOptions::client(endpoint.clone());
     options.connect_timeout = timeout.unwrap_or(CONNECT_LIMIT).min(CONNECT_LIMIT);
@@ -272,13 +302,19 @@ pub(crate) fn listen(
         options = options.with_credentials(credentials);
     }
     let selectors = subscriptions::selectors(&run, streams, &access)?;
-    let identity = Identity { run: run.clone(), process: principal.name(), cav: principal.cav };
+    let identity = Identity {
+        run: run.clone(),
+        process: principal.name(),
+        cav: principal.cav,
+    };
     let connect = || {
         let bus = Bus::join(&options, identity)?;
         let subscriber = bus.tap(&selectors, PLACES)?;
         Ok(Connection { bus, subscriber })
     };
-    let connection = py.detach(connect).map_err(|cause: bus::BusError| error(cause))?;
+    let connection = py
+        .detach(connect)
+        .map_err(|cause: bus::BusError| error(cause))?;
     let protocol = EvaluationProtocol::preset("opv2v").ok_or_else(|| error("no protocol opv2v"))?;
     Ok(Listener {
         connection: Some(connection),
@@ -297,7 +333,8 @@ pub(crate) fn listen(
 }
 
 fn seconds_of(name: &str, seconds: f64) -> PyResult<Duration> {
-    Duration::try_from_secs_f64(seconds).map_err(|cause| error(format!("{name}: {seconds}: {cause}")))
+    Duration::try_from_secs_f64(seconds)
+        .map_err(|cause| error(format!("{name}: {seconds}: {cause}")))
 }
 
 /// A viewer of a name of its own: several listeners of a process, or of several, may follow one run.

@@ -56,7 +56,10 @@ impl LiveFrames {
             return Ok(());
         }
         let (run, protocol) = (&self.run, &self.protocol);
-        let empty = || Pending { parts: FrameParts::empty(run, at, protocol), last_message: Instant::now() };
+        let empty = || Pending {
+            parts: FrameParts::empty(run, at, protocol),
+            last_message: Instant::now(),
+        };
         let pending = self.pending.entry(at).or_insert_with(empty);
         pending.last_message = Instant::now();
         let added = pending.parts.add(&message.key.topic, message.pieces());
@@ -68,7 +71,11 @@ impl LiveFrames {
 
     /// A replay that is started anew begins at its own first tick.
     fn begin_again_with(&mut self, epoch: u64) {
-        if self.replay_epoch.replace(epoch).is_some_and(|known| known != epoch) {
+        if self
+            .replay_epoch
+            .replace(epoch)
+            .is_some_and(|known| known != epoch)
+        {
             self.finish();
             self.handed_over = None;
         }

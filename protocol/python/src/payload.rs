@@ -23,14 +23,24 @@ pub(crate) struct PoseEstimate {
 impl PoseEstimate {
     pub(crate) fn new(py: Python<'_>, estimate: &protocol::PoseEstimate) -> PyResult<Py<Self>> {
         let made = match estimate {
-            protocol::PoseEstimate::Pose { world_from_cav, confidence, covariance } => Self {
+            protocol::PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                covariance,
+            } => Self {
                 world_from_cav: Some(arrays::pose(py, world_from_cav)?),
                 confidence: Some(*confidence),
-                covariance: covariance.as_ref().map(|one| arrays::covariance(py, one)).transpose()?,
+                covariance: covariance
+                    .as_ref()
+                    .map(|one| arrays::covariance(py, one))
+                    .transpose()?,
                 no_pose_reason: None,
                 inlier_count: None,
             },
-            protocol::PoseEstimate::NoPose { reason, inlier_count } => Self {
+            protocol::PoseEstimate::NoPose {
+                reason,
+                inlier_count,
+            } => Self {
                 world_from_cav: None,
                 confidence: None,
                 covariance: None,
@@ -46,7 +56,10 @@ impl PoseEstimate {
 impl PoseEstimate {
     fn __repr__(&self, py: Python<'_>) -> String {
         let (Some(matrix), Some(confidence)) = (&self.world_from_cav, self.confidence) else {
-            return format!("PoseEstimate(no pose: {})", self.no_pose_reason.as_deref().unwrap_or_default());
+            return format!(
+                "PoseEstimate(no pose: {})",
+                self.no_pose_reason.as_deref().unwrap_or_default()
+            );
         };
         let matrix = matrix.bind(py).readonly();
         let at = |row: usize, column: usize| matrix.get([row, column]).copied().unwrap_or(f64::NAN);
@@ -54,7 +67,11 @@ impl PoseEstimate {
         let [x, y, z] = [0, 1, 2].map(|row| at(row, 3));
         format!(
             "PoseEstimate(x={x:.2}, y={y:.2}, z={z:.2} m, yaw={yaw_deg:.1} deg, confidence={confidence:.3}{})",
-            if self.covariance.is_some() { ", covariance" } else { "" }
+            if self.covariance.is_some() {
+                ", covariance"
+            } else {
+                ""
+            }
         )
     }
 }
@@ -86,19 +103,45 @@ impl DecodedBev {
     pub(crate) fn decode(bev: protocol::Bev) -> Result<Self, protocol::WireError> {
         let protocol::Bev { pose, features } = bev;
         let (codec, payload_bytes) = (features.codec, features.body.len());
-        Ok(Self { pose, decoded: features.decode(&protocol::Limits::DEFAULT)?, codec, payload_bytes })
+        Ok(Self {
+            pose,
+            decoded: features.decode(&protocol::Limits::DEFAULT)?,
+            codec,
+            payload_bytes,
+        })
     }
 }
 
 impl Bev {
     pub(crate) fn new(py: Python<'_>, bev: DecodedBev) -> PyResult<Py<Self>> {
-        let DecodedBev { pose, decoded, codec, payload_bytes } = bev;
-        let protocol::BevFeatures { grid, channels, code_of, values } = decoded.features;
-        let BevGrid { x_min_m, y_min_m, cell_m, width, height } = grid;
+        let DecodedBev {
+            pose,
+            decoded,
+            codec,
+            payload_bytes,
+        } = bev;
+        let protocol::BevFeatures {
+            grid,
+            channels,
+            code_of,
+            values,
+        } = decoded.features;
+        let BevGrid {
+            x_min_m,
+            y_min_m,
+            cell_m,
+            width,
+            height,
+        } = grid;
         let [channels, height, width] = [channels, height, width].map(|size| size as usize);
-        let mask = decoded.sent.map(|sent| PyArray1::from_vec(py, sent).reshape([height, width])).transpose()?;
+        let mask = decoded
+            .sent
+            .map(|sent| PyArray1::from_vec(py, sent).reshape([height, width]))
+            .transpose()?;
         let made = Self {
-            features: PyArray1::from_vec(py, values).reshape([channels, height, width])?.unbind(),
+            features: PyArray1::from_vec(py, values)
+                .reshape([channels, height, width])?
+                .unbind(),
             mask: mask.map(pyo3::Bound::unbind),
             x_min_m,
             y_min_m,
@@ -115,9 +158,18 @@ impl Bev {
 #[pymethods]
 impl Bev {
     fn __repr__(&self, py: Python<'_>) -> String {
-        let shape = self.features.bind(py).readonly().as_array().shape().to_vec();
+        let shape = self
+            .features
+            .bind(py)
+            .readonly()
+            .as_array()
+            .shape()
+            .to_vec();
         let part = if self.mask.is_some() { ", masked" } else { "" };
-        format!("Bev({shape:?}, cells of {} m, {} bytes of {}{part})", self.cell_m, self.payload_bytes, self.dtype)
+        format!(
+            "Bev({shape:?}, cells of {} m, {} bytes of {}{part})",
+            self.cell_m, self.payload_bytes, self.dtype
+        )
     }
 }
 
@@ -140,8 +192,17 @@ pub(crate) struct Detections {
 impl Detections {
     /// The result of an ego.
     pub(crate) fn of_ego(py: Python<'_>, found: &protocol::Detections) -> PyResult<Py<Self>> {
-        let protocol::Detections { ego, agent_frame, method, pose, detections, fused, skipped, neighbours, stages } =
-            found;
+        let protocol::Detections {
+            ego,
+            agent_frame,
+            method,
+            pose,
+            detections,
+            fused,
+            skipped,
+            neighbours,
+            stages,
+        } = found;
         let stages_ms = PyDict::new(py);
         for timing in stages {
             stages_ms.set_item(&timing.stage, timing.nanos as f64 * 1e-6)?;
@@ -159,12 +220,23 @@ impl Detections {
     }
 
     /// Detections of one agent in its own sensor data.
-    pub(crate) fn of_agent(py: Python<'_>, cav: &str, boxes: &protocol::Boxes) -> PyResult<Py<Self>> {
+    pub(crate) fn of_agent(
+        py: Python<'_>,
+        cav: &str,
+        boxes: &protocol::Boxes,
+    ) -> PyResult<Py<Self>> {
         Py::new(py, Self::of_list(py, cav, &boxes.pose, &boxes.detections)?)
     }
 
-    fn of_list(py: Python<'_>, cav: &str, pose: &protocol::PoseEstimate, found: &[Detection]) -> PyResult<Self> {
-        let sources = found.iter().map(|one| one.source.as_ref().map(ToString::to_string));
+    fn of_list(
+        py: Python<'_>,
+        cav: &str,
+        pose: &protocol::PoseEstimate,
+        found: &[Detection],
+    ) -> PyResult<Self> {
+        let sources = found
+            .iter()
+            .map(|one| one.source.as_ref().map(ToString::to_string));
         let empty = || PyList::empty(py).into_any().unbind();
         Ok(Self {
             cav: cav.to_owned(),
@@ -191,7 +263,10 @@ impl Detections {
 impl Detections {
     fn __repr__(&self, py: Python<'_>) -> String {
         let count = self.__len__(py);
-        let method = self.method.as_deref().map_or(String::new(), |method| format!(", method={method:?}"));
+        let method = self
+            .method
+            .as_deref()
+            .map_or(String::new(), |method| format!(", method={method:?}"));
         format!("Detections(cav={:?}, {count} boxes{method})", self.cav)
     }
 
@@ -217,16 +292,29 @@ impl Objects {
         let objects: Vec<&Object> = frame.objects.iter().collect();
         let boxes = frame.world_from_lidar.map(|pose| {
             let lidar_from_world = pose.isometry().inverse();
-            objects.iter().map(|object| upright_box(object, &lidar_from_world)).collect::<Vec<_>>()
+            objects
+                .iter()
+                .map(|object| upright_box(object, &lidar_from_world))
+                .collect::<Vec<_>>()
         });
         Self::new(py, &objects, boxes.as_deref())
     }
 
     /// Objects with their boxes in the frame of a LiDAR, if its true pose is known.
-    pub(crate) fn new(py: Python<'_>, objects: &[&Object], boxes: Option<&[Box3d]>) -> PyResult<Py<Self>> {
+    pub(crate) fn new(
+        py: Python<'_>,
+        objects: &[&Object],
+        boxes: Option<&[Box3d]>,
+    ) -> PyResult<Py<Self>> {
         let boxes = boxes.map(|boxes| arrays::boxes(py, boxes.iter()));
-        let poses: Vec<Pose> = objects.iter().map(|object| object.world_from_object).collect();
-        let speeds = objects.iter().map(|object| object.speed_mps.unwrap_or(f64::NAN)).collect();
+        let poses: Vec<Pose> = objects
+            .iter()
+            .map(|object| object.world_from_object)
+            .collect();
+        let speeds = objects
+            .iter()
+            .map(|object| object.speed_mps.unwrap_or(f64::NAN))
+            .collect();
         let made = Self {
             ids: PyArray1::from_vec(py, objects.iter().map(|object| object.id).collect()).unbind(),
             classes: PyList::new(py, objects.iter().map(|object| object.class.name()))?.unbind(),
@@ -268,10 +356,24 @@ pub(crate) struct Camera {
 
 impl Camera {
     pub(crate) fn new(py: Python<'_>, camera: &protocol::Camera) -> PyResult<Py<Self>> {
-        let CameraMetadata { format, width_px, height_px, pinhole, lidar_from_camera } = camera.metadata;
+        let CameraMetadata {
+            format,
+            width_px,
+            height_px,
+            pinhole,
+            lidar_from_camera,
+        } = camera.metadata;
         let intrinsics = pinhole.map(|pinhole| {
-            let protocol::Pinhole { fx_px, fy_px, cx_px, cy_px } = pinhole;
-            arrays::rows(py, vec![[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
+            let protocol::Pinhole {
+                fx_px,
+                fy_px,
+                cx_px,
+                cy_px,
+            } = pinhole;
+            arrays::rows(
+                py,
+                vec![[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]],
+            )
         });
         let made = Self {
             image: PyBytes::new(py, &camera.image).unbind(),
@@ -279,7 +381,9 @@ impl Camera {
             width_px,
             height_px,
             intrinsics: intrinsics.transpose()?,
-            lidar_from_camera: lidar_from_camera.map(|pose| arrays::pose(py, &pose)).transpose()?,
+            lidar_from_camera: lidar_from_camera
+                .map(|pose| arrays::pose(py, &pose))
+                .transpose()?,
         };
         Py::new(py, made)
     }
@@ -288,6 +392,9 @@ impl Camera {
 #[pymethods]
 impl Camera {
     fn __repr__(&self) -> String {
-        format!("Camera({} x {} pixels, {})", self.width_px, self.height_px, self.format)
+        format!(
+            "Camera({} x {} pixels, {})",
+            self.width_px, self.height_px, self.format
+        )
     }
 }

@@ -29,11 +29,23 @@ impl RecordingFrames {
         let mut frames: BTreeMap<u64, Vec<usize>> = BTreeMap::new();
         for (index, Entry { key, header, .. }) in recording.entries().iter().enumerate() {
             if is_part_of_frames(&key.topic) && is_wanted(&key.topic, options) {
-                frames.entry(header.stamp.capture_nanos).or_default().push(index);
+                frames
+                    .entry(header.stamp.capture_nanos)
+                    .or_default()
+                    .push(index);
             }
         }
-        let run = recording.entries().first().map(|entry| entry.key.run.to_string()).unwrap_or_default();
-        Ok(Self { recording, run, protocol, frames: frames.into_iter().collect() })
+        let run = recording
+            .entries()
+            .first()
+            .map(|entry| entry.key.run.to_string())
+            .unwrap_or_default();
+        Ok(Self {
+            recording,
+            run,
+            protocol,
+            frames: frames.into_iter().collect(),
+        })
     }
 
     /// Name of the recorded run.
@@ -47,19 +59,31 @@ impl RecordingFrames {
 
     /// Parts of the file that cannot be read.
     pub(crate) fn problems(&self) -> Vec<String> {
-        self.recording.damage().iter().map(ToString::to_string).collect()
+        self.recording
+            .damage()
+            .iter()
+            .map(ToString::to_string)
+            .collect()
     }
 
     /// Reads the messages of a frame. One that cannot be read or decoded is left out and named.
     pub(crate) fn load(&self, index: usize) -> Option<FrameParts> {
         let (capture_nanos, messages) = self.frames.get(index)?;
         let mut parts = FrameParts::empty(&self.run, *capture_nanos, &self.protocol);
-        for entry in messages.iter().filter_map(|&index| self.recording.entries().get(index)) {
+        for entry in messages
+            .iter()
+            .filter_map(|&index| self.recording.entries().get(index))
+        {
             let problem = match self.recording.read(entry) {
-                Ok(bytes) => parts.add(&entry.key.topic, [bytes.as_slice()]).err().map(|cause| cause.to_string()),
+                Ok(bytes) => parts
+                    .add(&entry.key.topic, [bytes.as_slice()])
+                    .err()
+                    .map(|cause| cause.to_string()),
                 Err(cause) => Some(cause.to_string()),
             };
-            parts.problems.extend(problem.map(|cause| format!("{}: {cause}", entry.key)));
+            parts
+                .problems
+                .extend(problem.map(|cause| format!("{}: {cause}", entry.key)));
         }
         Some(parts)
     }
@@ -67,9 +91,18 @@ impl RecordingFrames {
 
 fn is_wanted(topic: &Topic, options: &LoadOptions) -> bool {
     match topic {
-        Topic::Stream { stream: Stream::Lidar | Stream::Points, .. } => options.points,
-        Topic::Stream { stream: Stream::Radar, .. } => options.radar,
-        Topic::Stream { stream: Stream::Camera(_), .. } => options.cameras,
+        Topic::Stream {
+            stream: Stream::Lidar | Stream::Points,
+            ..
+        } => options.points,
+        Topic::Stream {
+            stream: Stream::Radar,
+            ..
+        } => options.radar,
+        Topic::Stream {
+            stream: Stream::Camera(_),
+            ..
+        } => options.cameras,
         _ => true,
     }
 }

@@ -6,7 +6,16 @@ use pyo3::{PyErr, PyResult};
 use crate::error::error;
 
 /// Streams of a listener that asks for none: all but sweeps and images, which are most of the traffic.
-const STREAMS: [&str; 8] = ["gnss", "imu", "pose", "bev", "boxes", "points", "detections", "truth"];
+const STREAMS: [&str; 8] = [
+    "gnss",
+    "imu",
+    "pose",
+    "bev",
+    "boxes",
+    "points",
+    "detections",
+    "truth",
+];
 
 /// Key expressions that a listener may subscribe to.
 pub(crate) enum Access {
@@ -20,20 +29,28 @@ impl Access {
     /// Streams that a certificate permits in a run.
     pub(crate) fn of(principal: &Principal, run: &RunId) -> Self {
         let rights = principal.rights(&RunScope::One(run.clone())).into_iter();
-        let subscribed = rights.filter(|right| right.act == Operation::Subscribe).map(|right| right.keys);
+        let subscribed = rights
+            .filter(|right| right.act == Operation::Subscribe)
+            .map(|right| right.keys);
         Self::Of(principal.clone(), subscribed.collect())
     }
 
     fn permits(&self, run: &RunId, wanted: &KeyExpr) -> bool {
         match self {
             Self::All => true,
-            Self::Of(_, permitted) => permitted.iter().any(|keys| keys == wanted || *keys == KeyExpr::run(run)),
+            Self::Of(_, permitted) => permitted
+                .iter()
+                .any(|keys| keys == wanted || *keys == KeyExpr::run(run)),
         }
     }
 }
 
 /// Key expressions of the streams, and of the end of the run. Without names: those of [`STREAMS`] that are permitted.
-pub(crate) fn selectors(run: &RunId, names: Option<Vec<String>>, access: &Access) -> PyResult<Vec<KeyExpr>> {
+pub(crate) fn selectors(
+    run: &RunId,
+    names: Option<Vec<String>>,
+    access: &Access,
+) -> PyResult<Vec<KeyExpr>> {
     let mut selectors = vec![KeyExpr::control(run)];
     let is_choice = names.is_some();
     for name in names.unwrap_or_else(|| STREAMS.map(str::to_owned).into()) {
@@ -41,7 +58,9 @@ pub(crate) fn selectors(run: &RunId, names: Option<Vec<String>>, access: &Access
         match access {
             _ if access.permits(run, &wanted) => selectors.push(wanted),
             Access::Of(principal, _) if is_choice => {
-                return Err(error(format!("streams: a certificate of {principal} does not permit {name:?}")));
+                return Err(error(format!(
+                    "streams: a certificate of {principal} does not permit {name:?}"
+                )));
             }
             _ => {}
         }

@@ -38,10 +38,14 @@ pub(crate) fn xyz(cdr: &mut Cdr<'_>, values: [f64; 3]) {
 pub(crate) fn pose(cdr: &mut Cdr<'_>, pose: &Pose) {
     let [w, x, y, z] = pose.rotation_wxyz;
     xyz(cdr, pose.translation_m);
-    [x, y, z, w].into_iter().for_each(|value| cdr.write_f64(value));
+    [x, y, z, w]
+        .into_iter()
+        .for_each(|value| cdr.write_f64(value));
 }
 
 /// `float64[36]`: rows of x, y, z, and of the rotations about them.
 pub(crate) fn covariance(cdr: &mut Cdr<'_>, rows: &[[f64; 6]; 6]) {
-    rows.as_flattened().iter().for_each(|value| cdr.write_f64(*value));
+    rows.as_flattened()
+        .iter()
+        .for_each(|value| cdr.write_f64(*value));
 }

@@ -59,26 +59,48 @@ impl Node {
     /// Liveliness token of the node.
     #[must_use]
     pub fn token(&self) -> String {
-        format!("{TOKEN_ROOT}/{}/{}/0/0/NN/{}", self.domain_id, self.zid, self.identity())
+        format!(
+            "{TOKEN_ROOT}/{}/{}/0/0/NN/{}",
+            self.domain_id,
+            self.zid,
+            self.identity()
+        )
     }
 
     /// Liveliness token of one of its endpoints.
     #[must_use]
     pub fn endpoint_token(&self, endpoint: &Endpoint) -> String {
-        let Endpoint { id, kind, topic, ros_type, qos } = endpoint;
+        let Endpoint {
+            id,
+            kind,
+            topic,
+            ros_type,
+            qos,
+        } = endpoint;
         let kind = match kind {
             EndpointKind::Publisher => "MP",
             EndpointKind::Subscription => "MS",
         };
-        let (topic, name, hash) = (mangled(topic.as_str()), ros_type.dds_name(), ros_type.hash(self.distribution));
+        let (topic, name, hash) = (
+            mangled(topic.as_str()),
+            ros_type.dds_name(),
+            ros_type.hash(self.distribution),
+        );
         let identity = self.identity();
-        format!("{TOKEN_ROOT}/{}/{}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}", self.domain_id, self.zid)
+        format!(
+            "{TOKEN_ROOT}/{}/{}/0/{id}/{kind}/{identity}/{topic}/{name}/{hash}/{qos}",
+            self.domain_id, self.zid
+        )
     }
 
     /// Key on which messages of a topic are published.
     #[must_use]
     pub fn key(&self, topic: &RosName, ros_type: RosType) -> String {
-        format!("{}/{}", self.keys_of_any_hash(topic, ros_type), ros_type.hash(self.distribution))
+        format!(
+            "{}/{}",
+            self.keys_of_any_hash(topic, ros_type),
+            ros_type.hash(self.distribution)
+        )
     }
 
     /// Key expression of a topic's messages, whatever the hash: publishers of every distribution match.
@@ -126,9 +148,18 @@ impl Attachment {
     /// The bytes on the wire.
     #[must_use]
     pub fn to_bytes(&self) -> [u8; ATTACHMENT_LEN] {
-        let Self { sequence, source_nanos, gid } = self;
+        let Self {
+            sequence,
+            source_nanos,
+            gid,
+        } = self;
         let mut bytes = [0; ATTACHMENT_LEN];
-        let parts = [&sequence.to_le_bytes()[..], &source_nanos.to_le_bytes(), &[16], gid];
+        let parts = [
+            &sequence.to_le_bytes()[..],
+            &source_nanos.to_le_bytes(),
+            &[16],
+            gid,
+        ];
         for (place, byte) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
             *place = *byte;
         }
@@ -140,7 +171,9 @@ impl Attachment {
     pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (sequence, rest) = bytes.split_first_chunk()?;
         let (source_nanos, rest) = rest.split_first_chunk()?;
-        let (16, gid) = rest.split_first()? else { return None };
+        let (16, gid) = rest.split_first()? else {
+            return None;
+        };
         Some(Self {
             sequence: i64::from_le_bytes(*sequence),
             source_nanos: i64::from_le_bytes(*source_nanos),
@@ -193,25 +226,50 @@ mod tests {
             )
         );
         let key = "7/cav_1/points/sensor_msgs::msg::dds_::PointCloud2_";
-        assert_eq!(root.key(&points().topic, RosType::PointCloud2), format!("{key}/{HASH}"));
-        assert_eq!(root.any_hash(&points().topic, RosType::PointCloud2), format!("{key}/*"));
-        let humble = Node { distribution: Distribution::Humble, ..root };
-        assert_eq!(humble.key(&points().topic, RosType::PointCloud2), format!("{key}/TypeHashNotSupported"));
+        assert_eq!(
+            root.key(&points().topic, RosType::PointCloud2),
+            format!("{key}/{HASH}")
+        );
+        assert_eq!(
+            root.any_hash(&points().topic, RosType::PointCloud2),
+            format!("{key}/*")
+        );
+        let humble = Node {
+            distribution: Distribution::Humble,
+            ..root
+        };
+        assert_eq!(
+            humble.key(&points().topic, RosType::PointCloud2),
+            format!("{key}/TypeHashNotSupported")
+        );
     }
 
     #[test]
     fn a_gid_is_the_hash_of_the_token() {
         // XXH3-128 of no bytes, seed 0, in xxHash's own test vectors: 99aa06d3014798d8 6001c324468d497f.
-        let empty = [0x7f, 0x49, 0x8d, 0x46, 0x24, 0xc3, 0x01, 0x60, 0xd8, 0x98, 0x47, 0x01, 0xd3, 0x06, 0xaa, 0x99];
+        let empty = [
+            0x7f, 0x49, 0x8d, 0x46, 0x24, 0xc3, 0x01, 0x60, 0xd8, 0x98, 0x47, 0x01, 0xd3, 0x06,
+            0xaa, 0x99,
+        ];
         assert_eq!(gid(""), empty);
-        assert_ne!(gid(&node(None).endpoint_token(&points())), gid(&node(None).token()));
+        assert_ne!(
+            gid(&node(None).endpoint_token(&points())),
+            gid(&node(None).token())
+        );
     }
 
     #[test]
     fn an_attachment_is_laid_out_as_rmw_zenoh_lays_it_out() {
-        let attachment = Attachment { sequence: 1, source_nanos: 0x0102_0304, gid: *b"0123456789abcdef" };
+        let attachment = Attachment {
+            sequence: 1,
+            source_nanos: 0x0102_0304,
+            gid: *b"0123456789abcdef",
+        };
         let bytes = attachment.to_bytes();
-        assert_eq!(bytes[..], b"\x01\0\0\0\0\0\0\0\x04\x03\x02\x01\0\0\0\0\x100123456789abcdef"[..]);
+        assert_eq!(
+            bytes[..],
+            b"\x01\0\0\0\0\0\0\0\x04\x03\x02\x01\0\0\0\0\x100123456789abcdef"[..]
+        );
         assert_eq!(Attachment::from_bytes(&bytes), Some(attachment));
         let other_length = [bytes.as_slice(), &[0]].concat();
         let mut other_layout = bytes;

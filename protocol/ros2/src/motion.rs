@@ -87,14 +87,20 @@ impl MotionType {
         }
     }
 
-    fn read_body<BO: ByteOrder>(self, mut message: Reader<'_, BO>) -> Result<TimedMotion, MotionError> {
+    fn read_body<BO: ByteOrder>(
+        self,
+        mut message: Reader<'_, BO>,
+    ) -> Result<TimedMotion, MotionError> {
         let Header { nanos, .. } = message.header()?;
         let motion = match self {
             Self::Odometry => {
                 message.read("child_frame_id", CdrReader::read_str)?;
                 message.f64s::<7>("pose.pose")?;
                 message.f64s::<36>("pose.covariance")?;
-                let motion = read_twist(&mut message, ["twist.twist.linear.x", "twist.twist.angular.z"])?;
+                let motion = read_twist(
+                    &mut message,
+                    ["twist.twist.linear.x", "twist.twist.angular.z"],
+                )?;
                 let covariance: [f64; 36] = message.f64s("twist.covariance")?;
                 measured(motion, &covariance)?
             }
@@ -106,12 +112,21 @@ impl MotionType {
                 let [first, ..] = message.f64s::<9>("angular_velocity_covariance")?;
                 // REP-145: the first element is -1 where a sensor has no such measurement.
                 if first.to_bits() == (-1.0_f64).to_bits() {
-                    return Err(MotionError::Unmeasured { field: "angular_velocity_covariance[0]", found: first });
+                    return Err(MotionError::Unmeasured {
+                        field: "angular_velocity_covariance[0]",
+                        found: first,
+                    });
                 }
-                EgoMotion { speed_mps: None, yaw_rate_rad_s: Some(yaw_rate("angular_velocity.z", z)?) }
+                EgoMotion {
+                    speed_mps: None,
+                    yaw_rate_rad_s: Some(yaw_rate("angular_velocity.z", z)?),
+                }
             }
         };
-        Ok(TimedMotion { capture_nanos: nanos, motion })
+        Ok(TimedMotion {
+            capture_nanos: nanos,
+            motion,
+        })
     }
 }
 
@@ -123,19 +138,31 @@ fn read_twist<BO: ByteOrder>(
     let [speed_mps, _, _] = message.f64s(speed_field)?;
     let [_, _, z] = message.f64s(yaw_rate_field)?;
     let speed_mps = within(speed_field, speed_mps, EgoMotion::MAX_SPEED_MPS)?;
-    Ok(EgoMotion { speed_mps: Some(speed_mps), yaw_rate_rad_s: Some(yaw_rate(yaw_rate_field, z)?) })
+    Ok(EgoMotion {
+        speed_mps: Some(speed_mps),
+        yaw_rate_rad_s: Some(yaw_rate(yaw_rate_field, z)?),
+    })
 }
 
 /// The values of `motion` that are measured by their variances.
 fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
     let [speed_variance, .., yaw_rate_variance] = covariance;
-    let EgoMotion { speed_mps, yaw_rate_rad_s } = motion;
+    let EgoMotion {
+        speed_mps,
+        yaw_rate_rad_s,
+    } = motion;
     let speed_mps = speed_mps.filter(|_| *speed_variance < UNMEASURED);
     let yaw_rate_rad_s = yaw_rate_rad_s.filter(|_| *yaw_rate_variance < UNMEASURED);
     if speed_mps.is_none() && yaw_rate_rad_s.is_none() {
-        return Err(MotionError::Unmeasured { field: "twist.covariance[0]", found: *speed_variance });
+        return Err(MotionError::Unmeasured {
+            field: "twist.covariance[0]",
+            found: *speed_variance,
+        });
     }
-    Ok(EgoMotion { speed_mps, yaw_rate_rad_s })
+    Ok(EgoMotion {
+        speed_mps,
+        yaw_rate_rad_s,
+    })
 }
 
 fn yaw_rate(field: &'static str, found: f64) -> Result<f64, MotionError> {
@@ -144,7 +171,15 @@ fn yaw_rate(field: &'static str, found: f64) -> Result<f64, MotionError> {
 
 fn within(field: &'static str, found: f64, limit: f64) -> Result<f64, MotionError> {
     // A value that is no number is within nothing.
-    if found.abs() <= limit { Ok(found) } else { Err(MotionError::Value { field, found, limit }) }
+    if found.abs() <= limit {
+        Ok(found)
+    } else {
+        Err(MotionError::Value {
+            field,
+            found,
+            limit,
+        })
+    }
 }
 
 #[cfg(test)]
@@ -154,7 +189,11 @@ mod tests {
 
     use super::*;
 
-    const TYPES: [MotionType; 3] = [MotionType::Odometry, MotionType::TwistStamped, MotionType::Imu];
+    const TYPES: [MotionType; 3] = [
+        MotionType::Odometry,
+        MotionType::TwistStamped,
+        MotionType::Imu,
+    ];
 
     /// The numbers of a message, in the order of ROS.
     #[derive(Debug, Clone, Copy)]
@@ -167,7 +206,11 @@ mod tests {
 
     impl Numbers {
         fn of(speed: f64, yaw_rate: f64) -> Self {
-            Self { linear: [speed, 3.0, 4.0], angular: [5.0, 6.0, yaw_rate], variances: [0.01, 0.02] }
+            Self {
+                linear: [speed, 3.0, 4.0],
+                angular: [5.0, 6.0, yaw_rate],
+                variances: [0.01, 0.02],
+            }
         }
     }
 
@@ -216,12 +259,25 @@ mod tests {
         let cav = protocol::CavId::new("1").unwrap();
         let pose = protocol::Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.5);
         for motion in [
-            EgoMotion { speed_mps: Some(8.0), yaw_rate_rad_s: Some(-0.25) },
-            EgoMotion { speed_mps: None, yaw_rate_rad_s: Some(0.5) },
-            EgoMotion { speed_mps: Some(-1.0), yaw_rate_rad_s: None },
+            EgoMotion {
+                speed_mps: Some(8.0),
+                yaw_rate_rad_s: Some(-0.25),
+            },
+            EgoMotion {
+                speed_mps: None,
+                yaw_rate_rad_s: Some(0.5),
+            },
+            EgoMotion {
+                speed_mps: Some(-1.0),
+                yaw_rate_rad_s: None,
+            },
         ] {
-            let bytes = crate::encode::odometry(1_700_000_000_000_000_001, &cav, &pose, None, motion);
-            let expected = TimedMotion { capture_nanos: 1_700_000_000_000_000_001, motion };
+            let bytes =
+                crate::encode::odometry(1_700_000_000_000_000_001, &cav, &pose, None, motion);
+            let expected = TimedMotion {
+                capture_nanos: 1_700_000_000_000_000_001,
+                motion,
+            };
             assert_eq!(MotionType::Odometry.read(&bytes), Ok(expected));
         }
         let bytes = crate::encode::odometry(5, &cav, &pose, None, EgoMotion::default());
@@ -231,7 +287,8 @@ mod tests {
 
     #[test]
     fn a_wrong_message_is_named_with_field_and_value() {
-        let error = |ty: MotionType, numbers| ty.read(&little(ty, numbers)).unwrap_err().to_string();
+        let error =
+            |ty: MotionType, numbers| ty.read(&little(ty, numbers)).unwrap_err().to_string();
         assert_eq!(
             error(MotionType::Odometry, Numbers::of(f64::NAN, 0.0)),
             "twist.twist.linear.x is NaN, not from -200 to 200"
@@ -240,13 +297,21 @@ mod tests {
             error(MotionType::TwistStamped, Numbers::of(1.0, -30.0)),
             "twist.angular.z is -30, not from -20 to 20"
         );
-        let unmeasured = Numbers { variances: [-1.0, 0.0], ..Numbers::of(1.0, 0.5) };
-        assert!(error(MotionType::Imu, unmeasured).contains("angular_velocity_covariance[0] is -1"));
+        let unmeasured = Numbers {
+            variances: [-1.0, 0.0],
+            ..Numbers::of(1.0, 0.5)
+        };
+        assert!(
+            error(MotionType::Imu, unmeasured).contains("angular_velocity_covariance[0] is -1")
+        );
         for ty in TYPES {
             let bytes = little(ty, Numbers::of(1.0, 0.5));
             let cut = ty.read(&bytes[..bytes.len() / 2]).unwrap_err().to_string();
             assert!(cut.contains(" at byte "), "{cut}");
-            assert!(matches!(ty.read(&[9; 40]), Err(MotionError::Message(ReadError::Encoding { .. }))));
+            assert!(matches!(
+                ty.read(&[9; 40]),
+                Err(MotionError::Message(ReadError::Encoding { .. }))
+            ));
         }
     }
 

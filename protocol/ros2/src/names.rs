@@ -33,12 +33,21 @@ impl RosName {
     /// [`NameError`] states the text that is no name.
     pub fn new(text: &str) -> Result<Self, NameError> {
         let is_token = |token: &str| {
-            token.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
-                && token.bytes().next().is_some_and(|first| !first.is_ascii_digit())
+            token
+                .bytes()
+                .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+                && token
+                    .bytes()
+                    .next()
+                    .is_some_and(|first| !first.is_ascii_digit())
         };
         match text.strip_prefix('/') {
-            Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => Ok(Self(text.into())),
-            _ => Err(NameError { text: text.chars().take(MAX_BYTES).collect() }),
+            Some(tokens) if text.len() <= MAX_BYTES && tokens.split('/').all(is_token) => {
+                Ok(Self(text.into()))
+            }
+            _ => Err(NameError {
+                text: text.chars().take(MAX_BYTES).collect(),
+            }),
         }
     }
 
@@ -131,7 +140,20 @@ mod tests {
             assert_eq!(RosName::new(text).unwrap().as_str(), text);
         }
         let long = format!("/{}", "a".repeat(MAX_BYTES));
-        for text in ["", "/", "points", "/1000/points", "/a//b", "/a/", "/a-b", "/a*", "/a%b", "/@a", "~/a", &long] {
+        for text in [
+            "",
+            "/",
+            "points",
+            "/1000/points",
+            "/a//b",
+            "/a/",
+            "/a-b",
+            "/a*",
+            "/a%b",
+            "/@a",
+            "~/a",
+            &long,
+        ] {
             let error = RosName::new(text).unwrap_err().to_string();
             assert!(error.len() < 600 && error.contains("ROS 2 name"), "{error}");
         }

@@ -112,11 +112,21 @@ enum Datatype {
 }
 
 impl Datatype {
-    const ALL: [Self; 8] =
-        [Self::Int8, Self::Uint8, Self::Int16, Self::Uint16, Self::Int32, Self::Uint32, Self::Float32, Self::Float64];
+    const ALL: [Self; 8] = [
+        Self::Int8,
+        Self::Uint8,
+        Self::Int16,
+        Self::Uint16,
+        Self::Int32,
+        Self::Uint32,
+        Self::Float32,
+        Self::Float64,
+    ];
 
     fn of(number: u8) -> Option<Self> {
-        Self::ALL.into_iter().find(|datatype| *datatype as u8 == number)
+        Self::ALL
+            .into_iter()
+            .find(|datatype| *datatype as u8 == number)
     }
 
     /// Bytes of a value.
@@ -180,9 +190,22 @@ impl Columns {
     fn find(fields: &[Field<'_>]) -> Result<Self, PointCloudError> {
         let floats = |datatype| matches!(datatype, Datatype::Float32 | Datatype::Float64);
         let coordinate = |name| {
-            let found = || fields.iter().map(|field| field.name.chars().take(40).collect()).collect();
-            column(fields, name, "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1", floats)?
-                .ok_or_else(|| PointCloudError::NoField { missing: name, found: found() })
+            let found = || {
+                fields
+                    .iter()
+                    .map(|field| field.name.chars().take(40).collect())
+                    .collect()
+            };
+            column(
+                fields,
+                name,
+                "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1",
+                floats,
+            )?
+            .ok_or_else(|| PointCloudError::NoField {
+                missing: name,
+                found: found(),
+            })
         };
         Ok(Self {
             xyz: [coordinate("x")?, coordinate("y")?, coordinate("z")?],
@@ -191,7 +214,12 @@ impl Columns {
     }
 
     fn end(&self) -> u64 {
-        self.xyz.iter().chain(&self.intensity).map(|column| column.end()).max().unwrap_or(0)
+        self.xyz
+            .iter()
+            .chain(&self.intensity)
+            .map(|column| column.end())
+            .max()
+            .unwrap_or(0)
     }
 }
 
@@ -202,13 +230,24 @@ fn column(
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
 ) -> Result<Option<Column>, PointCloudError> {
-    let Some(&Field { offset, datatype, count, .. }) = fields.iter().find(|field| field.name == name) else {
+    let Some(&Field {
+        offset,
+        datatype,
+        count,
+        ..
+    }) = fields.iter().find(|field| field.name == name)
+    else {
         return Ok(None);
     };
     match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
         Some(datatype) if count <= 1 => Ok(Some(Column { offset, datatype })),
-        _ => Err(PointCloudError::FieldType { name, datatype, count, allowed }),
+        _ => Err(PointCloudError::FieldType {
+            name,
+            datatype,
+            count,
+            allowed,
+        }),
     }
 }
 
@@ -225,27 +264,61 @@ impl Layout {
     fn stride(&self) -> u64 {
         let row = u64::from(self.width) * u64::from(self.point_step);
         // The only row of a cloud needs no step, and some drivers give none.
-        if self.height > 1 { u64::from(self.row_step) } else { row }
+        if self.height > 1 {
+            u64::from(self.row_step)
+        } else {
+            row
+        }
     }
 
-    fn check(&self, columns: &Columns, data_len: usize, limits: SweepLimits) -> Result<(), PointCloudError> {
+    fn check(
+        &self,
+        columns: &Columns,
+        data_len: usize,
+        limits: SweepLimits,
+    ) -> Result<(), PointCloudError> {
         let at_least = |what, found, needed, why| {
-            if found >= needed { Ok(()) } else { Err(PointCloudError::Layout { what, found, needed, why }) }
+            if found >= needed {
+                Ok(())
+            } else {
+                Err(PointCloudError::Layout {
+                    what,
+                    found,
+                    needed,
+                    why,
+                })
+            }
         };
         let points = u64::from(self.height) * u64::from(self.width);
         if points > limits.max_points {
-            return Err(PointCloudError::TooMany { what: "height x width", found: points, max: limits.max_points });
+            return Err(PointCloudError::TooMany {
+                what: "height x width",
+                found: points,
+                max: limits.max_points,
+            });
         }
-        at_least("point_step", self.point_step.into(), columns.end(), "end of the last field")?;
+        at_least(
+            "point_step",
+            self.point_step.into(),
+            columns.end(),
+            "end of the last field",
+        )?;
         let row = u64::from(self.width) * u64::from(self.point_step);
         at_least("row_step", self.stride(), row, "width x point_step")?;
         let rows = u64::from(self.height.saturating_sub(1));
-        let needed = if self.height == 0 { 0 } else { rows.saturating_mul(self.stride()).saturating_add(row) };
+        let needed = if self.height == 0 {
+            0
+        } else {
+            rows.saturating_mul(self.stride()).saturating_add(row)
+        };
         at_least("length of data", data_len as u64, needed, "rows x row_step")
     }
 }
 
-fn read_sweep<BO: ByteOrder>(mut message: Reader<'_, BO>, limits: SweepLimits) -> Result<Sweep, PointCloudError> {
+fn read_sweep<BO: ByteOrder>(
+    mut message: Reader<'_, BO>,
+    limits: SweepLimits,
+) -> Result<Sweep, PointCloudError> {
     let Header { nanos, frame_id } = message.header()?;
     let (height, width) = (message.u32("height")?, message.u32("width")?);
     let fields = read_fields(&mut message)?;
@@ -254,7 +327,12 @@ fn read_sweep<BO: ByteOrder>(mut message: Reader<'_, BO>, limits: SweepLimits) -
     let (point_step, row_step) = (message.u32("point_step")?, message.u32("row_step")?);
     let data = message.read("data", CdrReader::read_byte_sequence)?;
     let columns = Columns::find(&fields)?;
-    let layout = Layout { height, width, point_step, row_step };
+    let layout = Layout {
+        height,
+        width,
+        point_step,
+        row_step,
+    };
     layout.check(&columns, data.len(), limits)?;
     let mut sweep = Sweep {
         capture_nanos: nanos,
@@ -271,10 +349,16 @@ fn read_sweep<BO: ByteOrder>(mut message: Reader<'_, BO>, limits: SweepLimits) -
     Ok(sweep)
 }
 
-fn read_fields<'a, BO: ByteOrder>(message: &mut Reader<'a, BO>) -> Result<Vec<Field<'a>>, PointCloudError> {
+fn read_fields<'a, BO: ByteOrder>(
+    message: &mut Reader<'a, BO>,
+) -> Result<Vec<Field<'a>>, PointCloudError> {
     let count = message.u32("length of fields")?;
     if count > MAX_FIELDS {
-        return Err(PointCloudError::TooMany { what: "fields", found: count.into(), max: MAX_FIELDS.into() });
+        return Err(PointCloudError::TooMany {
+            what: "fields",
+            found: count.into(),
+            max: MAX_FIELDS.into(),
+        });
     }
     let field = |_| {
         Ok(Field {
@@ -289,10 +373,20 @@ fn read_fields<'a, BO: ByteOrder>(message: &mut Reader<'a, BO>) -> Result<Vec<Fi
 
 impl Sweep {
     /// Adds the points of `data`, whose layout was checked.
-    fn fill<BO: ByteOrder>(&mut self, data: &[u8], layout: &Layout, columns: &Columns, max_abs_value: f32) {
+    fn fill<BO: ByteOrder>(
+        &mut self,
+        data: &[u8],
+        layout: &Layout,
+        columns: &Columns,
+        max_abs_value: f32,
+    ) {
         let (stride, step) = (layout.stride(), layout.point_step as usize);
         // Rows of no points may be as many as they like.
-        let rows = if layout.width == 0 { 0 } else { u64::from(layout.height) };
+        let rows = if layout.width == 0 {
+            0
+        } else {
+            u64::from(layout.height)
+        };
         for row in 0..rows {
             let begin = usize::try_from(row * stride).unwrap_or(usize::MAX);
             let row = data.get(begin..).unwrap_or_default();
@@ -304,15 +398,22 @@ impl Sweep {
     }
 
     fn add<BO: ByteOrder>(&mut self, point: &[u8], columns: &Columns, max_abs_value: f32) {
-        let xyz = columns.xyz.map(|column| column.value::<BO>(point).unwrap_or(f64::NAN));
+        let xyz = columns
+            .xyz
+            .map(|column| column.value::<BO>(point).unwrap_or(f64::NAN));
         let limit = f64::from(max_abs_value);
         if !xyz.iter().all(|value| value.is_finite()) {
             self.without_return += 1;
         } else if xyz.iter().any(|value| value.abs() > limit) {
             self.too_far += 1;
         } else {
-            let intensity = columns.intensity.and_then(|column| column.value::<BO>(point));
-            let intensity = intensity.filter(|value| value.is_finite()).unwrap_or(0.0).clamp(-limit, limit);
+            let intensity = columns
+                .intensity
+                .and_then(|column| column.value::<BO>(point));
+            let intensity = intensity
+                .filter(|value| value.is_finite())
+                .unwrap_or(0.0)
+                .clamp(-limit, limit);
             let [x, y, z] = xyz;
             self.points.xyzi.push([x, y, z, intensity].map(single));
         }

@@ -18,15 +18,35 @@ pub struct Qos {
 
 impl Qos {
     /// ROS's default profile: reliable, ten messages.
-    pub const DEFAULT: Self = Self { is_reliable: true, is_latched: false, depth: 10 };
+    pub const DEFAULT: Self = Self {
+        is_reliable: true,
+        is_latched: false,
+        depth: 10,
+    };
     /// ROS's profile for sensor data: best effort, five messages.
-    pub const SENSOR_DATA: Self = Self { is_reliable: false, is_latched: false, depth: 5 };
+    pub const SENSOR_DATA: Self = Self {
+        is_reliable: false,
+        is_latched: false,
+        depth: 5,
+    };
     /// ROS's profile for `/clock`: best effort, one message.
-    pub const CLOCK: Self = Self { is_reliable: false, is_latched: false, depth: 1 };
+    pub const CLOCK: Self = Self {
+        is_reliable: false,
+        is_latched: false,
+        depth: 1,
+    };
     /// tf2's profile for `/tf`.
-    pub const TF: Self = Self { is_reliable: true, is_latched: false, depth: 100 };
+    pub const TF: Self = Self {
+        is_reliable: true,
+        is_latched: false,
+        depth: 100,
+    };
     /// tf2's profile for `/tf_static`.
-    pub const TF_STATIC: Self = Self { is_reliable: true, is_latched: true, depth: 1 };
+    pub const TF_STATIC: Self = Self {
+        is_reliable: true,
+        is_latched: true,
+        depth: 1,
+    };
 
     /// As `offered_qos_profiles` of a channel, in the numbers that rosbag2 of every distribution reads.
     #[must_use]
@@ -43,7 +63,10 @@ impl Qos {
 
     /// Reliability and durability in the numbers of `rmw/types.h`.
     fn policies(self) -> (u8, u8) {
-        (if self.is_reliable { 1 } else { 2 }, if self.is_latched { 1 } else { 2 })
+        (
+            if self.is_reliable { 1 } else { 2 },
+            if self.is_latched { 1 } else { 2 },
+        )
     }
 }
 
@@ -51,10 +74,20 @@ impl Qos {
 /// rmw_zenoh's defaults left out.
 impl fmt::Display for Qos {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let shown = |value: u32, default| if value == default { String::new() } else { value.to_string() };
+        let shown = |value: u32, default| {
+            if value == default {
+                String::new()
+            } else {
+                value.to_string()
+            }
+        };
         let (reliability, durability) = self.policies();
         let (reliability, durability) = (shown(reliability.into(), 1), shown(durability.into(), 2));
-        write!(f, "{reliability}:{durability}:,{}:,:,:,,", shown(self.depth, DEFAULT_DEPTH))
+        write!(
+            f,
+            "{reliability}:{durability}:,{}:,:,:,,",
+            shown(self.depth, DEFAULT_DEPTH)
+        )
     }
 }
 
@@ -64,18 +97,41 @@ mod tests {
 
     #[test]
     fn tokens_leave_out_what_is_the_default() {
-        let texts = [Qos::DEFAULT, Qos::SENSOR_DATA, Qos::CLOCK, Qos::TF_STATIC].map(|qos| qos.to_string());
-        assert_eq!(texts, ["::,10:,:,:,,", "2::,5:,:,:,,", "2::,1:,:,:,,", ":1:,1:,:,:,,"]);
-        assert_eq!(Qos { depth: 42, ..Qos::DEFAULT }.to_string(), "::,:,:,:,,");
+        let texts =
+            [Qos::DEFAULT, Qos::SENSOR_DATA, Qos::CLOCK, Qos::TF_STATIC].map(|qos| qos.to_string());
+        assert_eq!(
+            texts,
+            [
+                "::,10:,:,:,,",
+                "2::,5:,:,:,,",
+                "2::,1:,:,:,,",
+                ":1:,1:,:,:,,"
+            ]
+        );
+        assert_eq!(
+            Qos {
+                depth: 42,
+                ..Qos::DEFAULT
+            }
+            .to_string(),
+            "::,:,:,:,,"
+        );
     }
 
     #[test]
     fn bags_get_numbers() {
         let text = Qos::TF_STATIC.offered_profiles();
+        assert!(text.starts_with(
+            "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: "
+        ));
         assert!(
-            text.starts_with("- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: ")
+            text.ends_with("\n  avoid_ros_namespace_conventions: false\n"),
+            "{text}"
         );
-        assert!(text.ends_with("\n  avoid_ros_namespace_conventions: false\n"), "{text}");
-        assert!(text.lines().all(|line| line.starts_with("- ") || line.starts_with("  ")), "{text}");
+        assert!(
+            text.lines()
+                .all(|line| line.starts_with("- ") || line.starts_with("  ")),
+            "{text}"
+        );
     }
 }

@@ -45,7 +45,9 @@ impl<'a> Body<'a> {
         match bytes.split_first_chunk() {
             Some(([0, 0, _, _], body)) => Ok(Self::BigEndian(Reader::new(body))),
             Some(([0, 1, _, _], body)) => Ok(Self::LittleEndian(Reader::new(body))),
-            _ => Err(ReadError::Encoding { found: bytes.iter().take(4).copied().collect() }),
+            _ => Err(ReadError::Encoding {
+                found: bytes.iter().take(4).copied().collect(),
+            }),
         }
     }
 }
@@ -66,7 +68,10 @@ pub(crate) struct Reader<'a, BO> {
 
 impl<'a, BO: ByteOrder> Reader<'a, BO> {
     fn new(body: &'a [u8]) -> Self {
-        Self { cdr: CdrReader::new(body), len: body.len() }
+        Self {
+            cdr: CdrReader::new(body),
+            len: body.len(),
+        }
     }
 
     /// Reads a value; an error names `field`.
@@ -77,7 +82,12 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
     ) -> Result<T, ReadError> {
         let at = self.cdr.position();
         let len = self.len;
-        read(&mut self.cdr).map_err(|cause| ReadError::Cdr { field, at, len, cause: cause.to_string() })
+        read(&mut self.cdr).map_err(|cause| ReadError::Cdr {
+            field,
+            at,
+            len,
+            cause: cause.to_string(),
+        })
     }
 
     pub(crate) fn u32(&mut self, field: &'static str) -> Result<u32, ReadError> {
@@ -85,7 +95,10 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
     }
 
     /// `float64[N]`, or a structure of as many.
-    pub(crate) fn f64s<const N: usize>(&mut self, field: &'static str) -> Result<[f64; N], ReadError> {
+    pub(crate) fn f64s<const N: usize>(
+        &mut self,
+        field: &'static str,
+    ) -> Result<[f64; N], ReadError> {
         let mut values = [0.0; N];
         for value in &mut values {
             *value = self.read(field, CdrReader::read_f64)?;
@@ -100,6 +113,9 @@ impl<'a, BO: ByteOrder> Reader<'a, BO> {
         let seconds = u64::try_from(sec).ok().filter(|_| nanosec < 1_000_000_000);
         let seconds = seconds.ok_or(ReadError::Stamp { sec, nanosec })?;
         let frame_id = self.read("header.frame_id", CdrReader::read_str)?;
-        Ok(Header { nanos: seconds * 1_000_000_000 + u64::from(nanosec), frame_id })
+        Ok(Header {
+            nanos: seconds * 1_000_000_000 + u64::from(nanosec),
+            frame_id,
+        })
     }
 }

@@ -83,7 +83,9 @@ impl RosTopic {
     #[must_use]
     pub fn ros_type(&self) -> RosType {
         match self {
-            Self::Vehicle(_, VehicleTopic::Pose) | Self::InitialPose => RosType::PoseWithCovarianceStamped,
+            Self::Vehicle(_, VehicleTopic::Pose) | Self::InitialPose => {
+                RosType::PoseWithCovarianceStamped
+            }
             Self::Vehicle(_, VehicleTopic::Odometry) => RosType::Odometry,
             Self::Vehicle(_, VehicleTopic::Points) => RosType::PointCloud2,
             Self::Vehicle(_, VehicleTopic::Image(_)) => RosType::CompressedImage,
@@ -100,9 +102,10 @@ impl RosTopic {
     #[must_use]
     pub fn qos(&self) -> Qos {
         match self {
-            Self::Vehicle(_, VehicleTopic::Points | VehicleTopic::Image(_) | VehicleTopic::CameraInfo(_)) => {
-                Qos::SENSOR_DATA
-            }
+            Self::Vehicle(
+                _,
+                VehicleTopic::Points | VehicleTopic::Image(_) | VehicleTopic::CameraInfo(_),
+            ) => Qos::SENSOR_DATA,
             Self::Tf => Qos::TF,
             Self::TfStatic => Qos::TF_STATIC,
             Self::Clock => Qos::CLOCK,
@@ -121,7 +124,13 @@ mod tests {
         let points = RosTopic::Vehicle(cav, VehicleTopic::Points);
         assert_eq!(points.name(None).as_str(), "/cav_1000/points");
         assert_eq!(points.name(Some(&fleet)).as_str(), "/fleet/cav_1000/points");
-        for topic in [RosTopic::Tf, RosTopic::TfStatic, RosTopic::Clock, RosTopic::Diagnostics, RosTopic::Truth] {
+        for topic in [
+            RosTopic::Tf,
+            RosTopic::TfStatic,
+            RosTopic::Clock,
+            RosTopic::Diagnostics,
+            RosTopic::Truth,
+        ] {
             let name = topic.name(Some(&fleet));
             assert_eq!(name, topic.name(None));
             assert_eq!(RosName::new(name.as_str()).unwrap(), name);

@@ -2,7 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use protocol::{Camera, CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth};
+use protocol::{
+    Camera, CavId, EgoMotion, Message, PoseEstimate, ProcessId, RunId, Stats, Stream, Topic, Truth,
+};
 
 use super::encode::{self, Level, Marked, Status};
 use super::names::{MAP_FRAME, camera_frame, lidar_frame, truth_frame};
@@ -35,7 +37,12 @@ impl Translator {
     /// A translator for `run`.
     #[must_use]
     pub fn new(run: &RunId) -> Self {
-        Self { run: run.clone(), motions: BTreeMap::new(), losses: BTreeMap::new(), latest_nanos: 0 }
+        Self {
+            run: run.clone(),
+            motions: BTreeMap::new(),
+            losses: BTreeMap::new(),
+            latest_nanos: 0,
+        }
     }
 
     /// True if messages of `topic` have to be passed to [`Self::translate`].
@@ -44,32 +51,68 @@ impl Translator {
         let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
         match topic {
             Topic::Truth | Topic::Stats(_) => true,
-            Topic::Stream { stream: Stream::Camera(_), .. } => true,
+            Topic::Stream {
+                stream: Stream::Camera(_),
+                ..
+            } => true,
             Topic::Stream { stream, .. } => streams.contains(stream),
             _ => false,
         }
     }
 
     /// The ROS 2 messages for a message published on `topic`, captured at `capture_nanos`; empty if ROS has none for it.
-    pub fn translate(&mut self, topic: &Topic, capture_nanos: u64, message: &Message) -> Vec<RosMessage> {
+    pub fn translate(
+        &mut self,
+        topic: &Topic,
+        capture_nanos: u64,
+        message: &Message,
+    ) -> Vec<RosMessage> {
         let at = capture_nanos;
         if matches!(topic, Topic::Stream { .. }) {
             self.latest_nanos = at;
         }
         match (topic, message) {
-            (Topic::Stream { cav, stream: Stream::Lidar }, Message::Lidar(lidar)) => {
+            (
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Lidar,
+                },
+                Message::Lidar(lidar),
+            ) => {
                 let cdr = encode::point_cloud(at, &lidar_frame(cav), &lidar.points);
                 vec![of_vehicle(cav, VehicleTopic::Points, cdr)]
             }
-            (Topic::Stream { cav, stream: Stream::Camera(number) }, Message::Camera(image)) => {
-                image_messages(cav, *number, at, image)
-            }
-            (Topic::Stream { cav, stream: Stream::Imu }, Message::Imu(motion)) => {
+            (
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Camera(number),
+                },
+                Message::Camera(image),
+            ) => image_messages(cav, *number, at, image),
+            (
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Imu,
+                },
+                Message::Imu(motion),
+            ) => {
                 self.motions.insert(cav.clone(), (at, *motion));
                 Vec::new()
             }
-            (Topic::Stream { cav, stream: Stream::Pose }, Message::Pose(estimate)) => self.pose(cav, at, estimate),
-            (Topic::Stream { cav, stream: Stream::Detections }, Message::Detections(result)) => {
+            (
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Pose,
+                },
+                Message::Pose(estimate),
+            ) => self.pose(cav, at, estimate),
+            (
+                Topic::Stream {
+                    cav,
+                    stream: Stream::Detections,
+                },
+                Message::Detections(result),
+            ) => {
                 let boxes: Vec<Marked> = result.detections.iter().map(Marked::from).collect();
                 let frame = lidar_frame(cav);
                 let detections = encode::detections(at, &frame, &result.detections);
@@ -83,21 +126,29 @@ impl Translator {
             (Topic::Stats(_), Message::Stats(stats)) => {
                 let status = self.status(stats);
                 let cdr = encode::diagnostics(self.latest_nanos, &[status]);
-                vec![RosMessage { topic: RosTopic::Diagnostics, cdr }]
+                vec![RosMessage {
+                    topic: RosTopic::Diagnostics,
+                    cdr,
+                }]
             }
             _ => Vec::new(),
         }
     }
 
     fn pose(&self, cav: &CavId, at: u64, estimate: &PoseEstimate) -> Vec<RosMessage> {
-        let Some(pose) = estimate.world_from_cav() else { return Vec::new() };
+        let Some(pose) = estimate.world_from_cav() else {
+            return Vec::new();
+        };
         let motion = self.motions.get(cav).filter(|(nanos, _)| *nanos == at);
         let motion = motion.map_or(EgoMotion::default(), |(_, motion)| *motion);
         let covariance = estimate.covariance();
         let odometry = encode::odometry(at, cav, pose, covariance, motion);
         // The transform first: a receiver of the others can use them at once.
         vec![
-            RosMessage { topic: RosTopic::Tf, cdr: encode::transforms(at, &[(lidar_frame(cav), *pose)]) },
+            RosMessage {
+                topic: RosTopic::Tf,
+                cdr: encode::transforms(at, &[(lidar_frame(cav), *pose)]),
+            },
             of_vehicle(cav, VehicleTopic::Pose, encode::pose(at, pose, covariance)),
             of_vehicle(cav, VehicleTopic::Odometry, odometry),
         ]
@@ -112,17 +163,29 @@ impl Translator {
             ("messages sent".to_owned(), total.sent.to_string()),
             ("messages received".to_owned(), total.received.to_string()),
         ];
-        values.extend(total.dropped.iter().map(|(reason, count)| (format!("dropped: {reason}"), count.to_string())));
+        values.extend(
+            total
+                .dropped
+                .iter()
+                .map(|(reason, count)| (format!("dropped: {reason}"), count.to_string())),
+        );
         values.extend(stats.stages.iter().flat_map(|stage| {
             [("median", stage.p50_ms), ("95th percentile", stage.p95_ms)]
                 .map(|(what, ms)| (format!("{} {what} (ms)", stage.stage), format!("{ms:.2}")))
         }));
         values.push(("CPU time (s)".into(), format!("{:.1}", stats.usage.cpu_s)));
-        values.push(("resident memory (bytes)".into(), stats.usage.resident_bytes.to_string()));
+        values.push((
+            "resident memory (bytes)".into(),
+            stats.usage.resident_bytes.to_string(),
+        ));
         Status {
             level: if new > 0 { Level::Warn } else { Level::Ok },
             name: format!("v2vloc: {}", stats.process),
-            message: if new > 0 { format!("{new} messages dropped since the last report") } else { "running".into() },
+            message: if new > 0 {
+                format!("{new} messages dropped since the last report")
+            } else {
+                "running".into()
+            },
             hardware_id: self.run.to_string(),
             values,
         }
@@ -130,44 +193,70 @@ impl Translator {
 }
 
 fn of_vehicle(cav: &CavId, topic: VehicleTopic, cdr: Vec<u8>) -> RosMessage {
-    RosMessage { topic: RosTopic::Vehicle(cav.clone(), topic), cdr }
+    RosMessage {
+        topic: RosTopic::Vehicle(cav.clone(), topic),
+        cdr,
+    }
 }
 
 /// An image, and the calibration that is known of its camera: projection and place on the vehicle.
 fn image_messages(cav: &CavId, number: u8, at: u64, image: &Camera) -> Vec<RosMessage> {
     let (frame, metadata) = (camera_frame(cav, number), &image.metadata);
-    let place = metadata
-        .lidar_from_camera
-        .map(|pose| RosMessage { topic: RosTopic::Tf, cdr: encode::mounted(at, &lidar_frame(cav), &frame, &pose) });
+    let place = metadata.lidar_from_camera.map(|pose| RosMessage {
+        topic: RosTopic::Tf,
+        cdr: encode::mounted(at, &lidar_frame(cav), &frame, &pose),
+    });
     let info = metadata.pinhole.map(|pinhole| {
         let cdr = encode::camera_info(at, &frame, metadata, &pinhole);
         of_vehicle(cav, VehicleTopic::CameraInfo(number), cdr)
     });
-    let encoded = of_vehicle(cav, VehicleTopic::Image(number), encode::compressed_image(at, &frame, image));
+    let encoded = of_vehicle(
+        cav,
+        VehicleTopic::Image(number),
+        encode::compressed_image(at, &frame, image),
+    );
     place.into_iter().chain(info).chain([encoded]).collect()
 }
 
 fn truth_messages(at: u64, truth: &Truth) -> Vec<RosMessage> {
     let mut seen = BTreeSet::new();
-    let objects = truth.agents.iter().flat_map(|agent| &agent.objects).filter(|object| seen.insert(object.id));
+    let objects = truth
+        .agents
+        .iter()
+        .flat_map(|agent| &agent.objects)
+        .filter(|object| seen.insert(object.id));
     let boxes: Vec<Marked> = objects.map(encode::truth_marker).collect();
-    let poses: Vec<_> = truth.agents.iter().map(|agent| (truth_frame(&agent.cav), agent.world_from_lidar)).collect();
+    let poses: Vec<_> = truth
+        .agents
+        .iter()
+        .map(|agent| (truth_frame(&agent.cav), agent.world_from_lidar))
+        .collect();
     vec![
-        RosMessage { topic: RosTopic::Tf, cdr: encode::transforms(at, &poses) },
-        RosMessage { topic: RosTopic::Truth, cdr: encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes) },
+        RosMessage {
+            topic: RosTopic::Tf,
+            cdr: encode::transforms(at, &poses),
+        },
+        RosMessage {
+            topic: RosTopic::Truth,
+            cdr: encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes),
+        },
     ]
 }
 
 #[cfg(test)]
 mod tests {
     use protocol::{
-        Account, CameraMetadata, DropReason, ImageFormat, Ledger, NoPoseReason, Pinhole, Pose, ProcessUsage,
+        Account, CameraMetadata, DropReason, ImageFormat, Ledger, NoPoseReason, Pinhole, Pose,
+        ProcessUsage,
     };
 
     use super::*;
 
     fn topic(stream: Stream) -> Topic {
-        Topic::Stream { cav: CavId::new("1").unwrap(), stream }
+        Topic::Stream {
+            cav: CavId::new("1").unwrap(),
+            stream,
+        }
     }
 
     fn translator() -> Translator {
@@ -177,18 +266,30 @@ mod tests {
     #[test]
     fn a_pose_is_a_transform_a_pose_and_an_odometry_with_the_motion_of_its_time() {
         let mut translator = translator();
-        let motion = Message::Imu(EgoMotion { speed_mps: Some(7.0), yaw_rate_rad_s: Some(0.5) });
+        let motion = Message::Imu(EgoMotion {
+            speed_mps: Some(7.0),
+            yaw_rate_rad_s: Some(0.5),
+        });
         assert_eq!(translator.translate(&topic(Stream::Imu), 100, &motion), []);
         let pose = Message::Pose(PoseEstimate::new(Pose::IDENTITY, 0.9));
         let speed = |translator: &mut Translator, at| {
             let messages = translator.translate(&topic(Stream::Pose), at, &pose);
-            let names: Vec<_> = messages.iter().map(|message| message.topic.name(None).to_string()).collect();
+            let names: Vec<_> = messages
+                .iter()
+                .map(|message| message.topic.name(None).to_string())
+                .collect();
             assert_eq!(names, ["/tf", "/cav_1/pose", "/cav_1/odometry"]);
             let cdr = &messages[2].cdr;
             f64::from_le_bytes(*cdr[cdr.len() - 8 * (6 + 36)..].first_chunk().unwrap())
         };
-        assert_eq!([speed(&mut translator, 100), speed(&mut translator, 200)], [7.0, 0.0]);
-        let none = Message::Pose(PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 });
+        assert_eq!(
+            [speed(&mut translator, 100), speed(&mut translator, 200)],
+            [7.0, 0.0]
+        );
+        let none = Message::Pose(PoseEstimate::NoPose {
+            reason: NoPoseReason::TooFewInliers,
+            inlier_count: 3,
+        });
         assert_eq!(translator.translate(&topic(Stream::Pose), 300, &none), []);
     }
 
@@ -205,11 +306,19 @@ mod tests {
         };
         let mut level = |stats: &Stats| translator.status(stats).level;
         assert_eq!(level(&stats), Level::Ok);
-        stats.ledger.dropped(&Account::towards(topic(Stream::Lidar), &process), DropReason::Superseded);
+        stats.ledger.dropped(
+            &Account::towards(topic(Stream::Lidar), &process),
+            DropReason::Superseded,
+        );
         assert_eq!([level(&stats), level(&stats)], [Level::Warn, Level::Ok]);
         let message = Message::Stats(stats);
         let messages = translator.translate(&Topic::Stats(process), 0, &message);
-        let has = |text: &[u8]| messages[0].cdr.windows(text.len()).any(|bytes| bytes == text);
+        let has = |text: &[u8]| {
+            messages[0]
+                .cdr
+                .windows(text.len())
+                .any(|bytes| bytes == text)
+        };
         assert!(has(b"v2vloc: agent-1\0") && has(b"dropped: superseded\0") && has(b"test\0"));
     }
 
@@ -219,15 +328,37 @@ mod tests {
             format: ImageFormat::Png,
             width_px: 8,
             height_px: 4,
-            pinhole: Some(Pinhole { fx_px: 4.0, fy_px: 5.0, cx_px: 6.0, cy_px: 7.0 }),
+            pinhole: Some(Pinhole {
+                fx_px: 4.0,
+                fy_px: 5.0,
+                cx_px: 6.0,
+                cy_px: 7.0,
+            }),
             lidar_from_camera: Some(Pose::IDENTITY),
         };
-        let mut camera = Camera { metadata, image: vec![1, 2, 3] };
-        let names = |camera: &Camera| {
-            let messages = translator().translate(&topic(Stream::Camera(2)), 5, &Message::Camera(camera.clone()));
-            messages.iter().map(|message| message.topic.name(None).to_string()).collect::<Vec<_>>()
+        let mut camera = Camera {
+            metadata,
+            image: vec![1, 2, 3],
         };
-        assert_eq!(names(&camera), ["/tf", "/cav_1/camera_2/camera_info", "/cav_1/camera_2/image/compressed"]);
+        let names = |camera: &Camera| {
+            let messages = translator().translate(
+                &topic(Stream::Camera(2)),
+                5,
+                &Message::Camera(camera.clone()),
+            );
+            messages
+                .iter()
+                .map(|message| message.topic.name(None).to_string())
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(
+            names(&camera),
+            [
+                "/tf",
+                "/cav_1/camera_2/camera_info",
+                "/cav_1/camera_2/image/compressed"
+            ]
+        );
         (camera.metadata.pinhole, camera.metadata.lidar_from_camera) = (None, None);
         assert_eq!(names(&camera), ["/cav_1/camera_2/image/compressed"]);
         assert!(Translator::wants(&topic(Stream::Camera(0))));
@@ -236,6 +367,9 @@ mod tests {
     #[test]
     fn only_streams_that_ros_has_types_for_are_wanted() {
         assert!(Translator::wants(&topic(Stream::Lidar)) && Translator::wants(&Topic::Truth));
-        assert!(!Translator::wants(&topic(Stream::Bev)) && !Translator::wants(&topic(Stream::DetectionsJson)));
+        assert!(
+            !Translator::wants(&topic(Stream::Bev))
+                && !Translator::wants(&topic(Stream::DetectionsJson))
+        );
     }
 }

@@ -69,20 +69,39 @@ pub(crate) fn type_hash(own: &Definition, contained: &[Definition]) -> String {
 }
 
 fn description((name, fields): &Definition) -> String {
-    let fields = fields.lines().filter(|line| !line.contains('=')).filter_map(|line| line.split_once(' '));
-    let fields: Vec<String> = fields.map(|(type_name, name)| field(type_name, name)).collect();
-    format!(r#"{{"type_name": "{}", "fields": [{}]}}"#, full_name(name), fields.join(", "))
+    let fields = fields
+        .lines()
+        .filter(|line| !line.contains('='))
+        .filter_map(|line| line.split_once(' '));
+    let fields: Vec<String> = fields
+        .map(|(type_name, name)| field(type_name, name))
+        .collect();
+    format!(
+        r#"{{"type_name": "{}", "fields": [{}]}}"#,
+        full_name(name),
+        fields.join(", ")
+    )
 }
 
 fn field(type_name: &str, name: &str) -> String {
-    let (value, length) = type_name.trim_end_matches(']').split_once('[').unwrap_or((type_name, "0"));
+    let (value, length) = type_name
+        .trim_end_matches(']')
+        .split_once('[')
+        .unwrap_or((type_name, "0"));
     let many = match length {
         "0" => 0,
         "" => SEQUENCE,
         _ => ARRAY,
     };
-    let id = TYPE_IDS.iter().find(|(known, _)| *known == value).map(|(_, id)| *id);
-    let nested = if id.is_none() { full_name(value) } else { String::new() };
+    let id = TYPE_IDS
+        .iter()
+        .find(|(known, _)| *known == value)
+        .map(|(_, id)| *id);
+    let nested = if id.is_none() {
+        full_name(value)
+    } else {
+        String::new()
+    };
     let id = id.unwrap_or(NESTED) + many;
     let capacity = if length.is_empty() { "0" } else { length };
     format!(
@@ -101,7 +120,10 @@ mod tests {
 
     #[test]
     fn a_description_has_fields_but_no_constants() {
-        let definition = ("a_msgs/B", "byte OK=0\nfloat64[36] c\nd_msgs/E[] f\nstring g\n");
+        let definition = (
+            "a_msgs/B",
+            "byte OK=0\nfloat64[36] c\nd_msgs/E[] f\nstring g\n",
+        );
         assert_eq!(
             description(&definition),
             concat!(

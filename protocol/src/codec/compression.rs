@@ -23,19 +23,32 @@ pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireErro
 /// # Errors
 /// [`WireError::Compression`] when the frame is corrupt, or decompresses to more or fewer bytes.
 pub(super) fn unpack(packed: Vec<u8>, expected: usize) -> Result<Vec<u8>, WireError> {
-    let refuse =
-        |detail: String| WireError::Compression { bytes: packed.len() as u64, expected: expected as u64, detail };
+    let refuse = |detail: String| WireError::Compression {
+        bytes: packed.len() as u64,
+        expected: expected as u64,
+        detail,
+    };
     // A frame states its content size before anything is allocated for it.
-    match zstd::zstd_safe::get_frame_content_size(&packed).map_err(|_| refuse("no zstd frame".into()))? {
+    match zstd::zstd_safe::get_frame_content_size(&packed)
+        .map_err(|_| refuse("no zstd frame".into()))?
+    {
         Some(claimed) if claimed == expected as u64 => {}
-        Some(claimed) => return Err(refuse(format!("the frame states {claimed} bytes of content"))),
+        Some(claimed) => {
+            return Err(refuse(format!(
+                "the frame states {claimed} bytes of content"
+            )));
+        }
         None => return Err(refuse("the frame does not state its content size".into())),
     }
     let mut bytes = Vec::with_capacity(expected);
     let found = zstd::bulk::Decompressor::new()
         .and_then(|mut decompressor| decompressor.decompress_to_buffer(&packed, &mut bytes))
         .map_err(|error| refuse(error.to_string()))?;
-    if found == expected { Ok(bytes) } else { Err(refuse(format!("the frame contains {found} bytes"))) }
+    if found == expected {
+        Ok(bytes)
+    } else {
+        Err(refuse(format!("the frame contains {found} bytes")))
+    }
 }
 
 #[cfg(test)]
@@ -48,10 +61,19 @@ mod tests {
         let packed = pack(&bytes, 3).unwrap().unwrap();
         assert_eq!(unpack(packed.clone(), bytes.len()).unwrap(), bytes);
         for wrong in [0, 1, bytes.len() - 1, bytes.len() + 1] {
-            assert!(matches!(unpack(packed.clone(), wrong), Err(WireError::Compression { .. })), "{wrong}");
+            assert!(
+                matches!(
+                    unpack(packed.clone(), wrong),
+                    Err(WireError::Compression { .. })
+                ),
+                "{wrong}"
+            );
         }
         for cut in 0..packed.len() {
-            assert!(unpack(packed[..cut].to_vec(), bytes.len()).is_err(), "cut at {cut}");
+            assert!(
+                unpack(packed[..cut].to_vec(), bytes.len()).is_err(),
+                "cut at {cut}"
+            );
         }
     }
 
@@ -59,7 +81,9 @@ mod tests {
     fn noise_is_left_unpacked() {
         let mut state = 1u64;
         let bytes: Vec<u8> = std::iter::repeat_with(|| {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             (state >> 56) as u8
         })
         .take(4096)
@@ -71,7 +95,14 @@ mod tests {
     /// 8878.
     fn wide(bytes: u32, states_size: bool) -> Vec<u8> {
         const BLOCK: u32 = 128 << 10;
-        let mut frame = vec![0x28, 0xb5, 0x2f, 0xfd, if states_size { 0x80 } else { 0 }, 21 << 3];
+        let mut frame = vec![
+            0x28,
+            0xb5,
+            0x2f,
+            0xfd,
+            if states_size { 0x80 } else { 0 },
+            21 << 3,
+        ];
         frame.extend(bytes.to_le_bytes().iter().filter(|_| states_size));
         for begin in (0..bytes).step_by(BLOCK as usize) {
             // One byte, repeated.
@@ -86,7 +117,10 @@ mod tests {
     #[test]
     fn a_huge_window_allocates_nothing_and_a_frame_without_size_is_refused() {
         let zeros = 300 << 10;
-        assert_eq!(unpack(wide(zeros, true), zeros as usize).unwrap(), vec![0; zeros as usize]);
+        assert_eq!(
+            unpack(wide(zeros, true), zeros as usize).unwrap(),
+            vec![0; zeros as usize]
+        );
         let error = unpack(wide(zeros, false), zeros as usize).unwrap_err();
         assert!(error.to_string().contains("does not state"), "{error}");
     }
@@ -95,10 +129,16 @@ mod tests {
     fn a_decompression_bomb_is_refused() {
         let bomb = pack(&vec![0; 64 << 20], 19).unwrap().unwrap();
         assert!(bomb.len() < 10_000);
-        assert!(matches!(unpack(bomb.clone(), 1000), Err(WireError::Compression { .. })));
+        assert!(matches!(
+            unpack(bomb.clone(), 1000),
+            Err(WireError::Compression { .. })
+        ));
         // Two frames that together contain more than announced.
         let mut twice = pack(&[0; 1000], 3).unwrap().unwrap();
         twice.extend(bomb);
-        assert!(matches!(unpack(twice, 1000), Err(WireError::Compression { .. })));
+        assert!(matches!(
+            unpack(twice, 1000),
+            Err(WireError::Compression { .. })
+        ));
     }
 }

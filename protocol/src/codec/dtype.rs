@@ -48,21 +48,34 @@ pub(super) fn scales(values: &[f32], channels: usize) -> Vec<f32> {
     }
     let scale = |channel: &[f32]| {
         // Without the sign, bit patterns have the order of the numbers, and integers have a vectorised maximum.
-        let largest = channel.iter().fold(0i32, |largest, value| largest.max(value.abs().to_bits() as i32));
+        let largest = channel.iter().fold(0i32, |largest, value| {
+            largest.max(value.abs().to_bits() as i32)
+        });
         let largest = f32::from_bits(largest.cast_unsigned());
         let scale = largest / I8_STEPS;
         // The inverse of a subnormal scale would be infinite.
         if scale.is_normal() { scale } else { 0.0 }
     };
-    values.chunks_exact(values.len() / channels).map(scale).collect()
+    values
+        .chunks_exact(values.len() / channels)
+        .map(scale)
+        .collect()
 }
 
 /// Appends `[C, K]` finite values; `scales` are those of their channels if the dtype has any.
 ///
 /// # Errors
 /// [`WireError::Value`] when a value is beyond the range of half precision.
-#[expect(clippy::cast_possible_truncation, reason = "the low byte of a sum with ROUND is the rounded value")]
-pub(super) fn append(dtype: Dtype, values: &[f32], scales: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
+#[expect(
+    clippy::cast_possible_truncation,
+    reason = "the low byte of a sum with ROUND is the rounded value"
+)]
+pub(super) fn append(
+    dtype: Dtype,
+    values: &[f32],
+    scales: &[f32],
+    bytes: &mut Vec<u8>,
+) -> Result<(), WireError> {
     match dtype {
         Dtype::F32 => bytes.extend_from_slice(cast_slice(values)),
         Dtype::F16 => append_f16(values, bytes)?,
@@ -70,14 +83,21 @@ pub(super) fn append(dtype: Dtype, values: &[f32], scales: &[f32], bytes: &mut V
         Dtype::I8 => {
             for (channel, scale) in values.chunks_exact(values.len() / scales.len()).zip(scales) {
                 let inverse = if *scale == 0.0 { 0.0 } else { scale.recip() };
-                bytes.extend(channel.iter().map(|value| (value * inverse + ROUND).to_bits() as u8));
+                bytes.extend(
+                    channel
+                        .iter()
+                        .map(|value| (value * inverse + ROUND).to_bits() as u8),
+                );
             }
         }
     }
     Ok(())
 }
 
-#[expect(clippy::indexing_slicing, reason = "a chunk has at most BLOCK values, and its positions are below its length")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "a chunk has at most BLOCK values, and its positions are below its length"
+)]
 fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
     let max = f32::from(f16::MAX);
     let mut block = [f16::ZERO; BLOCK];
@@ -85,10 +105,18 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
         let block = &mut block[..chunk.len()];
         block.convert_from_f32_slice(chunk);
         // Searched only if there is one: the search does not vectorise.
-        let finite = block.iter().fold(true, |finite, half| finite & half.is_finite());
+        let finite = block
+            .iter()
+            .fold(true, |finite, half| finite & half.is_finite());
         if !finite && let Some(at) = block.iter().position(|half| !half.is_finite()) {
             let (index, value) = (number * BLOCK + at, f64::from(chunk[at]));
-            return Err(WireError::Value { what: "feature", index, value, min: (-max).into(), max: max.into() });
+            return Err(WireError::Value {
+                what: "feature",
+                index,
+                value,
+                min: (-max).into(),
+                max: max.into(),
+            });
         }
         bytes.extend_from_slice(cast_slice(block));
     }
@@ -99,11 +127,24 @@ fn append_f16(values: &[f32], bytes: &mut Vec<u8>) -> Result<(), WireError> {
 ///
 /// # Errors
 /// [`WireError::Value`] when a scale is not a finite number of at least zero.
-#[expect(clippy::indexing_slicing, reason = "a chunk has at most 2 * BLOCK bytes")]
-pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -> Result<Vec<f32>, WireError> {
-    let mut values = Vec::with_capacity(usize::try_from(bytes.len() as u64 / dtype.size()).unwrap_or_default());
+#[expect(
+    clippy::indexing_slicing,
+    reason = "a chunk has at most 2 * BLOCK bytes"
+)]
+pub(super) fn read(
+    dtype: Dtype,
+    scales: &[u8],
+    bytes: &[u8],
+    selected: usize,
+) -> Result<Vec<f32>, WireError> {
+    let mut values =
+        Vec::with_capacity(usize::try_from(bytes.len() as u64 / dtype.size()).unwrap_or_default());
     match dtype {
-        Dtype::F32 => values.extend(bytes.chunks_exact(4).map(bytemuck::pod_read_unaligned::<f32>)),
+        Dtype::F32 => values.extend(
+            bytes
+                .chunks_exact(4)
+                .map(bytemuck::pod_read_unaligned::<f32>),
+        ),
         Dtype::F16 => {
             let (mut halves, mut floats) = ([f16::ZERO; BLOCK], [0f32; BLOCK]);
             for chunk in bytes.chunks(2 * BLOCK) {
@@ -129,11 +170,21 @@ pub(super) fn read(dtype: Dtype, scales: &[u8], bytes: &[u8], selected: usize) -
 fn read_scales(bytes: &[u8]) -> Result<Vec<f32>, WireError> {
     let mut scales = vec![0f32; bytes.len() / 4];
     cast_slice_mut(&mut scales).copy_from_slice(bytes);
-    match scales.iter().enumerate().find(|(_, scale)| !(scale.is_finite() && **scale >= 0.0)) {
+    match scales
+        .iter()
+        .enumerate()
+        .find(|(_, scale)| !(scale.is_finite() && **scale >= 0.0))
+    {
         None => Ok(scales),
         Some((index, scale)) => {
             let value = (*scale).into();
-            Err(WireError::Value { what: "channel scale", index, value, min: 0.0, max: f32::MAX.into() })
+            Err(WireError::Value {
+                what: "channel scale",
+                index,
+                value,
+                min: 0.0,
+                max: f32::MAX.into(),
+            })
         }
     }
 }
@@ -145,7 +196,11 @@ mod tests {
     use super::*;
 
     fn round_trip(dtype: Dtype, values: &[f32], channels: usize) -> Result<Vec<f32>, WireError> {
-        let scales = if dtype == Dtype::I8 { scales(values, channels) } else { Vec::new() };
+        let scales = if dtype == Dtype::I8 {
+            scales(values, channels)
+        } else {
+            Vec::new()
+        };
         let mut bytes = Vec::new();
         append(dtype, values, &scales, &mut bytes)?;
         assert_eq!(bytes.len() as u64, values.len() as u64 * dtype.size());
@@ -186,7 +241,12 @@ mod tests {
 
     #[test]
     fn i8_keeps_zero_and_the_largest() {
-        let back = round_trip(Dtype::I8, &[0.0, -12.7, 12.7, 6.35, 0.0, 0.0, 0.0, 1e-44], 2).unwrap();
+        let back = round_trip(
+            Dtype::I8,
+            &[0.0, -12.7, 12.7, 6.35, 0.0, 0.0, 0.0, 1e-44],
+            2,
+        )
+        .unwrap();
         assert_eq!(back[0], 0.0);
         assert!((back[1] + 12.7).abs() < 1e-5 && (back[2] - 12.7).abs() < 1e-5);
         assert_eq!(back[4..], [0.0; 4]);
@@ -197,14 +257,26 @@ mod tests {
         let mut values = vec![1.0; 2000];
         values[1500] = -65520.0;
         let error = round_trip(Dtype::F16, &values, 1).unwrap_err();
-        assert!(matches!(error, WireError::Value { index: 1500, .. }), "{error}");
+        assert!(
+            matches!(error, WireError::Value { index: 1500, .. }),
+            "{error}"
+        );
     }
 
     #[test]
     fn scales_that_are_no_scales_are_refused() {
         for scale in [f32::NAN, f32::INFINITY, -1.0] {
             let error = read(Dtype::I8, &scale.to_le_bytes(), &[1, 2], 2).unwrap_err();
-            assert!(matches!(error, WireError::Value { what: "channel scale", .. }), "{error}");
+            assert!(
+                matches!(
+                    error,
+                    WireError::Value {
+                        what: "channel scale",
+                        ..
+                    }
+                ),
+                "{error}"
+            );
         }
     }
 }

@@ -41,7 +41,13 @@ pub struct Smoothing {
 impl Default for ConfidenceGate {
     /// The published threshold and smoothing: 0.01 after 5 x 5 cells with a sigma of one.
     fn default() -> Self {
-        Self { threshold: 0.01, smoothing: Some(Smoothing { kernel: 5, sigma: 1.0 }) }
+        Self {
+            threshold: 0.01,
+            smoothing: Some(Smoothing {
+                kernel: 5,
+                sigma: 1.0,
+            }),
+        }
     }
 }
 
@@ -50,12 +56,26 @@ impl FromStr for ConfidenceGate {
 
     /// `THRESHOLD`, with the published smoothing; `THRESHOLD,CELLS,SIGMA`; or `THRESHOLD,none`.
     fn from_str(text: &str) -> Result<Self, String> {
-        let (threshold, smoothing) = text.split_once(',').map_or((text, None), |(first, rest)| (first, Some(rest)));
-        let threshold = threshold.trim().parse().map_err(|error| format!("threshold {threshold:?}: {error}"))?;
+        let (threshold, smoothing) = text
+            .split_once(',')
+            .map_or((text, None), |(first, rest)| (first, Some(rest)));
+        let threshold = threshold
+            .trim()
+            .parse()
+            .map_err(|error| format!("threshold {threshold:?}: {error}"))?;
         Ok(match smoothing {
-            None => Self { threshold, ..Self::default() },
-            Some("none") => Self { threshold, smoothing: None },
-            Some(window) => Self { threshold, smoothing: Some(window.parse()?) },
+            None => Self {
+                threshold,
+                ..Self::default()
+            },
+            Some("none") => Self {
+                threshold,
+                smoothing: None,
+            },
+            Some(window) => Self {
+                threshold,
+                smoothing: Some(window.parse()?),
+            },
         })
     }
 }
@@ -65,9 +85,17 @@ impl FromStr for Smoothing {
 
     /// `CELLS,SIGMA`.
     fn from_str(text: &str) -> Result<Self, String> {
-        let (kernel, sigma) = text.split_once(',').ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
-        let kernel = kernel.trim().parse().map_err(|error| format!("window {kernel:?}: {error}"))?;
-        let sigma = sigma.trim().parse().map_err(|error| format!("sigma {sigma:?}: {error}"))?;
+        let (kernel, sigma) = text
+            .split_once(',')
+            .ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
+        let kernel = kernel
+            .trim()
+            .parse()
+            .map_err(|error| format!("window {kernel:?}: {error}"))?;
+        let sigma = sigma
+            .trim()
+            .parse()
+            .map_err(|error| format!("sigma {sigma:?}: {error}"))?;
         Ok(Self { kernel, sigma })
     }
 }
@@ -80,7 +108,11 @@ impl ConfidenceGate {
     pub(super) fn cells(&self, confidence: &[f32], grid: &BevGrid) -> Result<Vec<u32>, WireError> {
         let threshold = self.threshold;
         let pass = |values: &[f32]| -> Vec<u32> {
-            (0u32..).zip(values).filter(|(_, value)| **value > threshold).map(|(cell, _)| cell).collect()
+            (0u32..)
+                .zip(values)
+                .filter(|(_, value)| **value > threshold)
+                .map(|(cell, _)| cell)
+                .collect()
         };
         Ok(match self.smoothing {
             Some(smoothing) => pass(&smoothing.smooth(confidence, grid)?),
@@ -90,12 +122,18 @@ impl ConfidenceGate {
 }
 
 impl Smoothing {
-    #[expect(clippy::indexing_slicing, reason = "the window of a row is cut at the first and the last row")]
+    #[expect(
+        clippy::indexing_slicing,
+        reason = "the window of a row is cut at the first and the last row"
+    )]
     fn smooth(&self, values: &[f32], grid: &BevGrid) -> Result<Vec<f32>, WireError> {
         let weights = self.weights()?;
         let width = grid.width as usize;
         let mut along_rows = vec![0f32; values.len()];
-        for (row, smoothed) in values.chunks_exact(width).zip(along_rows.chunks_exact_mut(width)) {
+        for (row, smoothed) in values
+            .chunks_exact(width)
+            .zip(along_rows.chunks_exact_mut(width))
+        {
             convolve(row, &weights, smoothed);
         }
         let mut smoothed = vec![0f32; values.len()];
@@ -106,38 +144,64 @@ impl Smoothing {
             for source in first..(row + half + 1).min(height) {
                 let weight = weights[source + half - row];
                 let values = &along_rows[source * width..][..width];
-                target.iter_mut().zip(values).for_each(|(target, value)| *target += weight * value);
+                target
+                    .iter_mut()
+                    .zip(values)
+                    .for_each(|(target, value)| *target += weight * value);
             }
         }
         Ok(smoothed)
     }
 
     /// One dimension of the separable window.
-    #[expect(clippy::cast_possible_truncation, reason = "weights are rounded to f32")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "weights are rounded to f32"
+    )]
     fn weights(&self) -> Result<Vec<f32>, WireError> {
         let Self { kernel, sigma } = *self;
-        let refuse = |what, value, max| Err(WireError::Value { what, index: 0, value, min: 1e-3, max });
+        let refuse = |what, value, max| {
+            Err(WireError::Value {
+                what,
+                index: 0,
+                value,
+                min: 1e-3,
+                max,
+            })
+        };
         if kernel % 2 == 0 || kernel > MAX_KERNEL {
-            return refuse("odd kernel of the confidence gate", f64::from(kernel), f64::from(MAX_KERNEL));
+            return refuse(
+                "odd kernel of the confidence gate",
+                f64::from(kernel),
+                f64::from(MAX_KERNEL),
+            );
         }
         if !(1e-3..=1e3).contains(&sigma) {
             return refuse("sigma of the confidence gate", f64::from(sigma), 1e3);
         }
         let (half, sigma) = (f64::from(kernel / 2), f64::from(sigma));
         let scale = 1.0 / (std::f64::consts::TAU * sigma).sqrt();
-        let weight = |cell: u32| scale * (-(f64::from(cell) - half).powi(2) / (2.0 * sigma * sigma)).exp();
+        let weight =
+            |cell: u32| scale * (-(f64::from(cell) - half).powi(2) / (2.0 * sigma * sigma)).exp();
         Ok((0..kernel).map(|cell| weight(cell) as f32).collect())
     }
 }
 
 /// Convolution of `values` with `weights`, zeros outside.
-#[expect(clippy::indexing_slicing, reason = "the window of a cell is cut at both ends of the row")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "the window of a cell is cut at both ends of the row"
+)]
 fn convolve(values: &[f32], weights: &[f32], smoothed: &mut [f32]) {
     let half = weights.len() / 2;
     for (cell, smoothed) in smoothed.iter_mut().enumerate() {
         let first = cell.saturating_sub(half);
         let window = &values[first..(cell + half + 1).min(values.len())];
-        *smoothed = window.iter().zip(&weights[first + half - cell..]).map(|(value, weight)| value * weight).sum();
+        *smoothed = window
+            .iter()
+            .zip(&weights[first + half - cell..])
+            .map(|(value, weight)| value * weight)
+            .sum();
     }
 }
 
@@ -145,23 +209,38 @@ fn convolve(values: &[f32], weights: &[f32], smoothed: &mut [f32]) {
 mod tests {
     use super::*;
 
-    const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 6, height: 5 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: 0.0,
+        y_min_m: 0.0,
+        cell_m: 1.0,
+        width: 6,
+        height: 5,
+    };
 
     #[test]
     fn smoothing_is_the_convolution_by_definition() {
-        let values: Vec<f32> = (0..30u8).map(|cell| f32::from(cell * 37 % 30) / 30.0).collect();
-        let smoothing = Smoothing { kernel: 5, sigma: 1.3 };
+        let values: Vec<f32> = (0..30u8)
+            .map(|cell| f32::from(cell * 37 % 30) / 30.0)
+            .collect();
+        let smoothing = Smoothing {
+            kernel: 5,
+            sigma: 1.3,
+        };
         let smoothed = smoothing.smooth(&values, &GRID).unwrap();
         for (row, column) in (0..5i32).flat_map(|row| (0..6i32).map(move |column| (row, column))) {
             let mut expected = 0.0;
             for (dy, dx) in (-2..=2).flat_map(|dy| (-2..=2).map(move |dx| (dy, dx))) {
                 if (0..5).contains(&(row + dy)) && (0..6).contains(&(column + dx)) {
-                    let weight = (-f64::from(dx * dx + dy * dy) / (2.0 * 1.69)).exp() / (std::f64::consts::TAU * 1.3);
+                    let weight = (-f64::from(dx * dx + dy * dy) / (2.0 * 1.69)).exp()
+                        / (std::f64::consts::TAU * 1.3);
                     expected += weight * f64::from(values[((row + dy) * 6 + column + dx) as usize]);
                 }
             }
             let found = f64::from(smoothed[(row * 6 + column) as usize]);
-            assert!((found - expected).abs() < 1e-6, "{row} {column}: {found} {expected}");
+            assert!(
+                (found - expected).abs() < 1e-6,
+                "{row} {column}: {found} {expected}"
+            );
         }
     }
 
@@ -169,13 +248,25 @@ mod tests {
     fn a_confident_cell_selects_its_surroundings() {
         let mut confidence = [0f32; 30];
         confidence[14] = 0.9;
-        let unsmoothed = ConfidenceGate { threshold: 0.01, smoothing: None };
+        let unsmoothed = ConfidenceGate {
+            threshold: 0.01,
+            smoothing: None,
+        };
         assert_eq!(unsmoothed.cells(&confidence, &GRID).unwrap(), [14]);
         let published = ConfidenceGate::default().cells(&confidence, &GRID).unwrap();
-        assert!(published.contains(&13) && published.contains(&8) && published.len() > 9, "{published:?}");
-        let nothing = ConfidenceGate { threshold: 1.0, ..unsmoothed };
+        assert!(
+            published.contains(&13) && published.contains(&8) && published.len() > 9,
+            "{published:?}"
+        );
+        let nothing = ConfidenceGate {
+            threshold: 1.0,
+            ..unsmoothed
+        };
         assert!(nothing.cells(&confidence, &GRID).unwrap().is_empty());
-        let everything = ConfidenceGate { threshold: -1.0, ..unsmoothed };
+        let everything = ConfidenceGate {
+            threshold: -1.0,
+            ..unsmoothed
+        };
         assert_eq!(everything.cells(&confidence, &GRID).unwrap().len(), 30);
     }
 
@@ -183,9 +274,25 @@ mod tests {
     fn a_gate_is_read_from_a_threshold_and_a_window() {
         let read = |text: &str| text.parse::<ConfidenceGate>();
         assert_eq!(read("0.01").unwrap(), ConfidenceGate::default());
-        assert_eq!(read("0.1,none").unwrap(), ConfidenceGate { threshold: 0.1, smoothing: None });
-        assert_eq!(read("-1,3,0.5").unwrap().smoothing, Some(Smoothing { kernel: 3, sigma: 0.5 }));
-        for (text, part) in [("much", "threshold \"much\""), ("0.1,3", "\"3\""), ("0.1,x,1", "window \"x\"")] {
+        assert_eq!(
+            read("0.1,none").unwrap(),
+            ConfidenceGate {
+                threshold: 0.1,
+                smoothing: None
+            }
+        );
+        assert_eq!(
+            read("-1,3,0.5").unwrap().smoothing,
+            Some(Smoothing {
+                kernel: 3,
+                sigma: 0.5
+            })
+        );
+        for (text, part) in [
+            ("much", "threshold \"much\""),
+            ("0.1,3", "\"3\""),
+            ("0.1,x,1", "window \"x\""),
+        ] {
             let message = read(text).unwrap_err();
             assert!(message.contains(part), "{text}: {message}");
         }
@@ -194,9 +301,18 @@ mod tests {
     #[test]
     fn even_windows_are_refused() {
         for smoothing in [(4, 1.0), (0, 1.0), (65, 1.0), (5, 0.0), (5, f32::NAN)] {
-            let smoothing = Smoothing { kernel: smoothing.0, sigma: smoothing.1 };
-            let gate = ConfidenceGate { threshold: 0.1, smoothing: Some(smoothing) };
-            assert!(matches!(gate.cells(&[0.0; 30], &GRID), Err(WireError::Value { .. })), "{smoothing:?}");
+            let smoothing = Smoothing {
+                kernel: smoothing.0,
+                sigma: smoothing.1,
+            };
+            let gate = ConfidenceGate {
+                threshold: 0.1,
+                smoothing: Some(smoothing),
+            };
+            assert!(
+                matches!(gate.cells(&[0.0; 30], &GRID), Err(WireError::Value { .. })),
+                "{smoothing:?}"
+            );
         }
     }
 }

@@ -27,28 +27,58 @@ impl Layout {
         clippy::cast_possible_truncation,
         reason = "no part exceeds the bytes of the whole map, which isize holds"
     )]
-    pub(super) fn new(grid: &BevGrid, channels: u32, codec: &Codec, limits: &Limits) -> Result<Self, WireError> {
+    pub(super) fn new(
+        grid: &BevGrid,
+        channels: u32,
+        codec: &Codec,
+        limits: &Limits,
+    ) -> Result<Self, WireError> {
         grid.check(limits)?;
         let cells = u64::from(grid.width) * u64::from(grid.height);
-        at_most("channels", u64::from(limits.max_channels), u64::from(channels))?;
+        at_most(
+            "channels",
+            u64::from(limits.max_channels),
+            u64::from(channels),
+        )?;
         if channels == 0 {
-            return Err(WireError::Shape { what: "channels", expected: 1, found: 0 });
+            return Err(WireError::Shape {
+                what: "channels",
+                expected: 1,
+                found: 0,
+            });
         }
         // A receiver always unpacks to the whole feature map, however few bytes claim it.
         let map_bytes = cells.saturating_mul(u64::from(channels)).saturating_mul(4);
-        at_most("feature map bytes", limits.max_body_bytes.min(isize::MAX as u64), map_bytes)?;
+        at_most(
+            "feature map bytes",
+            limits.max_body_bytes.min(isize::MAX as u64),
+            map_bytes,
+        )?;
         let (selected, mask_bytes) = match codec.selection {
             Selection::Dense => (cells, 0),
             Selection::TopK { cells: selected } => (u64::from(selected), cells.div_ceil(8)),
         };
         at_most("selected cells", cells, selected)?;
-        let scale_bytes = if codec.dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
+        let scale_bytes = if codec.dtype == Dtype::I8 {
+            4 * u64::from(channels)
+        } else {
+            0
+        };
         // Below the size of the whole feature map, which fits: the products cannot overflow.
         let value_bytes = selected * u64::from(channels) * codec.dtype.size();
-        let (mask, values) = (scale_bytes + mask_bytes, scale_bytes + mask_bytes + value_bytes);
+        let (mask, values) = (
+            scale_bytes + mask_bytes,
+            scale_bytes + mask_bytes + value_bytes,
+        );
         let [cells, selected, scales, mask, values] =
             [cells, selected, scale_bytes, mask, values].map(|count| count as usize);
-        Ok(Self { cells, selected, scales: 0..scales, mask: scales..mask, values: mask..values })
+        Ok(Self {
+            cells,
+            selected,
+            scales: 0..scales,
+            mask: scales..mask,
+            values: mask..values,
+        })
     }
 
     /// Bytes of the unpacked body.
@@ -58,5 +88,9 @@ impl Layout {
 }
 
 fn at_most(what: &'static str, max: u64, found: u64) -> Result<(), WireError> {
-    if found > max { Err(WireError::Limit { what, max, found }) } else { Ok(()) }
+    if found > max {
+        Err(WireError::Limit { what, max, found })
+    } else {
+        Ok(())
+    }
 }

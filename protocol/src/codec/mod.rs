@@ -38,14 +38,18 @@ use layout::Layout;
 pub use dtype::Dtype;
 pub use gate::{ConfidenceGate, Smoothing};
 pub use rate::{
-    ByteLimit, HEAD_BYTES, LimitedBy, RateChoice, RateReason, encode_within, largest_message, smallest_message,
+    ByteLimit, HEAD_BYTES, LimitedBy, RateChoice, RateReason, encode_within, largest_message,
+    smallest_message,
 };
 
 /// Codec of BEV feature maps.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 #[cfg_attr(feature = "config", derive(clap::Args, schemars::JsonSchema))]
-#[cfg_attr(feature = "config", command(next_help_heading = "Codec of BEV feature maps"))]
+#[cfg_attr(
+    feature = "config",
+    command(next_help_heading = "Codec of BEV feature maps")
+)]
 pub struct CodecConfig {
     /// Number format of the values.
     #[cfg_attr(feature = "config", arg(long, value_enum))]
@@ -54,7 +58,11 @@ pub struct CodecConfig {
     /// budget selects among those cells. Absent: default of the method, else all cells.
     #[cfg_attr(
         feature = "config",
-        arg(long, value_name = "THRESHOLD[,CELLS,SIGMA|,none]", allow_negative_numbers = true)
+        arg(
+            long,
+            value_name = "THRESHOLD[,CELLS,SIGMA|,none]",
+            allow_negative_numbers = true
+        )
     )]
     pub gate: Option<ConfidenceGate>,
     /// Most bytes of a map before compression: the cells with the highest confidence that fit are sent. Absent: all cells.
@@ -145,20 +153,35 @@ pub fn encode_features(
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures, WireError> {
     let BevFeatures { grid, channels, .. } = features;
-    let dense = Codec { dtype: config.dtype, selection: Selection::Dense, compression: Compression::Raw };
+    let dense = Codec {
+        dtype: config.dtype,
+        selection: Selection::Dense,
+        compression: Compression::Raw,
+    };
     let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
     let found = features.values.len();
     if found != expected {
-        return Err(WireError::Shape { what: "features", expected: expected as u64, found: found as u64 });
+        return Err(WireError::Shape {
+            what: "features",
+            expected: expected as u64,
+            found: found as u64,
+        });
     }
-    let budget = config.budget_bytes.filter(|budget| *budget < layout.len() as u64);
+    let budget = config
+        .budget_bytes
+        .filter(|budget| *budget < layout.len() as u64);
     if config.gate.is_none() && budget.is_none() {
         return encode_selected(features, dense, None, config.zstd_level);
     }
-    let confidence = confidence.ok_or(WireError::NoConfidence { cells: layout.cells as u64 })?;
+    let confidence = confidence.ok_or(WireError::NoConfidence {
+        cells: layout.cells as u64,
+    })?;
     selection::check_confidence(confidence, layout.cells)?;
-    let gated = config.gate.map(|gate| gate.cells(confidence, &grid)).transpose()?;
+    let gated = config
+        .gate
+        .map(|gate| gate.cells(confidence, &grid))
+        .transpose()?;
     let selected = match (gated, budget) {
         (gated, Some(budget)) => {
             selection::within_budget(confidence, gated.as_deref(), channels, config.dtype, budget)?
@@ -166,10 +189,19 @@ pub fn encode_features(
         (Some(gated), None) if gated.len() < layout.cells => gated,
         _ => return encode_selected(features, dense, None, config.zstd_level),
     };
-    let codec =
-        Codec { selection: Selection::TopK { cells: u32::try_from(selected.len()).unwrap_or(u32::MAX) }, ..dense };
+    let codec = Codec {
+        selection: Selection::TopK {
+            cells: u32::try_from(selected.len()).unwrap_or(u32::MAX),
+        },
+        ..dense
+    };
     let values = selection::gather(&features.values, layout.cells, &selected);
-    encode_selected(BevFeatures { values, ..features }, codec, Some(&selected), config.zstd_level)
+    encode_selected(
+        BevFeatures { values, ..features },
+        codec,
+        Some(&selected),
+        config.zstd_level,
+    )
 }
 
 /// Writes the values of the selected cells, `[C, K]`. Dense uncompressed `f32` is checked by its receiver.
@@ -179,7 +211,12 @@ fn encode_selected(
     selected: Option<&[u32]>,
     zstd_level: Option<i32>,
 ) -> Result<EncodedFeatures, WireError> {
-    let BevFeatures { grid, channels, code_of, values } = features;
+    let BevFeatures {
+        grid,
+        channels,
+        code_of,
+        values,
+    } = features;
     let is_sent_as_it_is = codec.dtype == Dtype::F32 && selected.is_none();
     if !is_sent_as_it_is || zstd_level.is_some() {
         check_values("feature", &values, Limits::SENDER.max_abs_value)?;
@@ -189,12 +226,28 @@ fn encode_selected(
     } else {
         Body::Bytes(unpacked_body(&grid, channels, &codec, &values, selected)?)
     };
-    let packed = zstd_level.map(|level| compression::pack(body.as_bytes(), level)).transpose()?.flatten();
+    let packed = zstd_level
+        .map(|level| compression::pack(body.as_bytes(), level))
+        .transpose()?
+        .flatten();
     let (codec, body) = match packed {
-        Some(packed) => (Codec { compression: Compression::Zstd, ..codec }, Body::Bytes(packed)),
+        Some(packed) => (
+            Codec {
+                compression: Compression::Zstd,
+                ..codec
+            },
+            Body::Bytes(packed),
+        ),
         None => (codec, body),
     };
-    Ok(EncodedFeatures { grid, channels, code_of, codec, rate: None, body })
+    Ok(EncodedFeatures {
+        grid,
+        channels,
+        code_of,
+        codec,
+        rate: None,
+        body,
+    })
 }
 
 /// Scales, mask and values, concatenated.
@@ -207,7 +260,11 @@ fn unpacked_body(
 ) -> Result<Vec<u8>, WireError> {
     let layout = Layout::new(grid, channels, codec, &Limits::SENDER)?;
     let mut bytes = Vec::with_capacity(layout.len());
-    let scales = if codec.dtype == Dtype::I8 { dtype::scales(values, channels as usize) } else { Vec::new() };
+    let scales = if codec.dtype == Dtype::I8 {
+        dtype::scales(values, channels as usize)
+    } else {
+        Vec::new()
+    };
     bytes.extend_from_slice(bytemuck::cast_slice(&scales));
     if let Some(selected) = selected {
         selection::append_mask(&mut bytes, layout.cells, selected);
@@ -229,10 +286,18 @@ impl EncodedFeatures {
     ) -> Result<BodyShape, WireError> {
         let layout = Layout::new(grid, channels, codec, limits)?;
         Ok(match (codec.compression, codec.dtype, codec.selection) {
-            (Compression::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats((layout.values.len() / 4) as u64),
-            (Compression::Raw, ..) => BodyShape::Bytes { min: layout.len() as u64, max: layout.len() as u64 },
+            (Compression::Raw, Dtype::F32, Selection::Dense) => {
+                BodyShape::Floats((layout.values.len() / 4) as u64)
+            }
+            (Compression::Raw, ..) => BodyShape::Bytes {
+                min: layout.len() as u64,
+                max: layout.len() as u64,
+            },
             // A body that compression does not make smaller is sent uncompressed.
-            (Compression::Zstd, ..) => BodyShape::Bytes { min: 1, max: layout.len() as u64 },
+            (Compression::Zstd, ..) => BodyShape::Bytes {
+                min: 1,
+                max: layout.len() as u64,
+            },
         })
     }
 
@@ -240,17 +305,36 @@ impl EncodedFeatures {
     ///
     /// # Errors
     /// [`WireError::Grid`] and [`WireError::Shape`] state both.
-    pub fn check_shape(&self, grid: &BevGrid, channels: u32, code_of: Option<u32>) -> Result<(), WireError> {
+    pub fn check_shape(
+        &self,
+        grid: &BevGrid,
+        channels: u32,
+        code_of: Option<u32>,
+    ) -> Result<(), WireError> {
         if self.grid != *grid {
-            return Err(WireError::Grid { expected: grid.to_string(), found: self.grid.to_string() });
+            return Err(WireError::Grid {
+                expected: grid.to_string(),
+                found: self.grid.to_string(),
+            });
         }
         let decoded = |channels: u32, code_of: Option<u32>| u64::from(code_of.unwrap_or(channels));
         if self.channels != channels {
-            return Err(WireError::Shape { what: "channels", expected: channels.into(), found: self.channels.into() });
+            return Err(WireError::Shape {
+                what: "channels",
+                expected: channels.into(),
+                found: self.channels.into(),
+            });
         }
         if self.code_of != code_of {
-            let (expected, found) = (decoded(channels, code_of), decoded(self.channels, self.code_of));
-            return Err(WireError::Shape { what: "channels of the map behind the compressor", expected, found });
+            let (expected, found) = (
+                decoded(channels, code_of),
+                decoded(self.channels, self.code_of),
+            );
+            return Err(WireError::Shape {
+                what: "channels of the map behind the compressor",
+                expected,
+                found,
+            });
         }
         Ok(())
     }
@@ -262,38 +346,80 @@ impl EncodedFeatures {
     /// [`WireError`] when sizes exceed `limits`, the body does not match shape and codec, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures, WireError> {
-        let Self { grid, channels, code_of, codec, rate: _, body } = self;
+        let Self {
+            grid,
+            channels,
+            code_of,
+            codec,
+            rate: _,
+            body,
+        } = self;
         let layout = Layout::new(&grid, channels, &codec, limits)?;
         let body = match (body, codec) {
             (
                 Body::Floats(values),
-                Codec { dtype: Dtype::F32, selection: Selection::Dense, compression: Compression::Raw },
+                Codec {
+                    dtype: Dtype::F32,
+                    selection: Selection::Dense,
+                    compression: Compression::Raw,
+                },
             ) => {
                 let (expected, found) = (layout.values.len() as u64 / 4, values.len() as u64);
                 if expected != found {
-                    return Err(WireError::Shape { what: "features", expected, found });
+                    return Err(WireError::Shape {
+                        what: "features",
+                        expected,
+                        found,
+                    });
                 }
-                return Ok(DecodedFeatures { features: BevFeatures { grid, channels, code_of, values }, sent: None });
+                return Ok(DecodedFeatures {
+                    features: BevFeatures {
+                        grid,
+                        channels,
+                        code_of,
+                        values,
+                    },
+                    sent: None,
+                });
             }
             (body, _) => body,
         };
         let raw = unpack(body, codec.compression, layout.len())?;
         let part = |range: &Range<usize>| {
             let (expected, found) = (range.end as u64, raw.len() as u64);
-            raw.get(range.clone()).ok_or(WireError::Shape { what: "bytes of a feature map", expected, found })
+            raw.get(range.clone()).ok_or(WireError::Shape {
+                what: "bytes of a feature map",
+                expected,
+                found,
+            })
         };
-        let values = dtype::read(codec.dtype, part(&layout.scales)?, part(&layout.values)?, layout.selected)?;
+        let values = dtype::read(
+            codec.dtype,
+            part(&layout.scales)?,
+            part(&layout.values)?,
+            layout.selected,
+        )?;
         check_values("feature", &values, limits.max_abs_value)?;
         let (values, sent) = match codec.selection {
             Selection::Dense => (values, None),
             Selection::TopK { .. } => {
-                let selected = selection::read_mask(part(&layout.mask)?, layout.cells, layout.selected)?;
+                let selected =
+                    selection::read_mask(part(&layout.mask)?, layout.cells, layout.selected)?;
                 drop(raw);
-                let (map, sent) = selection::scatter(&values, channels as usize, layout.cells, &selected);
+                let (map, sent) =
+                    selection::scatter(&values, channels as usize, layout.cells, &selected);
                 (map, Some(sent))
             }
         };
-        Ok(DecodedFeatures { features: BevFeatures { grid, channels, code_of, values }, sent })
+        Ok(DecodedFeatures {
+            features: BevFeatures {
+                grid,
+                channels,
+                code_of,
+                values,
+            },
+            sent,
+        })
     }
 }
 
@@ -310,25 +436,46 @@ fn unpack(body: Body, compression: Compression, expected: usize) -> Result<Vec<u
     if bytes.len() == expected {
         return Ok(bytes);
     }
-    Err(WireError::Shape { what: "encoded map bytes", expected: expected as u64, found: bytes.len() as u64 })
+    Err(WireError::Shape {
+        what: "encoded map bytes",
+        expected: expected as u64,
+        found: bytes.len() as u64,
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 4, height: 2 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: 0.0,
+        y_min_m: 0.0,
+        cell_m: 1.0,
+        width: 4,
+        height: 2,
+    };
 
     fn map(values: Vec<f32>) -> BevFeatures {
-        BevFeatures { grid: GRID, channels: values.len() as u32 / 8, code_of: None, values }
+        BevFeatures {
+            grid: GRID,
+            channels: values.len() as u32 / 8,
+            code_of: None,
+            values,
+        }
     }
 
     #[test]
     fn compression_that_does_not_help_leaves_the_tensor_unchanged() {
-        let config = CodecConfig { zstd_level: Some(3), ..CodecConfig::default() };
+        let config = CodecConfig {
+            zstd_level: Some(3),
+            ..CodecConfig::default()
+        };
         let noise: Vec<f32> = (1..=8u8).map(|n| f32::from(n).sin()).collect();
         let encoded = encode_features(map(noise.clone()), &config, None).unwrap();
-        assert_eq!((encoded.codec.compression, encoded.body), (Compression::Raw, Body::Floats(noise)));
+        assert_eq!(
+            (encoded.codec.compression, encoded.body),
+            (Compression::Raw, Body::Floats(noise))
+        );
         let encoded = encode_features(map(vec![0.1; 800]), &config, None).unwrap();
         assert_eq!(encoded.codec.compression, Compression::Zstd);
         assert!(encoded.body.len() < 100);
@@ -337,11 +484,28 @@ mod tests {
     #[test]
     fn a_value_that_is_not_finite_is_never_encoded() {
         for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
-            for (budget_bytes, zstd_level) in [(None, Some(1)), (Some(100), None), (Some(100), Some(1))] {
+            for (budget_bytes, zstd_level) in
+                [(None, Some(1)), (Some(100), None), (Some(100), Some(1))]
+            {
                 for bad in [f32::NAN, f32::INFINITY, 1e30] {
-                    let config = CodecConfig { dtype, budget_bytes, zstd_level, gate: None };
-                    let error = encode_features(map(vec![bad; 80]), &config, Some(&[1.0; 8])).unwrap_err();
-                    assert!(matches!(error, WireError::Value { what: "feature", .. }), "{error}");
+                    let config = CodecConfig {
+                        dtype,
+                        budget_bytes,
+                        zstd_level,
+                        gate: None,
+                    };
+                    let error =
+                        encode_features(map(vec![bad; 80]), &config, Some(&[1.0; 8])).unwrap_err();
+                    assert!(
+                        matches!(
+                            error,
+                            WireError::Value {
+                                what: "feature",
+                                ..
+                            }
+                        ),
+                        "{error}"
+                    );
                 }
             }
         }
@@ -349,28 +513,63 @@ mod tests {
 
     #[test]
     fn a_budget_that_fits_all_needs_no_confidence() {
-        let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(16), ..CodecConfig::default() };
-        assert_eq!(encode_features(map(vec![1.0; 8]), &config, None).unwrap().codec.selection, Selection::Dense);
-        let smaller = CodecConfig { budget_bytes: Some(15), ..config };
+        let config = CodecConfig {
+            dtype: Dtype::F16,
+            budget_bytes: Some(16),
+            ..CodecConfig::default()
+        };
+        assert_eq!(
+            encode_features(map(vec![1.0; 8]), &config, None)
+                .unwrap()
+                .codec
+                .selection,
+            Selection::Dense
+        );
+        let smaller = CodecConfig {
+            budget_bytes: Some(15),
+            ..config
+        };
         let error = encode_features(map(vec![1.0; 8]), &smaller, None).unwrap_err();
         assert_eq!(error, WireError::NoConfidence { cells: 8 });
         let sparse = encode_features(map(vec![1.0; 8]), &smaller, Some(&[0.5; 8])).unwrap();
         // One byte of mask, two bytes per cell.
-        assert_eq!((sparse.codec.selection, sparse.body.len()), (Selection::TopK { cells: 7 }, 15));
+        assert_eq!(
+            (sparse.codec.selection, sparse.body.len()),
+            (Selection::TopK { cells: 7 }, 15)
+        );
     }
 
     #[test]
     fn a_gate_sends_cells_that_pass_and_a_budget_the_best_of_them() {
         let confidence = [0.9, 0.1, 0.8, 0.1, 0.7, 0.1, 0.1, 0.1];
-        let gate = Some(ConfidenceGate { threshold: 0.5, smoothing: None });
-        let config = CodecConfig { dtype: Dtype::F16, gate, ..CodecConfig::default() };
+        let gate = Some(ConfidenceGate {
+            threshold: 0.5,
+            smoothing: None,
+        });
+        let config = CodecConfig {
+            dtype: Dtype::F16,
+            gate,
+            ..CodecConfig::default()
+        };
         let values: Vec<f32> = (0..8u8).map(f32::from).collect();
         let encoded = encode_features(map(values.clone()), &config, Some(&confidence)).unwrap();
-        assert_eq!((encoded.codec.selection, encoded.body.len()), (Selection::TopK { cells: 3 }, 1 + 3 * 2));
+        assert_eq!(
+            (encoded.codec.selection, encoded.body.len()),
+            (Selection::TopK { cells: 3 }, 1 + 3 * 2)
+        );
         let decoded = encoded.decode(&Limits::DEFAULT).unwrap();
-        assert_eq!(decoded.features.values, [0.0, 0.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0]);
-        assert_eq!(decoded.sent.unwrap().iter().filter(|sent| **sent).count(), 3);
-        let tight = CodecConfig { budget_bytes: Some(1 + 2 * 2), ..config };
+        assert_eq!(
+            decoded.features.values,
+            [0.0, 0.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0]
+        );
+        assert_eq!(
+            decoded.sent.unwrap().iter().filter(|sent| **sent).count(),
+            3
+        );
+        let tight = CodecConfig {
+            budget_bytes: Some(1 + 2 * 2),
+            ..config
+        };
         let encoded = encode_features(map(values.clone()), &tight, Some(&confidence)).unwrap();
         assert_eq!(
             encoded.decode(&Limits::DEFAULT).unwrap().features.values[4],
@@ -378,7 +577,10 @@ mod tests {
             "the least confident cell is left out"
         );
         // All cells that pass fit: the budget removes none.
-        let wide = CodecConfig { budget_bytes: Some(15), ..config };
+        let wide = CodecConfig {
+            budget_bytes: Some(15),
+            ..config
+        };
         let encoded = encode_features(map(values.clone()), &wide, Some(&confidence)).unwrap();
         assert_eq!(encoded.codec.selection, Selection::TopK { cells: 3 });
         let error = encode_features(map(values), &config, None).unwrap_err();
@@ -387,11 +589,20 @@ mod tests {
 
     #[test]
     fn an_empty_selection_is_encoded_in_every_dtype() {
-        let gate = Some(ConfidenceGate { threshold: 1.0, smoothing: None });
+        let gate = Some(ConfidenceGate {
+            threshold: 1.0,
+            smoothing: None,
+        });
         for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
             for zstd_level in [None, Some(1)] {
-                let config = CodecConfig { dtype, gate, zstd_level, budget_bytes: None };
-                let encoded = encode_features(map(vec![1.0; 16]), &config, Some(&[0.5; 8])).unwrap();
+                let config = CodecConfig {
+                    dtype,
+                    gate,
+                    zstd_level,
+                    budget_bytes: None,
+                };
+                let encoded =
+                    encode_features(map(vec![1.0; 16]), &config, Some(&[0.5; 8])).unwrap();
                 let decoded = encoded.decode(&Limits::DEFAULT).unwrap();
                 assert_eq!(decoded.features.values, [0.0; 16]);
                 assert_eq!(decoded.sent, Some(vec![false; 8]));
@@ -401,26 +612,60 @@ mod tests {
 
     #[test]
     fn a_gate_that_everything_passes_leaves_the_tensor_unchanged() {
-        let gate = Some(ConfidenceGate { threshold: -1.0, smoothing: None });
-        let config = CodecConfig { gate, ..CodecConfig::default() };
+        let gate = Some(ConfidenceGate {
+            threshold: -1.0,
+            smoothing: None,
+        });
+        let config = CodecConfig {
+            gate,
+            ..CodecConfig::default()
+        };
         let encoded = encode_features(map(vec![1.0; 8]), &config, Some(&[0.0; 8])).unwrap();
         assert_eq!(encoded.codec.selection, Selection::Dense);
     }
 
     #[test]
     fn a_map_must_fill_its_grid() {
-        let features = BevFeatures { grid: GRID, channels: 2, code_of: None, values: vec![0.0; 8] };
+        let features = BevFeatures {
+            grid: GRID,
+            channels: 2,
+            code_of: None,
+            values: vec![0.0; 8],
+        };
         let error = encode_features(features, &CodecConfig::default(), None).unwrap_err();
-        assert_eq!(error, WireError::Shape { what: "features", expected: 16, found: 8 });
+        assert_eq!(
+            error,
+            WireError::Shape {
+                what: "features",
+                expected: 16,
+                found: 8
+            }
+        );
     }
 
     #[test]
     fn a_map_of_another_shape_than_announced_is_named() {
         let encoded = encode_features(map(vec![0.0; 16]), &CodecConfig::default(), None).unwrap();
         assert_eq!(encoded.check_shape(&GRID, 2, None), Ok(()));
-        assert!(matches!(encoded.check_shape(&GRID, 3, None), Err(WireError::Shape { expected: 3, found: 2, .. })));
-        let other = BevGrid { cell_m: 0.5, ..GRID };
-        let message = encoded.check_shape(&other, 2, None).unwrap_err().to_string();
-        assert!(message.contains("4 x 2 cells of 1 m") && message.contains("4 x 2 cells of 0.5 m"), "{message}");
+        assert!(matches!(
+            encoded.check_shape(&GRID, 3, None),
+            Err(WireError::Shape {
+                expected: 3,
+                found: 2,
+                ..
+            })
+        ));
+        let other = BevGrid {
+            cell_m: 0.5,
+            ..GRID
+        };
+        let message = encoded
+            .check_shape(&other, 2, None)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("4 x 2 cells of 1 m") && message.contains("4 x 2 cells of 0.5 m"),
+            "{message}"
+        );
     }
 }

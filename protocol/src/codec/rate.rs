@@ -5,7 +5,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Codec, CodecConfig, Compression, Dtype, EncodedFeatures, Layout, Selection, encode_features, selection};
+use super::{
+    Codec, CodecConfig, Compression, Dtype, EncodedFeatures, Layout, Selection, encode_features,
+    selection,
+};
 use crate::BevFeatures;
 use crate::Limits;
 use crate::WireError;
@@ -92,11 +95,21 @@ pub fn encode_within(
     limit: &ByteLimit,
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures, WireError> {
-    let budget = limit.bytes.saturating_sub(HEAD_BYTES).min(config.budget_bytes.unwrap_or(u64::MAX));
+    let budget = limit
+        .bytes
+        .saturating_sub(HEAD_BYTES)
+        .min(config.budget_bytes.unwrap_or(u64::MAX));
     let (dtype, reduced_by) = choose(&features, config, budget, confidence)?;
-    let config = CodecConfig { dtype, budget_bytes: Some(budget), ..*config };
+    let config = CodecConfig {
+        dtype,
+        budget_bytes: Some(budget),
+        ..*config
+    };
     let encoded = encode_features(features, &config, confidence)?;
-    let rate = Some(RateChoice { reason: reason(limit.by, reduced_by), limit_bytes: limit.bytes });
+    let rate = Some(RateChoice {
+        reason: reason(limit.by, reduced_by),
+        limit_bytes: limit.bytes,
+    });
     Ok(EncodedFeatures { rate, ..encoded })
 }
 
@@ -124,12 +137,18 @@ fn choose(
     confidence: Option<&[f32]>,
 ) -> Result<(Dtype, ReducedBy), WireError> {
     let wanted = wanted(features, config, confidence)?;
-    let coarser = DTYPES_BY_PRECISION.into_iter().skip_while(|dtype| *dtype != config.dtype);
+    let coarser = DTYPES_BY_PRECISION
+        .into_iter()
+        .skip_while(|dtype| *dtype != config.dtype);
     for dtype in coarser {
         if body_bytes(features, dtype, wanted)? > budget {
             continue;
         }
-        let reduced_by = if dtype == config.dtype { ReducedBy::Nothing } else { ReducedBy::Exactness };
+        let reduced_by = if dtype == config.dtype {
+            ReducedBy::Nothing
+        } else {
+            ReducedBy::Exactness
+        };
         // Tested last: an overflow of half precision is rare, and the search for it takes time.
         if reduced_by == ReducedBy::Nothing
             || dtype != Dtype::F16
@@ -142,20 +161,36 @@ fn choose(
 }
 
 /// Selection without a limit.
-fn wanted(features: &BevFeatures, config: &CodecConfig, confidence: Option<&[f32]>) -> Result<Selection, WireError> {
-    let (Some(gate), Some(confidence)) = (config.gate, confidence) else { return Ok(Selection::Dense) };
+fn wanted(
+    features: &BevFeatures,
+    config: &CodecConfig,
+    confidence: Option<&[f32]>,
+) -> Result<Selection, WireError> {
+    let (Some(gate), Some(confidence)) = (config.gate, confidence) else {
+        return Ok(Selection::Dense);
+    };
     let cells = features.grid.cells();
     selection::check_confidence(confidence, cells)?;
     let passed = gate.cells(confidence, &features.grid)?.len();
     Ok(if passed < cells {
-        Selection::TopK { cells: u32::try_from(passed).unwrap_or(u32::MAX) }
+        Selection::TopK {
+            cells: u32::try_from(passed).unwrap_or(u32::MAX),
+        }
     } else {
         Selection::Dense
     })
 }
 
-fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Result<u64, WireError> {
-    let codec = Codec { dtype, selection, compression: Compression::Raw };
+fn body_bytes(
+    features: &BevFeatures,
+    dtype: Dtype,
+    selection: Selection,
+) -> Result<u64, WireError> {
+    let codec = Codec {
+        dtype,
+        selection,
+        compression: Compression::Raw,
+    };
     Ok(Layout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
 }
 
@@ -184,25 +219,56 @@ mod tests {
     use crate::message::Bev;
     use crate::wire;
 
-    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -6.0, cell_m: 1.0, width: 16, height: 12 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -8.0,
+        y_min_m: -6.0,
+        cell_m: 1.0,
+        width: 16,
+        height: 12,
+    };
 
     fn map() -> (BevFeatures, Vec<f32>) {
         let values = (0..8 * 192).map(|n| (n as f32 * 0.37).sin()).collect();
-        let confidence = (0..192).map(|cell| ((cell * 89) % 192) as f32 / 192.0).collect();
-        (BevFeatures { grid: GRID, channels: 8, code_of: None, values }, confidence)
+        let confidence = (0..192)
+            .map(|cell| ((cell * 89) % 192) as f32 / 192.0)
+            .collect();
+        (
+            BevFeatures {
+                grid: GRID,
+                channels: 8,
+                code_of: None,
+                values,
+            },
+            confidence,
+        )
     }
 
     fn encode(config: &CodecConfig, bytes: u64) -> Result<EncodedFeatures, WireError> {
         let (features, confidence) = map();
-        encode_within(features, config, &ByteLimit { bytes, by: LimitedBy::MessageSize }, Some(&confidence))
+        encode_within(
+            features,
+            config,
+            &ByteLimit {
+                bytes,
+                by: LimitedBy::MessageSize,
+            },
+            Some(&confidence),
+        )
     }
 
     fn message_bytes(features: EncodedFeatures) -> u64 {
         let cav = CavId::new(&"z".repeat(32)).unwrap();
-        let stamp =
-            Stamp { cav, epoch: u64::MAX, sequence: u64::MAX, capture_nanos: u64::MAX, publish_nanos: u64::MAX };
+        let stamp = Stamp {
+            cav,
+            epoch: u64::MAX,
+            sequence: u64::MAX,
+            capture_nanos: u64::MAX,
+            publish_nanos: u64::MAX,
+        };
         let pose = PoseEstimate::new(crate::Pose::from_xyz_yaw([-1e5, 1e5, -1e3], -3.0), 1.0);
-        wire::encode(&stamp, Bev { pose, features }).unwrap().wire_bytes() as u64
+        wire::encode(&stamp, Bev { pose, features })
+            .unwrap()
+            .wire_bytes() as u64
     }
 
     #[test]
@@ -210,13 +276,28 @@ mod tests {
         // 192 cells of 8 channels: 6,144 bytes, 3,072, and 1,536 with 32 of scales.
         let choice = |bytes| {
             let encoded = encode(&CodecConfig::default(), HEAD_BYTES + bytes).unwrap();
-            (encoded.codec.dtype, encoded.codec.selection, encoded.rate.unwrap().reason)
+            (
+                encoded.codec.dtype,
+                encoded.codec.selection,
+                encoded.rate.unwrap().reason,
+            )
         };
-        assert_eq!(choice(6144), (Dtype::F32, Selection::Dense, RateReason::Fits));
-        assert_eq!(choice(6143), (Dtype::F16, Selection::Dense, RateReason::SizeCoarser));
-        assert_eq!(choice(3071), (Dtype::I8, Selection::Dense, RateReason::SizeCoarser));
+        assert_eq!(
+            choice(6144),
+            (Dtype::F32, Selection::Dense, RateReason::Fits)
+        );
+        assert_eq!(
+            choice(6143),
+            (Dtype::F16, Selection::Dense, RateReason::SizeCoarser)
+        );
+        assert_eq!(
+            choice(3071),
+            (Dtype::I8, Selection::Dense, RateReason::SizeCoarser)
+        );
         // 24 bytes of mask and 8 per cell.
-        let fewer = Selection::TopK { cells: (1567 - 32 - 24) / 8 };
+        let fewer = Selection::TopK {
+            cells: (1567 - 32 - 24) / 8,
+        };
         assert_eq!(choice(1567), (Dtype::I8, fewer, RateReason::SizeFewerCells));
     }
 
@@ -225,39 +306,81 @@ mod tests {
         let (_, confidence) = map();
         let encoded = encode(&CodecConfig::default(), HEAD_BYTES + 32 + 24 + 8 * 10).unwrap();
         let sent = encoded.decode(&Limits::DEFAULT).unwrap().sent.unwrap();
-        let weakest = confidence.iter().zip(&sent).filter(|(_, sent)| **sent).map(|(c, _)| *c).fold(1.0, f32::min);
-        let strongest = confidence.iter().zip(&sent).filter(|(_, sent)| !**sent).map(|(c, _)| *c).fold(0.0, f32::max);
+        let weakest = confidence
+            .iter()
+            .zip(&sent)
+            .filter(|(_, sent)| **sent)
+            .map(|(c, _)| *c)
+            .fold(1.0, f32::min);
+        let strongest = confidence
+            .iter()
+            .zip(&sent)
+            .filter(|(_, sent)| !**sent)
+            .map(|(c, _)| *c)
+            .fold(0.0, f32::max);
         assert!(sent.iter().filter(|sent| **sent).count() == 10 && weakest > strongest);
     }
 
     #[test]
     fn a_gate_leaves_room_for_a_precise_format() {
-        let gate = Some(ConfidenceGate { threshold: 0.9, smoothing: None });
-        let config = CodecConfig { gate, ..CodecConfig::default() };
+        let gate = Some(ConfidenceGate {
+            threshold: 0.9,
+            smoothing: None,
+        });
+        let config = CodecConfig {
+            gate,
+            ..CodecConfig::default()
+        };
         let encoded = encode(&config, HEAD_BYTES + 1000).unwrap();
-        assert_eq!((encoded.codec.dtype, encoded.rate.unwrap().reason), (Dtype::F32, RateReason::Fits));
-        assert!(matches!(encoded.codec.selection, Selection::TopK { cells: 1..30 }));
+        assert_eq!(
+            (encoded.codec.dtype, encoded.rate.unwrap().reason),
+            (Dtype::F32, RateReason::Fits)
+        );
+        assert!(matches!(
+            encoded.codec.selection,
+            Selection::TopK { cells: 1..30 }
+        ));
     }
 
     #[test]
     fn values_beyond_half_precision_are_written_as_i8() {
         let (mut features, confidence) = map();
         features.values[5] = 1e5;
-        let limit = ByteLimit { bytes: HEAD_BYTES + 4000, by: LimitedBy::ByteRate };
-        let encoded = encode_within(features, &CodecConfig::default(), &limit, Some(&confidence)).unwrap();
-        assert_eq!((encoded.codec.dtype, encoded.rate.unwrap().reason), (Dtype::I8, RateReason::RateCoarser));
+        let limit = ByteLimit {
+            bytes: HEAD_BYTES + 4000,
+            by: LimitedBy::ByteRate,
+        };
+        let encoded =
+            encode_within(features, &CodecConfig::default(), &limit, Some(&confidence)).unwrap();
+        assert_eq!(
+            (encoded.codec.dtype, encoded.rate.unwrap().reason),
+            (Dtype::I8, RateReason::RateCoarser)
+        );
     }
 
     #[test]
     fn a_limit_below_the_smallest_message_is_an_error() {
         let (features, _) = map();
         let smallest = smallest_message(&features).unwrap();
-        assert!(matches!(encode(&CodecConfig::default(), smallest - 1), Err(WireError::Budget { .. })));
-        assert!(matches!(encode(&CodecConfig::default(), 0), Err(WireError::Budget { .. })));
+        assert!(matches!(
+            encode(&CodecConfig::default(), smallest - 1),
+            Err(WireError::Budget { .. })
+        ));
+        assert!(matches!(
+            encode(&CodecConfig::default(), 0),
+            Err(WireError::Budget { .. })
+        ));
         let nothing = encode(&CodecConfig::default(), smallest).unwrap();
         assert_eq!(nothing.codec.selection, Selection::TopK { cells: 0 });
         let largest = largest_message(&features, &CodecConfig::default()).unwrap();
-        assert_eq!(encode(&CodecConfig::default(), largest).unwrap().rate.unwrap().reason, RateReason::Fits);
+        assert_eq!(
+            encode(&CodecConfig::default(), largest)
+                .unwrap()
+                .rate
+                .unwrap()
+                .reason,
+            RateReason::Fits
+        );
     }
 
     proptest! {

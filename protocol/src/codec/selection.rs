@@ -10,11 +10,25 @@ use crate::WireError;
 pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), WireError> {
     if confidence.len() != cells {
         let (expected, found) = (cells as u64, confidence.len() as u64);
-        return Err(WireError::Shape { what: "confidence map", expected, found });
+        return Err(WireError::Shape {
+            what: "confidence map",
+            expected,
+            found,
+        });
     }
-    if let Some((index, value)) = confidence.iter().enumerate().find(|(_, value)| !value.is_finite()) {
+    if let Some((index, value)) = confidence
+        .iter()
+        .enumerate()
+        .find(|(_, value)| !value.is_finite())
+    {
         let (value, min, max) = ((*value).into(), f32::MIN.into(), f32::MAX.into());
-        return Err(WireError::Value { what: "confidence", index, value, min, max });
+        return Err(WireError::Value {
+            what: "confidence",
+            index,
+            value,
+            min,
+            max,
+        });
     }
     Ok(())
 }
@@ -31,10 +45,17 @@ pub(super) fn within_budget(
     dtype: Dtype,
     budget: u64,
 ) -> Result<Vec<u32>, WireError> {
-    let scale_bytes = if dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
+    let scale_bytes = if dtype == Dtype::I8 {
+        4 * u64::from(channels)
+    } else {
+        0
+    };
     let needed = scale_bytes + confidence.len().div_ceil(8) as u64;
-    let for_cells = budget.checked_sub(needed).ok_or(WireError::Budget { budget, needed })?;
-    let fitting = usize::try_from(for_cells / (u64::from(channels) * dtype.size())).unwrap_or(usize::MAX);
+    let for_cells = budget
+        .checked_sub(needed)
+        .ok_or(WireError::Budget { budget, needed })?;
+    let fitting =
+        usize::try_from(for_cells / (u64::from(channels) * dtype.size())).unwrap_or(usize::MAX);
     // A grid has at most 2^32 - 1 cells.
     let all = || (0..u32::try_from(confidence.len()).unwrap_or(u32::MAX)).collect();
     let candidates = candidates.map_or_else(all, <[u32]>::to_vec);
@@ -42,10 +63,17 @@ pub(super) fn within_budget(
 }
 
 /// The `count` most confident cells, in row-major order; ties go to the first.
-#[expect(clippy::indexing_slicing, reason = "cells are positions in the confidence map, whose length was checked")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "cells are positions in the confidence map, whose length was checked"
+)]
 fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<u32> {
     if count < cells.len() {
-        let descending = |a: &u32, b: &u32| confidence[*b as usize].total_cmp(&confidence[*a as usize]).then(a.cmp(b));
+        let descending = |a: &u32, b: &u32| {
+            confidence[*b as usize]
+                .total_cmp(&confidence[*a as usize])
+                .then(a.cmp(b))
+        };
         cells.select_nth_unstable_by(count, descending);
         cells.truncate(count);
         cells.sort_unstable();
@@ -54,7 +82,10 @@ fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<
 }
 
 /// `[C, K]` values of the selected cells out of `[C, H W]`.
-#[expect(clippy::indexing_slicing, reason = "the sender's own cells are positions in its map")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "the sender's own cells are positions in its map"
+)]
 pub(super) fn gather(values: &[f32], cells: usize, selected: &[u32]) -> Vec<f32> {
     let mut gathered = Vec::with_capacity(values.len() / cells * selected.len());
     for channel in values.chunks_exact(cells) {
@@ -64,7 +95,10 @@ pub(super) fn gather(values: &[f32], cells: usize, selected: &[u32]) -> Vec<f32>
 }
 
 /// Appends the mask of the selected cells.
-#[expect(clippy::indexing_slicing, reason = "the sender's own cells are positions in its map")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "the sender's own cells are positions in its map"
+)]
 pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
     let begin = bytes.len();
     bytes.resize(begin + cells.div_ceil(8), 0);
@@ -78,25 +112,48 @@ pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
 /// # Errors
 /// [`WireError::Shape`] when the number of cells in the mask differs from the announced one, or a cell is beyond the
 /// last.
-pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<Vec<u32>, WireError> {
+pub(super) fn read_mask(
+    mask: &[u8],
+    cells: usize,
+    announced: usize,
+) -> Result<Vec<u32>, WireError> {
     let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
     if found != announced as u64 {
-        return Err(WireError::Shape { what: "cells in the mask", expected: announced as u64, found });
+        return Err(WireError::Shape {
+            what: "cells in the mask",
+            expected: announced as u64,
+            found,
+        });
     }
     let mut selected = Vec::with_capacity(announced);
-    for (byte, first) in mask.iter().zip((0u32..).step_by(8)).filter(|(byte, _)| **byte != 0) {
-        selected.extend((0..8u32).filter(|bit| byte & (1 << bit) != 0).map(|bit| first + bit));
+    for (byte, first) in mask
+        .iter()
+        .zip((0u32..).step_by(8))
+        .filter(|(byte, _)| **byte != 0)
+    {
+        selected.extend(
+            (0..8u32)
+                .filter(|bit| byte & (1 << bit) != 0)
+                .map(|bit| first + bit),
+        );
     }
     match selected.last() {
-        Some(last) if *last as usize >= cells => {
-            Err(WireError::Shape { what: "last cell in the mask", expected: cells as u64 - 1, found: (*last).into() })
-        }
+        Some(last) if *last as usize >= cells => Err(WireError::Shape {
+            what: "last cell in the mask",
+            expected: cells as u64 - 1,
+            found: (*last).into(),
+        }),
         _ => Ok(selected),
     }
 }
 
 /// The feature map `[C, H, W]` with zeros for cells that were not sent, and the flags of the cells that were.
-pub(super) fn scatter(values: &[f32], channels: usize, cells: usize, selected: &[u32]) -> (Vec<f32>, Vec<bool>) {
+pub(super) fn scatter(
+    values: &[f32],
+    channels: usize,
+    cells: usize,
+    selected: &[u32],
+) -> (Vec<f32>, Vec<bool>) {
     let mut map = vec![0f32; channels * cells];
     let mut sent = vec![false; cells];
     for cell in selected {
@@ -105,7 +162,10 @@ pub(super) fn scatter(values: &[f32], channels: usize, cells: usize, selected: &
         }
     }
     if !selected.is_empty() {
-        for (plane, values) in map.chunks_exact_mut(cells).zip(values.chunks_exact(selected.len())) {
+        for (plane, values) in map
+            .chunks_exact_mut(cells)
+            .zip(values.chunks_exact(selected.len()))
+        {
             for (cell, value) in selected.iter().zip(values) {
                 if let Some(target) = plane.get_mut(*cell as usize) {
                     *target = *value;
@@ -138,7 +198,13 @@ mod tests {
         let selected = within_budget(&confidence, None, 3, Dtype::I8, 12 + 13 + 3 * 5 + 2).unwrap();
         assert_eq!(selected, [95, 96, 97, 98, 99]);
         let error = within_budget(&confidence, None, 3, Dtype::I8, 24).unwrap_err();
-        assert_eq!(error, WireError::Budget { budget: 24, needed: 25 });
+        assert_eq!(
+            error,
+            WireError::Budget {
+                budget: 24,
+                needed: 25
+            }
+        );
         assert!(check_confidence(&confidence, 100).is_ok());
         assert!(check_confidence(&confidence[1..], 100).is_err());
         assert!(check_confidence(&[f32::NAN; 100], 100).is_err());
@@ -150,8 +216,22 @@ mod tests {
         append_mask(&mut mask, 12, &[0, 9, 11]);
         assert_eq!(mask, [0b0000_0001, 0b0000_1010]);
         assert_eq!(read_mask(&mask, 12, 3).unwrap(), [0, 9, 11]);
-        assert!(matches!(read_mask(&mask, 12, 2), Err(WireError::Shape { expected: 2, found: 3, .. })));
-        assert!(matches!(read_mask(&mask, 11, 3), Err(WireError::Shape { expected: 10, found: 11, .. })));
+        assert!(matches!(
+            read_mask(&mask, 12, 2),
+            Err(WireError::Shape {
+                expected: 2,
+                found: 3,
+                ..
+            })
+        ));
+        assert!(matches!(
+            read_mask(&mask, 11, 3),
+            Err(WireError::Shape {
+                expected: 10,
+                found: 11,
+                ..
+            })
+        ));
     }
 
     #[test]

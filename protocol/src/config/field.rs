@@ -17,7 +17,11 @@ pub struct FieldError {
 impl FieldError {
     /// An error about one field.
     pub fn new(field: impl Into<String>, found: impl Display, rule: impl Into<String>) -> Self {
-        Self { field: field.into(), found: found.to_string(), rule: rule.into() }
+        Self {
+            field: field.into(),
+            found: found.to_string(),
+            rule: rule.into(),
+        }
     }
 }
 
@@ -25,11 +29,20 @@ impl FieldError {
 ///
 /// # Errors
 /// [`FieldError`] with the value and both bounds.
-pub fn within<T: PartialOrd + Display>(field: &str, value: T, low: T, high: T) -> Result<(), FieldError> {
+pub fn within<T: PartialOrd + Display>(
+    field: &str,
+    value: T,
+    low: T,
+    high: T,
+) -> Result<(), FieldError> {
     if value >= low && value <= high {
         return Ok(());
     }
-    Err(FieldError::new(field, value, format!("must be {low} to {high}")))
+    Err(FieldError::new(
+        field,
+        value,
+        format!("must be {low} to {high}"),
+    ))
 }
 
 /// Refuses a number that is not above 0 and at most a million: rates and waiting times.
@@ -40,7 +53,11 @@ pub fn above_zero(field: &str, value: f64) -> Result<(), FieldError> {
     if value > 0.0 && value <= 1e6 {
         return Ok(());
     }
-    Err(FieldError::new(field, value, "must be a number above 0 and at most 1000000"))
+    Err(FieldError::new(
+        field,
+        value,
+        "must be a number above 0 and at most 1000000",
+    ))
 }
 
 #[cfg(test)]

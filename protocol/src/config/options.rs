@@ -30,7 +30,12 @@ impl<T: Args + Default + Serialize> Args for Section<T> {
     fn augment_args(command: Command) -> Command {
         let defaults = serde_json::to_value(T::default()).unwrap_or_default();
         let heading = None::<&str>;
-        document(T::augment_args_for_update(command), options_of::<T>(), &defaults).next_help_heading(heading)
+        document(
+            T::augment_args_for_update(command),
+            options_of::<T>(),
+            &defaults,
+        )
+        .next_help_heading(heading)
     }
 
     fn augment_args_for_update(command: Command) -> Command {
@@ -41,7 +46,11 @@ impl<T: Args + Default + Serialize> Args for Section<T> {
 /// The options of a type that a configuration consists of.
 pub fn options_of<A: Args>() -> impl Iterator<Item = Arg> {
     let command = A::augment_args_for_update(Command::new("options"));
-    command.get_arguments().cloned().collect::<Vec<_>>().into_iter()
+    command
+        .get_arguments()
+        .cloned()
+        .collect::<Vec<_>>()
+        .into_iter()
 }
 
 /// Appends its default to the help of each of `options`, and lets flags be switched off (`--flag=false`), so that they
@@ -56,19 +65,37 @@ pub fn document(command: Command, options: impl Iterator<Item = Arg>, defaults: 
 }
 
 fn with_default(option: Arg, default: Option<String>) -> Arg {
-    let Some(default) = default else { return option };
+    let Some(default) = default else {
+        return option;
+    };
     let add = |help: &dyn std::fmt::Display| format!("{help} [default: {default}]");
-    let (short, long) = (option.get_help().map(|help| add(help)), option.get_long_help().map(|help| add(help)));
-    let option = if let Some(help) = short { option.help(help) } else { option };
-    if let Some(help) = long { option.long_help(help) } else { option }
+    let (short, long) = (
+        option.get_help().map(|help| add(help)),
+        option.get_long_help().map(|help| add(help)),
+    );
+    let option = if let Some(help) = short {
+        option.help(help)
+    } else {
+        option
+    };
+    if let Some(help) = long {
+        option.long_help(help)
+    } else {
+        option
+    }
 }
 
 fn switchable(option: Arg) -> Arg {
     if !matches!(option.get_action(), ArgAction::SetTrue) {
         return option;
     }
-    let option = option.action(ArgAction::Set).num_args(0..=1).require_equals(true);
-    option.default_missing_value("true").value_name("true|false")
+    let option = option
+        .action(ArgAction::Set)
+        .num_args(0..=1)
+        .require_equals(true);
+    option
+        .default_missing_value("true")
+        .value_name("true|false")
 }
 
 /// Values by the names that an option for them may have: the field alone, or with its sections, joined by `_`.
@@ -79,7 +106,11 @@ fn names(defaults: &Value) -> BTreeMap<String, Value> {
     for (path, value) in &leaves {
         for start in 0..path.len() {
             let name = path.get(start..).unwrap_or_default();
-            let is_unique = leaves.iter().filter(|(other, _)| other.ends_with(name)).count() == 1;
+            let is_unique = leaves
+                .iter()
+                .filter(|(other, _)| other.ends_with(name))
+                .count()
+                == 1;
             if is_unique || start == 0 {
                 names.insert(name.join("_"), value.clone());
             }

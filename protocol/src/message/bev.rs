@@ -48,8 +48,29 @@ impl Payload for Bev {
     type Metadata = BevMetadata;
 
     fn into_parts(self) -> (BevMetadata, Body) {
-        let Self { pose, features: EncodedFeatures { grid, channels, code_of, codec, rate, body } } = self;
-        (BevMetadata { pose, grid, channels, code_of, codec, rate }, body)
+        let Self {
+            pose,
+            features:
+                EncodedFeatures {
+                    grid,
+                    channels,
+                    code_of,
+                    codec,
+                    rate,
+                    body,
+                },
+        } = self;
+        (
+            BevMetadata {
+                pose,
+                grid,
+                channels,
+                code_of,
+                codec,
+                rate,
+            },
+            body,
+        )
     }
 
     fn check(metadata: &BevMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
@@ -59,20 +80,47 @@ impl Payload for Bev {
     }
 
     fn from_parts(metadata: BevMetadata, body: Body) -> Result<Self, WireError> {
-        let BevMetadata { pose, grid, channels, code_of, codec, rate } = metadata;
-        Ok(Self { pose, features: EncodedFeatures { grid, channels, code_of, codec, rate, body } })
+        let BevMetadata {
+            pose,
+            grid,
+            channels,
+            code_of,
+            codec,
+            rate,
+        } = metadata;
+        Ok(Self {
+            pose,
+            features: EncodedFeatures {
+                grid,
+                channels,
+                code_of,
+                codec,
+                rate,
+                body,
+            },
+        })
     }
 }
 
 /// A code has no more channels than the map that it encodes, and the map no more than permitted.
 fn check_code(channels: u32, code_of: Option<u32>, limits: &Limits) -> Result<(), WireError> {
-    let Some(decoded) = code_of else { return Ok(()) };
+    let Some(decoded) = code_of else {
+        return Ok(());
+    };
     if decoded > limits.max_channels {
-        return Err(WireError::Limit { what: "channels", max: limits.max_channels.into(), found: decoded.into() });
+        return Err(WireError::Limit {
+            what: "channels",
+            max: limits.max_channels.into(),
+            found: decoded.into(),
+        });
     }
     if channels > decoded {
         let (expected, found) = (decoded.into(), channels.into());
-        return Err(WireError::Shape { what: "channels of a code", expected, found });
+        return Err(WireError::Shape {
+            what: "channels of a code",
+            expected,
+            found,
+        });
     }
     Ok(())
 }

@@ -88,7 +88,12 @@ impl Pinhole {
     /// Column and row of a point of the camera's frame, pixels; `None` for a point that is not ahead of it.
     #[must_use]
     pub fn project(&self, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
-        (z > 0.0).then(|| [self.fx_px * x / z + self.cx_px, self.fy_px * y / z + self.cy_px])
+        (z > 0.0).then(|| {
+            [
+                self.fx_px * x / z + self.cx_px,
+                self.fy_px * y / z + self.cy_px,
+            ]
+        })
     }
 
     fn check_values(&self) -> Result<(), WireError> {
@@ -110,18 +115,36 @@ impl Payload for Camera {
     }
 
     fn check(metadata: &CameraMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
-        for (what, edge_px) in [("width_px", metadata.width_px), ("height_px", metadata.height_px)] {
+        for (what, edge_px) in [
+            ("width_px", metadata.width_px),
+            ("height_px", metadata.height_px),
+        ] {
             check_within(what, edge_px.into(), 1.0, MAX_EDGE_PX.into())?;
         }
-        metadata.pinhole.iter().try_for_each(Pinhole::check_values)?;
-        metadata.lidar_from_camera.iter().try_for_each(|pose| check_pose("lidar_from_camera", pose))?;
-        Ok(BodyShape::Bytes { min: 1, max: limits.max_body_bytes })
+        metadata
+            .pinhole
+            .iter()
+            .try_for_each(Pinhole::check_values)?;
+        metadata
+            .lidar_from_camera
+            .iter()
+            .try_for_each(|pose| check_pose("lidar_from_camera", pose))?;
+        Ok(BodyShape::Bytes {
+            min: 1,
+            max: limits.max_body_bytes,
+        })
     }
 
     fn from_parts(metadata: CameraMetadata, body: Body) -> Result<Self, WireError> {
         match body {
             Body::Bytes(image) => Ok(Self { metadata, image }),
-            body => Err(wrong_body(BodyShape::Bytes { min: 1, max: u64::MAX }, &body)),
+            body => Err(wrong_body(
+                BodyShape::Bytes {
+                    min: 1,
+                    max: u64::MAX,
+                },
+                &body,
+            )),
         }
     }
 }

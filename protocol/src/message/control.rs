@@ -87,10 +87,15 @@ impl Control {
         match self {
             Self::Start { rate } => check_within("rate", *rate, 0.0, 1e6),
             Self::End { sent, .. } => check_count("topics", sent.len(), limits.max_entries),
-            Self::Ready { subscribed, .. } => check_count("topics", subscribed.len(), limits.max_entries),
-            Self::Pause | Self::Resume | Self::Step { .. } | Self::Seek { .. } | Self::Probe | Self::Done { .. } => {
-                Ok(())
+            Self::Ready { subscribed, .. } => {
+                check_count("topics", subscribed.len(), limits.max_entries)
             }
+            Self::Pause
+            | Self::Resume
+            | Self::Step { .. }
+            | Self::Seek { .. }
+            | Self::Probe
+            | Self::Done { .. } => Ok(()),
         }
     }
 }

@@ -35,7 +35,11 @@ impl Descriptor {
         self.grid.check(limits)?;
         let (max, found) = (limits.max_channels.into(), self.channels.into());
         if found > max {
-            return Err(WireError::Limit { what: "channels", max, found });
+            return Err(WireError::Limit {
+                what: "channels",
+                max,
+                found,
+            });
         }
         check_count("streams", self.streams.len(), limits.max_entries)
     }
@@ -90,7 +94,15 @@ mod tests {
     fn a_hash_is_its_own_spelling() {
         let text = "00ff".repeat(16);
         assert_eq!(text.parse::<ModelHash>().unwrap().to_string(), text);
-        for bad in ["", "00", &"0".repeat(63), &"0".repeat(65), &"G".repeat(64), &"F".repeat(64), &"é".repeat(32)] {
+        for bad in [
+            "",
+            "00",
+            &"0".repeat(63),
+            &"0".repeat(65),
+            &"G".repeat(64),
+            &"F".repeat(64),
+            &"é".repeat(32),
+        ] {
             assert!(bad.parse::<ModelHash>().is_err(), "{bad}");
         }
     }

@@ -3,7 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::{
-    PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos, check_within, metadata_only,
+    PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos,
+    check_within, metadata_only,
 };
 use crate::CavId;
 use crate::Detection;
@@ -92,7 +93,12 @@ impl Detections {
         for neighbour in &self.neighbours {
             check_within("trust", neighbour.trust.unwrap_or(0.0), 0.0, 1.0)?;
             // The clock of an attacker may be wrong by any amount.
-            check_within("clock offset", neighbour.clock_offset_s.unwrap_or(0.0), -1e11, 1e11)?;
+            check_within(
+                "clock offset",
+                neighbour.clock_offset_s.unwrap_or(0.0),
+                -1e11,
+                1e11,
+            )?;
         }
         StageTiming::check_all(&self.stages, limits)
     }
@@ -123,8 +129,21 @@ impl DetectionsReport {
     /// The result of `stamp`'s frame, at a tick of the scene if that is known.
     #[must_use]
     pub fn new(stamp: &Stamp, tick: Option<u64>, result: Detections) -> Self {
-        let Stamp { cav: _, epoch, sequence, capture_nanos, publish_nanos } = *stamp;
-        Self { tick, epoch, sequence, capture_nanos, publish_nanos, result }
+        let Stamp {
+            cav: _,
+            epoch,
+            sequence,
+            capture_nanos,
+            publish_nanos,
+        } = *stamp;
+        Self {
+            tick,
+            epoch,
+            sequence,
+            capture_nanos,
+            publish_nanos,
+            result,
+        }
     }
 
     /// As JSON, on one line.

@@ -32,7 +32,9 @@ pub use boxes::Boxes;
 pub use camera::{Camera, CameraMetadata, ImageFormat, Pinhole};
 pub use control::{Control, TopicCount};
 pub use descriptor::{Descriptor, ModelHash};
-pub use detections::{Detections, DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour};
+pub use detections::{
+    Detections, DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour,
+};
 pub use ego_motion::EgoMotion;
 pub use gnss::{Gnss, GnssSource};
 pub use pace::Pace;
@@ -83,7 +85,10 @@ macro_rules! metadata_only {
                 (self, crate::Body::Empty)
             }
 
-            fn check(metadata: &Self, limits: &crate::Limits) -> Result<crate::BodyShape, crate::WireError> {
+            fn check(
+                metadata: &Self,
+                limits: &crate::Limits,
+            ) -> Result<crate::BodyShape, crate::WireError> {
                 metadata.check_values(limits)?;
                 Ok(crate::BodyShape::Empty)
             }
@@ -98,15 +103,34 @@ use metadata_only;
 
 fn check_within(what: &'static str, value: f64, min: f64, max: f64) -> Result<(), WireError> {
     // NaN is within nothing.
-    if (min..=max).contains(&value) { Ok(()) } else { Err(WireError::Value { what, index: 0, value, min, max }) }
+    if (min..=max).contains(&value) {
+        Ok(())
+    } else {
+        Err(WireError::Value {
+            what,
+            index: 0,
+            value,
+            min,
+            max,
+        })
+    }
 }
 
 fn check_count(what: &'static str, found: usize, max: usize) -> Result<(), WireError> {
-    if found <= max { Ok(()) } else { Err(WireError::Limit { what, max: max as u64, found: found as u64 }) }
+    if found <= max {
+        Ok(())
+    } else {
+        Err(WireError::Limit {
+            what,
+            max: max as u64,
+            found: found as u64,
+        })
+    }
 }
 
 fn check_pose(what: &'static str, pose: &Pose) -> Result<(), WireError> {
-    pose.validate().map_err(|source| WireError::Pose { what, source })
+    pose.validate()
+        .map_err(|source| WireError::Pose { what, source })
 }
 
 /// Checks names in metadata: stages, classes.
@@ -121,14 +145,26 @@ fn wrong_body(shape: BodyShape, body: &Body) -> WireError {
         BodyShape::Floats(count) => count.saturating_mul(4),
         BodyShape::Points(count) => count.saturating_mul(16),
     };
-    WireError::Shape { what: "body bytes", expected, found: body.len() as u64 }
+    WireError::Shape {
+        what: "body bytes",
+        expected,
+        found: body.len() as u64,
+    }
 }
 
 /// Maximum duration that a receiver accepts, nanoseconds: one day.
 const MAX_NANOS: u64 = 86_400_000_000_000;
 
 fn check_nanos(what: &'static str, nanos: u64) -> Result<(), WireError> {
-    if nanos <= MAX_NANOS { Ok(()) } else { Err(WireError::Limit { what, max: MAX_NANOS, found: nanos }) }
+    if nanos <= MAX_NANOS {
+        Ok(())
+    } else {
+        Err(WireError::Limit {
+            what,
+            max: MAX_NANOS,
+            found: nanos,
+        })
+    }
 }
 
 /// A box from outside: finite, of positive and plausible size.

@@ -66,7 +66,12 @@ impl PlanarCovariance {
     fn check_values(&self) -> Result<(), WireError> {
         check_within("covariance xx_m2", self.xx_m2.into(), 0.0, MAX_VARIANCE)?;
         check_within("covariance yy_m2", self.yy_m2.into(), 0.0, MAX_VARIANCE)?;
-        check_within("covariance yaw_rad2", self.yaw_rad2.into(), 0.0, MAX_VARIANCE)?;
+        check_within(
+            "covariance yaw_rad2",
+            self.yaw_rad2.into(),
+            0.0,
+            MAX_VARIANCE,
+        )?;
         // Rounding to single precision may exceed the bound by a little.
         let bound = (f64::from(self.xx_m2) * f64::from(self.yy_m2)).sqrt() * (1.0 + 1e-5);
         check_within("covariance xy_m2", self.xy_m2.into(), -bound, bound)
@@ -93,7 +98,11 @@ impl PoseEstimate {
     /// A pose and its confidence, without a covariance.
     #[must_use]
     pub fn new(world_from_cav: Pose, confidence: f32) -> Self {
-        Self::Pose { world_from_cav, confidence, covariance: None }
+        Self::Pose {
+            world_from_cav,
+            confidence,
+            covariance: None,
+        }
     }
 
     /// Covariance of the pose in the plane, if its source has one.
@@ -125,10 +134,16 @@ impl PoseEstimate {
 
     pub(super) fn check_values(&self, _: &Limits) -> Result<(), WireError> {
         match self {
-            Self::Pose { world_from_cav, confidence, covariance } => {
+            Self::Pose {
+                world_from_cav,
+                confidence,
+                covariance,
+            } => {
                 check_pose("world_from_cav", world_from_cav)?;
                 check_within("confidence", f64::from(*confidence), 0.0, 1.0)?;
-                covariance.as_ref().map_or(Ok(()), PlanarCovariance::check_values)
+                covariance
+                    .as_ref()
+                    .map_or(Ok(()), PlanarCovariance::check_values)
             }
             Self::NoPose { .. } => Ok(()),
         }
@@ -158,11 +173,35 @@ mod tests {
 
     #[test]
     fn a_covariance_that_is_none_is_rejected_by_its_field() {
-        let good = PlanarCovariance { xx_m2: 1.0, xy_m2: 0.5, yy_m2: 1.0, yaw_rad2: 0.1 };
-        let field = |covariance: PlanarCovariance| covariance.check_values().unwrap_err().to_string();
-        assert!(field(PlanarCovariance { xx_m2: -1.0, ..good }).contains("xx_m2"));
+        let good = PlanarCovariance {
+            xx_m2: 1.0,
+            xy_m2: 0.5,
+            yy_m2: 1.0,
+            yaw_rad2: 0.1,
+        };
+        let field =
+            |covariance: PlanarCovariance| covariance.check_values().unwrap_err().to_string();
+        assert!(
+            field(PlanarCovariance {
+                xx_m2: -1.0,
+                ..good
+            })
+            .contains("xx_m2")
+        );
         assert!(field(PlanarCovariance { xy_m2: 1.1, ..good }).contains("xy_m2"));
-        assert!(field(PlanarCovariance { yy_m2: f32::NAN, ..good }).contains("yy_m2"));
-        assert!(field(PlanarCovariance { yaw_rad2: f32::INFINITY, ..good }).contains("yaw_rad2"));
+        assert!(
+            field(PlanarCovariance {
+                yy_m2: f32::NAN,
+                ..good
+            })
+            .contains("yy_m2")
+        );
+        assert!(
+            field(PlanarCovariance {
+                yaw_rad2: f32::INFINITY,
+                ..good
+            })
+            .contains("yaw_rad2")
+        );
     }
 }

@@ -79,7 +79,10 @@ impl StageTiming {
     /// Duration of one stage.
     #[must_use]
     pub fn new(stage: &str, time: std::time::Duration) -> Self {
-        Self { stage: stage.into(), nanos: u64::try_from(time.as_nanos()).unwrap_or(u64::MAX) }
+        Self {
+            stage: stage.into(),
+            nanos: u64::try_from(time.as_nanos()).unwrap_or(u64::MAX),
+        }
     }
 
     pub(super) fn check_all(stages: &[Self], limits: &Limits) -> Result<(), WireError> {
@@ -99,7 +102,12 @@ impl Stats {
         check_within("cpu_s", self.usage.cpu_s, 0.0, MAX_CPU_S)?;
         for summary in &self.stages {
             check_name("stage", &summary.stage)?;
-            for time_ms in [summary.p50_ms, summary.p95_ms, summary.p99_ms, summary.max_ms] {
+            for time_ms in [
+                summary.p50_ms,
+                summary.p95_ms,
+                summary.p99_ms,
+                summary.max_ms,
+            ] {
                 check_within("stage milliseconds", time_ms, 0.0, 1e9)?;
             }
         }

@@ -57,7 +57,11 @@ pub struct PointsMetadata {
 
 fn check_points(count: u64, limits: &Limits) -> Result<BodyShape, WireError> {
     if count > limits.max_points {
-        return Err(WireError::Limit { what: "points", max: limits.max_points, found: count });
+        return Err(WireError::Limit {
+            what: "points",
+            max: limits.max_points,
+            found: count,
+        });
     }
     Ok(BodyShape::Points(count))
 }
@@ -78,7 +82,12 @@ macro_rules! sweep {
             type Metadata = SweepMetadata;
 
             fn into_parts(self) -> (SweepMetadata, Body) {
-                (SweepMetadata { count: self.points.len() as u64 }, Body::Points(self.points.xyzi))
+                (
+                    SweepMetadata {
+                        count: self.points.len() as u64,
+                    },
+                    Body::Points(self.points.xyzi),
+                )
             }
 
             fn check(metadata: &SweepMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
@@ -86,7 +95,9 @@ macro_rules! sweep {
             }
 
             fn from_parts(metadata: SweepMetadata, body: Body) -> Result<Self, WireError> {
-                Ok(Self { points: points_of(body, metadata.count)? })
+                Ok(Self {
+                    points: points_of(body, metadata.count)?,
+                })
             }
         }
     };
@@ -102,7 +113,13 @@ impl Payload for Points {
 
     fn into_parts(self) -> (PointsMetadata, Body) {
         let Self { pose, points } = self;
-        (PointsMetadata { pose, count: points.len() as u64 }, Body::Points(points.xyzi))
+        (
+            PointsMetadata {
+                pose,
+                count: points.len() as u64,
+            },
+            Body::Points(points.xyzi),
+        )
     }
 
     fn check(metadata: &PointsMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
@@ -111,6 +128,9 @@ impl Payload for Points {
     }
 
     fn from_parts(metadata: PointsMetadata, body: Body) -> Result<Self, WireError> {
-        Ok(Self { pose: metadata.pose, points: points_of(body, metadata.count)? })
+        Ok(Self {
+            pose: metadata.pose,
+            points: points_of(body, metadata.count)?,
+        })
     }
 }

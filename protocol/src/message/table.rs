@@ -5,8 +5,8 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Bev, Boxes, Camera, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload, Points, PoseEstimate,
-    Radar, Stats, Truth,
+    Bev, Boxes, Camera, Control, Descriptor, Detections, EgoMotion, Gnss, Lidar, Pace, Payload,
+    Points, PoseEstimate, Radar, Stats, Truth,
 };
 use crate::WireError;
 
@@ -187,9 +187,19 @@ mod tests {
     #[test]
     fn a_new_message_is_one_row() {
         let ping = Message::Ping(Ping { count: 7 });
-        assert_eq!((ping.kind(), Kind::ALL.len(), Kind::Ping.to_string().as_str()), (Kind::Ping, 1, "ping"));
+        assert_eq!(
+            (
+                ping.kind(),
+                Kind::ALL.len(),
+                Kind::Ping.to_string().as_str()
+            ),
+            (Kind::Ping, 1, "ping")
+        );
         assert_eq!(Kind::from_wire(200).unwrap(), Kind::Ping);
-        assert!(matches!(Kind::from_wire(1), Err(WireError::UnknownKind { found: 1 })));
+        assert!(matches!(
+            Kind::from_wire(1),
+            Err(WireError::UnknownKind { found: 1 })
+        ));
         let bytes = ping.clone().visit(MetadataBytes);
         assert_eq!(Message::read(Kind::Ping, FromBytes(bytes)).unwrap(), ping);
     }

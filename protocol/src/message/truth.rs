@@ -53,7 +53,10 @@ impl Truth {
         check_count("objects", objects, limits.max_boxes)?;
         for agent in &self.agents {
             check_pose("world_from_lidar", &agent.world_from_lidar)?;
-            agent.objects.iter().try_for_each(TrueObject::check_values)?;
+            agent
+                .objects
+                .iter()
+                .try_for_each(TrueObject::check_values)?;
         }
         Ok(())
     }
@@ -70,7 +73,8 @@ impl TrueObject {
         };
         // Data sets have objects without length, width or height: one of them must not reject the whole message.
         check_box_from(&box3d, 0.0)?;
-        self.speed_mps.map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
+        self.speed_mps
+            .map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
     }
 }
 
@@ -84,11 +88,33 @@ mod tests {
 
     fn encoded(size_m: [f64; 3]) -> Result<Vec<u8>, WireError> {
         let cav = CavId::new("4279").unwrap();
-        let object =
-            TrueObject { id: 1, class: "car".into(), world_from_object: Pose::IDENTITY, size_m, speed_mps: None };
-        let agent = AgentTruth { cav: cav.clone(), world_from_lidar: Pose::IDENTITY, objects: vec![object] };
-        let stamp = Stamp { cav, epoch: 1, sequence: 0, capture_nanos: 5, publish_nanos: 7 };
-        wire::encode(&stamp, Truth { tick: 0, agents: vec![agent] }).map(|encoded| encoded.to_vec())
+        let object = TrueObject {
+            id: 1,
+            class: "car".into(),
+            world_from_object: Pose::IDENTITY,
+            size_m,
+            speed_mps: None,
+        };
+        let agent = AgentTruth {
+            cav: cav.clone(),
+            world_from_lidar: Pose::IDENTITY,
+            objects: vec![object],
+        };
+        let stamp = Stamp {
+            cav,
+            epoch: 1,
+            sequence: 0,
+            capture_nanos: 5,
+            publish_nanos: 7,
+        };
+        wire::encode(
+            &stamp,
+            Truth {
+                tick: 0,
+                agents: vec![agent],
+            },
+        )
+        .map(|encoded| encoded.to_vec())
     }
 
     #[test]
@@ -99,7 +125,16 @@ mod tests {
             assert_eq!(truth.agents[0].objects[0].size_m, size_m);
         }
         for size in [-1e-9, 1001.0, f64::NAN, f64::INFINITY] {
-            assert!(matches!(encoded([4.0, size, 1.5]), Err(WireError::Value { what: "box size_m", .. })), "{size}");
+            assert!(
+                matches!(
+                    encoded([4.0, size, 1.5]),
+                    Err(WireError::Value {
+                        what: "box size_m",
+                        ..
+                    })
+                ),
+                "{size}"
+            );
         }
     }
 }

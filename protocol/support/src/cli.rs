@@ -55,13 +55,20 @@ impl Outcome {
     /// [`Self::DataLost`] if data were lost.
     #[must_use]
     pub fn of(lost_data: bool) -> Self {
-        if lost_data { Self::DataLost } else { Self::Done }
+        if lost_data {
+            Self::DataLost
+        } else {
+            Self::Done
+        }
     }
 }
 
 /// Exit code of a command; prints the chain of causes of an error. `is_bad_input` recognises causes that are errors of
 /// the input, in addition to [`BadInput`].
-pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Error + 'static)) -> bool) -> ExitCode {
+pub fn exit_code(
+    result: anyhow::Result<Outcome>,
+    is_bad_input: impl Fn(&(dyn Error + 'static)) -> bool,
+) -> ExitCode {
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::BadInput) => ExitCode::from(2),
@@ -72,8 +79,14 @@ pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Er
         }
         Err(error) => {
             output::error(chain_of(&error));
-            let is_bad = error.chain().any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
-            if is_bad { ExitCode::from(2) } else { ExitCode::FAILURE }
+            let is_bad = error
+                .chain()
+                .any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
+            if is_bad {
+                ExitCode::from(2)
+            } else {
+                ExitCode::FAILURE
+            }
         }
     }
 }
@@ -102,21 +115,38 @@ mod tests {
 
     #[test]
     fn exit_codes_are_0_to_3_and_130() {
-        for (outcome, code) in [(Outcome::Done, 0), (Outcome::BadInput, 2), (Outcome::DataLost, 3)] {
+        for (outcome, code) in [
+            (Outcome::Done, 0),
+            (Outcome::BadInput, 2),
+            (Outcome::DataLost, 3),
+        ] {
             assert_eq!(code_of(Ok(outcome)), ExitCode::from(code));
         }
-        assert_eq!((Outcome::of(false), Outcome::of(true)), (Outcome::Done, Outcome::DataLost));
+        assert_eq!(
+            (Outcome::of(false), Outcome::of(true)),
+            (Outcome::Done, Outcome::DataLost)
+        );
         assert_eq!(code_of(Err(anyhow::anyhow!("broken"))), ExitCode::from(1));
-        assert_eq!(code_of(Err(anyhow::anyhow!(Interrupted).context("stopped at step 3"))), ExitCode::from(130));
+        assert_eq!(
+            code_of(Err(
+                anyhow::anyhow!(Interrupted).context("stopped at step 3")
+            )),
+            ExitCode::from(130)
+        );
         let bad: anyhow::Result<Outcome> = Err(BadInput::new("--frames is 0").into());
         assert_eq!(code_of(bad.context("reading")), ExitCode::from(2));
-        let bad = "x".parse::<i32>().context("--frames").map(|_| Outcome::Done);
+        let bad = "x"
+            .parse::<i32>()
+            .context("--frames")
+            .map(|_| Outcome::Done);
         assert_eq!(code_of(bad), ExitCode::from(2));
     }
 
     #[test]
     fn a_cause_that_is_quoted_is_printed_once() {
-        let error = anyhow::anyhow!("no such file").context("a.yaml: no such file").context("scenario");
+        let error = anyhow::anyhow!("no such file")
+            .context("a.yaml: no such file")
+            .context("scenario");
         assert_eq!(chain_of(&error), "scenario: a.yaml: no such file");
         let error = BadInput::of(anyhow::anyhow!("inner").context("outer"));
         assert_eq!(chain_of(&error.into()), "outer: inner");

@@ -48,17 +48,34 @@ fn parse_with<P: Parser>(sibling: Option<&Sibling>) -> P {
         output::error(error);
         process::exit(1)
     };
-    sibling.and_then(|sibling| sibling.exec_help(env::args_os())).map(end);
-    let matches = with_verbosity(sibling.map_or_else(P::command, |sibling| sibling.extend(P::command()))).get_matches();
-    output::set_verbosity(verbosity(matches.get_count("verbose"), matches.get_flag("quiet")));
-    sibling.and_then(|sibling| sibling.exec_subcommand(&matches)).map(end);
+    sibling
+        .and_then(|sibling| sibling.exec_help(env::args_os()))
+        .map(end);
+    let matches =
+        with_verbosity(sibling.map_or_else(P::command, |sibling| sibling.extend(P::command())))
+            .get_matches();
+    output::set_verbosity(verbosity(
+        matches.get_count("verbose"),
+        matches.get_flag("quiet"),
+    ));
+    sibling
+        .and_then(|sibling| sibling.exec_subcommand(&matches))
+        .map(end);
     P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
 }
 
 /// The options of the verbosity on standard error.
 fn with_verbosity(command: Command) -> Command {
-    let verbose = Arg::new("verbose").short('v').long("verbose").action(ArgAction::Count).global(true);
-    let quiet = Arg::new("quiet").short('q').long("quiet").action(ArgAction::SetTrue).global(true);
+    let verbose = Arg::new("verbose")
+        .short('v')
+        .long("verbose")
+        .action(ArgAction::Count)
+        .global(true);
+    let quiet = Arg::new("quiet")
+        .short('q')
+        .long("quiet")
+        .action(ArgAction::SetTrue)
+        .global(true);
     command
         .arg(
             verbose
@@ -66,7 +83,11 @@ fn with_verbosity(command: Command) -> Command {
                 .conflicts_with("quiet")
                 .display_order(LAST - 1),
         )
-        .arg(quiet.help("Errors only on standard error: no progress, notes and warnings").display_order(LAST))
+        .arg(
+            quiet
+                .help("Errors only on standard error: no progress, notes and warnings")
+                .display_order(LAST),
+        )
 }
 
 fn verbosity(verbose: u8, quiet: bool) -> Verbosity {
@@ -82,11 +103,15 @@ fn generate(command: Command, sibling: Option<&Sibling>, wanted: &str) -> io::Re
     if wanted == DESCRIPTION {
         return output::line(serde_json::to_string(&CommandTree::of(&command))?);
     }
-    let mut command = with_verbosity(sibling.map_or_else(|| command.clone(), |sibling| complete(&command, sibling)));
+    let mut command = with_verbosity(
+        sibling.map_or_else(|| command.clone(), |sibling| complete(&command, sibling)),
+    );
     if let Some(folder) = wanted.strip_prefix("man:") {
         return clap_mangen::generate_to(command, Path::new(folder));
     }
-    let shell: Shell = wanted.parse().map_err(|error: String| io::Error::new(io::ErrorKind::InvalidInput, error))?;
+    let shell: Shell = wanted
+        .parse()
+        .map_err(|error: String| io::Error::new(io::ErrorKind::InvalidInput, error))?;
     let name = command.get_name().to_owned();
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut command, name, &mut script);
@@ -95,10 +120,15 @@ fn generate(command: Command, sibling: Option<&Sibling>, wanted: &str) -> io::Re
 
 /// The command with the subcommands of a sibling; without their options where the sibling is not installed.
 fn complete(command: &Command, sibling: &Sibling) -> Command {
-    sibling.extend_described(command.clone()).unwrap_or_else(|error| {
-        output::note(format_args!("without the options of {}: {error}", sibling.program));
-        sibling.extend(command.clone())
-    })
+    sibling
+        .extend_described(command.clone())
+        .unwrap_or_else(|error| {
+            output::note(format_args!(
+                "without the options of {}: {error}",
+                sibling.program
+            ));
+            sibling.extend(command.clone())
+        })
 }
 
 #[cfg(test)]
@@ -133,7 +163,11 @@ mod tests {
             ("program act --quiet", Verbosity::Quiet),
         ] {
             let matches = of(line).unwrap();
-            assert_eq!(verbosity(matches.get_count("verbose"), matches.get_flag("quiet")), expected, "{line}");
+            assert_eq!(
+                verbosity(matches.get_count("verbose"), matches.get_flag("quiet")),
+                expected,
+                "{line}"
+            );
             let Sub::Act { fast } = Cli::from_arg_matches(&matches).unwrap().command;
             assert_eq!(fast, line.contains("--fast"));
         }
@@ -143,10 +177,23 @@ mod tests {
     #[test]
     fn manual_pages_are_written_and_an_unknown_shell_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        generate(Cli::command(), None, &format!("man:{}", folder.path().display())).unwrap();
-        let mut pages: Vec<_> = folder.path().read_dir().unwrap().map(|page| page.unwrap().file_name()).collect();
+        generate(
+            Cli::command(),
+            None,
+            &format!("man:{}", folder.path().display()),
+        )
+        .unwrap();
+        let mut pages: Vec<_> = folder
+            .path()
+            .read_dir()
+            .unwrap()
+            .map(|page| page.unwrap().file_name())
+            .collect();
         pages.sort();
-        assert!(pages.contains(&"program.1".into()) && pages.contains(&"program-act.1".into()), "{pages:?}");
+        assert!(
+            pages.contains(&"program.1".into()) && pages.contains(&"program-act.1".into()),
+            "{pages:?}"
+        );
         assert!(generate(Cli::command(), None, "tcsh").is_err());
     }
 }

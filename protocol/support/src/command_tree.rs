@@ -1,7 +1,9 @@
 //! Command tree: subcommands and options of a command line as data, so that one program completes and documents those
 //! of another.
 
-use clap::builder::{PossibleValue, PossibleValuesParser, Resettable, Str, StyledStr, ValueParser, ValueRange};
+use clap::builder::{
+    PossibleValue, PossibleValuesParser, Resettable, Str, StyledStr, ValueParser, ValueRange,
+};
 use clap::{Arg, ArgAction, ArgGroup, Command, ValueHint};
 use serde::{Deserialize, Serialize};
 
@@ -72,8 +74,12 @@ impl CommandTree {
     /// Describes a command that is not built yet.
     pub(crate) fn of(command: &Command) -> Self {
         let groups = command.get_groups().filter(|group| group.is_required_set());
-        let group =
-            |group: &ArgGroup| (group.get_id().to_string(), group.get_args().map(ToString::to_string).collect());
+        let group = |group: &ArgGroup| {
+            (
+                group.get_id().to_string(),
+                group.get_args().map(ToString::to_string).collect(),
+            )
+        };
         Self {
             name: command.get_name().to_owned(),
             about: text(command.get_about()),
@@ -81,7 +87,10 @@ impl CommandTree {
             after_help: text(command.get_after_help()),
             is_hidden: command.is_hide_set(),
             requires_subcommand: command.is_subcommand_required_set(),
-            arguments: command.get_arguments().map(|argument| ArgumentTree::of(command, argument)).collect(),
+            arguments: command
+                .get_arguments()
+                .map(|argument| ArgumentTree::of(command, argument))
+                .collect(),
             required_groups: groups.map(group).collect(),
             subcommands: command.get_subcommands().map(Self::of).collect(),
         }
@@ -90,7 +99,10 @@ impl CommandTree {
     /// The command, for completions and manual pages: it parses nothing.
     pub(crate) fn command(&self) -> Command {
         let group = |(id, members): &(String, Vec<String>)| {
-            ArgGroup::new(kept(id)).args(members.iter().map(|id| kept(id))).multiple(true).required(true)
+            ArgGroup::new(kept(id))
+                .args(members.iter().map(|id| kept(id)))
+                .multiple(true)
+                .required(true)
         };
         Command::new(kept(&self.name))
             .about(styled(&self.about))
@@ -113,9 +125,16 @@ impl ArgumentTree {
             _ => Kind::Flag,
         };
         let takes_values = argument.get_action().takes_values();
-        let values = if takes_values { argument.get_possible_values() } else { Vec::new() };
+        let values = if takes_values {
+            argument.get_possible_values()
+        } else {
+            Vec::new()
+        };
         let names = |names: &[_]| names.iter().map(ToString::to_string).collect();
-        let defaults = argument.get_default_values().iter().filter(|_| takes_values);
+        let defaults = argument
+            .get_default_values()
+            .iter()
+            .filter(|_| takes_values);
         Self {
             id: argument.get_id().to_string(),
             short: argument.get_short(),
@@ -124,10 +143,16 @@ impl ArgumentTree {
             long_help: text(argument.get_long_help()),
             heading: argument.get_help_heading().map(str::to_owned),
             kind,
-            num_args: argument.get_num_args().map(|range| (range.min_values(), range.max_values())),
+            num_args: argument
+                .get_num_args()
+                .map(|range| (range.min_values(), range.max_values())),
             value_names: argument.get_value_names().map(names).unwrap_or_default(),
-            hint: takes_values.then(|| hint_name(argument.get_value_hint())).flatten(),
-            default_values: defaults.map(|value| value.to_string_lossy().into_owned()).collect(),
+            hint: takes_values
+                .then(|| hint_name(argument.get_value_hint()))
+                .flatten(),
+            default_values: defaults
+                .map(|value| value.to_string_lossy().into_owned())
+                .collect(),
             hides_default: argument.is_hide_default_value_set(),
             values: values.iter().map(ValueTree::of).collect(),
             hides_values: argument.is_hide_possible_values_set(),
@@ -160,7 +185,10 @@ impl ArgumentTree {
             .long_help(styled(&self.long_help))
             .help_heading(name(&self.heading))
             .action(action)
-            .num_args(Resettable::from(self.num_args.map(|(least, most)| ValueRange::new(least..=most))))
+            .num_args(Resettable::from(
+                self.num_args
+                    .map(|(least, most)| ValueRange::new(least..=most)),
+            ))
             .value_names(self.value_names.iter().map(|name| kept(name)))
             .value_hint(hint)
             .default_values(self.default_values.iter().map(|value| kept(value)))
@@ -178,7 +206,11 @@ impl ArgumentTree {
 
 impl ValueTree {
     fn of(value: &PossibleValue) -> Self {
-        Self { name: value.get_name().to_owned(), help: text(value.get_help()), is_hidden: value.is_hide_set() }
+        Self {
+            name: value.get_name().to_owned(),
+            help: text(value.get_help()),
+            is_hidden: value.is_hide_set(),
+        }
     }
 
     fn value(&self) -> PossibleValue {
@@ -285,7 +317,10 @@ mod tests {
     fn told() -> Command {
         let json = serde_json::to_string(&CommandTree::of(&Program::command())).unwrap();
         let told: CommandTree = serde_json::from_str(&json).unwrap();
-        let own = Command::new("program").version(env!("CARGO_PKG_VERSION")).about("Does it").subcommand_required(true);
+        let own = Command::new("program")
+            .version(env!("CARGO_PKG_VERSION"))
+            .about("Does it")
+            .subcommand_required(true);
         own.arg_required_else_help(true)
             .after_help("Exit codes: 0 and 1.")
             .subcommands(told.command().get_subcommands())
@@ -309,7 +344,13 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             clap_mangen::generate_to(command, folder.path()).unwrap();
             let read = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
-            ["program.1", "program-train.1", "program-both.1", "program-both-second.1"].map(read)
+            [
+                "program.1",
+                "program-train.1",
+                "program-both.1",
+                "program-both-second.1",
+            ]
+            .map(read)
         };
         assert_eq!(pages(told()), pages(Program::command()));
     }

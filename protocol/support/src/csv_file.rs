@@ -81,12 +81,20 @@ impl CsvFile {
             return Ok(self);
         }
         let found = excerpt(found, SHOWN_CHARS);
-        Err(CsvError::Header { path: self.path, found, expected: self.header })
+        Err(CsvError::Header {
+            path: self.path,
+            found,
+            expected: self.header,
+        })
     }
 
     /// The rows below the header; lines without content are skipped.
     pub fn rows(&self) -> impl Iterator<Item = CsvRow<'_>> {
-        records(&self.text).skip(1).map(|(line, record)| CsvRow { file: self, line, record })
+        records(&self.text).skip(1).map(|(line, record)| CsvRow {
+            file: self,
+            line,
+            record,
+        })
     }
 }
 
@@ -106,15 +114,28 @@ impl CsvRow<'_> {
         if self.record.len() == expected {
             return Ok(self);
         }
-        Err(self.fault(format_args!("{:?} has {} columns, must be {expected}", self.shown(), self.record.len())))
+        Err(self.fault(format_args!(
+            "{:?} has {} columns, must be {expected}",
+            self.shown(),
+            self.record.len()
+        )))
     }
 
     /// A field as a number within `range`; `must` describes the allowed numbers.
     ///
     /// # Errors
     /// [`CsvError::Row`] states the field.
-    pub fn number(&self, column: usize, range: RangeInclusive<f64>, must: &str) -> Result<f64, CsvError> {
-        let number = self.field(column).parse().ok().filter(|number| range.contains(number));
+    pub fn number(
+        &self,
+        column: usize,
+        range: RangeInclusive<f64>,
+        must: &str,
+    ) -> Result<f64, CsvError> {
+        let number = self
+            .field(column)
+            .parse()
+            .ok()
+            .filter(|number| range.contains(number));
         number.ok_or_else(|| self.wrong(column, must))
     }
 
@@ -122,17 +143,27 @@ impl CsvRow<'_> {
     #[must_use]
     pub fn wrong(&self, column: usize, must: impl Display) -> CsvError {
         let name = self.file.header.split(',').nth(column).unwrap_or_default();
-        self.fault(format_args!("{name} is {:?}, must be {must}", excerpt(self.field(column), SHOWN_CHARS)))
+        self.fault(format_args!(
+            "{name} is {:?}, must be {must}",
+            excerpt(self.field(column), SHOWN_CHARS)
+        ))
     }
 
     /// The error for this row.
     #[must_use]
     pub fn fault(&self, problem: impl Display) -> CsvError {
-        CsvError::Row { path: self.file.path.clone(), line: self.line, problem: problem.to_string() }
+        CsvError::Row {
+            path: self.file.path.clone(),
+            line: self.line,
+            problem: problem.to_string(),
+        }
     }
 
     fn shown(&self) -> String {
-        excerpt(&self.record.iter().collect::<Vec<_>>().join(","), SHOWN_CHARS)
+        excerpt(
+            &self.record.iter().collect::<Vec<_>>().join(","),
+            SHOWN_CHARS,
+        )
     }
 }
 
@@ -153,7 +184,9 @@ pub fn records(text: &str) -> impl Iterator<Item = (u64, StringRecord)> {
     std::iter::from_fn(next).filter_map(|record| {
         let position = record.position()?;
         // The reader skips empty lines after it has stored the position.
-        let rest = text.as_bytes().get(usize::try_from(position.byte()).ok()?..)?;
+        let rest = text
+            .as_bytes()
+            .get(usize::try_from(position.byte()).ok()?..)?;
         let empty_lines = rest.iter().take_while(|byte| **byte == b'\n').count() as u64;
         let is_blank = record.iter().all(str::is_empty) && record.len() == 1;
         (!is_blank).then_some((position.line() + empty_lines, record))
@@ -198,7 +231,12 @@ mod tests {
     use super::*;
 
     fn file(text: &str) -> Result<CsvFile, CsvError> {
-        CsvFile { path: "a.csv".into(), header: "name,size_m", text: text.into() }.checked()
+        CsvFile {
+            path: "a.csv".into(),
+            header: "name,size_m",
+            text: text.into(),
+        }
+        .checked()
     }
 
     #[test]
@@ -210,13 +248,24 @@ mod tests {
         assert_eq!(text, "name,size_m\n\"a, \"\"b\"\"\",1.5\nno_pose\n");
         let file = file(&text).unwrap();
         let rows: Vec<CsvRow<'_>> = file.rows().collect();
-        assert_eq!((rows.len(), rows[0].field(0), rows[1].field(0), rows[1].field(1)), (2, "a, \"b\"", "no_pose", ""));
+        assert_eq!(
+            (
+                rows.len(),
+                rows[0].field(0),
+                rows[1].field(0),
+                rows[1].field(1)
+            ),
+            (2, "a, \"b\"", "no_pose", "")
+        );
         assert_eq!(rows[0].number(1, 0.0..=2.0, "0 to 2").unwrap(), 1.5);
     }
 
     #[test]
     fn lines_are_counted_with_blank_ones_and_either_line_end() {
-        for text in ["name,size_m\n\n \na,1\n\nb,2", "name,size_m\r\n\r\n \r\na,1\r\n\r\nb,2\r\n"] {
+        for text in [
+            "name,size_m\n\n \na,1\n\nb,2",
+            "name,size_m\r\n\r\n \r\na,1\r\n\r\nb,2\r\n",
+        ] {
             let file = file(text).unwrap();
             let rows: Vec<(u64, String)> = file.rows().map(|row| (row.line, row.shown())).collect();
             assert_eq!(rows, [(4, "a,1".into()), (6, "b,2".into())], "{text:?}");
@@ -229,15 +278,32 @@ mod tests {
         let message = |row: &str| {
             let file = file_with(row);
             let row = file.rows().next().unwrap();
-            row.complete().and_then(|row| row.number(1, 0.0..=1.0, "0 to 1")).unwrap_err().to_string()
+            row.complete()
+                .and_then(|row| row.number(1, 0.0..=1.0, "0 to 1"))
+                .unwrap_err()
+                .to_string()
         };
         assert_eq!(message("a,2"), "a.csv:2: size_m is \"2\", must be 0 to 1");
-        assert_eq!(message("a,NaN"), "a.csv:2: size_m is \"NaN\", must be 0 to 1");
-        assert_eq!(message("a,1,2"), "a.csv:2: \"a,1,2\" has 3 columns, must be 2");
-        assert_eq!(message("\"a,1"), "a.csv:2: \"a,1\" has 1 columns, must be 2");
-        assert_eq!(file("x,y\n").unwrap_err().to_string(), "a.csv:1: header is \"x,y\", must be \"name,size_m\"");
+        assert_eq!(
+            message("a,NaN"),
+            "a.csv:2: size_m is \"NaN\", must be 0 to 1"
+        );
+        assert_eq!(
+            message("a,1,2"),
+            "a.csv:2: \"a,1,2\" has 3 columns, must be 2"
+        );
+        assert_eq!(
+            message("\"a,1"),
+            "a.csv:2: \"a,1\" has 1 columns, must be 2"
+        );
+        assert_eq!(
+            file("x,y\n").unwrap_err().to_string(),
+            "a.csv:1: header is \"x,y\", must be \"name,size_m\""
+        );
         assert!(file("").is_err());
-        let error = CsvFile::read(Path::new("/nowhere/a.csv"), "x", 9).unwrap_err().to_string();
+        let error = CsvFile::read(Path::new("/nowhere/a.csv"), "x", 9)
+            .unwrap_err()
+            .to_string();
         assert!(error.starts_with("/nowhere/a.csv: "), "{error}");
     }
 }

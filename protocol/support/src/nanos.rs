@@ -28,9 +28,21 @@ mod tests {
 
     #[test]
     fn times_out_of_range_become_the_nearest_in_range() {
-        assert_eq!((of(Duration::from_micros(3)), of(Duration::MAX)), (3_000, u64::MAX));
-        assert_eq!([1.5, -1.0, f64::NAN, 1e300].map(of_ms), [1_500_000, 0, 0, u64::MAX]);
+        assert_eq!(
+            (of(Duration::from_micros(3)), of(Duration::MAX)),
+            (3_000, u64::MAX)
+        );
+        assert_eq!(
+            [1.5, -1.0, f64::NAN, 1e300].map(of_ms),
+            [1_500_000, 0, 0, u64::MAX]
+        );
         let now = Instant::now();
-        assert_eq!((between(now, now + Duration::from_nanos(7)), between(now + Duration::from_nanos(7), now)), (7, 0));
+        assert_eq!(
+            (
+                between(now, now + Duration::from_nanos(7)),
+                between(now + Duration::from_nanos(7), now)
+            ),
+            (7, 0)
+        );
     }
 }

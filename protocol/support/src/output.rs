@@ -31,8 +31,15 @@ pub fn set_verbosity(verbosity: Verbosity) {
 #[must_use]
 pub fn verbosity() -> Verbosity {
     let set = VERBOSITY.load(Ordering::Relaxed);
-    let all = [Verbosity::Quiet, Verbosity::Usual, Verbosity::Debug, Verbosity::Trace];
-    all.into_iter().find(|verbosity| *verbosity as u8 == set).unwrap_or(Verbosity::Usual)
+    let all = [
+        Verbosity::Quiet,
+        Verbosity::Usual,
+        Verbosity::Debug,
+        Verbosity::Trace,
+    ];
+    all.into_iter()
+        .find(|verbosity| *verbosity as u8 == set)
+        .unwrap_or(Verbosity::Usual)
 }
 
 /// Prints a line to standard output.
@@ -67,7 +74,10 @@ pub fn error(line: impl Display) {
 fn print(mut to: impl Write, text: impl Display) -> io::Result<()> {
     match write!(to, "{text}").and_then(|()| to.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
-        Err(error) => Err(io::Error::new(error.kind(), format!("cannot write to standard output: {error}"))),
+        Err(error) => Err(io::Error::new(
+            error.kind(),
+            format!("cannot write to standard output: {error}"),
+        )),
         Ok(()) => Ok(()),
     }
 }

@@ -9,19 +9,28 @@ use crate::output::{Verbosity, verbosity};
 /// A bar over `total` steps with the name `unit`, for example `frames`; its message, if any, is behind it.
 #[must_use]
 pub fn bar(total: usize, unit: &str) -> ProgressBar {
-    with_template(total, &format!("{{bar:30}} {{pos}}/{{len}} {unit}  {{eta}} left  {{msg}}"))
+    with_template(
+        total,
+        &format!("{{bar:30}} {{pos}}/{{len}} {unit}  {{eta}} left  {{msg}}"),
+    )
 }
 
 /// A bar over 1000 steps for each of `count` parts, which displays per cent.
 #[must_use]
 pub fn percent_bar(count: usize) -> ProgressBar {
-    with_template(1000 * count, "{bar:30} {percent} %  {elapsed}, {eta} left  {msg}")
+    with_template(
+        1000 * count,
+        "{bar:30} {percent} %  {elapsed}, {eta} left  {msg}",
+    )
 }
 
 /// A counter of steps with the name `unit`, for an unknown total.
 #[must_use]
 pub fn spinner(unit: &str) -> ProgressBar {
-    styled(ProgressBar::new_spinner(), &format!("{{spinner}} {{pos}} {unit}  {{msg}}"))
+    styled(
+        ProgressBar::new_spinner(),
+        &format!("{{spinner}} {{pos}} {unit}  {{msg}}"),
+    )
 }
 
 fn with_template(total: usize, template: &str) -> ProgressBar {

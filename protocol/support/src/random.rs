@@ -34,7 +34,9 @@ impl SplitMix64 {
     /// overlap in practice, and no stream depends on the number of draws of another.
     #[must_use]
     pub fn derived(seed: u64, purpose: &[u64]) -> Self {
-        Self { state: derive_seed(seed, purpose) }
+        Self {
+            state: derive_seed(seed, purpose),
+        }
     }
 
     /// Uniform random number in 0..1.
@@ -49,7 +51,10 @@ impl SplitMix64 {
     }
 
     /// Uniform integer in `0..count`; 0 if `count` is 0.
-    #[expect(clippy::cast_possible_truncation, reason = "the product's upper half is below `count`")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the product's upper half is below `count`"
+    )]
     pub fn below(&mut self, count: usize) -> usize {
         ((u128::from(self.next_u64()) * count as u128) >> 64) as usize
     }
@@ -84,7 +89,10 @@ impl RngCore for SplitMix64 {
 
     fn fill_bytes(&mut self, bytes: &mut [u8]) {
         for chunk in bytes.chunks_mut(8) {
-            chunk.iter_mut().zip(self.next_u64().to_le_bytes()).for_each(|(byte, random)| *byte = random);
+            chunk
+                .iter_mut()
+                .zip(self.next_u64().to_le_bytes())
+                .for_each(|(byte, random)| *byte = random);
         }
     }
 }
@@ -92,9 +100,12 @@ impl RngCore for SplitMix64 {
 /// A seed for one purpose under another seed.
 #[must_use]
 pub fn derive_seed(seed: u64, purpose: &[u64]) -> u64 {
-    purpose.iter().fold(mix(seed ^ 0x5851_f42d_4c95_7f2d), |state, &label| {
-        mix(state.wrapping_add(0x9e37_79b9_7f4a_7c15) ^ mix(label.wrapping_add(0x1405_7b7e_f767_814f)))
-    })
+    purpose
+        .iter()
+        .fold(mix(seed ^ 0x5851_f42d_4c95_7f2d), |state, &label| {
+            mix(state.wrapping_add(0x9e37_79b9_7f4a_7c15)
+                ^ mix(label.wrapping_add(0x1405_7b7e_f767_814f)))
+        })
 }
 
 fn mix(mut z: u64) -> u64 {
@@ -134,8 +145,12 @@ mod tests {
         let mut random = SplitMix64::new(7);
         let draws: Vec<f64> = (0..100_000).map(|_| random.unit()).collect();
         let mean = draws.iter().sum::<f64>() / draws.len() as f64;
-        let variance = draws.iter().map(|draw| (draw - mean).powi(2)).sum::<f64>() / draws.len() as f64;
-        assert!((mean - 0.5).abs() < 0.005 && (variance - 1.0 / 12.0).abs() < 0.002, "{mean} {variance}");
+        let variance =
+            draws.iter().map(|draw| (draw - mean).powi(2)).sum::<f64>() / draws.len() as f64;
+        assert!(
+            (mean - 0.5).abs() < 0.005 && (variance - 1.0 / 12.0).abs() < 0.002,
+            "{mean} {variance}"
+        );
     }
 
     #[test]

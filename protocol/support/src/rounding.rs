@@ -2,7 +2,11 @@
 
 /// The nearest integer; 0 for negative values and for NaN, the largest integer for values beyond it.
 #[must_use]
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cast from a float saturates")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a cast from a float saturates"
+)]
 pub fn to_u64(value: f64) -> u64 {
     value.round() as u64
 }

@@ -10,7 +10,11 @@ const FROM_PROGRAMS: [&str; 2] = ["../share/v2vloc", "../../deploy"];
 /// first.
 #[must_use]
 pub fn shared(name: &str) -> Vec<PathBuf> {
-    let programs = env::current_exe().ok().and_then(|own| own.parent().map(Path::to_owned));
-    let places = programs.iter().flat_map(|folder| FROM_PROGRAMS.map(|place| folder.join(place).join(name)));
+    let programs = env::current_exe()
+        .ok()
+        .and_then(|own| own.parent().map(Path::to_owned));
+    let places = programs
+        .iter()
+        .flat_map(|folder| FROM_PROGRAMS.map(|place| folder.join(place).join(name)));
     places.filter(|place| place.exists()).collect()
 }

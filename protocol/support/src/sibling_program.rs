@@ -31,11 +31,23 @@ pub struct Sibling {
 impl Sibling {
     /// Adds the subcommands to `command`. Their options are known to the program only.
     pub(crate) fn extend(&self, command: Command) -> Command {
-        let rest =
-            || Arg::new(REST).action(ArgAction::Append).value_parser(clap::value_parser!(OsString)).num_args(0..);
-        let rest = || rest().trailing_var_arg(true).allow_hyphen_values(true).hide(true);
+        let rest = || {
+            Arg::new(REST)
+                .action(ArgAction::Append)
+                .value_parser(clap::value_parser!(OsString))
+                .num_args(0..)
+        };
+        let rest = || {
+            rest()
+                .trailing_var_arg(true)
+                .allow_hyphen_values(true)
+                .hide(true)
+        };
         let stub = |(name, about): &(&'static str, &'static str)| {
-            Command::new(*name).about(*about).disable_help_flag(true).arg(rest())
+            Command::new(*name)
+                .about(*about)
+                .disable_help_flag(true)
+                .arg(rest())
         };
         command.subcommands(self.subcommands.iter().map(stub))
     }
@@ -45,22 +57,39 @@ impl Sibling {
     /// # Errors
     /// The system's if the program cannot be executed; also when it does not describe its subcommands.
     pub(crate) fn extend_described(&self, command: Command) -> io::Result<Command> {
-        let output = process::Command::new(self.path()).env(GENERATE, DESCRIPTION).output()?;
+        let output = process::Command::new(self.path())
+            .env(GENERATE, DESCRIPTION)
+            .output()?;
         let described: CommandTree = serde_json::from_slice(&output.stdout)?;
         let subcommand = |(name, _): &(&'static str, &'static str)| {
-            let known = described.subcommands.iter().find(|known| known.name == *name);
-            known.map(CommandTree::command).ok_or_else(|| io::Error::other(format!("it has no subcommand {name}")))
+            let known = described
+                .subcommands
+                .iter()
+                .find(|known| known.name == *name);
+            known
+                .map(CommandTree::command)
+                .ok_or_else(|| io::Error::other(format!("it has no subcommand {name}")))
         };
-        let subcommands = self.subcommands.iter().map(subcommand).collect::<io::Result<Vec<_>>>()?;
+        let subcommands = self
+            .subcommands
+            .iter()
+            .map(subcommand)
+            .collect::<io::Result<Vec<_>>>()?;
         Ok(command.subcommands(subcommands))
     }
 
     /// Replaces this process by the program if the arguments ask for the help of one of the subcommands. Returns only
     /// otherwise or on failure.
-    pub(crate) fn exec_help(&self, mut arguments: impl Iterator<Item = OsString>) -> Option<io::Error> {
+    pub(crate) fn exec_help(
+        &self,
+        mut arguments: impl Iterator<Item = OsString>,
+    ) -> Option<io::Error> {
         let [_, help] = [arguments.next()?, arguments.next()?];
         let rest: Vec<OsString> = arguments.collect();
-        let name = rest.first()?.to_str().filter(|name| help == "help" && self.has(name))?;
+        let name = rest
+            .first()?
+            .to_str()
+            .filter(|name| help == "help" && self.has(name))?;
         Some(self.exec(name, [&help].into_iter().chain(&rest)))
     }
 
@@ -84,14 +113,24 @@ impl Sibling {
             Verbosity::Trace => &["-vv"],
         };
         let path = self.path();
-        let error = process::Command::new(&path).args(verbosity).args(arguments).exec();
-        io::Error::new(error.kind(), format!("{name} is part of the program {}: {error}", path.display()))
+        let error = process::Command::new(&path)
+            .args(verbosity)
+            .args(arguments)
+            .exec();
+        io::Error::new(
+            error.kind(),
+            format!("{name} is part of the program {}: {error}", path.display()),
+        )
     }
 
     /// The program of the same folder, or else the one in `PATH`.
     fn path(&self) -> PathBuf {
-        let beside = env::current_exe().ok().map(|own| own.with_file_name(self.program));
-        beside.filter(|path| path.exists()).unwrap_or_else(|| self.program.into())
+        let beside = env::current_exe()
+            .ok()
+            .map(|own| own.with_file_name(self.program));
+        beside
+            .filter(|path| path.exists())
+            .unwrap_or_else(|| self.program.into())
     }
 }
 
@@ -99,8 +138,10 @@ impl Sibling {
 mod tests {
     use super::*;
 
-    const SIBLING: Sibling =
-        Sibling { program: "/no/program", subcommands: &[("train", "Train"), ("eval", "Evaluate")] };
+    const SIBLING: Sibling = Sibling {
+        program: "/no/program",
+        subcommands: &[("train", "Train"), ("eval", "Evaluate")],
+    };
 
     fn failure(line: &str) -> Option<String> {
         let words = || line.split(' ').map(OsString::from);
@@ -112,18 +153,32 @@ mod tests {
 
     #[test]
     fn a_program_that_is_missing_is_named() {
-        for line in ["program train --fast -v x", "program train --help", "program help train"] {
+        for line in [
+            "program train --fast -v x",
+            "program train --help",
+            "program help train",
+        ] {
             let message = failure(line).unwrap();
-            assert!(message.starts_with("train is part of the program /no/program: "), "{line}: {message}");
+            assert!(
+                message.starts_with("train is part of the program /no/program: "),
+                "{line}: {message}"
+            );
         }
         assert_eq!(failure("program run"), None);
     }
 
     #[test]
     fn everything_behind_the_name_is_passed_on() {
-        let matches =
-            SIBLING.extend(Command::new("program")).get_matches_from(["program", "eval", "--a=1", "-h", "--", "b"]);
-        let rest: Vec<_> = matches.subcommand().unwrap().1.get_many::<OsString>(REST).unwrap().collect();
+        let matches = SIBLING
+            .extend(Command::new("program"))
+            .get_matches_from(["program", "eval", "--a=1", "-h", "--", "b"]);
+        let rest: Vec<_> = matches
+            .subcommand()
+            .unwrap()
+            .1
+            .get_many::<OsString>(REST)
+            .unwrap()
+            .collect();
         assert_eq!(rest, ["--a=1", "-h", "--", "b"]);
     }
 }

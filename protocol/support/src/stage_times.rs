@@ -15,7 +15,10 @@ impl StageTimes {
     /// Starts the first stage now.
     #[must_use]
     pub fn start() -> Self {
-        Self { last: Instant::now(), timings: Vec::new() }
+        Self {
+            last: Instant::now(),
+            timings: Vec::new(),
+        }
     }
 
     /// Ends a stage and starts the next one; returns its duration.
@@ -47,6 +50,12 @@ mod tests {
         let second = times.lap("second");
         assert!(first >= Duration::from_millis(2) && first + second <= began.elapsed());
         let timings = times.into_timings();
-        assert_eq!(timings, [StageTiming::new("first", first), StageTiming::new("second", second)]);
+        assert_eq!(
+            timings,
+            [
+                StageTiming::new("first", first),
+                StageTiming::new("second", second)
+            ]
+        );
     }
 }

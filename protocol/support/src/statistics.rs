@@ -20,15 +20,27 @@ pub fn sorted(values: &[f64]) -> Vec<f64> {
 /// Every p50, p95 and p99 of a report is computed here. Order statistics that a fitted model takes as its input are not
 /// percentiles of a report and keep the rule with which the model was fitted.
 #[must_use]
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cast from a float saturates")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a cast from a float saturates"
+)]
 pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
     let last = sorted.len().checked_sub(1)?;
     let rank = q * last as f64;
     let below = (rank.floor() as usize).min(last);
     let above = (below + 1).min(last);
-    let (low, high, share) = (*sorted.get(below)?, *sorted.get(above)?, rank - below as f64);
+    let (low, high, share) = (
+        *sorted.get(below)?,
+        *sorted.get(above)?,
+        rank - below as f64,
+    );
     // The difference of infinite values is undefined.
-    Some(if share == 0.0 || low == high { low } else { low + (high - low) * share })
+    Some(if share == 0.0 || low == high {
+        low
+    } else {
+        low + (high - low) * share
+    })
 }
 
 /// The median of a sample in any order; `None` for an empty one.
@@ -48,9 +60,15 @@ mod tests {
         assert_eq!(quantile(&five, 0.5), Some(3.0));
         assert!((quantile(&five, 0.95).unwrap() - 4.8).abs() < 1e-12);
         let four = [1.0, 2.0, 3.0, 4.0];
-        assert_eq!([0.0, 0.5, 1.0].map(|q| quantile(&four, q)), [Some(1.0), Some(2.5), Some(4.0)]);
+        assert_eq!(
+            [0.0, 0.5, 1.0].map(|q| quantile(&four, q)),
+            [Some(1.0), Some(2.5), Some(4.0)]
+        );
         assert_eq!((median(&[4.0, 1.0, 3.0]), median(&[])), (Some(3.0), None));
-        assert_eq!((quantile(&[], 0.5), mean(&[]), mean(&four)), (None, None, Some(2.5)));
+        assert_eq!(
+            (quantile(&[], 0.5), mean(&[]), mean(&four)),
+            (None, None, Some(2.5))
+        );
     }
 
     #[test]
@@ -58,7 +76,12 @@ mod tests {
         let sample = [1.0, f64::INFINITY, f64::INFINITY];
         assert_eq!(
             [0.0, 0.25, 0.5, 0.75].map(|q| quantile(&sample, q)),
-            [Some(1.0), Some(f64::INFINITY), Some(f64::INFINITY), Some(f64::INFINITY)]
+            [
+                Some(1.0),
+                Some(f64::INFINITY),
+                Some(f64::INFINITY),
+                Some(f64::INFINITY)
+            ]
         );
     }
 }

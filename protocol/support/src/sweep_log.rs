@@ -20,7 +20,11 @@ impl SweepLog {
     /// # Errors
     /// The system's, if the file cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
-        OpenOptions::new().create(true).append(true).open(path).map(Self)
+        OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(path)
+            .map(Self)
     }
 
     /// Appends a sweep.
@@ -28,7 +32,8 @@ impl SweepLog {
     /// # Errors
     /// The system's, if the file cannot be written.
     pub fn note(&mut self, capture_nanos: u64, arrived_nanos: u64) -> io::Result<()> {
-        self.0.write_all(format!("{capture_nanos},{arrived_nanos}\n").as_bytes())
+        self.0
+            .write_all(format!("{capture_nanos},{arrived_nanos}\n").as_bytes())
     }
 }
 
@@ -40,7 +45,9 @@ pub fn read(path: &Path) -> io::Result<BTreeMap<u64, u64>> {
     let mut arrived = BTreeMap::new();
     for line in BufReader::new(File::open(path)?.take(MOST_BYTES)).lines() {
         let line = line?;
-        let numbers = line.split_once(',').map(|(at, came)| (at.parse::<u64>(), came.parse::<u64>()));
+        let numbers = line
+            .split_once(',')
+            .map(|(at, came)| (at.parse::<u64>(), came.parse::<u64>()));
         if let Some((Ok(at), Ok(came))) = numbers {
             arrived.insert(at, came);
         }
@@ -57,11 +64,17 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("sweeps.csv");
         assert!(read(&path).is_err());
-        SweepLog::open(&path).unwrap().note(100, 1_700_000_000_000_000_000).unwrap();
+        SweepLog::open(&path)
+            .unwrap()
+            .note(100, 1_700_000_000_000_000_000)
+            .unwrap();
         let mut log = SweepLog::open(&path).unwrap();
         log.note(200, 1_700_000_000_100_000_000).unwrap();
         log.0.write_all(b"300,").unwrap();
-        let expected = BTreeMap::from([(100, 1_700_000_000_000_000_000), (200, 1_700_000_000_100_000_000)]);
+        let expected = BTreeMap::from([
+            (100, 1_700_000_000_000_000_000),
+            (200, 1_700_000_000_100_000_000),
+        ]);
         assert_eq!(read(&path).unwrap(), expected);
     }
 }

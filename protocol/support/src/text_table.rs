@@ -45,7 +45,9 @@ impl TextTable {
 
 impl fmt::Display for TextTable {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.lines().try_for_each(|line| writeln!(f, "{}", line.trim_end()))
+        self.0
+            .lines()
+            .try_for_each(|line| writeln!(f, "{}", line.trim_end()))
     }
 }
 
@@ -61,9 +63,16 @@ mod tests {
 
     #[test]
     fn texts_are_left_aligned_and_numbers_right_aligned() {
-        let mut table = TextTable::new([("name", Side::Left), ("size", Side::Right), ("note", Side::Left)]);
+        let mut table = TextTable::new([
+            ("name", Side::Left),
+            ("size", Side::Right),
+            ("note", Side::Left),
+        ]);
         table.row(["a".to_owned(), "1.5".to_owned(), "largest".to_owned()]);
         table.row(["longer".to_owned(), "12345".to_owned(), String::new()]);
-        assert_eq!(table.to_string(), "name     size  note\na         1.5  largest\nlonger  12345\n");
+        assert_eq!(
+            table.to_string(),
+            "name     size  note\na         1.5  largest\nlonger  12345\n"
+        );
     }
 }

@@ -12,33 +12,61 @@ pub(crate) fn cav(text: &str) -> CavId {
 }
 
 pub(crate) fn stamp() -> Stamp {
-    Stamp { cav: cav("4279"), epoch: 77, sequence: 12, capture_nanos: 1_500_000_000, publish_nanos: 1_600_000_000 }
+    Stamp {
+        cav: cav("4279"),
+        epoch: 77,
+        sequence: 12,
+        capture_nanos: 1_500_000_000,
+        publish_nanos: 1_600_000_000,
+    }
 }
 
 pub(crate) fn grid() -> BevGrid {
-    BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 16, height: 12 }
+    BevGrid {
+        x_min_m: -51.2,
+        y_min_m: -38.4,
+        cell_m: 0.8,
+        width: 16,
+        height: 12,
+    }
 }
 
 /// `[3, 12, 16]` with values of both signs and different sizes per channel.
 pub(crate) fn features() -> BevFeatures {
-    let values = (0..3 * 12 * 16).map(|index| ((index * 37 % 101) as f32 - 50.0) * 0.1 * (1 + index / 192) as f32);
-    BevFeatures { grid: grid(), channels: 3, code_of: None, values: values.collect() }
+    let values = (0..3 * 12 * 16)
+        .map(|index| ((index * 37 % 101) as f32 - 50.0) * 0.1 * (1 + index / 192) as f32);
+    BevFeatures {
+        grid: grid(),
+        channels: 3,
+        code_of: None,
+        values: values.collect(),
+    }
 }
 
 pub(crate) fn confidence() -> Vec<f32> {
-    (0..12 * 16).map(|cell| (cell * 29 % 97) as f32 / 97.0).collect()
+    (0..12 * 16)
+        .map(|cell| (cell * 29 % 97) as f32 / 97.0)
+        .collect()
 }
 
 /// Rotated by 2 atan(3/4), in numbers that are the same on every machine.
 fn pose_at(translation_m: [f64; 3]) -> Pose {
-    Pose { translation_m, rotation_wxyz: [0.8, 0.0, 0.0, 0.6] }
+    Pose {
+        translation_m,
+        rotation_wxyz: [0.8, 0.0, 0.0, 0.6],
+    }
 }
 
 pub(crate) fn tracked_pose() -> PoseEstimate {
     PoseEstimate::Pose {
         world_from_cav: pose_at([120.5, -30.25, 1.75]),
         confidence: 0.875,
-        covariance: Some(PlanarCovariance { xx_m2: 0.04, xy_m2: -0.01, yy_m2: 0.09, yaw_rad2: 0.0001 }),
+        covariance: Some(PlanarCovariance {
+            xx_m2: 0.04,
+            xy_m2: -0.01,
+            yy_m2: 0.09,
+            yaw_rad2: 0.0001,
+        }),
     }
 }
 
@@ -47,12 +75,31 @@ pub(crate) fn pose() -> PoseEstimate {
 }
 
 pub(crate) fn points() -> PointCloud {
-    PointCloud { xyzi: (0..100u8).map(|n| [f32::from(n), -0.5 * f32::from(n), 0.25, f32::from(n) / 255.0]).collect() }
+    PointCloud {
+        xyzi: (0..100u8)
+            .map(|n| {
+                [
+                    f32::from(n),
+                    -0.5 * f32::from(n),
+                    0.25,
+                    f32::from(n) / 255.0,
+                ]
+            })
+            .collect(),
+    }
 }
 
 fn detection(score: f32) -> Detection {
-    let box3d = Box3d { center_m: [10.0, -3.5, 0.4], size_m: [4.2, 1.8, 1.5], heading_rad: -0.3 };
-    Detection { box3d, score, source: Some(cav("-1")) }
+    let box3d = Box3d {
+        center_m: [10.0, -3.5, 0.4],
+        size_m: [4.2, 1.8, 1.5],
+        heading_rad: -0.3,
+    };
+    Detection {
+        box3d,
+        score,
+        source: Some(cav("-1")),
+    }
 }
 
 /// A feature map in every codec: dtype times selection times compression.
@@ -61,7 +108,12 @@ pub(crate) fn every_codec() -> Vec<CodecConfig> {
     for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
         for budget_bytes in [None, Some(400)] {
             for zstd_level in [None, Some(3)] {
-                configs.push(CodecConfig { dtype, budget_bytes, zstd_level, gate: None });
+                configs.push(CodecConfig {
+                    dtype,
+                    budget_bytes,
+                    zstd_level,
+                    gate: None,
+                });
             }
         }
     }
@@ -69,20 +121,41 @@ pub(crate) fn every_codec() -> Vec<CodecConfig> {
 }
 
 pub(crate) fn bev(config: &CodecConfig) -> Bev {
-    Bev { pose: pose(), features: encode_features(features(), config, Some(&confidence())).unwrap() }
+    Bev {
+        pose: pose(),
+        features: encode_features(features(), config, Some(&confidence())).unwrap(),
+    }
 }
 
 /// A feature map that had to keep within a limit.
 pub(crate) fn adapted_bev() -> Bev {
-    let limit = ByteLimit { bytes: 600, by: LimitedBy::Queue };
-    let features = encode_within(features(), &CodecConfig::default(), &limit, Some(&confidence())).unwrap();
-    Bev { pose: pose(), features }
+    let limit = ByteLimit {
+        bytes: 600,
+        by: LimitedBy::Queue,
+    };
+    let features = encode_within(
+        features(),
+        &CodecConfig::default(),
+        &limit,
+        Some(&confidence()),
+    )
+    .unwrap();
+    Bev {
+        pose: pose(),
+        features,
+    }
 }
 
 /// A code of three channels for a feature map of 24.
 pub(crate) fn compressed_bev() -> Bev {
-    let features = BevFeatures { code_of: Some(24), ..features() };
-    Bev { pose: pose(), features: encode_features(features, &CodecConfig::default(), None).unwrap() }
+    let features = BevFeatures {
+        code_of: Some(24),
+        ..features()
+    };
+    Bev {
+        pose: pose(),
+        features: encode_features(features, &CodecConfig::default(), None).unwrap(),
+    }
 }
 
 pub(crate) fn ledger() -> Ledger {
@@ -112,11 +185,22 @@ pub(crate) fn detections() -> Detections {
             wire_bytes: 24_800,
         }],
         skipped: vec![
-            SkippedNeighbour { cav: cav("-1"), reason: None },
-            SkippedNeighbour { cav: cav("7"), reason: Some(DropReason::Stale) },
+            SkippedNeighbour {
+                cav: cav("-1"),
+                reason: None,
+            },
+            SkippedNeighbour {
+                cav: cav("7"),
+                reason: Some(DropReason::Stale),
+            },
         ],
         neighbours: vec![
-            NeighbourState { cav: cav("4288"), trust: Some(0.75), misbehaviour: None, clock_offset_s: Some(-0.002) },
+            NeighbourState {
+                cav: cav("4288"),
+                trust: Some(0.75),
+                misbehaviour: None,
+                clock_offset_s: Some(-0.002),
+            },
             NeighbourState {
                 cav: cav("7"),
                 trust: Some(0.0),
@@ -139,9 +223,19 @@ fn truth() -> Truth {
     let agent = |name| AgentTruth {
         cav: cav(name),
         world_from_lidar: pose_at([5.0, 5.0, 2.0]),
-        objects: vec![object.clone(), TrueObject { id: 18, speed_mps: None, ..object.clone() }],
+        objects: vec![
+            object.clone(),
+            TrueObject {
+                id: 18,
+                speed_mps: None,
+                ..object.clone()
+            },
+        ],
     };
-    Truth { tick: 9, agents: vec![agent("4279"), agent("-1")] }
+    Truth {
+        tick: 9,
+        agents: vec![agent("4279"), agent("-1")],
+    }
 }
 
 pub(crate) fn camera() -> Camera {
@@ -149,10 +243,18 @@ pub(crate) fn camera() -> Camera {
         format: ImageFormat::Png,
         width_px: 480,
         height_px: 300,
-        pinhole: Some(Pinhole { fx_px: 201.5, fy_px: 201.25, cx_px: 240.0, cy_px: 150.0 }),
+        pinhole: Some(Pinhole {
+            fx_px: 201.5,
+            fy_px: 201.25,
+            cx_px: 240.0,
+            cy_px: 150.0,
+        }),
         lidar_from_camera: Some(pose_at([3.0, 0.0, -0.9])),
     };
-    Camera { metadata, image: (0..200u8).collect() }
+    Camera {
+        metadata,
+        image: (0..200u8).collect(),
+    }
 }
 
 pub(crate) fn every_kind() -> Vec<Message> {
@@ -163,8 +265,14 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Message::Lidar(Lidar::default()),
         Message::Radar(Radar { points: points() }),
         Message::Camera(camera()),
-        Message::Pace(Pace { interval_nanos: 200_000_000, phase_nanos: 1_500_000_000 }),
-        Message::Imu(EgoMotion { speed_mps: Some(8.25), yaw_rate_rad_s: None }),
+        Message::Pace(Pace {
+            interval_nanos: 200_000_000,
+            phase_nanos: 1_500_000_000,
+        }),
+        Message::Imu(EgoMotion {
+            speed_mps: Some(8.25),
+            yaw_rate_rad_s: None,
+        }),
         Message::Gnss(Gnss {
             world_from_lidar: pose_at([1.0, 2.0, 3.0]),
             position_std_m: 0.4,
@@ -173,9 +281,18 @@ pub(crate) fn every_kind() -> Vec<Message> {
         }),
         Message::Pose(pose()),
         Message::Pose(tracked_pose()),
-        Message::Pose(PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 4 }),
-        Message::Boxes(Boxes { pose: pose(), detections: vec![detection(0.25); 5] }),
-        Message::Points(Points { pose: pose(), points: points() }),
+        Message::Pose(PoseEstimate::NoPose {
+            reason: NoPoseReason::TooFewInliers,
+            inlier_count: 4,
+        }),
+        Message::Boxes(Boxes {
+            pose: pose(),
+            detections: vec![detection(0.25); 5],
+        }),
+        Message::Points(Points {
+            pose: pose(),
+            points: points(),
+        }),
         Message::Descriptor(Descriptor {
             model_hash: ModelHash(std::array::from_fn(|index| index as u8)),
             grid: grid(),
@@ -196,8 +313,16 @@ pub(crate) fn every_kind() -> Vec<Message> {
                 p99_ms: 3.0,
                 max_ms: 4.0,
             }],
-            usage: ProcessUsage { cpu_s: 1.5, resident_bytes: 1 << 20, peak_resident_bytes: 2 << 20 },
-            traffic: vec![TopicTraffic { topic: "4279/bev".parse().unwrap(), messages: 3, bytes: 4_500_000 }],
+            usage: ProcessUsage {
+                cpu_s: 1.5,
+                resident_bytes: 1 << 20,
+                peak_resident_bytes: 2 << 20,
+            },
+            traffic: vec![TopicTraffic {
+                topic: "4279/bev".parse().unwrap(),
+                messages: 3,
+                bytes: 4_500_000,
+            }],
         }),
     ];
     messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));
@@ -209,8 +334,17 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Control::Resume,
         Control::Step { ticks: 2 },
         Control::Seek { tick: 5 },
-        Control::End { ticks: 100, sent: vec![TopicCount { topic: topic.clone(), messages: 100 }] },
-        Control::Ready { process: process.clone(), subscribed: vec![topic] },
+        Control::End {
+            ticks: 100,
+            sent: vec![TopicCount {
+                topic: topic.clone(),
+                messages: 100,
+            }],
+        },
+        Control::Ready {
+            process: process.clone(),
+            subscribed: vec![topic],
+        },
         Control::Probe,
         Control::Done { process, tick: 4 },
     ];

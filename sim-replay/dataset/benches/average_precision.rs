@@ -14,7 +14,11 @@ use rand_chacha::ChaCha8Rng;
 fn frame(rng: &mut impl Rng) -> (Vec<Detection>, Vec<Box3d>) {
     let objects: Vec<Box3d> = (0..25)
         .map(|_| Box3d {
-            center_m: [rng.random_range(-50.0..50.0), rng.random_range(-38.0..38.0), -1.0],
+            center_m: [
+                rng.random_range(-50.0..50.0),
+                rng.random_range(-38.0..38.0),
+                -1.0,
+            ],
             size_m: [4.5, 1.9, 1.6],
             heading_rad: rng.random_range(-3.0..3.0),
         })
@@ -24,7 +28,11 @@ fn frame(rng: &mut impl Rng) -> (Vec<Detection>, Vec<Box3d>) {
             let mut box3d = objects[index % objects.len()];
             let spread = if index < 20 { 0.5 } else { 20.0 };
             box3d.center_m[0] += rng.random_range(-spread..spread);
-            Detection { box3d, score: rng.random(), source: None }
+            Detection {
+                box3d,
+                score: rng.random(),
+                source: None,
+            }
         })
         .collect();
     (detections, objects)
@@ -36,8 +44,11 @@ fn average_precision(criterion: &mut Criterion) {
     criterion.bench_function("average_precision/50_frames/40x25", |bencher| {
         bencher.iter(|| {
             let mut scorer = Scorer::default();
-            frames.iter().for_each(|(detections, objects)| scorer.add(detections, objects));
-            let found = [Ordering::Global, Ordering::Frame].map(|ordering| scorer.average_precisions(ordering));
+            frames
+                .iter()
+                .for_each(|(detections, objects)| scorer.add(detections, objects));
+            let found = [Ordering::Global, Ordering::Frame]
+                .map(|ordering| scorer.average_precisions(ordering));
             assert!(found.iter().flatten().all(|ap| (0.0..=1.0).contains(ap)));
             black_box(found)
         });

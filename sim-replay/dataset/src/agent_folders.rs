@@ -44,9 +44,18 @@ pub(super) fn find(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<Path
     Ok(found)
 }
 
-fn find_below(dir: &Path, listing: &Listing, depth: usize, found: &mut Vec<PathBuf>, problems: &mut Vec<ReadError>) {
+fn find_below(
+    dir: &Path,
+    listing: &Listing,
+    depth: usize,
+    found: &mut Vec<PathBuf>,
+    problems: &mut Vec<ReadError>,
+) {
     let below: Vec<(PathBuf, Listing)> = files::list_below(dir, listing, problems);
-    if below.iter().any(|(folder, listing)| is_agent_folder(folder, listing)) {
+    if below
+        .iter()
+        .any(|(folder, listing)| is_agent_folder(folder, listing))
+    {
         found.push(dir.to_owned());
     } else if depth > 0 {
         for (folder, listing) in &below {
@@ -63,13 +72,22 @@ pub(super) fn is_agent(dir: &Path) -> bool {
 /// True for names that are CARLA actor ids (negative for roadside units) if there is any frame; for other names if
 /// there is a complete frame and no folder below has one: a scenario may hold a stray folder.
 fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
-    let name = dir.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let name = dir
+        .file_name()
+        .and_then(|name| name.to_str())
+        .unwrap_or_default();
     if is_number(name) {
-        return listing.files.iter().any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
+        return listing
+            .files
+            .iter()
+            .any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
     }
     let is_whole = |listing: &Listing| holds_pairs(listing, PCD) || holds_pairs(listing, BIN);
     let holds_agents = || {
-        let mut below = listing.folders.iter().filter_map(|folder| files::list(&dir.join(folder)).ok());
+        let mut below = listing
+            .folders
+            .iter()
+            .filter_map(|folder| files::list(&dir.join(folder)).ok());
         below.any(|listing| is_whole(&listing))
     };
     is_whole(listing) && !holds_agents()
@@ -81,24 +99,38 @@ fn is_number(name: &str) -> bool {
 
 /// The agents of a scenario with the contents of their folders. Copies of folders such as `650 (1)` or `650_old` are
 /// not agents.
-fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Listing)>, ReadError> {
+fn agents_in(
+    dir: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<Vec<(CavId, Listing)>, ReadError> {
     let mut below = files::list_below(dir, &files::list(dir)?, problems);
-    let name = |folder: &Path| folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let name = |folder: &Path| {
+        folder
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
+    };
     below.retain(|(folder, listing)| is_number(&name(folder)) || is_agent_folder(folder, listing));
-    let are_numbers =
-        below.iter().any(|(folder, listing)| is_number(&name(folder)) && is_agent_folder(folder, listing));
+    let are_numbers = below
+        .iter()
+        .any(|(folder, listing)| is_number(&name(folder)) && is_agent_folder(folder, listing));
     let mut agents = Vec::new();
     for (folder, listing) in below {
         let name = name(&folder);
         let reason = match CavId::new(&name) {
-            Ok(_) if are_numbers && !is_number(&name) => "no number as the other agents' are".to_owned(),
+            Ok(_) if are_numbers && !is_number(&name) => {
+                "no number as the other agents' are".to_owned()
+            }
             Ok(id) => {
                 agents.push((id, listing));
                 continue;
             }
             Err(error) => error.to_string(),
         };
-        let reason = format!("it holds frames, but its name is no agent's: {reason}: the folder is left out");
+        let reason = format!(
+            "it holds frames, but its name is no agent's: {reason}: the folder is left out"
+        );
         problems.push(ReadError::malformed(&folder, reason));
     }
     Ok(agents)
@@ -108,14 +140,21 @@ impl ScenarioFolder {
     /// Lists the folders of all agents. Parts that have to be left out are added to `problems`.
     pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let listed = agents_in(dir, problems)?;
-        let has = |suffix: &str| listed.iter().any(|(_, listing)| holds_pairs(listing, suffix));
+        let has = |suffix: &str| {
+            listed
+                .iter()
+                .any(|(_, listing)| holds_pairs(listing, suffix))
+        };
         let suffix = if !has(PCD) && has(BIN) { BIN } else { PCD };
         let mut by_agent = BTreeMap::new();
         for (id, listing) in &listed {
             let agent_dir = dir.join(id.as_str());
             let agent = AgentFolder::new(&agent_dir, listing, suffix, problems);
             if agent.stems.is_empty() {
-                let reason = format!("no frame with both YAML and {}: the agent is left out", &suffix[1..]);
+                let reason = format!(
+                    "no frame with both YAML and {}: the agent is left out",
+                    &suffix[1..]
+                );
                 problems.push(ReadError::malformed(&agent_dir, reason));
             } else {
                 by_agent.insert(id.clone(), agent);
@@ -125,21 +164,44 @@ impl ScenarioFolder {
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
         let mut missing = Vec::new();
         for stem in &all {
-            let without = agents.iter().filter(|id| by_agent.get(id).is_some_and(|agent| !agent.stems.contains(*stem)));
-            missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: (*stem).clone() }));
+            let without = agents.iter().filter(|id| {
+                by_agent
+                    .get(id)
+                    .is_some_and(|agent| !agent.stems.contains(*stem))
+            });
+            missing.extend(without.map(|id| MissingFrame {
+                agent: id.clone(),
+                stem: (*stem).clone(),
+            }));
         }
         let mut stems: Vec<String> = all.into_iter().cloned().collect();
         problems.extend(without_common_frame(dir, &agents, &by_agent));
         if stems.iter().all(|stem| stem.parse::<u64>().is_ok()) {
             stems.sort_by_key(|stem| stem.parse::<u64>().unwrap_or(u64::MAX));
         }
-        let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
+        let variants: BTreeSet<String> = by_agent
+            .values()
+            .flat_map(|agent| agent.variants.iter().cloned())
+            .collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
-        let cameras = by_agent.iter().map(|(id, agent)| (id.clone(), agent.cameras.clone())).collect();
+        let cameras = by_agent
+            .iter()
+            .map(|(id, agent)| (id.clone(), agent.cameras.clone()))
+            .collect();
         let variants = variants.into_iter().collect();
         let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
         let without_yaml = bare.map(|(id, _)| id.clone()).collect();
-        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, cameras, suffix, without_yaml })
+        Ok(Self {
+            dir: dir.to_owned(),
+            agents,
+            stems,
+            missing,
+            variants,
+            has_radar,
+            cameras,
+            suffix,
+            without_yaml,
+        })
     }
 
     /// The folder of an agent.
@@ -159,20 +221,34 @@ impl ScenarioFolder {
 
     /// The plain sweep of a frame, or a variant of it.
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
-        let suffix = variant.map(|variant| format!("_{variant}")).unwrap_or_default();
-        self.agent_dir(agent).join(format!("{stem}{suffix}{}", self.suffix))
+        let suffix = variant
+            .map(|variant| format!("_{variant}"))
+            .unwrap_or_default();
+        self.agent_dir(agent)
+            .join(format!("{stem}{suffix}{}", self.suffix))
     }
 
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
-        let missing: HashSet<(&CavId, &str)> =
-            self.missing.iter().map(|frame| (&frame.agent, frame.stem.as_str())).collect();
+        let missing: HashSet<(&CavId, &str)> = self
+            .missing
+            .iter()
+            .map(|frame| (&frame.agent, frame.stem.as_str()))
+            .collect();
         let of_agent = |agent: &CavId| {
-            let stems = self.stems.iter().filter(|stem| !missing.contains(&(agent, stem.as_str())));
-            stems.map(|stem| self.pcd(agent, stem, None)).take(Sweeps::MOST_TRIED).collect::<Vec<_>>()
+            let stems = self
+                .stems
+                .iter()
+                .filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            stems
+                .map(|stem| self.pcd(agent, stem, None))
+                .take(Sweeps::MOST_TRIED)
+                .collect::<Vec<_>>()
         };
         let sweeps = Sweeps::new(SweepStorage::ByName, options);
-        self.agents.iter().fold(sweeps, |sweeps, agent| sweeps.with_agent(agent.clone(), of_agent(agent)))
+        self.agents.iter().fold(sweeps, |sweeps, agent| {
+            sweeps.with_agent(agent.clone(), of_agent(agent))
+        })
     }
 
     /// The radar's points of a frame.
@@ -190,15 +266,31 @@ impl ScenarioFolder {
         });
         let numbers: Option<Vec<u64>> = self.stems.iter().map(|stem| stem.parse().ok()).collect();
         let times: Vec<u64> = match (numbers, tick_nanos) {
-            (Some(numbers), Some(nanos)) => numbers.iter().map(|number| number.saturating_mul(nanos)).collect(),
+            (Some(numbers), Some(nanos)) => numbers
+                .iter()
+                .map(|number| number.saturating_mul(nanos))
+                .collect(),
             (Some(numbers), None) => {
-                let step = numbers.array_windows().map(|[a, b]| b - a).filter(|&step| step > 0).min().unwrap_or(1);
+                let step = numbers
+                    .array_windows()
+                    .map(|[a, b]| b - a)
+                    .filter(|&step| step > 0)
+                    .min()
+                    .unwrap_or(1);
                 let first = numbers.first().copied().unwrap_or(0);
-                numbers.iter().map(|number| ((number - first) / step).saturating_mul(period_nanos)).collect()
+                numbers
+                    .iter()
+                    .map(|number| ((number - first) / step).saturating_mul(period_nanos))
+                    .collect()
             }
-            (None, _) => (0..self.stems.len() as u64).map(|index| index.saturating_mul(period_nanos)).collect(),
+            (None, _) => (0..self.stems.len() as u64)
+                .map(|index| index.saturating_mul(period_nanos))
+                .collect(),
         };
-        let tick = |(stem, capture_nanos): (&String, u64)| Tick { stem: stem.clone(), capture_nanos };
+        let tick = |(stem, capture_nanos): (&String, u64)| Tick {
+            stem: stem.clone(),
+            capture_nanos,
+        };
         self.stems.iter().zip(times).map(tick).collect()
     }
 
@@ -209,11 +301,17 @@ impl ScenarioFolder {
             return Ok(None);
         }
         let node = yaml::read(&path)?;
-        let Some(world) = Field::root(&path, &node).optional("world")? else { return Ok(None) };
-        let Some(delta) = world.optional("fixed_delta_seconds")? else { return Ok(None) };
+        let Some(world) = Field::root(&path, &node).optional("world")? else {
+            return Ok(None);
+        };
+        let Some(delta) = world.optional("fixed_delta_seconds")? else {
+            return Ok(None);
+        };
         let seconds = delta.number()?;
         if !(1e-6..=10.0).contains(&seconds) {
-            return Err(delta.error(format!("{seconds} s, expected 1e-6 to 10 s: the tick's length is not used")));
+            return Err(delta.error(format!(
+                "{seconds} s, expected 1e-6 to 10 s: the tick's length is not used"
+            )));
         }
         Ok(Some(rounding::to_u64(seconds * 1e9)))
     }
@@ -226,14 +324,23 @@ fn without_common_frame(
     by_agent: &BTreeMap<CavId, AgentFolder>,
 ) -> impl Iterator<Item = ReadError> {
     let stems = |id: &CavId| by_agent.get(id).map(|agent| &agent.stems);
-    let first = |id: &CavId| stems(id).and_then(BTreeSet::first).cloned().unwrap_or_default();
+    let first = |id: &CavId| {
+        stems(id)
+            .and_then(BTreeSet::first)
+            .cloned()
+            .unwrap_or_default()
+    };
     let ego = agents.first().cloned();
     let strangers = agents.iter().skip(1).filter(|id| {
         let ego = ego.as_ref().and_then(stems);
-        ego.zip(stems(id)).is_some_and(|(ego, own)| ego.is_disjoint(own))
+        ego.zip(stems(id))
+            .is_some_and(|(ego, own)| ego.is_disjoint(own))
     });
     let problem = |id: &CavId| {
-        let ego = ego.as_ref().map(|ego| (ego.to_string(), first(ego))).unwrap_or_default();
+        let ego = ego
+            .as_ref()
+            .map(|ego| (ego.to_string(), first(ego)))
+            .unwrap_or_default();
         let reason = format!(
             "no frame of agent {id} (first {}) at a tick of the ego {} (first {}): it takes no part",
             first(id),
@@ -248,7 +355,8 @@ fn without_common_frame(
 /// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the
 /// ego if there is a vehicle; OpenCOOD moves the first of them only.
 fn in_order<'a>(ids: impl Iterator<Item = &'a CavId>) -> Vec<CavId> {
-    let (units, mut agents): (Vec<CavId>, Vec<CavId>) = ids.cloned().partition(|id| id.as_str().starts_with('-'));
+    let (units, mut agents): (Vec<CavId>, Vec<CavId>) =
+        ids.cloned().partition(|id| id.as_str().starts_with('-'));
     agents.extend(units);
     agents
 }
@@ -271,7 +379,13 @@ mod tests {
         let mut problems = Vec::new();
         let folder = ScenarioFolder::scan(root, &mut problems).unwrap();
         let root = root.to_string_lossy();
-        (folder, problems.iter().map(|problem| problem.to_string().replace(&*root, "")).collect())
+        (
+            folder,
+            problems
+                .iter()
+                .map(|problem| problem.to_string().replace(&*root, ""))
+                .collect(),
+        )
     }
 
     fn ids(folder: &ScenarioFolder) -> Vec<&str> {
@@ -281,10 +395,22 @@ mod tests {
     #[test]
     fn scenarios_are_found_at_every_level() {
         let dir = tempfile::tempdir().unwrap();
-        touch(dir.path(), &["test/a/1/0.yaml", "test/b/1/0.pcd", "train/c/1/0.yaml", "README.md", "empty/x"]);
+        touch(
+            dir.path(),
+            &[
+                "test/a/1/0.yaml",
+                "test/b/1/0.pcd",
+                "train/c/1/0.yaml",
+                "README.md",
+                "empty/x",
+            ],
+        );
         let names = |below: &str| {
             let found = find(&dir.path().join(below), &mut Vec::new()).unwrap();
-            found.iter().map(|found| files::name_below(dir.path(), found)).collect::<Vec<_>>()
+            found
+                .iter()
+                .map(|found| files::name_below(dir.path(), found))
+                .collect::<Vec<_>>()
         };
         assert_eq!(names(""), ["test/a", "test/b", "train/c"]);
         assert_eq!(names("test"), ["test/a", "test/b"]);
@@ -297,7 +423,10 @@ mod tests {
     fn agents_are_in_text_order_with_roadside_units_last() {
         let dir = tempfile::tempdir().unwrap();
         for agent in ["650", "1045", "-1", "-2"] {
-            touch(dir.path(), &[&format!("{agent}/0.yaml"), &format!("{agent}/0.pcd")]);
+            touch(
+                dir.path(),
+                &[&format!("{agent}/0.yaml"), &format!("{agent}/0.pcd")],
+            );
         }
         assert_eq!(ids(&scan(dir.path()).0), ["1045", "650", "-1", "-2"]);
     }
@@ -305,12 +434,35 @@ mod tests {
     #[test]
     fn frames_are_listed_and_so_are_missing_ones() {
         let dir = tempfile::tempdir().unwrap();
-        touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
-        touch(dir.path(), &["2/000070.yaml", "2/000070.pcd", "2/000072.yaml", "2/000074.pcd", "2/000076_radar.pcd"]);
+        touch(
+            dir.path(),
+            &[
+                "1/000068.yaml",
+                "1/000068.pcd",
+                "1/000070.yaml",
+                "1/000070.pcd",
+            ],
+        );
+        touch(
+            dir.path(),
+            &[
+                "2/000070.yaml",
+                "2/000070.pcd",
+                "2/000072.yaml",
+                "2/000074.pcd",
+                "2/000076_radar.pcd",
+            ],
+        );
         touch(dir.path(), &["3/000070.yaml"]);
         let (folder, problems) = scan(dir.path());
         assert_eq!((ids(&folder), folder.stems.len()), (vec!["1", "2"], 2));
-        assert_eq!(folder.missing, [MissingFrame { agent: CavId::new("2").unwrap(), stem: "000068".into() }]);
+        assert_eq!(
+            folder.missing,
+            [MissingFrame {
+                agent: CavId::new("2").unwrap(),
+                stem: "000068".into()
+            }]
+        );
         assert_eq!(
             problems,
             [
@@ -326,7 +478,15 @@ mod tests {
     #[test]
     fn an_agent_without_a_common_tick_is_reported() {
         let dir = tempfile::tempdir().unwrap();
-        touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
+        touch(
+            dir.path(),
+            &[
+                "1/000068.yaml",
+                "1/000068.pcd",
+                "1/000070.yaml",
+                "1/000070.pcd",
+            ],
+        );
         touch(dir.path(), &["2/000069.yaml", "2/000069.pcd"]);
         let (folder, problems) = scan(dir.path());
         assert_eq!((folder.agents.len(), folder.stems.len()), (2, 3));
@@ -337,8 +497,24 @@ mod tests {
     #[test]
     fn variants_radar_and_other_files_are_distinguished() {
         let dir = tempfile::tempdir().unwrap();
-        touch(dir.path(), &["1/000010.yaml", "1/000010.pcd", "1/000010_radar.pcd", "1/000010_snow_2.5_2.0.pcd"]);
-        touch(dir.path(), &["1/000010_fog_0.060.pcd", "1/000010_camera0.png", "1/000010_additional.yaml", "1/a.json"]);
+        touch(
+            dir.path(),
+            &[
+                "1/000010.yaml",
+                "1/000010.pcd",
+                "1/000010_radar.pcd",
+                "1/000010_snow_2.5_2.0.pcd",
+            ],
+        );
+        touch(
+            dir.path(),
+            &[
+                "1/000010_fog_0.060.pcd",
+                "1/000010_camera0.png",
+                "1/000010_additional.yaml",
+                "1/a.json",
+            ],
+        );
         let (folder, problems) = scan(dir.path());
         assert_eq!(folder.variants, ["fog_0.060", "snow_2.5_2.0"]);
         assert!(folder.has_radar && problems.is_empty(), "{problems:?}");
@@ -348,20 +524,39 @@ mod tests {
     fn capture_times_come_from_ticks_or_the_period() {
         let dir = tempfile::tempdir().unwrap();
         for stem in ["98", "100", "104"] {
-            touch(dir.path(), &[&format!("1/{stem}.yaml"), &format!("1/{stem}.pcd")]);
+            touch(
+                dir.path(),
+                &[&format!("1/{stem}.yaml"), &format!("1/{stem}.pcd")],
+            );
         }
         let times = |expected_problems: usize| {
             let mut problems = Vec::new();
             let ticks = scan(dir.path()).0.ticks(100_000_000, &mut problems);
             assert_eq!(problems.len(), expected_problems, "{problems:?}");
-            ticks.into_iter().map(|tick| (tick.stem, tick.capture_nanos / 1_000_000)).collect::<Vec<_>>()
+            ticks
+                .into_iter()
+                .map(|tick| (tick.stem, tick.capture_nanos / 1_000_000))
+                .collect::<Vec<_>>()
         };
-        let expected =
-            |millis: [u64; 3]| ["98", "100", "104"].map(str::to_owned).into_iter().zip(millis).collect::<Vec<_>>();
+        let expected = |millis: [u64; 3]| {
+            ["98", "100", "104"]
+                .map(str::to_owned)
+                .into_iter()
+                .zip(millis)
+                .collect::<Vec<_>>()
+        };
         assert_eq!(times(0), expected([0, 100, 300]));
-        fs::write(dir.path().join("data_protocol.yaml"), "world: {fixed_delta_seconds: 0.05}").unwrap();
+        fs::write(
+            dir.path().join("data_protocol.yaml"),
+            "world: {fixed_delta_seconds: 0.05}",
+        )
+        .unwrap();
         assert_eq!(times(0), expected([4900, 5000, 5200]));
-        fs::write(dir.path().join("data_protocol.yaml"), "world: {fixed_delta_seconds: -1}").unwrap();
+        fs::write(
+            dir.path().join("data_protocol.yaml"),
+            "world: {fixed_delta_seconds: -1}",
+        )
+        .unwrap();
         assert_eq!(times(1), expected([0, 100, 300]));
     }
 }

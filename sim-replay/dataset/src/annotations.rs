@@ -31,7 +31,10 @@ pub(super) struct Annotations<'a> {
 
 impl<'a> Annotations<'a> {
     pub(super) fn new(root: Field<'a>) -> Self {
-        Self { root, problems: Vec::new() }
+        Self {
+            root,
+            problems: Vec::new(),
+        }
     }
 
     /// Parts that were left out.
@@ -55,7 +58,9 @@ impl<'a> Annotations<'a> {
         keys: &[&str],
         read: impl Fn(&Field<'a>) -> Result<T, ReadError>,
     ) -> Option<T> {
-        let field = keys.iter().find_map(|key| parent.optional(key).ok().flatten())?;
+        let field = keys
+            .iter()
+            .find_map(|key| parent.optional(key).ok().flatten())?;
         let value = read(&field).map_err(|error| self.left_out("field", error));
         value.ok()
     }
@@ -65,16 +70,25 @@ impl<'a> Annotations<'a> {
     pub(super) fn motion(&mut self, handedness: Handedness) -> EgoMotion {
         let imu = self.root.optional("imu").ok().flatten();
         let mut measured = |key, read: &dyn Fn(&Field<'a>) -> Result<f64, ReadError>| {
-            imu.as_ref().and_then(|imu| self.optional_of(imu, &[key], read))
+            imu.as_ref()
+                .and_then(|imu| self.optional_of(imu, &[key], read))
         };
-        let counter_clockwise = if handedness == Handedness::Left { -1.0 } else { 1.0 };
+        let counter_clockwise = if handedness == Handedness::Left {
+            -1.0
+        } else {
+            1.0
+        };
         let yaw_rate_rad_s = measured("yaw_rate_degps", &|field| {
             let most_degps = EgoMotion::MAX_YAW_RATE_RAD_S.to_degrees();
-            Ok(counter_clockwise * within(field, field.number()?, most_degps, "degrees/s")?.to_radians())
+            Ok(counter_clockwise
+                * within(field, field.number()?, most_degps, "degrees/s")?.to_radians())
         });
         let speed_mps = measured("speed_mps", &|field| own_speed_mps(field, field.number()?));
         let recorded = |field: &Field<'a>| own_speed_mps(field, speed_mps_of_kmh(field)?);
-        EgoMotion { speed_mps: speed_mps.or_else(|| self.optional(&["ego_speed"], recorded)), yaw_rate_rad_s }
+        EgoMotion {
+            speed_mps: speed_mps.or_else(|| self.optional(&["ego_speed"], recorded)),
+            yaw_rate_rad_s,
+        }
     }
 
     /// All valid objects. `id` gives the id of an object of the listed number, `pose` transforms its pose from the file
@@ -88,7 +102,11 @@ impl<'a> Annotations<'a> {
             self.left_out("list of objects", error);
             Vec::new()
         });
-        let last: HashMap<&str, usize> = entries.iter().enumerate().map(|(index, (key, _))| (*key, index)).collect();
+        let last: HashMap<&str, usize> = entries
+            .iter()
+            .enumerate()
+            .map(|(index, (key, _))| (*key, index))
+            .collect();
         let mut objects = Vec::with_capacity(entries.len());
         for (index, (key, field)) in entries.iter().enumerate() {
             let object = if last.get(key) == Some(&index) {
@@ -114,7 +132,8 @@ impl<'a> Annotations<'a> {
         let listed_id = listed_id(key, field)?;
         Ok(Object {
             id: id(listed_id, field)?,
-            world_from_object: pose(&place(field)?).map_err(|error| field.error(error.to_string()))?,
+            world_from_object: pose(&place(field)?)
+                .map_err(|error| field.error(error.to_string()))?,
             size_m: size_m(field)?,
             class: self.class(field),
             speed_mps: self.optional_of(field, &["speed"], speed_mps),
@@ -124,10 +143,18 @@ impl<'a> Annotations<'a> {
     /// The map of annotated objects: `vehicles`, or `objects` in relatives of the format.
     fn object_entries(&self) -> Result<Vec<(&'a str, Field<'a>)>, ReadError> {
         let root = &self.root;
-        let key = if !root.has("vehicles") && root.has("objects") { "objects" } else { "vehicles" };
+        let key = if !root.has("vehicles") && root.has("objects") {
+            "objects"
+        } else {
+            "vehicles"
+        };
         match root.optional(key)? {
-            Some(field) if matches!(&field.node().value, Value::List(items) if items.is_empty()) => Ok(Vec::new()),
-            Some(field) => field.entries().map_err(|_| field.expected("a map of objects by id")),
+            Some(field) if matches!(&field.node().value, Value::List(items) if items.is_empty()) => {
+                Ok(Vec::new())
+            }
+            Some(field) => field
+                .entries()
+                .map_err(|_| field.expected("a map of objects by id")),
             // An empty map may be written as nothing; a missing key is a fault.
             None if root.has(key) => Ok(Vec::new()),
             None => root.required(key).map(|_| Vec::new()),
@@ -136,16 +163,28 @@ impl<'a> Annotations<'a> {
 
     /// A car if no type is given. An unknown type is not a vehicle, and is reported once per scenario.
     fn class(&mut self, field: &Field<'a>) -> ObjectClass {
-        let kind = CLASS_KEYS.iter().find_map(|key| Some((*key, field.optional(key).ok().flatten()?)));
-        let Some((key, kind)) = kind else { return ObjectClass::Car };
-        kind.text().ok().and_then(classes::of_name).unwrap_or_else(|| {
-            self.unknown_class(key, &kind.found());
-            ObjectClass::Other
-        })
+        let kind = CLASS_KEYS
+            .iter()
+            .find_map(|key| Some((*key, field.optional(key).ok().flatten()?)));
+        let Some((key, kind)) = kind else {
+            return ObjectClass::Car;
+        };
+        kind.text()
+            .ok()
+            .and_then(classes::of_name)
+            .unwrap_or_else(|| {
+                self.unknown_class(key, &kind.found());
+                ObjectClass::Other
+            })
     }
 
     fn unknown_class(&mut self, key: &str, found: &str) {
-        let scenario = self.root.path().parent().and_then(Path::parent).unwrap_or(Path::new(""));
+        let scenario = self
+            .root
+            .path()
+            .parent()
+            .and_then(Path::parent)
+            .unwrap_or(Path::new(""));
         let problem = classes::unknown(scenario, key, found);
         if !self.problems.contains(&problem) {
             self.problems.push(problem);
@@ -153,22 +192,36 @@ impl<'a> Annotations<'a> {
     }
 
     fn left_out(&mut self, what: &str, error: ReadError) {
-        self.problems.push(Problem::from(&error.with_consequence(&format!("the {what} is left out"))));
+        self.problems.push(Problem::from(
+            &error.with_consequence(&format!("the {what} is left out")),
+        ));
     }
 }
 
 /// Ids are integers; those that went through an array of floats have a point.
 #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
 fn listed_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
-    let whole = || key.parse().ok().filter(|number: &f64| number.fract() == 0.0 && number.abs() < 1e15);
-    let id = key.parse().ok().or_else(|| whole().map(|number| number as i64));
+    let whole = || {
+        key.parse()
+            .ok()
+            .filter(|number: &f64| number.fract() == 0.0 && number.abs() < 1e15)
+    };
+    let id = key
+        .parse()
+        .ok()
+        .or_else(|| whole().map(|number| number as i64));
     id.ok_or_else(|| field.error(format!("{key:?} is no object id, expected an integer")))
 }
 
 /// Centre and rotation of the box, in the numbers of the file.
 fn place(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
-    let center = field.optional("center")?.map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
-    let (location, angle) = (field.required("location")?.numbers()?, field.required("angle")?);
+    let center = field
+        .optional("center")?
+        .map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
+    let (location, angle) = (
+        field.required("location")?.numbers()?,
+        field.required("angle")?,
+    );
     let angle_deg = angle.numbers::<3>()?;
     if angle_deg.iter().any(|angle| angle.abs() > MAX_ANGLE_DEG) {
         return Err(angle.error(format!("{angle_deg:?}, expected angles in degrees")));
@@ -180,8 +233,13 @@ fn place(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
 fn size_m(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
     let extent = field.required("extent")?;
     let half = extent.numbers::<3>()?;
-    if half.iter().any(|&half| half <= 0.0 || half > MAX_HALF_SIZE_M) {
-        return Err(extent.error(format!("{half:?} m, expected half sizes above 0 and up to {MAX_HALF_SIZE_M} m")));
+    if half
+        .iter()
+        .any(|&half| half <= 0.0 || half > MAX_HALF_SIZE_M)
+    {
+        return Err(extent.error(format!(
+            "{half:?} m, expected half sizes above 0 and up to {MAX_HALF_SIZE_M} m"
+        )));
     }
     Ok(half.map(|half| 2.0 * half))
 }
@@ -200,7 +258,11 @@ fn own_speed_mps(field: &Field<'_>, speed_mps: f64) -> Result<f64, ReadError> {
 fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64, ReadError> {
     let kmh = field.number().or_else(|error| {
         let vector = field.array().map_err(|_| error)?.values;
-        Ok(vector.iter().map(|component| component * component).sum::<f64>().sqrt())
+        Ok(vector
+            .iter()
+            .map(|component| component * component)
+            .sum::<f64>()
+            .sqrt())
     });
     Ok(kmh? / KMH_PER_MPS)
 }
@@ -209,5 +271,9 @@ fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64, ReadError> {
 fn within(field: &Field<'_>, value: f64, most: f64, unit: &str) -> Result<f64, ReadError> {
     // NaN does not satisfy this comparison.
     let is_within = value.abs() <= most;
-    if is_within { Ok(value) } else { Err(field.error(format!("{value} {unit}, expected at most {most:.0}"))) }
+    if is_within {
+        Ok(value)
+    } else {
+        Err(field.error(format!("{value} {unit}, expected at most {most:.0}")))
+    }
 }

@@ -74,7 +74,11 @@ impl Tally {
     /// An empty tally.
     #[must_use]
     pub fn new(iou_threshold: f64) -> Self {
-        Self { iou_threshold, matched: Vec::new(), objects: 0 }
+        Self {
+            iou_threshold,
+            matched: Vec::new(),
+            objects: 0,
+        }
     }
 
     /// The curve of everything matched so far.
@@ -98,8 +102,14 @@ impl Tally {
             precision[index - 1] = precision[index - 1].max(precision[index]);
         }
         let steps = recall.windows(2).zip(&precision[1..]);
-        let average_precision = steps.map(|(recall, precision)| (recall[1] - recall[0]) * precision).sum();
-        Curve { average_precision, recall, precision }
+        let average_precision = steps
+            .map(|(recall, precision)| (recall[1] - recall[0]) * precision)
+            .sum();
+        Curve {
+            average_precision,
+            recall,
+            precision,
+        }
     }
 }
 
@@ -119,12 +129,17 @@ impl Scorer {
     /// A scorer at the given overlaps.
     #[must_use]
     pub fn new(thresholds: &[f64]) -> Self {
-        Self { tallies: thresholds.iter().copied().map(Tally::new).collect() }
+        Self {
+            tallies: thresholds.iter().copied().map(Tally::new).collect(),
+        }
     }
 
     /// Adds a frame of detections and true boxes.
     pub fn add(&mut self, detections: &[Detection], objects: &[Box3d]) {
-        let scored: Vec<_> = detections.iter().map(|found| (footprint(&found.box3d), found.score)).collect();
+        let scored: Vec<_> = detections
+            .iter()
+            .map(|found| (footprint(&found.box3d), found.score))
+            .collect();
         let objects: Vec<_> = objects.iter().map(footprint).collect();
         self.add_footprints(&scored, &objects);
     }
@@ -134,12 +149,18 @@ impl Scorer {
         let mut order: Vec<&(Polygon, f32)> = detections.iter().collect();
         // A stable sort: equal scores stay in the order of the detector.
         order.sort_by(|a, b| b.1.total_cmp(&a.1));
-        let overlaps: Vec<Vec<f32>> = order.iter().map(|(found, _)| overlaps(found, objects)).collect();
+        let overlaps: Vec<Vec<f32>> = order
+            .iter()
+            .map(|(found, _)| overlaps(found, objects))
+            .collect();
         for tally in &mut self.tallies {
             let mut taken = vec![false; objects.len()];
             for ((_, score), overlaps) in order.iter().zip(&overlaps) {
                 let is_true = take_best(overlaps, &mut taken, tally.iou_threshold).is_some();
-                tally.matched.push(Matched { score: *score, is_true });
+                tally.matched.push(Matched {
+                    score: *score,
+                    is_true,
+                });
             }
             tally.objects += objects.len();
         }
@@ -154,7 +175,10 @@ impl Scorer {
     /// AP at every threshold, in their order.
     #[must_use]
     pub fn average_precisions(&self, ordering: Ordering) -> Vec<f64> {
-        self.tallies.iter().map(|tally| tally.curve(ordering).average_precision).collect()
+        self.tallies
+            .iter()
+            .map(|tally| tally.curve(ordering).average_precision)
+            .collect()
     }
 }
 
@@ -164,12 +188,19 @@ fn footprint(box3d: &Box3d) -> Polygon {
 
 /// Overlap with every object, single precision as in the reference.
 fn overlaps(found: &Polygon, objects: &[Polygon]) -> Vec<f32> {
-    objects.iter().map(|object| found.iou(object) as f32).collect()
+    objects
+        .iter()
+        .map(|object| found.iou(object) as f32)
+        .collect()
 }
 
 /// For each detection of a frame the index of the object that it matches at an overlap, as [`Scorer`] counts them.
 #[must_use]
-pub fn matches(detections: &[Detection], objects: &[Box3d], iou_threshold: f64) -> Vec<Option<usize>> {
+pub fn matches(
+    detections: &[Detection],
+    objects: &[Box3d],
+    iou_threshold: f64,
+) -> Vec<Option<usize>> {
     let objects: Vec<_> = objects.iter().map(footprint).collect();
     let mut order: Vec<usize> = (0..detections.len()).collect();
     order.sort_by(|&a, &b| detections[b].score.total_cmp(&detections[a].score));
@@ -205,21 +236,44 @@ mod tests {
     use super::*;
 
     fn car(x: f64) -> Box3d {
-        Box3d { center_m: [x, 0.0, 0.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 }
+        Box3d {
+            center_m: [x, 0.0, 0.0],
+            size_m: [4.0, 2.0, 1.5],
+            heading_rad: 0.0,
+        }
     }
 
     fn found(x: f64, score: f32) -> Detection {
-        Detection { box3d: car(x), score, source: None }
+        Detection {
+            box3d: car(x),
+            score,
+            source: None,
+        }
     }
 
     #[test]
     fn matches_are_those_that_are_counted() {
-        let detections = [found(0.3, 0.4), found(0.1, 0.9), found(30.0, 0.8), found(10.0, 0.2)];
+        let detections = [
+            found(0.3, 0.4),
+            found(0.1, 0.9),
+            found(30.0, 0.8),
+            found(10.0, 0.2),
+        ];
         let objects = [car(10.0), car(0.0)];
-        assert_eq!(matches(&detections, &objects, 0.5), [None, Some(1), None, Some(0)]);
+        assert_eq!(
+            matches(&detections, &objects, 0.5),
+            [None, Some(1), None, Some(0)]
+        );
         let mut scorer = Scorer::new(&[0.5]);
         scorer.add(&detections, &objects);
-        assert_eq!(scorer.tallies()[0].matched.iter().filter(|matched| matched.is_true).count(), 2);
+        assert_eq!(
+            scorer.tallies()[0]
+                .matched
+                .iter()
+                .filter(|matched| matched.is_true)
+                .count(),
+            2
+        );
     }
 
     #[test]
@@ -235,7 +289,11 @@ mod tests {
     fn a_second_box_on_one_object_is_false() {
         let mut scorer = Scorer::new(&[0.5]);
         scorer.add(&[found(0.1, 0.8), found(0.0, 0.9)], &[car(0.0)]);
-        let is_true: Vec<bool> = scorer.tallies()[0].matched.iter().map(|entry| entry.is_true).collect();
+        let is_true: Vec<bool> = scorer.tallies()[0]
+            .matched
+            .iter()
+            .map(|entry| entry.is_true)
+            .collect();
         assert_eq!(is_true, [true, false]);
     }
 
@@ -244,7 +302,12 @@ mod tests {
         let mut scorer = Scorer::new(&[0.3]);
         // Both detections overlap the first object most; the second takes the other one.
         scorer.add(&[found(0.0, 0.9), found(0.6, 0.8)], &[car(0.2), car(2.0)]);
-        assert!(scorer.tallies()[0].matched.iter().all(|entry| entry.is_true));
+        assert!(
+            scorer.tallies()[0]
+                .matched
+                .iter()
+                .all(|entry| entry.is_true)
+        );
     }
 
     #[test]

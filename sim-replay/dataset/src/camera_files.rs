@@ -27,21 +27,35 @@ pub(super) fn numbers(names: &[String]) -> BTreeSet<u8> {
 fn number(name: &str) -> Option<u8> {
     let (name, ending) = name.rsplit_once('.')?;
     let (_, camera) = name.rsplit_once('_')?;
-    let digits = PREFIXES.iter().find_map(|prefix| camera.strip_prefix(prefix))?;
-    let is_image = ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known));
-    (is_image && digits.bytes().all(|byte| byte.is_ascii_digit())).then(|| digits.parse().ok()).flatten()
+    let digits = PREFIXES
+        .iter()
+        .find_map(|prefix| camera.strip_prefix(prefix))?;
+    let is_image = ENDINGS
+        .iter()
+        .any(|known| ending.eq_ignore_ascii_case(known));
+    (is_image && digits.bytes().all(|byte| byte.is_ascii_digit()))
+        .then(|| digits.parse().ok())
+        .flatten()
 }
 
 /// The image of a camera beside `dir/stem.yaml`.
 pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf, ReadError> {
-    let names = PREFIXES
-        .iter()
-        .flat_map(|prefix| ENDINGS.iter().map(move |ending| dir.join(format!("{stem}_{prefix}{number}.{ending}"))));
+    let names = PREFIXES.iter().flat_map(|prefix| {
+        ENDINGS
+            .iter()
+            .map(move |ending| dir.join(format!("{stem}_{prefix}{number}.{ending}")))
+    });
     let missing = || {
         let path = dir.join(format!("{stem}_{}{number}.{}", PREFIXES[0], ENDINGS[0]));
-        ReadError::malformed(&path, "there is no image of this camera, which has some of other frames")
+        ReadError::malformed(
+            &path,
+            "there is no image of this camera, which has some of other frames",
+        )
     };
-    names.into_iter().find(|path| path.is_file()).ok_or_else(missing)
+    names
+        .into_iter()
+        .find(|path| path.is_file())
+        .ok_or_else(missing)
 }
 
 /// Reads an image; its calibration is that of the entry for the camera in `root`, if there is one.
@@ -56,8 +70,8 @@ pub(super) fn read(
     let image = files::read_limited(path, MAX_BYTES)?;
     let format = ImageFormat::of_bytes(&image)
         .ok_or_else(|| ReadError::malformed(path, "neither a PNG nor a JPEG by its first bytes"))?;
-    let ImageSize { width, height } =
-        imagesize::blob_size(&image).map_err(|error| ReadError::malformed(path, error.to_string()))?;
+    let ImageSize { width, height } = imagesize::blob_size(&image)
+        .map_err(|error| ReadError::malformed(path, error.to_string()))?;
     let edge = |edge: usize| u32::try_from(edge).unwrap_or(u32::MAX);
     let mut metadata = CameraMetadata {
         format,
@@ -67,21 +81,36 @@ pub(super) fn read(
         lidar_from_camera: None,
     };
     for prefix in PREFIXES {
-        let Some(entry) = root.optional(&format!("{prefix}{number}"))? else { continue };
-        metadata.pinhole = entry.optional("intrinsic")?.map(|field| pinhole(&field)).transpose()?;
-        if let (Some(cords), Some(lidar)) = (entry.optional("cords")?, root.optional("lidar_pose")?) {
+        let Some(entry) = root.optional(&format!("{prefix}{number}"))? else {
+            continue;
+        };
+        metadata.pinhole = entry
+            .optional("intrinsic")?
+            .map(|field| pinhole(&field))
+            .transpose()?;
+        if let (Some(cords), Some(lidar)) = (entry.optional("cords")?, root.optional("lidar_pose")?)
+        {
             metadata.lidar_from_camera = Some(lidar_from_camera(&pose(&lidar)?, &pose(&cords)?));
         }
     }
-    Camera::check(&metadata, &Limits::DEFAULT).map_err(|error| ReadError::malformed(path, error.to_string()))?;
+    Camera::check(&metadata, &Limits::DEFAULT)
+        .map_err(|error| ReadError::malformed(path, error.to_string()))?;
     Ok(Camera { metadata, image })
 }
 
 fn pinhole(field: &Field<'_>) -> Result<Pinhole, ReadError> {
     let rows = field.items()?;
-    let rows = rows.iter().map(Field::numbers::<3>).collect::<Result<Vec<_>, _>>()?;
+    let rows = rows
+        .iter()
+        .map(Field::numbers::<3>)
+        .collect::<Result<Vec<_>, _>>()?;
     match rows.as_slice() {
-        &[[fx_px, _, cx_px], [_, fy_px, cy_px], _] => Ok(Pinhole { fx_px, fy_px, cx_px, cy_px }),
+        &[[fx_px, _, cx_px], [_, fy_px, cy_px], _] => Ok(Pinhole {
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+        }),
         _ => Err(field.error(format!("{} rows, expected 3", rows.len()))),
     }
 }
@@ -95,7 +124,9 @@ pub fn body_from_optical() -> Isometry3<f64> {
 }
 
 fn lidar_from_camera(world_from_lidar: &Pose, world_from_body: &Pose) -> Pose {
-    let lidar_from_body = world_from_lidar.isometry().inv_mul(&world_from_body.isometry());
+    let lidar_from_body = world_from_lidar
+        .isometry()
+        .inv_mul(&world_from_body.isometry());
     (lidar_from_body * body_from_optical()).into()
 }
 
@@ -105,7 +136,13 @@ mod tests {
 
     #[test]
     fn images_are_told_by_their_names() {
-        let names = ["000069_camera0.png", "000069_camera3.JPG", "000069_cam2.jpeg", "000069_camera_gt.png", "a.png"];
+        let names = [
+            "000069_camera0.png",
+            "000069_camera3.JPG",
+            "000069_cam2.jpeg",
+            "000069_camera_gt.png",
+            "a.png",
+        ];
         let found = numbers(&names.map(str::to_owned));
         assert_eq!(found.into_iter().collect::<Vec<_>>(), [0, 2, 3]);
     }
@@ -116,8 +153,16 @@ mod tests {
         let ahead = lidar.isometry() * Isometry3::translation(3.0, 0.0, -0.9);
         let found = lidar_from_camera(&lidar, &ahead.into()).isometry();
         let point = found.inverse() * nalgebra::Point3::new(13.0, 1.0, -1.9);
-        assert!((point.coords - nalgebra::Vector3::new(-1.0, 1.0, 10.0)).norm() < 1e-9, "{point}");
-        let pinhole = Pinhole { fx_px: 100.0, fy_px: 100.0, cx_px: 50.0, cy_px: 40.0 };
+        assert!(
+            (point.coords - nalgebra::Vector3::new(-1.0, 1.0, 10.0)).norm() < 1e-9,
+            "{point}"
+        );
+        let pinhole = Pinhole {
+            fx_px: 100.0,
+            fy_px: 100.0,
+            cx_px: 50.0,
+            cy_px: 40.0,
+        };
         assert_eq!(pinhole.project([-1.0, 1.0, 10.0]), Some([40.0, 50.0]));
         assert_eq!(pinhole.project([0.0, 0.0, -1.0]), None);
     }

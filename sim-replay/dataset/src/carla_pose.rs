@@ -18,7 +18,10 @@ pub struct CarlaPose {
 
 impl From<[f64; 6]> for CarlaPose {
     fn from([x, y, z, roll, yaw, pitch]: [f64; 6]) -> Self {
-        Self { position_m: [x, y, z], roll_yaw_pitch_deg: [roll, yaw, pitch] }
+        Self {
+            position_m: [x, y, z],
+            roll_yaw_pitch_deg: [roll, yaw, pitch],
+        }
     }
 }
 
@@ -35,13 +38,18 @@ impl CarlaPose {
     #[must_use]
     pub fn of_box(location_m: [f64; 3], roll_yaw_pitch_deg: [f64; 3], center_m: [f64; 3]) -> Self {
         let ([x, y, z], [dx, dy, dz]) = (location_m, center_m);
-        Self { position_m: [x + dx, y + dy, z + dz], roll_yaw_pitch_deg }
+        Self {
+            position_m: [x + dx, y + dy, z + dz],
+            roll_yaw_pitch_deg,
+        }
     }
 
     /// Local-to-world matrix, still left-handed.
     #[must_use]
     pub fn left_handed_matrix(&self) -> Matrix4<f64> {
-        let [(sr, cr), (sy, cy), (sp, cp)] = self.roll_yaw_pitch_deg.map(|deg| deg.to_radians().sin_cos());
+        let [(sr, cr), (sy, cy), (sp, cp)] = self
+            .roll_yaw_pitch_deg
+            .map(|deg| deg.to_radians().sin_cos());
         let [x, y, z] = self.position_m;
         Matrix4::new(
             cp * cy,
@@ -83,14 +91,20 @@ impl CarlaPose {
     /// V2V4Real and V2X-Real use the formula in right-handed axes.
     #[must_use]
     pub fn from_right_handed(pose: &Pose) -> Self {
-        Self::from_parts(pose.translation_m, pose.isometry().rotation.to_rotation_matrix().matrix())
+        Self::from_parts(
+            pose.translation_m,
+            pose.isometry().rotation.to_rotation_matrix().matrix(),
+        )
     }
 
     fn from_parts(position_m: [f64; 3], rotation: &Matrix3<f64>) -> Self {
         let pitch = rotation[(2, 0)].clamp(-1.0, 1.0).asin();
         let roll = (-rotation[(2, 1)]).atan2(rotation[(2, 2)]);
         let yaw = rotation[(1, 0)].atan2(rotation[(0, 0)]);
-        Self { position_m, roll_yaw_pitch_deg: [roll, yaw, pitch].map(f64::to_degrees) }
+        Self {
+            position_m,
+            roll_yaw_pitch_deg: [roll, yaw, pitch].map(f64::to_degrees),
+        }
     }
 }
 
@@ -104,7 +118,11 @@ pub fn mirrored_point([x, y, z]: [f64; 3]) -> [f64; 3] {
 fn mirrored_rotation(rotation: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::from_fn(|row, column| {
         let entry = rotation[(row, column)];
-        if (row == 1) == (column == 1) { entry } else { -entry }
+        if (row == 1) == (column == 1) {
+            entry
+        } else {
+            -entry
+        }
     })
 }
 
@@ -116,7 +134,12 @@ mod tests {
     use super::*;
 
     fn any_pose() -> impl Strategy<Value = CarlaPose> {
-        (prop::array::uniform3(-1e4..1e4f64), -180.0..180.0f64, -180.0..180.0f64, -89.0..89.0f64)
+        (
+            prop::array::uniform3(-1e4..1e4f64),
+            -180.0..180.0f64,
+            -180.0..180.0f64,
+            -89.0..89.0f64,
+        )
             .prop_map(|([x, y, z], roll, yaw, pitch)| [x, y, z, roll, yaw, pitch].into())
     }
 

@@ -32,12 +32,18 @@ impl ClassSet {
     #[must_use]
     pub fn names(self) -> Vec<String> {
         let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
-        let single =
-            |class: &&ObjectClass| self.contains(**class) && !(has_vehicles && Self::VEHICLES.contains(**class));
+        let single = |class: &&ObjectClass| {
+            self.contains(**class) && !(has_vehicles && Self::VEHICLES.contains(**class))
+        };
         has_vehicles
             .then(|| VEHICLE.to_owned())
             .into_iter()
-            .chain(ObjectClass::ALL.iter().filter(single).map(|class| class.name().to_owned()))
+            .chain(
+                ObjectClass::ALL
+                    .iter()
+                    .filter(single)
+                    .map(|class| class.name().to_owned()),
+            )
             .collect()
     }
 
@@ -47,15 +53,24 @@ impl ClassSet {
             set.0 |= if asked == VEHICLE {
                 Self::VEHICLES.0
             } else {
-                bit(asked.parse().map_err(|error: UnknownClass| error.to_string())?)
+                bit(asked
+                    .parse()
+                    .map_err(|error: UnknownClass| error.to_string())?)
             };
         }
-        if set.0 == 0 { Err("no class is given".into()) } else { Ok(set) }
+        if set.0 == 0 {
+            Err("no class is given".into())
+        } else {
+            Ok(set)
+        }
     }
 }
 
 fn bit(class: ObjectClass) -> u8 {
-    ObjectClass::ALL.iter().position(|known| *known == class).map_or(0, |index| 1 << index)
+    ObjectClass::ALL
+        .iter()
+        .position(|known| *known == class)
+        .map_or(0, |index| 1 << index)
 }
 
 impl FromStr for ClassSet {
@@ -95,8 +110,13 @@ mod tests {
         let vehicles: ClassSet = "vehicle".parse().unwrap();
         assert_eq!(vehicles, ClassSet::VEHICLES);
         assert_eq!(vehicles, "car,van,truck,bus".parse().unwrap());
-        assert!(vehicles.contains(ObjectClass::Truck) && !vehicles.contains(ObjectClass::TwoWheeler));
-        assert_eq!(ClassSet::ALL_BUT_PEDESTRIANS.to_string(), "vehicle,two_wheeler,other");
+        assert!(
+            vehicles.contains(ObjectClass::Truck) && !vehicles.contains(ObjectClass::TwoWheeler)
+        );
+        assert_eq!(
+            ClassSet::ALL_BUT_PEDESTRIANS.to_string(),
+            "vehicle,two_wheeler,other"
+        );
     }
 
     #[test]
@@ -111,7 +131,10 @@ mod tests {
     #[test]
     fn an_unknown_class_is_reported_with_the_known_ones() {
         let error = "vehicles".parse::<ClassSet>().unwrap_err();
-        assert!(error.starts_with("\"vehicles\" is no class: expected vehicle, car,"), "{error}");
+        assert!(
+            error.starts_with("\"vehicles\" is no class: expected vehicle, car,"),
+            "{error}"
+        );
         assert!("".parse::<ClassSet>().is_err());
     }
 }

@@ -10,8 +10,22 @@ use crate::frame::ObjectClass;
 
 /// CARLA's blueprints of the library `vehicle.*` that are no cars, by their last word.
 const BLUEPRINTS: [(ObjectClass, &[&str]); 4] = [
-    (ObjectClass::TwoWheeler, &["crossbike", "century", "omafiets", "lowrider", "ninja", "yzf", "zx125"]),
-    (ObjectClass::Truck, &["carlacola", "firetruck", "europeanhgv"]),
+    (
+        ObjectClass::TwoWheeler,
+        &[
+            "crossbike",
+            "century",
+            "omafiets",
+            "lowrider",
+            "ninja",
+            "yzf",
+            "zx125",
+        ],
+    ),
+    (
+        ObjectClass::Truck,
+        &["carlacola", "firetruck", "europeanhgv"],
+    ),
     (ObjectClass::Van, &["ambulance", "sprinter", "t2", "t22021"]),
     (ObjectClass::Bus, &["fusorosa"]),
 ];
@@ -22,9 +36,8 @@ pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
         return Some(class);
     }
     Some(match plain(name).as_str() {
-        "car" | "suv" | "sedan" | "vehicle" | "motorvehicle" | "passengercar" | "policecar" | "tourcar" | "taxi" => {
-            ObjectClass::Car
-        }
+        "car" | "suv" | "sedan" | "vehicle" | "motorvehicle" | "passengercar" | "policecar"
+        | "tourcar" | "taxi" => ObjectClass::Car,
         // V2X-Real counts it among cars.
         "longvehicle" => ObjectClass::Car,
         "van" | "minibus" | "ambulance" => ObjectClass::Van,
@@ -46,17 +59,18 @@ pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
         | "excavator"
         | "trashcan" => ObjectClass::Truck,
         "bus" | "tram" | "coach" => ObjectClass::Bus,
-        "cyclist" | "bicycle" | "bike" | "bicyclerider" | "bicyclegroup" | "densebicycle" | "biker" | "rider"
-        | "motorcycle" | "motorcyclist" | "motorcyclerider" | "motorcylerider" | "motorbike" | "motorrider"
-        | "nonmotorrider" | "scooter" | "scooterrider" | "tricycle" | "tricyclist" | "tricyclerider"
-        | "trimotorcycle" | "threewheeler" | "twowheeler" | "barrow" | "barrowlist" => ObjectClass::TwoWheeler,
-        "pedestrian" | "person" | "personsitting" | "humansitting" | "child" | "roadworker" | "walker" | "adult" => {
-            ObjectClass::Pedestrian
-        }
-        "other" | "misc" | "dontcare" | "cone" | "trafficcone" | "trafficsign" | "trafficsigns" | "barrier"
-        | "trafficbarrier" | "roadbarrel" | "babycart" | "firehydrant" | "saftytriangle" | "safetytriangle"
-        | "animal" | "dog" | "unknown" | "unknownmovable" | "unknownunmovable" | "unknownsmovable"
-        | "unknownsunmovable" | "pedestrianignore" | "carignore" | "otherignore" => ObjectClass::Other,
+        "cyclist" | "bicycle" | "bike" | "bicyclerider" | "bicyclegroup" | "densebicycle"
+        | "biker" | "rider" | "motorcycle" | "motorcyclist" | "motorcyclerider"
+        | "motorcylerider" | "motorbike" | "motorrider" | "nonmotorrider" | "scooter"
+        | "scooterrider" | "tricycle" | "tricyclist" | "tricyclerider" | "trimotorcycle"
+        | "threewheeler" | "twowheeler" | "barrow" | "barrowlist" => ObjectClass::TwoWheeler,
+        "pedestrian" | "person" | "personsitting" | "humansitting" | "child" | "roadworker"
+        | "walker" | "adult" => ObjectClass::Pedestrian,
+        "other" | "misc" | "dontcare" | "cone" | "trafficcone" | "trafficsign" | "trafficsigns"
+        | "barrier" | "trafficbarrier" | "roadbarrel" | "babycart" | "firehydrant"
+        | "saftytriangle" | "safetytriangle" | "animal" | "dog" | "unknown" | "unknownmovable"
+        | "unknownunmovable" | "unknownsmovable" | "unknownsunmovable" | "pedestrianignore"
+        | "carignore" | "otherignore" => ObjectClass::Other,
         _ => return None,
     })
 }
@@ -67,7 +81,9 @@ pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
         path: dir.to_owned(),
         line: None,
         field: Some(field.to_owned()),
-        reason: format!("{found} is an unknown type of object: it counts as other, not as a vehicle"),
+        reason: format!(
+            "{found} is an unknown type of object: it counts as other, not as a vehicle"
+        ),
     })
 }
 
@@ -76,21 +92,37 @@ fn of_library(name: &str) -> Option<ObjectClass> {
     let (library, rest) = name.split_once('.')?;
     match library {
         "human" | "walker" => Some(ObjectClass::Pedestrian),
-        "movable_object" | "static_object" | "static" | "traffic" | "animal" => Some(ObjectClass::Other),
+        "movable_object" | "static_object" | "static" | "traffic" | "animal" => {
+            Some(ObjectClass::Other)
+        }
         "vehicle" => {
             let kind = rest.split('.').next().unwrap_or(rest);
             let model = plain(rest.rsplit('.').next().unwrap_or(rest));
-            let blueprint = BLUEPRINTS.iter().find(|(_, models)| models.contains(&model.as_str()));
+            let blueprint = BLUEPRINTS
+                .iter()
+                .find(|(_, models)| models.contains(&model.as_str()));
             // `vehicle.bus.rigid` and `vehicle.emergency.police` of nuScenes, or make and model.
-            let category = if kind == "emergency" { of_name(&model) } else { of_name(kind) };
-            Some(blueprint.map(|(class, _)| *class).or(category).unwrap_or(ObjectClass::Car))
+            let category = if kind == "emergency" {
+                of_name(&model)
+            } else {
+                of_name(kind)
+            };
+            Some(
+                blueprint
+                    .map(|(class, _)| *class)
+                    .or(category)
+                    .unwrap_or(ObjectClass::Car),
+            )
         }
         _ => None,
     }
 }
 
 fn plain(name: &str) -> String {
-    name.chars().filter(char::is_ascii_alphanumeric).map(|letter| letter.to_ascii_lowercase()).collect()
+    name.chars()
+        .filter(char::is_ascii_alphanumeric)
+        .map(|letter| letter.to_ascii_lowercase())
+        .collect()
 }
 
 #[cfg(test)]
@@ -100,13 +132,44 @@ mod tests {
     #[test]
     fn names_of_all_layouts_are_known() {
         let cases: [(ObjectClass, &[&str]); 7] = [
-            (ObjectClass::Car, &["Car", "car", "PoliceCar", "LongVehicle", "vehicle.car", "vehicle.audi.tt"]),
-            (ObjectClass::Van, &["Van", "vehicle.emergency.ambulance", "vehicle.volkswagen.t2_2021"]),
+            (
+                ObjectClass::Car,
+                &[
+                    "Car",
+                    "car",
+                    "PoliceCar",
+                    "LongVehicle",
+                    "vehicle.car",
+                    "vehicle.audi.tt",
+                ],
+            ),
+            (
+                ObjectClass::Van,
+                &[
+                    "Van",
+                    "vehicle.emergency.ambulance",
+                    "vehicle.volkswagen.t2_2021",
+                ],
+            ),
             (
                 ObjectClass::Truck,
-                &["Truck", "ConcreteTruck", "huge_vehicle", "vehicle.truck", "vehicle.carlamotors.european_hgv"],
+                &[
+                    "Truck",
+                    "ConcreteTruck",
+                    "huge_vehicle",
+                    "vehicle.truck",
+                    "vehicle.carlamotors.european_hgv",
+                ],
             ),
-            (ObjectClass::Bus, &["Bus", "Tram", "vehicle.bus.rigid", "vehicle.mitsubishi.fusorosa"]),
+            (
+                ObjectClass::Bus,
+                &[
+                    "Bus",
+                    "Tram",
+                    "vehicle.bus.rigid",
+                    "vehicle.mitsubishi.fusorosa",
+                ],
+            ),
             (
                 ObjectClass::TwoWheeler,
                 &[
@@ -132,7 +195,15 @@ mod tests {
                     "walker.pedestrian.0001",
                 ],
             ),
-            (ObjectClass::Other, &["Misc", "TrafficCone", "Traffic cone", "movable_object.barrier"]),
+            (
+                ObjectClass::Other,
+                &[
+                    "Misc",
+                    "TrafficCone",
+                    "Traffic cone",
+                    "movable_object.barrier",
+                ],
+            ),
         ];
         for (class, names) in cases {
             for name in names {

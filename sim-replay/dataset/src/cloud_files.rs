@@ -25,7 +25,11 @@ pub struct CloudFile {
 #[derive(Debug, Clone)]
 enum Source {
     /// A frame of a data set.
-    Frame { scenario: Arc<Scenario>, agent: usize, tick: usize },
+    Frame {
+        scenario: Arc<Scenario>,
+        agent: usize,
+        tick: usize,
+    },
     /// A file by itself, with the others of its folder.
     File(Arc<Sweeps>),
 }
@@ -53,18 +57,28 @@ pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile, ReadError>> {
         }
     }
     let mut folders = Folders::of(found.iter().flatten());
-    found.into_iter().map(|listed| listed.map(|listed| folders.source_of(listed))).collect()
+    found
+        .into_iter()
+        .map(|listed| listed.map(|listed| folders.source_of(listed)))
+        .collect()
 }
 
 /// Files of points directly in a folder, in text order.
 pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
-    let paths = files::list(dir)?.files.into_iter().map(|name| dir.join(name));
+    let paths = files::list(dir)?
+        .files
+        .into_iter()
+        .map(|name| dir.join(name));
     Ok(paths.filter(|path| is_cloud(path)).collect())
 }
 
 fn is_cloud(path: &Path) -> bool {
     let ending = path.extension().and_then(|ending| ending.to_str());
-    ending.is_some_and(|ending| ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known)))
+    ending.is_some_and(|ending| {
+        ENDINGS
+            .iter()
+            .any(|known| ending.eq_ignore_ascii_case(known))
+    })
 }
 
 /// A listed file.
@@ -82,9 +96,17 @@ fn listed(path: &Path) -> Result<Vec<Listed>, ReadError> {
     if !clouds.is_empty() {
         return Ok(clouds.into_iter().map(Listed::File).collect());
     }
-    let sweeps: Vec<Listed> = crate::open(path)?.scenarios.into_iter().flat_map(frames_of).map(Listed::Known).collect();
+    let sweeps: Vec<Listed> = crate::open(path)?
+        .scenarios
+        .into_iter()
+        .flat_map(frames_of)
+        .map(Listed::Known)
+        .collect();
     match sweeps.is_empty() {
-        true => Err(ReadError::malformed(path, "no cloud in it: expected files .pcd, .ply, .npy or .bin")),
+        true => Err(ReadError::malformed(
+            path,
+            "no cloud in it: expected files .pcd, .ply, .npy or .bin",
+        )),
         false => Ok(sweeps),
     }
 }
@@ -92,10 +114,18 @@ fn listed(path: &Path) -> Result<Vec<Listed>, ReadError> {
 /// All sweeps of a scenario.
 fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
     let scenario = Arc::new(scenario);
-    let all = (0..scenario.agents.len()).flat_map(|agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
+    let all = (0..scenario.agents.len())
+        .flat_map(|agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
     let file = |(agent, tick)| {
         let path = scenario.points_path(agent, tick, None).ok()?;
-        Some(CloudFile { path, source: Source::Frame { scenario: Arc::clone(&scenario), agent, tick } })
+        Some(CloudFile {
+            path,
+            source: Source::Frame {
+                scenario: Arc::clone(&scenario),
+                agent,
+                tick,
+            },
+        })
     };
     all.filter_map(file).collect()
 }
@@ -116,10 +146,20 @@ impl Folders {
             }
         }
         let sweeps = |files: Vec<PathBuf>| {
-            Arc::new(Sweeps::of_single_vehicle(SweepStorage::ByName, files, &OpenOptions::default()))
+            Arc::new(Sweeps::of_single_vehicle(
+                SweepStorage::ByName,
+                files,
+                &OpenOptions::default(),
+            ))
         };
-        let alone = files.into_iter().map(|(folder, files)| (folder, sweeps(files))).collect();
-        Self { alone, scenes: BTreeMap::new() }
+        let alone = files
+            .into_iter()
+            .map(|(folder, files)| (folder, sweeps(files)))
+            .collect();
+        Self {
+            alone,
+            scenes: BTreeMap::new(),
+        }
     }
 
     fn source_of(&mut self, listed: Listed) -> CloudFile {
@@ -129,13 +169,29 @@ impl Folders {
         };
         let known = scene_of(&path).and_then(|scene| {
             let frames = self.scenes.entry(scene.clone()).or_insert_with(|| {
-                let scenarios = crate::open(&scene).map(|dataset| dataset.scenarios).unwrap_or_default();
-                scenarios.into_iter().flat_map(frames_of).map(|file| (canonical(&file.path), file)).collect()
+                let scenarios = crate::open(&scene)
+                    .map(|dataset| dataset.scenarios)
+                    .unwrap_or_default();
+                scenarios
+                    .into_iter()
+                    .flat_map(frames_of)
+                    .map(|file| (canonical(&file.path), file))
+                    .collect()
             });
             frames.get(&canonical(&path)).cloned()
         });
-        let alone = self.alone.get(&folder_of(&path)).cloned().unwrap_or_default();
-        known.map_or(CloudFile { path: path.clone(), source: Source::File(alone) }, |known| CloudFile { path, ..known })
+        let alone = self
+            .alone
+            .get(&folder_of(&path))
+            .cloned()
+            .unwrap_or_default();
+        known.map_or(
+            CloudFile {
+                path: path.clone(),
+                source: Source::File(alone),
+            },
+            |known| CloudFile { path, ..known },
+        )
     }
 }
 
@@ -153,7 +209,9 @@ fn scene_of(path: &Path) -> Option<PathBuf> {
     let folder = path.parent()?;
     let is_of_sequence = SEQUENCE_FOLDERS.iter().any(|name| folder.ends_with(name));
     let is_frame = path.with_extension("yaml").is_file();
-    (is_frame || is_of_sequence).then(|| folder.parent().map(Path::to_owned)).flatten()
+    (is_frame || is_of_sequence)
+        .then(|| folder.parent().map(Path::to_owned))
+        .flatten()
 }
 
 impl CloudFile {
@@ -169,8 +227,16 @@ impl CloudFile {
     /// [`ReadError`] when the file cannot be read, is malformed or holds no points that a LiDAR measures: in this case
     /// with the exceeded limit.
     pub fn read(&self) -> Result<Cloud, ReadError> {
-        let PcdCloud { mut points, dropped, .. } = match &self.source {
-            Source::Frame { scenario, agent, tick } => scenario.load_points(*agent, *tick, None)?,
+        let PcdCloud {
+            mut points,
+            dropped,
+            ..
+        } = match &self.source {
+            Source::Frame {
+                scenario,
+                agent,
+                tick,
+            } => scenario.load_points(*agent, *tick, None)?,
             Source::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
         };
         let before = points.len();
@@ -182,7 +248,11 @@ impl CloudFile {
             let reason = format!("{fault}; a cloud is in the LiDAR frame, in metres");
             return Err(ReadError::malformed(&self.path, reason));
         }
-        Ok(Cloud { points, left_out, is_of_data_set: matches!(self.source, Source::Frame { .. }) })
+        Ok(Cloud {
+            points,
+            left_out,
+            is_of_data_set: matches!(self.source, Source::Frame { .. }),
+        })
     }
 }
 
@@ -195,12 +265,23 @@ mod tests {
     const POINTS: [[f32; 3]; 3] = [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [4.0, -5.0, 1.5]];
 
     fn ascii_pcd(points: &[[f32; 3]]) -> String {
-        let head = format!("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {}\nHEIGHT 1\nDATA ascii\n", points.len());
-        points.iter().fold(head, |text, [x, y, z]| format!("{text}{x} {y} {z}\n"))
+        let head = format!(
+            "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {}\nHEIGHT 1\nDATA ascii\n",
+            points.len()
+        );
+        points
+            .iter()
+            .fold(head, |text, [x, y, z]| format!("{text}{x} {y} {z}\n"))
     }
 
     fn xyz(file: &CloudFile) -> Vec<[f32; 3]> {
-        file.read().unwrap().points.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]).collect()
+        file.read()
+            .unwrap()
+            .points
+            .xyzi
+            .iter()
+            .map(|&[x, y, z, _]| [x, y, z])
+            .collect()
     }
 
     #[test]
@@ -215,10 +296,34 @@ mod tests {
         let files = clouds_at(&[folder.clone(), none.clone(), folder.join("a.pcd")]);
         assert_eq!(files.len(), 4);
         let first = files[0].as_ref().unwrap();
-        assert_eq!(xyz(first), [POINTS[0], POINTS[2]], "no return lies at the origin");
-        assert_eq!((first.read().unwrap().left_out, first.read().unwrap().is_of_data_set), (1, false));
-        assert!(files[1].as_ref().unwrap().read().unwrap_err().to_string().contains("b.npy: it does not begin"));
-        assert!(files[2].as_ref().unwrap_err().to_string().contains("none.pcd"));
+        assert_eq!(
+            xyz(first),
+            [POINTS[0], POINTS[2]],
+            "no return lies at the origin"
+        );
+        assert_eq!(
+            (
+                first.read().unwrap().left_out,
+                first.read().unwrap().is_of_data_set
+            ),
+            (1, false)
+        );
+        assert!(
+            files[1]
+                .as_ref()
+                .unwrap()
+                .read()
+                .unwrap_err()
+                .to_string()
+                .contains("b.npy: it does not begin")
+        );
+        assert!(
+            files[2]
+                .as_ref()
+                .unwrap_err()
+                .to_string()
+                .contains("none.pcd")
+        );
         assert_eq!(files[3].as_ref().unwrap().path(), folder.join("a.pcd"));
     }
 
@@ -228,7 +333,11 @@ mod tests {
         let agent = dir.path().join("scene/7");
         fs::create_dir_all(&agent).unwrap();
         fs::write(agent.join("000069.pcd"), ascii_pcd(&POINTS)).unwrap();
-        fs::write(agent.join("000069.yaml"), "lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles: {}\n").unwrap();
+        fs::write(
+            agent.join("000069.yaml"),
+            "lidar_pose: [0, 0, 0, 0, 0, 0]\nvehicles: {}\n",
+        )
+        .unwrap();
         for path in [agent.join("000069.pcd"), dir.path().to_owned()] {
             let file = clouds_at(&[path]).remove(0).unwrap();
             assert_eq!(xyz(&file), [[1.0, -2.0, 3.0], [4.0, 5.0, 1.5]]);
@@ -241,9 +350,15 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("map.pcd");
         fs::write(&path, ascii_pcd(&[[450_000.0, 5_400_000.0, 110.0]])).unwrap();
-        let message = clouds_at(&[path]).remove(0).unwrap().read().unwrap_err().to_string();
+        let message = clouds_at(&[path])
+            .remove(0)
+            .unwrap()
+            .read()
+            .unwrap_err()
+            .to_string();
         assert!(
-            message.contains("0.0 % of the points lie within 300 m") && message.ends_with("LiDAR frame, in metres")
+            message.contains("0.0 % of the points lie within 300 m")
+                && message.ends_with("LiDAR frame, in metres")
         );
     }
 }

@@ -61,12 +61,20 @@ pub enum ReadError {
 impl ReadError {
     /// A [`ReadError::Malformed`] of a whole file.
     pub fn malformed(path: &Path, reason: impl Into<String>) -> Self {
-        Self::Malformed { path: path.to_owned(), line: None, field: None, reason: reason.into() }
+        Self::Malformed {
+            path: path.to_owned(),
+            line: None,
+            field: None,
+            reason: reason.into(),
+        }
     }
 
     /// A [`ReadError::Io`].
     pub fn io(path: &Path, source: std::io::Error) -> Self {
-        Self::Io { path: path.to_owned(), source }
+        Self::Io {
+            path: path.to_owned(),
+            source,
+        }
     }
 
     /// The same error with its consequence at the end of the reason.
@@ -82,7 +90,9 @@ impl ReadError {
     #[must_use]
     pub fn path(&self) -> Option<&Path> {
         match self {
-            Self::Io { path, .. } | Self::Layout { path, .. } | Self::Malformed { path, .. } => Some(path),
+            Self::Io { path, .. } | Self::Layout { path, .. } | Self::Malformed { path, .. } => {
+                Some(path)
+            }
             Self::NoSuch { .. } | Self::Absent { .. } => None,
         }
     }
@@ -96,13 +106,21 @@ impl ReadError {
     /// The line at fault, from 1.
     #[must_use]
     pub fn line(&self) -> Option<u64> {
-        if let Self::Malformed { line, .. } = self { *line } else { None }
+        if let Self::Malformed { line, .. } = self {
+            *line
+        } else {
+            None
+        }
     }
 
     /// The field at fault.
     #[must_use]
     pub fn field(&self) -> Option<&str> {
-        if let Self::Malformed { field, .. } = self { field.as_deref() } else { None }
+        if let Self::Malformed { field, .. } = self {
+            field.as_deref()
+        } else {
+            None
+        }
     }
 }
 
@@ -134,7 +152,13 @@ mod tests {
             field: Some("POINTS".into()),
             reason: "3 stated, 2 found".into(),
         };
-        assert_eq!(error.to_string(), "a/000069.pcd:10: POINTS: 3 stated, 2 found");
-        assert_eq!(ReadError::malformed(Path::new("b.bin"), "empty").to_string(), "b.bin: empty");
+        assert_eq!(
+            error.to_string(),
+            "a/000069.pcd:10: POINTS: 3 stated, 2 found"
+        );
+        assert_eq!(
+            ReadError::malformed(Path::new("b.bin"), "empty").to_string(),
+            "b.bin: empty"
+        );
     }
 }

@@ -39,7 +39,9 @@ pub struct EvaluationProtocol {
 }
 
 /// Kinds of agents of a scenario that take part.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum AgentKinds {
     /// Vehicles and roadside units.
@@ -52,7 +54,9 @@ pub enum AgentKinds {
 }
 
 /// Choice of the ego in a scenario.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum EgoKind {
     /// The first vehicle; the first roadside unit if there is no vehicle.
@@ -63,7 +67,9 @@ pub enum EgoKind {
 }
 
 /// Order of detections when precision and recall are summed up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum ApOrder {
     /// By score over all frames.
@@ -91,15 +97,25 @@ impl EvaluationProtocol {
         let within = |[low, high]: [f64; 2], from, to| [low.max(from), high.min(to)];
         let GroundTruthRule { x_m, y_m, z_m, .. } = self.ground_truth;
         let (x_m, y_m) = (within(x_m, x_low, x_high), within(y_m, y_low, y_high));
-        GroundTruthRule { x_m, y_m, z_m: within(z_m, z_low, z_high), ..self.ground_truth }
+        GroundTruthRule {
+            x_m,
+            y_m,
+            z_m: within(z_m, z_low, z_high),
+            ..self.ground_truth
+        }
     }
 
     /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
     #[must_use]
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
-        let is_unit =
-            |index: &usize| scenario.agents.get(*index).is_some_and(|agent| scenario.roadside_units.contains(agent));
-        let (units, vehicles): (Vec<usize>, Vec<usize>) = (0..scenario.agents.len()).partition(is_unit);
+        let is_unit = |index: &usize| {
+            scenario
+                .agents
+                .get(*index)
+                .is_some_and(|agent| scenario.roadside_units.contains(agent))
+        };
+        let (units, vehicles): (Vec<usize>, Vec<usize>) =
+            (0..scenario.agents.len()).partition(is_unit);
         let mut order = match (self.agents, self.ego) {
             (AgentKinds::Vehicles, _) => vehicles,
             (AgentKinds::Units, _) => units,
@@ -107,15 +123,25 @@ impl EvaluationProtocol {
             (AgentKinds::All, EgoKind::Unit) => [units, vehicles].concat(),
         };
         order.truncate(self.max_agents);
-        if order.is_empty() { None } else { Some(scenario.arranged(&order)) }
+        if order.is_empty() {
+            None
+        } else {
+            Some(scenario.arranged(&order))
+        }
     }
 }
 
 impl fmt::Display for EvaluationProtocol {
     /// One line for reports.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let GroundTruthRule { x_m: [x0, x1], y_m: [y0, y1], z_m: [z0, z1], comm_range_m, min_corners, classes } =
-            self.ground_truth;
+        let GroundTruthRule {
+            x_m: [x0, x1],
+            y_m: [y0, y1],
+            z_m: [z0, z1],
+            comm_range_m,
+            min_corners,
+            classes,
+        } = self.ground_truth;
         write!(
             f,
             "protocol {}: {classes} with {min_corners} of 8 corners in x {x0} to {x1}, y {y0} to {y1}, z {z0} to {z1} m of \

@@ -20,12 +20,21 @@ pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
     let mut listing = Listing::default();
     for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
         let entry = entry.map_err(|error| ReadError::io(dir, error))?;
-        let Some(name) = entry.file_name().to_str().filter(|name| !name.starts_with('.')).map(str::to_owned) else {
+        let Some(name) = entry
+            .file_name()
+            .to_str()
+            .filter(|name| !name.starts_with('.'))
+            .map(str::to_owned)
+        else {
             continue;
         };
         // Data often lies behind symbolic links, so these are followed.
         let kind = entry.file_type().ok().filter(|kind| !kind.is_symlink());
-        match kind.or_else(|| fs::metadata(entry.path()).ok().map(|metadata| metadata.file_type())) {
+        match kind.or_else(|| {
+            fs::metadata(entry.path())
+                .ok()
+                .map(|metadata| metadata.file_type())
+        }) {
             Some(kind) if kind.is_dir() => listing.folders.push(name),
             Some(_) => listing.files.push(name),
             None => {}
@@ -37,7 +46,11 @@ pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
 }
 
 /// The folders below one with their contents; one that cannot be listed is left out.
-pub(super) fn list_below(dir: &Path, listing: &Listing, problems: &mut Vec<ReadError>) -> Vec<(PathBuf, Listing)> {
+pub(super) fn list_below(
+    dir: &Path,
+    listing: &Listing,
+    problems: &mut Vec<ReadError>,
+) -> Vec<(PathBuf, Listing)> {
     let mut below = Vec::with_capacity(listing.folders.len());
     for path in listing.folders.iter().map(|folder| dir.join(folder)) {
         match list(&path) {
@@ -60,7 +73,8 @@ pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadE
 /// contains.
 pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String, ReadError> {
     let bytes = read_limited(path, max_bytes)?;
-    Ok(String::from_utf8(bytes).unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
+    Ok(String::from_utf8(bytes)
+        .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
 }
 
 /// True if a folder has a file whose name ends in `suffix`.
@@ -70,14 +84,21 @@ pub(super) fn holds(dir: &Path, suffix: &str) -> bool {
 
 /// The stems of the files that end in `suffix`, in the order given.
 pub(super) fn stems<'a>(files: &'a [String], suffix: &str) -> Vec<&'a str> {
-    files.iter().filter_map(|name| name.strip_suffix(suffix)).collect()
+    files
+        .iter()
+        .filter_map(|name| name.strip_suffix(suffix))
+        .collect()
 }
 
 /// Paths of a folder: as given, absolute, and canonical. `.` or `00` shows little of the folders above; a symbolic link
 /// may lead to other ones.
 pub(super) fn names_of(dir: &Path) -> impl Iterator<Item = PathBuf> {
-    let others = [std::path::absolute(dir), dir.canonicalize()].into_iter().flatten();
-    std::iter::once(dir.to_owned()).chain(others).filter(|name| name.file_name().is_some())
+    let others = [std::path::absolute(dir), dir.canonicalize()]
+        .into_iter()
+        .flatten();
+    std::iter::once(dir.to_owned())
+        .chain(others)
+        .filter(|name| name.file_name().is_some())
 }
 
 /// The folders above one, by its [`names_of`].
@@ -87,9 +108,20 @@ pub(super) fn above(dir: &Path) -> impl Iterator<Item = PathBuf> {
 
 /// The name of a path below `root`, or the folder's own name where they are the same.
 pub(super) fn name_below(root: &Path, dir: &Path) -> String {
-    let below = dir.strip_prefix(root).ok().filter(|below| !below.as_os_str().is_empty());
-    let own_name = || dir.canonicalize().ok().and_then(|dir| dir.file_name().map(PathBuf::from)).unwrap_or_default();
-    below.map_or_else(own_name, Path::to_owned).to_string_lossy().replace('\\', "/")
+    let below = dir
+        .strip_prefix(root)
+        .ok()
+        .filter(|below| !below.as_os_str().is_empty());
+    let own_name = || {
+        dir.canonicalize()
+            .ok()
+            .and_then(|dir| dir.file_name().map(PathBuf::from))
+            .unwrap_or_default()
+    };
+    below
+        .map_or_else(own_name, Path::to_owned)
+        .to_string_lossy()
+        .replace('\\', "/")
 }
 
 #[cfg(test)]
@@ -104,13 +136,18 @@ mod tests {
         }
         fs::create_dir(dir.path().join("4279")).unwrap();
         let listing = list(dir.path()).unwrap();
-        assert_eq!((listing.files, listing.folders), (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into()]));
+        assert_eq!(
+            (listing.files, listing.folders),
+            (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into()])
+        );
     }
 
     #[test]
     fn links_are_followed_and_those_to_nothing_are_not_there() {
         let dir = tempfile::tempdir().unwrap();
-        let link = |target: &Path, name: &str| std::os::unix::fs::symlink(target, dir.path().join(name)).unwrap();
+        let link = |target: &Path, name: &str| {
+            std::os::unix::fs::symlink(target, dir.path().join(name)).unwrap()
+        };
         fs::create_dir(dir.path().join("4279")).unwrap();
         fs::write(dir.path().join("a.yaml"), "").unwrap();
         link(&dir.path().join("4279"), "4288");
@@ -120,7 +157,10 @@ mod tests {
         let listing = list(dir.path()).unwrap();
         assert_eq!(
             (listing.files, listing.folders),
-            (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into(), "4288".into()])
+            (
+                vec!["a.yaml".into(), "b.yaml".into()],
+                vec!["4279".into(), "4288".into()]
+            )
         );
     }
 
@@ -136,12 +176,18 @@ mod tests {
                 .to_string()
                 .ends_with("a: larger than 10 bytes, the most that is read")
         );
-        assert!(matches!(read_limited(&dir.path().join("b"), 10), Err(ReadError::Io { .. })));
+        assert!(matches!(
+            read_limited(&dir.path().join("b"), 10),
+            Err(ReadError::Io { .. })
+        ));
     }
 
     #[test]
     fn a_scenario_is_named_by_its_path_below_the_root() {
-        assert_eq!(name_below(Path::new("/data"), Path::new("/data/test/one")), "test/one");
+        assert_eq!(
+            name_below(Path::new("/data"), Path::new("/data/test/one")),
+            "test/one"
+        );
         let dir = tempfile::tempdir().unwrap();
         let own = dir.path().file_name().unwrap().to_string_lossy();
         assert_eq!(name_below(dir.path(), dir.path()), own);

@@ -31,8 +31,15 @@ pub enum ObjectClass {
 
 impl ObjectClass {
     /// Every class.
-    pub const ALL: [Self; 7] =
-        [Self::Car, Self::Van, Self::Truck, Self::Bus, Self::TwoWheeler, Self::Pedestrian, Self::Other];
+    pub const ALL: [Self; 7] = [
+        Self::Car,
+        Self::Van,
+        Self::Truck,
+        Self::Bus,
+        Self::TwoWheeler,
+        Self::Pedestrian,
+        Self::Other,
+    ];
     /// Classes of motor vehicles with at least three wheels: the default targets of detection.
     pub const VEHICLES: [Self; 4] = [Self::Car, Self::Van, Self::Truck, Self::Bus];
 
@@ -62,13 +69,18 @@ impl FromStr for ObjectClass {
 
     /// Reads [`ObjectClass::name`].
     fn from_str(text: &str) -> Result<Self, UnknownClass> {
-        Self::ALL.into_iter().find(|class| class.name() == text).ok_or_else(|| UnknownClass(text.to_owned()))
+        Self::ALL
+            .into_iter()
+            .find(|class| class.name() == text)
+            .ok_or_else(|| UnknownClass(text.to_owned()))
     }
 }
 
 /// A text that names no class.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} is no class: expected vehicle, car, van, truck, bus, two_wheeler, pedestrian or other")]
+#[error(
+    "{0:?} is no class: expected vehicle, car, van, truck, bus, two_wheeler, pedestrian or other"
+)]
 pub struct UnknownClass(String);
 
 /// An annotated object.
@@ -89,9 +101,21 @@ pub struct Object {
 impl From<&TrueObject> for Object {
     /// An object of a message; a class of another version is [`ObjectClass::Other`].
     fn from(object: &TrueObject) -> Self {
-        let TrueObject { id, class, world_from_object, size_m, speed_mps } = object;
+        let TrueObject {
+            id,
+            class,
+            world_from_object,
+            size_m,
+            speed_mps,
+        } = object;
         let class = class.parse().unwrap_or(ObjectClass::Other);
-        Self { id: *id, class, world_from_object: *world_from_object, size_m: *size_m, speed_mps: *speed_mps }
+        Self {
+            id: *id,
+            class,
+            world_from_object: *world_from_object,
+            size_m: *size_m,
+            speed_mps: *speed_mps,
+        }
     }
 }
 
@@ -135,7 +159,10 @@ impl Frame {
     /// Motion of the vehicle, as far as it is recorded.
     #[must_use]
     pub fn motion(&self) -> EgoMotion {
-        EgoMotion { speed_mps: self.speed_mps, yaw_rate_rad_s: self.yaw_rate_rad_s }
+        EgoMotion {
+            speed_mps: self.speed_mps,
+            yaw_rate_rad_s: self.yaw_rate_rad_s,
+        }
     }
 
     /// An empty frame.
@@ -174,7 +201,10 @@ impl Frame {
     #[must_use]
     pub fn gnss_world_from_lidar(&self) -> Option<Pose> {
         let gnss = self.gnss_world_from_vehicle?.isometry();
-        let vehicle_from_lidar = self.world_from_vehicle?.isometry().inv_mul(&self.world_from_lidar?.isometry());
+        let vehicle_from_lidar = self
+            .world_from_vehicle?
+            .isometry()
+            .inv_mul(&self.world_from_lidar?.isometry());
         Some((gnss * vehicle_from_lidar).into())
     }
 }

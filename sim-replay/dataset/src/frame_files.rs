@@ -29,7 +29,9 @@ pub(super) struct AgentFolder {
 /// True if a folder has a frame's YAML and its sweep of the given suffix.
 pub(super) fn holds_pairs(listing: &Listing, suffix: &str) -> bool {
     let yamls: BTreeSet<&str> = yaml_stems(listing).collect();
-    files::stems(&listing.files, suffix).iter().any(|stem| yamls.contains(stem))
+    files::stems(&listing.files, suffix)
+        .iter()
+        .any(|stem| yamls.contains(stem))
 }
 
 fn yaml_stems(listing: &Listing) -> impl Iterator<Item = &str> {
@@ -45,25 +47,38 @@ fn is_number(stem: &str) -> bool {
 /// The stems of frames, and those of other files. Copies such as `000070 (1)` beside numbers are not frames; frames may
 /// have other names if most have.
 pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str>) {
-    let (numbers, others): (BTreeSet<&str>, BTreeSet<&str>) = all.iter().partition(|stem| is_number(stem));
+    let (numbers, others): (BTreeSet<&str>, BTreeSet<&str>) =
+        all.iter().partition(|stem| is_number(stem));
     let is_copy = |stem: &&&str| {
         let rest = stem.trim_start_matches(|letter: char| letter.is_ascii_digit());
         numbers.contains(&stem[..stem.len() - rest.len()])
     };
     let names = others.iter().filter(|stem| !is_copy(stem)).count();
-    if !numbers.is_empty() && numbers.len() >= names { (numbers, others) } else { (all, BTreeSet::new()) }
+    if !numbers.is_empty() && numbers.len() >= names {
+        (numbers, others)
+    } else {
+        (all, BTreeSet::new())
+    }
 }
 
 /// One problem for all files whose names differ from those of frames.
 pub(super) fn named_once(dir: &Path, strays: &[String]) -> Option<ReadError> {
     let first = strays.iter().min()?;
-    let reason = format!("{} files whose names are no frame numbers are left out, first: {first}", strays.len());
+    let reason = format!(
+        "{} files whose names are no frame numbers are left out, first: {first}",
+        strays.len()
+    );
     Some(ReadError::malformed(dir, reason))
 }
 
 impl AgentFolder {
     /// Sorts the files of `dir`. Parts that have to be left out are added to `problems`.
-    pub(super) fn new(dir: &Path, listing: &Listing, suffix: &str, problems: &mut Vec<ReadError>) -> Self {
+    pub(super) fn new(
+        dir: &Path,
+        listing: &Listing,
+        suffix: &str,
+        problems: &mut Vec<ReadError>,
+    ) -> Self {
         let mut listed: BTreeSet<&str> = yaml_stems(listing).collect();
         let is_without_yaml = listed.is_empty();
         if is_without_yaml {
@@ -74,32 +89,48 @@ impl AgentFolder {
         let (yamls, strays) = usual_stems(listed);
         let are_numbers = !yamls.is_empty() && yamls.iter().all(|stem| is_number(stem));
         let ending = if is_without_yaml { suffix } else { ".yaml" };
-        let mut strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}{ending}")).collect();
+        let mut strays: Vec<String> = strays
+            .into_iter()
+            .map(|stem| format!("{stem}{ending}"))
+            .collect();
         let cameras = camera_files::numbers(&listing.files);
-        let mut agent = Self { is_without_yaml, cameras, ..Self::default() };
+        let mut agent = Self {
+            is_without_yaml,
+            cameras,
+            ..Self::default()
+        };
         let mut without_yaml = BTreeSet::new();
         for name in files::stems(&listing.files, suffix) {
             match Sweep::of(name, &yamls) {
                 Sweep::Plain => drop(agent.stems.insert(name.to_owned())),
                 Sweep::Radar => agent.has_radar = true,
                 Sweep::Variant(variant) => drop(agent.variants.insert(variant.to_owned())),
-                Sweep::WithoutYaml(stem) if are_numbers && !is_number(stem) => strays.push(format!("{name}{suffix}")),
+                Sweep::WithoutYaml(stem) if are_numbers && !is_number(stem) => {
+                    strays.push(format!("{name}{suffix}"))
+                }
                 Sweep::WithoutYaml(stem) => drop(without_yaml.insert(stem)),
             }
         }
         if let Some(first) = strays.iter().min() {
-            let reason =
-                format!("{} files whose names are no frame numbers are left out, first: {first}", strays.len());
+            let reason = format!(
+                "{} files whose names are no frame numbers are left out, first: {first}",
+                strays.len()
+            );
             problems.push(ReadError::malformed(dir, reason));
         }
-        let without_sweep = yamls.into_iter().filter(|stem| !agent.stems.contains(*stem));
+        let without_sweep = yamls
+            .into_iter()
+            .filter(|stem| !agent.stems.contains(*stem));
         for (stem, missing, there) in without_yaml
             .into_iter()
             .map(|stem| (stem, ".yaml", suffix))
             .chain(without_sweep.map(|stem| (stem, suffix, ".yaml")))
         {
             let reason = format!("does not exist beside {stem}{there}: the frame is left out");
-            problems.push(ReadError::malformed(&dir.join(format!("{stem}{missing}")), reason));
+            problems.push(ReadError::malformed(
+                &dir.join(format!("{stem}{missing}")),
+                reason,
+            ));
         }
         agent
     }
@@ -133,7 +164,10 @@ mod tests {
     use super::*;
 
     fn scan(names: &[&str], suffix: &str) -> (AgentFolder, Vec<String>) {
-        let listing = Listing { folders: vec![], files: names.iter().map(|name| (*name).to_owned()).collect() };
+        let listing = Listing {
+            folders: vec![],
+            files: names.iter().map(|name| (*name).to_owned()).collect(),
+        };
         let mut problems = Vec::new();
         let agent = AgentFolder::new(Path::new("1"), &listing, suffix, &mut problems);
         (agent, problems.iter().map(ToString::to_string).collect())
@@ -145,26 +179,50 @@ mod tests {
 
     #[test]
     fn copies_and_other_names_are_no_frames_and_are_named_once() {
-        let copies =
-            ["000070 (1).pcd", "000070 (1).yaml", "000070.pcd", "000070.yaml", "000070 copy_radar.pcd", "notes.yaml"];
+        let copies = [
+            "000070 (1).pcd",
+            "000070 (1).yaml",
+            "000070.pcd",
+            "000070.yaml",
+            "000070 copy_radar.pcd",
+            "notes.yaml",
+        ];
         let (agent, problems) = scan(&copies, PCD);
         assert_eq!(stems(&agent), ["000070"]);
         assert!(!agent.has_radar);
-        assert_eq!(problems, ["1: 4 files whose names are no frame numbers are left out, first: 000070 (1).pcd"]);
+        assert_eq!(
+            problems,
+            ["1: 4 files whose names are no frame numbers are left out, first: 000070 (1).pcd"]
+        );
     }
 
     #[test]
     fn frames_may_have_names() {
-        let (agent, problems) = scan(&["a_1.pcd", "a_1.yaml", "a_1_fog.pcd", "b.pcd", "b.yaml"], PCD);
+        let (agent, problems) = scan(
+            &["a_1.pcd", "a_1.yaml", "a_1_fog.pcd", "b.pcd", "b.yaml"],
+            PCD,
+        );
         assert_eq!(stems(&agent), ["a_1", "b"]);
-        assert_eq!(problems, ["1/a.yaml: does not exist beside a.pcd: the frame is left out"]);
+        assert_eq!(
+            problems,
+            ["1/a.yaml: does not exist beside a.pcd: the frame is left out"]
+        );
     }
 
     #[test]
     fn bare_floats_are_sweeps_where_there_is_no_pcd() {
-        let names = ["000000.bin", "000000.yaml", "000001.yaml", "000000_cam1.jpeg", "000000_additional.yaml"];
+        let names = [
+            "000000.bin",
+            "000000.yaml",
+            "000001.yaml",
+            "000000_cam1.jpeg",
+            "000000_additional.yaml",
+        ];
         let (agent, problems) = scan(&names, BIN);
         assert_eq!(stems(&agent), ["000000"]);
-        assert_eq!(problems, ["1/000001.bin: does not exist beside 000001.yaml: the frame is left out"]);
+        assert_eq!(
+            problems,
+            ["1/000001.bin: does not exist beside 000001.yaml: the frame is left out"]
+        );
     }
 }

@@ -28,14 +28,21 @@ impl Scenario {
     /// [`ReadError`] when there is no protocol of a generation in the scenario's folder, or it names no map.
     pub fn generated_map(&self) -> Result<GeneratedMap, ReadError> {
         let points = self.points_path(0, 0, None)?;
-        let folder = points.ancestors().nth(2).map(PathBuf::from).unwrap_or_default();
+        let folder = points
+            .ancestors()
+            .nth(2)
+            .map(PathBuf::from)
+            .unwrap_or_default();
         let path = folder.join("data_protocol.yaml");
         let node = yaml::read(&path)?;
         let generator = Field::root(&path, &node).required("generator")?;
         let seed = generator.required("town_seed")?;
         Ok(GeneratedMap {
             name: generator.required("town")?.text()?.to_owned(),
-            seed: seed.integer()?.try_into().map_err(|_| seed.expected("a seed"))?,
+            seed: seed
+                .integer()?
+                .try_into()
+                .map_err(|_| seed.expected("a seed"))?,
         })
     }
 }
@@ -49,10 +56,19 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let agent = dir.path().join("scene/7");
         fs::create_dir_all(&agent).unwrap();
-        fs::write(agent.join("000069.yaml"), "lidar_pose: [0, 0, 0, 0, 0, 0]\n").unwrap();
+        fs::write(
+            agent.join("000069.yaml"),
+            "lidar_pose: [0, 0, 0, 0, 0, 0]\n",
+        )
+        .unwrap();
         fs::write(agent.join("000069.pcd"), "").unwrap();
         let map = || crate::open(dir.path()).unwrap().scenarios[0].generated_map();
-        assert!(map().unwrap_err().to_string().contains("data_protocol.yaml"));
+        assert!(
+            map()
+                .unwrap_err()
+                .to_string()
+                .contains("data_protocol.yaml")
+        );
         let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
         fs::write(dir.path().join("scene/data_protocol.yaml"), text).unwrap();
         assert_eq!(map().unwrap().to_string(), "town4:5");

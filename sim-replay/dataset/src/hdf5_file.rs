@@ -10,7 +10,9 @@
 
 /// A signed number of 8 bytes, little-endian, and a double, as messages of type.
 const I64: [u8; 12] = [0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
-const F64: [u8; 20] = [0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];
+const F64: [u8; 20] = [
+    0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0,
+];
 /// An undefined address.
 const UNDEFINED: [u8; 8] = [0xff; 8];
 /// Offset of the root group, after the superblock.
@@ -43,7 +45,11 @@ fn dataset_header(shape: &[u64], datatype: &[u8], address: usize, bytes: usize) 
     let mut layout = vec![3, 1];
     layout.extend((address as u64).to_le_bytes());
     layout.extend((bytes as u64).to_le_bytes());
-    object_header(&[message(1, space), message(3, datatype.to_vec()), message(8, layout)])
+    object_header(&[
+        message(1, space),
+        message(3, datatype.to_vec()),
+        message(8, layout),
+    ])
 }
 
 /// A link of a group to the object at `address`.
@@ -69,12 +75,26 @@ fn superblock(end: usize) -> Vec<u8> {
 
 /// The bytes of a file with these time stamps and rows.
 pub fn poses_file(stamps: &[i64], poses: &[[f64; 12]]) -> Vec<u8> {
-    let stamp_bytes: Vec<u8> = stamps.iter().flat_map(|stamp| stamp.to_le_bytes()).collect();
-    let pose_bytes: Vec<u8> = poses.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    let stamp_bytes: Vec<u8> = stamps
+        .iter()
+        .flat_map(|stamp| stamp.to_le_bytes())
+        .collect();
+    let pose_bytes: Vec<u8> = poses
+        .iter()
+        .flatten()
+        .flat_map(|value| value.to_le_bytes())
+        .collect();
     let link_info = message(2, [&[0, 0][..], &UNDEFINED, &UNDEFINED].concat());
-    let root_of = |a, b| object_header(&[link_info.clone(), link("valid_timestamps", a), link("poses", b)]);
+    let root_of = |a, b| {
+        object_header(&[
+            link_info.clone(),
+            link("valid_timestamps", a),
+            link("poses", b),
+        ])
+    };
     let stamp_header = |data| dataset_header(&[stamps.len() as u64], &I64, data, stamp_bytes.len());
-    let pose_header = |data| dataset_header(&[poses.len() as u64, 12], &F64, data, pose_bytes.len());
+    let pose_header =
+        |data| dataset_header(&[poses.len() as u64, 12], &F64, data, pose_bytes.len());
     // Headers have the same length for every address.
     let first = ROOT + root_of(0, 0).len();
     let second = first + stamp_header(0).len();

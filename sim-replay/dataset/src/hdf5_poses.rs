@@ -44,34 +44,61 @@ fn parse(
     order: RowOrder,
     problems: &mut Vec<ReadError>,
 ) -> Result<BTreeMap<u64, Pose>, ReadError> {
-    let options = OpenOptions::default().with_max_read_bytes(MAX_BYTES).with_max_chunk_bytes(MAX_BYTES);
+    let options = OpenOptions::default()
+        .with_max_read_bytes(MAX_BYTES)
+        .with_max_chunk_bytes(MAX_BYTES);
     let file = Hdf5File::from_vec_with_options(bytes, options)
         .map_err(|error| ReadError::malformed(path, format!("no sound HDF5: {error}")))?;
     let (stamps_shape, stamps) = numbers(path, &file, "valid_timestamps")?;
     let (poses_shape, poses) = numbers(path, &file, "poses")?;
     let [count] = stamps_shape[..] else {
-        return Err(wrong(path, "valid_timestamps", format!("shape {stamps_shape:?}, expected [n]")));
+        return Err(wrong(
+            path,
+            "valid_timestamps",
+            format!("shape {stamps_shape:?}, expected [n]"),
+        ));
     };
     if poses_shape != [count, 12] {
-        return Err(wrong(path, "poses", format!("shape {poses_shape:?}, expected [{count}, 12]")));
+        return Err(wrong(
+            path,
+            "poses",
+            format!("shape {poses_shape:?}, expected [{count}, 12]"),
+        ));
     }
     let (rows, _) = poses.as_chunks::<12>();
     let kept = TRIMMED..stamps.len().saturating_sub(TRIMMED);
     let mut faults = Faults::default();
     let mut by_time = BTreeMap::new();
-    for (index, (stamp, row)) in stamps.iter().zip(rows).enumerate().filter(|(index, _)| kept.contains(index)) {
+    for (index, (stamp, row)) in stamps
+        .iter()
+        .zip(rows)
+        .enumerate()
+        .filter(|(index, _)| kept.contains(index))
+    {
         if !(0.0..=1e18).contains(stamp) {
-            faults.push(wrong(path, "valid_timestamps", format!("entry {index}: {stamp} are no microseconds")));
+            faults.push(wrong(
+                path,
+                "valid_timestamps",
+                format!("entry {index}: {stamp} are no microseconds"),
+            ));
             continue;
         }
-        let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")));
-        by_time.extend(faults.take(pose).map(|pose| (rounding::to_u64(stamp.floor()), pose)));
+        let pose = pose(row, order)
+            .map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")));
+        by_time.extend(
+            faults
+                .take(pose)
+                .map(|pose| (rounding::to_u64(stamp.floor()), pose)),
+        );
     }
     faults.report("row", problems);
     Ok(by_time)
 }
 
-#[expect(clippy::indexing_slicing, reason = "three lines of four columns are twelve numbers")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "three lines of four columns are twelve numbers"
+)]
 fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::InvalidPose> {
     let mut matrix = Matrix4::identity();
     for line in 0..3 {
@@ -88,7 +115,12 @@ fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::InvalidPose>
 }
 
 fn wrong(path: &Path, field: &str, reason: String) -> ReadError {
-    ReadError::Malformed { path: path.to_owned(), line: None, field: Some(field.to_owned()), reason }
+    ReadError::Malformed {
+        path: path.to_owned(),
+        line: None,
+        field: Some(field.to_owned()),
+        reason,
+    }
 }
 
 /// Shape and values of a dataset of numbers. Microseconds since 1970 fit a double exactly.
@@ -109,7 +141,11 @@ fn values<T: hdf5_reader::H5Type>(
     dataset: &Dataset,
     convert: fn(T) -> f64,
 ) -> Result<Vec<f64>, hdf5_reader::error::Error> {
-    Ok(dataset.read_array::<T>()?.into_iter().map(convert).collect())
+    Ok(dataset
+        .read_array::<T>()?
+        .into_iter()
+        .map(convert)
+        .collect())
 }
 
 #[cfg(test)]
@@ -133,9 +169,16 @@ pub(super) mod tests {
     fn both_arrangements_give_the_same_and_the_ends_are_left_out() {
         let stamps: Vec<i64> = (0..12).map(|index| 1_326_652_795_280_148 + index).collect();
         let by_matrix = parse(file(&stamps, &[MATRIX; 12]), RowOrder::Matrix).unwrap();
-        let by_rotation = parse(file(&stamps, &[ROTATION_FIRST; 12]), RowOrder::RotationFirst).unwrap();
+        let by_rotation = parse(
+            file(&stamps, &[ROTATION_FIRST; 12]),
+            RowOrder::RotationFirst,
+        )
+        .unwrap();
         assert_eq!(by_matrix, by_rotation);
-        assert_eq!(by_matrix.keys().copied().collect::<Vec<_>>(), [1_326_652_795_280_153, 1_326_652_795_280_154]);
+        assert_eq!(
+            by_matrix.keys().copied().collect::<Vec<_>>(),
+            [1_326_652_795_280_153, 1_326_652_795_280_154]
+        );
         let pose = by_matrix[&1_326_652_795_280_153];
         assert_eq!(pose.translation_m, [4.0, 5.0, 6.0]);
         assert!((pose.yaw_rad() - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
@@ -145,7 +188,10 @@ pub(super) mod tests {
     fn what_is_wrong_is_named() {
         let message = |bytes, order| parse(bytes, order).unwrap_err().to_string();
         let stamps: Vec<i64> = (0..11).collect();
-        assert!(message(file(&stamps, &[MATRIX; 10]), RowOrder::Matrix).contains("shape [10, 12], expected [11, 12]"));
+        assert!(
+            message(file(&stamps, &[MATRIX; 10]), RowOrder::Matrix)
+                .contains("shape [10, 12], expected [11, 12]")
+        );
         assert!(message(b"no".to_vec(), RowOrder::Matrix).starts_with("a.h5: no sound HDF5"));
     }
 
@@ -159,10 +205,19 @@ pub(super) mod tests {
             let mut rows = [MATRIX; 13];
             rows[6][0] = value;
             let mut problems = Vec::new();
-            let poses = super::parse(Path::new("a.h5"), file(&stamps, &rows), RowOrder::Matrix, &mut problems).unwrap();
+            let poses = super::parse(
+                Path::new("a.h5"),
+                file(&stamps, &rows),
+                RowOrder::Matrix,
+                &mut problems,
+            )
+            .unwrap();
             assert_eq!(poses.keys().copied().collect::<Vec<_>>(), [5, 7]);
             let message = problems[0].to_string();
-            assert!(message.starts_with(expected) && message.ends_with("the row is left out"), "{message}");
+            assert!(
+                message.starts_with(expected) && message.ends_with("the row is left out"),
+                "{message}"
+            );
             assert_eq!(problems.len(), 1);
         }
     }
@@ -172,7 +227,11 @@ pub(super) mod tests {
         let stamps: Vec<i64> = (0..12).collect();
         let whole = file(&stamps, &[MATRIX; 12]);
         for length in 0..whole.len() {
-            assert!(parse(whole[..length].to_vec(), RowOrder::Matrix).is_err(), "{length} of {}", whole.len());
+            assert!(
+                parse(whole[..length].to_vec(), RowOrder::Matrix).is_err(),
+                "{length} of {}",
+                whole.len()
+            );
         }
     }
 

@@ -13,7 +13,12 @@ const MAX_FRAME_BYTES: u64 = 16 << 20;
 pub(super) fn read(path: &Path) -> Result<Value, ReadError> {
     serde_json::from_slice(&files::read_limited(path, MAX_FRAME_BYTES)?).map_err(|error| {
         let line = Some(error.line() as u64).filter(|&line| line > 0);
-        ReadError::Malformed { path: path.to_owned(), line, field: None, reason: format!("no sound JSON: {error}") }
+        ReadError::Malformed {
+            path: path.to_owned(),
+            line,
+            field: None,
+            reason: format!("no sound JSON: {error}"),
+        }
     })
 }
 
@@ -29,18 +34,31 @@ pub(super) struct Field<'a> {
 impl<'a> Field<'a> {
     /// The whole document.
     pub(super) fn root(path: &'a Path, value: &'a Value) -> Self {
-        Self { path, name: String::new(), value }
+        Self {
+            path,
+            name: String::new(),
+            value,
+        }
     }
 
     /// Entry `index` of a list.
     pub(super) fn entry(path: &'a Path, index: usize, value: &'a Value) -> Self {
-        Self { path, name: index.to_string(), value }
+        Self {
+            path,
+            name: index.to_string(),
+            value,
+        }
     }
 
     /// An error about this field.
     pub(super) fn error(&self, reason: impl Into<String>) -> ReadError {
         let field = (!self.name.is_empty()).then(|| self.name.clone());
-        ReadError::Malformed { path: self.path.to_owned(), line: None, field, reason: reason.into() }
+        ReadError::Malformed {
+            path: self.path.to_owned(),
+            line: None,
+            field,
+            reason: reason.into(),
+        }
     }
 
     fn expected(&self, what: &str) -> ReadError {
@@ -48,26 +66,46 @@ impl<'a> Field<'a> {
     }
 
     fn child(&self, key: &str, value: &'a Value) -> Self {
-        let name = if self.name.is_empty() { key.to_owned() } else { format!("{}.{key}", self.name) };
-        Self { path: self.path, name, value }
+        let name = if self.name.is_empty() {
+            key.to_owned()
+        } else {
+            format!("{}.{key}", self.name)
+        };
+        Self {
+            path: self.path,
+            name,
+            value,
+        }
     }
 
     /// The items of a list.
     pub(super) fn items(&self) -> Result<impl ExactSizeIterator<Item = Self>, ReadError> {
-        let items = self.value.as_array().ok_or_else(|| self.expected("a list"))?;
-        Ok(items.iter().enumerate().map(|(index, item)| self.child(&index.to_string(), item)))
+        let items = self
+            .value
+            .as_array()
+            .ok_or_else(|| self.expected("a list"))?;
+        Ok(items
+            .iter()
+            .enumerate()
+            .map(|(index, item)| self.child(&index.to_string(), item)))
     }
 
     /// An entry that may be missing, null or an empty text.
     pub(super) fn optional(&self, key: &str) -> Result<Option<Self>, ReadError> {
-        let map = self.value.as_object().ok_or_else(|| self.expected("a map"))?;
-        let found = map.get(key).filter(|value| !value.is_null() && value.as_str() != Some(""));
+        let map = self
+            .value
+            .as_object()
+            .ok_or_else(|| self.expected("a map"))?;
+        let found = map
+            .get(key)
+            .filter(|value| !value.is_null() && value.as_str() != Some(""));
         Ok(found.map(|value| self.child(key, value)))
     }
 
     /// A required entry.
     pub(super) fn required(&self, key: &str) -> Result<Self, ReadError> {
-        self.optional(key)?.ok_or_else(|| self.child(key, self.value).error("missing"))
+        self.optional(key)?
+            .ok_or_else(|| self.child(key, self.value).error("missing"))
     }
 
     /// A finite number, as such or as text.
@@ -77,7 +115,9 @@ impl<'a> Field<'a> {
             Value::String(text) => text.trim().parse().ok(),
             _ => None,
         };
-        number.filter(|number: &f64| number.is_finite()).ok_or_else(|| self.expected("a finite number"))
+        number
+            .filter(|number: &f64| number.is_finite())
+            .ok_or_else(|| self.expected("a finite number"))
     }
 
     /// A whole number from 0, as such or as text.
@@ -107,12 +147,16 @@ impl<'a> Field<'a> {
     pub(super) fn numbers<const N: usize>(&self) -> Result<[f64; N], ReadError> {
         let mut numbers = Vec::with_capacity(N);
         self.flatten(N, &mut numbers)?;
-        numbers.try_into().map_err(|found: Vec<f64>| self.error(format!("{} numbers, expected {N}", found.len())))
+        numbers
+            .try_into()
+            .map_err(|found: Vec<f64>| self.error(format!("{} numbers, expected {N}", found.len())))
     }
 
     fn flatten(&self, most: usize, numbers: &mut Vec<f64>) -> Result<(), ReadError> {
         if self.value.is_array() {
-            return self.items()?.try_for_each(|item| item.flatten(most, numbers));
+            return self
+                .items()?
+                .try_for_each(|item| item.flatten(most, numbers));
         }
         if numbers.len() == most {
             return Err(self.error(format!("more than {most} numbers, expected {most}")));
@@ -150,17 +194,29 @@ mod tests {
     fn numbers_come_as_numbers_or_text_and_nested_or_not() {
         let value = json!({"a": [[1], ["2.5"], [-3e-2]], "b": [1, [2, 3]], "c": "7", "d": ["nan"]});
         let root = Field::root(Path::new("a.json"), &value);
-        assert_eq!(root.required("a").unwrap().numbers().unwrap(), [1.0, 2.5, -0.03]);
-        assert_eq!(root.required("b").unwrap().numbers().unwrap(), [1.0, 2.0, 3.0]);
         assert_eq!(
-            (root.required("c").unwrap().number().unwrap(), root.required("c").unwrap().count().unwrap()),
+            root.required("a").unwrap().numbers().unwrap(),
+            [1.0, 2.5, -0.03]
+        );
+        assert_eq!(
+            root.required("b").unwrap().numbers().unwrap(),
+            [1.0, 2.0, 3.0]
+        );
+        assert_eq!(
+            (
+                root.required("c").unwrap().number().unwrap(),
+                root.required("c").unwrap().count().unwrap()
+            ),
             (7.0, 7)
         );
         assert_eq!(
             message(root.required("b").unwrap().numbers::<2>()),
             "a.json: b.1.1: more than 2 numbers, expected 2"
         );
-        assert_eq!(message(root.required("b").unwrap().numbers::<4>()), "a.json: b: 3 numbers, expected 4");
+        assert_eq!(
+            message(root.required("b").unwrap().numbers::<4>()),
+            "a.json: b: 3 numbers, expected 4"
+        );
         assert_eq!(
             message(root.required("d").unwrap().numbers::<1>()),
             "a.json: d.0: the text \"nan\", expected a finite number"
@@ -173,11 +229,20 @@ mod tests {
         let entry = Field::entry(Path::new("a.json"), 3, &value[0]);
         for key in ["x", "y", "other"] {
             assert!(entry.optional(key).unwrap().is_none());
-            assert_eq!(message(entry.required(key)), format!("a.json: 3.{key}: missing"));
+            assert_eq!(
+                message(entry.required(key)),
+                format!("a.json: 3.{key}: missing")
+            );
         }
         let z = entry.required("z").unwrap();
-        assert_eq!(message(z.number()), "a.json: 3.z: a map of 0, expected a finite number");
-        assert_eq!(message(z.text()), "a.json: 3.z: a map of 0, expected a text");
+        assert_eq!(
+            message(z.number()),
+            "a.json: 3.z: a map of 0, expected a finite number"
+        );
+        assert_eq!(
+            message(z.text()),
+            "a.json: 3.z: a map of 0, expected a text"
+        );
         assert_eq!(
             message(Field::root(Path::new("a.json"), &value).required("x")),
             "a.json: a list of 1, expected a map"

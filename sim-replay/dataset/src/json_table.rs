@@ -49,7 +49,8 @@ pub(super) fn read(
         if serde_json::from_slice(raw).is_ok_and(|keys: Keys<'_>| !is_needed(&keys)) {
             return;
         }
-        match parse_row(path, index, raw).and_then(|value| row(&Field::entry(path, index, &value))) {
+        match parse_row(path, index, raw).and_then(|value| row(&Field::entry(path, index, &value)))
+        {
             Ok(()) => used += 1,
             Err(problem) => {
                 unusable += 1;
@@ -60,7 +61,9 @@ pub(super) fn read(
         }
     });
     if unusable > first_problems.len() {
-        let reason = format!("{unusable} entries cannot be used: left out; the first {MAX_PROBLEMS} are listed");
+        let reason = format!(
+            "{unusable} entries cannot be used: left out; the first {MAX_PROBLEMS} are listed"
+        );
         first_problems.push(ReadError::malformed(path, reason));
     }
     problems.append(&mut first_problems);
@@ -83,9 +86,16 @@ fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value, ReadError> 
 
 /// Passes on the entries of the list in the order of the file. An entry need not be valid: it ends when its brackets
 /// are closed.
-fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])) -> Result<(), ReadError> {
+fn for_each_row(
+    path: &Path,
+    max_bytes: u64,
+    mut entry: impl FnMut(usize, &[u8]),
+) -> Result<(), ReadError> {
     let file = File::open(path).map_err(|error| ReadError::io(path, error))?;
-    let size = file.metadata().map_err(|error| ReadError::io(path, error))?.len();
+    let size = file
+        .metadata()
+        .map_err(|error| ReadError::io(path, error))?
+        .len();
     if size > max_bytes {
         let reason = format!("{size} bytes: larger than {max_bytes} bytes, the most that is read");
         return Err(ReadError::malformed(path, reason));
@@ -94,12 +104,15 @@ fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, file.take(max_bytes));
     let mut list = RowSplitter::default();
     loop {
-        let bytes = reader.fill_buf().map_err(|error| ReadError::io(path, error))?;
+        let bytes = reader
+            .fill_buf()
+            .map_err(|error| ReadError::io(path, error))?;
         if bytes.is_empty() {
             return list.finish().map_err(|reason| list.error(path, reason));
         }
         let count = bytes.len();
-        list.push(bytes, &mut entry).map_err(|reason| list.error(path, reason))?;
+        list.push(bytes, &mut entry)
+            .map_err(|reason| list.error(path, reason))?;
         reader.consume(count);
     }
 }
@@ -155,7 +168,10 @@ impl RowSplitter {
             _ => {}
         }
         if self.entry.len() == MAX_ROW_BYTES {
-            return Err(format!("entry {} is larger than {MAX_ROW_BYTES} bytes", self.count));
+            return Err(format!(
+                "entry {} is larger than {MAX_ROW_BYTES} bytes",
+                self.count
+            ));
         }
         self.entry.push(byte);
         Ok(())
@@ -177,11 +193,23 @@ impl RowSplitter {
     }
 
     fn finish(&self) -> Result<(), String> {
-        if self.is_over { Ok(()) } else { Err(format!("ends within the list, behind {} entries", self.count)) }
+        if self.is_over {
+            Ok(())
+        } else {
+            Err(format!(
+                "ends within the list, behind {} entries",
+                self.count
+            ))
+        }
     }
 
     fn error(&self, path: &Path, reason: String) -> ReadError {
-        ReadError::Malformed { path: path.to_owned(), line: Some(self.lines + 1), field: None, reason }
+        ReadError::Malformed {
+            path: path.to_owned(),
+            line: Some(self.lines + 1),
+            field: None,
+            reason,
+        }
     }
 }
 
@@ -206,28 +234,44 @@ mod tests {
                 Ok(())
             },
         );
-        (numbers, problems.iter().map(shown).collect(), result.map_err(|error| shown(&error)))
+        (
+            numbers,
+            problems.iter().map(shown).collect(),
+            result.map_err(|error| shown(&error)),
+        )
     }
 
     #[test]
     fn rows_of_a_table_are_taken_one_by_one() {
-        let (numbers, problems, result) =
-            read_numbers(r#"[{"n": 1}, {"n": "x", "token": "other"}, {"n": "7"}, {"m": 2}, 3]"#, 100);
+        let (numbers, problems, result) = read_numbers(
+            r#"[{"n": 1}, {"n": "x", "token": "other"}, {"n": "7"}, {"m": 2}, 3]"#,
+            100,
+        );
         assert_eq!((numbers, result), (vec![1, 7], Ok(2)));
         assert_eq!(problems, [": 3.n: missing", ": 4: 3, expected a map"]);
         let many = format!("[{}]", vec!["{}"; 50].join(","));
         let (_, problems, result) = read_numbers(&many, 1000);
         assert_eq!((problems.len(), result), (21, Ok(0)));
-        assert_eq!(problems[20], ": 50 entries cannot be used: left out; the first 20 are listed");
+        assert_eq!(
+            problems[20],
+            ": 50 entries cannot be used: left out; the first 20 are listed"
+        );
     }
 
     #[test]
     fn a_row_that_is_no_json_costs_only_itself() {
-        let (numbers, problems, result) = read_numbers(r#"[{"n": 1}, {"n": NaN}, , {"n": "a]\"b"}, {"n": 4}]"#, 100);
+        let (numbers, problems, result) =
+            read_numbers(r#"[{"n": 1}, {"n": NaN}, , {"n": "a]\"b"}, {"n": 4}]"#, 100);
         assert_eq!((numbers, result), (vec![1, 4], Ok(2)));
         assert_eq!(problems.len(), 3);
-        assert!(problems[0].starts_with(": 1: no sound JSON: expected value"), "{problems:?}");
-        assert!(problems[1].starts_with(": 2: no sound JSON: EOF"), "{problems:?}");
+        assert!(
+            problems[0].starts_with(": 1: no sound JSON: expected value"),
+            "{problems:?}"
+        );
+        assert!(
+            problems[1].starts_with(": 2: no sound JSON: EOF"),
+            "{problems:?}"
+        );
     }
 
     #[test]
@@ -235,12 +279,27 @@ mod tests {
         let (numbers, problems, result) = read_numbers("[{\"n\": 1},\n {\"n\"", 100);
         assert_eq!((numbers, result), (vec![1], Ok(1)));
         assert_eq!(problems, [":2: ends within the list, behind 1 entries"]);
-        assert_eq!(read_numbers("[{", 100).2.unwrap_err(), ":1: ends within the list, behind 0 entries");
-        assert_eq!(read_numbers("", 100).2.unwrap_err(), ":1: ends within the list, behind 0 entries");
-        assert_eq!(read_numbers("{}", 100).2.unwrap_err(), ":1: '{', expected a list");
-        assert_eq!(read_numbers("\n[{\"n\": 1}] x", 100).1, [":2: more follows the list"]);
+        assert_eq!(
+            read_numbers("[{", 100).2.unwrap_err(),
+            ":1: ends within the list, behind 0 entries"
+        );
+        assert_eq!(
+            read_numbers("", 100).2.unwrap_err(),
+            ":1: ends within the list, behind 0 entries"
+        );
+        assert_eq!(
+            read_numbers("{}", 100).2.unwrap_err(),
+            ":1: '{', expected a list"
+        );
+        assert_eq!(
+            read_numbers("\n[{\"n\": 1}] x", 100).1,
+            [":2: more follows the list"]
+        );
         assert_eq!(read_numbers(" [ ] ", 100), (vec![], vec![], Ok(0)));
-        assert_eq!(read_numbers("[1, 2]", 5).2.unwrap_err(), ": 6 bytes: larger than 5 bytes, the most that is read");
+        assert_eq!(
+            read_numbers("[1, 2]", 5).2.unwrap_err(),
+            ": 6 bytes: larger than 5 bytes, the most that is read"
+        );
     }
 
     #[test]
@@ -250,7 +309,10 @@ mod tests {
         for size in 1..text.len() {
             let (mut list, mut entries) = (RowSplitter::default(), Vec::new());
             for bytes in text.chunks(size) {
-                list.push(bytes, &mut |_, raw| entries.push(serde_json::from_slice::<Value>(raw).unwrap())).unwrap();
+                list.push(bytes, &mut |_, raw| {
+                    entries.push(serde_json::from_slice::<Value>(raw).unwrap())
+                })
+                .unwrap();
             }
             assert_eq!((list.finish(), &entries), (Ok(()), &whole));
         }

@@ -12,7 +12,10 @@ use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
 use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
-use super::{FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files, single_vehicle};
+use super::{
+    FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files,
+    single_vehicle,
+};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
 
@@ -23,7 +26,10 @@ pub(crate) static KITTI_OBJECT: LayoutRow = LayoutRow {
     data_sets: "KITTI object detection",
     files: "velodyne/<frame>.bin and calib/<frame>.txt (a folder)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence { is_one: is_split, open }),
+    reader: Some(Reader::Sequence {
+        is_one: is_split,
+        open,
+    }),
 };
 
 /// Numbers after the type in a line of labels; detections have a score as well.
@@ -54,15 +60,32 @@ pub(super) fn open(
     let velodyne = dir.join("velodyne");
     let listing = files::list(&velodyne)?;
     let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").into_iter().collect());
-    let strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}.bin")).collect();
+    let strays: Vec<String> = strays
+        .into_iter()
+        .map(|stem| format!("{stem}.bin"))
+        .collect();
     problems.extend(named_once(&velodyne, &strays));
     let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
-    let tick = |(stem, capture_nanos): (&str, u64)| Tick { stem: stem.to_owned(), capture_nanos };
+    let tick = |(stem, capture_nanos): (&str, u64)| Tick {
+        stem: stem.to_owned(),
+        capture_nanos,
+    };
     let ticks: Vec<Tick> = stems.into_iter().zip(times).map(tick).collect();
-    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let files = ticks
+        .iter()
+        .map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
-    let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir(), sweeps };
-    Ok(single_vehicle(files::name_below(root, dir), Layout::KITTI_OBJECT, ticks, Arc::new(source)))
+    let source = Split {
+        dir: dir.to_owned(),
+        has_labels: dir.join("label_2").is_dir(),
+        sweeps,
+    };
+    Ok(single_vehicle(
+        files::name_below(root, dir),
+        Layout::KITTI_OBJECT,
+        ticks,
+        Arc::new(source),
+    ))
 }
 
 impl FrameSource for Split {
@@ -70,16 +93,24 @@ impl FrameSource for Split {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(Pose::IDENTITY);
         if self.has_labels {
-            let calibration = Calibration::read(&self.dir.join("calib").join(format!("{}.txt", tick.stem)))?;
+            let calibration =
+                Calibration::read(&self.dir.join("calib").join(format!("{}.txt", tick.stem)))?;
             let rectified = calibration.rotation("R0_rect")?.isometry();
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
-            (frame.objects, frame.problems) = objects(&self.labels(tick), &camera_from_lidar.inverse())?;
+            (frame.objects, frame.problems) =
+                objects(&self.labels(tick), &camera_from_lidar.inverse())?;
         }
         Ok(frame)
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        self.sweeps
+            .read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, _agent: &CavId, tick: &Tick) -> Option<PathBuf> {
@@ -99,14 +130,23 @@ impl Split {
 
 /// The labelled objects in the LiDAR frame, and the faults of those left out. `DontCare` regions have no box and are
 /// not counted.
-fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Object>, Vec<Problem>), ReadError> {
+fn objects(
+    path: &Path,
+    lidar_from_camera: &Isometry3<f64>,
+) -> Result<(Vec<Object>, Vec<Problem>), ReadError> {
     let (mut objects, mut problems) = (Vec::new(), Vec::new());
     for (line, text) in kitti_text::lines(path)? {
         let (kind, numbers) = text.trim().split_once(' ').unwrap_or((text.trim(), ""));
         if kind == "DontCare" {
             continue;
         }
-        match object((path, line), kind, numbers, objects.len() as i64, lidar_from_camera) {
+        match object(
+            (path, line),
+            kind,
+            numbers,
+            objects.len() as i64,
+            lidar_from_camera,
+        ) {
             Ok(object) => {
                 if classes::of_name(kind).is_none() {
                     let dir = path.parent().unwrap_or(path);
@@ -115,7 +155,9 @@ fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Objec
                 }
                 objects.push(object);
             }
-            Err(error) => problems.push(Problem::from(&error.with_consequence("the object is left out"))),
+            Err(error) => problems.push(Problem::from(
+                &error.with_consequence("the object is left out"),
+            )),
         }
     }
     Ok((objects, problems))
@@ -134,18 +176,32 @@ fn object(
     let count = numbers.split_ascii_whitespace().count();
     // A score may follow.
     let has_score = count == LABEL_NUMBERS + 1;
-    let numbers = numbers.trim().rsplit_once(' ').filter(|_| has_score).map_or(numbers, |(numbers, _)| numbers);
+    let numbers = numbers
+        .trim()
+        .rsplit_once(' ')
+        .filter(|_| has_score)
+        .map_or(numbers, |(numbers, _)| numbers);
     let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
     let [.., height, width, length, x, y, z, rotation_y] = values;
     let size_m = [length, width, height];
     if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
-        return Err(malformed(format!("{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m")));
+        return Err(malformed(format!(
+            "{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m"
+        )));
     }
     let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
     let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
     let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
-    world_from_object.validate().map_err(|error| malformed(error.to_string()))?;
-    Ok(Object { id, class, world_from_object, size_m, speed_mps: None })
+    world_from_object
+        .validate()
+        .map_err(|error| malformed(error.to_string()))?;
+    Ok(Object {
+        id,
+        class,
+        world_from_object,
+        size_m,
+        speed_mps: None,
+    })
 }
 
 /// The label's position is the centre of the bottom face in the camera frame (x right, y down, z forward); `rotation_y`
@@ -154,7 +210,8 @@ fn camera_from_object(bottom: [f64; 3], height: f64, rotation_y: f64) -> Isometr
     let (sin, cos) = rotation_y.sin_cos();
     // Columns: directions of the object's length, left side and top.
     let rotation = Matrix3::new(cos, sin, 0.0, 0.0, 0.0, -1.0, -sin, cos, 0.0);
-    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    let rotation =
+        UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
     let [x, y, z] = bottom;
     Isometry3::from_parts(Point3::new(x, y - height / 2.0, z).coords.into(), rotation)
 }
@@ -186,15 +243,25 @@ mod tests {
     #[test]
     fn labels_become_boxes_in_the_lidar_frame() {
         let line = "Car 0.00 0 -1.57 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 -1.5707963267948966";
-        let dir = build(&format!("{line}\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n{line} 0.9\n"));
+        let dir = build(&format!(
+            "{line}\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n{line} 0.9\n"
+        ));
         let dataset = crate::open(dir.path()).unwrap();
-        assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::KITTI_OBJECT, "training"));
-        let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!(
+            (dataset.layout, dataset.scenarios[0].name.as_str()),
+            (Layout::KITTI_OBJECT, "training")
+        );
+        let frame = dataset.scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap();
         assert_eq!(frame.objects.len(), 2);
         let car = &frame.objects[0];
         let [x, y, z] = car.world_from_object.translation_m;
         // 10 m ahead, 2 m to the right, its middle 0.85 m below the LiDAR.
-        assert!((x - 10.0).abs() < 1e-9 && (y + 2.0).abs() < 1e-9 && (z + 1.05).abs() < 1e-9, "{x} {y} {z}");
+        assert!(
+            (x - 10.0).abs() < 1e-9 && (y + 2.0).abs() < 1e-9 && (z + 1.05).abs() < 1e-9,
+            "{x} {y} {z}"
+        );
         assert_eq!(car.size_m, [4.0, 1.6, 1.5]);
         // A quarter turn from the camera's x towards -z... of the camera points along the LiDAR's x.
         assert!(car.world_from_object.yaw_rad().abs() < 1e-9);
@@ -206,7 +273,11 @@ mod tests {
     fn a_bad_label_loses_only_its_object_and_gives_line_and_field() {
         let sound = "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n";
         for (bad, field, expected) in [
-            ("Van 0 0 0", "Van", "3 numbers, expected 14: the object is left out"),
+            (
+                "Van 0 0 0",
+                "Van",
+                "3 numbers, expected 14: the object is left out",
+            ),
             (
                 "Car 0 0 0 0 0 0 0 1.5 nan 4.0 2.0 1.7 9.7 0",
                 "Car",
@@ -217,14 +288,27 @@ mod tests {
                 "Car",
                 "expected sizes above 0 and up to 100 m: the object is left out",
             ),
-            ("Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1e9 9.7 0", "Car", "within 1e7: the object is left out"),
-            ("\u{fffd}\u{1}", "\u{fffd}\u{1}", "0 numbers, expected 14: the object is left out"),
+            (
+                "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1e9 9.7 0",
+                "Car",
+                "within 1e7: the object is left out",
+            ),
+            (
+                "\u{fffd}\u{1}",
+                "\u{fffd}\u{1}",
+                "0 numbers, expected 14: the object is left out",
+            ),
         ] {
             let dir = build(&format!("{sound}{bad}\n{sound}"));
-            let frame = crate::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            let frame = crate::open(dir.path()).unwrap().scenarios[0]
+                .load(0, 0, &LoadOptions::default())
+                .unwrap();
             assert_eq!((frame.objects.len(), frame.problems.len()), (2, 1), "{bad}");
             let problem = &frame.problems[0];
-            assert_eq!((problem.line, problem.field.as_deref()), (Some(2), Some(field)));
+            assert_eq!(
+                (problem.line, problem.field.as_deref()),
+                (Some(2), Some(field))
+            );
             assert!(problem.message.ends_with(expected), "{problem:?}");
         }
     }
@@ -232,10 +316,14 @@ mod tests {
     #[test]
     fn an_unknown_type_is_named_and_counts_as_other() {
         let dir = build("Ufo 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n");
-        let frame = crate::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        let frame = crate::open(dir.path()).unwrap().scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap();
         assert_eq!(frame.objects[0].class, ObjectClass::Other);
         assert!(
-            frame.problems[0].message.contains("type: \"Ufo\" is an unknown type of object"),
+            frame.problems[0]
+                .message
+                .contains("type: \"Ufo\" is an unknown type of object"),
             "{:?}",
             frame.problems
         );
@@ -246,15 +334,32 @@ mod tests {
         let dir = build("");
         fs::write(dir.path().join("training/velodyne/000000 (1).bin"), "").unwrap();
         let dataset = crate::open(dir.path()).unwrap();
-        assert_eq!((dataset.scenarios[0].ticks.len(), dataset.problems.len()), (1, 1));
-        assert!(dataset.problems[0].to_string().ends_with("first: 000000 (1).bin"), "{:?}", dataset.problems);
+        assert_eq!(
+            (dataset.scenarios[0].ticks.len(), dataset.problems.len()),
+            (1, 1)
+        );
+        assert!(
+            dataset.problems[0]
+                .to_string()
+                .ends_with("first: 000000 (1).bin"),
+            "{:?}",
+            dataset.problems
+        );
     }
 
     #[test]
     fn a_folder_without_sweeps_is_no_split() {
         let dir = build("");
-        fs::rename(dir.path().join("training/velodyne/000000.bin"), dir.path().join("training/velodyne/000000.pcd"))
-            .unwrap();
-        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no supported layout"));
+        fs::rename(
+            dir.path().join("training/velodyne/000000.bin"),
+            dir.path().join("training/velodyne/000000.pcd"),
+        )
+        .unwrap();
+        assert!(
+            crate::open(dir.path())
+                .unwrap_err()
+                .to_string()
+                .contains("no supported layout")
+        );
     }
 }

@@ -25,7 +25,10 @@ pub(crate) static KITTI_ODOMETRY: LayoutRow = LayoutRow {
     data_sets: "KITTI odometry, SemanticKITTI",
     files: "velodyne/<scan>.bin and calib.txt (a file)",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence { is_one: is_sequence, open }),
+    reader: Some(Reader::Sequence {
+        is_one: is_sequence,
+        open,
+    }),
 };
 
 /// A sequence.
@@ -53,33 +56,66 @@ pub(super) fn open(
     let mut scans = scans(&velodyne, problems)?;
     let times = or_without("times", times(dir, &scans, problems), problems);
     let poses = or_without("poses", poses(dir, problems), problems);
-    keep_those_with(&mut scans, &dir.join("times.txt"), times.as_deref(), problems);
-    keep_those_with(&mut scans, &poses_path(dir).unwrap_or_default(), poses.as_deref(), problems);
+    keep_those_with(
+        &mut scans,
+        &dir.join("times.txt"),
+        times.as_deref(),
+        problems,
+    );
+    keep_those_with(
+        &mut scans,
+        &poses_path(dir).unwrap_or_default(),
+        poses.as_deref(),
+        problems,
+    );
     let capture_nanos = |scan: usize| match &times {
         Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
         None => options.period_nanos.saturating_mul(scan as u64),
     };
-    let tick = |(scan, stem): (usize, String)| Tick { stem, capture_nanos: capture_nanos(scan) };
+    let tick = |(scan, stem): (usize, String)| Tick {
+        stem,
+        capture_nanos: capture_nanos(scan),
+    };
     let mut ticks: Vec<Tick> = scans.into_iter().map(tick).collect();
     ticks.sort_by_key(|tick| tick.capture_nanos);
-    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let files = ticks
+        .iter()
+        .map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
-    let source = Sequence { dir: dir.to_owned(), world_from_lidar: poses, sweeps };
-    Ok(single_vehicle(files::name_below(root, dir), Layout::KITTI_ODOMETRY, ticks, Arc::new(source)))
+    let source = Sequence {
+        dir: dir.to_owned(),
+        world_from_lidar: poses,
+        sweeps,
+    };
+    Ok(single_vehicle(
+        files::name_below(root, dir),
+        Layout::KITTI_ODOMETRY,
+        ticks,
+        Arc::new(source),
+    ))
 }
 
 /// Number and stem of the scans. Files of other names are left out.
-fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, String)>, ReadError> {
+fn scans(
+    velodyne: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<Vec<(usize, String)>, ReadError> {
     let mut strays = Faults::default();
     let listing = files::list(velodyne)?;
     let stems = files::stems(&listing.files, ".bin").into_iter();
-    let scans = stems.filter_map(|stem| Some((strays.take(scan_number(velodyne, stem))?, stem.to_owned()))).collect();
+    let scans = stems
+        .filter_map(|stem| Some((strays.take(scan_number(velodyne, stem))?, stem.to_owned())))
+        .collect();
     strays.report("file", problems);
     Ok(scans)
 }
 
 /// Values that a file gives for all scans; if it cannot be read, a problem and nothing.
-fn or_without<T>(what: &str, read: Result<Option<T>, ReadError>, problems: &mut Vec<ReadError>) -> Option<T> {
+fn or_without<T>(
+    what: &str,
+    read: Result<Option<T>, ReadError>,
+    problems: &mut Vec<ReadError>,
+) -> Option<T> {
     read.unwrap_or_else(|error| {
         problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
         None
@@ -99,7 +135,10 @@ fn keep_those_with<T>(
     scans.retain(|(scan, _)| match rows.get(*scan) {
         Some(row) => row.is_some(),
         None => {
-            faults.push(ReadError::malformed(path, format!("no line for scan {scan}: there are {}", rows.len())));
+            faults.push(ReadError::malformed(
+                path,
+                format!("no line for scan {scan}: there are {}", rows.len()),
+            ));
             false
         }
     });
@@ -116,8 +155,14 @@ impl FrameSource for Sequence {
         Ok(frame)
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        self.sweeps
+            .read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
@@ -127,22 +172,39 @@ impl FrameSource for Sequence {
 
 fn scan_number(velodyne: &Path, stem: &str) -> Result<usize, ReadError> {
     let path = velodyne.join(format!("{stem}.bin"));
-    stem.parse().map_err(|_| ReadError::malformed(&path, format!("{stem:?} is no scan number")))
+    stem.parse()
+        .map_err(|_| ReadError::malformed(&path, format!("{stem:?} is no scan number")))
 }
 
 /// Path of the sequence's poses: beside the scans, or in the release's common folder.
 fn poses_path(dir: &Path) -> Option<PathBuf> {
-    let beside = ["poses.txt", "poses_cam0.txt"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file());
+    let beside = ["poses.txt", "poses_cam0.txt"]
+        .map(|name| dir.join(name))
+        .into_iter()
+        .find(|path| path.is_file());
     let common = |dir: PathBuf| {
         let name = dir.file_name()?.to_str()?;
-        Some(dir.parent()?.parent()?.join("poses").join(format!("{name}.txt"))).filter(|path| path.is_file())
+        Some(
+            dir.parent()?
+                .parent()?
+                .join("poses")
+                .join(format!("{name}.txt")),
+        )
+        .filter(|path| path.is_file())
     };
     beside.or_else(|| files::names_of(dir).find_map(common))
 }
 
-fn poses(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Option<Vec<Option<Pose>>>, ReadError> {
-    let Some(path) = poses_path(dir) else { return Ok(None) };
-    let camera_from_lidar = Calibration::read(&dir.join("calib.txt"))?.transform("Tr")?.isometry();
+fn poses(
+    dir: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<Option<Vec<Option<Pose>>>, ReadError> {
+    let Some(path) = poses_path(dir) else {
+        return Ok(None);
+    };
+    let camera_from_lidar = Calibration::read(&dir.join("calib.txt"))?
+        .transform("Tr")?
+        .isometry();
     let lidar_from_camera = camera_from_lidar.inverse();
     let mut faults = Faults::default();
     let poses = kitti_text::rows(&path, &mut faults, |line, text| {
@@ -168,14 +230,22 @@ fn times(
     let times = kitti_text::rows(&path, &mut faults, |line, text| {
         let [seconds] = kitti_text::numbers(&path, line, None, text)?;
         if !(0.0..=1e9).contains(&seconds) {
-            return Err(kitti_text::malformed(&path, line, None, format!("{seconds} s, expected 0 to 1e9")));
+            return Err(kitti_text::malformed(
+                &path,
+                line,
+                None,
+                format!("{seconds} s, expected 0 to 1e9"),
+            ));
         }
         Ok(rounding::to_u64(seconds * 1e9))
     })?;
     faults.report("scan", problems);
     let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);
     if times.len() > needed {
-        let reason = format!("{} lines for {needed} scans: those beyond the last scan are not used", times.len());
+        let reason = format!(
+            "{} lines for {needed} scans: those beyond the last scan are not used",
+            times.len()
+        );
         problems.push(ReadError::malformed(&path, reason));
     }
     Ok(Some(times))
@@ -196,8 +266,10 @@ mod tests {
         fs::create_dir_all(dir.join("velodyne")).unwrap();
         fs::write(dir.join("calib.txt"), TR).unwrap();
         for scan in 0..2u8 {
-            let point: Vec<u8> =
-                [f32::from(scan), 2.0, 3.0, 0.5].iter().flat_map(|value| value.to_le_bytes()).collect();
+            let point: Vec<u8> = [f32::from(scan), 2.0, 3.0, 0.5]
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect();
             fs::write(dir.join(format!("velodyne/{scan:06}.bin")), point).unwrap();
         }
         let poses_at = root.join(poses_at);
@@ -213,22 +285,38 @@ mod tests {
         build(dir.path(), "sequences/07", "poses/07.txt", poses);
         let dataset = crate::open(dir.path()).unwrap();
         let scenario = &dataset.scenarios[0];
-        assert_eq!((dataset.layout, scenario.name.as_str()), (Layout::KITTI_ODOMETRY, "sequences/07"));
+        assert_eq!(
+            (dataset.layout, scenario.name.as_str()),
+            (Layout::KITTI_ODOMETRY, "sequences/07")
+        );
         let frame = scenario.load(0, 1, &LoadOptions::default()).unwrap();
         let moved = frame.world_from_lidar.unwrap().translation_m;
-        assert!((moved[0] - 2.0).abs() < 1e-9 && (moved[1] + 1.0).abs() < 1e-9 && moved[2].abs() < 1e-9, "{moved:?}");
-        assert_eq!((frame.points.xyzi, frame.capture_nanos), (vec![[1.0, 2.0, 3.0, 0.5]], 100_000_000));
+        assert!(
+            (moved[0] - 2.0).abs() < 1e-9 && (moved[1] + 1.0).abs() < 1e-9 && moved[2].abs() < 1e-9,
+            "{moved:?}"
+        );
+        assert_eq!(
+            (frame.points.xyzi, frame.capture_nanos),
+            (vec![[1.0, 2.0, 3.0, 0.5]], 100_000_000)
+        );
     }
 
     #[test]
     fn poses_above_are_found_by_whatever_name_the_folder_has() {
         let dir = tempfile::tempdir().unwrap();
-        build(dir.path(), "sequences/07", "poses/07.txt", &"1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2));
+        build(
+            dir.path(),
+            "sequences/07",
+            "poses/07.txt",
+            &"1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2),
+        );
         let sequence = dir.path().join("sequences/07");
         for name in [sequence.clone(), sequence.join("velodyne/..")] {
             let dataset = crate::open(&name).unwrap();
             assert_eq!(dataset.scenarios[0].name, "07");
-            let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            let frame = dataset.scenarios[0]
+                .load(0, 0, &LoadOptions::default())
+                .unwrap();
             assert!(frame.world_from_lidar.is_some(), "{}", name.display());
         }
     }
@@ -240,37 +328,86 @@ mod tests {
         fs::write(dir.path().join("times.txt"), "0.0\n1.036e-01\n").unwrap();
         let problems = |dataset: &Dataset| {
             let root = dir.path().to_string_lossy();
-            dataset.problems.iter().map(|problem| problem.to_string().replace(&*root, "")).collect::<Vec<_>>()
+            dataset
+                .problems
+                .iter()
+                .map(|problem| problem.to_string().replace(&*root, ""))
+                .collect::<Vec<_>>()
         };
         let dataset = crate::open(dir.path()).unwrap();
         assert_eq!(stems(&dataset), ["000000"]);
-        assert_eq!(problems(&dataset), ["/poses.txt: no line for scan 1: there are 1: the scan is left out"]);
-        fs::write(dir.path().join("poses.txt"), "1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2)).unwrap();
+        assert_eq!(
+            problems(&dataset),
+            ["/poses.txt: no line for scan 1: there are 1: the scan is left out"]
+        );
+        fs::write(
+            dir.path().join("poses.txt"),
+            "1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2),
+        )
+        .unwrap();
         let dataset = crate::open(dir.path()).unwrap();
-        assert_eq!((dataset.scenarios[0].ticks[1].capture_nanos, dataset.problems.len()), (103_600_000, 0));
+        assert_eq!(
+            (
+                dataset.scenarios[0].ticks[1].capture_nanos,
+                dataset.problems.len()
+            ),
+            (103_600_000, 0)
+        );
         for (times, kept, expected) in [
-            ("0.0\n", 1, "/times.txt: no line for scan 1: there are 1: the scan is left out"),
-            ("0\nsoon\n", 1, "/times.txt:2: \"soon\" is no finite number: the scan is left out"),
-            ("0\n0.1\n0.2\n", 2, "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used"),
+            (
+                "0.0\n",
+                1,
+                "/times.txt: no line for scan 1: there are 1: the scan is left out",
+            ),
+            (
+                "0\nsoon\n",
+                1,
+                "/times.txt:2: \"soon\" is no finite number: the scan is left out",
+            ),
+            (
+                "0\n0.1\n0.2\n",
+                2,
+                "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used",
+            ),
         ] {
             fs::write(dir.path().join("times.txt"), times).unwrap();
             let dataset = crate::open(dir.path()).unwrap();
-            assert_eq!((stems(&dataset).len(), problems(&dataset)), (kept, vec![expected.to_owned()]));
+            assert_eq!(
+                (stems(&dataset).len(), problems(&dataset)),
+                (kept, vec![expected.to_owned()])
+            );
         }
     }
 
     #[test]
     fn a_bad_pose_loses_only_its_scan() {
         let dir = tempfile::tempdir().unwrap();
-        build(dir.path(), ".", "poses.txt", "1 0 0 0 0 1 0 0 0 0 -1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n");
+        build(
+            dir.path(),
+            ".",
+            "poses.txt",
+            "1 0 0 0 0 1 0 0 0 0 -1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n",
+        );
         fs::write(dir.path().join("velodyne/000001 (1).bin"), [0; 16]).unwrap();
         let dataset = crate::open(dir.path()).unwrap();
         assert_eq!(stems(&dataset), ["000001"]);
-        assert!(dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap().world_from_lidar.is_some());
+        assert!(
+            dataset.scenarios[0]
+                .load(0, 0, &LoadOptions::default())
+                .unwrap()
+                .world_from_lidar
+                .is_some()
+        );
         let problems: Vec<String> = dataset.problems.iter().map(ToString::to_string).collect();
         assert_eq!((problems.len(), dataset.problems[1].line()), (2, Some(1)));
-        assert!(problems[0].ends_with("\"000001 (1)\" is no scan number: the file is left out"), "{problems:?}");
-        assert!(problems[1].ends_with("the scan is left out"), "{problems:?}");
+        assert!(
+            problems[0].ends_with("\"000001 (1)\" is no scan number: the file is left out"),
+            "{problems:?}"
+        );
+        assert!(
+            problems[1].ends_with("the scan is left out"),
+            "{problems:?}"
+        );
     }
 
     #[test]
@@ -280,7 +417,11 @@ mod tests {
         fs::write(dir.path().join("calib.txt"), "Tr: 1 2 3\n").unwrap();
         let dataset = crate::open(dir.path()).unwrap();
         assert_eq!((stems(&dataset).len(), dataset.problems.len()), (2, 1));
-        assert!(dataset.problems[0].to_string().ends_with("expected 12: the sequence is read without poses"));
+        assert!(
+            dataset.problems[0]
+                .to_string()
+                .ends_with("expected 12: the sequence is read without poses")
+        );
     }
 
     #[test]
@@ -289,10 +430,19 @@ mod tests {
         fs::create_dir(dir.path().join("velodyne")).unwrap();
         fs::write(dir.path().join("velodyne/000000.pcd"), "").unwrap();
         fs::write(dir.path().join("calib.txt"), TR).unwrap();
-        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no supported layout"));
+        assert!(
+            crate::open(dir.path())
+                .unwrap_err()
+                .to_string()
+                .contains("no supported layout")
+        );
     }
 
     fn stems(dataset: &Dataset) -> Vec<&str> {
-        dataset.scenarios[0].ticks.iter().map(|tick| tick.stem.as_str()).collect()
+        dataset.scenarios[0]
+            .ticks
+            .iter()
+            .map(|tick| tick.stem.as_str())
+            .collect()
     }
 }

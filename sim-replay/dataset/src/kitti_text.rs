@@ -22,8 +22,12 @@ pub(super) struct Calibration {
 /// The lines of a text file, with their numbers from 1, blank ones left out.
 pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
     let text = files::read_text(path, MAX_BYTES)?;
-    let numbered = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
-    Ok(numbered.map(|(number, line)| (number, line.to_owned())).collect())
+    let numbered = (1..)
+        .zip(text.lines())
+        .filter(|(_, line)| !line.trim().is_empty());
+    Ok(numbered
+        .map(|(number, line)| (number, line.to_owned()))
+        .collect())
 }
 
 /// One value per line; a line that cannot be read has none and is added to `faults`.
@@ -32,11 +36,19 @@ pub(super) fn rows<T>(
     faults: &mut Faults,
     read: impl Fn(u64, &str) -> Result<T, ReadError>,
 ) -> Result<Vec<Option<T>>, ReadError> {
-    Ok(lines(path)?.into_iter().map(|(line, text)| faults.take(read(line, &text))).collect())
+    Ok(lines(path)?
+        .into_iter()
+        .map(|(line, text)| faults.take(read(line, &text)))
+        .collect())
 }
 
 pub(super) fn malformed(path: &Path, line: u64, field: Option<&str>, reason: String) -> ReadError {
-    ReadError::Malformed { path: path.to_owned(), line: Some(line), field: field.map(str::to_owned), reason }
+    ReadError::Malformed {
+        path: path.to_owned(),
+        line: Some(line),
+        field: field.map(str::to_owned),
+        reason,
+    }
 }
 
 /// Exactly `N` finite numbers, separated by blanks.
@@ -52,22 +64,45 @@ pub(super) fn numbers<const N: usize>(
         let number = word.parse().ok().filter(|number: &f64| number.is_finite());
         let Some(number) = number else {
             let word: String = word.chars().take(40).collect();
-            return Err(malformed(path, line, field, format!("{word:?} is no finite number")));
+            return Err(malformed(
+                path,
+                line,
+                field,
+                format!("{word:?} is no finite number"),
+            ));
         };
         if let Some(place) = numbers.get_mut(found) {
             *place = number;
         }
         found += 1;
     }
-    if found == N { Ok(numbers) } else { Err(malformed(path, line, field, format!("{found} numbers, expected {N}"))) }
+    if found == N {
+        Ok(numbers)
+    } else {
+        Err(malformed(
+            path,
+            line,
+            field,
+            format!("{found} numbers, expected {N}"),
+        ))
+    }
 }
 
 /// A rigid transform from a row-major 3x4 matrix.
-pub(super) fn rigid(path: &Path, line: u64, field: Option<&str>, rows: &[f64; 12]) -> Result<Pose, ReadError> {
-    Pose::from_matrix(&matrix(rows)).map_err(|error| malformed(path, line, field, error.to_string()))
+pub(super) fn rigid(
+    path: &Path,
+    line: u64,
+    field: Option<&str>,
+    rows: &[f64; 12],
+) -> Result<Pose, ReadError> {
+    Pose::from_matrix(&matrix(rows))
+        .map_err(|error| malformed(path, line, field, error.to_string()))
 }
 
-#[expect(clippy::indexing_slicing, reason = "twelve numbers are three lines of four columns")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "twelve numbers are three lines of four columns"
+)]
 fn matrix(rows: &[f64; 12]) -> Matrix4<f64> {
     let mut matrix = Matrix4::identity();
     for (index, value) in rows.iter().enumerate() {
@@ -82,7 +117,10 @@ impl Calibration {
             let (name, values) = line.split_once(':')?;
             Some((name.trim().to_owned(), number, values.to_owned()))
         });
-        Ok(Self { path: path.to_owned(), entries: entries.collect() })
+        Ok(Self {
+            path: path.to_owned(),
+            entries: entries.collect(),
+        })
     }
 
     fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N]), ReadError> {
@@ -106,7 +144,12 @@ impl Calibration {
     /// A 3x3 rotation.
     pub(super) fn rotation(&self, name: &str) -> Result<Pose, ReadError> {
         let (line, [a, b, c, d, e, f, g, h, i]) = self.numbers::<9>(name)?;
-        rigid(&self.path, line, Some(name), &[a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0])
+        rigid(
+            &self.path,
+            line,
+            Some(name),
+            &[a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0],
+        )
     }
 }
 
@@ -124,12 +167,25 @@ mod tests {
         )
         .unwrap();
         let calibration = Calibration::read(&path).unwrap();
-        assert_eq!(calibration.transform("Tr").unwrap().translation_m, [1.0, 2.0, 3.0]);
+        assert_eq!(
+            calibration.transform("Tr").unwrap().translation_m,
+            [1.0, 2.0, 3.0]
+        );
         assert_eq!(calibration.rotation("R0_rect").unwrap(), Pose::IDENTITY);
-        let message =
-            |result: Result<Pose, ReadError>| result.unwrap_err().to_string().replace(&*path.to_string_lossy(), "");
-        assert_eq!(message(calibration.rotation("Bad")), ":5: Bad: \"x\" is no finite number");
-        assert_eq!(message(calibration.transform("P0")), ":1: P0: 2 numbers, expected 12");
+        let message = |result: Result<Pose, ReadError>| {
+            result
+                .unwrap_err()
+                .to_string()
+                .replace(&*path.to_string_lossy(), "")
+        };
+        assert_eq!(
+            message(calibration.rotation("Bad")),
+            ":5: Bad: \"x\" is no finite number"
+        );
+        assert_eq!(
+            message(calibration.transform("P0")),
+            ":1: P0: 2 numbers, expected 12"
+        );
         assert_eq!(message(calibration.transform("Q")), ": Q: missing");
     }
 }

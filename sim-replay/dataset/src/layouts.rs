@@ -8,8 +8,8 @@ use std::path::Path;
 use serde::{Serialize, Serializer};
 
 use crate::{
-    Dataset, OpenOptions, ReadError, Scenario, cloud_sequence, dair, kitti_object, kitti_odometry, localization,
-    nuscenes, opv2v_family, recorded,
+    Dataset, OpenOptions, ReadError, Scenario, cloud_sequence, dair, kitti_object, kitti_odometry,
+    localization, nuscenes, opv2v_family, recorded,
 };
 
 /// A layout of files on disk: its row of the table.
@@ -128,8 +128,18 @@ pub fn layouts_text() -> String {
 
 pub(crate) fn text_of(layouts: &[&LayoutRow]) -> String {
     let mut text = String::new();
-    for LayoutRow { name, data_sets, files, .. } in layouts {
-        let data_sets = if name == data_sets { String::new() } else { format!(" ({data_sets})") };
+    for LayoutRow {
+        name,
+        data_sets,
+        files,
+        ..
+    } in layouts
+    {
+        let data_sets = if name == data_sets {
+            String::new()
+        } else {
+            format!(" ({data_sets})")
+        };
         // Writing to a String does not fail.
         let _ = writeln!(text, "  {name}{data_sets}: {files}");
     }

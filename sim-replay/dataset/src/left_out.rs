@@ -42,8 +42,14 @@ impl LeftOut {
     /// Adds the missing and unreadable frames of a tick.
     pub fn add_tick(&mut self, loaded: &LoadedTick) {
         self.absent_frames += loaded.absent as u64;
-        loaded.frames.iter().for_each(|(_, frame)| self.add_parts(frame));
-        loaded.unreadable.iter().for_each(|(agent, problem)| self.add_unreadable(*agent, problem.clone()));
+        loaded
+            .frames
+            .iter()
+            .for_each(|(_, frame)| self.add_parts(frame));
+        loaded
+            .unreadable
+            .iter()
+            .for_each(|(agent, problem)| self.add_unreadable(*agent, problem.clone()));
     }
 
     /// Adds a frame that cannot be read; the ego is agent 0.
@@ -59,7 +65,10 @@ impl LeftOut {
     /// Adds the parts left out of a frame.
     pub(crate) fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
-        frame.problems.iter().for_each(|problem| self.keep(problem.clone()));
+        frame
+            .problems
+            .iter()
+            .for_each(|problem| self.keep(problem.clone()));
     }
 
     /// Adds another account.
@@ -69,7 +78,10 @@ impl LeftOut {
         self.parts += other.parts;
         self.absent_frames += other.absent_frames;
         self.files += other.files;
-        other.problems.iter().for_each(|problem| self.keep(problem.clone()));
+        other
+            .problems
+            .iter()
+            .for_each(|problem| self.keep(problem.clone()));
     }
 
     /// True if nothing was lost. Absent agents are no loss.
@@ -85,7 +97,8 @@ impl LeftOut {
 
     /// Prints the findings to standard error; returns the outcome of a command that lost no other data.
     pub fn print(&self) -> Outcome {
-        self.problems().for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
+        self.problems()
+            .for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
         Outcome::of(!self.is_nothing())
     }
 
@@ -105,8 +118,11 @@ impl fmt::Display for LeftOut {
             (self.parts, "objects or other parts of frames"),
             (self.files, "files or folders"),
         ];
-        let left_out: Vec<String> =
-            counts.iter().filter(|(count, _)| *count > 0).map(|(count, kind)| format!("{count} {kind}")).collect();
+        let left_out: Vec<String> = counts
+            .iter()
+            .filter(|(count, _)| *count > 0)
+            .map(|(count, kind)| format!("{count} {kind}"))
+            .collect();
         if !left_out.is_empty() {
             write!(f, "left out: {}", left_out.join(", "))?;
         }
@@ -125,18 +141,30 @@ mod tests {
     use super::*;
 
     fn problem(name: &str) -> Problem {
-        Problem { path: name.into(), line: None, field: None, message: format!("{name}: cut off") }
+        Problem {
+            path: name.into(),
+            line: None,
+            field: None,
+            message: format!("{name}: cut off"),
+        }
     }
 
     fn frame(problems: &[&str]) -> Frame {
         let problems = problems.iter().map(|name| problem(name)).collect();
-        Frame { problems, ..Frame::empty(CavId::new("1").unwrap(), 0, Handedness::Right) }
+        Frame {
+            problems,
+            ..Frame::empty(CavId::new("1").unwrap(), 0, Handedness::Right)
+        }
     }
 
     #[test]
     fn losses_and_absent_frames_are_distinguished() {
         let mut left_out = LeftOut::default();
-        let loaded = LoadedTick { frames: vec![(0, frame(&[]))], unreadable: vec![], absent: 2 };
+        let loaded = LoadedTick {
+            frames: vec![(0, frame(&[]))],
+            unreadable: vec![],
+            absent: 2,
+        };
         left_out.add_tick(&loaded);
         assert!(left_out.is_nothing());
         assert_eq!(left_out.to_string(), "absent agents: 2 frames");
@@ -147,7 +175,15 @@ mod tests {
         };
         left_out.add_tick(&loaded);
         assert!(!left_out.is_nothing());
-        assert_eq!((left_out.ticks, left_out.frames, left_out.parts, left_out.problems().count()), (1, 1, 2, 4));
+        assert_eq!(
+            (
+                left_out.ticks,
+                left_out.frames,
+                left_out.parts,
+                left_out.problems().count()
+            ),
+            (1, 1, 2, 4)
+        );
         let expected = "left out: 1 ticks (the ego's frame cannot be read), 1 frames of other agents that cannot be read, \
                         2 objects or other parts of frames; absent agents: 2 frames";
         assert_eq!(left_out.to_string(), expected);

@@ -14,7 +14,14 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::indexing_slicing
+    )
+)]
 
 mod agent_folders;
 mod annotations;
@@ -159,7 +166,12 @@ pub struct LoadOptions {
 
 impl Default for LoadOptions {
     fn default() -> Self {
-        Self { lidar_variant: None, points: true, radar: false, cameras: false }
+        Self {
+            lidar_variant: None,
+            points: true,
+            radar: false,
+            cameras: false,
+        }
     }
 }
 
@@ -186,12 +198,20 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError>;
 
     /// Reads the LiDAR's points, the plain sweep or a variant.
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError>;
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError>;
 
     /// Reads the radar's points. Called only for scenarios that have them.
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let path = self.points_path(agent, tick, None);
-        Err(ReadError::malformed(&path, "there are no radar points beside it"))
+        Err(ReadError::malformed(
+            &path,
+            "there are no radar points beside it",
+        ))
     }
 
     /// Reads the images of some cameras, by number; those that are missing or unreadable are named.
@@ -213,11 +233,17 @@ impl Scenario {
     ///
     /// # Errors
     /// [`ReadError`] if there is no such agent, tick or variant, and if a file is missing or malformed.
-    pub fn load(&self, agent_index: usize, tick_index: usize, options: &LoadOptions) -> Result<Frame, ReadError> {
+    pub fn load(
+        &self,
+        agent_index: usize,
+        tick_index: usize,
+        options: &LoadOptions,
+    ) -> Result<Frame, ReadError> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         let mut frame = self.source.frame(agent, tick)?;
         if options.points {
-            let cloud = self.load_points(agent_index, tick_index, options.lidar_variant.as_deref())?;
+            let cloud =
+                self.load_points(agent_index, tick_index, options.lidar_variant.as_deref())?;
             (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
         }
         if options.radar && self.has_radar {
@@ -251,7 +277,9 @@ impl Scenario {
         variant: Option<&str>,
     ) -> Result<PcdCloud, ReadError> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
-        if let Some(asked) = variant.filter(|asked| !self.lidar_variants.iter().any(|known| known == asked)) {
+        if let Some(asked) =
+            variant.filter(|asked| !self.lidar_variants.iter().any(|known| known == asked))
+        {
             return Err(ReadError::NoSuch {
                 scenario: self.name.clone(),
                 what: "LiDAR variant",
@@ -276,10 +304,19 @@ impl Scenario {
         Ok(self.source.points_path(agent, tick, variant))
     }
 
-    fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick), ReadError> {
-        let agent =
-            self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
-        let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+    fn frame_of(
+        &self,
+        agent_index: usize,
+        tick_index: usize,
+    ) -> Result<(&CavId, &Tick), ReadError> {
+        let agent = self
+            .agents
+            .get(agent_index)
+            .ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
+        let tick = self
+            .ticks
+            .get(tick_index)
+            .ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
         if !self.is_present(agent_index, tick_index) {
             return Err(ReadError::Absent {
                 scenario: self.name.clone(),
@@ -292,7 +329,12 @@ impl Scenario {
 
     fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
         let available = format!("there are {count}, counted from 0");
-        ReadError::NoSuch { scenario: self.name.clone(), what, asked: index.to_string(), available }
+        ReadError::NoSuch {
+            scenario: self.name.clone(),
+            what,
+            asked: index.to_string(),
+            available,
+        }
     }
 }
 
@@ -302,7 +344,12 @@ fn single_vehicle_id() -> CavId {
 }
 
 /// A scenario of a layout with one unnamed vehicle.
-fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
+fn single_vehicle(
+    name: String,
+    layout: Layout,
+    ticks: Vec<Tick>,
+    source: Arc<dyn FrameSource>,
+) -> Scenario {
     Scenario {
         name,
         agents: vec![single_vehicle_id()],

@@ -23,7 +23,9 @@ const MAX_ANNOTATION_BYTES: u64 = 32 << 20;
 #[cfg(test)]
 fn listing_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> String {
     let mut hash = Sha256::new();
-    scenarios.into_iter().for_each(|scenario| list(scenario, &mut hash));
+    scenarios
+        .into_iter()
+        .for_each(|scenario| list(scenario, &mut hash));
     digits(hash)
 }
 
@@ -38,10 +40,15 @@ pub fn content_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> 
     let mut hash = Sha256::new();
     for scenario in scenarios {
         list(scenario, &mut hash);
-        let frames: Vec<(&CavId, &Tick)> =
-            scenario.agents.iter().flat_map(|agent| scenario.ticks.iter().map(move |tick| (agent, tick))).collect();
-        let digests: Vec<[u8; 32]> =
-            frames.into_par_iter().map(|(agent, tick)| frame_digest(scenario, agent, tick)).collect();
+        let frames: Vec<(&CavId, &Tick)> = scenario
+            .agents
+            .iter()
+            .flat_map(|agent| scenario.ticks.iter().map(move |tick| (agent, tick)))
+            .collect();
+        let digests: Vec<[u8; 32]> = frames
+            .into_par_iter()
+            .map(|(agent, tick)| frame_digest(scenario, agent, tick))
+            .collect();
         digests.iter().for_each(|digest| hash.update(digest));
     }
     digits(hash)
@@ -49,8 +56,14 @@ pub fn content_sha256<'a>(scenarios: impl IntoIterator<Item = &'a Scenario>) -> 
 
 fn list(scenario: &Scenario, hash: &mut Sha256) {
     hash.update(scenario.name.as_bytes());
-    scenario.agents.iter().for_each(|agent| hash.update(format!("/{agent}")));
-    scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
+    scenario
+        .agents
+        .iter()
+        .for_each(|agent| hash.update(format!("/{agent}")));
+    scenario
+        .ticks
+        .iter()
+        .for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
 }
 
 /// Hash of a frame. A file that cannot be read, or is too large for any reader, is hashed as such: its reader reports
@@ -67,7 +80,11 @@ fn frame_digest(scenario: &Scenario, agent: &CavId, tick: &Tick) -> [u8; 32] {
             Err(_) => hash.update("\nno annotations"),
         },
         None => {
-            let pose = scenario.source.frame(agent, tick).ok().and_then(|frame| frame.world_from_lidar);
+            let pose = scenario
+                .source
+                .frame(agent, tick)
+                .ok()
+                .and_then(|frame| frame.world_from_lidar);
             hash.update(format!("\n{pose:?}"));
         }
     }
@@ -147,8 +164,16 @@ mod tests {
         assert_ne!(changed("000070.pcd", &with(3)), original, "the beginning");
         assert_ne!(changed("000070.pcd", &with(4990)), original, "the end");
         assert_ne!(changed("000070.pcd", &points[..4000]), original, "the size");
-        assert_ne!(changed("000068.yaml", b"lidar_pose: [0, 0, 0, 0, 0, 0]"), original, "a pose");
-        assert_eq!(changed("000070.pcd", &with(2500)), original, "the middle of a cloud is not read");
+        assert_ne!(
+            changed("000068.yaml", b"lidar_pose: [0, 0, 0, 0, 0, 0]"),
+            original,
+            "a pose"
+        );
+        assert_eq!(
+            changed("000070.pcd", &with(2500)),
+            original,
+            "the middle of a cloud is not read"
+        );
         assert_eq!(
             listing_sha256(&scene(one.path(), &points).scenarios),
             listing_sha256(&scene(other.path(), b"").scenarios)
@@ -169,7 +194,10 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let dataset = scene(folder.path(), b"points");
         let path = folder.path().join("scene/4279/000068.yaml");
-        File::create(&path).unwrap().set_len(MAX_ANNOTATION_BYTES + 1).unwrap();
+        File::create(&path)
+            .unwrap()
+            .set_len(MAX_ANNOTATION_BYTES + 1)
+            .unwrap();
         let huge = content_sha256(&dataset.scenarios);
         fs::remove_file(path).unwrap();
         assert_eq!(content_sha256(&dataset.scenarios), huge);

@@ -38,7 +38,10 @@ pub(crate) static NCLT: LayoutRow = LayoutRow {
     data_sets: "NCLT, as published or as LightLoc converts it",
     files: "<day>/velodyne_sync/<microseconds>.bin, or <day>/velodyne_left/<microseconds>.bin in a folder named by a date",
     protocol: "opv2v",
-    reader: Some(Reader::Sequence { is_one: is_sequence, open }),
+    reader: Some(Reader::Sequence {
+        is_one: is_sequence,
+        open,
+    }),
 };
 
 /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
@@ -84,7 +87,9 @@ struct Sequence {
 
 /// True if a folder is a sequence.
 pub(super) fn is_sequence(dir: &Path) -> bool {
-    [CONVERTED, RAW].iter().any(|name| files::holds(&dir.join(name), ".bin"))
+    [CONVERTED, RAW]
+        .iter()
+        .any(|name| files::holds(&dir.join(name), ".bin"))
 }
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
@@ -95,14 +100,21 @@ pub(super) fn open(
     problems: &mut Vec<ReadError>,
 ) -> Result<Scenario, ReadError> {
     let storage = storage(dir);
-    let points_dir = dir.join(if storage == Storage::NcltRaw { RAW } else { CONVERTED });
+    let points_dir = dir.join(if storage == Storage::NcltRaw {
+        RAW
+    } else {
+        CONVERTED
+    });
     let mut stamps = BTreeMap::new();
     for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
         match stem.parse::<u64>() {
             Ok(micros) => drop(stamps.insert(micros, stem.to_owned())),
             Err(_) => {
                 let path = points_dir.join(format!("{stem}.bin"));
-                problems.push(ReadError::malformed(&path, format!("{stem:?} is no time in microseconds: left out")));
+                problems.push(ReadError::malformed(
+                    &path,
+                    format!("{stem:?} is no time in microseconds: left out"),
+                ));
             }
         }
     }
@@ -113,21 +125,45 @@ pub(super) fn open(
     if let Some(poses) = &poses {
         for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
             let path = points_dir.join(format!("{micros}.bin"));
-            problems.push(ReadError::malformed(&path, "does not exist, but there is a pose for it: left out"));
+            problems.push(ReadError::malformed(
+                &path,
+                "does not exist, but there is a pose for it: left out",
+            ));
         }
         let before = stamps.len();
         stamps.retain(|micros, _| poses.contains_key(micros));
         if stamps.is_empty() && before > 0 {
-            problems.push(ReadError::malformed(dir, format!("none of {before} sweeps has a pose: all left out")));
+            problems.push(ReadError::malformed(
+                dir,
+                format!("none of {before} sweeps has a pose: all left out"),
+            ));
         }
     }
-    let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
+    let tick = |(micros, stem): (u64, String)| Tick {
+        stem,
+        capture_nanos: micros.saturating_mul(1000),
+    };
     let ticks: Vec<Tick> = stamps.into_iter().map(tick).collect();
-    let layout = if storage == Storage::Oxford { Layout::OXFORD } else { Layout::NCLT };
-    let files = ticks.iter().map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
+    let layout = if storage == Storage::Oxford {
+        Layout::OXFORD
+    } else {
+        Layout::NCLT
+    };
+    let files = ticks
+        .iter()
+        .map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
-    let source = Sequence { points_dir, world_from_lidar: poses.unwrap_or_default(), sweeps };
-    Ok(single_vehicle(files::name_below(root, dir), layout, ticks, Arc::new(source)))
+    let source = Sequence {
+        points_dir,
+        world_from_lidar: poses.unwrap_or_default(),
+        sweeps,
+    };
+    Ok(single_vehicle(
+        files::name_below(root, dir),
+        layout,
+        ticks,
+        Arc::new(source),
+    ))
 }
 
 /// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.
@@ -148,7 +184,9 @@ fn poses(
     stamps: &BTreeMap<u64, String>,
     problems: &mut Vec<ReadError>,
 ) -> Result<Option<BTreeMap<u64, Pose>>, ReadError> {
-    let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps, problems)? else { return Ok(None) };
+    let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps, problems)? else {
+        return Ok(None);
+    };
     let middle = Isometry3::from(middle_m(dir, scene)?);
     let turn = half_turn();
     for pose in poses.values_mut() {
@@ -170,14 +208,25 @@ fn poses_as_stored(
     let is_nclt = storage != Storage::Oxford;
     let aligned = dir.join("velodyne_left_calibrateFalse.h5");
     if aligned.is_file() {
-        return Ok(Some(("QEOxford", hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?)));
+        return Ok(Some((
+            "QEOxford",
+            hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?,
+        )));
     }
     let plain = dir.join("velodyne_left_False.h5");
     if plain.is_file() {
         let scene = if is_nclt { "NCLT" } else { "Oxford" };
-        return Ok(Some((scene, hdf5_poses::read(&plain, RowOrder::Matrix, problems)?)));
+        return Ok(Some((
+            scene,
+            hdf5_poses::read(&plain, RowOrder::Matrix, problems)?,
+        )));
     }
-    let Some(path) = is_nclt.then(|| nclt_ground_truth::find(dir, &own_name(dir))).flatten() else { return Ok(None) };
+    let Some(path) = is_nclt
+        .then(|| nclt_ground_truth::find(dir, &own_name(dir)))
+        .flatten()
+    else {
+        return Ok(None);
+    };
     let truth = GroundTruth::read(&path, problems)?;
     let at = |&micros: &u64| Some((micros, Pose::from(truth.at(micros)?)));
     Ok(Some(("NCLT", stamps.keys().filter_map(at).collect())))
@@ -187,7 +236,10 @@ fn poses_as_stored(
 /// file.
 fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
     let name = format!("{scene}_pose_stats.txt");
-    let Some(path) = files::above(dir).map(|above| above.join(&name)).find(|path| path.is_file()) else {
+    let Some(path) = files::above(dir)
+        .map(|above| above.join(&name))
+        .find(|path| path.is_file())
+    else {
         return Ok(Translation3::identity());
     };
     let [x, y, z] = first_row(&path)?;
@@ -202,16 +254,26 @@ fn first_row(path: &Path) -> Result<[f64; 3], ReadError> {
     let first = lines.first().map(|(line, text)| (*line, text.clone()));
     let count = |text: &str| text.split_ascii_whitespace().count();
     match (first, lines.len()) {
-        (Some((line, text)), 1 | 2) if lines.iter().all(|(_, row)| count(row) == 3) => numbers(path, line, None, &text),
+        (Some((line, text)), 1 | 2) if lines.iter().all(|(_, row)| count(row) == 3) => {
+            numbers(path, line, None, &text)
+        }
         (first, _) => {
             let all: Vec<String> = lines.into_iter().map(|(_, text)| text).collect();
-            numbers(path, first.map_or(1, |(line, _)| line), None, &all.join(" "))
+            numbers(
+                path,
+                first.map_or(1, |(line, _)| line),
+                None,
+                &all.join(" "),
+            )
         }
     }
 }
 
 fn own_name(dir: &Path) -> String {
-    let name = dir.canonicalize().ok().and_then(|dir| Some(dir.file_name()?.to_string_lossy().into_owned()));
+    let name = dir
+        .canonicalize()
+        .ok()
+        .and_then(|dir| Some(dir.file_name()?.to_string_lossy().into_owned()));
     name.unwrap_or_default()
 }
 
@@ -226,12 +288,22 @@ fn half_turn() -> Isometry3<f64> {
 impl FrameSource for Sequence {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
-        frame.world_from_lidar = self.world_from_lidar.get(&(tick.capture_nanos / 1000)).copied();
+        frame.world_from_lidar = self
+            .world_from_lidar
+            .get(&(tick.capture_nanos / 1000))
+            .copied();
         Ok(frame)
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        let mut cloud = self.sweeps.read(agent, &self.points_path(agent, tick, variant))?;
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        let mut cloud = self
+            .sweeps
+            .read(agent, &self.points_path(agent, tick, variant))?;
         for [_, y, z, _] in &mut cloud.points.xyzi {
             (*y, *z) = (-*y, -*z);
         }
@@ -260,7 +332,10 @@ mod tests {
     }
 
     fn floats(values: &[f32]) -> Vec<u8> {
-        values.iter().flat_map(|value| value.to_le_bytes()).collect()
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
     }
 
     fn stamps() -> Vec<i64> {
@@ -271,7 +346,24 @@ mod tests {
     /// the right.
     fn poses() -> Vec<[f64; 12]> {
         let (sin, cos) = 0.1f64.sin_cos();
-        (0..12).map(|i| [cos, -sin, 0.0, f64::from(i), sin, cos, 0.0, 2.0, 0.0, 0.0, 1.0, 1.0]).collect()
+        (0..12)
+            .map(|i| {
+                [
+                    cos,
+                    -sin,
+                    0.0,
+                    f64::from(i),
+                    sin,
+                    cos,
+                    0.0,
+                    2.0,
+                    0.0,
+                    0.0,
+                    1.0,
+                    1.0,
+                ]
+            })
+            .collect()
     }
 
     fn open(root: &Path) -> Dataset {
@@ -282,23 +374,46 @@ mod tests {
     fn oxford_points_and_poses_turn_together() {
         let dir = tempfile::tempdir().unwrap();
         let sequence = "Oxford/2019-01-11-14-02-26-radar-oxford-10k";
-        write(dir.path(), &format!("{sequence}/velodyne_left_False.h5"), &hdf5_poses::tests::file(&stamps(), &poses()));
+        write(
+            dir.path(),
+            &format!("{sequence}/velodyne_left_False.h5"),
+            &hdf5_poses::tests::file(&stamps(), &poses()),
+        );
         for index in [5, 6] {
             // All x, all y, all z, all intensities; z points down.
             let points = floats(&[10.0, 20.0, 1.0, 2.0, 1.5, -3.0, 51.0, 255.0]);
-            write(dir.path(), &format!("{sequence}/velodyne_left/{}.bin", T0 + 50_000 * index), &points);
+            write(
+                dir.path(),
+                &format!("{sequence}/velodyne_left/{}.bin", T0 + 50_000 * index),
+                &points,
+            );
         }
         let dataset = open(dir.path());
-        assert_eq!((dataset.layout, dataset.problems.len()), (Layout::OXFORD, 0));
+        assert_eq!(
+            (dataset.layout, dataset.problems.len()),
+            (Layout::OXFORD, 0)
+        );
         let scenario = &dataset.scenarios[0];
-        assert_eq!((scenario.name.as_str(), scenario.ticks.len()), (sequence, 2));
+        assert_eq!(
+            (scenario.name.as_str(), scenario.ticks.len()),
+            (sequence, 2)
+        );
         let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
-        assert_eq!(frame.points.xyzi, [[10.0, -1.0, -1.5, 0.2], [20.0, -2.0, 3.0, 1.0]]);
+        assert_eq!(
+            frame.points.xyzi,
+            [[10.0, -1.0, -1.5, 0.2], [20.0, -2.0, 3.0, 1.0]]
+        );
         assert_eq!(frame.capture_nanos, (T0 + 250_000) * 1000);
         let pose = frame.world_from_lidar.unwrap();
         let [x, y, z] = pose.translation_m;
-        assert!((x - 5.0).abs() < 1e-9 && (y + 2.0).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{pose:?}");
-        assert!((pose.yaw_rad() + 0.1).abs() < 1e-9, "to the right is negative");
+        assert!(
+            (x - 5.0).abs() < 1e-9 && (y + 2.0).abs() < 1e-9 && (z + 1.0).abs() < 1e-9,
+            "{pose:?}"
+        );
+        assert!(
+            (pose.yaw_rad() + 0.1).abs() < 1e-9,
+            "to the right is negative"
+        );
     }
 
     #[test]
@@ -306,17 +421,34 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let sequence = dir.path().join("2012-01-22");
         let (down, rows) = ([3.0f32, -4.0, 1.0], poses());
-        write(&sequence, "velodyne_left_False.h5", &hdf5_poses::tests::file(&stamps(), &rows));
-        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &floats(&[down[0], down[1], down[2], 0.0]));
-        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 300_000), &[]);
+        write(
+            &sequence,
+            "velodyne_left_False.h5",
+            &hdf5_poses::tests::file(&stamps(), &rows),
+        );
+        write(
+            &sequence,
+            &format!("velodyne_left/{}.bin", T0 + 250_000),
+            &floats(&[down[0], down[1], down[2], 0.0]),
+        );
+        write(
+            &sequence,
+            &format!("velodyne_left/{}.bin", T0 + 300_000),
+            &[],
+        );
         let dataset = open(&sequence);
         assert_eq!(dataset.layout, Layout::NCLT);
-        let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        let frame = dataset.scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap();
         let [x, y, z, _] = frame.points.xyzi[0].map(f64::from);
         let ours = frame.world_from_lidar.unwrap().isometry() * nalgebra::Point3::new(x, y, z);
         let theirs: [f64; 3] = std::array::from_fn(|line| {
             let row = &rows[5][4 * line..4 * line + 4];
-            row[0] * f64::from(down[0]) + row[1] * f64::from(down[1]) + row[2] * f64::from(down[2]) + row[3]
+            row[0] * f64::from(down[0])
+                + row[1] * f64::from(down[1])
+                + row[2] * f64::from(down[2])
+                + row[3]
         });
         // The reference's world with its z turned up, and nothing mirrored.
         assert!((ours - nalgebra::Point3::new(theirs[0], -theirs[1], -theirs[2])).norm() < 1e-6);
@@ -330,9 +462,18 @@ mod tests {
         let rotation_first = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 7.0, 8.0, 9.0];
         let poses = hdf5_poses::tests::file(&stamps(), &[rotation_first; 12]);
         write(&sequence, "velodyne_left_calibrateFalse.h5", &poses);
-        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &[]);
-        let frame = open(&sequence).scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
-        assert_eq!(frame.world_from_lidar.unwrap().translation_m, [7.0, -8.0, -9.0]);
+        write(
+            &sequence,
+            &format!("velodyne_left/{}.bin", T0 + 250_000),
+            &[],
+        );
+        let frame = open(&sequence).scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap();
+        assert_eq!(
+            frame.world_from_lidar.unwrap().translation_m,
+            [7.0, -8.0, -9.0]
+        );
     }
 
     #[test]
@@ -345,40 +486,92 @@ mod tests {
         }
         // 2 m north and 1 m east of where it was, facing east; half the way at the time of the sweep.
         let turn = std::f64::consts::FRAC_PI_2;
-        let rows = format!("{},0,0,-3,0,0,{turn}\n{},2,1,-3,0,0,{turn}\n", stamp - 5_000, stamp + 5_000);
-        write(dir.path(), "ground_truth/groundtruth_2012-01-15.csv", rows.as_bytes());
+        let rows = format!(
+            "{},0,0,-3,0,0,{turn}\n{},2,1,-3,0,0,{turn}\n",
+            stamp - 5_000,
+            stamp + 5_000
+        );
+        write(
+            dir.path(),
+            "ground_truth/groundtruth_2012-01-15.csv",
+            rows.as_bytes(),
+        );
         let load = || {
             let dataset = open(dir.path());
-            assert_eq!((dataset.problems.len(), dataset.scenarios[0].ticks.len()), (0, 1), "one sweep has no pose");
-            dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap()
+            assert_eq!(
+                (dataset.problems.len(), dataset.scenarios[0].ticks.len()),
+                (0, 1),
+                "one sweep has no pose"
+            );
+            dataset.scenarios[0]
+                .load(0, 0, &LoadOptions::default())
+                .unwrap()
         };
         let pose = load().world_from_lidar.unwrap();
         let [x, y, z] = pose.translation_m;
-        assert!((x - 1.0).abs() < 1e-9 && (y + 0.5).abs() < 1e-9 && (z - 3.0).abs() < 1e-9, "{pose:?}");
-        assert!((pose.yaw_rad() + turn).abs() < 1e-9, "east is to the right of north");
+        assert!(
+            (x - 1.0).abs() < 1e-9 && (y + 0.5).abs() < 1e-9 && (z - 3.0).abs() < 1e-9,
+            "{pose:?}"
+        );
+        assert!(
+            (pose.yaw_rad() + turn).abs() < 1e-9,
+            "east is to the right of north"
+        );
         // LightLoc's positions are relative to the mean of the training sequences.
-        write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n-4.0\n");
+        write(
+            dir.path(),
+            "NCLT_pose_stats.txt",
+            b"100.0\n-50.0000000\n-4.0\n",
+        );
         let moved = load().world_from_lidar.unwrap();
         let [x, y, z] = moved.translation_m;
-        assert!((x + 99.0).abs() < 1e-9 && (y + 50.5).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{x} {y} {z}");
+        assert!(
+            (x + 99.0).abs() < 1e-9 && (y + 50.5).abs() < 1e-9 && (z + 1.0).abs() < 1e-9,
+            "{x} {y} {z}"
+        );
         // The files above the folder do not depend on the path by which it is opened.
         let same = open(&dir.path().join("2012-01-15/velodyne_sync/.."));
-        assert_eq!(same.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap().world_from_lidar, Some(moved));
+        assert_eq!(
+            same.scenarios[0]
+                .load(0, 0, &LoadOptions::default())
+                .unwrap()
+                .world_from_lidar,
+            Some(moved)
+        );
         // Other tools write a row of three, and their deviation below it.
-        for rows in ["100.0 -50.0 -4.0\n", "100.0 -50.0 -4.0\n3 4 5\n", "# mean, deviation\n100 -50 -4\n3 4 nan\n"] {
+        for rows in [
+            "100.0 -50.0 -4.0\n",
+            "100.0 -50.0 -4.0\n3 4 5\n",
+            "# mean, deviation\n100 -50 -4\n3 4 nan\n",
+        ] {
             write(dir.path(), "NCLT_pose_stats.txt", rows.as_bytes());
             assert_eq!(load().world_from_lidar, Some(moved), "{rows}");
         }
         for (rows, expected) in [
-            ("100.0\n-50.0000000\n", "NCLT_pose_stats.txt:1: 2 numbers, expected 3"),
-            ("1 2 3\n4 5 6\n7 8 9\n", "NCLT_pose_stats.txt:1: 9 numbers, expected 3"),
-            ("1 2 nan\n4 5 6\n", "NCLT_pose_stats.txt:1: \"nan\" is no finite number"),
+            (
+                "100.0\n-50.0000000\n",
+                "NCLT_pose_stats.txt:1: 2 numbers, expected 3",
+            ),
+            (
+                "1 2 3\n4 5 6\n7 8 9\n",
+                "NCLT_pose_stats.txt:1: 9 numbers, expected 3",
+            ),
+            (
+                "1 2 nan\n4 5 6\n",
+                "NCLT_pose_stats.txt:1: \"nan\" is no finite number",
+            ),
         ] {
             write(dir.path(), "NCLT_pose_stats.txt", rows.as_bytes());
             let dataset = open(dir.path());
             let message = dataset.problems[0].to_string();
-            assert!(message.contains(expected) && message.ends_with("the sequence is read without poses"), "{message}");
-            let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            assert!(
+                message.contains(expected)
+                    && message.ends_with("the sequence is read without poses"),
+                "{message}"
+            );
+            let frame = dataset.scenarios[0]
+                .load(0, 0, &LoadOptions::default())
+                .unwrap();
             assert_eq!(frame.world_from_lidar, None, "not counted from elsewhere");
         }
     }
@@ -386,20 +579,38 @@ mod tests {
     #[test]
     fn raw_nclt_has_no_poses_and_missing_sweeps_are_reported() {
         let dir = tempfile::tempdir().unwrap();
-        write(dir.path(), "2012-01-15/velodyne_sync/1326652795280148.bin", &[0x20, 0x4e, 0x20, 0x4e, 0, 0, 51, 3]);
+        write(
+            dir.path(),
+            "2012-01-15/velodyne_sync/1326652795280148.bin",
+            &[0x20, 0x4e, 0x20, 0x4e, 0, 0, 51, 3],
+        );
         let dataset = open(dir.path());
-        let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
-        assert_eq!((frame.world_from_lidar, frame.points.xyzi.as_slice()), (None, [[0.0, 0.0, 100.0, 0.2]].as_slice()));
+        let frame = dataset.scenarios[0]
+            .load(0, 0, &LoadOptions::default())
+            .unwrap();
+        assert_eq!(
+            (frame.world_from_lidar, frame.points.xyzi.as_slice()),
+            (None, [[0.0, 0.0, 100.0, 0.2]].as_slice())
+        );
 
         let sequence = dir.path().join("2012-01-22");
-        write(&sequence, "velodyne_left_False.h5", &hdf5_poses::tests::file(&stamps(), &poses()));
-        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &[]);
+        write(
+            &sequence,
+            "velodyne_left_False.h5",
+            &hdf5_poses::tests::file(&stamps(), &poses()),
+        );
+        write(
+            &sequence,
+            &format!("velodyne_left/{}.bin", T0 + 250_000),
+            &[],
+        );
         write(&sequence, "velodyne_left/readme.bin", &[]);
         let dataset = open(&sequence);
         assert_eq!(dataset.scenarios[0].ticks.len(), 1);
         let problems: Vec<String> = dataset.problems.iter().map(ToString::to_string).collect();
         assert!(
-            problems[0].contains("is no time in microseconds") && problems[1].contains("but there is a pose for it")
+            problems[0].contains("is no time in microseconds")
+                && problems[1].contains("but there is a pose for it")
         );
     }
 }

@@ -33,7 +33,8 @@ pub(super) struct GroundTruth {
 pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
     let file = format!("groundtruth_{name}.csv");
     let folders = std::iter::once(dir.to_owned()).chain(files::above(dir));
-    let mut places = folders.flat_map(|folder| [folder.join(&file), folder.join("ground_truth").join(&file)]);
+    let mut places =
+        folders.flat_map(|folder| [folder.join(&file), folder.join("ground_truth").join(&file)]);
     places.find(|path| path.is_file())
 }
 
@@ -41,7 +42,11 @@ impl GroundTruth {
     /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and
     /// reported.
     pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
-        Ok(Self::parse(path, &files::read_text(path, MAX_BYTES)?, problems))
+        Ok(Self::parse(
+            path,
+            &files::read_text(path, MAX_BYTES)?,
+            problems,
+        ))
     }
 
     fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Self {
@@ -59,7 +64,12 @@ impl GroundTruth {
             if in_order.next_if_eq(&index).is_some() {
                 poses.push((micros, pose));
             } else {
-                faults.push(wrong(path, number, 0, format!("{micros} is not between the times around it")));
+                faults.push(wrong(
+                    path,
+                    number,
+                    0,
+                    format!("{micros} is not between the times around it"),
+                ));
             }
         }
         faults.report("row", problems);
@@ -78,12 +88,17 @@ impl GroundTruth {
         let gap = next_time - last_time;
         let share = (micros - last_time) as f64 / gap as f64;
         // Half a turn within a gap cannot be interpolated.
-        (gap <= MAX_GAP_MICROS).then(|| last.try_lerp_slerp(next, share, 1e-9)).flatten()
+        (gap <= MAX_GAP_MICROS)
+            .then(|| last.try_lerp_slerp(next, share, 1e-9))
+            .flatten()
     }
 }
 
 /// Indices of the longest selection of values that increase.
-#[expect(clippy::indexing_slicing, reason = "all indices are of `values`, and `length` is at most that of `ends`")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "all indices are of `values`, and `length` is at most that of `ends`"
+)]
 fn longest_increasing(values: &[u64]) -> Vec<usize> {
     // Of the selections of each length, the index of the smallest last value; and the predecessor of each value.
     let mut ends: Vec<usize> = Vec::new();
@@ -97,39 +112,67 @@ fn longest_increasing(values: &[u64]) -> Vec<usize> {
             ends[length] = index;
         }
     }
-    let mut selection: Vec<usize> = std::iter::successors(ends.last().copied(), |&index| before[index]).collect();
+    let mut selection: Vec<usize> =
+        std::iter::successors(ends.last().copied(), |&index| before[index]).collect();
     selection.reverse();
     selection
 }
 
 /// Time and pose of a row; `None` if it holds no pose.
-fn row(path: &Path, line: u64, record: &StringRecord) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
+fn row(
+    path: &Path,
+    line: u64,
+    record: &StringRecord,
+) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
     if record.len() != COLUMNS.len() {
         let reason = format!("{} columns, expected {}", record.len(), COLUMNS.len());
-        return Err(ReadError::Malformed { path: path.to_owned(), line: Some(line), field: None, reason });
+        return Err(ReadError::Malformed {
+            path: path.to_owned(),
+            line: Some(line),
+            field: None,
+            reason,
+        });
     }
     let mut numbers = [0.0; COLUMNS.len()];
     for (column, (number, word)) in numbers.iter_mut().zip(record).enumerate() {
-        *number = word
-            .parse::<f64>()
-            .map_err(|_| wrong(path, line, column, format!("{:?} is no number", excerpt(word, 40))))?;
+        *number = word.parse::<f64>().map_err(|_| {
+            wrong(
+                path,
+                line,
+                column,
+                format!("{:?} is no number", excerpt(word, 40)),
+            )
+        })?;
     }
     let [micros, x, y, z, roll, pitch, heading] = numbers;
     // Times may be written like any other number: 1.326652795e15.
     if !(0.0..=1e18).contains(&micros) {
-        return Err(wrong(path, line, 0, format!("{micros} are no microseconds")));
+        return Err(wrong(
+            path,
+            line,
+            0,
+            format!("{micros} are no microseconds"),
+        ));
     }
     if numbers.iter().any(|number| !number.is_finite()) {
         return Ok(None);
     }
     // nalgebra's Euler angles are Rz(yaw) Ry(pitch) Rx(roll) too.
     let rotation = UnitQuaternion::from_euler_angles(roll, pitch, heading);
-    Ok(Some((rounding::to_u64(micros.floor()), Isometry3::from_parts(Translation3::new(x, y, z), rotation))))
+    Ok(Some((
+        rounding::to_u64(micros.floor()),
+        Isometry3::from_parts(Translation3::new(x, y, z), rotation),
+    )))
 }
 
 fn wrong(path: &Path, line: u64, column: usize, reason: String) -> ReadError {
     let field = COLUMNS.get(column).map(|name| (*name).to_owned());
-    ReadError::Malformed { path: path.to_owned(), line: Some(line), field, reason }
+    ReadError::Malformed {
+        path: path.to_owned(),
+        line: Some(line),
+        field,
+        reason,
+    }
 }
 
 #[cfg(test)]
@@ -140,7 +183,8 @@ mod tests {
 
     fn parse(text: &str) -> (GroundTruth, Vec<String>) {
         let mut problems = Vec::new();
-        let truth = GroundTruth::parse(Path::new("groundtruth_2012-01-15.csv"), text, &mut problems);
+        let truth =
+            GroundTruth::parse(Path::new("groundtruth_2012-01-15.csv"), text, &mut problems);
         (truth, problems.iter().map(ToString::to_string).collect())
     }
 
@@ -159,9 +203,14 @@ mod tests {
         );
         let truth = sound(&text);
         assert_eq!(truth.at(T0 - 5_000), None);
-        assert_eq!(truth.at(T0).unwrap().translation.vector.as_slice(), [10.0, 20.0, -1.0]);
+        assert_eq!(
+            truth.at(T0).unwrap().translation.vector.as_slice(),
+            [10.0, 20.0, -1.0]
+        );
         let middle = truth.at(T0 + 25_000).unwrap();
-        assert!((middle.translation.vector - nalgebra::Vector3::new(10.5, 20.0, -1.5)).norm() < 1e-9);
+        assert!(
+            (middle.translation.vector - nalgebra::Vector3::new(10.5, 20.0, -1.5)).norm() < 1e-9
+        );
         // The shorter rotation, through pi.
         let (_, _, heading) = truth.at(T0 + 50_000).unwrap().rotation.euler_angles();
         assert!(heading.abs() > 3.13, "{heading}");
@@ -172,14 +221,21 @@ mod tests {
     fn angles_turn_about_z_then_y_then_x() {
         let truth = sound(&format!("{T0},0,0,0,0.1,0.2,0.3"));
         let axis = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
-        let (x, y, z) = (nalgebra::Vector3::x_axis(), nalgebra::Vector3::y_axis(), nalgebra::Vector3::z_axis());
+        let (x, y, z) = (
+            nalgebra::Vector3::x_axis(),
+            nalgebra::Vector3::y_axis(),
+            nalgebra::Vector3::z_axis(),
+        );
         let expected = axis(z, 0.3) * axis(y, 0.2) * axis(x, 0.1);
         assert!(truth.at(T0).unwrap().rotation.angle_to(&expected) < 1e-12);
     }
 
     #[test]
     fn gaps_are_not_interpolated() {
-        let truth = sound(&format!("{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n", T0 + 1_000_001));
+        let truth = sound(&format!(
+            "{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n",
+            T0 + 1_000_001
+        ));
         assert_eq!(truth.at(T0 + 500_000), None);
         assert!(truth.at(T0 + 1_000_001).is_some());
     }
@@ -188,14 +244,34 @@ mod tests {
     fn a_bad_row_is_left_out_and_named_with_its_line() {
         let row = |micros: u64, x: u64| format!("{micros},{x},0,0,0,0,0\n");
         for (bad, expected) in [
-            ("2,0,0\n".to_owned(), ":2: 3 columns, expected 7: the row is left out"),
-            (format!("{},0,up,0,0,0,0\n", T0 + 10), ":2: y: \"up\" is no number: the row is left out"),
-            ("-5,0,0,0,0,0,0\n".into(), ":2: utime: -5 are no microseconds: the row is left out"),
-            (row(T0, 99), ":2: utime: 1326652795000000 is not between the times around it: the row is left out"),
-            (row(T0 + 999, 99), ":2: utime: 1326652795000999 is not between the times around it: the row is left out"),
+            (
+                "2,0,0\n".to_owned(),
+                ":2: 3 columns, expected 7: the row is left out",
+            ),
+            (
+                format!("{},0,up,0,0,0,0\n", T0 + 10),
+                ":2: y: \"up\" is no number: the row is left out",
+            ),
+            (
+                "-5,0,0,0,0,0,0\n".into(),
+                ":2: utime: -5 are no microseconds: the row is left out",
+            ),
+            (
+                row(T0, 99),
+                ":2: utime: 1326652795000000 is not between the times around it: the row is left out",
+            ),
+            (
+                row(T0 + 999, 99),
+                ":2: utime: 1326652795000999 is not between the times around it: the row is left out",
+            ),
         ] {
-            let (truth, problems) = parse(&(row(T0, 1) + &bad + &row(T0 + 20, 3) + &row(T0 + 30, 4)));
-            assert_eq!(problems, [format!("groundtruth_2012-01-15.csv{expected}")], "{bad}");
+            let (truth, problems) =
+                parse(&(row(T0, 1) + &bad + &row(T0 + 20, 3) + &row(T0 + 30, 4)));
+            assert_eq!(
+                problems,
+                [format!("groundtruth_2012-01-15.csv{expected}")],
+                "{bad}"
+            );
             // Of two rows of one time the first may be left out.
             assert_eq!(truth.at(T0 + 20).unwrap().translation.vector.x, 3.0);
             assert_eq!(truth.poses.len(), 3);

@@ -31,38 +31,61 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let shape = shape_of(header)?;
     let columns = match descr.strip_prefix('[') {
         Some(fields) => named(fields, &shape)?,
-        None => numbered(scalar_of(quoted(descr).unwrap_or_default())?, &shape, is_fortran(header))?,
+        None => numbered(
+            scalar_of(quoted(descr).unwrap_or_default())?,
+            &shape,
+            is_fortran(header),
+        )?,
     };
-    let stated = shape.iter().try_fold(size_of_one(descr)?, |product, &size| product.checked_mul(size));
+    let stated = shape
+        .iter()
+        .try_fold(size_of_one(descr)?, |product, &size| {
+            product.checked_mul(size)
+        });
     if stated.is_none_or(|stated| body.len() < stated) {
         let found = body.len();
-        return Err(format!("shape {shape:?} stated, {found} bytes found: the file is cut off"));
+        return Err(format!(
+            "shape {shape:?} stated, {found} bytes found: the file is cut off"
+        ));
     }
     let point = |index: usize| {
         columns.places.map(|place| {
-            let value = place.and_then(|(first, scalar)| scalar.read(body.get(first + index * columns.step..)?));
+            let value = place
+                .and_then(|(first, scalar)| scalar.read(body.get(first + index * columns.step..)?));
             value.map_or(0.0, |value| value as f32)
         })
     };
     let points = (0..columns.points).map(point).collect();
     let [.., intensity] = columns.places;
     let intensity = intensity.map(|(_, scalar)| {
-        let kind = if scalar.is_byte() { IntensityKind::Byte } else { IntensityKind::Number };
+        let kind = if scalar.is_byte() {
+            IntensityKind::Byte
+        } else {
+            IntensityKind::Number
+        };
         IntensityOrigin::stored(columns.intensity.as_deref().unwrap_or("4th column"), kind)
     });
-    Ok(PcdCloud { intensity, form: "NumPy array", ..PcdCloud::of_finite(points, Vec::new()) })
+    Ok(PcdCloud {
+        intensity,
+        form: "NumPy array",
+        ..PcdCloud::of_finite(points, Vec::new())
+    })
 }
 
 /// Text of the header and the bytes behind it.
 fn split(bytes: &[u8]) -> Result<(&str, &[u8]), String> {
-    let rest = bytes.strip_prefix(MAGIC).ok_or("it does not begin as a NumPy file")?;
+    let rest = bytes
+        .strip_prefix(MAGIC)
+        .ok_or("it does not begin as a NumPy file")?;
     let (length, rest) = match rest {
         [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
         [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
         [version, ..] => return Err(format!("version {version} of the format, expected 1 to 3")),
         [] => return Err("it ends after its first bytes".to_owned()),
     };
-    let header = rest.get(..length).ok_or_else(|| format!("header of {length} bytes stated, {} found", rest.len()))?;
+    let header = rest
+        .get(..length)
+        .ok_or_else(|| format!("header of {length} bytes stated, {} found", rest.len()))?;
     let header = std::str::from_utf8(header).map_err(|_| "the header is no text".to_owned())?;
     Ok((header, rest.get(length..).unwrap_or_default()))
 }
@@ -74,7 +97,10 @@ fn entry<'a>(header: &'a str, key: &str) -> Option<&'a str> {
 }
 
 fn quoted(text: &str) -> Option<&str> {
-    let quote = text.chars().next().filter(|quote| matches!(quote, '\'' | '"'))?;
+    let quote = text
+        .chars()
+        .next()
+        .filter(|quote| matches!(quote, '\'' | '"'))?;
     text.get(1..)?.split(quote).next()
 }
 
@@ -83,14 +109,26 @@ fn is_fortran(header: &str) -> bool {
 }
 
 fn shape_of(header: &str) -> Result<Vec<usize>, String> {
-    let text = entry(header, "shape").and_then(|text| text.strip_prefix('(')?.split_once(')')).ok_or("no shape")?.0;
-    let sizes = text.split(',').map(str::trim).filter(|size| !size.is_empty());
-    sizes.map(|size| size.parse().map_err(|_| format!("shape ({text}): {size:?} is no size"))).collect()
+    let text = entry(header, "shape")
+        .and_then(|text| text.strip_prefix('(')?.split_once(')'))
+        .ok_or("no shape")?
+        .0;
+    let sizes = text
+        .split(',')
+        .map(str::trim)
+        .filter(|size| !size.is_empty());
+    sizes
+        .map(|size| {
+            size.parse()
+                .map_err(|_| format!("shape ({text}): {size:?} is no size"))
+        })
+        .collect()
 }
 
 /// The number type of NumPy's code, for example `<f4`.
 fn scalar_of(code: &str) -> Result<Scalar, String> {
-    let fault = || format!("numbers of type {code:?}, expected integers, or floats of 4 or 8 bytes");
+    let fault =
+        || format!("numbers of type {code:?}, expected integers, or floats of 4 or 8 bytes");
     let (order, rest) = code.split_at_checked(1).ok_or_else(fault)?;
     let (kind, size) = rest.split_at_checked(1).ok_or_else(fault)?;
     let size = size.parse().map_err(|_| fault())?;
@@ -101,7 +139,11 @@ fn scalar_of(code: &str) -> Result<Scalar, String> {
         ("V", _) => ScalarKind::Padding,
         _ => return Err(fault()),
     };
-    Ok(Scalar { kind, size, is_big_endian: order == ">" })
+    Ok(Scalar {
+        kind,
+        size,
+        is_big_endian: order == ">",
+    })
 }
 
 /// Fields of a structured array: name and type.
@@ -110,8 +152,13 @@ fn fields_of(text: &str) -> Result<Vec<(String, Scalar)>, String> {
     let tuples = list.split('(').skip(1).map(|tuple| {
         let words: Vec<&str> = tuple.split(['\'', '"']).collect();
         match words[..] {
-            [_, name, _, code, end] if end.trim().starts_with(')') => Ok((name.to_owned(), scalar_of(code)?)),
-            _ => Err(format!("field ({}, expected a name and a type", tuple.trim_end())),
+            [_, name, _, code, end] if end.trim().starts_with(')') => {
+                Ok((name.to_owned(), scalar_of(code)?))
+            }
+            _ => Err(format!(
+                "field ({}, expected a name and a type",
+                tuple.trim_end()
+            )),
         }
     });
     tuples.collect()
@@ -120,7 +167,10 @@ fn fields_of(text: &str) -> Result<Vec<(String, Scalar)>, String> {
 /// Bytes of one element of the array.
 fn size_of_one(descr: &str) -> Result<usize, String> {
     match descr.strip_prefix('[') {
-        Some(fields) => Ok(fields_of(fields)?.iter().map(|(_, scalar)| scalar.size).sum()),
+        Some(fields) => Ok(fields_of(fields)?
+            .iter()
+            .map(|(_, scalar)| scalar.size)
+            .sum()),
         None => Ok(scalar_of(quoted(descr).unwrap_or_default())?.size),
     }
 }
@@ -129,15 +179,25 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
     let fields = fields_of(fields)?;
     let is_number = |(_, scalar): &(String, Scalar)| scalar.kind != ScalarKind::Padding;
     let find = |names: &[&str]| {
-        let index = names
+        let index = names.iter().find_map(|name| {
+            fields
+                .iter()
+                .position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name))
+        })?;
+        let first = fields
             .iter()
-            .find_map(|name| fields.iter().position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name)))?;
-        let first = fields.iter().take(index).map(|(_, scalar)| scalar.size).sum();
-        fields.get(index).map(|(name, scalar)| (name.clone(), (first, *scalar)))
+            .take(index)
+            .map(|(_, scalar)| scalar.size)
+            .sum();
+        fields
+            .get(index)
+            .map(|(name, scalar)| (name.clone(), (first, *scalar)))
     };
     let coordinate = |name: &str| {
         let names: Vec<&str> = fields.iter().map(|(name, _)| name.as_str()).collect();
-        find(&[name]).map(|(_, place)| place).ok_or_else(|| format!("no field {name}, there are {names:?}"))
+        find(&[name])
+            .map(|(_, place)| place)
+            .ok_or_else(|| format!("no field {name}, there are {names:?}"))
     };
     let intensity = find(&INTENSITY);
     Ok(Columns {
@@ -148,7 +208,10 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
             intensity.as_ref().map(|f| f.1),
         ],
         step: fields.iter().map(|(_, scalar)| scalar.size).sum(),
-        points: shape.iter().try_fold(1_usize, |product, &size| product.checked_mul(size)).unwrap_or(usize::MAX),
+        points: shape
+            .iter()
+            .try_fold(1_usize, |product, &size| product.checked_mul(size))
+            .unwrap_or(usize::MAX),
         intensity: intensity.map(|(name, _)| name),
     })
 }
@@ -160,7 +223,10 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
     let (count, columns, is_planar) = match before {
         [components] if is_by_component => (last, *components, !is_fortran),
         [_, ..] if COLUMNS.contains(&last) => (
-            before.iter().try_fold(1_usize, |product, &size| product.checked_mul(size)).ok_or_else(fault)?,
+            before
+                .iter()
+                .try_fold(1_usize, |product, &size| product.checked_mul(size))
+                .ok_or_else(fault)?,
             last,
             is_fortran,
         ),
@@ -171,7 +237,12 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
         let first = column.checked_mul(column_step)?.checked_mul(scalar.size)?;
         (column < columns).then_some((first, scalar))
     };
-    Ok(Columns { places: [0, 1, 2, 3].map(place), step: point_step * scalar.size, points: count, intensity: None })
+    Ok(Columns {
+        places: [0, 1, 2, 3].map(place),
+        step: point_step * scalar.size,
+        points: count,
+        intensity: None,
+    })
 }
 
 #[cfg(test)]
@@ -184,12 +255,21 @@ mod tests {
     }
 
     fn floats(values: &[f32]) -> Vec<u8> {
-        values.iter().flat_map(|value| value.to_le_bytes()).collect()
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
     }
 
-    fn array(descr: &str, is_fortran: bool, shape: &str, body: &[u8]) -> Result<Vec<[f32; 4]>, String> {
+    fn array(
+        descr: &str,
+        is_fortran: bool,
+        shape: &str,
+        body: &[u8],
+    ) -> Result<Vec<[f32; 4]>, String> {
         let order = if is_fortran { "True" } else { "False" };
-        let header = format!("{{'descr': '{descr}', 'fortran_order': {order}, 'shape': ({shape}), }}\n");
+        let header =
+            format!("{{'descr': '{descr}', 'fortran_order': {order}, 'shape': ({shape}), }}\n");
         decode(&file(&header, body)).map(|cloud| cloud.points.xyzi)
     }
 
@@ -199,13 +279,31 @@ mod tests {
         let by_point = floats(&[1.0, 2.0, 3.0, 0.5, 4.0, 5.0, 6.0, 0.25]);
         let by_component = floats(&[1.0, 4.0, 2.0, 5.0, 3.0, 6.0, 0.5, 0.25]);
         assert_eq!(array("<f4", false, "2, 4", &by_point), Ok(expected.clone()));
-        assert_eq!(array("<f4", false, "1, 2, 4", &by_point), Ok(expected.clone()));
-        assert_eq!(array("<f4", true, "2, 4", &by_component), Ok(expected.clone()));
+        assert_eq!(
+            array("<f4", false, "1, 2, 4", &by_point),
+            Ok(expected.clone())
+        );
+        assert_eq!(
+            array("<f4", true, "2, 4", &by_component),
+            Ok(expected.clone())
+        );
         assert_eq!(array("<f4", false, "4, 2", &by_component), Ok(expected));
-        let doubles: Vec<u8> = [1.0, 2.0, 3.0_f64].iter().flat_map(|value| value.to_be_bytes()).collect();
-        assert_eq!(array(">f8", false, "1, 3", &doubles), Ok(vec![[1.0, 2.0, 3.0, 0.0]]));
-        let shorts: Vec<u8> = [-1, 2, 3, 9, 9_i16].iter().flat_map(|value| value.to_le_bytes()).collect();
-        assert_eq!(array("<i2", false, "1, 5", &shorts), Ok(vec![[-1.0, 2.0, 3.0, 9.0]]));
+        let doubles: Vec<u8> = [1.0, 2.0, 3.0_f64]
+            .iter()
+            .flat_map(|value| value.to_be_bytes())
+            .collect();
+        assert_eq!(
+            array(">f8", false, "1, 3", &doubles),
+            Ok(vec![[1.0, 2.0, 3.0, 0.0]])
+        );
+        let shorts: Vec<u8> = [-1, 2, 3, 9, 9_i16]
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect();
+        assert_eq!(
+            array("<i2", false, "1, 5", &shorts),
+            Ok(vec![[-1.0, 2.0, 3.0, 9.0]])
+        );
     }
 
     #[test]
@@ -223,14 +321,30 @@ mod tests {
     #[test]
     fn faults_are_named_with_both_values() {
         let message = |result: Result<Vec<[f32; 4]>, String>| result.unwrap_err();
-        assert!(message(array("<f4", false, "3, 4", &[0; 47])).starts_with("shape [3, 4] stated, 47 bytes found"));
-        assert!(message(array("<f4", false, "7", &[0; 28])).starts_with("shape [7], expected N x 3"));
-        assert!(message(array("<f4", false, "9, 2", &[0; 72])).starts_with("shape [9, 2], expected N x 3"));
+        assert!(
+            message(array("<f4", false, "3, 4", &[0; 47]))
+                .starts_with("shape [3, 4] stated, 47 bytes found")
+        );
+        assert!(
+            message(array("<f4", false, "7", &[0; 28])).starts_with("shape [7], expected N x 3")
+        );
+        assert!(
+            message(array("<f4", false, "9, 2", &[0; 72]))
+                .starts_with("shape [9, 2], expected N x 3")
+        );
         assert!(message(array("|O", false, "1, 4", &[])).contains("numbers of type \"|O\""));
         assert!(message(array("<f4", false, "18446744073709551615, 4", &[])).contains("cut off"));
-        assert!(decode(b"\x93NUMPY\x01\x00\xff\xff").unwrap_err().contains("header of 65535 bytes stated"));
+        assert!(
+            decode(b"\x93NUMPY\x01\x00\xff\xff")
+                .unwrap_err()
+                .contains("header of 65535 bytes stated")
+        );
         assert!(decode(b"PK").is_err());
         let padding = "{'descr': [('x', '|V0'), ('y', '|V0'), ('z', '|V0')], 'fortran_order': False, 'shape': (9,), }";
-        assert!(decode(&file(padding, b"")).unwrap_err().contains("no field x"));
+        assert!(
+            decode(&file(padding, b""))
+                .unwrap_err()
+                .contains("no field x")
+        );
     }
 }

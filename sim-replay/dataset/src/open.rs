@@ -23,7 +23,10 @@ pub struct OpenOptions {
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::AUTO }
+        Self {
+            period_nanos: 100_000_000,
+            intensity_scale: IntensityScale::AUTO,
+        }
     }
 }
 
@@ -47,7 +50,11 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError
 }
 
 /// Tries `layouts` in their order.
-fn open_among(layouts: &[&LayoutRow], dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+fn open_among(
+    layouts: &[&LayoutRow],
+    dir: &Path,
+    options: &OpenOptions,
+) -> Result<Dataset, ReadError> {
     for layout in layouts {
         if let Some(Reader::DataSet(open)) = layout.reader
             && let Some(dataset) = open(dir, options)?
@@ -56,9 +63,20 @@ fn open_among(layouts: &[&LayoutRow], dir: &Path, options: &OpenOptions) -> Resu
         }
     }
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
-    open_sequences(layouts, dir, (dir, SEQUENCE_DEPTH), options, &mut scenarios, &mut problems)?;
+    open_sequences(
+        layouts,
+        dir,
+        (dir, SEQUENCE_DEPTH),
+        options,
+        &mut scenarios,
+        &mut problems,
+    )?;
     match scenarios.first().map(|scenario: &Scenario| scenario.layout) {
-        Some(layout) => Ok(Dataset { layout, scenarios, problems }),
+        Some(layout) => Ok(Dataset {
+            layout,
+            scenarios,
+            problems,
+        }),
         None => Err(nothing_opened(dir, problems)),
     }
 }
@@ -82,7 +100,14 @@ fn open_sequences(
         Some(Err(error)) => problems.push(error),
         None if depth > 0 => {
             for (folder, _) in files::list_below(dir, &files::list(dir)?, problems) {
-                open_sequences(layouts, root, (&folder, depth - 1), options, scenarios, problems)?;
+                open_sequences(
+                    layouts,
+                    root,
+                    (&folder, depth - 1),
+                    options,
+                    scenarios,
+                    problems,
+                )?;
             }
         }
         None => {}
@@ -96,9 +121,16 @@ pub(super) fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadEr
         0 => unknown(dir),
         1 => problems.swap_remove(0),
         count => {
-            let shown: Vec<String> = problems.iter().take(SHOWN_PROBLEMS).map(ToString::to_string).collect();
-            let more =
-                if count > SHOWN_PROBLEMS { format!("; and {} more", count - SHOWN_PROBLEMS) } else { String::new() };
+            let shown: Vec<String> = problems
+                .iter()
+                .take(SHOWN_PROBLEMS)
+                .map(ToString::to_string)
+                .collect();
+            let more = if count > SHOWN_PROBLEMS {
+                format!("; and {} more", count - SHOWN_PROBLEMS)
+            } else {
+                String::new()
+            };
             ReadError::Layout {
                 path: dir.to_owned(),
                 reason: format!("nothing can be opened: {}{more}", shown.join("; ")),
@@ -112,9 +144,15 @@ fn unknown(dir: &Path) -> ReadError {
         "this is the folder of one agent: open the scenario above it".to_owned()
     } else {
         let layouts = layouts_text();
-        format!("no supported layout; at most three folders down, expected one of\n{}", layouts.trim_end())
+        format!(
+            "no supported layout; at most three folders down, expected one of\n{}",
+            layouts.trim_end()
+        )
     };
-    ReadError::Layout { path: dir.to_owned(), reason }
+    ReadError::Layout {
+        path: dir.to_owned(),
+        reason,
+    }
 }
 
 #[cfg(test)]
@@ -138,7 +176,10 @@ mod tests {
         data_sets: "none",
         files: "dummy.txt with a number of ticks",
         protocol: "opv2v",
-        reader: Some(Reader::Sequence { is_one: |dir| dir.join("dummy.txt").is_file(), open: open_dummy }),
+        reader: Some(Reader::Sequence {
+            is_one: |dir| dir.join("dummy.txt").is_file(),
+            open: open_dummy,
+        }),
     };
 
     #[derive(Debug)]
@@ -165,11 +206,21 @@ mod tests {
         _: &mut Vec<ReadError>,
     ) -> Result<Scenario, ReadError> {
         let file = dir.join("dummy.txt");
-        let count = fs::read_to_string(&file).ok().and_then(|text| text.trim().parse().ok());
+        let count = fs::read_to_string(&file)
+            .ok()
+            .and_then(|text| text.trim().parse().ok());
         let count: u64 = count.ok_or_else(|| ReadError::malformed(&file, "no number"))?;
-        let tick = |index: u64| Tick { stem: index.to_string(), capture_nanos: index * options.period_nanos };
+        let tick = |index: u64| Tick {
+            stem: index.to_string(),
+            capture_nanos: index * options.period_nanos,
+        };
         let ticks = (0..count).map(tick).collect();
-        Ok(single_vehicle(files::name_below(root, dir), Layout(&DUMMY), ticks, Arc::new(Dummy(file))))
+        Ok(single_vehicle(
+            files::name_below(root, dir),
+            Layout(&DUMMY),
+            ticks,
+            Arc::new(Dummy(file)),
+        ))
     }
 
     #[test]
@@ -180,11 +231,29 @@ mod tests {
         assert!(open(dir.path()).is_err(), "the table has no such row");
         let layouts: Vec<&LayoutRow> = LAYOUTS.iter().copied().chain([&DUMMY]).collect();
         let dataset = open_among(&layouts, dir.path(), &OpenOptions::default()).unwrap();
-        assert_eq!((dataset.layout, dataset.scenarios.len(), dataset.problems.len()), (Layout(&DUMMY), 1, 0));
+        assert_eq!(
+            (
+                dataset.layout,
+                dataset.scenarios.len(),
+                dataset.problems.len()
+            ),
+            (Layout(&DUMMY), 1, 0)
+        );
         let scenario = &dataset.scenarios[0];
         assert_eq!((scenario.name.as_str(), scenario.ticks.len()), ("first", 3));
-        assert_eq!(scenario.source.points(&scenario.agents[0], &scenario.ticks[0], None).unwrap().points.xyzi.len(), 1);
+        assert_eq!(
+            scenario
+                .source
+                .points(&scenario.agents[0], &scenario.ticks[0], None)
+                .unwrap()
+                .points
+                .xyzi
+                .len(),
+            1
+        );
         assert_eq!(serde_json::to_string(&dataset.layout).unwrap(), "\"dummy\"");
-        assert!(text_of(&layouts).contains("  dummy layout (none): dummy.txt with a number of ticks"));
+        assert!(
+            text_of(&layouts).contains("  dummy layout (none): dummy.txt with a number of ticks")
+        );
     }
 }

@@ -28,19 +28,31 @@ pub(super) struct Opv2v {
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         if self.folder.without_yaml.contains(agent) {
-            return Ok(Frame::empty(agent.clone(), tick.capture_nanos, self.handedness));
+            return Ok(Frame::empty(
+                agent.clone(),
+                tick.capture_nanos,
+                self.handedness,
+            ));
         }
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
         self.frame_without_points(agent, tick, Field::root(&path, &node))
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        self.sweeps.read(agent, &self.points_path(agent, tick, variant)).map(|cloud| self.right_handed(cloud))
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        self.sweeps
+            .read(agent, &self.points_path(agent, tick, variant))
+            .map(|cloud| self.right_handed(cloud))
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
-        points::read_pcd(&self.folder.radar(agent, &tick.stem)).map(|cloud| self.right_handed(cloud))
+        points::read_pcd(&self.folder.radar(agent, &tick.stem))
+            .map(|cloud| self.right_handed(cloud))
     }
 
     fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8]) -> CameraImages {
@@ -50,15 +62,25 @@ impl FrameSource for Opv2v {
         let path = self.folder.yaml(agent, &tick.stem);
         let node = match yaml::read(&path) {
             Ok(node) => node,
-            Err(error) => return CameraImages { problems: vec![Problem::from(&error)], ..CameraImages::default() },
+            Err(error) => {
+                return CameraImages {
+                    problems: vec![Problem::from(&error)],
+                    ..CameraImages::default()
+                };
+            }
         };
         let (root, dir) = (Field::root(&path, &node), self.folder.agent_dir(agent));
         let mut found = CameraImages::default();
         // An agent may have fewer cameras than others.
         let own = self.folder.cameras.get(agent);
-        for &number in numbers.iter().filter(|number| own.is_some_and(|own| own.contains(number))) {
+        for &number in numbers
+            .iter()
+            .filter(|number| own.is_some_and(|own| own.contains(number)))
+        {
             let file = camera_files::find(&dir, &tick.stem, number);
-            let read = |file: PathBuf| camera_files::read(&file, number, &root, &|field| self.six_numbers(field));
+            let read = |file: PathBuf| {
+                camera_files::read(&file, number, &root, &|field| self.six_numbers(field))
+            };
             found.add(number, file.and_then(read));
         }
         found
@@ -75,15 +97,27 @@ impl FrameSource for Opv2v {
 }
 
 impl Opv2v {
-    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame, ReadError> {
+    fn frame_without_points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        root: Field<'_>,
+    ) -> Result<Frame, ReadError> {
         let pose = |field: &Field<'_>| self.six_numbers(field);
-        let world_from_lidar = root.optional("lidar_pose")?.map(|field| pose(&field)).transpose()?;
+        let world_from_lidar = root
+            .optional("lidar_pose")?
+            .map(|field| pose(&field))
+            .transpose()?;
         let mut annotations = Annotations::new(root);
-        let EgoMotion { speed_mps, yaw_rate_rad_s } = annotations.motion(self.handedness);
+        let EgoMotion {
+            speed_mps,
+            yaw_rate_rad_s,
+        } = annotations.motion(self.handedness);
         Ok(Frame {
             world_from_lidar,
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
-            gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
+            gnss_world_from_vehicle: annotations
+                .optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
             speed_mps,
             yaw_rate_rad_s,
             objects: annotations.objects(|id, _| Ok(id), |place| self.world_from(place)),

@@ -61,14 +61,23 @@ fn open(root: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError
     for dir in &folders {
         match ScenarioFolder::scan(dir, &mut problems) {
             Ok(folder) if folder.agents.is_empty() => {
-                problems.push(ReadError::malformed(dir, "no agent with a frame: the scenario is left out"));
+                problems.push(ReadError::malformed(
+                    dir,
+                    "no agent with a frame: the scenario is left out",
+                ));
             }
-            Ok(folder) => scenarios.push(agent_folder_scenario(root, folder, options, &mut problems)),
+            Ok(folder) => {
+                scenarios.push(agent_folder_scenario(root, folder, options, &mut problems))
+            }
             Err(error) => problems.push(error),
         }
     }
     match scenarios.first().map(|scenario| scenario.layout) {
-        Some(layout) => Ok(Some(Dataset { layout, scenarios, problems })),
+        Some(layout) => Ok(Some(Dataset {
+            layout,
+            scenarios,
+            problems,
+        })),
         None => Err(nothing_opened(root, problems)),
     }
 }
@@ -84,12 +93,23 @@ fn agent_folder_scenario(
     }
     let layout = family_layout(&folder);
     let sweeps = folder.sweeps(options);
-    let source_handedness = if layout == Layout::OPV2V { Handedness::Left } else { Handedness::Right };
+    let source_handedness = if layout == Layout::OPV2V {
+        Handedness::Left
+    } else {
+        Handedness::Right
+    };
     let moments = folder.ticks(options.period_nanos, problems);
     let ego_lacks = |tick: &Tick| {
-        folder.missing.iter().any(|frame| Some(&frame.agent) == folder.agents.first() && frame.stem == tick.stem)
+        folder
+            .missing
+            .iter()
+            .any(|frame| Some(&frame.agent) == folder.agents.first() && frame.stem == tick.stem)
     };
-    let ticks: Vec<Tick> = moments.iter().filter(|tick| !ego_lacks(tick)).cloned().collect();
+    let ticks: Vec<Tick> = moments
+        .iter()
+        .filter(|tick| !ego_lacks(tick))
+        .cloned()
+        .collect();
     let is_unit = |id: &&CavId| id.as_str().starts_with('-');
     Scenario {
         name: files::name_below(root, &folder.dir),
@@ -100,13 +120,21 @@ fn agent_folder_scenario(
         roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
         lidar_variants: folder.variants.clone(),
         has_radar: folder.has_radar,
-        cameras: if layout == Layout::V2V4REAL { Vec::new() } else { all_cameras(&folder) },
+        cameras: if layout == Layout::V2V4REAL {
+            Vec::new()
+        } else {
+            all_cameras(&folder)
+        },
         layout,
         source_handedness,
         source: if layout == Layout::V2V4REAL {
             Arc::new(V2v4Real { folder, sweeps }) as Arc<dyn FrameSource>
         } else {
-            Arc::new(Opv2v { folder, sweeps, handedness: source_handedness })
+            Arc::new(Opv2v {
+                folder,
+                sweeps,
+                handedness: source_handedness,
+            })
         },
     }
 }
@@ -120,8 +148,16 @@ fn all_cameras(folder: &ScenarioFolder) -> Vec<u8> {
 /// The layout by the shape of the first pose that can be read, and then by the kind of sweeps. Frames with another
 /// shape are reported when they are loaded.
 fn family_layout(folder: &ScenarioFolder) -> Layout {
-    let frames = folder.stems.iter().flat_map(|stem| folder.agents.iter().map(move |agent| folder.yaml(agent, stem)));
-    match frames.take(FRAMES_TO_TRY).find_map(|path| lidar_pose(&path).ok()) {
+    let frames = folder.stems.iter().flat_map(|stem| {
+        folder
+            .agents
+            .iter()
+            .map(move |agent| folder.yaml(agent, stem))
+    });
+    match frames
+        .take(FRAMES_TO_TRY)
+        .find_map(|path| lidar_pose(&path).ok())
+    {
         Some(WrittenPose::Matrix(_)) => Layout::V2V4REAL,
         _ if folder.has_bare_floats() => Layout::V2XREAL,
         _ => Layout::OPV2V,

@@ -36,7 +36,11 @@ impl Element {
 
     /// Index of a property, by any of the names, the first preferred.
     fn find(&self, names: &[&str]) -> Option<usize> {
-        names.iter().find_map(|name| self.properties.iter().position(|(found, _)| found.eq_ignore_ascii_case(name)))
+        names.iter().find_map(|name| {
+            self.properties
+                .iter()
+                .position(|(found, _)| found.eq_ignore_ascii_case(name))
+        })
     }
 }
 
@@ -47,26 +51,58 @@ impl Element {
 pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let (storage, elements, body) = header(bytes)?;
     let place = elements.iter().position(|element| element.name == "vertex");
-    let (before, vertex) =
-        place.and_then(|place| Some((elements.get(..place)?, elements.get(place)?))).ok_or_else(|| {
-            let names: Vec<&str> = elements.iter().map(|element| element.name.as_str()).collect();
+    let (before, vertex) = place
+        .and_then(|place| Some((elements.get(..place)?, elements.get(place)?)))
+        .ok_or_else(|| {
+            let names: Vec<&str> = elements
+                .iter()
+                .map(|element| element.name.as_str())
+                .collect();
             format!("no element vertex, there are {names:?}")
         })?;
     if let Some(list) = &vertex.list {
-        return Err(format!("element vertex has the list {list:?}, expected numbers only"));
+        return Err(format!(
+            "element vertex has the list {list:?}, expected numbers only"
+        ));
     }
-    let coordinate = |name: &str| vertex.find(&[name]).ok_or_else(|| format!("element vertex has no property {name}"));
-    let columns = [Some(coordinate("x")?), Some(coordinate("y")?), Some(coordinate("z")?), vertex.find(&INTENSITY)];
+    let coordinate = |name: &str| {
+        vertex
+            .find(&[name])
+            .ok_or_else(|| format!("element vertex has no property {name}"))
+    };
+    let columns = [
+        Some(coordinate("x")?),
+        Some(coordinate("y")?),
+        Some(coordinate("z")?),
+        vertex.find(&INTENSITY),
+    ];
     let points = match storage {
         Storage::Ascii => ascii(vertex, before, body, &columns)?,
         Storage::LittleEndian | Storage::BigEndian => binary(vertex, before, body, &columns)?,
     };
     let [.., intensity] = columns;
-    let intensity = intensity.and_then(|index| vertex.properties.get(index)).map(|(name, scalar)| {
-        IntensityOrigin::stored(name, if scalar.is_byte() { IntensityKind::Byte } else { IntensityKind::Number })
-    });
-    let form = if storage == Storage::Ascii { "PLY, ascii" } else { "PLY, binary" };
-    Ok(PcdCloud { intensity, form, ..PcdCloud::of_finite(points, Vec::new()) })
+    let intensity = intensity
+        .and_then(|index| vertex.properties.get(index))
+        .map(|(name, scalar)| {
+            IntensityOrigin::stored(
+                name,
+                if scalar.is_byte() {
+                    IntensityKind::Byte
+                } else {
+                    IntensityKind::Number
+                },
+            )
+        });
+    let form = if storage == Storage::Ascii {
+        "PLY, ascii"
+    } else {
+        "PLY, binary"
+    };
+    Ok(PcdCloud {
+        intensity,
+        form,
+        ..PcdCloud::of_finite(points, Vec::new())
+    })
 }
 
 /// Storage, elements, and the bytes behind the header.
@@ -76,7 +112,10 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     if !start.starts_with(b"ply") {
         return Err("the first line is not ply".to_owned());
     }
-    let end = start.windows(END.len()).position(|window| window == END).ok_or("no line end_header")?;
+    let end = start
+        .windows(END.len())
+        .position(|window| window == END)
+        .ok_or("no line end_header")?;
     let (text, rest) = bytes.split_at(end);
     let body = match rest.get(END.len()..).unwrap_or_default() {
         [b'\r', b'\n', body @ ..] | [b'\n', body @ ..] => body,
@@ -90,16 +129,26 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         match *words {
             ["format", name, _] => storage = Some((name.to_owned(), number)),
             ["element", name, count] => {
-                let count = count.parse().map_err(|_| fault(format!("{count:?} is no number of elements")))?;
-                elements.push(Element { name: name.to_owned(), count, properties: Vec::new(), list: None });
+                let count = count
+                    .parse()
+                    .map_err(|_| fault(format!("{count:?} is no number of elements")))?;
+                elements.push(Element {
+                    name: name.to_owned(),
+                    count,
+                    properties: Vec::new(),
+                    list: None,
+                });
             }
             ["property", "list", _, _, name] => match elements.last_mut() {
                 Some(element) => drop(element.list.get_or_insert_with(|| name.to_owned())),
                 None => return Err(fault("a property before the first element".to_owned())),
             },
             ["property", kind, name] => {
-                let scalar = scalar_of(kind).ok_or_else(|| fault(format!("{kind:?} is no type of a number")))?;
-                let element = elements.last_mut().ok_or_else(|| fault("a property before the first element".into()))?;
+                let scalar = scalar_of(kind)
+                    .ok_or_else(|| fault(format!("{kind:?} is no type of a number")))?;
+                let element = elements
+                    .last_mut()
+                    .ok_or_else(|| fault("a property before the first element".into()))?;
                 if element.properties.len() >= MAX_PROPERTIES {
                     return Err(fault(format!("more than {MAX_PROPERTIES} properties")));
                 }
@@ -113,11 +162,15 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         Some("binary_little_endian") => Storage::LittleEndian,
         Some("binary_big_endian") => Storage::BigEndian,
         Some(other) => {
-            return Err(format!("format {other:?}, expected ascii, binary_little_endian or binary_big_endian"));
+            return Err(format!(
+                "format {other:?}, expected ascii, binary_little_endian or binary_big_endian"
+            ));
         }
         None => return Err("no line format".to_owned()),
     };
-    let properties = elements.iter_mut().flat_map(|element| &mut element.properties);
+    let properties = elements
+        .iter_mut()
+        .flat_map(|element| &mut element.properties);
     properties.for_each(|(_, scalar)| scalar.is_big_endian = storage == Storage::BigEndian);
     Ok((storage, elements, body))
 }
@@ -134,7 +187,11 @@ fn scalar_of(name: &str) -> Option<Scalar> {
         "double" | "float64" => (ScalarKind::Float, 8),
         _ => return None,
     };
-    Some(Scalar { kind, size, is_big_endian: false })
+    Some(Scalar {
+        kind,
+        size,
+        is_big_endian: false,
+    })
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
@@ -144,9 +201,14 @@ fn ascii(
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
-    let skipped = before.iter().fold(0_usize, |sum, element| sum.saturating_add(element.count));
+    let skipped = before
+        .iter()
+        .fold(0_usize, |sum, element| sum.saturating_add(element.count));
     let text = String::from_utf8_lossy(body);
-    let lines = text.lines().filter(|line| !line.trim().is_empty()).skip(skipped);
+    let lines = text
+        .lines()
+        .filter(|line| !line.trim().is_empty())
+        .skip(skipped);
     let mut points = Vec::new();
     for (index, line) in lines.take(vertex.count).enumerate() {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
@@ -154,15 +216,25 @@ fn ascii(
         for (value, column) in point.iter_mut().zip(columns) {
             let Some(column) = column else { continue };
             let word = words.get(*column).ok_or_else(|| {
-                format!("vertex {index}: {} numbers, expected {}", words.len(), vertex.properties.len())
+                format!(
+                    "vertex {index}: {} numbers, expected {}",
+                    words.len(),
+                    vertex.properties.len()
+                )
             })?;
-            *value = word.parse::<f64>().map_err(|_| format!("vertex {index}: {word:?} is no number"))? as f32;
+            *value = word
+                .parse::<f64>()
+                .map_err(|_| format!("vertex {index}: {word:?} is no number"))?
+                as f32;
         }
         points.push(point);
     }
     match points.len() {
         found if found == vertex.count => Ok(points),
-        found => Err(format!("{} vertices stated, {found} found: the file is cut off", vertex.count)),
+        found => Err(format!(
+            "{} vertices stated, {found} found: the file is cut off",
+            vertex.count
+        )),
     }
 }
 
@@ -177,23 +249,43 @@ fn binary(
     for element in before {
         if let Some(list) = &element.list {
             let name = &element.name;
-            return Err(format!("element {name} before the vertices has the list {list:?}: their place is unknown"));
+            return Err(format!(
+                "element {name} before the vertices has the list {list:?}: their place is unknown"
+            ));
         }
         skipped = skipped.saturating_add(element.count.saturating_mul(element.stride()));
     }
     let stride = vertex.stride();
     let body = body.get(skipped..).unwrap_or_default();
-    let Some(body) = vertex.count.checked_mul(stride).and_then(|length| body.get(..length)) else {
+    let Some(body) = vertex
+        .count
+        .checked_mul(stride)
+        .and_then(|length| body.get(..length))
+    else {
         let (count, found) = (vertex.count, body.len());
-        return Err(format!("{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"));
+        return Err(format!(
+            "{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"
+        ));
     };
     let column = |index: usize| {
-        let first: usize = vertex.properties.iter().take(index).map(|(_, scalar)| scalar.size).sum();
-        vertex.properties.get(index).map(|(_, scalar)| (first, *scalar))
+        let first: usize = vertex
+            .properties
+            .iter()
+            .take(index)
+            .map(|(_, scalar)| scalar.size)
+            .sum();
+        vertex
+            .properties
+            .get(index)
+            .map(|(_, scalar)| (first, *scalar))
     };
     let places = columns.map(|index| index.and_then(column));
     let point = |bytes: &[u8]| {
-        places.map(|place| place.and_then(|(first, scalar)| scalar.read(bytes.get(first..)?)).map_or(0.0, |v| v as f32))
+        places.map(|place| {
+            place
+                .and_then(|(first, scalar)| scalar.read(bytes.get(first..)?))
+                .map_or(0.0, |v| v as f32)
+        })
     };
     Ok(body.chunks_exact(stride.max(1)).map(point).collect())
 }
@@ -206,26 +298,46 @@ mod tests {
                         property double z\nproperty uchar red\nproperty uint16 scalar_Intensity\n";
 
     fn file(format: &str, body: &[u8]) -> Vec<u8> {
-        let head = format!("ply\nformat {format} 1.0\n{HEAD}element face 0\nproperty list uchar int v\nend_header\n");
+        let head = format!(
+            "ply\nformat {format} 1.0\n{HEAD}element face 0\nproperty list uchar int v\nend_header\n"
+        );
         [head.as_bytes(), body].concat()
     }
 
     fn body(double: fn(f64) -> [u8; 8], short: fn(u16) -> [u8; 2]) -> Vec<u8> {
-        let point = |x: f64, intensity| [&double(x)[..], &double(-2.0), &double(3.5), &[9], &short(intensity)].concat();
+        let point = |x: f64, intensity| {
+            [
+                &double(x)[..],
+                &double(-2.0),
+                &double(3.5),
+                &[9],
+                &short(intensity),
+            ]
+            .concat()
+        };
         [point(1.25, 7), point(f64::NAN, 8)].concat()
     }
 
     #[test]
     fn all_storages_give_the_same_points() {
         let files = [
-            file("binary_little_endian", &body(f64::to_le_bytes, u16::to_le_bytes)),
-            file("binary_big_endian", &body(f64::to_be_bytes, u16::to_be_bytes)),
+            file(
+                "binary_little_endian",
+                &body(f64::to_le_bytes, u16::to_le_bytes),
+            ),
+            file(
+                "binary_big_endian",
+                &body(f64::to_be_bytes, u16::to_be_bytes),
+            ),
             file("ascii", b"1.25 -2 3.5e0 9 7\nnan -2 3.5 9 8\n"),
         ];
         for file in files {
             let cloud = decode(&file).unwrap();
             assert_eq!(cloud.points.xyzi, [[1.25, -2.0, 3.5, 7.0]]);
-            assert_eq!((cloud.dropped, cloud.intensity.unwrap().field.as_str()), (1, "scalar_Intensity"));
+            assert_eq!(
+                (cloud.dropped, cloud.intensity.unwrap().field.as_str()),
+                (1, "scalar_Intensity")
+            );
         }
     }
 
@@ -235,9 +347,15 @@ mod tests {
         assert_eq!(message(b"ply\n"), "no line end_header");
         assert_eq!(message(b"PLY\n"), "the first line is not ply");
         let cut = file("binary_little_endian", &[0; 53]);
-        assert_eq!(message(&cut), "2 vertices of 27 bytes stated, 53 bytes found: the file is cut off");
+        assert_eq!(
+            message(&cut),
+            "2 vertices of 27 bytes stated, 53 bytes found: the file is cut off"
+        );
         assert!(message(&file("ascii", b"1 2 3 4 5\n")).starts_with("2 vertices stated, 1 found"));
-        assert_eq!(message(&file("ascii", b"1 2 3 4 5\n1 2\n")), "vertex 1: 2 numbers, expected 5");
+        assert_eq!(
+            message(&file("ascii", b"1 2 3 4 5\n1 2\n")),
+            "vertex 1: 2 numbers, expected 5"
+        );
         assert!(message(&file("binary", b"")).starts_with("format \"binary\", expected ascii"));
         let huge = b"ply\nformat binary_little_endian 1.0\nelement vertex 18446744073709551615\nproperty float x\n\
                      property float y\nproperty float z\nend_header\n";

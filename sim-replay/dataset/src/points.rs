@@ -65,14 +65,28 @@ impl Sweeps {
 
     /// Sweeps of files with this storage.
     pub(super) fn new(storage: SweepStorage, options: &OpenOptions) -> Self {
-        Self { storage, scale: options.intensity_scale, agents: BTreeMap::new() }
+        Self {
+            storage,
+            scale: options.intensity_scale,
+            agents: BTreeMap::new(),
+        }
     }
 
     /// Adds an agent with the files of its plain sweeps, in order. The first that can be read and hold points determine
     /// the properties that files do not record; nothing is read before the first [`Self::read`].
-    pub(super) fn with_agent(mut self, agent: CavId, files: impl IntoIterator<Item = PathBuf>) -> Self {
+    pub(super) fn with_agent(
+        mut self,
+        agent: CavId,
+        files: impl IntoIterator<Item = PathBuf>,
+    ) -> Self {
         let files = files.into_iter().take(Self::MOST_TRIED).collect();
-        self.agents.insert(agent, AgentSweeps { files, ..AgentSweeps::default() });
+        self.agents.insert(
+            agent,
+            AgentSweeps {
+                files,
+                ..AgentSweeps::default()
+            },
+        );
         self
     }
 
@@ -96,7 +110,10 @@ impl Sweeps {
         let mut cloud = agent.read_stored(self.storage, path)?;
         if cloud.intensity.is_none() {
             agent.is_told.get_or_init(|| {
-                tracing::warn!("{}: no intensity field (possibly in other files too): intensity is 0", path.display())
+                tracing::warn!(
+                    "{}: no intensity field (possibly in other files too): intensity is 0",
+                    path.display()
+                )
             });
         }
         self.scale.apply(&mut cloud, || agent.divisor(self.storage));
@@ -126,11 +143,20 @@ impl AgentSweeps {
     /// Number of floats per point.
     fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
         let form = self.form.get_or_init(|| {
-            let files = self.files.iter().filter(|path| !FileKind::of(path).is_described());
+            let files = self
+                .files
+                .iter()
+                .filter(|path| !FileKind::of(path).is_described());
             let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
-            FloatForm::of(&samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES).collect::<Vec<_>>())
+            FloatForm::of(
+                &samples
+                    .filter(|bytes| !bytes.is_empty())
+                    .take(SAMPLES)
+                    .collect::<Vec<_>>(),
+            )
         });
-        form.clone().map_err(|reason| ReadError::malformed(path, reason))
+        form.clone()
+            .map_err(|reason| ReadError::malformed(path, reason))
     }
 
     /// Reads a sweep with the intensities as stored.
@@ -166,7 +192,10 @@ enum FileKind {
 
 impl FileKind {
     fn of(path: &Path) -> Self {
-        let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
+        let ending = path
+            .extension()
+            .and_then(|ending| ending.to_str())
+            .unwrap_or_default();
         match ending.to_ascii_lowercase().as_str() {
             "pcd" => Self::Pcd,
             "ply" => Self::Ply,
@@ -181,7 +210,10 @@ impl FileKind {
     }
 }
 
-fn read_described(path: &Path, decode: fn(&[u8]) -> Result<PcdCloud, String>) -> Result<PcdCloud, ReadError> {
+fn read_described(
+    path: &Path,
+    decode: fn(&[u8]) -> Result<PcdCloud, String>,
+) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     decode(&bytes).map_err(|reason| ReadError::malformed(path, reason))
 }
@@ -195,7 +227,10 @@ fn read_pcd_stored(path: &Path) -> Result<PcdCloud, ReadError> {
     read_with(path, pcd::decode_stored)
 }
 
-fn read_with(path: &Path, decode: fn(&[u8]) -> Result<PcdCloud, pcd::PcdError>) -> Result<PcdCloud, ReadError> {
+fn read_with(
+    path: &Path,
+    decode: fn(&[u8]) -> Result<PcdCloud, pcd::PcdError>,
+) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     decode(&bytes).map_err(|error| ReadError::Malformed {
         path: path.to_owned(),
@@ -212,8 +247,12 @@ fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
     let (xy, zi) = numbers.split_at(numbers.len() / 2);
     let ((x, y), (z, i)) = (xy.split_at(xy.len() / 2), zi.split_at(zi.len() / 2));
     let points = x.iter().zip(y).zip(z.iter().zip(i));
-    let points = points.map(|((x, y), (z, i))| [x, y, z, i].map(|number| f32::from_le_bytes(*number)));
-    let intensity = Some(IntensityOrigin::stored("4th block of floats", IntensityKind::Number));
+    let points =
+        points.map(|((x, y), (z, i))| [x, y, z, i].map(|number| f32::from_le_bytes(*number)));
+    let intensity = Some(IntensityOrigin::stored(
+        "4th block of floats",
+        IntensityKind::Number,
+    ));
     Ok(PcdCloud {
         intensity,
         form: "floats by component: x, y, z, intensity",
@@ -228,10 +267,17 @@ fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     check_whole_points(path, bytes.len(), 8)?;
     let (points, _) = bytes.as_chunks::<8>();
-    let points = points.iter().map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
-        let metres = |bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32;
-        [metres([x0, x1]), metres([y0, y1]), metres([z0, z1]), f32::from(intensity)]
-    });
+    let points = points
+        .iter()
+        .map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
+            let metres = |bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32;
+            [
+                metres([x0, x1]),
+                metres([y0, y1]),
+                metres([z0, z1]),
+                f32::from(intensity),
+            ]
+        });
     let intensity = Some(IntensityOrigin::stored("7th byte", IntensityKind::Byte));
     Ok(PcdCloud {
         intensity,
@@ -251,7 +297,9 @@ fn check_whole_points(path: &Path, len: usize, point: usize) -> Result<(), ReadE
     if len.is_multiple_of(point) {
         return Ok(());
     }
-    let reason = format!("{len} bytes are not a whole number of points of {point} bytes: the file is cut off");
+    let reason = format!(
+        "{len} bytes are not a whole number of points of {point} bytes: the file is cut off"
+    );
     Err(ReadError::malformed(path, reason))
 }
 

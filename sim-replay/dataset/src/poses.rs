@@ -9,11 +9,16 @@ impl Scenario {
     /// True if the recording gives the pose of an agent's LiDAR, according to the first readable frame from `tick` on.
     #[must_use]
     pub fn has_poses(&self, agent: usize, tick: usize) -> bool {
-        let blind = LoadOptions { points: false, ..LoadOptions::default() };
+        let blind = LoadOptions {
+            points: false,
+            ..LoadOptions::default()
+        };
         let ticks = (tick..self.ticks.len()).take(FRAMES_TO_TRY);
         let mut frames = ticks.filter_map(|tick| self.load(agent, tick, &blind).ok());
         // If nothing can be read, that is reported instead.
-        frames.next().is_none_or(|frame| frame.world_from_lidar.is_some())
+        frames
+            .next()
+            .is_none_or(|frame| frame.world_from_lidar.is_some())
     }
 }
 
@@ -31,8 +36,14 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let folder = dir.path().join("1");
         fs::create_dir(&folder).unwrap();
-        let cloud = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]] };
-        fs::write(folder.join("000070.pcd"), encode(&cloud, Encoding::Binary, IntensityField::Intensity)).unwrap();
+        let cloud = PointCloud {
+            xyzi: vec![[1.0, 2.0, 3.0, 0.5]],
+        };
+        fs::write(
+            folder.join("000070.pcd"),
+            encode(&cloud, Encoding::Binary, IntensityField::Intensity),
+        )
+        .unwrap();
         if let Some(yaml) = yaml {
             fs::write(folder.join("000070.yaml"), yaml).unwrap();
         }
@@ -43,11 +54,19 @@ mod tests {
 
     #[test]
     fn sweeps_without_poses_are_frames() {
-        for yaml in [None, Some("ego_speed: 36\n"), Some("lidar_pose: null\nvehicles: null\nego_speed: 36\n")] {
+        for yaml in [
+            None,
+            Some("ego_speed: 36\n"),
+            Some("lidar_pose: null\nvehicles: null\nego_speed: 36\n"),
+        ] {
             let (_dir, scenario) = scenario(yaml);
             assert!(!scenario.has_poses(0, 0), "{yaml:?}");
             let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
-            assert_eq!(frame.points.xyzi, [[1.0, -2.0, 3.0, 0.5]], "the files of the family are left-handed");
+            assert_eq!(
+                frame.points.xyzi,
+                [[1.0, -2.0, 3.0, 0.5]],
+                "the files of the family are left-handed"
+            );
             assert!(frame.objects.is_empty() && frame.world_from_lidar.is_none());
             assert_eq!(frame.speed_mps, yaml.map(|_| 10.0));
         }

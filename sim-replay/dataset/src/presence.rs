@@ -20,16 +20,31 @@ pub(super) struct Absences {
 impl Absences {
     /// The missing frames of `agents` at `ticks`; other missing frames are ignored.
     pub(super) fn new(agents: &[CavId], ticks: &[Tick], missing: &[MissingFrame]) -> Self {
-        let agents: HashMap<&CavId, usize> = agents.iter().enumerate().map(|(index, agent)| (agent, index)).collect();
-        let ticks: HashMap<&str, usize> =
-            ticks.iter().enumerate().map(|(index, tick)| (tick.stem.as_str(), index)).collect();
-        let place = |frame: &MissingFrame| Some((*agents.get(&frame.agent)?, *ticks.get(frame.stem.as_str())?));
-        Self { pairs: Arc::new(missing.iter().filter_map(place).collect()), moments: None }
+        let agents: HashMap<&CavId, usize> = agents
+            .iter()
+            .enumerate()
+            .map(|(index, agent)| (agent, index))
+            .collect();
+        let ticks: HashMap<&str, usize> = ticks
+            .iter()
+            .enumerate()
+            .map(|(index, tick)| (tick.stem.as_str(), index))
+            .collect();
+        let place = |frame: &MissingFrame| {
+            Some((*agents.get(&frame.agent)?, *ticks.get(frame.stem.as_str())?))
+        };
+        Self {
+            pairs: Arc::new(missing.iter().filter_map(place).collect()),
+            moments: None,
+        }
     }
 
     /// The same with further capture times of other agents; `moments` are all of them.
     pub(super) fn among(self, moments: Vec<Tick>) -> Self {
-        Self { moments: Some(Arc::new(moments)), ..self }
+        Self {
+            moments: Some(Arc::new(moments)),
+            ..self
+        }
     }
 }
 
@@ -61,7 +76,10 @@ impl Scenario {
     /// a frame.
     #[must_use]
     pub(crate) fn arranged(&self, order: &[usize]) -> Self {
-        let agents: Vec<CavId> = order.iter().filter_map(|&index| self.agents.get(index).cloned()).collect();
+        let agents: Vec<CavId> = order
+            .iter()
+            .filter_map(|&index| self.agents.get(index).cloned())
+            .collect();
         let is_kept = |frame: &&MissingFrame| agents.contains(&frame.agent);
         let missing: Vec<MissingFrame> = self.missing.iter().filter(is_kept).cloned().collect();
         let lacking: HashSet<&str> = (missing.iter())
@@ -71,15 +89,34 @@ impl Scenario {
         let moments = self.absences.moments.as_deref().unwrap_or(&self.ticks);
         let is_tick = |tick: &&Tick| !lacking.contains(tick.stem.as_str());
         let ticks: Vec<Tick> = moments.iter().filter(is_tick).cloned().collect();
-        let absences = Absences { moments: self.absences.moments.clone(), ..Absences::new(&agents, &ticks, &missing) };
-        let roadside_units = self.roadside_units.iter().filter(|unit| agents.contains(unit)).cloned().collect();
-        Self { agents, ticks, missing, absences, roadside_units, ..self.clone() }
+        let absences = Absences {
+            moments: self.absences.moments.clone(),
+            ..Absences::new(&agents, &ticks, &missing)
+        };
+        let roadside_units = self
+            .roadside_units
+            .iter()
+            .filter(|unit| agents.contains(unit))
+            .cloned()
+            .collect();
+        Self {
+            agents,
+            ticks,
+            missing,
+            absences,
+            roadside_units,
+            ..self.clone()
+        }
     }
 
     /// Number of missing frames of agents other than the ego at its ticks.
     #[must_use]
     pub fn absent_frames(&self) -> usize {
-        self.absences.pairs.iter().filter(|(_, tick)| *tick < self.ticks.len()).count()
+        self.absences
+            .pairs
+            .iter()
+            .filter(|(_, tick)| *tick < self.ticks.len())
+            .count()
     }
 
     /// Reads the frames of `agents` (indices) at a tick, of those present and readable.
@@ -126,27 +163,55 @@ mod tests {
         (0..2).for_each(|stem| frame(dir.path(), "2", stem));
         (8..12).for_each(|stem| frame(dir.path(), "3", stem));
         let scenario = crate::open(dir.path()).unwrap().scenarios.remove(0);
-        assert_eq!((scenario.ticks.len(), scenario.absent_frames()), (10, 8 + 8));
+        assert_eq!(
+            (scenario.ticks.len(), scenario.absent_frames()),
+            (10, 8 + 8)
+        );
         let present = |tick| scenario.present_agents(tick).collect::<Vec<_>>();
-        assert_eq!([present(1), present(2), present(9)], [vec![0, 1], vec![0], vec![0, 2]]);
+        assert_eq!(
+            [present(1), present(2), present(9)],
+            [vec![0, 1], vec![0], vec![0, 2]]
+        );
         let loaded = scenario.load_tick(9, 0..3, &LoadOptions::default());
-        assert_eq!(loaded.frames.iter().map(|(agent, _)| *agent).collect::<Vec<_>>(), [0, 2]);
+        assert_eq!(
+            loaded
+                .frames
+                .iter()
+                .map(|(agent, _)| *agent)
+                .collect::<Vec<_>>(),
+            [0, 2]
+        );
         assert!(loaded.unreadable.is_empty());
         let error = scenario.load(1, 9, &LoadOptions::default()).unwrap_err();
         assert!(error.is_absence());
-        assert!(error.to_string().ends_with("agent 2 has no frame at tick 000009"), "{error}");
-        assert_eq!(scenario.missing.len(), 8 + 8 + 2 * 2, "and two of agent 3 that neither the ego nor agent 2 has");
+        assert!(
+            error
+                .to_string()
+                .ends_with("agent 2 has no frame at tick 000009"),
+            "{error}"
+        );
+        assert_eq!(
+            scenario.missing.len(),
+            8 + 8 + 2 * 2,
+            "and two of agent 3 that neither the ego nor agent 2 has"
+        );
     }
 
     #[test]
     fn a_frame_that_cannot_be_read_is_left_out_of_its_tick() {
         let dir = tempfile::tempdir().unwrap();
-        ["1", "2"].iter().for_each(|agent| frame(dir.path(), agent, 0));
+        ["1", "2"]
+            .iter()
+            .for_each(|agent| frame(dir.path(), agent, 0));
         fs::write(dir.path().join("2/000000.pcd"), &PCD[..PCD.len() - 6]).unwrap();
         let scenario = crate::open(dir.path()).unwrap().scenarios.remove(0);
         let loaded = scenario.load_tick(0, 0..2, &LoadOptions::default());
         assert_eq!((loaded.frames.len(), loaded.unreadable.len()), (1, 1));
         assert_eq!(loaded.unreadable[0].0, 1);
-        assert!(loaded.unreadable[0].1.path.ends_with("2/000000.pcd"), "{:?}", loaded.unreadable);
+        assert!(
+            loaded.unreadable[0].1.path.ends_with("2/000000.pcd"),
+            "{:?}",
+            loaded.unreadable
+        );
     }
 }

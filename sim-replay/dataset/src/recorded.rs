@@ -4,11 +4,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use protocol::{CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
+use protocol::{
+    CavId, EgoMotion, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth,
+    wire,
+};
 
 use super::layouts::{LayoutRow, Reader};
 use super::presence::Absences;
-use super::{CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick};
+use super::{
+    CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario,
+    Tick,
+};
 use crate::frame::{Frame, Object};
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use recording::{Entry, Recording, RecordingError};
@@ -29,8 +35,11 @@ const IN_RUN_FOLDER: &str = "recording.mcap";
 /// The recording that `path` names: the file itself, or that of a run folder.
 #[must_use]
 pub fn recording_of(path: &Path) -> Option<PathBuf> {
-    let is_recording = |file: &Path| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap");
-    [path.to_path_buf(), path.join(IN_RUN_FOLDER)].into_iter().find(|file| is_recording(file))
+    let is_recording =
+        |file: &Path| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap");
+    [path.to_path_buf(), path.join(IN_RUN_FOLDER)]
+        .into_iter()
+        .find(|file| is_recording(file))
 }
 
 /// Opens the recording that a path names.
@@ -45,16 +54,25 @@ fn open(file: &Path) -> Result<Dataset, ReadError> {
     for damage in recording.damage() {
         problems.push(ReadError::malformed(file, damage.to_string()));
     }
-    let name = file.file_stem().map_or("recording".into(), |stem| stem.to_string_lossy().into_owned());
+    let name = file.file_stem().map_or("recording".into(), |stem| {
+        stem.to_string_lossy().into_owned()
+    });
     let source = Recorded::new(recording, &mut problems)?;
     let agents = source.agents.clone();
     let (ticks, missing) = source.ticks();
     let scenario = Scenario {
         name,
         absences: Absences::new(&agents, &ticks, &missing),
-        roadside_units: agents.iter().filter(|id| id.as_str().starts_with('-')).cloned().collect(),
+        roadside_units: agents
+            .iter()
+            .filter(|id| id.as_str().starts_with('-'))
+            .cloned()
+            .collect(),
         cameras: source.cameras(),
-        has_radar: source.sensors.keys().any(|(_, _, stream)| *stream == Stream::Radar),
+        has_radar: source
+            .sensors
+            .keys()
+            .any(|(_, _, stream)| *stream == Stream::Radar),
         agents,
         ticks,
         missing,
@@ -63,7 +81,11 @@ fn open(file: &Path) -> Result<Dataset, ReadError> {
         source_handedness: Handedness::Right,
         source: Arc::new(source),
     };
-    Ok(Dataset { layout: Layout::RECORDING, scenarios: vec![scenario], problems })
+    Ok(Dataset {
+        layout: Layout::RECORDING,
+        scenarios: vec![scenario],
+        problems,
+    })
 }
 
 /// The sensors and the truth of a recording, by capture time.
@@ -82,13 +104,24 @@ impl Recorded {
         let mut sensors = BTreeMap::new();
         let (mut truth, mut first_epochs, mut duplicates) = (BTreeMap::new(), BTreeMap::new(), 0);
         for entry in recording.entries() {
-            let Stamp { capture_nanos, epoch, .. } = entry.header.stamp;
+            let Stamp {
+                capture_nanos,
+                epoch,
+                ..
+            } = entry.header.stamp;
             match &entry.key.topic {
                 Topic::Stream {
                     cav,
-                    stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_)),
+                    stream:
+                        stream @ (Stream::Lidar
+                        | Stream::Gnss
+                        | Stream::Imu
+                        | Stream::Radar
+                        | Stream::Camera(_)),
                 } => {
-                    sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
+                    sensors
+                        .entry((capture_nanos, cav.clone(), *stream))
+                        .or_insert_with(|| entry.clone());
                 }
                 Topic::Truth => match first_epochs.get(&capture_nanos) {
                     Some(first) => duplicates += u64::from(*first != epoch),
@@ -104,11 +137,17 @@ impl Recorded {
             }
         }
         if duplicates > 0 {
-            let reason =
-                format!("more than one replay published the ground truth of {duplicates} ticks: the first is used");
+            let reason = format!(
+                "more than one replay published the ground truth of {duplicates} ticks: the first is used"
+            );
             problems.push(ReadError::malformed(recording.path(), reason));
         }
-        let mut recorded = Self { recording, agents: Vec::new(), sensors, truth };
+        let mut recorded = Self {
+            recording,
+            agents: Vec::new(),
+            sensors,
+            truth,
+        };
         recorded.agents = recorded.in_order();
         if recorded.agents.is_empty() {
             let reason = "no sweep of any vehicle in it: recorded --without lidar?";
@@ -119,9 +158,15 @@ impl Recorded {
 
     /// All agents with sweeps, in the order of the scene, which is that of the ground truth: the ego comes first.
     fn in_order(&self) -> Vec<CavId> {
-        let has_sweeps =
-            |cav: &CavId| self.sensors.keys().any(|(_, known, stream)| known == cav && *stream == Stream::Lidar);
-        let listed = self.truth.values().flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
+        let has_sweeps = |cav: &CavId| {
+            self.sensors
+                .keys()
+                .any(|(_, known, stream)| known == cav && *stream == Stream::Lidar)
+        };
+        let listed = self
+            .truth
+            .values()
+            .flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
         let unlisted = self.sensors.keys().map(|(_, cav, _)| cav);
         let mut agents: Vec<CavId> = Vec::new();
         for cav in listed.chain(unlisted) {
@@ -134,18 +179,32 @@ impl Recorded {
 
     /// The ticks at which the ego's sweep was recorded, and the missing sweeps at any capture time.
     fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
-        let mut captures: Vec<u64> =
-            self.sensors.keys().filter(|(_, _, stream)| *stream == Stream::Lidar).map(|(at, _, _)| *at).collect();
+        let mut captures: Vec<u64> = self
+            .sensors
+            .keys()
+            .filter(|(_, _, stream)| *stream == Stream::Lidar)
+            .map(|(at, _, _)| *at)
+            .collect();
         captures.dedup();
         let (mut ticks, mut missing) = (Vec::new(), Vec::new());
         for capture_nanos in captures {
             let stem = capture_nanos.to_string();
-            let lacks = |cav: &&CavId| !self.sensors.contains_key(&(capture_nanos, (*cav).clone(), Stream::Lidar));
+            let lacks = |cav: &&CavId| {
+                !self
+                    .sensors
+                    .contains_key(&(capture_nanos, (*cav).clone(), Stream::Lidar))
+            };
             let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
-            let frame = |cav: &&CavId| MissingFrame { agent: (*cav).clone(), stem: stem.clone() };
+            let frame = |cav: &&CavId| MissingFrame {
+                agent: (*cav).clone(),
+                stem: stem.clone(),
+            };
             missing.extend(lacking.iter().map(frame));
             if lacking.first() != self.agents.first().as_ref() {
-                ticks.push(Tick { stem, capture_nanos });
+                ticks.push(Tick {
+                    stem,
+                    capture_nanos,
+                });
             }
         }
         (ticks, missing)
@@ -153,16 +212,29 @@ impl Recorded {
 
     /// Numbers of the cameras that have images.
     fn cameras(&self) -> Vec<u8> {
-        let numbers = self.sensors.keys().filter_map(|(_, _, stream)| match stream {
-            Stream::Camera(number) => Some(*number),
-            _ => None,
-        });
+        let numbers = self
+            .sensors
+            .keys()
+            .filter_map(|(_, _, stream)| match stream {
+                Stream::Camera(number) => Some(*number),
+                _ => None,
+            });
         numbers.collect::<BTreeSet<u8>>().into_iter().collect()
     }
 
-    fn sensor<M: Payload>(&self, agent: &CavId, tick: &Tick, stream: Stream) -> Result<M, ReadError> {
+    fn sensor<M: Payload>(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        stream: Stream,
+    ) -> Result<M, ReadError> {
         let key = (tick.capture_nanos, agent.clone(), stream);
-        let lacks = || ReadError::malformed(self.recording.path(), format!("no {agent}/{stream} at {}", tick.stem));
+        let lacks = || {
+            ReadError::malformed(
+                self.recording.path(),
+                format!("no {agent}/{stream} at {}", tick.stem),
+            )
+        };
         message(&self.recording, self.sensors.get(&key).ok_or_else(lacks)?)
     }
 }
@@ -171,15 +243,23 @@ impl FrameSource for Recorded {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         let truth = self.truth.get(&tick.capture_nanos);
-        if let Some(truth) = truth.and_then(|truth| truth.agents.iter().find(|known| known.cav == *agent)) {
+        if let Some(truth) =
+            truth.and_then(|truth| truth.agents.iter().find(|known| known.cav == *agent))
+        {
             frame.world_from_lidar = Some(truth.world_from_lidar);
             frame.objects = truth.objects.iter().map(Object::from).collect();
         }
-        if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), Stream::Gnss)) {
+        if self
+            .sensors
+            .contains_key(&(tick.capture_nanos, agent.clone(), Stream::Gnss))
+        {
             let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
             frame.world_from_lidar = Some(gnss.world_from_lidar);
         }
-        if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), Stream::Imu)) {
+        if self
+            .sensors
+            .contains_key(&(tick.capture_nanos, agent.clone(), Stream::Imu))
+        {
             let motion: EgoMotion = self.sensor(agent, tick, Stream::Imu)?;
             (frame.speed_mps, frame.yaw_rate_rad_s) = (motion.speed_mps, motion.yaw_rate_rad_s);
         }
@@ -189,19 +269,30 @@ impl FrameSource for Recorded {
     fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
         let Lidar { points } = self.sensor(agent, tick, Stream::Lidar)?;
         let intensity = Some(IntensityOrigin::stored("intensity", IntensityKind::Number));
-        Ok(PcdCloud { points, intensity, form: "recorded message", ..PcdCloud::default() })
+        Ok(PcdCloud {
+            points,
+            intensity,
+            form: "recorded message",
+            ..PcdCloud::default()
+        })
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let Radar { points } = self.sensor(agent, tick, Stream::Radar)?;
-        Ok(PcdCloud { points, ..PcdCloud::default() })
+        Ok(PcdCloud {
+            points,
+            ..PcdCloud::default()
+        })
     }
 
     fn cameras(&self, agent: &CavId, tick: &Tick, numbers: &[u8]) -> CameraImages {
         let mut found = CameraImages::default();
         for &number in numbers {
             let stream = Stream::Camera(number);
-            if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), stream)) {
+            if self
+                .sensors
+                .contains_key(&(tick.capture_nanos, agent.clone(), stream))
+            {
                 found.add(number, self.sensor(agent, tick, stream));
             }
         }
@@ -227,8 +318,10 @@ fn as_read_error(error: RecordingError) -> ReadError {
         RecordingError::NotOurs { path, reason } | RecordingError::Ended { path, reason } => {
             ReadError::Layout { path, reason }
         }
-        RecordingError::Malformed { path, offset, reason } => {
-            ReadError::malformed(&path, format!("byte {offset}: {reason}"))
-        }
+        RecordingError::Malformed {
+            path,
+            offset,
+            reason,
+        } => ReadError::malformed(&path, format!("byte {offset}: {reason}")),
     }
 }

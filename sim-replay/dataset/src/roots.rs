@@ -14,7 +14,8 @@ pub(super) fn find(dir: &Path, is_root: impl Fn(&Path) -> bool) -> Vec<PathBuf> 
     let mut level = vec![dir.to_owned()];
     let mut found = Vec::new();
     for _ in 0..=MAX_DEPTH {
-        let (roots, others): (Vec<PathBuf>, Vec<PathBuf>) = level.into_iter().partition(|folder| is_root(folder));
+        let (roots, others): (Vec<PathBuf>, Vec<PathBuf>) =
+            level.into_iter().partition(|folder| is_root(folder));
         found.extend(roots);
         level = others.iter().flat_map(|folder| folders(folder)).collect();
     }
@@ -31,7 +32,10 @@ fn folders(dir: &Path) -> Vec<PathBuf> {
         kind => kind.is_ok_and(|kind| kind.is_dir()),
     };
     let is_hidden = |entry: &fs::DirEntry| entry.file_name().as_encoded_bytes().starts_with(b".");
-    entries.filter(|entry| !is_hidden(entry) && is_folder(entry)).map(|entry| entry.path()).collect()
+    entries
+        .filter(|entry| !is_hidden(entry) && is_folder(entry))
+        .map(|entry| entry.path())
+        .collect()
 }
 
 #[cfg(test)]
@@ -41,14 +45,26 @@ mod tests {
     #[test]
     fn roots_are_found_a_little_below_and_not_below_roots() {
         let dir = tempfile::tempdir().unwrap();
-        for name in ["b/mark", "a/c/mark", "a/c/d/mark", "a/x/y/z/mark", ".hidden/mark", "file"] {
+        for name in [
+            "b/mark",
+            "a/c/mark",
+            "a/c/d/mark",
+            "a/x/y/z/mark",
+            ".hidden/mark",
+            "file",
+        ] {
             let path = dir.path().join(name);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, "").unwrap();
         }
         let found = find(dir.path(), |folder| folder.join("mark").is_file());
         assert_eq!(found, ["a/c", "b"].map(|name| dir.path().join(name)));
-        assert_eq!(find(&dir.path().join("b"), |folder| folder.join("mark").is_file()), [dir.path().join("b")]);
+        assert_eq!(
+            find(&dir.path().join("b"), |folder| folder
+                .join("mark")
+                .is_file()),
+            [dir.path().join("b")]
+        );
         assert!(find(&dir.path().join("none"), |_| false).is_empty());
     }
 }

@@ -24,7 +24,10 @@ pub(super) struct Scalar {
 
 impl Scalar {
     /// The number at the start of `bytes`; `None` if they are too few, or there is no such type.
-    #[expect(clippy::cast_possible_truncation, reason = "the upper bytes of a shorter number are zero")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "the upper bytes of a shorter number are zero"
+    )]
     pub(super) fn read(self, bytes: &[u8]) -> Option<f64> {
         let stored = bytes.get(..self.size)?;
         let mut little = [0; 8];
@@ -58,13 +61,32 @@ mod tests {
 
     #[test]
     fn numbers_of_every_type_and_order_are_read() {
-        let read = |kind, size, is_big_endian, bytes: &[u8]| Scalar { kind, size, is_big_endian }.read(bytes);
-        assert_eq!(read(ScalarKind::Signed, 2, false, &[0xfe, 0xff, 9]), Some(-2.0));
+        let read = |kind, size, is_big_endian, bytes: &[u8]| {
+            Scalar {
+                kind,
+                size,
+                is_big_endian,
+            }
+            .read(bytes)
+        };
+        assert_eq!(
+            read(ScalarKind::Signed, 2, false, &[0xfe, 0xff, 9]),
+            Some(-2.0)
+        );
         assert_eq!(read(ScalarKind::Signed, 2, true, &[0xff, 0xfe]), Some(-2.0));
-        assert_eq!(read(ScalarKind::Signed, 8, false, &(-7_i64).to_le_bytes()), Some(-7.0));
+        assert_eq!(
+            read(ScalarKind::Signed, 8, false, &(-7_i64).to_le_bytes()),
+            Some(-7.0)
+        );
         assert_eq!(read(ScalarKind::Unsigned, 1, false, &[0xfe]), Some(254.0));
-        assert_eq!(read(ScalarKind::Float, 4, true, &1.5_f32.to_be_bytes()), Some(1.5));
-        assert_eq!(read(ScalarKind::Float, 8, false, &(-1e300_f64).to_le_bytes()), Some(-1e300));
+        assert_eq!(
+            read(ScalarKind::Float, 4, true, &1.5_f32.to_be_bytes()),
+            Some(1.5)
+        );
+        assert_eq!(
+            read(ScalarKind::Float, 8, false, &(-1e300_f64).to_le_bytes()),
+            Some(-1e300)
+        );
         assert_eq!(read(ScalarKind::Float, 8, false, &[0; 7]), None);
         assert_eq!(read(ScalarKind::Float, 2, false, &[0; 8]), None);
         assert_eq!(read(ScalarKind::Padding, 4, false, &[0; 8]), None);

@@ -9,11 +9,19 @@ pub const UNFINISHED: &str = ".unfinished";
 
 /// Adds a problem for each marker in the opened folder and in those of its scenarios.
 pub(super) fn report(dir: &Path, dataset: &mut Dataset) {
-    let scenarios = dataset.scenarios.iter().map(|scenario| dir.join(&scenario.name).join(UNFINISHED));
-    let marks: Vec<PathBuf> =
-        std::iter::once(dir.join(UNFINISHED)).chain(scenarios).filter(|mark| mark.is_file()).collect();
+    let scenarios = dataset
+        .scenarios
+        .iter()
+        .map(|scenario| dir.join(&scenario.name).join(UNFINISHED));
+    let marks: Vec<PathBuf> = std::iter::once(dir.join(UNFINISHED))
+        .chain(scenarios)
+        .filter(|mark| mark.is_file())
+        .collect();
     let problem = |mark: PathBuf| {
-        ReadError::malformed(&mark, "the run that wrote this folder did not end: frames may be missing or cut off")
+        ReadError::malformed(
+            &mark,
+            "the run that wrote this folder did not end: frames may be missing or cut off",
+        )
     };
     dataset.problems.extend(marks.into_iter().map(problem));
 }

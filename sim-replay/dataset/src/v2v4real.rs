@@ -33,8 +33,14 @@ impl FrameSource for V2v4Real {
         self.frame_without_points(agent, tick, Field::root(&path, &node))
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        self.sweeps
+            .read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
@@ -47,22 +53,32 @@ impl FrameSource for V2v4Real {
 }
 
 impl V2v4Real {
-    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame, ReadError> {
+    fn frame_without_points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        root: Field<'_>,
+    ) -> Result<Frame, ReadError> {
         let world_from_lidar = lidar_pose(&root.required("lidar_pose")?)?;
         let mut annotations = Annotations::new(root);
         let objects = annotations.objects(
             |id, field| self.associated_id(agent, id, field),
             |place| {
                 let lidar_from_object = Pose::from_matrix(&place.left_handed_matrix())?;
-                let pose: Pose = (world_from_lidar.isometry() * lidar_from_object.isometry()).into();
+                let pose: Pose =
+                    (world_from_lidar.isometry() * lidar_from_object.isometry()).into();
                 pose.validate().map(|()| pose)
             },
         );
-        let EgoMotion { speed_mps, yaw_rate_rad_s } = annotations.motion(Handedness::Right);
+        let EgoMotion {
+            speed_mps,
+            yaw_rate_rad_s,
+        } = annotations.motion(Handedness::Right);
         Ok(Frame {
             world_from_lidar: Some(world_from_lidar),
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
-            gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
+            gnss_world_from_vehicle: annotations
+                .optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
             speed_mps,
             yaw_rate_rad_s,
             objects,
@@ -72,12 +88,27 @@ impl V2v4Real {
     }
 
     /// `ass_id` is the id that both agents share; -1 means that only this agent has the object.
-    fn associated_id(&self, agent: &CavId, listed_id: i64, field: &Field<'_>) -> Result<i64, ReadError> {
-        match field.optional("ass_id")?.map(|id| id.integer()).transpose()? {
+    fn associated_id(
+        &self,
+        agent: &CavId,
+        listed_id: i64,
+        field: &Field<'_>,
+    ) -> Result<i64, ReadError> {
+        match field
+            .optional("ass_id")?
+            .map(|id| id.integer())
+            .transpose()?
+        {
             None => Ok(listed_id),
             Some(-1) => {
                 // Agents with names count by their index.
-                let place = || self.folder.agents.iter().position(|id| id == agent).unwrap_or(0) as i64;
+                let place = || {
+                    self.folder
+                        .agents
+                        .iter()
+                        .position(|id| id == agent)
+                        .unwrap_or(0) as i64
+                };
                 let agent = agent.as_str().parse::<i64>().unwrap_or_else(|_| place());
                 Ok(listed_id.saturating_add(UNMATCHED_STEP.saturating_mul(agent)))
             }
@@ -114,8 +145,12 @@ mod tests {
     use crate::{Layout, LoadOptions, ReadError};
 
     /// 30 m ahead, half a turn.
-    const PARTNER: [f64; 16] = [-1.0, 0.0, 0.0, 30.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-    const EGO: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    const PARTNER: [f64; 16] = [
+        -1.0, 0.0, 0.0, 30.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0,
+    ];
+    const EGO: [f64; 16] = [
+        1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0,
+    ];
 
     fn object(id: i64, x: f64, y: f64, keys: &str) -> String {
         format!(
@@ -124,8 +159,14 @@ mod tests {
     }
 
     fn write(root: &Path, agent: &str, pose: &str, objects: &str) {
-        let yaml = format!("{pose}true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n{objects}");
-        write_frame(root, &format!("{agent}/000000"), &yaml, &[[1.0, 2.0, 3.0, 0.5]]);
+        let yaml =
+            format!("{pose}true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n{objects}");
+        write_frame(
+            root,
+            &format!("{agent}/000000"),
+            &yaml,
+            &[[1.0, 2.0, 3.0, 0.5]],
+        );
     }
 
     fn load(root: &Path, agent: usize) -> Result<Frame, ReadError> {
@@ -139,23 +180,47 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let matched = "    ass_id: 5\n    obj_type: Truck\n";
         let walker = object(9, 3.0, 0.0, "    ass_id: 9\n    obj_type: Pedestrian\n");
-        write(dir.path(), "0", &pickled_matrix(&EGO), &(object(1, 10.0, 4.0, matched) + &walker));
+        write(
+            dir.path(),
+            "0",
+            &pickled_matrix(&EGO),
+            &(object(1, 10.0, 4.0, matched) + &walker),
+        );
         let lonely = object(7, 25.0, 0.0, "    ass_id: -1\n");
-        write(dir.path(), "1", &pickled_matrix(&PARTNER), &(object(2, 20.0, -4.0, matched) + &lonely));
+        write(
+            dir.path(),
+            "1",
+            &pickled_matrix(&PARTNER),
+            &(object(2, 20.0, -4.0, matched) + &lonely),
+        );
         let (ego, partner) = (load(dir.path(), 0).unwrap(), load(dir.path(), 1).unwrap());
-        assert_eq!(ego.points.xyzi, [[1.0, 2.0, 3.0, 0.5]], "nothing is mirrored");
+        assert_eq!(
+            ego.points.xyzi,
+            [[1.0, 2.0, 3.0, 0.5]],
+            "nothing is mirrored"
+        );
         assert_eq!(ego.speed_mps, Some(1.0));
         assert_eq!(ego.objects[0].class, ObjectClass::Truck);
         let place = |frame: &Frame| frame.objects[0].world_from_object.translation_m;
         for (a, b) in place(&ego).iter().zip(place(&partner)) {
-            assert!((a - b).abs() < 1e-9, "the same truck: {:?} {:?}", place(&ego), place(&partner));
+            assert!(
+                (a - b).abs() < 1e-9,
+                "the same truck: {:?} {:?}",
+                place(&ego),
+                place(&partner)
+            );
         }
         // Without partner: object id + 100 * agent id. The pedestrian does not count.
-        let ids: Vec<i64> =
-            merge(&[&ego, &partner], 0, &GroundTruthRule::V2V4REAL).into_iter().map(|(id, _)| id).collect();
+        let ids: Vec<i64> = merge(&[&ego, &partner], 0, &GroundTruthRule::V2V4REAL)
+            .into_iter()
+            .map(|(id, _)| id)
+            .collect();
         assert_eq!(ids, [5, 107]);
         let heading = ego.objects[0].world_from_object.yaw_rad().to_degrees();
-        assert!((heading - 90.0).abs() < 1e-9, "right-handed as it stands: {heading}");
+        assert!(
+            (heading - 90.0).abs() < 1e-9,
+            "right-handed as it stands: {heading}"
+        );
     }
 
     #[test]
@@ -167,8 +232,13 @@ mod tests {
             "lidar_pose: [-1, 0, 0, 30, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",
         ] {
             write(dir.path(), "0", pose, &object);
-            let [x, y, z] = load(dir.path(), 0).unwrap().objects[0].world_from_object.translation_m;
-            assert!((x - 20.0).abs() < 1e-9 && (y + 4.0).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{x} {y} {z}");
+            let [x, y, z] = load(dir.path(), 0).unwrap().objects[0]
+                .world_from_object
+                .translation_m;
+            assert!(
+                (x - 20.0).abs() < 1e-9 && (y + 4.0).abs() < 1e-9 && (z + 1.0).abs() < 1e-9,
+                "{x} {y} {z}"
+            );
         }
     }
 
@@ -180,10 +250,22 @@ mod tests {
         let mut scaled = PARTNER;
         scaled[0] = -1.1;
         for (pose, expected) in [
-            (pickled_matrix(&scaled), "000000.yaml:2: lidar_pose: pose matrix is not a rotation"),
-            ("lidar_pose: [[1, 0], [0, 1]]\n".into(), "lidar_pose: a list of 2, expected 6 numbers or a 4x4 matrix"),
-            (pickled_matrix(&EGO).replace("_reconstruct", "evil"), "is not supported"),
-            ("lidar_pose: [1, 2, 3, 4, 5, 6]\n".into(), "lidar_pose: 6 numbers as in OPV2V, but the scenario's first"),
+            (
+                pickled_matrix(&scaled),
+                "000000.yaml:2: lidar_pose: pose matrix is not a rotation",
+            ),
+            (
+                "lidar_pose: [[1, 0], [0, 1]]\n".into(),
+                "lidar_pose: a list of 2, expected 6 numbers or a 4x4 matrix",
+            ),
+            (
+                pickled_matrix(&EGO).replace("_reconstruct", "evil"),
+                "is not supported",
+            ),
+            (
+                "lidar_pose: [1, 2, 3, 4, 5, 6]\n".into(),
+                "lidar_pose: 6 numbers as in OPV2V, but the scenario's first",
+            ),
         ] {
             write(dir.path(), "1", &pose, &object(1, 10.0, 4.0, ""));
             let error = load(dir.path(), 1).unwrap_err().to_string();
@@ -194,11 +276,25 @@ mod tests {
     #[test]
     fn faults_of_an_object_or_another_pose_cost_no_frame() {
         let dir = tempfile::tempdir().unwrap();
-        let objects = object(1, 10.0, 4.0, "    ass_id: one\n") + &object(2, 1e9, 0.0, "") + &object(3, 5.0, 0.0, "");
-        write(dir.path(), "0", &(pickled_matrix(&EGO) + "predicted_ego_pos: [1, 2]\n"), &objects);
+        let objects = object(1, 10.0, 4.0, "    ass_id: one\n")
+            + &object(2, 1e9, 0.0, "")
+            + &object(3, 5.0, 0.0, "");
+        write(
+            dir.path(),
+            "0",
+            &(pickled_matrix(&EGO) + "predicted_ego_pos: [1, 2]\n"),
+            &objects,
+        );
         let frame = load(dir.path(), 0).unwrap();
         assert_eq!((frame.objects.len(), frame.points.len()), (1, 1));
-        let fields: Vec<&str> = frame.problems.iter().filter_map(|problem| problem.field.as_deref()).collect();
-        assert_eq!(fields, ["vehicles.1.ass_id", "vehicles.2", "predicted_ego_pos"]);
+        let fields: Vec<&str> = frame
+            .problems
+            .iter()
+            .filter_map(|problem| problem.field.as_deref())
+            .collect();
+        assert_eq!(
+            fields,
+            ["vehicles.1.ass_id", "vehicles.2", "predicted_ego_pos"]
+        );
     }
 }

@@ -29,9 +29,9 @@ impl WrittenPose {
         match (&sizes[..], values.first_chunk::<6>()) {
             ([6], Some(numbers)) => Ok(Self::SixNumbers(CarlaPose::from(*numbers))),
             ([4, 4] | [16], _) => Ok(Self::Matrix(Matrix4::from_row_slice(&values))),
-            _ if numpy_tags::is_call(field.node()) => {
-                Err(field.error(format!("an array of shape {shape:?}, expected 6 numbers or a 4x4 matrix")))
-            }
+            _ if numpy_tags::is_call(field.node()) => Err(field.error(format!(
+                "an array of shape {shape:?}, expected 6 numbers or a 4x4 matrix"
+            ))),
             _ => Err(field.expected("6 numbers or a 4x4 matrix")),
         }
     }
@@ -69,15 +69,28 @@ mod tests {
         let six = WrittenPose::SixNumbers(CarlaPose::from(SIX));
         let values: Vec<f64> = (0..16).map(f64::from).collect();
         let matrix = WrittenPose::Matrix(Matrix4::from_row_slice(&values));
-        let nested = values.chunks(4).map(|row| format!("{row:?}")).collect::<Vec<_>>().join(", ");
-        let rows: String = values.chunks(4).map(|row| format!("- {}", pickled_array(&[4], row, "  "))).collect();
+        let nested = values
+            .chunks(4)
+            .map(|row| format!("{row:?}"))
+            .collect::<Vec<_>>()
+            .join(", ");
+        let rows: String = values
+            .chunks(4)
+            .map(|row| format!("- {}", pickled_array(&[4], row, "  ")))
+            .collect();
         for (text, expected) in [
             (format!("pose: {SIX:?}\n"), six),
             (format!("pose: !!python/tuple {SIX:?}\n"), six),
             (format!("pose: {}", pickled_array(&[6], &SIX, "  ")), six),
             (format!("pose: {}", pickled_array(&[1, 6], &SIX, "  ")), six),
-            (format!("pose: {}", pickled_array(&[4, 4], &values, "  ")), matrix),
-            (format!("pose: {}", pickled_array(&[16], &values, "  ")), matrix),
+            (
+                format!("pose: {}", pickled_array(&[4, 4], &values, "  ")),
+                matrix,
+            ),
+            (
+                format!("pose: {}", pickled_array(&[16], &values, "  ")),
+                matrix,
+            ),
             (format!("pose: [{nested}]\n"), matrix),
             (format!("pose: {values:?}\n"), matrix),
             (format!("pose:\n{rows}"), matrix),
@@ -89,12 +102,30 @@ mod tests {
     #[test]
     fn other_shapes_are_named() {
         for (text, expected) in [
-            ("pose: [1, 2, 3]\n".to_owned(), "0.yaml:1: pose: a list of 3, expected 6 numbers or a 4x4 matrix"),
-            ("pose: [[1, 2], [3]]\n".into(), "pose: rows of different lengths"),
-            ("pose: [1, 2, .inf, 4, 5, 6]\n".into(), "pose.2: inf, expected a finite number"),
-            ("pose: far\n".into(), "pose: the text \"far\", expected numbers"),
-            (format!("pose: {}", pickled_array(&[3], &SIX[..3], "  ")), "pose: an array of shape [3], expected 6"),
-            (format!("pose: {}", pickled_array(&[6], &[f64::NAN; 6], "  ")), "pose: NaN, expected finite numbers"),
+            (
+                "pose: [1, 2, 3]\n".to_owned(),
+                "0.yaml:1: pose: a list of 3, expected 6 numbers or a 4x4 matrix",
+            ),
+            (
+                "pose: [[1, 2], [3]]\n".into(),
+                "pose: rows of different lengths",
+            ),
+            (
+                "pose: [1, 2, .inf, 4, 5, 6]\n".into(),
+                "pose.2: inf, expected a finite number",
+            ),
+            (
+                "pose: far\n".into(),
+                "pose: the text \"far\", expected numbers",
+            ),
+            (
+                format!("pose: {}", pickled_array(&[3], &SIX[..3], "  ")),
+                "pose: an array of shape [3], expected 6",
+            ),
+            (
+                format!("pose: {}", pickled_array(&[6], &[f64::NAN; 6], "  ")),
+                "pose: NaN, expected finite numbers",
+            ),
         ] {
             let message = read(&text).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");

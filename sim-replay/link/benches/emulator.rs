@@ -17,7 +17,8 @@ use std::time::{Duration, Instant};
 
 use bus::{BusOptions, Endpoint, open};
 use protocol::{
-    Bev, BevFeatures, BevGrid, CavId, CodecConfig, Limits, Pose, PoseEstimate, Stamp, encode_features, wire,
+    Bev, BevFeatures, BevGrid, CavId, CodecConfig, Limits, Pose, PoseEstimate, Stamp,
+    encode_features, wire,
 };
 use zenoh::Session;
 use zenoh::Wait;
@@ -34,18 +35,38 @@ type Failure = Box<dyn std::error::Error>;
 
 fn features(kib: usize) -> BevFeatures {
     let cells = kib * 1024 / 4 / CHANNELS;
-    let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 32, height: cells as u32 / 32 };
-    let values = (0..CHANNELS * cells).map(|index| (index % 1013) as f32 * 0.01).collect();
-    BevFeatures { grid, channels: CHANNELS as u32, code_of: None, values }
+    let grid = BevGrid {
+        x_min_m: -51.2,
+        y_min_m: -38.4,
+        cell_m: 0.8,
+        width: 32,
+        height: cells as u32 / 32,
+    };
+    let values = (0..CHANNELS * cells)
+        .map(|index| (index % 1013) as f32 * 0.01)
+        .collect();
+    BevFeatures {
+        grid,
+        channels: CHANNELS as u32,
+        code_of: None,
+        values,
+    }
 }
 
 /// Puts a payload of `values`' bytes; returns the time until the subscriber's callback has it, and until its bytes are
 /// contiguous, as any use of them requires.
-fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> Result<[Duration; 2], Failure> {
+fn raw(
+    publisher: &Publisher,
+    arrivals: &Receiver<ZBytes>,
+    values: Vec<f32>,
+) -> Result<[Duration; 2], Failure> {
     let bytes = values.len() * 4;
     let payload = bytes::Bytes::from_owner(protocol::Body::Floats(values));
     let begin = Instant::now();
-    publisher.put(payload).wait().map_err(|cause| cause.to_string())?;
+    publisher
+        .put(payload)
+        .wait()
+        .map_err(|cause| cause.to_string())?;
     let arrived = arrivals.recv_timeout(TIMEOUT)?;
     let in_callback = begin.elapsed();
     let together = arrived.to_bytes();
@@ -55,16 +76,35 @@ fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> 
 }
 
 /// Encodes, sends, receives and decodes a feature map.
-fn message(publisher: &Publisher, arrivals: &Receiver<ZBytes>, features: BevFeatures) -> Result<Duration, Failure> {
-    let stamp = Stamp { cav: CavId::new("4279")?, epoch: 1, sequence: 1, capture_nanos: 0, publish_nanos: 0 };
+fn message(
+    publisher: &Publisher,
+    arrivals: &Receiver<ZBytes>,
+    features: BevFeatures,
+) -> Result<Duration, Failure> {
+    let stamp = Stamp {
+        cav: CavId::new("4279")?,
+        epoch: 1,
+        sequence: 1,
+        capture_nanos: 0,
+        publish_nanos: 0,
+    };
     let expected = features.values[features.values.len() - 1];
     let begin = Instant::now();
     let features = encode_features(features, &CodecConfig::default(), None)?;
-    let encoded = wire::encode(&stamp, Bev { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), features })?;
+    let encoded = wire::encode(
+        &stamp,
+        Bev {
+            pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
+            features,
+        },
+    )?;
     let mut writer = ZBytes::writer();
     writer.append(encoded.head.into());
     writer.append(bytes::Bytes::from_owner(encoded.body).into());
-    publisher.put(writer.finish()).wait().map_err(|cause| cause.to_string())?;
+    publisher
+        .put(writer.finish())
+        .wait()
+        .map_err(|cause| cause.to_string())?;
     let arrived = arrivals.recv_timeout(TIMEOUT)?;
     let (_, bev) = wire::decode::<Bev>(arrived.slices(), &Limits::DEFAULT)?;
     let decoded = bev.features.decode(&Limits::DEFAULT)?;
@@ -82,7 +122,9 @@ fn summary(mut times: Vec<Duration>) -> [f64; 2] {
 fn report(case: &str, times: Vec<Duration>, [raw_p50, raw_min]: [f64; 2]) {
     let [p50, min] = summary(times);
     let (ratio, min_ratio) = (p50 / raw_p50, min / raw_min);
-    println!("link/{case}: p50 {p50:.3} ms ({ratio:.2} x raw), min {min:.3} ms ({min_ratio:.2} x raw)");
+    println!(
+        "link/{case}: p50 {p50:.3} ms ({ratio:.2} x raw), min {min:.3} ms ({min_ratio:.2} x raw)"
+    );
 }
 
 fn main() -> Result<(), Failure> {
@@ -100,23 +142,39 @@ fn main() -> Result<(), Failure> {
 
 fn measure(route: &str, sender: &Session, receiver: &Session) -> Result<(), Failure> {
     let (arrive, arrivals) = channel();
-    let subscriber = receiver.declare_subscriber("v2v/bench/4279/bev").callback(move |sample| {
-        // The receiver is dropped only when the benchmark ends.
-        let _ = arrive.send(sample.payload().clone());
-    });
+    let subscriber = receiver
+        .declare_subscriber("v2v/bench/4279/bev")
+        .callback(move |sample| {
+            // The receiver is dropped only when the benchmark ends.
+            let _ = arrive.send(sample.payload().clone());
+        });
     let subscriber = subscriber.wait().map_err(|cause| cause.to_string())?;
-    let publisher = sender.declare_publisher("v2v/bench/4279/bev").congestion_control(CongestionControl::Block);
+    let publisher = sender
+        .declare_publisher("v2v/bench/4279/bev")
+        .congestion_control(CongestionControl::Block);
     let publisher = publisher.wait().map_err(|cause| cause.to_string())?;
     let deadline = Instant::now() + TIMEOUT;
-    while !publisher.matching_status().wait().map_err(|cause| cause.to_string())?.matching() {
-        assert!(Instant::now() < deadline, "no route between two sessions of one process");
+    while !publisher
+        .matching_status()
+        .wait()
+        .map_err(|cause| cause.to_string())?
+        .matching()
+    {
+        assert!(
+            Instant::now() < deadline,
+            "no route between two sessions of one process"
+        );
         std::thread::yield_now();
     }
 
-    for (pace, pause) in [("10-hz", Duration::from_millis(50)), ("back-to-back", Duration::ZERO)] {
+    for (pace, pause) in [
+        ("10-hz", Duration::from_millis(50)),
+        ("back-to-back", Duration::ZERO),
+    ] {
         for kib in [64, 1024, 8192] {
             let features = features(kib);
-            let (mut raw_times, mut copied_times, mut message_times) = (Vec::new(), Vec::new(), Vec::new());
+            let (mut raw_times, mut copied_times, mut message_times) =
+                (Vec::new(), Vec::new(), Vec::new());
             for round in 0..WARM_UP + ROUNDS {
                 std::thread::sleep(pause);
                 let [raw_time, copied_time] = raw(&publisher, &arrivals, features.values.clone())?;
@@ -130,10 +188,24 @@ fn measure(route: &str, sender: &Session, receiver: &Session) -> Result<(), Fail
             }
             let base = summary(raw_times.clone());
             report(&format!("{route}/raw/{pace}/{kib}"), raw_times, base);
-            report(&format!("{route}/raw-copied/{pace}/{kib}"), copied_times, base);
-            report(&format!("{route}/message/{pace}/{kib}"), message_times, base);
+            report(
+                &format!("{route}/raw-copied/{pace}/{kib}"),
+                copied_times,
+                base,
+            );
+            report(
+                &format!("{route}/message/{pace}/{kib}"),
+                message_times,
+                base,
+            );
         }
     }
-    publisher.undeclare().wait().map_err(|cause| cause.to_string())?;
-    Ok(subscriber.undeclare().wait().map_err(|cause| cause.to_string())?)
+    publisher
+        .undeclare()
+        .wait()
+        .map_err(|cause| cause.to_string())?;
+    Ok(subscriber
+        .undeclare()
+        .wait()
+        .map_err(|cause| cause.to_string())?)
 }

@@ -38,13 +38,16 @@ pub(super) fn work(bytes: u64) -> u128 {
 impl Capacity {
     pub(super) fn new(config: &CapacityConfig, trace: Option<&Trace>) -> Self {
         match (config, trace) {
-            (CapacityConfig::TokenBucket { rate_mbps, .. }, _) => Self::Constant(rounding::to_u64(rate_mbps * 1e6)),
+            (CapacityConfig::TokenBucket { rate_mbps, .. }, _) => {
+                Self::Constant(rounding::to_u64(rate_mbps * 1e6))
+            }
             (_, Some(Trace::Steps(steps))) => {
                 let mut done = 0;
                 let mut last: Option<&Step> = None;
                 let steps = steps.iter().map(|step| {
                     if let Some(last) = last {
-                        done += u128::from(last.bits_per_s) * u128::from(step.from_nanos - last.from_nanos);
+                        done += u128::from(last.bits_per_s)
+                            * u128::from(step.from_nanos - last.from_nanos);
                     }
                     last = Some(step);
                     (*step, done)
@@ -55,7 +58,15 @@ impl Capacity {
                 let offset_nanos = config.trace().map_or(0, TraceConfig::offset_nanos);
                 let all = Self::Opportunities(times.clone());
                 let before = all.done_by(offset_nanos);
-                if offset_nanos == 0 { all } else { Self::Later { all: Box::new(all), offset_nanos, before } }
+                if offset_nanos == 0 {
+                    all
+                } else {
+                    Self::Later {
+                        all: Box::new(all),
+                        offset_nanos,
+                        before,
+                    }
+                }
             }
             _ => Self::Unlimited,
         }
@@ -67,8 +78,12 @@ impl Capacity {
             Self::Unlimited => 0,
             Self::Constant(rate) => u128::from(*rate) * u128::from(nanos),
             Self::Steps(steps) => {
-                let index = steps.partition_point(|(step, _)| step.from_nanos <= nanos).saturating_sub(1);
-                let Some((step, before)) = steps.get(index) else { return 0 };
+                let index = steps
+                    .partition_point(|(step, _)| step.from_nanos <= nanos)
+                    .saturating_sub(1);
+                let Some((step, before)) = steps.get(index) else {
+                    return 0;
+                };
                 before + u128::from(step.bits_per_s) * u128::from(nanos - step.from_nanos)
             }
             Self::Opportunities(times) => {
@@ -77,7 +92,11 @@ impl Capacity {
                 let passed = times.partition_point(|&time| time <= rest) as u128;
                 (u128::from(rounds) * times.len() as u128 + passed) * work(OPPORTUNITY_BYTES)
             }
-            Self::Later { all, offset_nanos, before } => all.done_by(nanos.saturating_add(*offset_nanos)) - before,
+            Self::Later {
+                all,
+                offset_nanos,
+                before,
+            } => all.done_by(nanos.saturating_add(*offset_nanos)) - before,
         }
     }
 
@@ -87,7 +106,9 @@ impl Capacity {
             Self::Unlimited => Some(0),
             Self::Constant(rate) => u64::try_from(wanted.div_ceil(u128::from(*rate))).ok(),
             Self::Steps(steps) => {
-                let index = steps.partition_point(|(_, before)| *before < wanted).saturating_sub(1);
+                let index = steps
+                    .partition_point(|(_, before)| *before < wanted)
+                    .saturating_sub(1);
                 let (step, before) = steps.get(index)?;
                 let left = wanted.saturating_sub(*before);
                 if left == 0 {
@@ -95,17 +116,26 @@ impl Capacity {
                 }
                 let nanos = left.checked_div(u128::from(step.bits_per_s))?;
                 let whole = nanos * u128::from(step.bits_per_s) == left;
-                step.from_nanos.checked_add(u64::try_from(nanos + u128::from(!whole)).ok()?)
+                step.from_nanos
+                    .checked_add(u64::try_from(nanos + u128::from(!whole)).ok()?)
             }
             Self::Opportunities(times) => {
                 let count = wanted.div_ceil(work(OPPORTUNITY_BYTES)).max(1) - 1;
                 let (rounds, place) = (count / times.len() as u128, count % times.len() as u128);
                 let (period, time) = (times.last()?, times.get(usize::try_from(place).ok()?)?);
-                u64::try_from(rounds).ok()?.checked_mul(*period)?.checked_add(*time)
+                u64::try_from(rounds)
+                    .ok()?
+                    .checked_mul(*period)?
+                    .checked_add(*time)
             }
-            Self::Later { all, offset_nanos, before } => {
-                Some(all.time_of(wanted.checked_add(*before)?)?.saturating_sub(*offset_nanos))
-            }
+            Self::Later {
+                all,
+                offset_nanos,
+                before,
+            } => Some(
+                all.time_of(wanted.checked_add(*before)?)?
+                    .saturating_sub(*offset_nanos),
+            ),
         }
     }
 }
@@ -124,7 +154,10 @@ mod tests {
             loss: 0.0,
         };
         let trace = Trace::Steps(rates.iter().enumerate().map(step).collect());
-        Capacity::new(&CapacityConfig::Trace(TraceConfig::new("trace.csv".as_ref())), Some(&trace))
+        Capacity::new(
+            &CapacityConfig::Trace(TraceConfig::new("trace.csv".as_ref())),
+            Some(&trace),
+        )
     }
 
     proptest! {
@@ -153,7 +186,9 @@ mod tests {
     #[test]
     fn an_opportunity_is_repeated_after_the_last() {
         let capacity = Capacity::Opportunities(vec![2, 2, 5]);
-        let times: Vec<_> = (1..=7).map(|packet| capacity.time_of(work(packet * 1500)).unwrap()).collect();
+        let times: Vec<_> = (1..=7)
+            .map(|packet| capacity.time_of(work(packet * 1500)).unwrap())
+            .collect();
         assert_eq!(times, [2, 2, 5, 7, 7, 10, 12]);
     }
 }

@@ -21,8 +21,11 @@ pub(super) struct Chance {
 
 impl Chance {
     pub(super) fn new(seed: u64, from: &CavId, to: &CavId) -> Self {
-        let letters = |cav: &CavId| derive_seed(0, &cav.as_str().bytes().map(u64::from).collect::<Vec<_>>());
-        Self { seed: derive_seed(seed, &[letters(from), letters(to)]) }
+        let letters =
+            |cav: &CavId| derive_seed(0, &cav.as_str().bytes().map(u64::from).collect::<Vec<_>>());
+        Self {
+            seed: derive_seed(seed, &[letters(from), letters(to)]),
+        }
     }
 
     /// Random numbers for one decision about one message.

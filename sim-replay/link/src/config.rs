@@ -75,7 +75,10 @@ impl LinkError {
     pub(super) fn in_file(name: &str, source: Self) -> Self {
         match source {
             in_file @ Self::InFile { .. } => in_file,
-            source => Self::InFile { path: name.into(), source: Box::new(source) },
+            source => Self::InFile {
+                path: name.into(),
+                source: Box::new(source),
+            },
         }
     }
 }
@@ -138,7 +141,12 @@ pub struct QueueConfig {
 
 impl Default for QueueConfig {
     fn default() -> Self {
-        Self { bytes: 16 << 20, drop: QueueDrop::Tail, keep_last: false, urgent_bytes: FRAGMENT_BYTES }
+        Self {
+            bytes: 16 << 20,
+            drop: QueueDrop::Tail,
+            keep_last: false,
+            urgent_bytes: FRAGMENT_BYTES,
+        }
     }
 }
 
@@ -295,24 +303,52 @@ impl LinkConfig {
         if let CapacityConfig::TokenBucket { rate_mbps, .. } = self.capacity {
             bounded("capacity.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
         }
-        bounded("clock.offset_ms", self.clock.offset_ms, -MAX_MS, MAX_MS, "-600,000 to 600,000 ms")?;
-        bounded("clock.drift_ppm", self.clock.drift_ppm, -1e5, 1e5, "-100,000 to 100,000")?;
+        bounded(
+            "clock.offset_ms",
+            self.clock.offset_ms,
+            -MAX_MS,
+            MAX_MS,
+            "-600,000 to 600,000 ms",
+        )?;
+        bounded(
+            "clock.drift_ppm",
+            self.clock.drift_ppm,
+            -1e5,
+            1e5,
+            "-100,000 to 100,000",
+        )?;
         if let Some(ClockStep { at_s, by_ms }) = self.clock.step {
             bounded("clock.step.at_s", at_s, 0.0, 1e9, "0 to 1e9 s")?;
-            bounded("clock.step.by_ms", by_ms, -MAX_MS, MAX_MS, "-600,000 to 600,000 ms")?;
+            bounded(
+                "clock.step.by_ms",
+                by_ms,
+                -MAX_MS,
+                MAX_MS,
+                "-600,000 to 600,000 ms",
+            )?;
         }
         match self.delay {
             DelayModel::None | DelayModel::Trace => {}
             DelayModel::ConstantMs(ms) => time("delay", ms)?,
             DelayModel::UniformMs([low, high]) => {
                 time("delay", low)?;
-                bounded("delay", high, low, MAX_MS, "from the lower bound to 600,000 ms")?;
+                bounded(
+                    "delay",
+                    high,
+                    low,
+                    MAX_MS,
+                    "from the lower bound to 600,000 ms",
+                )?;
             }
             DelayModel::Normal { mean_ms, std_ms } => {
                 time("delay.mean_ms", mean_ms)?;
                 time("delay.std_ms", std_ms)?;
             }
-            DelayModel::BySize { overhead_ms, rate_mbps, fixed_ms } => {
+            DelayModel::BySize {
+                overhead_ms,
+                rate_mbps,
+                fixed_ms,
+            } => {
                 time("delay.overhead_ms", overhead_ms)?;
                 bounded("delay.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
                 time("delay.fixed_ms", fixed_ms)?;
@@ -326,7 +362,12 @@ impl LinkConfig {
         match &self.loss {
             LossModel::None | LossModel::Trace => {}
             LossModel::Bernoulli(share) => probability("loss", *share)?,
-            LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
+            LossModel::GilbertElliott {
+                to_bad,
+                to_good,
+                loss_good,
+                loss_bad,
+            } => {
                 probability("loss.to_bad", *to_bad)?;
                 probability("loss.to_good", *to_good)?;
                 probability("loss.loss_good", *loss_good)?;
@@ -341,7 +382,11 @@ impl LinkConfig {
                 }
             }
         }
-        if let Some(ReorderConfig { probability: share, extra_ms }) = self.reorder {
+        if let Some(ReorderConfig {
+            probability: share,
+            extra_ms,
+        }) = self.reorder
+        {
             probability("reorder.probability", share)?;
             time("reorder.extra_ms", extra_ms)?;
         }
@@ -370,8 +415,12 @@ impl LinkConfig {
         let offset_nanos = self.capacity.trace().map_or(0, TraceConfig::offset_nanos);
         let trace = match &self.capacity {
             CapacityConfig::Unlimited | CapacityConfig::TokenBucket { .. } => None,
-            CapacityConfig::Trace(TraceConfig { path, .. }) => Some(Trace::read_csv(&folder.join(path), offset_nanos)?),
-            CapacityConfig::Mahimahi(TraceConfig { path, .. }) => Some(Trace::read_mahimahi(&folder.join(path))?),
+            CapacityConfig::Trace(TraceConfig { path, .. }) => {
+                Some(Trace::read_csv(&folder.join(path), offset_nanos)?)
+            }
+            CapacityConfig::Mahimahi(TraceConfig { path, .. }) => {
+                Some(Trace::read_mahimahi(&folder.join(path))?)
+            }
         };
         let has_steps = matches!(trace, Some(Trace::Steps(_)));
         if self.delay == DelayModel::Trace && !has_steps {
@@ -395,8 +444,18 @@ fn probability(field: &'static str, share: f64) -> Result<(), LinkError> {
     bounded(field, share, 0.0, 1.0, "0 to 1")
 }
 
-fn bounded(field: &'static str, value: f64, low: f64, high: f64, must: &'static str) -> Result<(), LinkError> {
-    if (low..=high).contains(&value) { Ok(()) } else { Err(LinkError::Value { field, value, must }) }
+fn bounded(
+    field: &'static str,
+    value: f64,
+    low: f64,
+    high: f64,
+    must: &'static str,
+) -> Result<(), LinkError> {
+    if (low..=high).contains(&value) {
+        Ok(())
+    } else {
+        Err(LinkError::Value { field, value, must })
+    }
 }
 
 #[cfg(test)]
@@ -416,27 +475,74 @@ mod tests {
         assert_eq!(config.queue.urgent_bytes, FRAGMENT_BYTES);
         assert_eq!(
             config.loss,
-            LossModel::GilbertElliott { to_bad: 0.01, to_good: 0.2, loss_good: 0.0, loss_bad: 1.0 }
+            LossModel::GilbertElliott {
+                to_bad: 0.01,
+                to_good: 0.2,
+                loss_good: 0.0,
+                loss_bad: 1.0
+            }
         );
         let written = serde_json::to_string(&config).unwrap();
-        assert_eq!(serde_json::from_str::<LinkConfig>(&written).unwrap(), config);
+        assert_eq!(
+            serde_json::from_str::<LinkConfig>(&written).unwrap(),
+            config
+        );
         assert!(serde_saphyr::from_str::<LinkConfig>("dely: none\n").is_err());
     }
 
     #[test]
     fn wrong_numbers_are_named() {
         let message = |config: LinkConfig| config.validate().unwrap_err().to_string();
-        let rate = CapacityConfig::TokenBucket { rate_mbps: 0.0, burst_bytes: 0 };
-        assert!(message(LinkConfig { capacity: rate, ..LinkConfig::default() }).contains("rate_mbps is 0"));
+        let rate = CapacityConfig::TokenBucket {
+            rate_mbps: 0.0,
+            burst_bytes: 0,
+        };
+        assert!(
+            message(LinkConfig {
+                capacity: rate,
+                ..LinkConfig::default()
+            })
+            .contains("rate_mbps is 0")
+        );
         let delay = DelayModel::UniformMs([5.0, 2.0]);
-        assert!(message(LinkConfig { delay, ..LinkConfig::default() }).contains("delay is 2"));
-        let clock = DeviceClock { offset_ms: f64::NAN, ..DeviceClock::default() };
-        assert!(message(LinkConfig { clock, ..LinkConfig::default() }).contains("offset_ms is NaN"));
+        assert!(
+            message(LinkConfig {
+                delay,
+                ..LinkConfig::default()
+            })
+            .contains("delay is 2")
+        );
+        let clock = DeviceClock {
+            offset_ms: f64::NAN,
+            ..DeviceClock::default()
+        };
+        assert!(
+            message(LinkConfig {
+                clock,
+                ..LinkConfig::default()
+            })
+            .contains("offset_ms is NaN")
+        );
         let loss = LossModel::Bernoulli(f64::NAN);
-        assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("loss is NaN"));
+        assert!(
+            message(LinkConfig {
+                loss,
+                ..LinkConfig::default()
+            })
+            .contains("loss is NaN")
+        );
         let loss = LossModel::Distance(vec![[50.0, 0.1], [20.0, 0.2]]);
-        assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("rising"));
-        let config = LinkConfig { delay: DelayModel::Trace, ..LinkConfig::default() };
+        assert!(
+            message(LinkConfig {
+                loss,
+                ..LinkConfig::default()
+            })
+            .contains("rising")
+        );
+        let config = LinkConfig {
+            delay: DelayModel::Trace,
+            ..LinkConfig::default()
+        };
         let message = config.read_trace(Path::new(".")).unwrap_err().to_string();
         assert!(message.contains("delay is trace"), "{message}");
     }

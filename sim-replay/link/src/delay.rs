@@ -8,18 +8,29 @@ use support::random::SplitMix64;
 
 impl DelayModel {
     /// Delay of one message, nanoseconds.
-    pub(super) fn draw(self, random: &mut SplitMix64, trace: Option<&Trace>, message: &SentMessage) -> u64 {
+    pub(super) fn draw(
+        self,
+        random: &mut SplitMix64,
+        trace: Option<&Trace>,
+        message: &SentMessage,
+    ) -> u64 {
         nanos::of_ms(match self {
             Self::None => 0.0,
             Self::ConstantMs(ms) => ms,
             Self::UniformMs([low, high]) => random.between(low, high),
             Self::Normal { mean_ms, std_ms } => mean_ms + std_ms * random.normal(),
             Self::Lognormal { median_ms, sigma } => median_ms * (sigma * random.normal()).exp(),
-            Self::BySize { overhead_ms, rate_mbps, fixed_ms } => {
+            Self::BySize {
+                overhead_ms,
+                rate_mbps,
+                fixed_ms,
+            } => {
                 let bits = 8.0 * message.bytes as f64;
                 random.between(0.0, overhead_ms) + bits / (1e3 * rate_mbps) + fixed_ms
             }
-            Self::Trace => trace.and_then(|trace| trace.at(message.sent_nanos)).map_or(0.0, |step| step.delay_ms),
+            Self::Trace => trace
+                .and_then(|trace| trace.at(message.sent_nanos))
+                .map_or(0.0, |step| step.delay_ms),
         })
     }
 }
@@ -31,34 +42,72 @@ mod tests {
     const COUNT: u64 = 20_000;
 
     fn draws(law: DelayModel) -> Vec<f64> {
-        let message = SentMessage { bytes: 132_500, distance_m: 0.0, sent_nanos: 0 };
-        (0..COUNT).map(|k| law.draw(&mut SplitMix64::derived(3, &[k]), None, &message) as f64 * 1e-6).collect()
+        let message = SentMessage {
+            bytes: 132_500,
+            distance_m: 0.0,
+            sent_nanos: 0,
+        };
+        (0..COUNT)
+            .map(|k| law.draw(&mut SplitMix64::derived(3, &[k]), None, &message) as f64 * 1e-6)
+            .collect()
     }
 
     fn check(law: DelayModel, mean: f64, std: f64) {
         let draws = draws(law);
         let found = draws.iter().sum::<f64>() / COUNT as f64;
         let deviation = 3.0 * std / (COUNT as f64).sqrt();
-        assert!((found - mean).abs() <= deviation + 1e-6, "{law:?}: {found}, not {mean} +- {deviation}");
+        assert!(
+            (found - mean).abs() <= deviation + 1e-6,
+            "{law:?}: {found}, not {mean} +- {deviation}"
+        );
     }
 
     #[test]
     fn every_law_has_its_mean() {
         check(DelayModel::None, 0.0, 0.0);
         check(DelayModel::ConstantMs(12.5), 12.5, 0.0);
-        check(DelayModel::UniformMs([20.0, 100.0]), 60.0, 80.0 / 12f64.sqrt());
+        check(
+            DelayModel::UniformMs([20.0, 100.0]),
+            60.0,
+            80.0 / 12f64.sqrt(),
+        );
         // 1.06 Mbit at 27 Mbit/s take 39.26 ms.
-        let by_size = DelayModel::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 };
+        let by_size = DelayModel::BySize {
+            overhead_ms: 100.0,
+            rate_mbps: 27.0,
+            fixed_ms: 10.0,
+        };
         check(by_size, 50.0 + 39.259_259 + 10.0, 100.0 / 12f64.sqrt());
         // Nine standard deviations from 0: no truncation.
-        check(DelayModel::Normal { mean_ms: 45.0, std_ms: 5.0 }, 45.0, 5.0);
+        check(
+            DelayModel::Normal {
+                mean_ms: 45.0,
+                std_ms: 5.0,
+            },
+            45.0,
+            5.0,
+        );
         let (median, sigma) = (10.0, 0.5f64);
         let mean = median * (0.5 * sigma * sigma).exp();
-        check(DelayModel::Lognormal { median_ms: median, sigma }, mean, mean * ((sigma * sigma).exp() - 1.0).sqrt());
+        check(
+            DelayModel::Lognormal {
+                median_ms: median,
+                sigma,
+            },
+            mean,
+            mean * ((sigma * sigma).exp() - 1.0).sqrt(),
+        );
     }
 
     #[test]
     fn no_delay_is_below_zero() {
-        assert!(draws(DelayModel::Normal { mean_ms: 1.0, std_ms: 10.0 }).iter().all(|&ms| ms >= 0.0));
+        assert!(
+            draws(DelayModel::Normal {
+                mean_ms: 1.0,
+                std_ms: 10.0
+            })
+            .iter()
+            .all(|&ms| ms >= 0.0)
+        );
     }
 }

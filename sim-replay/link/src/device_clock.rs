@@ -42,9 +42,14 @@ impl DeviceClock {
     }
 
     /// Offset at a time after the beginning.
-    #[expect(clippy::cast_possible_truncation, reason = "a cast from a float saturates")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "a cast from a float saturates"
+    )]
     fn ahead_nanos(&self, since_nanos: u64) -> i128 {
-        let set = self.step.filter(|step| since_nanos as f64 >= step.at_s * 1e9);
+        let set = self
+            .step
+            .filter(|step| since_nanos as f64 >= step.at_s * 1e9);
         let offset_ms = self.offset_ms + set.map_or(0.0, |step| step.by_ms);
         (offset_ms * 1e6 + self.drift_ppm * 1e-6 * since_nanos as f64).round() as i128
     }
@@ -57,17 +62,33 @@ mod tests {
     #[test]
     fn a_clock_is_off_by_its_offset_and_gains_by_its_drift() {
         assert_eq!(DeviceClock::default().shown_since(7, 123), 123);
-        let clock = DeviceClock { offset_ms: -5.0, drift_ppm: 100.0, step: None };
+        let clock = DeviceClock {
+            offset_ms: -5.0,
+            drift_ppm: 100.0,
+            step: None,
+        };
         assert_eq!(clock.shown_since(0, 0), 0, "no time is before 0");
         assert_eq!(clock.shown_since(0, 1_000_000_000), 995_100_000);
-        assert_eq!(clock.shown_since(1_000_000_000, 2_000_000_000), 1_995_100_000);
+        assert_eq!(
+            clock.shown_since(1_000_000_000, 2_000_000_000),
+            1_995_100_000
+        );
     }
 
     #[test]
     fn a_clock_that_is_set_jumps_once() {
-        let clock = DeviceClock { step: Some(ClockStep { at_s: 2.0, by_ms: -500.0 }), ..DeviceClock::default() };
+        let clock = DeviceClock {
+            step: Some(ClockStep {
+                at_s: 2.0,
+                by_ms: -500.0,
+            }),
+            ..DeviceClock::default()
+        };
         assert_eq!(clock.shown_since(0, 1_999_999_999), 1_999_999_999);
         assert_eq!(clock.shown_since(0, 2_000_000_000), 1_500_000_000);
-        assert_eq!(clock.shown_since(1_000_000_000, 3_500_000_000), 3_000_000_000);
+        assert_eq!(
+            clock.shown_since(1_000_000_000, 3_500_000_000),
+            3_000_000_000
+        );
     }
 }

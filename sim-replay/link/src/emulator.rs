@@ -164,7 +164,10 @@ impl LinkEmulator {
         };
         let mut left = Vec::new();
         let rules = rules(&self.config, &self.capacity);
-        self.lines.entry(key).or_default().submit(packet, &rules, &mut left);
+        self.lines
+            .entry(key)
+            .or_default()
+            .submit(packet, &rules, &mut left);
         left.into_iter().for_each(|left| self.settle(left));
         self.collect(self.now_nanos);
     }
@@ -179,9 +182,15 @@ impl LinkEmulator {
     #[must_use]
     pub fn next_nanos(&self) -> Option<u64> {
         let rules = rules(&self.config, &self.capacity);
-        let sent = self.lines.values().filter_map(|line| line.next_nanos(&rules));
+        let sent = self
+            .lines
+            .values()
+            .filter_map(|line| line.next_nanos(&rules));
         let known = self.outcomes.first().map(|outcome| outcome.nanos);
-        let ahead = self.under_way.peek().map(|Reverse(under_way)| under_way.nanos);
+        let ahead = self
+            .under_way
+            .peek()
+            .map(|Reverse(under_way)| under_way.nanos);
         sent.chain(known).chain(ahead).min()
     }
 
@@ -189,8 +198,13 @@ impl LinkEmulator {
     fn run(&mut self, until_nanos: u64) {
         loop {
             let rules = rules(&self.config, &self.capacity);
-            let next = self.lines.iter_mut().filter_map(|(_, line)| Some((line.next_nanos(&rules)?, line)));
-            let Some((nanos, line)) = next.min_by_key(|(nanos, _)| *nanos).filter(|(nanos, _)| *nanos <= until_nanos)
+            let next = self
+                .lines
+                .iter_mut()
+                .filter_map(|(_, line)| Some((line.next_nanos(&rules)?, line)));
+            let Some((nanos, line)) = next
+                .min_by_key(|(nanos, _)| *nanos)
+                .filter(|(nanos, _)| *nanos <= until_nanos)
             else {
                 break;
             };
@@ -203,39 +217,85 @@ impl LinkEmulator {
     }
 
     fn collect(&mut self, until_nanos: u64) {
-        while self.under_way.peek().is_some_and(|Reverse(under_way)| under_way.nanos <= until_nanos) {
-            let Some(Reverse(UnderWay { nanos, packet, delivery, .. })) = self.under_way.pop() else { return };
-            self.outcomes.push(Outcome { nanos, packet, delivery });
+        while self
+            .under_way
+            .peek()
+            .is_some_and(|Reverse(under_way)| under_way.nanos <= until_nanos)
+        {
+            let Some(Reverse(UnderWay {
+                nanos,
+                packet,
+                delivery,
+                ..
+            })) = self.under_way.pop()
+            else {
+                return;
+            };
+            self.outcomes.push(Outcome {
+                nanos,
+                packet,
+                delivery,
+            });
         }
     }
 
     /// Decides the result of a packet that has left its queue.
     fn settle(&mut self, left: Departure) {
         match left {
-            Departure::Dropped { packet, reason, nanos } => self.schedule(nanos, packet, Delivery::Dropped(reason)),
-            Departure::Sent { packet, start_nanos, end_nanos } => self.propagate(packet, start_nanos, end_nanos),
+            Departure::Dropped {
+                packet,
+                reason,
+                nanos,
+            } => self.schedule(nanos, packet, Delivery::Dropped(reason)),
+            Departure::Sent {
+                packet,
+                start_nanos,
+                end_nanos,
+            } => self.propagate(packet, start_nanos, end_nanos),
         }
     }
 
     fn propagate(&mut self, packet: Packet, start_nanos: u64, end_nanos: u64) {
-        let Self { config, trace, seed, directions, .. } = self;
-        let direction = directions.entry((packet.from.clone(), packet.to.clone())).or_insert_with(|| Direction {
-            chance: Chance::new(*seed, &packet.from, &packet.to),
-            loss: LossState::default(),
-            latest_nanos: BTreeMap::new(),
-        });
+        let Self {
+            config,
+            trace,
+            seed,
+            directions,
+            ..
+        } = self;
+        let direction = directions
+            .entry((packet.from.clone(), packet.to.clone()))
+            .or_insert_with(|| Direction {
+                chance: Chance::new(*seed, &packet.from, &packet.to),
+                loss: LossState::default(),
+                latest_nanos: BTreeMap::new(),
+            });
         let stream = label(packet.stream);
         let random = |purpose| direction.chance.of(purpose, stream, packet.sequence);
-        let message = SentMessage { bytes: packet.bytes, distance_m: packet.distance_m, sent_nanos: end_nanos };
-        let is_lost =
-            direction.loss.loses(&config.loss, config.loss_unit, &message, trace.as_ref(), &mut random(Purpose::Loss));
+        let message = SentMessage {
+            bytes: packet.bytes,
+            distance_m: packet.distance_m,
+            sent_nanos: end_nanos,
+        };
+        let is_lost = direction.loss.loses(
+            &config.loss,
+            config.loss_unit,
+            &message,
+            trace.as_ref(),
+            &mut random(Purpose::Loss),
+        );
         if is_lost || config.is_cut(start_nanos, end_nanos) {
             self.schedule(end_nanos, packet, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
-        let delay_nanos = config.delay.draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
+        let delay_nanos = config
+            .delay
+            .draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
         // No packet arrives before its last bit was sent, also with rounding.
-        let arrival_nanos = config.floored(packet.submitted_nanos, end_nanos.saturating_add(delay_nanos));
+        let arrival_nanos = config.floored(
+            packet.submitted_nanos,
+            end_nanos.saturating_add(delay_nanos),
+        );
         let mut arrival_nanos = arrival_nanos.max(end_nanos);
         if config.keep_order {
             let latest = direction.latest_nanos.entry(packet.stream).or_default();
@@ -251,15 +311,41 @@ impl LinkEmulator {
         if config.duplicate > 0.0 && twice.chance(config.duplicate) {
             let again_nanos = config.delay.draw(&mut twice, trace.as_ref(), &message);
             let copy_nanos = arrival_nanos.saturating_add(again_nanos);
-            self.schedule(arrival_nanos, packet.clone(), Delivery::Arrived { is_copy: false, is_repeated: true });
-            self.schedule(copy_nanos, packet, Delivery::Arrived { is_copy: true, is_repeated: false });
+            self.schedule(
+                arrival_nanos,
+                packet.clone(),
+                Delivery::Arrived {
+                    is_copy: false,
+                    is_repeated: true,
+                },
+            );
+            self.schedule(
+                copy_nanos,
+                packet,
+                Delivery::Arrived {
+                    is_copy: true,
+                    is_repeated: false,
+                },
+            );
             return;
         }
-        self.schedule(arrival_nanos, packet, Delivery::Arrived { is_copy: false, is_repeated: false });
+        self.schedule(
+            arrival_nanos,
+            packet,
+            Delivery::Arrived {
+                is_copy: false,
+                is_repeated: false,
+            },
+        );
     }
 
     fn schedule(&mut self, nanos: u64, packet: Packet, delivery: Delivery) {
-        self.under_way.push(Reverse(UnderWay { nanos, number: self.next, packet, delivery }));
+        self.under_way.push(Reverse(UnderWay {
+            nanos,
+            number: self.next,
+            packet,
+            delivery,
+        }));
         self.next += 1;
     }
 }
@@ -268,7 +354,9 @@ impl LinkConfig {
     /// True if an outage lies in an interval.
     fn is_cut(&self, start_nanos: u64, end_nanos: u64) -> bool {
         let nanos = |seconds: f64| nanos::of_ms(1e3 * seconds);
-        self.outages.iter().any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
+        self.outages
+            .iter()
+            .any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
     }
 
     /// Rounds the time since `submitted_nanos` down to whole steps, if the link has them.
@@ -286,12 +374,23 @@ fn rules<'a>(config: &'a LinkConfig, capacity: &'a Capacity) -> Rules<'a> {
         CapacityConfig::TokenBucket { burst_bytes, .. } => burst_bytes,
         _ => 0,
     };
-    Rules { capacity, burst_bytes, queue: &config.queue }
+    Rules {
+        capacity,
+        burst_bytes,
+        queue: &config.queue,
+    }
 }
 
 /// A number for a stream that does not depend on the order in which the streams are listed.
 fn label(stream: Stream) -> u64 {
-    derive_seed(0, &stream.to_string().bytes().map(u64::from).collect::<Vec<_>>())
+    derive_seed(
+        0,
+        &stream
+            .to_string()
+            .bytes()
+            .map(u64::from)
+            .collect::<Vec<_>>(),
+    )
 }
 
 #[cfg(test)]

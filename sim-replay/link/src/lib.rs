@@ -28,7 +28,14 @@
 
 // This crate reads what other processes and people wrote: an index or a cast that does not fit is an error there, not
 // a panic or another number.
-#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::indexing_slicing
+    )
+)]
 
 mod capacity;
 mod chance;
@@ -43,8 +50,8 @@ mod trace;
 mod trace_config;
 
 pub use config::{
-    CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, Outage, QueueConfig, QueueDrop,
-    ReorderConfig,
+    CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, Outage,
+    QueueConfig, QueueDrop, ReorderConfig,
 };
 pub use device_clock::{ClockStep, DeviceClock};
 pub use emulator::{Delivery, LinkEmulator, Outcome, Packet};

@@ -41,8 +41,15 @@ impl LossState {
             LossModel::None => false,
             LossModel::Bernoulli(share) => any(*share),
             LossModel::Distance(points) => any(interpolate(points, message.distance_m)),
-            LossModel::Trace => any(trace.and_then(|trace| trace.at(message.sent_nanos)).map_or(0.0, |step| step.loss)),
-            LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
+            LossModel::Trace => any(trace
+                .and_then(|trace| trace.at(message.sent_nanos))
+                .map_or(0.0, |step| step.loss)),
+            LossModel::GilbertElliott {
+                to_bad,
+                to_good,
+                loss_good,
+                loss_bad,
+            } => {
                 let mut is_lost = false;
                 for _ in 0..units {
                     let leaves = if self.is_bad { *to_good } else { *to_bad };
@@ -58,7 +65,10 @@ impl LossState {
 /// Linear interpolation through `points` at `x`, constant beyond both ends; 0 without points.
 fn interpolate(points: &[[f64; 2]], x: f64) -> f64 {
     let after = points.partition_point(|point| point[0] <= x);
-    match (after.checked_sub(1).and_then(|before| points.get(before)), points.get(after)) {
+    match (
+        after.checked_sub(1).and_then(|before| points.get(before)),
+        points.get(after),
+    ) {
         (None, None) => 0.0,
         (None, Some(&[_, y])) | (Some(&[_, y]), None) => y,
         (Some(&[x0, y0]), Some(&[x1, y1])) => y0 + (y1 - y0) * (x - x0) / (x1 - x0),
@@ -73,8 +83,13 @@ mod tests {
 
     fn losses(law: &LossModel, unit: LossUnit, bytes: u64, distance_m: f64) -> f64 {
         let mut state = LossState::default();
-        let message = SentMessage { bytes, distance_m, sent_nanos: 0 };
-        let lost = (0..COUNT).filter(|&k| state.loses(law, unit, &message, None, &mut SplitMix64::derived(7, &[k])));
+        let message = SentMessage {
+            bytes,
+            distance_m,
+            sent_nanos: 0,
+        };
+        let lost = (0..COUNT)
+            .filter(|&k| state.loses(law, unit, &message, None, &mut SplitMix64::derived(7, &[k])));
         lost.count() as f64 / COUNT as f64
     }
 
@@ -87,7 +102,10 @@ mod tests {
         for (bytes, fragments) in [(0, 1), (1, 1), (1400, 1), (1401, 2), (70_000, 50)] {
             let expected = 1.0 - 0.99f64.powi(fragments);
             let found = losses(&LossModel::Bernoulli(0.01), LossUnit::Fragment, bytes, 0.0);
-            assert!((found - expected).abs() < three_sigma(expected), "{bytes}: {found}, not {expected}");
+            assert!(
+                (found - expected).abs() < three_sigma(expected),
+                "{bytes}: {found}, not {expected}"
+            );
             let found = losses(&LossModel::Bernoulli(0.01), LossUnit::Message, bytes, 0.0);
             assert!((found - 0.01).abs() < three_sigma(0.01), "{found}");
         }
@@ -96,7 +114,12 @@ mod tests {
     #[test]
     fn the_chain_has_its_stationary_loss() {
         let (to_bad, to_good, loss_good, loss_bad) = (0.02, 0.1, 0.001, 0.7);
-        let law = LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad };
+        let law = LossModel::GilbertElliott {
+            to_bad,
+            to_good,
+            loss_good,
+            loss_bad,
+        };
         let bad = to_bad / (to_bad + to_good);
         let expected = bad * loss_bad + (1.0 - bad) * loss_good;
         // Neighbours are correlated: the variance of the mean grows by (1 + r) / (1 - r) for the part explained by the
@@ -106,17 +129,35 @@ mod tests {
         let within = expected * (1.0 - expected) - between;
         let sigma = ((between * (1.0 + r) / (1.0 - r) + within) / COUNT as f64).sqrt();
         let found = losses(&law, LossUnit::Message, 1000, 0.0);
-        assert!((found - expected).abs() < 3.0 * sigma, "{found}, not {expected} +- {sigma}");
+        assert!(
+            (found - expected).abs() < 3.0 * sigma,
+            "{found}, not {expected} +- {sigma}"
+        );
     }
 
     #[test]
     fn distance_is_interpolated() {
         let law = LossModel::Distance(vec![[50.0, 0.0], [150.0, 0.5]]);
-        for (distance_m, expected) in [(0.0, 0.0), (50.0, 0.0), (100.0, 0.25), (150.0, 0.5), (900.0, 0.5)] {
+        for (distance_m, expected) in [
+            (0.0, 0.0),
+            (50.0, 0.0),
+            (100.0, 0.25),
+            (150.0, 0.5),
+            (900.0, 0.5),
+        ] {
             let found = losses(&law, LossUnit::Message, 10, distance_m);
-            assert!((found - expected).abs() <= three_sigma(expected), "{distance_m}: {found}, not {expected}");
+            assert!(
+                (found - expected).abs() <= three_sigma(expected),
+                "{distance_m}: {found}, not {expected}"
+            );
         }
-        assert_eq!(losses(&LossModel::Distance(Vec::new()), LossUnit::Message, 10, 5.0), 0.0);
-        assert_eq!(losses(&LossModel::Bernoulli(1.0), LossUnit::Message, 10, 5.0), 1.0);
+        assert_eq!(
+            losses(&LossModel::Distance(Vec::new()), LossUnit::Message, 10, 5.0),
+            0.0
+        );
+        assert_eq!(
+            losses(&LossModel::Bernoulli(1.0), LossUnit::Message, 10, 5.0),
+            1.0
+        );
     }
 }

@@ -2,17 +2,34 @@
 
 use std::path::{Path, PathBuf};
 
-use super::config::{CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig};
+use super::config::{
+    CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig,
+};
 use support::bounded_file;
 
 /// Every preset with a one-line description.
 pub const PRESETS: [(&str, &str); 6] = [
     ("ideal", "everything arrives at once"),
-    ("opencood-sim", "OpenCOOD's constant delay of 100 ms, in whole frames"),
-    ("opencood-real", "OpenCOOD's 27 Mbit/s, 10 ms and up to 100 ms of overhead, in whole frames of 100 ms"),
-    ("dsrc", "802.11p at 6 Mbit/s, one channel for all, loss by distance"),
-    ("c-v2x", "LTE sidelink (PC5 mode 4) at 8 Mbit/s, one channel for all, 20 ms"),
-    ("5g-uu", "5G over a base station: 50 Mbit/s up for each, 20 ms with a long tail"),
+    (
+        "opencood-sim",
+        "OpenCOOD's constant delay of 100 ms, in whole frames",
+    ),
+    (
+        "opencood-real",
+        "OpenCOOD's 27 Mbit/s, 10 ms and up to 100 ms of overhead, in whole frames of 100 ms",
+    ),
+    (
+        "dsrc",
+        "802.11p at 6 Mbit/s, one channel for all, loss by distance",
+    ),
+    (
+        "c-v2x",
+        "LTE sidelink (PC5 mode 4) at 8 Mbit/s, one channel for all, 20 ms",
+    ),
+    (
+        "5g-uu",
+        "5G over a base station: 50 Mbit/s up for each, 20 ms with a long tail",
+    ),
 ];
 
 /// Largest file that is read, bytes.
@@ -34,9 +51,13 @@ impl LinkConfig {
             known: names.join(", "),
             source,
         })?;
-        let config: Self = serde_saphyr::from_str(&text)
-            .map_err(|source| LinkError::Yaml { path: path.clone(), source: Box::new(source) })?;
-        config.validate().map_err(|source| LinkError::in_file(name, source))?;
+        let config: Self = serde_saphyr::from_str(&text).map_err(|source| LinkError::Yaml {
+            path: path.clone(),
+            source: Box::new(source),
+        })?;
+        config
+            .validate()
+            .map_err(|source| LinkError::in_file(name, source))?;
         let folder = path.parent().unwrap_or(Path::new(".")).to_path_buf();
         Ok((config, folder))
     }
@@ -53,15 +74,30 @@ impl LinkConfig {
     /// # Errors
     /// [`LinkError::Preset`] lists the available names.
     pub fn preset(name: &str) -> Result<Self, LinkError> {
-        let shaped = |rate_mbps: f64, burst_bytes| CapacityConfig::TokenBucket { rate_mbps, burst_bytes };
-        let radio = QueueConfig { bytes: 1 << 20, keep_last: true, ..QueueConfig::default() };
+        let shaped = |rate_mbps: f64, burst_bytes| CapacityConfig::TokenBucket {
+            rate_mbps,
+            burst_bytes,
+        };
+        let radio = QueueConfig {
+            bytes: 1 << 20,
+            keep_last: true,
+            ..QueueConfig::default()
+        };
         Ok(match name {
             "ideal" => Self::default(),
             // OpenCOOD's `wild_setting`, async_mode `sim`: async_overhead 100 ms.
-            "opencood-sim" => Self { delay: DelayModel::ConstantMs(100.0), floor_ms: 100.0, ..Self::default() },
+            "opencood-sim" => Self {
+                delay: DelayModel::ConstantMs(100.0),
+                floor_ms: 100.0,
+                ..Self::default()
+            },
             // The same, async_mode `real`: transmission_speed 27 Mbit/s, backbone_delay 10 ms, U(0, async_overhead).
             "opencood-real" => Self {
-                delay: DelayModel::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 },
+                delay: DelayModel::BySize {
+                    overhead_ms: 100.0,
+                    rate_mbps: 27.0,
+                    fixed_ms: 10.0,
+                },
                 floor_ms: 100.0,
                 ..Self::default()
             },
@@ -95,14 +131,25 @@ impl LinkConfig {
             "5g-uu" => Self {
                 capacity: shaped(50.0, 64 << 10),
                 queue: radio,
-                delay: DelayModel::Lognormal { median_ms: 20.0, sigma: 0.35 },
+                delay: DelayModel::Lognormal {
+                    median_ms: 20.0,
+                    sigma: 0.35,
+                },
                 keep_order: true,
-                loss: LossModel::GilbertElliott { to_bad: 0.0005, to_good: 0.1, loss_good: 0.0, loss_bad: 0.3 },
+                loss: LossModel::GilbertElliott {
+                    to_bad: 0.0005,
+                    to_good: 0.1,
+                    loss_good: 0.0,
+                    loss_bad: 0.3,
+                },
                 ..Self::default()
             },
             _ => {
                 let known = PRESETS.map(|(name, _)| name).join(", ");
-                return Err(LinkError::Preset { name: name.chars().take(40).collect(), known });
+                return Err(LinkError::Preset {
+                    name: name.chars().take(40).collect(),
+                    known,
+                });
             }
         })
     }
@@ -117,9 +164,17 @@ mod tests {
         for (name, _) in PRESETS {
             let link = LinkConfig::preset(name).unwrap();
             link.validate().unwrap();
-            assert_eq!(serde_saphyr::from_str::<LinkConfig>(&link.to_yaml()).unwrap(), link, "{}", link.to_yaml());
+            assert_eq!(
+                serde_saphyr::from_str::<LinkConfig>(&link.to_yaml()).unwrap(),
+                link,
+                "{}",
+                link.to_yaml()
+            );
         }
         let message = LinkConfig::preset("6g").unwrap_err().to_string();
-        assert!(PRESETS.iter().all(|(name, _)| message.contains(name)), "{message}");
+        assert!(
+            PRESETS.iter().all(|(name, _)| message.contains(name)),
+            "{message}"
+        );
     }
 }

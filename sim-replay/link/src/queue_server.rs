@@ -33,9 +33,17 @@ struct Sending {
 #[derive(Debug, Clone)]
 pub(super) enum Departure {
     /// Times at which its first and its last bit were sent.
-    Sent { packet: Packet, start_nanos: u64, end_nanos: u64 },
+    Sent {
+        packet: Packet,
+        start_nanos: u64,
+        end_nanos: u64,
+    },
     /// The packet was dropped in the queue.
-    Dropped { packet: Packet, reason: DropReason, nanos: u64 },
+    Dropped {
+        packet: Packet,
+        reason: DropReason,
+        nanos: u64,
+    },
 }
 
 /// Parameters of a queue.
@@ -51,7 +59,11 @@ impl QueueServer {
     pub(super) fn submit(&mut self, packet: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
         let nanos = packet.submitted_nanos;
         if *rules.capacity == Capacity::Unlimited {
-            left.push(Departure::Sent { packet, start_nanos: nanos, end_nanos: nanos });
+            left.push(Departure::Sent {
+                packet,
+                start_nanos: nanos,
+                end_nanos: nanos,
+            });
             return;
         }
         if self.sending.is_none() {
@@ -65,14 +77,25 @@ impl QueueServer {
         if rules.queue.keep_last {
             self.supersede(&packet, left);
         }
-        let is_full = |line: &Self| line.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes;
+        let is_full =
+            |line: &Self| line.waiting_bytes.saturating_add(packet.bytes) > rules.queue.bytes;
         while rules.queue.drop == QueueDrop::Head && is_full(self) {
-            let Some(oldest) = self.waiting.pop_front() else { break };
+            let Some(oldest) = self.waiting.pop_front() else {
+                break;
+            };
             self.waiting_bytes -= oldest.bytes;
-            left.push(Departure::Dropped { packet: oldest, reason: DropReason::LinkQueue, nanos });
+            left.push(Departure::Dropped {
+                packet: oldest,
+                reason: DropReason::LinkQueue,
+                nanos,
+            });
         }
         if is_full(self) {
-            left.push(Departure::Dropped { packet, reason: DropReason::LinkQueue, nanos });
+            left.push(Departure::Dropped {
+                packet,
+                reason: DropReason::LinkQueue,
+                nanos,
+            });
             return;
         }
         self.waiting_bytes += packet.bytes;
@@ -81,10 +104,28 @@ impl QueueServer {
 
     /// Advances to `nanos`; the packets sent by then are added to `left`, in that order.
     pub(super) fn advance(&mut self, nanos: u64, rules: &Rules<'_>, left: &mut Vec<Departure>) {
-        while let Some((end_nanos, is_urgent)) = self.next(rules).filter(|(end_nanos, _)| *end_nanos <= nanos) {
-            let sent = if is_urgent { self.urgent.pop_front() } else { self.sending.take() };
-            let Some(Sending { packet, start_nanos, .. }) = sent else { return };
-            left.push(Departure::Sent { packet, start_nanos, end_nanos });
+        while let Some((end_nanos, is_urgent)) = self
+            .next(rules)
+            .filter(|(end_nanos, _)| *end_nanos <= nanos)
+        {
+            let sent = if is_urgent {
+                self.urgent.pop_front()
+            } else {
+                self.sending.take()
+            };
+            let Some(Sending {
+                packet,
+                start_nanos,
+                ..
+            }) = sent
+            else {
+                return;
+            };
+            left.push(Departure::Sent {
+                packet,
+                start_nanos,
+                end_nanos,
+            });
             if !is_urgent && let Some(next) = self.waiting.pop_front() {
                 self.waiting_bytes -= next.bytes;
                 self.send(next, end_nanos, rules);
@@ -99,9 +140,18 @@ impl QueueServer {
 
     /// The same, with true for an urgent packet.
     fn next(&self, rules: &Rules<'_>) -> Option<(u64, bool)> {
-        let end = |sending: &Sending| rules.capacity.time_of(sending.end).map(|nanos| nanos.max(sending.start_nanos));
+        let end = |sending: &Sending| {
+            rules
+                .capacity
+                .time_of(sending.end)
+                .map(|nanos| nanos.max(sending.start_nanos))
+        };
         let urgent = self.urgent.front().and_then(end).map(|nanos| (nanos, true));
-        let usual = self.sending.as_ref().and_then(end).map(|nanos| (nanos, false));
+        let usual = self
+            .sending
+            .as_ref()
+            .and_then(end)
+            .map(|nanos| (nanos, false));
         match (urgent, usual) {
             (Some(urgent), Some(usual)) => Some(if urgent.0 <= usual.0 { urgent } else { usual }),
             (urgent, usual) => urgent.or(usual),
@@ -110,9 +160,16 @@ impl QueueServer {
 
     fn send(&mut self, packet: Packet, nanos: u64, rules: &Rules<'_>) {
         // Capacity unused before now is lost, except for the burst.
-        let idle = rules.capacity.done_by(nanos).saturating_sub(work(rules.burst_bytes));
+        let idle = rules
+            .capacity
+            .done_by(nanos)
+            .saturating_sub(work(rules.burst_bytes));
         self.used = self.used.max(idle) + work(packet.bytes);
-        self.sending = Some(Sending { packet, start_nanos: nanos, end: self.used });
+        self.sending = Some(Sending {
+            packet,
+            start_nanos: nanos,
+            end: self.used,
+        });
     }
 
     /// Inserts an urgent packet: the end of the packet being sent is delayed by its duration.
@@ -124,16 +181,28 @@ impl QueueServer {
         if let Some(sending) = &mut self.sending {
             sending.end += added;
         }
-        self.urgent.push_back(Sending { packet, start_nanos: nanos, end: self.urgent_used });
+        self.urgent.push_back(Sending {
+            packet,
+            start_nanos: nanos,
+            end: self.urgent_used,
+        });
     }
 
     fn supersede(&mut self, newer: &Packet, left: &mut Vec<Departure>) {
-        let is_same = |other: &Packet| (&other.from, &other.to, other.stream) == (&newer.from, &newer.to, newer.stream);
+        let is_same = |other: &Packet| {
+            (&other.from, &other.to, other.stream) == (&newer.from, &newer.to, newer.stream)
+        };
         while let Some(place) = self.waiting.iter().position(is_same) {
-            let Some(older) = self.waiting.remove(place) else { return };
+            let Some(older) = self.waiting.remove(place) else {
+                return;
+            };
             self.waiting_bytes -= older.bytes;
             let nanos = newer.submitted_nanos;
-            left.push(Departure::Dropped { packet: older, reason: DropReason::Superseded, nanos });
+            left.push(Departure::Dropped {
+                packet: older,
+                reason: DropReason::Superseded,
+                nanos,
+            });
         }
     }
 }

@@ -82,23 +82,38 @@ impl Trace {
         for row in CsvFile::read(path, HEADER, MAX_FILE_BYTES)?.rows() {
             let row = row.complete()?;
             let step = step(&row)?;
-            let is_later =
-                steps.last().map_or(step.from_nanos <= offset_nanos, |last| step.from_nanos > last.from_nanos);
+            let is_later = steps
+                .last()
+                .map_or(step.from_nanos <= offset_nanos, |last| {
+                    step.from_nanos > last.from_nanos
+                });
             if !is_later {
                 let must = "later than the line before, the first at offset_s (0) or before";
                 return Err(row.wrong(0, must).into());
             }
             steps.push(step);
         }
-        let is_past = steps.last().is_some_and(|last| last.from_nanos < offset_nanos);
+        let is_past = steps
+            .last()
+            .is_some_and(|last| last.from_nanos < offset_nanos);
         if is_past {
-            return Err(TraceError::Past { path: path.to_owned(), offset_s: offset_nanos as f64 * 1e-9 });
+            return Err(TraceError::Past {
+                path: path.to_owned(),
+                offset_s: offset_nanos as f64 * 1e-9,
+            });
         }
-        let begin = steps.partition_point(|step| step.from_nanos <= offset_nanos).saturating_sub(1);
-        let shifted = |step: &Step| Step { from_nanos: step.from_nanos.saturating_sub(offset_nanos), ..*step };
+        let begin = steps
+            .partition_point(|step| step.from_nanos <= offset_nanos)
+            .saturating_sub(1);
+        let shifted = |step: &Step| Step {
+            from_nanos: step.from_nanos.saturating_sub(offset_nanos),
+            ..*step
+        };
         match steps.get(begin..) {
             Some(left @ [_, ..]) => Ok(Self::Steps(left.iter().map(shifted).collect())),
-            _ => Err(TraceError::Empty { path: path.to_owned() }),
+            _ => Err(TraceError::Empty {
+                path: path.to_owned(),
+            }),
         }
     }
 
@@ -108,15 +123,32 @@ impl Trace {
     /// [`TraceError`] with the file and the line.
     pub fn read_mahimahi(path: &Path) -> Result<Self, TraceError> {
         let mut times = Vec::new();
-        for (index, line) in read(path)?.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
-            let time = line.trim().parse::<u64>().ok().and_then(|ms| ms.checked_mul(1_000_000));
+        for (index, line) in read(path)?
+            .lines()
+            .enumerate()
+            .filter(|(_, line)| !line.trim().is_empty())
+        {
+            let time = line
+                .trim()
+                .parse::<u64>()
+                .ok()
+                .and_then(|ms| ms.checked_mul(1_000_000));
             match time {
                 Some(time) if times.last().is_none_or(|&last| time >= last) => times.push(time),
-                _ => return Err(wrong(path, index, line, "whole milliseconds, not before the line above")),
+                _ => {
+                    return Err(wrong(
+                        path,
+                        index,
+                        line,
+                        "whole milliseconds, not before the line above",
+                    ));
+                }
             }
         }
         match times.last() {
-            None => Err(TraceError::Empty { path: path.to_owned() }),
+            None => Err(TraceError::Empty {
+                path: path.to_owned(),
+            }),
             // The length of a trace is its last time: one that ends at 0 would deliver everything at once.
             Some(0) => Err(wrong(path, times.len() - 1, "0", "a last line above 0")),
             Some(_) => Ok(Self::Opportunities(times)),
@@ -126,7 +158,11 @@ impl Trace {
     /// The step at a time; `None` for opportunities.
     pub(super) fn at(&self, nanos: u64) -> Option<&Step> {
         match self {
-            Self::Steps(steps) => steps.get(steps.partition_point(|step| step.from_nanos <= nanos).saturating_sub(1)),
+            Self::Steps(steps) => steps.get(
+                steps
+                    .partition_point(|step| step.from_nanos <= nanos)
+                    .saturating_sub(1),
+            ),
             Self::Opportunities(_) => None,
         }
     }
@@ -144,11 +180,19 @@ fn step(row: &CsvRow<'_>) -> Result<Step, CsvError> {
 }
 
 fn read(path: &Path) -> Result<String, CsvError> {
-    bounded_file::read_text(path, MAX_FILE_BYTES).map_err(|source| CsvError::Io { path: path.to_owned(), source })
+    bounded_file::read_text(path, MAX_FILE_BYTES).map_err(|source| CsvError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 fn wrong(path: &Path, index: usize, found: &str, must: &'static str) -> TraceError {
-    TraceError::Line { path: path.to_owned(), line: index + 1, found: excerpt(found, 80), must }
+    TraceError::Line {
+        path: path.to_owned(),
+        line: index + 1,
+        found: excerpt(found, 80),
+        must,
+    }
 }
 
 #[cfg(test)]
@@ -167,7 +211,10 @@ mod tests {
         let (_folder, path) = file("time_s,rate_mbps,delay_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
         let trace = Trace::read_csv(&path, 0).unwrap();
         let rate = |seconds: f64| trace.at((seconds * 1e9) as u64).unwrap().bits_per_s;
-        assert_eq!([rate(0.0), rate(2.499), rate(2.5), rate(900.0)], [27_000_000, 27_000_000, 1_500_000, 1_500_000]);
+        assert_eq!(
+            [rate(0.0), rate(2.499), rate(2.5), rate(900.0)],
+            [27_000_000, 27_000_000, 1_500_000, 1_500_000]
+        );
     }
 
     #[test]
@@ -175,16 +222,27 @@ mod tests {
         let text = "time_s,rate_mbps,delay_ms,loss\n10,27,10,0\n12.5,1.5,40,0.1\n20,6,5,0\n";
         let (_folder, path) = file(text);
         let steps = |offset_s: f64| match Trace::read_csv(&path, (offset_s * 1e9) as u64) {
-            Ok(Trace::Steps(steps)) => {
-                Ok(steps.iter().map(|step| (step.from_nanos as f64 * 1e-9, step.bits_per_s)).collect::<Vec<_>>())
-            }
+            Ok(Trace::Steps(steps)) => Ok(steps
+                .iter()
+                .map(|step| (step.from_nanos as f64 * 1e-9, step.bits_per_s))
+                .collect::<Vec<_>>()),
             other => Err(other.unwrap_err().to_string()),
         };
-        assert_eq!(steps(10.0).unwrap(), [(0.0, 27_000_000), (2.5, 1_500_000), (10.0, 6_000_000)]);
+        assert_eq!(
+            steps(10.0).unwrap(),
+            [(0.0, 27_000_000), (2.5, 1_500_000), (10.0, 6_000_000)]
+        );
         assert_eq!(steps(13.0).unwrap(), [(0.0, 1_500_000), (7.0, 6_000_000)]);
         assert_eq!(steps(20.0).unwrap(), [(0.0, 6_000_000)]);
-        assert!(steps(9.0).unwrap_err().contains("trace.txt:2:"), "it has not begun");
-        assert!(steps(20.5).unwrap_err().contains("offset_s is 20.5, behind the last line"));
+        assert!(
+            steps(9.0).unwrap_err().contains("trace.txt:2:"),
+            "it has not begun"
+        );
+        assert!(
+            steps(20.5)
+                .unwrap_err()
+                .contains("offset_s is 20.5, behind the last line")
+        );
     }
 
     #[test]
@@ -207,10 +265,18 @@ mod tests {
             Err(TraceError::Csv(CsvError::Io { .. }))
         ));
         let (_folder, path) = file("time,rate\n");
-        assert!(Trace::read_csv(&path, 0).unwrap_err().to_string().contains("header"));
+        assert!(
+            Trace::read_csv(&path, 0)
+                .unwrap_err()
+                .to_string()
+                .contains("header")
+        );
         let (_folder, path) = file("2\n5\n3\n");
         let message = Trace::read_mahimahi(&path).unwrap_err().to_string();
-        assert!(message.contains("trace.txt:3: \"3\"") && message.contains("not before the line above"), "{message}");
+        assert!(
+            message.contains("trace.txt:3: \"3\"") && message.contains("not before the line above"),
+            "{message}"
+        );
         for text in ["x\n", "-1\n", "0\n0\n", ""] {
             let (_folder, path) = file(text);
             assert!(Trace::read_mahimahi(&path).is_err(), "{text:?}");

@@ -22,7 +22,10 @@ impl TraceConfig {
     /// A trace from its beginning on.
     #[must_use]
     pub fn new(path: &Path) -> Self {
-        Self { path: path.to_owned(), offset_s: 0.0 }
+        Self {
+            path: path.to_owned(),
+            offset_s: 0.0,
+        }
     }
 
     /// [`Self::offset_s`] in nanoseconds.
@@ -91,11 +94,30 @@ mod tests {
     #[test]
     fn a_path_without_offset_begins_at_the_beginning() {
         let read = |text: &str| serde_saphyr::from_str::<TraceConfig>(text);
-        assert_eq!(read("link.csv").unwrap(), TraceConfig::new(Path::new("link.csv")));
-        let later = TraceConfig { offset_s: 90.5, ..TraceConfig::new(Path::new("link.csv")) };
+        assert_eq!(
+            read("link.csv").unwrap(),
+            TraceConfig::new(Path::new("link.csv"))
+        );
+        let later = TraceConfig {
+            offset_s: 90.5,
+            ..TraceConfig::new(Path::new("link.csv"))
+        };
         assert_eq!(read("{path: link.csv, offset_s: 90.5}").unwrap(), later);
-        assert_eq!(read(&serde_json::to_string(&later).unwrap()).unwrap(), later);
-        assert!(read("{path: link.csv, ofset_s: 1}").unwrap_err().to_string().contains("ofset_s"));
-        assert!(read("{offset_s: 1}").unwrap_err().to_string().contains("path"));
+        assert_eq!(
+            read(&serde_json::to_string(&later).unwrap()).unwrap(),
+            later
+        );
+        assert!(
+            read("{path: link.csv, ofset_s: 1}")
+                .unwrap_err()
+                .to_string()
+                .contains("ofset_s")
+        );
+        assert!(
+            read("{offset_s: 1}")
+                .unwrap_err()
+                .to_string()
+                .contains("path")
+        );
     }
 }

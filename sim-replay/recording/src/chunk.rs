@@ -59,7 +59,9 @@ impl Channels {
 
     /// The message of a record; `None` if its channel is not described anywhere.
     pub(super) fn message(&self, record: &[u8]) -> McapResult<Option<Message<'static>>> {
-        let Record::Message { header, data } = parse_record(op::MESSAGE, record)? else { return Ok(None) };
+        let Record::Message { header, data } = parse_record(op::MESSAGE, record)? else {
+            return Ok(None);
+        };
         Ok(self.get(header.channel_id).map(|channel| Message {
             channel,
             sequence: header.sequence,
@@ -85,16 +87,26 @@ fn add(channels: &mut ChannelAccumulator<'static>, opcode: u8, data: &[u8]) -> M
 /// The summary of a complete file, after its checksum was verified.
 fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     let end_len = (RECORD_HEAD + FOOTER_LEN + MAGIC.len()) as u64;
-    let Some(footer_begin) = size.checked_sub(end_len) else { return Ok(None) };
+    let Some(footer_begin) = size.checked_sub(end_len) else {
+        return Ok(None);
+    };
     let mut end = [0; RECORD_HEAD + FOOTER_LEN + MAGIC.len()];
     file.read_exact_at(&mut end, footer_begin)?;
     let (head, rest) = end.split_at(RECORD_HEAD);
     let (footer, magic) = rest.split_at(FOOTER_LEN);
-    let number =
-        |at: usize| footer.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u64::from_le_bytes(*bytes));
+    let number = |at: usize| {
+        footer
+            .get(at..)
+            .and_then(<[u8]>::first_chunk)
+            .map_or(0, |bytes| u64::from_le_bytes(*bytes))
+    };
     let begin = number(0);
-    let len = footer_begin.checked_sub(begin).filter(|len| begin > 0 && *len <= MAX_SUMMARY_BYTES);
-    let Some(len) = len.filter(|_| head.first() == Some(&op::FOOTER) && magic == MAGIC) else { return Ok(None) };
+    let len = footer_begin
+        .checked_sub(begin)
+        .filter(|len| begin > 0 && *len <= MAX_SUMMARY_BYTES);
+    let Some(len) = len.filter(|_| head.first() == Some(&op::FOOTER) && magic == MAGIC) else {
+        return Ok(None);
+    };
     let mut summary = vec![0; usize::try_from(len).unwrap_or_default()];
     file.read_exact_at(&mut summary, begin)?;
     let mut crc = crc32fast::Hasher::new();
@@ -107,10 +119,15 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
 
 /// The messages of a chunk, after its checksum was verified, and the number of those whose channel is not described
 /// anywhere; its channels are added to `channels`.
-pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<(Vec<Message<'static>>, usize)> {
+pub(super) fn unpack(
+    body: &[u8],
+    channels: &mut Channels,
+) -> McapResult<(Vec<Message<'static>>, usize)> {
     lengths::check(op::CHUNK, body)?;
     let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
-    let options = LinearReaderOptions::default().with_skip_start_magic(true).with_prevalidate_chunk_crcs(true);
+    let options = LinearReaderOptions::default()
+        .with_skip_start_magic(true)
+        .with_prevalidate_chunk_crcs(true);
     let (mut messages, mut orphans, mut unpacked_bytes) = (Vec::new(), 0, 0);
     for_each_record(head.chain(body), options, |opcode, data| {
         unpacked_bytes += data.len();
@@ -144,15 +161,19 @@ fn for_each_record(
     options: LinearReaderOptions,
     mut visit: impl FnMut(u8, &[u8]) -> McapResult<ControlFlow<()>>,
 ) -> McapResult<()> {
-    let options = options.with_record_length_limit(MAX_RECORD_BYTES).with_skip_end_magic(true);
+    let options = options
+        .with_record_length_limit(MAX_RECORD_BYTES)
+        .with_skip_end_magic(true);
     let mut reader = LinearReader::new_with_options(options);
     while let Some(event) = reader.next_event() {
         match event? {
-            LinearReadEvent::ReadRequest(wanted) => match source.read(reader.insert(wanted.min(READ_BYTES))) {
-                Ok(count) => reader.notify_read(count),
-                Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) => return Err(error.into()),
-            },
+            LinearReadEvent::ReadRequest(wanted) => {
+                match source.read(reader.insert(wanted.min(READ_BYTES))) {
+                    Ok(count) => reader.notify_read(count),
+                    Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                    Err(error) => return Err(error.into()),
+                }
+            }
             LinearReadEvent::Record { opcode, data } => {
                 if visit(opcode, data)?.is_break() {
                     return Ok(());

@@ -22,8 +22,17 @@ pub struct Damage {
 
 impl fmt::Display for Damage {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { begin_bytes, lost_bytes, from_s, to_s, reason } = self;
-        write!(f, "{lost_bytes} bytes from byte {begin_bytes} on are lost, ")?;
+        let Self {
+            begin_bytes,
+            lost_bytes,
+            from_s,
+            to_s,
+            reason,
+        } = self;
+        write!(
+            f,
+            "{lost_bytes} bytes from byte {begin_bytes} on are lost, "
+        )?;
         match (from_s, to_s) {
             (Some(from), Some(to)) => write!(f, "from {from:.1} s to {to:.1} s")?,
             (Some(from), None) => write!(f, "from {from:.1} s on")?,

@@ -43,10 +43,17 @@ pub enum RecordingError {
 
 impl RecordingError {
     pub(super) fn io(path: &Path, source: std::io::Error) -> Self {
-        Self::Io { path: path.into(), source }
+        Self::Io {
+            path: path.into(),
+            source,
+        }
     }
 
     pub(super) fn malformed(path: &Path, offset: u64, reason: impl Into<String>) -> Self {
-        Self::Malformed { path: path.into(), offset, reason: reason.into() }
+        Self::Malformed {
+            path: path.into(),
+            offset,
+            reason: reason.into(),
+        }
     }
 }

@@ -7,7 +7,9 @@ use protocol::{CavId, Topic};
 use ros2::{Mount, Translator};
 use serde::Serialize;
 
-use super::{Contents, Damage, Entry, Recording, RecordingError, RecordingOptions, RecordingWriter};
+use super::{
+    Contents, Damage, Entry, Recording, RecordingError, RecordingOptions, RecordingWriter,
+};
 
 /// Times of the messages in a bag.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -49,15 +51,28 @@ pub fn export_ros2(
         ExportTimes::Capture => Some(entry.header.stamp.capture_nanos),
         ExportTimes::Arrival => Some(entry.arrived_nanos),
     };
-    let wanted: Vec<&Entry> = recording.entries().iter().filter(|entry| Translator::wants(&entry.key.topic)).collect();
+    let wanted: Vec<&Entry> = recording
+        .entries()
+        .iter()
+        .filter(|entry| Translator::wants(&entry.key.topic))
+        .collect();
     let timed = in_order(&wanted, nanos);
     if timed.is_empty() {
         let reason = "it holds no message that can be read and that ROS 2 has a type for; recordings of other versions of this program cannot be read";
-        return Err(RecordingError::NotOurs { path: from.into(), reason: reason.into() });
+        return Err(RecordingError::NotOurs {
+            path: from.into(),
+            reason: reason.into(),
+        });
     }
-    let options = RecordingOptions { zstd_level, contents: Contents::Ros2 };
+    let options = RecordingOptions {
+        zstd_level,
+        contents: Contents::Ros2,
+    };
     let mut writer = RecordingWriter::create(to, options)?;
-    let vehicles: BTreeSet<CavId> = wanted.iter().filter_map(|entry| vehicle(&entry.key.topic)).collect();
+    let vehicles: BTreeSet<CavId> = wanted
+        .iter()
+        .filter_map(|entry| vehicle(&entry.key.topic))
+        .collect();
     if let Some((first, _)) = timed.first().filter(|_| !vehicles.is_empty()) {
         writer.write_static_transforms(*first, &vehicles, mount)?;
     }
@@ -67,11 +82,18 @@ pub fn export_ros2(
     writer.finish()?;
     let messages = writer.whole_messages();
     let left_out = (recording.entries().len() as u64).saturating_sub(messages);
-    Ok(ExportReport { messages, left_out, damage: recording.damage().to_vec() })
+    Ok(ExportReport {
+        messages,
+        left_out,
+        damage: recording.damage().to_vec(),
+    })
 }
 
 /// Entries by time. One without a time of its own gets that of the entry before it.
-fn in_order<'a>(entries: &[&'a Entry], nanos: impl Fn(&Entry) -> Option<u64>) -> Vec<(u64, &'a Entry)> {
+fn in_order<'a>(
+    entries: &[&'a Entry],
+    nanos: impl Fn(&Entry) -> Option<u64>,
+) -> Vec<(u64, &'a Entry)> {
     let first = entries.iter().find_map(|entry| nanos(entry)).unwrap_or(0);
     let mut latest = first;
     let timed = entries.iter().map(|entry| {

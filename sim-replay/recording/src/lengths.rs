@@ -25,7 +25,11 @@ pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
     let fits = match opcode {
         op::CHUNK => chunk_fits(record),
         // Its number; name and encoding.
-        op::SCHEMA => record.get(2..).and_then(text).and_then(|(_, rest)| text(rest)).map(|_| ()),
+        op::SCHEMA => record
+            .get(2..)
+            .and_then(text)
+            .and_then(|(_, rest)| text(rest))
+            .map(|_| ()),
         op::CHANNEL => channel_fits(record),
         _ => Some(()),
     };
@@ -49,7 +53,10 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
         op::CHUNK => texts(CHUNK_HEAD, 1).and_then(long),
         op::MESSAGE_INDEX => texts(2, 1),
         // The contents are followed by their checksum.
-        op::ATTACHMENT => texts(16, 2).and_then(long).filter(|rest| rest.len() == 4).map(|_| [].as_slice()),
+        op::ATTACHMENT => texts(16, 2)
+            .and_then(long)
+            .filter(|rest| rest.len() == 4)
+            .map(|_| [].as_slice()),
         op::DATA_END => record.get(DATA_END_LEN..),
         _ => None,
     };
@@ -58,10 +65,15 @@ pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
 
 /// True if a chunk of `len` bytes begins here: its compression is known, and its records fill the rest.
 pub(super) fn is_chunk_head(bytes: &[u8], len: u64) -> bool {
-    let Some((compression, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else { return false };
-    let Some((&records_len, _)) = rest.split_first_chunk() else { return false };
+    let Some((compression, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else {
+        return false;
+    };
+    let Some((&records_len, _)) = rest.split_first_chunk() else {
+        return false;
+    };
     let head_len = (CHUNK_HEAD + 4 + compression.len() + 8) as u64;
-    COMPRESSIONS.contains(&compression) && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)
+    COMPRESSIONS.contains(&compression)
+        && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)
 }
 
 /// The channel of a message, and its payload.
@@ -73,7 +85,10 @@ pub(super) fn message(record: &[u8]) -> Option<(u16, &[u8])> {
 /// The length of a message of this program, from its header; `None` without a valid header.
 pub(super) fn own_message(payload: &[u8]) -> Option<u64> {
     let header = wire::decode_header([payload]).ok()?;
-    header.body_len.checked_add(u64::from(header.metadata_len))?.checked_add(HEADER_LEN as u64)
+    header
+        .body_len
+        .checked_add(u64::from(header.metadata_len))?
+        .checked_add(HEADER_LEN as u64)
 }
 
 fn chunk_fits(chunk: &[u8]) -> Option<()> {
@@ -132,19 +147,51 @@ mod tests {
             (op::SCHEMA, [&[0; 2][..], &word, &word].concat(), true),
             (op::SCHEMA, [&[0; 2][..], &word, &long].concat(), false),
             (op::SCHEMA, vec![0], false),
-            (op::CHANNEL, [&[0; 4][..], &word, &word, &pair].concat(), true),
+            (
+                op::CHANNEL,
+                [&[0; 4][..], &word, &word, &pair].concat(),
+                true,
+            ),
             (op::CHANNEL, [&[0; 4][..], &long, &[0; 9]].concat(), true),
-            (op::CHANNEL, [&[0; 4][..], &word, &word, &broken_pair].concat(), false),
-            (op::CHANNEL, [&[0; 4][..], &word, &with_len(b"", 1 << 31)].concat(), false),
+            (
+                op::CHANNEL,
+                [&[0; 4][..], &word, &word, &broken_pair].concat(),
+                false,
+            ),
+            (
+                op::CHANNEL,
+                [&[0; 4][..], &word, &with_len(b"", 1 << 31)].concat(),
+                false,
+            ),
             (op::CHUNK, chunk(&with_len(b"", 1 << 31), 0, b""), false),
-            (op::CHUNK, chunk(&with_len(b"zstd", 4), 8, b"anything"), true),
-            (op::CHUNK, chunk(&with_len(b"zstd", 4), 9, b"anything"), false),
-            (op::CHUNK, chunk(&with_len(b"", 0), 10, &[5, 1, 0, 0, 0, 0, 0, 0, 0, 7]), true),
-            (op::CHUNK, chunk(&with_len(b"", 0), 10, &[5, 2, 0, 0, 0, 0, 0, 0, 0, 7]), false),
+            (
+                op::CHUNK,
+                chunk(&with_len(b"zstd", 4), 8, b"anything"),
+                true,
+            ),
+            (
+                op::CHUNK,
+                chunk(&with_len(b"zstd", 4), 9, b"anything"),
+                false,
+            ),
+            (
+                op::CHUNK,
+                chunk(&with_len(b"", 0), 10, &[5, 1, 0, 0, 0, 0, 0, 0, 0, 7]),
+                true,
+            ),
+            (
+                op::CHUNK,
+                chunk(&with_len(b"", 0), 10, &[5, 2, 0, 0, 0, 0, 0, 0, 0, 7]),
+                false,
+            ),
             (op::MESSAGE, vec![], true),
         ];
         for (opcode, record, is_sound) in cases {
-            assert_eq!(check(opcode, &record).is_ok(), is_sound, "{opcode} {record:?}");
+            assert_eq!(
+                check(opcode, &record).is_ok(),
+                is_sound,
+                "{opcode} {record:?}"
+            );
         }
     }
 }

@@ -74,23 +74,50 @@ impl Recording {
     /// [`RecordingError`] if the file cannot be read or is no recording of this program.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let io = |source| RecordingError::io(path, source);
-        let not_ours = |reason| RecordingError::NotOurs { path: path.into(), reason };
+        let not_ours = |reason| RecordingError::NotOurs {
+            path: path.into(),
+            reason,
+        };
         let file = File::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
-        let mut records = Records::open(&file, size).map_err(io)?.ok_or_else(|| not_ours("not an MCAP file".into()))?;
-        let mut contents = Contents { channels: Channels::of_summary(&file, size).map_err(io)?, ..Contents::default() };
+        let mut records = Records::open(&file, size)
+            .map_err(io)?
+            .ok_or_else(|| not_ours("not an MCAP file".into()))?;
+        let mut contents = Contents {
+            channels: Channels::of_summary(&file, size).map_err(io)?,
+            ..Contents::default()
+        };
         contents.look_through(&mut records, size).map_err(io)?;
         let damage = contents.damage();
-        let Contents { channels, has_any, has_own, holders, entries, .. } = contents;
+        let Contents {
+            channels,
+            has_any,
+            has_own,
+            holders,
+            entries,
+            ..
+        } = contents;
         if !has_own {
-            let what = damage.first().map_or(String::new(), |damage| format!("; {damage}"));
+            let what = damage
+                .first()
+                .map_or(String::new(), |damage| format!("; {damage}"));
             return Err(not_ours(match has_any || damage.is_empty() {
                 true => format!("no channel of encoding {OWN_ENCODING:?} in it{what}"),
                 false => format!("none of its messages can be read{what}"),
             }));
         }
-        let unpacked = Mutex::new(Unpacked { channels, kept: VecDeque::new() });
-        Ok(Self { path: path.into(), file, holders, entries, damage, unpacked })
+        let unpacked = Mutex::new(Unpacked {
+            channels,
+            kept: VecDeque::new(),
+        });
+        Ok(Self {
+            path: path.into(),
+            file,
+            holders,
+            entries,
+            damage,
+            unpacked,
+        })
     }
 
     /// The file.
@@ -117,7 +144,9 @@ impl Recording {
     /// [`RecordingError`] if the file has changed since it was opened.
     pub fn read(&self, entry: &Entry) -> Result<Vec<u8>, RecordingError> {
         let messages = self.messages(entry.holder)?;
-        let message = messages.get(entry.place).ok_or_else(|| self.changed(entry.holder, "the file has changed"))?;
+        let message = messages
+            .get(entry.place)
+            .ok_or_else(|| self.changed(entry.holder, "the file has changed"))?;
         Ok(message.data.to_vec())
     }
 
@@ -127,7 +156,11 @@ impl Recording {
     }
 
     fn changed(&self, holder: usize, reason: impl Into<String>) -> RecordingError {
-        RecordingError::malformed(&self.path, self.holders.get(holder).map_or(0, |holder| holder.begin), reason)
+        RecordingError::malformed(
+            &self.path,
+            self.holders.get(holder).map_or(0, |holder| holder.begin),
+            reason,
+        )
     }
 
     fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
@@ -135,15 +168,25 @@ impl Recording {
         if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
             return Ok(Arc::clone(messages));
         }
-        let Some(&Holder { begin, len, is_chunk }) = self.holders.get(holder) else {
+        let Some(&Holder {
+            begin,
+            len,
+            is_chunk,
+        }) = self.holders.get(holder)
+        else {
             return Err(self.changed(holder, "there is no such chunk"));
         };
         let mut body = vec![0; len];
-        let read = self.file.read_exact_at(&mut body, begin + RECORD_HEAD as u64);
+        let read = self
+            .file
+            .read_exact_at(&mut body, begin + RECORD_HEAD as u64);
         read.map_err(|source| RecordingError::io(&self.path, source))?;
         let messages = match is_chunk {
             true => unpack(&body, &mut unpacked.channels).map(|(messages, _)| messages),
-            false => unpacked.channels.message(&body).map(|message| message.into_iter().collect()),
+            false => unpacked
+                .channels
+                .message(&body)
+                .map(|message| message.into_iter().collect()),
         };
         let messages = Arc::new(messages.map_err(|error| self.changed(holder, in_words(error)))?);
         unpacked.kept.truncate(KEPT_CHUNKS - 1);
@@ -200,7 +243,11 @@ impl Contents {
                 }
                 Err(reason) => {
                     let has_chunks = self.has_chunks();
-                    let is_own = |id| self.channels.get(id).is_some_and(|channel| is_own(&channel.message_encoding));
+                    let is_own = |id| {
+                        self.channels
+                            .get(id)
+                            .is_some_and(|channel| is_own(&channel.message_encoding))
+                    };
                     records.seek(begin + 1, |id| !has_chunks && is_own(id))?;
                     self.lose((begin, records.at()), reason);
                 }
@@ -216,7 +263,11 @@ impl Contents {
 
     /// Processes the next record of the file; ends with the checksum of the data section.
     fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
-        let RawRecord { begin, opcode, body } = *record;
+        let RawRecord {
+            begin,
+            opcode,
+            body,
+        } = *record;
         let added = match opcode {
             op::DATA_END => {
                 let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
@@ -224,7 +275,14 @@ impl Contents {
             }
             op::CHUNK => {
                 let (messages, orphans) = unpack(body, &mut self.channels).map_err(in_words)?;
-                self.add(Holder { begin, len: body.len(), is_chunk: true }, &messages);
+                self.add(
+                    Holder {
+                        begin,
+                        len: body.len(),
+                        is_chunk: true,
+                    },
+                    &messages,
+                );
                 if orphans > 0 {
                     let what = format!("{orphans} messages of channels that are described nowhere");
                     self.lose((begin, begin), what);
@@ -246,7 +304,14 @@ impl Contents {
         {
             return Err("a message whose length differs from the one in its header".into());
         }
-        self.add(Holder { begin, len: body.len(), is_chunk: false }, &[message]);
+        self.add(
+            Holder {
+                begin,
+                len: body.len(),
+                is_chunk: false,
+            },
+            &[message],
+        );
         Ok(Ok(()))
     }
 
@@ -261,7 +326,13 @@ impl Contents {
             let header = wire::decode_header([message.data.as_ref()]).ok();
             if let Some((key, header)) = message.channel.topic.parse().ok().zip(header) {
                 let holder = self.holders.len();
-                self.entries.push(Entry { key, header, arrived_nanos: message.log_time, holder, place });
+                self.entries.push(Entry {
+                    key,
+                    header,
+                    arrived_nanos: message.log_time,
+                    holder,
+                    place,
+                });
             }
         }
         self.holders.push(holder);
@@ -270,16 +341,29 @@ impl Contents {
     /// Records a skipped part; one that continues the last one is merged with it.
     fn lose(&mut self, (begin, end): (u64, u64), reason: String) {
         match self.lost.last_mut() {
-            Some(last) if last.end == begin && end > begin && last.end > last.begin => last.end = end,
-            _ => self.lost.push(Lost { begin, end, before: self.entries.len(), reason }),
+            Some(last) if last.end == begin && end > begin && last.end > last.begin => {
+                last.end = end
+            }
+            _ => self.lost.push(Lost {
+                begin,
+                end,
+                before: self.entries.len(),
+                reason,
+            }),
         }
     }
 
     /// Verifies the checksum of all data, for files without checksums of chunks.
     fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
-        if stated != 0 && stated != found && self.lost.is_empty() && self.holders.iter().all(|holder| !holder.is_chunk)
+        if stated != 0
+            && stated != found
+            && self.lost.is_empty()
+            && self.holders.iter().all(|holder| !holder.is_chunk)
         {
-            self.lose((end, end), "the checksum of the data does not agree with them".into());
+            self.lose(
+                (end, end),
+                "the checksum of the data does not agree with them".into(),
+            );
         }
     }
 
@@ -289,7 +373,11 @@ impl Contents {
         let damage = |lost: &Lost| Damage {
             begin_bytes: lost.begin,
             lost_bytes: lost.end - lost.begin,
-            from_s: self.entries.get(..lost.before).and_then(<[Entry]>::last).map(seconds),
+            from_s: self
+                .entries
+                .get(..lost.before)
+                .and_then(<[Entry]>::last)
+                .map(seconds),
             to_s: self.entries.get(lost.before).map(seconds),
             reason: lost.reason.clone(),
         };

@@ -49,7 +49,13 @@ impl<'a> Records<'a> {
         }
         let mut crc = crc32fast::Hasher::new();
         crc.update(mcap::MAGIC);
-        Ok(Some(Self { file, size, at: magic_len, body: Vec::new(), crc }))
+        Ok(Some(Self {
+            file,
+            size,
+            at: magic_len,
+            body: Vec::new(),
+            crc,
+        }))
     }
 
     /// Start of the next record, bytes.
@@ -75,26 +81,39 @@ impl<'a> Records<'a> {
         self.file.read_exact_at(&mut head, begin)?;
         let (opcode, claimed) = split_head(head);
         if !is_known(opcode) {
-            return Ok(Err(format!("a record of kind {opcode:#04x} where none can be")));
+            return Ok(Err(format!(
+                "a record of kind {opcode:#04x} where none can be"
+            )));
         }
         let len = match usize::try_from(claimed) {
             Ok(len) if len <= MAX_RECORD_BYTES => len,
-            _ => return Ok(Err(format!("a record of {claimed} bytes, {MAX_RECORD_BYTES} at most are read"))),
+            _ => {
+                return Ok(Err(format!(
+                    "a record of {claimed} bytes, {MAX_RECORD_BYTES} at most are read"
+                )));
+            }
         };
         if claimed > left - RECORD_HEAD as u64 {
             return Ok(Err("the file ends in the middle of a record".into()));
         }
         self.body.resize(len, 0);
-        self.file.read_exact_at(&mut self.body, begin + RECORD_HEAD as u64)?;
+        self.file
+            .read_exact_at(&mut self.body, begin + RECORD_HEAD as u64)?;
         if !lengths::is_filled(opcode, &self.body) {
-            return Ok(Err(format!("a record of kind {opcode:#04x} differs in length from its contents")));
+            return Ok(Err(format!(
+                "a record of kind {opcode:#04x} differs in length from its contents"
+            )));
         }
         if opcode != op::DATA_END {
             self.crc.update(&head);
             self.crc.update(&self.body);
         }
         self.at = begin + (RECORD_HEAD + len) as u64;
-        Ok(Ok(Some(RawRecord { begin, opcode, body: &self.body })))
+        Ok(Ok(Some(RawRecord {
+            begin,
+            opcode,
+            body: &self.body,
+        })))
     }
 
     /// Continues at the next chunk or end of the data from `from` on whose lengths agree, or at the next message
@@ -104,13 +123,21 @@ impl<'a> Records<'a> {
         let mut begin = from;
         while begin < self.size {
             let left = self.size - begin;
-            let len = usize::try_from(left).unwrap_or(usize::MAX).min(WINDOW + KNOWN_BY);
+            let len = usize::try_from(left)
+                .unwrap_or(usize::MAX)
+                .min(WINDOW + KNOWN_BY);
             window.resize(len, 0);
             self.file.read_exact_at(&mut window, begin)?;
             let is_record = |place: &usize| {
-                window.get(*place..).is_some_and(|bytes| is_record(bytes, left - *place as u64, &is_own))
+                window
+                    .get(*place..)
+                    .is_some_and(|bytes| is_record(bytes, left - *place as u64, &is_own))
             };
-            let known = window.iter().take(WINDOW).enumerate().filter(|(_, opcode)| is_known(**opcode));
+            let known = window
+                .iter()
+                .take(WINDOW)
+                .enumerate()
+                .filter(|(_, opcode)| is_known(**opcode));
             let found = known.map(|(place, _)| place).find(is_record);
             if let Some(place) = found {
                 self.at = begin + place as u64;
@@ -146,7 +173,9 @@ fn is_known(opcode: u8) -> bool {
 
 /// True if a record certainly begins here, `left` bytes before the end of the file.
 fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
-    let Some((&head, body)) = bytes.split_first_chunk::<RECORD_HEAD>() else { return false };
+    let Some((&head, body)) = bytes.split_first_chunk::<RECORD_HEAD>() else {
+        return false;
+    };
     let (opcode, len) = split_head(head);
     if len > left - RECORD_HEAD as u64 {
         return false;
@@ -158,7 +187,8 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
             is_own(channel) && lengths::own_message(payload) == Some(payload_len)
         }),
         op::DATA_END => {
-            len == lengths::DATA_END_LEN as u64 && begins_summary(body.get(lengths::DATA_END_LEN..).unwrap_or_default())
+            len == lengths::DATA_END_LEN as u64
+                && begins_summary(body.get(lengths::DATA_END_LEN..).unwrap_or_default())
         }
         _ => false,
     }
@@ -166,8 +196,13 @@ fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
 
 /// True if the bytes after an apparent end of the data are those of a summary or footer.
 fn begins_summary(bytes: &[u8]) -> bool {
-    bytes.split_first_chunk::<RECORD_HEAD>().is_some_and(|(&head, _)| {
-        let (opcode, len) = split_head(head);
-        matches!(opcode, op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS) && len < 1 << 32
-    })
+    bytes
+        .split_first_chunk::<RECORD_HEAD>()
+        .is_some_and(|(&head, _)| {
+            let (opcode, len) = split_head(head);
+            matches!(
+                opcode,
+                op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS
+            ) && len < 1 << 32
+        })
 }

@@ -19,13 +19,20 @@ pub struct RecoverReport {
 ///
 /// # Errors
 /// [`RecordingError`] if `from` holds no message of this program, or `to` exists already or cannot be written.
-pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<RecoverReport, RecordingError> {
+pub fn recover(
+    from: &Path,
+    to: &Path,
+    options: RecordingOptions,
+) -> Result<RecoverReport, RecordingError> {
     let recording = Recording::open(from)?;
     let mut writer = RecordingWriter::create(to, options)?;
     let mut messages = 0;
     for held in recording.all() {
         for message in held?.iter() {
-            let (topic, encoding) = (&message.channel.topic, message.channel.message_encoding.as_str());
+            let (topic, encoding) = (
+                &message.channel.topic,
+                message.channel.message_encoding.as_str(),
+            );
             // The channels for ROS 2 are derived from these.
             if matches!(encoding, OWN_ENCODING | "json")
                 && let Ok(key) = topic.parse()
@@ -36,5 +43,8 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
         }
     }
     writer.finish()?;
-    Ok(RecoverReport { messages, damage: recording.damage().to_vec() })
+    Ok(RecoverReport {
+        messages,
+        damage: recording.damage().to_vec(),
+    })
 }

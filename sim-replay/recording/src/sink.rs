@@ -30,11 +30,20 @@ pub(super) struct WholeChunks<S> {
 
 impl<S> WholeChunks<S> {
     pub(super) fn new(store: S) -> Self {
-        Self { store, pending: Vec::new(), whole: 0, has_failed: false }
+        Self {
+            store,
+            pending: Vec::new(),
+            whole: 0,
+            has_failed: false,
+        }
     }
 
     fn check(&self) -> io::Result<()> {
-        if self.has_failed { Err(io::Error::other("writing has failed before")) } else { Ok(()) }
+        if self.has_failed {
+            Err(io::Error::other("writing has failed before"))
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -47,7 +56,10 @@ impl<S: Store> Write for WholeChunks<S> {
 
     fn flush(&mut self) -> io::Result<()> {
         self.check()?;
-        let taken = self.store.write_all(&self.pending).and_then(|()| self.store.flush());
+        let taken = self
+            .store
+            .write_all(&self.pending)
+            .and_then(|()| self.store.flush());
         if taken.is_ok() {
             self.whole += self.pending.len() as u64;
         } else {

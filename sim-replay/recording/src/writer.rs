@@ -17,8 +17,12 @@ use super::{OWN_ENCODING, RecordingError};
 const CHUNK_BYTES: usize = 4 << 20;
 /// Recorded data are passed to ROS 2 tools unchanged: sweeps in map coordinates (UTM, for example) exceed the limits of
 /// a receiver.
-const ANY_SIZE: Limits =
-    Limits { max_abs_value: f32::MAX, max_points: u64::MAX, max_body_bytes: u64::MAX, ..Limits::DEFAULT };
+const ANY_SIZE: Limits = Limits {
+    max_abs_value: f32::MAX,
+    max_points: u64::MAX,
+    max_body_bytes: u64::MAX,
+    ..Limits::DEFAULT
+};
 
 /// Channels of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -82,7 +86,11 @@ impl<S: Store> RecordingWriter<S> {
     pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
         let format = WriteOptions::new()
             // The profile promises that every channel is one of ROS 2.
-            .profile(if options.contents == Contents::Ros2 { "ros2" } else { "" })
+            .profile(if options.contents == Contents::Ros2 {
+                "ros2"
+            } else {
+                ""
+            })
             .library(concat!("v2vloc ", env!("CARGO_PKG_VERSION")))
             .compression(options.zstd_level.map(|_| Compression::Zstd))
             .compression_level(options.zstd_level.unwrap_or_default())
@@ -112,33 +120,64 @@ impl<S: Store> RecordingWriter<S> {
     ///
     /// # Errors
     /// [`RecordingError`] if the message, and with it its chunk, is not written.
-    pub fn write(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> Result<(), RecordingError> {
+    pub fn write(
+        &mut self,
+        key: &Key,
+        arrived_nanos: u64,
+        payload: &[u8],
+    ) -> Result<(), RecordingError> {
         self.check_open()?;
         let added = self.add(key, arrived_nanos, payload);
         self.checked(added)?;
-        if self.open.1 > CHUNK_BYTES { self.flush() } else { Ok(()) }
+        if self.open.1 > CHUNK_BYTES {
+            self.flush()
+        } else {
+            Ok(())
+        }
     }
 
-    #[expect(clippy::cast_possible_truncation, reason = "MCAP has 32 bits for the sequence number, which may wrap")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "MCAP has 32 bits for the sequence number, which may wrap"
+    )]
     fn add(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> McapResult<()> {
         let header = wire::decode_header([payload]).ok();
-        let sequence = header.as_ref().map_or(0, |header| header.stamp.sequence as u32);
+        let sequence = header
+            .as_ref()
+            .map_or(0, |header| header.stamp.sequence as u32);
         if self.options.contents != Contents::Ros2 {
-            let publish_time = header.as_ref().map_or(arrived_nanos, |header| header.stamp.publish_nanos);
+            let publish_time = header
+                .as_ref()
+                .map_or(arrived_nanos, |header| header.stamp.publish_nanos);
             let channel_id = self.own_channel(key)?;
-            let head = MessageHeader { channel_id, sequence, log_time: arrived_nanos, publish_time };
+            let head = MessageHeader {
+                channel_id,
+                sequence,
+                log_time: arrived_nanos,
+                publish_time,
+            };
             self.put(&head, payload)?;
         }
         let translations = self.translated(key, payload);
         let is_counted = self.options.contents == Contents::Ros2 && !translations.is_empty();
         self.open.0 += u64::from(is_counted || self.options.contents != Contents::Ros2);
-        translations.iter().try_for_each(|message| self.add_ros(arrived_nanos, sequence, message))
+        translations
+            .iter()
+            .try_for_each(|message| self.add_ros(arrived_nanos, sequence, message))
     }
 
     fn add_ros(&mut self, nanos: u64, sequence: u32, message: &RosMessage) -> McapResult<()> {
         let channel_id = self.ros_channel(&message.topic)?;
         // Published at the time of its arrival: several senders share /tf, whose times have to be in order.
-        self.put(&MessageHeader { channel_id, sequence, log_time: nanos, publish_time: nanos }, &message.cdr)
+        self.put(
+            &MessageHeader {
+                channel_id,
+                sequence,
+                log_time: nanos,
+                publish_time: nanos,
+            },
+            &message.cdr,
+        )
     }
 
     fn put(&mut self, head: &MessageHeader, data: &[u8]) -> McapResult<()> {
@@ -158,7 +197,14 @@ impl<S: Store> RecordingWriter<S> {
     ) -> Result<(), RecordingError> {
         self.check_open()?;
         let cdr = ros2::static_transforms(nanos, vehicles.iter(), mount);
-        let added = self.add_ros(nanos, 0, &RosMessage { topic: RosTopic::TfStatic, cdr });
+        let added = self.add_ros(
+            nanos,
+            0,
+            &RosMessage {
+                topic: RosTopic::TfStatic,
+                cdr,
+            },
+        );
         self.checked(added)
     }
 
@@ -209,10 +255,18 @@ impl<S: Store> RecordingWriter<S> {
             return Ok(*id);
         }
         let ros_type = topic.ros_type();
-        let schema_id = self.mcap.add_schema(&ros_type.name(), "ros2msg", ros_type.schema().as_bytes())?;
+        let schema_id =
+            self.mcap
+                .add_schema(&ros_type.name(), "ros2msg", ros_type.schema().as_bytes())?;
         let metadata = [
-            ("offered_qos_profiles".to_owned(), topic.qos().offered_profiles()),
-            ("topic_type_hash".to_owned(), ros_type.hash(Distribution::Jazzy)),
+            (
+                "offered_qos_profiles".to_owned(),
+                topic.qos().offered_profiles(),
+            ),
+            (
+                "topic_type_hash".to_owned(),
+                ros_type.hash(Distribution::Jazzy),
+            ),
         ];
         self.add_channel(name, schema_id, "cdr", &metadata.into())
     }
@@ -224,7 +278,9 @@ impl<S: Store> RecordingWriter<S> {
         encoding: &str,
         metadata: &BTreeMap<String, String>,
     ) -> McapResult<u16> {
-        let id = self.mcap.add_channel(schema_id, &topic, encoding, metadata)?;
+        let id = self
+            .mcap
+            .add_channel(schema_id, &topic, encoding, metadata)?;
         self.channels.insert(topic, id);
         Ok(id)
     }
@@ -253,7 +309,10 @@ impl<S: Store> RecordingWriter<S> {
     fn check_open(&self) -> Result<(), RecordingError> {
         match &self.ended {
             None => Ok(()),
-            Some(reason) => Err(RecordingError::Ended { path: self.path.clone(), reason: reason.clone() }),
+            Some(reason) => Err(RecordingError::Ended {
+                path: self.path.clone(),
+                reason: reason.clone(),
+            }),
         }
     }
 
@@ -270,7 +329,11 @@ impl<S: Store> RecordingWriter<S> {
 /// it.
 fn encoding_of(topic: &Topic) -> &'static str {
     match topic {
-        Topic::Stream { stream, .. } | Topic::Received { stream, .. } if stream.kind().is_none() => "json",
+        Topic::Stream { stream, .. } | Topic::Received { stream, .. }
+            if stream.kind().is_none() =>
+        {
+            "json"
+        }
         _ => OWN_ENCODING,
     }
 }

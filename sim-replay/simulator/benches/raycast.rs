@@ -23,14 +23,24 @@ fn sensor_motion(map_model: &MapModel) -> Sweep {
         let [x, y, _] = lane.at(0.5 * lane.length_m).0;
         x.hypot(y)
     };
-    let roads = map_model.lanes.lanes.iter().filter(|lane| !lane.in_junction && lane.length_m > 30.0);
-    let lane = roads.min_by(|a, b| center(a).total_cmp(&center(b))).expect("the map has a road");
+    let roads = map_model
+        .lanes
+        .lanes
+        .iter()
+        .filter(|lane| !lane.in_junction && lane.length_m > 30.0);
+    let lane = roads
+        .min_by(|a, b| center(a).total_cmp(&center(b)))
+        .expect("the map has a road");
     let at = |s_m: f64| {
         let (position, heading) = lane.at(s_m);
         Placement::level(position, heading)
     };
     // 12 m/s.
-    Sweep { start: at(15.0), end: at(15.6) }.mounted(LIDAR_MOUNT_M)
+    Sweep {
+        start: at(15.0),
+        end: at(15.6),
+    }
+    .mounted(LIDAR_MOUNT_M)
 }
 
 fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Sweep)> {
@@ -40,7 +50,8 @@ fn vehicles(map_model: &MapModel, around: &Placement) -> Vec<(Vehicle, Sweep)> {
         let mut s_m = 5.0;
         while s_m < lane.length_m - 5.0 {
             let (position, heading) = lane.at(s_m);
-            let distance = (position[0] - around.position_m.x).hypot(position[1] - around.position_m.y);
+            let distance =
+                (position[0] - around.position_m.x).hypot(position[1] - around.position_m.y);
             if (6.0..RANGE_M).contains(&distance) {
                 let end = Placement::level(position, heading);
                 let start = end.mounted([-0.5, 0.0, 0.0]);
@@ -59,24 +70,53 @@ fn bench_map(criterion: &mut Criterion, name: &str, source: &RoadMapSource) {
     let standing: Vec<(BodyShape, Placement)> = map_model
         .solids
         .iter()
-        .map(|solid| (BodyShape::from(solid), Placement::level(solid.center_m, solid.yaw_rad)))
+        .map(|solid| {
+            (
+                BodyShape::from(solid),
+                Placement::level(solid.center_m, solid.yaw_rad),
+            )
+        })
         .filter(|(shape, place)| {
             let distance = (place.position_m - sensor.end.position_m).xy().norm();
             distance < RANGE_M + shape.bounds.radius_m()
         })
         .collect();
     let vehicles = vehicles(&map_model, &sensor.end);
-    let moving = vehicles.iter().map(|(vehicle, motion)| Body { shape: &vehicle.shape, motion: *motion });
-    let bodies: Vec<Body<'_>> =
-        moving.chain(standing.iter().map(|(shape, place)| Body { shape, motion: Sweep::still(*place) })).collect();
+    let moving = vehicles.iter().map(|(vehicle, motion)| Body {
+        shape: &vehicle.shape,
+        motion: *motion,
+    });
+    let bodies: Vec<Body<'_>> = moving
+        .chain(standing.iter().map(|(shape, place)| Body {
+            shape,
+            motion: Sweep::still(*place),
+        }))
+        .collect();
     let mut lidar = Lidar::default();
-    let points = lidar.sweep(&sensor, &*ground, &bodies, Weather::Sunny, 0).points.len();
-    assert!(points > 45_000, "{name}: a sweep of {points} points is no measure");
-    eprintln!("{name}: {points} points, {} vehicles, {} standing solids", vehicles.len(), standing.len());
+    let points = lidar
+        .sweep(&sensor, &*ground, &bodies, Weather::Sunny, 0)
+        .points
+        .len();
+    assert!(
+        points > 45_000,
+        "{name}: a sweep of {points} points is no measure"
+    );
+    eprintln!(
+        "{name}: {points} points, {} vehicles, {} standing solids",
+        vehicles.len(),
+        standing.len()
+    );
     let mut group = criterion.benchmark_group("sweep");
     group.throughput(Throughput::Elements(points as u64));
     group.bench_function(name, |bencher| {
-        bencher.iter(|| black_box(lidar.sweep(&sensor, &*ground, &bodies, Weather::Sunny, 0).points.len()));
+        bencher.iter(|| {
+            black_box(
+                lidar
+                    .sweep(&sensor, &*ground, &bodies, Weather::Sunny, 0)
+                    .points
+                    .len(),
+            )
+        });
     });
     group.finish();
 }

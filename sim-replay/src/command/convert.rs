@@ -27,7 +27,12 @@ pub(crate) struct Args {
     layout: SceneLayout,
     /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as shown by
     /// inspect].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Write into a folder that is not empty; existing files of the layout are replaced.
     #[arg(long)]
@@ -39,7 +44,10 @@ pub(crate) struct Args {
 
 /// Converts and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let open = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let open = OpenOptions {
+        intensity_scale: args.intensity_scale,
+        ..OpenOptions::default()
+    };
     let input = match dataset::open_with(&args.from, &open) {
         Ok(input) => input,
         Err(error) => {
@@ -55,7 +63,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Ok(Outcome::BadInput);
     }
     let bar = progress::bar(0, "frames");
-    let options = ConvertOptions { out: args.out.clone(), layout: args.layout, force: args.force };
+    let options = ConvertOptions {
+        out: args.out.clone(),
+        layout: args.layout,
+        force: args.force,
+    };
     let result = convert(&input, &options, &|done, total| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
@@ -64,7 +76,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     match result {
         Ok(converted) => {
             print(&converted, args)?;
-            Ok(if converted.left_out.is_nothing() { Outcome::Done } else { Outcome::DataLost })
+            Ok(if converted.left_out.is_nothing() {
+                Outcome::Done
+            } else {
+                Outcome::DataLost
+            })
         }
         Err(error @ SynthError::Write { .. }) => Err(error.into()),
         Err(error) => {
@@ -77,11 +93,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 /// True if one of the two contains the other: the input would be overwritten.
 fn overlap(from: &Path, out: &Path) -> bool {
     let real = |path: &Path| path.canonicalize().ok();
-    real(from).zip(real(out)).is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
+    real(from)
+        .zip(real(out))
+        .is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
 }
 
 fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
-    let Converted { scenarios, agent_frames, omitted, left_out } = converted;
+    let Converted {
+        scenarios,
+        agent_frames,
+        omitted,
+        left_out,
+    } = converted;
     for problem in left_out.problems().take(SHOWN_PROBLEMS) {
         output::note(format_args!("left out: {}", problem.message));
     }
@@ -99,7 +122,11 @@ fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
     ))?;
     super::synth::print_omitted(omitted)?;
     let summary = left_out.to_string();
-    if summary.is_empty() { Ok(()) } else { output::line(summary) }
+    if summary.is_empty() {
+        Ok(())
+    } else {
+        output::line(summary)
+    }
 }
 
 #[cfg(test)]

@@ -65,11 +65,19 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     } else {
         print(&report, args)?;
     }
-    Ok(if report.damage.is_empty() { Outcome::Done } else { Outcome::DataLost })
+    Ok(if report.damage.is_empty() {
+        Outcome::Done
+    } else {
+        Outcome::DataLost
+    })
 }
 
 fn print(report: &ExportReport, args: &Args) -> anyhow::Result<()> {
-    let ExportReport { messages, left_out, damage } = report;
+    let ExportReport {
+        messages,
+        left_out,
+        damage,
+    } = report;
     output::line(format_args!(
         "{messages} messages in {}; {left_out} others have no type in ROS 2",
         args.to.display()

@@ -20,7 +20,12 @@ pub(crate) struct Args {
     dir: PathBuf,
     /// Number that stored intensities are divided by [default: 255 for bytes and red; other numbers by the range of
     /// each agent's first sweeps: up to 1 unchanged, up to 255 by 255].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     #[command(flatten)]
     protocol: ProtocolConfig,
@@ -31,12 +36,21 @@ pub(crate) struct Args {
 
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    if args.dir.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("xodr")) && args.dir.is_file() {
+    if args
+        .dir
+        .extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("xodr"))
+        && args.dir.is_file()
+    {
         return run_map(&args.dir, args.json);
     }
     let report = with_progress(args);
     print(&report, args.json)?;
-    Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
+    Ok(if report.problems.is_empty() {
+        Outcome::Done
+    } else {
+        Outcome::BadInput
+    })
 }
 
 /// Prints the contents of a map to standard output.
@@ -66,7 +80,10 @@ fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> 
 fn with_progress(args: &Args) -> Report {
     // The bar hides itself if stderr is no terminal.
     let bar = progress::bar(0, "frames");
-    let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let options = OpenOptions {
+        intensity_scale: args.intensity_scale,
+        ..OpenOptions::default()
+    };
     let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);

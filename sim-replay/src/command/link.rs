@@ -31,7 +31,10 @@ pub(crate) struct ForwardArgs {
 
 impl clap::Args for Args {
     fn augment_args(command: Command) -> Command {
-        let print = Arg::new("print").long("print").value_name("PRESET|FILE").exclusive(true);
+        let print = Arg::new("print")
+            .long("print")
+            .value_name("PRESET|FILE")
+            .exclusive(true);
         let help = "Print a link as YAML, every field with its value, and exit: a start for a file of one's own";
         ForwardArgs::augment_args(command).arg(print.help(help))
     }
@@ -45,7 +48,9 @@ impl FromArgMatches for Args {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
         match matches.get_one::<String>("print") {
             Some(name) => Ok(Self::Print(name.clone())),
-            None => ForwardArgs::from_arg_matches(matches).map(|args| Self::Forward(Box::new(args))),
+            None => {
+                ForwardArgs::from_arg_matches(matches).map(|args| Self::Forward(Box::new(args)))
+            }
         }
     }
 
@@ -91,7 +96,11 @@ fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
-    Ok(if report.is_complete() { Outcome::Done } else { Outcome::DataLost })
+    Ok(if report.is_complete() {
+        Outcome::Done
+    } else {
+        Outcome::DataLost
+    })
 }
 
 fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
@@ -99,7 +108,14 @@ fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
         output::line(serde_json::to_string(report)?)?;
         return Ok(());
     }
-    let LinkReport { submitted, arrived, copies, under_way, longest_ms, dropped } = report;
+    let LinkReport {
+        submitted,
+        arrived,
+        copies,
+        under_way,
+        longest_ms,
+        dropped,
+    } = report;
     output::line(format_args!(
         "{submitted} messages: {arrived} arrived, {copies} of them twice, {under_way} still in flight"
     ))?;

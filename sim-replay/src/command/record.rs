@@ -29,11 +29,18 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
     let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config.bus.join(&config.run, Role::Recorder, &CavId::new("recorder")?)?;
+    let bus = config
+        .bus
+        .join(&config.run, Role::Recorder, &CavId::new("recorder")?)?;
     let options = config.options();
     // A failure is reported at once to a process that waits for the report; the last line is the final report.
     let mut on_failure = |report: &RecordReport| {
-        if args.json && serde_json::to_string(report).map_err(Into::into).and_then(output::line).is_err() {
+        if args.json
+            && serde_json::to_string(report)
+                .map_err(Into::into)
+                .and_then(output::line)
+                .is_err()
+        {
             tracing::error!("the failure cannot be printed");
         }
     };
@@ -46,7 +53,11 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
-    Ok(if report.is_complete() { Outcome::Done } else { Outcome::DataLost })
+    Ok(if report.is_complete() {
+        Outcome::Done
+    } else {
+        Outcome::DataLost
+    })
 }
 
 fn print(report: &RecordReport, as_json: bool) -> anyhow::Result<()> {
@@ -60,5 +71,7 @@ fn print(report: &RecordReport, as_json: bool) -> anyhow::Result<()> {
         report.bytes as f64 / 1e6,
         report.file.display()
     ))?;
-    report.loss_in_words().map_or(Ok(()), |words| Ok(output::line(words)?))
+    report
+        .loss_in_words()
+        .map_or(Ok(()), |words| Ok(output::line(words)?))
 }

@@ -29,8 +29,15 @@ pub(crate) struct Args {
 /// Copies and reports the losses.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let contents = if args.plain { Contents::Messages } else { Contents::All };
-    let options = RecordingOptions { contents, ..RecordingOptions::default() };
+    let contents = if args.plain {
+        Contents::Messages
+    } else {
+        Contents::All
+    };
+    let options = RecordingOptions {
+        contents,
+        ..RecordingOptions::default()
+    };
     let report = match recover(&args.from, &args.out, options) {
         Ok(report) => report,
         Err(error) => {
@@ -41,10 +48,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if args.json {
         output::line(serde_json::to_string(&report)?)?;
     } else {
-        output::line(format_args!("{} messages in {}", report.messages, args.out.display()))?;
+        output::line(format_args!(
+            "{} messages in {}",
+            report.messages,
+            args.out.display()
+        ))?;
         for damage in &report.damage {
             output::line(damage)?;
         }
     }
-    Ok(if report.damage.is_empty() { Outcome::Done } else { Outcome::DataLost })
+    Ok(if report.damage.is_empty() {
+        Outcome::Done
+    } else {
+        Outcome::DataLost
+    })
 }

@@ -40,7 +40,9 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Err(error) => return Ok(Outcome::bad_input(&format_args!("{error:#}"))),
     };
     let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config.bus.join(&config.run, Role::Replay, &CavId::new("replay")?)?;
+    let bus = config
+        .bus
+        .join(&config.run, Role::Replay, &CavId::new("replay")?)?;
     let replay = match Replay::prepare(&bus, &scenario, config.options(), &stop) {
         Ok(replay) => replay,
         Err(
@@ -60,29 +62,56 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Err(StreamError::NotReady(_)) if stop.requested() => return Ok(Outcome::Done),
         Err(error) => return Err(error.into()),
     }
-    tracing::info!(scenario = scenario.name, ticks = scenario.ticks.len(), rate = config.scene.rate, "the clock runs");
+    tracing::info!(
+        scenario = scenario.name,
+        ticks = scenario.ticks.len(),
+        rate = config.scene.rate,
+        "the clock runs"
+    );
     let report = replay.play();
     print(&report, args.json)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
-    Ok(if report.is_complete() { Outcome::Done } else { Outcome::DataLost })
+    Ok(if report.is_complete() {
+        Outcome::Done
+    } else {
+        Outcome::DataLost
+    })
 }
 
 fn open(scene: &SceneConfig) -> anyhow::Result<Scenario> {
-    let options = OpenOptions { intensity_scale: scene.intensity_scale, ..OpenOptions::default() };
+    let options = OpenOptions {
+        intensity_scale: scene.intensity_scale,
+        ..OpenOptions::default()
+    };
     let dataset = dataset::open_with(&scene.dir, &options)?;
     for problem in &dataset.problems {
         tracing::warn!("{problem}");
     }
-    let names = || dataset.scenarios.iter().map(|scenario| scenario.name.as_str()).collect::<Vec<_>>().join(", ");
+    let names = || {
+        dataset
+            .scenarios
+            .iter()
+            .map(|scenario| scenario.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
     let found = match &scene.scenario {
         None => dataset.scenarios.first().cloned(),
-        Some(name) => dataset.scenarios.iter().find(|scenario| scenario.name == *name).cloned(),
+        Some(name) => dataset
+            .scenarios
+            .iter()
+            .find(|scenario| scenario.name == *name)
+            .cloned(),
     };
     found.with_context(|| {
         let asked = scene.scenario.as_deref().unwrap_or("any");
-        format!("{}: no scenario {asked}; there are: {}", scene.dir.display(), names())
+        format!(
+            "{}: no scenario {asked}; there are: {}",
+            scene.dir.display(),
+            names()
+        )
     })
 }
 
@@ -92,13 +121,21 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         return Ok(());
     }
     let messages: u64 = report.sent.iter().map(|count| count.messages).sum();
-    output::line(format_args!("{} ticks, {messages} messages in {:.1} s", report.ticks, report.seconds))?;
+    output::line(format_args!(
+        "{} ticks, {messages} messages in {:.1} s",
+        report.ticks, report.seconds
+    ))?;
     let lateness = &report.lateness;
     output::line(format_args!(
         "late by p50 {:.1} ms, p95 {:.1} ms, at most {:.1} ms; {} ticks over 5 ms",
         lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
     ))?;
-    if let Some(SensorLinkReport { submitted, arrived, dropped }) = &report.sensor_link {
+    if let Some(SensorLinkReport {
+        submitted,
+        arrived,
+        dropped,
+    }) = &report.sensor_link
+    {
         output::line(format_args!(
             "{submitted} sensor frames crossed a link: {arrived} arrived{}",
             by_reason(dropped)
@@ -118,18 +155,30 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     }
     if !report.unsent.is_empty() {
         let unsent: u64 = report.unsent.values().sum();
-        output::line(format_args!("{unsent} of the messages were not sent{}", by_reason(&report.unsent)))?;
+        output::line(format_args!(
+            "{unsent} of the messages were not sent{}",
+            by_reason(&report.unsent)
+        ))?;
     }
     // The losses of the run are printed last.
     if report.unreadable_frames > 0 {
-        output::line(format_args!("{} frames could not be read", report.unreadable_frames))?;
+        output::line(format_args!(
+            "{} frames could not be read",
+            report.unreadable_frames
+        ))?;
     }
     if report.unanswered > 0 {
-        output::line(format_args!("{} ticks were not answered", report.unanswered))?;
+        output::line(format_args!(
+            "{} ticks were not answered",
+            report.unanswered
+        ))?;
     }
     Ok(())
 }
 
 fn by_reason(dropped: &BTreeMap<DropReason, u64>) -> String {
-    dropped.iter().map(|(reason, count)| format!(", {count} {reason}")).collect()
+    dropped
+        .iter()
+        .map(|(reason, count)| format!(", {count} {reason}"))
+        .collect()
 }

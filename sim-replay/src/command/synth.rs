@@ -6,7 +6,9 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use simulator::generate::{self, ImageSize, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
+use simulator::generate::{
+    self, ImageSize, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather,
+};
 use simulator::map::RoadMapSource;
 use support::output;
 use support::progress;
@@ -91,7 +93,9 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
             print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
-        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => Err(error.into()),
+        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => {
+            Err(error.into())
+        }
         Err(error) => {
             output::note(format_args!("error: {error}"));
             Ok(Outcome::BadInput)
@@ -110,10 +114,15 @@ fn options(args: Args) -> SynthOptions {
         weather: args.weather,
         copies: args.copies,
         cameras: args.cameras,
-        frames: args.frames.unwrap_or_else(|| SynthOptions::default_frames(args.subset)),
+        frames: args
+            .frames
+            .unwrap_or_else(|| SynthOptions::default_frames(args.subset)),
         period_s: args.period,
         force: args.force,
-        threads: args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)).max(1),
+        threads: args
+            .threads
+            .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
+            .max(1),
         ..SynthOptions::new(args.subset, args.seed, args.out)
     }
 }
@@ -123,13 +132,28 @@ fn print_findings(summary: &Summary) {
     for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
         output::note(format_args!("map: {finding}"));
     }
-    if let Some(further) = summary.findings.len().checked_sub(PRINTED_FINDINGS).filter(|&further| further > 0) {
-        output::note(format_args!("map: {further} further findings; all are in data_protocol.yaml of each scenario"));
+    if let Some(further) = summary
+        .findings
+        .len()
+        .checked_sub(PRINTED_FINDINGS)
+        .filter(|&further| further > 0)
+    {
+        output::note(format_args!(
+            "map: {further} further findings; all are in data_protocol.yaml of each scenario"
+        ));
     }
 }
 
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {
-    let Summary { layout, scenarios, agent_frames, points, annotations, omitted, findings } = summary;
+    let Summary {
+        layout,
+        scenarios,
+        agent_frames,
+        points,
+        annotations,
+        omitted,
+        findings,
+    } = summary;
     let per_frame = |count: &usize| *count as f64 / (*agent_frames).max(1) as f64;
     if json {
         let report = serde_json::json!({
@@ -140,19 +164,27 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) ->
         return output::line(report);
     }
     let out = options.out.display();
-    output::line(format_args!("{out}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}", layout.name()))?;
+    output::line(format_args!(
+        "{out}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}",
+        layout.name()
+    ))?;
     output::line(format_args!(
         "{:.0} points and {:.1} annotated vehicles a frame",
         per_frame(points),
         per_frame(annotations)
     ))?;
-    output::line(format_args!("{seconds:.1} s, {:.0} agent-frames a second", *agent_frames as f64 / seconds))?;
+    output::line(format_args!(
+        "{seconds:.1} s, {:.0} agent-frames a second",
+        *agent_frames as f64 / seconds
+    ))?;
     print_omitted(omitted)
 }
 
 /// Prints the data that a layout cannot hold.
 pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) -> io::Result<()> {
-    omitted.iter().try_for_each(|(what, count)| output::line(format_args!("not in this layout: {count} {what}")))
+    omitted.iter().try_for_each(|(what, count)| {
+        output::line(format_args!("not in this layout: {count} {what}"))
+    })
 }
 
 fn parse_map(text: &str) -> Result<RoadMapSource, String> {
@@ -165,7 +197,11 @@ fn parse_map(text: &str) -> Result<RoadMapSource, String> {
 }
 
 fn parse_agents(text: &str) -> Result<RangeInclusive<usize>, String> {
-    let number = |text: &str| text.trim().parse::<usize>().map_err(|_| format!("{text:?} is no number"));
+    let number = |text: &str| {
+        text.trim()
+            .parse::<usize>()
+            .map_err(|_| format!("{text:?} is no number"))
+    };
     match text.split_once('-') {
         Some((low, high)) => Ok(number(low)?..=number(high)?),
         None => number(text).map(|count| count..=count),
@@ -186,7 +222,10 @@ mod tests {
     #[test]
     fn maps_are_names_or_files() {
         assert_eq!(parse_map("town4"), Ok(RoadMapSource::Town4));
-        assert_eq!(parse_map("a/Town01.xodr"), Ok(RoadMapSource::OpenDrive("a/Town01.xodr".into())));
+        assert_eq!(
+            parse_map("a/Town01.xodr"),
+            Ok(RoadMapSource::OpenDrive("a/Town01.xodr".into()))
+        );
         assert!(parse_map("town2").is_err());
     }
 }

@@ -59,12 +59,17 @@ pub struct LinkSelection {
 
 impl Default for LinkSelection {
     fn default() -> Self {
-        Self { model: "ideal".into(), seed: 0 }
+        Self {
+            model: "ideal".into(),
+            seed: 0,
+        }
     }
 }
 
 fn link_help() -> String {
-    let presets = PRESETS.map(|(name, about)| format!("\n  {name}: {about}")).concat();
+    let presets = PRESETS
+        .map(|(name, about)| format!("\n  {name}: {about}"))
+        .concat();
     format!("A YAML file with the stages of the link, or a preset:{presets}\n")
 }
 

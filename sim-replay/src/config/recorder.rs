@@ -74,11 +74,22 @@ impl RecorderConfig {
     /// The options of the recorder.
     #[must_use]
     pub fn options(&self) -> RecorderOptions {
-        let RecordingConfig { without, plain, zstd_level } = self.record.clone();
-        let contents = if plain { Contents::Messages } else { Contents::All };
+        let RecordingConfig {
+            without,
+            plain,
+            zstd_level,
+        } = self.record.clone();
+        let contents = if plain {
+            Contents::Messages
+        } else {
+            Contents::All
+        };
         RecorderOptions {
             out: self.out.clone(),
-            recording: RecordingOptions { zstd_level, contents },
+            recording: RecordingOptions {
+                zstd_level,
+                contents,
+            },
             without,
             keeps_running: self.keep_running || self.bus.supervised,
         }

@@ -59,7 +59,12 @@ pub struct WaitConfig {
     #[arg(long, value_name = "S")]
     pub ready_timeout_s: f64,
     /// Egos whose detections of a tick are awaited in lockstep.
-    #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "IDS",
+        value_delimiter = ',',
+        allow_hyphen_values = true
+    )]
     pub egos: Vec<CavId>,
     /// Longest time to wait for an ego's detections in lockstep, seconds; the tick then counts as unanswered.
     #[arg(long, value_name = "S")]
@@ -68,12 +73,20 @@ pub struct WaitConfig {
 
 impl Default for WaitConfig {
     fn default() -> Self {
-        Self { await_agents: true, expect: Vec::new(), ready_timeout_s: 60.0, egos: Vec::new(), answer_timeout_s: 60.0 }
+        Self {
+            await_agents: true,
+            expect: Vec::new(),
+            ready_timeout_s: 60.0,
+            egos: Vec::new(),
+            answer_timeout_s: 60.0,
+        }
     }
 }
 
 /// Link emulation for sensor frames on their way to the agents. Nothing set: none.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args,
+)]
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Link from sensors to agents")]
 pub struct SensorLinkConfig {
@@ -98,7 +111,13 @@ impl SensorLinkConfig {
     /// The stages of the link; `None` if nothing is set.
     #[must_use]
     pub fn stages(&self) -> Option<LinkConfig> {
-        let Self { latency_ms, jitter_ms, bandwidth_mbps, loss, .. } = *self;
+        let Self {
+            latency_ms,
+            jitter_ms,
+            bandwidth_mbps,
+            loss,
+            ..
+        } = *self;
         if latency_ms.is_none() && bandwidth_mbps.is_none() && loss.is_none() {
             return None;
         }
@@ -108,9 +127,11 @@ impl SensorLinkConfig {
                 (Some(mean_ms), None) => DelayModel::ConstantMs(mean_ms),
                 (Some(mean_ms), Some(std_ms)) => DelayModel::Normal { mean_ms, std_ms },
             },
-            capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, |rate_mbps| CapacityConfig::TokenBucket {
-                rate_mbps,
-                burst_bytes: 0,
+            capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, |rate_mbps| {
+                CapacityConfig::TokenBucket {
+                    rate_mbps,
+                    burst_bytes: 0,
+                }
             }),
             loss: loss.map_or(LossModel::None, LossModel::Bernoulli),
             // A vehicle's own bus does not reorder.
@@ -126,12 +147,25 @@ impl ProcessConfig for ReplayConfig {
     fn validate(&self) -> Result<(), FieldError> {
         self.scene.validate()?;
         within("wait.ready_timeout_s", self.wait.ready_timeout_s, 0.0, 1e6)?;
-        within("wait.answer_timeout_s", self.wait.answer_timeout_s, 0.0, 1e6)?;
+        within(
+            "wait.answer_timeout_s",
+            self.wait.answer_timeout_s,
+            0.0,
+            1e6,
+        )?;
         if self.scene.lockstep && self.wait.egos.is_empty() {
-            return Err(FieldError::new("wait.egos", "empty", "must name the egos that scene.lockstep waits for"));
+            return Err(FieldError::new(
+                "wait.egos",
+                "empty",
+                "must name the egos that scene.lockstep waits for",
+            ));
         }
         if self.sensor_link.jitter_ms.is_some() && self.sensor_link.latency_ms.is_none() {
-            return Err(FieldError::new("sensor_link.latency_ms", "absent", "must be given with jitter_ms"));
+            return Err(FieldError::new(
+                "sensor_link.latency_ms",
+                "absent",
+                "must be given with jitter_ms",
+            ));
         }
         self.bus.validate()
     }
@@ -158,9 +192,16 @@ impl ReplayConfig {
             await_agents: wait.await_agents,
             expect: wait.expect.clone(),
             ready_timeout: seconds(wait.ready_timeout_s),
-            lockstep: if scene.lockstep { wait.egos.clone() } else { Vec::new() },
+            lockstep: if scene.lockstep {
+                wait.egos.clone()
+            } else {
+                Vec::new()
+            },
             answer_timeout: seconds(wait.answer_timeout_s),
-            link: self.sensor_link.stages().map(|link| (link, self.sensor_link.seed)),
+            link: self
+                .sensor_link
+                .stages()
+                .map(|link| (link, self.sensor_link.seed)),
             checkpoint: self.checkpoint.clone(),
         }
     }

@@ -9,9 +9,14 @@ const MAX_EMPTY_SHARE: f64 = 0.5;
 const HINT: &str = "frames (axes, order of the pose's numbers) or units of the boxes may be wrong";
 
 /// The finding that agents list `targets` objects of the protocol's classes, and none is ground truth of any ego.
-pub(super) fn without_ground_truth(scenario: &str, targets: usize, merged: usize) -> Option<Problem> {
-    let reason =
-        format!("ground truth 0 for every ego and tick, though agents list {targets} objects of its classes: {HINT}");
+pub(super) fn without_ground_truth(
+    scenario: &str,
+    targets: usize,
+    merged: usize,
+) -> Option<Problem> {
+    let reason = format!(
+        "ground truth 0 for every ego and tick, though agents list {targets} objects of its classes: {HINT}"
+    );
     (targets > 0 && merged == 0).then(|| problem(scenario, "ground truth", &reason))
 }
 
@@ -29,5 +34,10 @@ pub(super) fn mostly_empty(scenario: &str, agent: &AgentReport, boxes: usize) ->
 
 fn problem(scenario: &str, field: &str, reason: &str) -> Problem {
     let message = format!("{scenario}: {reason}");
-    Problem { path: scenario.to_owned(), line: None, field: Some(field.to_owned()), message }
+    Problem {
+        path: scenario.to_owned(),
+        line: None,
+        field: Some(field.to_owned()),
+        message,
+    }
 }

@@ -44,10 +44,12 @@ impl Cells {
         let mut rows = index(center.y - radius)..=index(center.y + radius);
         rows.any(|row| {
             let (first, last) = (row * ACROSS + columns.start(), row * ACROSS + columns.end());
-            self.points[self.begins[first]..self.begins[last + 1]].iter().any(|&[x, y, z]| {
-                let local = box_from_lidar * Point3::new(x, y, z);
-                (0..3).all(|axis| local[axis].abs() <= half[axis])
-            })
+            self.points[self.begins[first]..self.begins[last + 1]]
+                .iter()
+                .any(|&[x, y, z]| {
+                    let local = box_from_lidar * Point3::new(x, y, z);
+                    (0..3).all(|axis| local[axis].abs() <= half[axis])
+                })
         })
     }
 }

@@ -43,8 +43,17 @@ pub struct MapReport {
 pub fn inspect_map(path: &Path) -> Result<MapReport, RoadMapError> {
     let Map { network, lanes } = read_map(path)?;
     let roads = &network.roads;
-    let heights = || lanes.lanes.iter().flat_map(|lane| &lane.centerline).map(|point| point[2]);
-    let range = [heights().fold(f64::INFINITY, f64::min), heights().fold(f64::NEG_INFINITY, f64::max)];
+    let heights = || {
+        lanes
+            .lanes
+            .iter()
+            .flat_map(|lane| &lane.centerline)
+            .map(|point| point[2])
+    };
+    let range = [
+        heights().fold(f64::INFINITY, f64::min),
+        heights().fold(f64::NEG_INFINITY, f64::max),
+    ];
     Ok(MapReport {
         path: path.display().to_string(),
         roads: roads.len(),
@@ -52,10 +61,18 @@ pub fn inspect_map(path: &Path) -> Result<MapReport, RoadMapError> {
         left_hand_roads: roads.iter().filter(|road| road.left_hand).count(),
         banked_roads: roads.iter().filter(|road| !road.lateral.is_level()).count(),
         junctions: network.junctions.len(),
-        direct_junctions: network.junctions.iter().filter(|junction| junction.direct).count(),
+        direct_junctions: network
+            .junctions
+            .iter()
+            .filter(|junction| junction.direct)
+            .count(),
         lanes: lanes.lanes.len(),
         lanes_m: lanes.lanes.iter().map(|lane| lane.length_m).sum(),
-        dead_ends: lanes.lanes.iter().filter(|lane| lane.successors.is_empty()).count(),
+        dead_ends: lanes
+            .lanes
+            .iter()
+            .filter(|lane| lane.successors.is_empty())
+            .count(),
         heights_m: (!lanes.lanes.is_empty()).then_some(range),
         findings: network.findings,
     })
@@ -74,7 +91,11 @@ impl fmt::Display for MapReport {
             "roads      {} of {:.0} m, {keeps}, {} not level across",
             self.roads, self.roads_m, self.banked_roads
         )?;
-        writeln!(out, "junctions  {}, {} of them direct", self.junctions, self.direct_junctions)?;
+        writeln!(
+            out,
+            "junctions  {}, {} of them direct",
+            self.junctions, self.direct_junctions
+        )?;
         writeln!(
             out,
             "lanes      {} of {:.0} m to drive on, {} with none after it",
@@ -84,7 +105,9 @@ impl fmt::Display for MapReport {
             writeln!(out, "heights    {low:.2} to {high:.2} m")?;
         }
         write!(out, "findings   {}", self.findings.len())?;
-        self.findings.iter().try_for_each(|finding| write!(out, "\n  {finding}"))
+        self.findings
+            .iter()
+            .try_for_each(|finding| write!(out, "\n  {finding}"))
     }
 }
 
@@ -111,13 +134,36 @@ mod tests {
         );
         std::fs::write(&path, text).unwrap();
         let report = inspect_map(&path).unwrap();
-        assert_eq!((report.roads, report.left_hand_roads, report.banked_roads, report.lanes), (1, 1, 1, 2));
-        assert_eq!((report.dead_ends, report.findings.len(), report.findings[0].count), (2, 1, 2));
+        assert_eq!(
+            (
+                report.roads,
+                report.left_hand_roads,
+                report.banked_roads,
+                report.lanes
+            ),
+            (1, 1, 1, 2)
+        );
+        assert_eq!(
+            (
+                report.dead_ends,
+                report.findings.len(),
+                report.findings[0].count
+            ),
+            (2, 1, 2)
+        );
         let [low, high] = report.heights_m.unwrap();
         assert!((high - 1.5 * 0.1f64.sin()).abs() < 1e-9 && (low + high).abs() < 1e-9);
         let text = report.to_string();
-        assert!(text.contains("roads      1 of 40 m, traffic keeps left, 1 not level across"), "{text}");
-        assert!(text.ends_with("expected a value from 0 to 1000; speed limit treated as absent (2 times)"), "{text}");
+        assert!(
+            text.contains("roads      1 of 40 m, traffic keeps left, 1 not level across"),
+            "{text}"
+        );
+        assert!(
+            text.ends_with(
+                "expected a value from 0 to 1000; speed limit treated as absent (2 times)"
+            ),
+            "{text}"
+        );
         assert!(inspect_map(&folder.path().join("b.xodr")).is_err());
     }
 }

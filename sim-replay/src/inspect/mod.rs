@@ -104,7 +104,11 @@ impl Summary {
     #[must_use]
     pub fn of(counts: &[usize]) -> Option<Self> {
         let (min, max) = (*counts.iter().min()?, *counts.iter().max()?);
-        Some(Self { min, mean: counts.iter().sum::<usize>() as f64 / counts.len() as f64, max })
+        Some(Self {
+            min,
+            mean: counts.iter().sum::<usize>() as f64 / counts.len() as f64,
+            max,
+        })
     }
 }
 

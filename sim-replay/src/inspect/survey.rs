@@ -72,13 +72,22 @@ pub fn inspect(
     let protocol = match protocol.resolve(dataset.layout) {
         Ok(protocol) => protocol,
         Err(reason) => {
-            report.problems.push(Problem::from(&ReadError::Layout { path: dir.to_owned(), reason }));
+            report.problems.push(Problem::from(&ReadError::Layout {
+                path: dir.to_owned(),
+                reason,
+            }));
             return report;
         }
     };
     report.protocol = Some(protocol.clone());
-    report.problems.extend(dataset.problems.iter().map(Problem::from));
-    let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
+    report
+        .problems
+        .extend(dataset.problems.iter().map(Problem::from));
+    let total = dataset
+        .scenarios
+        .iter()
+        .map(|scenario| scenario.ticks.len())
+        .sum();
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         let findings: Vec<TickFindings> = (0..scenario.ticks.len())
@@ -92,10 +101,14 @@ pub fn inspect(
         let summary = summarize(scenario, &findings);
         report.problems.extend(box_problems(&summary, &findings));
         report.scenarios.push(summary);
-        report.problems.extend(sweep_problems(scenario, &findings, open));
+        report
+            .problems
+            .extend(sweep_problems(scenario, &findings, open));
         for tick in findings {
             report.ticks.extend(tick.merged);
-            report.problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
+            report
+                .problems
+                .extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
         }
     }
     report.problems = counted(report.problems);
@@ -111,7 +124,10 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
     }
     let with_count = |(problem, count): (Problem, usize)| match count {
         1 => problem,
-        count => Problem { message: format!("{} ({count} times)", problem.message), ..problem },
+        count => Problem {
+            message: format!("{} ({count} times)", problem.message),
+            ..problem
+        },
     };
     counts.into_iter().map(with_count).collect()
 }
@@ -119,10 +135,19 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
 /// Problems of the boxes of a scenario as a whole.
 fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Problem> {
     let targets = findings.iter().map(|tick| tick.targets).sum();
-    let merged = findings.iter().flat_map(|tick| &tick.merged).map(|tick| tick.merged_boxes).sum();
-    let mut problems: Vec<Problem> = boxes::without_ground_truth(&scenario.name, targets, merged).into_iter().collect();
+    let merged = findings
+        .iter()
+        .flat_map(|tick| &tick.merged)
+        .map(|tick| tick.merged_boxes)
+        .sum();
+    let mut problems: Vec<Problem> = boxes::without_ground_truth(&scenario.name, targets, merged)
+        .into_iter()
+        .collect();
     for (index, agent) in scenario.agents.iter().enumerate() {
-        let boxes = findings.iter().map(|tick| tick.agents[index].boxes_with_sweep).sum();
+        let boxes = findings
+            .iter()
+            .map(|tick| tick.agents[index].boxes_with_sweep)
+            .sum();
         problems.extend(boxes::mostly_empty(&scenario.name, agent, boxes));
     }
     problems
@@ -142,16 +167,28 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
     }
     let frames: Vec<&Frame> = frames.iter().collect();
     let objects = frames.iter().flat_map(|frame| &frame.objects);
-    let targets = objects.filter(|object| rule.classes.contains(object.class)).count();
+    let targets = objects
+        .filter(|object| rule.classes.contains(object.class))
+        .count();
     let merged = merged_counts(scenario, tick, &frames, rule);
-    TickFindings { agents, targets, merged }
+    TickFindings {
+        agents,
+        targets,
+        merged,
+    }
 }
 
 fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFindings, Option<Frame>) {
     let mut findings = FrameFindings::default();
-    let without_points = dataset::LoadOptions { points: false, cameras: true, ..Default::default() };
+    let without_points = dataset::LoadOptions {
+        points: false,
+        cameras: true,
+        ..Default::default()
+    };
     let frame = scenario.load(agent, tick, &without_points);
-    let frame = frame.map_err(|error| findings.problems.push(Problem::from(&error))).ok();
+    let frame = frame
+        .map_err(|error| findings.problems.push(Problem::from(&error)))
+        .ok();
     let plain = survey_points(scenario, agent, tick, None, &mut findings);
     for variant in &scenario.lidar_variants {
         survey_points(scenario, agent, tick, Some(variant), &mut findings);
@@ -162,7 +199,8 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
             let cells = Cells::new(points);
-            let empty = |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, &cells);
+            let empty =
+                |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, &cells);
             findings.boxes_with_sweep = frame.objects.len();
             findings.boxes_without_points = frame.objects.iter().filter(empty).count();
         }
@@ -192,7 +230,9 @@ fn survey_points(
     };
     // Organised clouds have a point for every ray, including rays without a hit.
     if cloud.dropped as f64 > MOST_DROPPED * (cloud.dropped + cloud.points.len()) as f64 {
-        let path = scenario.points_path(agent, tick, variant).unwrap_or_default();
+        let path = scenario
+            .points_path(agent, tick, variant)
+            .unwrap_or_default();
         findings.problems.push(not_finite(&path, &cloud));
     }
     if variant.is_none() {
@@ -211,34 +251,68 @@ fn not_finite(path: &Path, cloud: &PcdCloud) -> Problem {
     };
     let path = path.display().to_string();
     let (dropped, all) = (cloud.dropped, cloud.dropped + cloud.points.len());
-    let message = format!("{path}: {dropped} of {all} points are not finite and are left out, {place}");
-    Problem { path, line, field: Some("x y z intensity".into()), message }
+    let message =
+        format!("{path}: {dropped} of {all} points are not finite and are left out, {place}");
+    Problem {
+        path,
+        line,
+        field: Some("x y z intensity".into()),
+        message,
+    }
 }
 
 fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, cells: &Cells) -> bool {
-    let Some(world_from_lidar) = world_from_lidar else { return false };
-    let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar.isometry());
-    cells.holds_point(&object_from_lidar.cast::<f32>(), object.size_m.map(|size| (size / 2.0) as f32))
+    let Some(world_from_lidar) = world_from_lidar else {
+        return false;
+    };
+    let object_from_lidar = object
+        .world_from_object
+        .isometry()
+        .inv_mul(&world_from_lidar.isometry());
+    cells.holds_point(
+        &object_from_lidar.cast::<f32>(),
+        object.size_m.map(|size| (size / 2.0) as f32),
+    )
 }
 
 /// Problems of the sweeps of each agent as a whole.
-fn sweep_problems(scenario: &Scenario, findings: &[TickFindings], options: &OpenOptions) -> Vec<Problem> {
+fn sweep_problems(
+    scenario: &Scenario,
+    findings: &[TickFindings],
+    options: &OpenOptions,
+) -> Vec<Problem> {
     let of_agent = |agent: usize| {
         let sweeps = sweeps_of(findings, agent);
-        let first = findings.iter().position(|tick| tick.agents[agent].sweep.is_some()).unwrap_or(0);
+        let first = findings
+            .iter()
+            .position(|tick| tick.agents[agent].sweep.is_some())
+            .unwrap_or(0);
         let path = scenario.points_path(agent, first, None).unwrap_or_default();
         let folder = path.parent().unwrap_or(&path);
-        sweeps::problems(folder, &scenario.agents[agent], &sweeps, options.intensity_scale)
+        sweeps::problems(
+            folder,
+            &scenario.agents[agent],
+            &sweeps,
+            options.intensity_scale,
+        )
     };
     (0..scenario.agents.len()).flat_map(of_agent).collect()
 }
 
 fn sweeps_of(findings: &[TickFindings], agent: usize) -> Vec<&SweepFindings> {
-    findings.iter().filter_map(|tick| tick.agents[agent].sweep.as_ref()).collect()
+    findings
+        .iter()
+        .filter_map(|tick| tick.agents[agent].sweep.as_ref())
+        .collect()
 }
 
 /// One ego-only entry for every ego, and one with all agents in range, if there are any.
-fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame], rule: &GroundTruthRule) -> Vec<TickReport> {
+fn merged_counts(
+    scenario: &Scenario,
+    tick: usize,
+    frames: &[&Frame],
+    rule: &GroundTruthRule,
+) -> Vec<TickReport> {
     let report = |ego: &CavId, agents: Vec<CavId>, merged_boxes: usize| TickReport {
         scenario: scenario.name.clone(),
         tick: scenario.ticks[tick].stem.clone(),
@@ -252,19 +326,36 @@ fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame], rule: &Gro
         merged.push(report(&ego.cav, vec![ego.cav.clone()], alone));
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
         if contributors.len() > 1 {
-            let agents = contributors.iter().map(|&other| frames[other].cav.clone()).collect();
-            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, rule).len()));
+            let agents = contributors
+                .iter()
+                .map(|&other| frames[other].cav.clone())
+                .collect();
+            merged.push(report(
+                &ego.cav,
+                agents,
+                ground_truth::merge(frames, index, rule).len(),
+            ));
         }
     }
     merged
 }
 
 fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
-    let times: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
-    let mut steps: Vec<u64> = times.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).collect();
+    let times: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
+    let mut steps: Vec<u64> = times
+        .windows(2)
+        .map(|pair| pair[1].saturating_sub(pair[0]))
+        .collect();
     steps.sort_unstable();
     let median = steps.get(steps.len() / 2).copied().filter(|&step| step > 0);
-    let span = times.last().zip(times.first()).map_or(0, |(last, first)| last.saturating_sub(*first));
+    let span = times
+        .last()
+        .zip(times.first())
+        .map_or(0, |(last, first)| last.saturating_sub(*first));
     ScenarioReport {
         name: scenario.name.clone(),
         layout: scenario.layout,
@@ -274,7 +365,8 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         rate_hz: median.map(|step| 1e9 / step as f64),
         agents: (0..scenario.agents.len())
             .map(|agent| {
-                let frames: Vec<&FrameFindings> = findings.iter().map(|tick| &tick.agents[agent]).collect();
+                let frames: Vec<&FrameFindings> =
+                    findings.iter().map(|tick| &tick.agents[agent]).collect();
                 summarize_agent(&scenario.agents[agent], &frames)
             })
             .collect(),
@@ -287,22 +379,44 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
 
 fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
     let counts = |count: fn(&FrameFindings) -> Option<usize>| {
-        Summary::of(&frames.iter().filter_map(|frame| count(frame)).collect::<Vec<_>>())
+        Summary::of(
+            &frames
+                .iter()
+                .filter_map(|frame| count(frame))
+                .collect::<Vec<_>>(),
+        )
     };
-    let positions: Vec<[f64; 3]> =
-        frames.iter().filter_map(|frame| Some(frame.world_from_lidar?.translation_m)).collect();
-    let step = |pair: &[[f64; 3]]| (0..3).map(|axis| (pair[1][axis] - pair[0][axis]).powi(2)).sum::<f64>().sqrt();
+    let positions: Vec<[f64; 3]> = frames
+        .iter()
+        .filter_map(|frame| Some(frame.world_from_lidar?.translation_m))
+        .collect();
+    let step = |pair: &[[f64; 3]]| {
+        (0..3)
+            .map(|axis| (pair[1][axis] - pair[0][axis]).powi(2))
+            .sum::<f64>()
+            .sqrt()
+    };
     AgentReport {
         id: id.clone(),
         points: counts(|frame| frame.points),
         dropped_points: frames.iter().map(|frame| frame.dropped).sum(),
         radar_points: counts(|frame| frame.radar_points),
-        sweeps: sweeps::summarize(&frames.iter().filter_map(|frame| frame.sweep.as_ref()).collect::<Vec<_>>()),
+        sweeps: sweeps::summarize(
+            &frames
+                .iter()
+                .filter_map(|frame| frame.sweep.as_ref())
+                .collect::<Vec<_>>(),
+        ),
         boxes: counts(|frame| frame.boxes),
         boxes_without_points: frames.iter().map(|frame| frame.boxes_without_points).sum(),
         frames: frames.iter().filter(|frame| frame.points.is_some()).count(),
         // An empty sum is -0.
-        distance_m: (!positions.is_empty()).then(|| positions.windows(2).map(step).fold(0.0, |sum, step| sum + step)),
+        distance_m: (!positions.is_empty()).then(|| {
+            positions
+                .windows(2)
+                .map(step)
+                .fold(0.0, |sum, step| sum + step)
+        }),
     }
 }
 
@@ -325,20 +439,38 @@ mod tests {
     }
 
     fn sweep(points: &[[f32; 4]]) -> Vec<u8> {
-        encode(&PointCloud { xyzi: points.to_vec() }, Encoding::Ascii, IntensityField::Intensity)
+        encode(
+            &PointCloud {
+                xyzi: points.to_vec(),
+            },
+            Encoding::Ascii,
+            IntensityField::Intensity,
+        )
     }
 
     fn survey(root: &Path) -> (Report, Vec<String>) {
-        let report = inspect(root, &OpenOptions::default(), &ProtocolConfig::default(), &|_, _| {});
+        let report = inspect(
+            root,
+            &OpenOptions::default(),
+            &ProtocolConfig::default(),
+            &|_, _| {},
+        );
         let root = root.to_string_lossy();
-        let messages = report.problems.iter().map(|problem| problem.message.replace(&*root, "")).collect();
+        let messages = report
+            .problems
+            .iter()
+            .map(|problem| problem.message.replace(&*root, ""))
+            .collect();
         (report, messages)
     }
 
     #[test]
     fn sound_frames_are_counted() {
         let dir = tempfile::tempdir().unwrap();
-        for (stem, points) in [("000010", vec![[10.0, 0.0, -1.3, 0.5]]), ("000012", vec![[1.0, 0.0, 0.0, 0.25]; 3])] {
+        for (stem, points) in [
+            ("000010", vec![[10.0, 0.0, -1.3, 0.5]]),
+            ("000012", vec![[1.0, 0.0, 0.0, 0.25]; 3]),
+        ] {
             write(dir.path(), &format!("1/{stem}.yaml"), YAML.as_bytes());
             write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&points));
         }
@@ -347,10 +479,25 @@ mod tests {
         let scenario = &report.scenarios[0];
         assert_eq!((scenario.frames, scenario.rate_hz), (2, Some(10.0)));
         let agent = &scenario.agents[0];
-        assert_eq!(agent.points, Some(Summary { min: 1, mean: 2.0, max: 3 }));
-        assert_eq!(agent.boxes_without_points, 1, "the second sweep has no point in the box");
+        assert_eq!(
+            agent.points,
+            Some(Summary {
+                min: 1,
+                mean: 2.0,
+                max: 3
+            })
+        );
+        assert_eq!(
+            agent.boxes_without_points, 1,
+            "the second sweep has no point in the box"
+        );
         assert_eq!(agent.distance_m, Some(0.0));
-        assert!(report.to_string().contains("ground truth of ego 1: 1 ego-only"), "{report}");
+        assert!(
+            report
+                .to_string()
+                .contains("ground truth of ego 1: 1 ego-only"),
+            "{report}"
+        );
     }
 
     #[test]
@@ -362,10 +509,18 @@ mod tests {
         write(root, "1/000010.yaml", YAML.as_bytes());
         write(root, "1/000010.pcd", &whole[..whole.len() - 3]);
         write(root, "1/000012.yaml", YAML.as_bytes());
-        write(root, "1/000012.pcd", &sweep(&[[1.0, 2.0, f32::NAN, 0.5], [1.0, 2.0, 3.0, 0.5]]));
+        write(
+            root,
+            "1/000012.pcd",
+            &sweep(&[[1.0, 2.0, f32::NAN, 0.5], [1.0, 2.0, 3.0, 0.5]]),
+        );
         write(root, "1/000013.yaml", YAML.as_bytes());
         write(root, "1/000013.pcd", &sweep(&[[f32::NAN; 4]; 2]));
-        write(root, "1/000014.yaml", YAML.replace("[0, 0, 2, 0, 0, 0]", "[0, 0, 2]").as_bytes());
+        write(
+            root,
+            "1/000014.yaml",
+            YAML.replace("[0, 0, 2, 0, 0, 0]", "[0, 0, 2]").as_bytes(),
+        );
         write(root, "1/000014.pcd", &whole);
         write(root, "1/000016.pcd", &whole);
         write(root, "1/000018.yaml", YAML.as_bytes());
@@ -380,17 +535,30 @@ mod tests {
                 "/1/000016.yaml: does not exist beside 000016.pcd: the frame is left out",
             ]
         );
-        assert_eq!((report.problems[2].line, report.problems[2].field.as_deref()), (Some(1), Some("lidar_pose")));
+        assert_eq!(
+            (report.problems[2].line, report.problems[2].field.as_deref()),
+            (Some(1), Some("lidar_pose"))
+        );
         let agent = &report.scenarios[0].agents[0];
-        assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
-        assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
+        assert_eq!(
+            (agent.points, agent.dropped_points),
+            (Summary::of(&[1, 0, 2, 2]), 3)
+        );
+        assert_eq!(
+            report.ticks.len(),
+            4,
+            "annotations of sound YAML count even where the sweep is broken"
+        );
     }
 
     /// Messages and table of an agent whose sweeps have these intensities.
     fn of_intensities(sweeps: &[&[f32]]) -> (Vec<String>, String) {
         let dir = tempfile::tempdir().unwrap();
         for (stem, intensities) in sweeps.iter().enumerate() {
-            let points: Vec<[f32; 4]> = intensities.iter().map(|&intensity| [10.0, 0.0, -1.3, intensity]).collect();
+            let points: Vec<[f32; 4]> = intensities
+                .iter()
+                .map(|&intensity| [10.0, 0.0, -1.3, intensity])
+                .collect();
             write(dir.path(), &format!("1/{stem:06}.yaml"), YAML.as_bytes());
             write(dir.path(), &format!("1/{stem:06}.pcd"), &sweep(&points));
         }
@@ -405,7 +573,10 @@ mod tests {
         let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.375";
         assert!(table.contains(line), "{table}");
         let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
-        assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
+        assert!(
+            messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"),
+            "{table}"
+        );
         let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
         assert_eq!(message(&[&[0.5; 19]]), "", "few points are not evaluated");
         assert_eq!(
@@ -431,7 +602,11 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         write(dir.path(), "1/000010.yaml", YAML.as_bytes());
         let head = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 2\nDATA ascii\n";
-        write(dir.path(), "1/000010.pcd", format!("{head}1 2 3 0\n4000 5 6 1\n").as_bytes());
+        write(
+            dir.path(),
+            "1/000010.pcd",
+            format!("{head}1 2 3 0\n4000 5 6 1\n").as_bytes(),
+        );
         let (_, messages) = survey(dir.path());
         assert_eq!(
             messages,
@@ -446,11 +621,17 @@ mod tests {
     #[test]
     fn boxes_that_cannot_be_in_the_right_frame_are_a_problem() {
         let dir = tempfile::tempdir().unwrap();
-        let car = |id: usize| format!("  {id}: {{location: [900, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n");
+        let car = |id: usize| {
+            format!("  {id}: {{location: [900, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n")
+        };
         let cars: String = (0..20).map(car).collect();
         let yaml = format!("lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n{cars}");
         write(dir.path(), "scene/1/000010.yaml", yaml.as_bytes());
-        write(dir.path(), "scene/1/000010.pcd", &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]));
+        write(
+            dir.path(),
+            "scene/1/000010.pcd",
+            &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]),
+        );
         let (_, messages) = survey(dir.path());
         assert_eq!(
             messages,
@@ -470,7 +651,11 @@ mod tests {
             + "  9: {type: Ufo, location: [5, 0, 0], angle: [0, 0, 0], extent: [2, 1, 1]}\n";
         for stem in ["000010", "000012"] {
             write(dir.path(), &format!("1/{stem}.yaml"), yaml.as_bytes());
-            write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]));
+            write(
+                dir.path(),
+                &format!("1/{stem}.pcd"),
+                &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]),
+            );
         }
         let (report, messages) = survey(dir.path());
         assert_eq!(

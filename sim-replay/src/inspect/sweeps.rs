@@ -52,8 +52,13 @@ impl SweepFindings {
         let values = || cloud.points.xyzi.iter().map(|point| point[3]);
         let step = cloud.points.len().div_ceil(MEDIAN_OF).max(1);
         let median = median(&values().step_by(step).collect::<Vec<_>>());
-        let range = median
-            .map(|median| [values().fold(f32::INFINITY, f32::min), median, values().fold(f32::NEG_INFINITY, f32::max)]);
+        let range = median.map(|median| {
+            [
+                values().fold(f32::INFINITY, f32::min),
+                median,
+                values().fold(f32::NEG_INFINITY, f32::max),
+            ]
+        });
         Self {
             points: cloud.points.len(),
             form: cloud.form,
@@ -80,20 +85,36 @@ pub(super) fn summarize(sweeps: &[&SweepFindings]) -> Option<SweepReport> {
         intensity: first.intensity.clone(),
         min_intensity: ranges().map(|[min, ..]| min).fold(f32::INFINITY, f32::min),
         median_intensity: median(&ranges().map(|[_, median, _]| median).collect::<Vec<_>>())?,
-        max_intensity: ranges().map(|[.., max]| max).fold(f32::NEG_INFINITY, f32::max),
+        max_intensity: ranges()
+            .map(|[.., max]| max)
+            .fold(f32::NEG_INFINITY, f32::max),
     })
 }
 
 /// Problems of the sweeps of an agent in `folder`.
-pub(super) fn problems(folder: &Path, agent: &CavId, sweeps: &[&SweepFindings], scale: IntensityScale) -> Vec<Problem> {
-    let Some(report) = summarize(sweeps) else { return Vec::new() };
+pub(super) fn problems(
+    folder: &Path,
+    agent: &CavId,
+    sweeps: &[&SweepFindings],
+    scale: IntensityScale,
+) -> Vec<Problem> {
+    let Some(report) = summarize(sweeps) else {
+        return Vec::new();
+    };
     let mut plausibility = Plausibility::default();
-    sweeps.iter().for_each(|sweep| plausibility.join(&sweep.plausibility));
+    sweeps
+        .iter()
+        .for_each(|sweep| plausibility.join(&sweep.plausibility));
     let mut problems = Vec::new();
     let mut add = |field: &str, what: String| {
         let path = folder.display().to_string();
         let message = format!("{path}: sweeps of agent {agent}: {what}");
-        problems.push(Problem { path, line: None, field: Some(field.into()), message });
+        problems.push(Problem {
+            path,
+            line: None,
+            field: Some(field.into()),
+            message,
+        });
     };
     if let Some(fault) = plausibility.fault() {
         add("x y z", fault);
@@ -105,13 +126,21 @@ pub(super) fn problems(folder: &Path, agent: &CavId, sweeps: &[&SweepFindings], 
 }
 
 /// The first fault of the intensities.
-fn intensity_fault(report: &SweepReport, sweeps: &[&SweepFindings], scale: IntensityScale) -> Option<String> {
+fn intensity_fault(
+    report: &SweepReport,
+    sweeps: &[&SweepFindings],
+    scale: IntensityScale,
+) -> Option<String> {
     let Some(origin) = &report.intensity else {
         return Some(
             "no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for all points".into(),
         );
     };
-    let SweepReport { min_intensity: min, max_intensity: max, .. } = *report;
+    let SweepReport {
+        min_intensity: min,
+        max_intensity: max,
+        ..
+    } = *report;
     let points: usize = sweeps.iter().map(|sweep| sweep.points).sum();
     let from = format!("field {} divided by {}", origin.field, origin.divisor);
     let above: usize = sweeps.iter().map(|sweep| sweep.above_one).sum();
@@ -122,10 +151,14 @@ fn intensity_fault(report: &SweepReport, sweeps: &[&SweepFindings], scale: Inten
     }
     let below: usize = sweeps.iter().map(|sweep| sweep.below_zero).sum();
     if below > 0 {
-        return Some(format!("{below} of {points} intensities are below 0, down to {min} ({from})"));
+        return Some(format!(
+            "{below} of {points} intensities are below 0, down to {min} ({from})"
+        ));
     }
     if points >= LEAST_POINTS && min.total_cmp(&max).is_eq() {
-        return Some(format!("all {points} intensities are {min} ({from}), expected a sensor's, which differ"));
+        return Some(format!(
+            "all {points} intensities are {min} ({from}), expected a sensor's, which differ"
+        ));
     }
     let is_unusual = scale == IntensityScale::AUTO && !USUAL_DIVISORS.contains(&origin.divisor);
     is_unusual.then(|| {
@@ -138,14 +171,30 @@ fn intensity_fault(report: &SweepReport, sweeps: &[&SweepFindings], scale: Inten
 
 impl std::fmt::Display for SweepReport {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { form, intensity, min_intensity: min, median_intensity: median, max_intensity: max } = self;
+        let Self {
+            form,
+            intensity,
+            min_intensity: min,
+            median_intensity: median,
+            max_intensity: max,
+        } = self;
         write!(f, "{form}; ")?;
-        let Some(IntensityOrigin { field, kind, divisor }) = intensity else { return f.write_str("no intensity") };
+        let Some(IntensityOrigin {
+            field,
+            kind,
+            divisor,
+        }) = intensity
+        else {
+            return f.write_str("no intensity");
+        };
         let stored = match kind {
             IntensityKind::RedByte => ", red byte",
             IntensityKind::Byte => ", a byte",
             IntensityKind::Number => "",
         };
-        write!(f, "intensity from {field}{stored}, divided by {divisor}: {min:.3} to {max:.3}, median {median:.3}")
+        write!(
+            f,
+            "intensity from {field}{stored}, divided by {divisor}: {min:.3} to {max:.3}, median {median:.3}"
+        )
     }
 }

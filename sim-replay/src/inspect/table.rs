@@ -24,7 +24,9 @@ impl fmt::Display for Report {
             count(frames, "frame")
         )?;
         let agents = self.scenarios.iter().flat_map(|scenario| &scenario.agents);
-        let has_boxes = agents.filter_map(|agent| agent.boxes).any(|boxes| boxes.max > 0);
+        let has_boxes = agents
+            .filter_map(|agent| agent.boxes)
+            .any(|boxes| boxes.max > 0);
         if let Some(protocol) = self.protocol.as_ref().filter(|_| has_boxes) {
             writeln!(f, "{protocol}")?;
         }
@@ -51,9 +53,17 @@ impl Report {
             Handedness::Left => "left-handed",
             Handedness::Right => "right-handed",
         };
-        let rate = scenario.rate_hz.map(|rate| format!(" at {rate:.1} Hz")).unwrap_or_default();
+        let rate = scenario
+            .rate_hz
+            .map(|rate| format!(" at {rate:.1} Hz"))
+            .unwrap_or_default();
         let seconds = scenario.seconds;
-        writeln!(f, "\n{}: {}{rate}, {seconds:.1} s, {axes} on disk", scenario.name, count(scenario.frames, "frame"))?;
+        writeln!(
+            f,
+            "\n{}: {}{rate}, {seconds:.1} s, {axes} on disk",
+            scenario.name,
+            count(scenario.frames, "frame")
+        )?;
         write!(f, "{}", agents_table(&scenario.agents))?;
         for agent in &scenario.agents {
             if let Some(sweeps) = &agent.sweeps {
@@ -61,7 +71,11 @@ impl Report {
             }
         }
         if !scenario.lidar_variants.is_empty() {
-            writeln!(f, "  LiDAR variants: {}", scenario.lidar_variants.join(", "))?;
+            writeln!(
+                f,
+                "  LiDAR variants: {}",
+                scenario.lidar_variants.join(", ")
+            )?;
         }
         if !scenario.cameras.is_empty() {
             let numbers: Vec<String> = scenario.cameras.iter().map(u8::to_string).collect();
@@ -73,9 +87,18 @@ impl Report {
 
     /// One line per ego: boxes ego-only, and with the other agents.
     fn write_merged(&self, f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
-        let of_scenario = self.ticks.iter().filter(|tick| tick.scenario == scenario.name);
+        let of_scenario = self
+            .ticks
+            .iter()
+            .filter(|tick| tick.scenario == scenario.name);
         let mut by_ego: BTreeMap<&str, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
-        for TickReport { ego, agents, merged_boxes, .. } in of_scenario {
+        for TickReport {
+            ego,
+            agents,
+            merged_boxes,
+            ..
+        } in of_scenario
+        {
             let (alone, together) = by_ego.entry(ego.as_str()).or_default();
             if agents.len() == 1 { alone } else { together }.push(*merged_boxes);
         }
@@ -84,7 +107,11 @@ impl Report {
                 Some(summary) => format!(", {} with those in range", shown(Some(summary))),
                 None => String::new(),
             };
-            writeln!(f, "  ground truth of ego {ego}: {} ego-only{with_others}", shown(Summary::of(&alone)))?;
+            writeln!(
+                f,
+                "  ground truth of ego {ego}: {} ego-only{with_others}",
+                shown(Summary::of(&alone))
+            )?;
         }
         Ok(())
     }
@@ -93,17 +120,39 @@ impl Report {
 /// One line for every agent that lacks frames which others have; at those that the ego lacks there is no tick.
 fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
     for (index, AgentReport { id, .. }) in scenario.agents.iter().enumerate() {
-        let lacking: Vec<_> = scenario.missing.iter().filter(|frame| frame.agent == *id).collect();
-        let (Some(first), Some(last)) = (lacking.first(), lacking.last()) else { continue };
+        let lacking: Vec<_> = scenario
+            .missing
+            .iter()
+            .filter(|frame| frame.agent == *id)
+            .collect();
+        let (Some(first), Some(last)) = (lacking.first(), lacking.last()) else {
+            continue;
+        };
         let frames = count(lacking.len(), "frame");
-        let consequence = if index == 0 { "the frames of others are not used there" } else { "absent there" };
-        writeln!(f, "  agent {id} lacks {frames}, from {} to {}: {consequence}", first.stem, last.stem)?;
+        let consequence = if index == 0 {
+            "the frames of others are not used there"
+        } else {
+            "absent there"
+        };
+        writeln!(
+            f,
+            "  agent {id} lacks {frames}, from {} to {}: {consequence}",
+            first.stem, last.stem
+        )?;
     }
     Ok(())
 }
 
 fn agents_table(agents: &[AgentReport]) -> TextTable {
-    let right = ["points", "dropped", "boxes", "empty boxes", "radar", "metres"].map(|name| (name, Side::Right));
+    let right = [
+        "points",
+        "dropped",
+        "boxes",
+        "empty boxes",
+        "radar",
+        "metres",
+    ]
+    .map(|name| (name, Side::Right));
     let mut table = TextTable::new([("agent", Side::Left)].into_iter().chain(right));
     for agent in agents {
         table.row([
@@ -113,7 +162,9 @@ fn agents_table(agents: &[AgentReport]) -> TextTable {
             shown(agent.boxes),
             agent.boxes_without_points.to_string(),
             shown(agent.radar_points),
-            agent.distance_m.map_or("no pose".into(), |metres| format!("{metres:.1}")),
+            agent
+                .distance_m
+                .map_or("no pose".into(), |metres| format!("{metres:.1}")),
         ]);
     }
     table

@@ -39,17 +39,30 @@ impl Place {
     ///
     /// # Errors
     /// [`CheckpointError`] if the file holds no state, or that of another scene.
-    pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, CheckpointError> {
+    pub fn read(
+        path: &Path,
+        scenario: &str,
+        ticks: usize,
+    ) -> Result<Option<Self>, CheckpointError> {
         let at = || path.to_path_buf();
         let text = match bounded_file::read_text(path, MAX_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(CheckpointError::Read { path: at(), source }),
         };
-        let place: Self = serde_json::from_str(&text).map_err(|source| CheckpointError::Text { path: at(), source })?;
+        let place: Self = serde_json::from_str(&text)
+            .map_err(|source| CheckpointError::Text { path: at(), source })?;
         if place.scenario != scenario || place.position.next_tick > ticks {
-            let position = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
-            return Err(CheckpointError::Elsewhere { path: at(), place: position, scenario: scenario.into(), ticks });
+            let position = format!(
+                "is tick {} of scenario {}",
+                place.position.next_tick, place.scenario
+            );
+            return Err(CheckpointError::Elsewhere {
+                path: at(),
+                place: position,
+                scenario: scenario.into(),
+                ticks,
+            });
         }
         Ok(Some(place))
     }
@@ -58,8 +71,14 @@ impl Place {
     pub(super) fn report(&self) -> StreamReport {
         // The file may hold any number; counting continues from here.
         let [ticks, unanswered, unreadable_frames] =
-            [self.ticks, self.unanswered, self.unreadable_frames].map(|count| count.min(u64::MAX >> 1));
-        StreamReport { ticks, unanswered, unreadable_frames, ..StreamReport::default() }
+            [self.ticks, self.unanswered, self.unreadable_frames]
+                .map(|count| count.min(u64::MAX >> 1));
+        StreamReport {
+            ticks,
+            unanswered,
+            unreadable_frames,
+            ..StreamReport::default()
+        }
     }
 }
 
@@ -111,13 +130,19 @@ impl Checkpoint {
             let newest = Arc::clone(&newest);
             move || write_all(&path, &newest)
         })?;
-        Ok(Self { newest, writing: Some(writing) })
+        Ok(Self {
+            newest,
+            writing: Some(writing),
+        })
     }
 
     /// Queues a state for writing; one that still waits for the disk is replaced.
     pub(super) fn note(&self, place: Place) {
         match self.newest.push((), place) {
-            PushOutcome::Queued | PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {}
+            PushOutcome::Queued
+            | PushOutcome::Replaced(_)
+            | PushOutcome::NoLane(_)
+            | PushOutcome::Closed(_) => {}
         }
     }
 }
@@ -125,7 +150,11 @@ impl Checkpoint {
 impl Drop for Checkpoint {
     fn drop(&mut self) {
         self.newest.close();
-        if self.writing.take().is_some_and(|writing| writing.join().is_err()) {
+        if self
+            .writing
+            .take()
+            .is_some_and(|writing| writing.join().is_err())
+        {
             tracing::error!("the thread that writes checkpoints panicked");
         }
     }
@@ -162,7 +191,12 @@ mod tests {
     fn place() -> Place {
         Place {
             scenario: "town1".into(),
-            position: Position { next_tick: 7, left: Some(3), shift_nanos: 5, last_nanos: Some(700) },
+            position: Position {
+                next_tick: 7,
+                left: Some(3),
+                shift_nanos: 5,
+                last_nanos: Some(700),
+            },
             is_halted: true,
             ticks: 7,
             unanswered: 1,
@@ -181,9 +215,16 @@ mod tests {
         }
         drop(checkpoint);
         assert_eq!(Place::read(&path, "town1", 10).unwrap(), Some(place()));
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
+        assert_eq!(
+            fs::read_dir(folder.path()).unwrap().count(),
+            1,
+            "nothing is left beside it"
+        );
         let report = place().report();
-        assert_eq!((report.ticks, report.unanswered, report.unreadable_frames), (7, 1, 2));
+        assert_eq!(
+            (report.ticks, report.unanswered, report.unreadable_frames),
+            (7, 1, 2)
+        );
     }
 
     #[test]
@@ -191,10 +232,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         write(&path, &place()).unwrap();
-        let error_of = |found: Result<Option<Place>, CheckpointError>| found.unwrap_err().to_string();
+        let error_of =
+            |found: Result<Option<Place>, CheckpointError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
             let error = error_of(Place::read(&path, scenario, ticks));
-            assert!(error.contains("tick 7 of scenario town1") && error.contains(scenario), "{error}");
+            assert!(
+                error.contains("tick 7 of scenario town1") && error.contains(scenario),
+                "{error}"
+            );
         }
         for broken in ["{", "[]", "{\"scenario\": \"town1\"}"] {
             fs::write(&path, broken).unwrap();
@@ -209,6 +254,10 @@ mod tests {
         let checkpoint = Checkpoint::open(PathBuf::from("/nowhere/place.json")).unwrap();
         checkpoint.note(place());
         drop(checkpoint);
-        assert!(Place::read(Path::new("/nowhere/place.json"), "town1", 10).unwrap().is_none());
+        assert!(
+            Place::read(Path::new("/nowhere/place.json"), "town1", 10)
+                .unwrap()
+                .is_none()
+        );
     }
 }

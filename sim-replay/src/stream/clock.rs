@@ -26,7 +26,11 @@ impl ReplayClock {
     /// A running clock.
     #[must_use]
     pub(crate) fn new(rate: f64) -> Self {
-        Self { rate, state: State::Running, anchor: None }
+        Self {
+            rate,
+            state: State::Running,
+            anchor: None,
+        }
     }
 
     /// Runs on from here, at another rate if one is given.
@@ -52,7 +56,9 @@ impl ReplayClock {
             State::Halted { steps } => steps,
             State::Running => 0,
         };
-        self.state = State::Halted { steps: steps.saturating_add(ticks) };
+        self.state = State::Halted {
+            steps: steps.saturating_add(ticks),
+        };
     }
 
     /// After a jump of the scene's time, or a wait: the next tick is due at once.
@@ -96,7 +102,9 @@ mod tests {
         assert_eq!(clock.due(5 * TENTH, start), Some(start));
         clock.published(5 * TENTH, start);
         for tick in 1..5 {
-            let due = clock.due((5 + tick) * TENTH, start + Duration::from_secs(9)).unwrap();
+            let due = clock
+                .due((5 + tick) * TENTH, start + Duration::from_secs(9))
+                .unwrap();
             assert_eq!(due, start + Duration::from_millis(50 * tick));
             clock.published((5 + tick) * TENTH, due);
         }
@@ -115,7 +123,11 @@ mod tests {
         }
         assert_eq!(clock.due(2 * TENTH, now), None);
         clock.resume(None);
-        assert_eq!(clock.due(2 * TENTH, now), Some(now), "the pause does not count as lateness");
+        assert_eq!(
+            clock.due(2 * TENTH, now),
+            Some(now),
+            "the pause does not count as lateness"
+        );
     }
 
     #[test]
@@ -136,6 +148,9 @@ mod tests {
         assert_eq!(clock.due(TENTH, now), Some(now));
         clock.resume(Some(1.0));
         clock.published(0, now);
-        assert_eq!(clock.due(TENTH, now), Some(now + Duration::from_millis(100)));
+        assert_eq!(
+            clock.due(TENTH, now),
+            Some(now + Duration::from_millis(100))
+        );
     }
 }

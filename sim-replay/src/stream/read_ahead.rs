@@ -20,7 +20,10 @@ struct State {
 
 impl State {
     fn next(&self) -> Option<usize> {
-        self.wanted.iter().copied().find(|index| !self.ready.contains_key(index))
+        self.wanted
+            .iter()
+            .copied()
+            .find(|index| !self.ready.contains_key(index))
     }
 }
 
@@ -35,13 +38,20 @@ impl ReadAhead {
     ///
     /// # Errors
     /// If the system provides no thread.
-    pub(crate) fn start(scenario: Scenario, agents: Vec<usize>, options: LoadOptions) -> std::io::Result<Self> {
+    pub(crate) fn start(
+        scenario: Scenario,
+        agents: Vec<usize>,
+        options: LoadOptions,
+    ) -> std::io::Result<Self> {
         let shared: Arc<(Mutex<State>, Condvar)> = Arc::default();
         let thread = thread::Builder::new().name("read ahead".into()).spawn({
             let shared = Arc::clone(&shared);
             move || {
                 while let Some(tick) = next_wanted(&shared) {
-                    let frames = agents.iter().map(|&agent| scenario.load(agent, tick, &options)).collect();
+                    let frames = agents
+                        .iter()
+                        .map(|&agent| scenario.load(agent, tick, &options))
+                        .collect();
                     let mut state = lock(&shared);
                     // The tick may no longer be requested after a jump.
                     if state.wanted.contains(&tick) {
@@ -51,7 +61,10 @@ impl ReadAhead {
                 }
             }
         })?;
-        Ok(Self { shared, thread: Some(thread) })
+        Ok(Self {
+            shared,
+            thread: Some(thread),
+        })
     }
 
     /// Sets the ticks that will be taken next, in order; other frames that were read are dropped.
@@ -78,7 +91,12 @@ impl ReadAhead {
                 self.shared.1.notify_all();
             }
             // A thread that panics does not notify the waiters.
-            state = self.shared.1.wait_timeout(state, Duration::from_secs(1)).unwrap_or_else(PoisonError::into_inner).0;
+            state = self
+                .shared
+                .1
+                .wait_timeout(state, Duration::from_secs(1))
+                .unwrap_or_else(PoisonError::into_inner)
+                .0;
         }
     }
 }

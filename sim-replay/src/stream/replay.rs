@@ -16,7 +16,10 @@ use super::sensor_link::{DelayedSweep, SensorLink};
 use super::sensor_publisher::{SensorPublisher, truth_of};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Barrier, Bus, BusError, Event, Inbox, LivelinessToken, NotReady, Route, Subscription, process_id};
+use bus::{
+    Barrier, Bus, BusError, Event, Inbox, LivelinessToken, NotReady, Route, Subscription,
+    process_id,
+};
 use dataset::{LoadOptions, Scenario};
 use link::{LinkConfig, LinkError};
 
@@ -117,7 +120,9 @@ pub enum StreamError {
     #[error(transparent)]
     Link(#[from] LinkError),
     /// A lost frame is never answered.
-    #[error("a link and lockstep exclude each other: a tick whose frames are late or lost is not answered")]
+    #[error(
+        "a link and lockstep exclude each other: a tick whose frames are late or lost is not answered"
+    )]
     LinkInLockstep,
     /// The checkpoint is invalid.
     #[error("checkpoint: {0}")]
@@ -168,11 +173,22 @@ impl<'a> Replay<'a> {
     ) -> Result<Self, StreamError> {
         let agents = agent_indices(scenario, &options.agents)?;
         check(scenario, &options)?;
-        let cavs: Vec<CavId> = agents.iter().map(|&index| scenario.agents[index].clone()).collect();
-        let options = StreamOptions { agents: cavs, ..options };
+        let cavs: Vec<CavId> = agents
+            .iter()
+            .map(|&index| scenario.agents[index].clone())
+            .collect();
+        let options = StreamOptions {
+            agents: cavs,
+            ..options
+        };
         let read = |path: &PathBuf| Place::read(path, &scenario.name, scenario.ticks.len());
         let place = options.checkpoint.as_ref().map(read).transpose()?.flatten();
-        let schedule = Schedule::new(&scenario.ticks, options.seek, options.frames, options.repeats);
+        let schedule = Schedule::new(
+            &scenario.ticks,
+            options.seek,
+            options.frames,
+            options.repeats,
+        );
         let mut clock = ReplayClock::new(options.rate);
         let schedule = match &place {
             Some(place) => schedule.resumed(place.position),
@@ -181,7 +197,8 @@ impl<'a> Replay<'a> {
         if place.as_ref().is_some_and(|place| place.is_halted) {
             clock.pause();
         }
-        let reading = ReadAhead::start(scenario.clone(), agents, options.load.clone()).map_err(StreamError::Thread)?;
+        let reading = ReadAhead::start(scenario.clone(), agents, options.load.clone())
+            .map_err(StreamError::Thread)?;
         reading.want(&schedule.ahead(READ_AHEAD));
 
         let inbox = bus.inbox(COMMANDS, 16);
@@ -189,21 +206,49 @@ impl<'a> Replay<'a> {
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let verbs = [Verb::Start, Verb::Pause, Verb::Resume, Verb::Step, Verb::Seek].map(Topic::Control);
-        let answers = options.lockstep.iter().map(|ego| Topic::Stream { cav: ego.clone(), stream: Stream::Detections });
-        let subscriptions = verbs.into_iter().chain(answers).map(|topic| bus.subscribe(topic, &inbox));
-        let sensor_link = options.link.as_ref().map(|(link, seed)| SensorLink::new(link, *seed)).transpose()?;
+        let verbs = [
+            Verb::Start,
+            Verb::Pause,
+            Verb::Resume,
+            Verb::Step,
+            Verb::Seek,
+        ]
+        .map(Topic::Control);
+        let answers = options.lockstep.iter().map(|ego| Topic::Stream {
+            cav: ego.clone(),
+            stream: Stream::Detections,
+        });
+        let subscriptions = verbs
+            .into_iter()
+            .chain(answers)
+            .map(|topic| bus.subscribe(topic, &inbox));
+        let sensor_link = options
+            .link
+            .as_ref()
+            .map(|(link, seed)| SensorLink::new(link, *seed))
+            .transpose()?;
         Ok(Self {
             bus,
             scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
-            checkpoint: options.checkpoint.clone().map(Checkpoint::open).transpose().map_err(StreamError::Thread)?,
+            checkpoint: options
+                .checkpoint
+                .clone()
+                .map(Checkpoint::open)
+                .transpose()
+                .map_err(StreamError::Thread)?,
             is_resumed: place.is_some(),
             reading,
             schedule,
             present: BTreeSet::new(),
             clock,
-            outlet: SensorPublisher::open(bus, &options.agents, &options.load, &scenario.cameras, options.is_paced())?,
+            outlet: SensorPublisher::open(
+                bus,
+                &options.agents,
+                &options.load,
+                &scenario.cameras,
+                options.is_paced(),
+            )?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
             sensor_link,
             inbox,
@@ -226,7 +271,11 @@ impl<'a> Replay<'a> {
             return Ok(wait(self.options.ready_timeout)?);
         }
         let (tick, ticks) = (self.schedule.position().next_tick, self.tick_count);
-        tracing::warn!(tick, ticks, "resuming from the checkpoint of the previous process instance");
+        tracing::warn!(
+            tick,
+            ticks,
+            "resuming from the checkpoint of the previous process instance"
+        );
         if let Err(not_ready) = wait(RESUME_TIMEOUT.min(self.options.ready_timeout)) {
             tracing::warn!("the replay continues, although {not_ready}");
         }
@@ -253,29 +302,55 @@ impl<'a> Replay<'a> {
         }
         self.await_the_last();
         drop(working);
-        let Self { bus, outlet, sensor_link, mut report, .. } = self;
+        let Self {
+            bus,
+            outlet,
+            sensor_link,
+            mut report,
+            ..
+        } = self;
         report.sensor_link = sensor_link.map(|link| link.report().clone());
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
         report.sent = outlet.finish();
         report.count_unsent(&bus.stats().ledger());
-        bus.publish_control(Control::End { ticks: report.ticks, sent: report.sent.clone() }, 0);
+        bus.publish_control(
+            Control::End {
+                ticks: report.ticks,
+                sent: report.sent.clone(),
+            },
+            0,
+        );
         report
     }
 
     fn expected_routes(&self) -> Vec<Route> {
         let sensors = |cav: &CavId| {
             [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Route {
-                topic: Topic::Stream { cav: cav.clone(), stream },
+                topic: Topic::Stream {
+                    cav: cav.clone(),
+                    stream,
+                },
                 receiver: process_id(Role::Agent, cav),
             })
         };
         let answers = self.options.lockstep.iter().map(|ego| Route {
-            topic: Topic::Stream { cav: ego.clone(), stream: Stream::Detections },
+            topic: Topic::Stream {
+                cav: ego.clone(),
+                stream: Stream::Detections,
+            },
             receiver: self.bus.identity().process.clone(),
         });
-        let agents = self.options.agents.iter().filter(|_| self.options.await_agents);
-        agents.flat_map(sensors).chain(answers).chain(self.options.expect.iter().cloned()).collect()
+        let agents = self
+            .options
+            .agents
+            .iter()
+            .filter(|_| self.options.await_agents);
+        agents
+            .flat_map(sensors)
+            .chain(answers)
+            .chain(self.options.expect.iter().cloned())
+            .collect()
     }
 
     /// The next tick with its due time, at that time. `None`: the scene has ended, or a stop was requested.
@@ -292,7 +367,10 @@ impl<'a> Replay<'a> {
                 }
                 _ => {}
             }
-            match self.inbox.take(due.into_iter().chain(self.next_arrival()).min()) {
+            match self
+                .inbox
+                .take(due.into_iter().chain(self.next_arrival()).min())
+            {
                 Pop::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
                         self.apply(command);
@@ -312,8 +390,15 @@ impl<'a> Replay<'a> {
 
     /// Publishes the frames that have passed the emulated link.
     fn deliver(&mut self) {
-        let Some(link) = &mut self.sensor_link else { return };
-        for DelayedSweep { agent, capture_nanos, frame } in link.arrived(Instant::now()) {
+        let Some(link) = &mut self.sensor_link else {
+            return;
+        };
+        for DelayedSweep {
+            agent,
+            capture_nanos,
+            frame,
+        } in link.arrived(Instant::now())
+        {
             self.outlet.submit(agent, capture_nanos, frame);
         }
     }
@@ -330,8 +415,15 @@ impl<'a> Replay<'a> {
 
     /// After a tick was submitted completely: a restarted replay resumes with the next one.
     fn note_place(&self) {
-        let Some(checkpoint) = &self.checkpoint else { return };
-        let StreamReport { ticks, unanswered, unreadable_frames, .. } = self.report;
+        let Some(checkpoint) = &self.checkpoint else {
+            return;
+        };
+        let StreamReport {
+            ticks,
+            unanswered,
+            unreadable_frames,
+            ..
+        } = self.report;
         checkpoint.note(Place {
             scenario: self.scenario.clone(),
             position: self.schedule.position(),
@@ -357,16 +449,24 @@ impl<'a> Replay<'a> {
                 }
                 _ => tracing::warn!(tick, ticks = self.tick_count, "no such tick to seek"),
             },
-            Control::End { .. } | Control::Ready { .. } | Control::Probe | Control::Done { .. } => {}
+            Control::End { .. } | Control::Ready { .. } | Control::Probe | Control::Done { .. } => {
+            }
         }
     }
 
     fn publish(&mut self, planned: Planned, due: Instant) {
-        let Planned { tick_index, capture_nanos } = planned;
+        let Planned {
+            tick_index,
+            capture_nanos,
+        } = planned;
         let frames: TickFrames = self.reading.take(tick_index);
         self.reading.want(&self.schedule.ahead(READ_AHEAD));
         let agents = truth_of(&frames.iter().flatten().collect::<Vec<_>>());
-        self.present = frames.iter().flatten().map(|frame| frame.cav.clone()).collect();
+        self.present = frames
+            .iter()
+            .flatten()
+            .map(|frame| frame.cav.clone())
+            .collect();
         if self.options.lockstep.is_empty() && self.options.rate > 0.0 {
             self.report.lateness.add(due.elapsed());
         }
@@ -378,7 +478,15 @@ impl<'a> Replay<'a> {
                         None => self.outlet.submit(agent, capture_nanos, frame),
                         Some(link) => {
                             let cav = frame.cav.clone();
-                            link.submit(&cav, DelayedSweep { agent, capture_nanos, frame }, Instant::now());
+                            link.submit(
+                                &cav,
+                                DelayedSweep {
+                                    agent,
+                                    capture_nanos,
+                                    frame,
+                                },
+                                Instant::now(),
+                            );
                         }
                     }
                 }
@@ -386,7 +494,13 @@ impl<'a> Replay<'a> {
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
-        self.outlet.submit_truth(capture_nanos, Truth { tick: tick_index as u64, agents });
+        self.outlet.submit_truth(
+            capture_nanos,
+            Truth {
+                tick: tick_index as u64,
+                agents,
+            },
+        );
         self.deliver();
         self.report.ticks += 1;
         self.clock.published(capture_nanos, due);
@@ -399,7 +513,13 @@ impl<'a> Replay<'a> {
         }
         let capture_nanos = planned.capture_nanos;
         let is_asked = |ego: &&CavId| self.present.contains(ego);
-        let mut missing: BTreeSet<CavId> = self.options.lockstep.iter().filter(is_asked).cloned().collect();
+        let mut missing: BTreeSet<CavId> = self
+            .options
+            .lockstep
+            .iter()
+            .filter(is_asked)
+            .cloned()
+            .collect();
         let deadline = end_of(self.options.answer_timeout);
         while !missing.is_empty() {
             match self.inbox.take(deadline) {
@@ -416,7 +536,12 @@ impl<'a> Replay<'a> {
                 }
                 Pop::Item(_, Event::End { .. }) => {}
                 Pop::TimedOut => {
-                    tracing::error!(capture_nanos, ?missing, "no detections within {:?}", self.options.answer_timeout);
+                    tracing::error!(
+                        capture_nanos,
+                        ?missing,
+                        "no detections within {:?}",
+                        self.options.answer_timeout
+                    );
                     self.report.unanswered += 1;
                     break;
                 }
@@ -442,7 +567,11 @@ fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError
     }
     if options.seek >= scenario.ticks.len() {
         let (scenario, ticks) = (scenario.name.clone(), scenario.ticks.len());
-        return Err(StreamError::NoTick { scenario, asked: options.seek, ticks });
+        return Err(StreamError::NoTick {
+            scenario,
+            asked: options.seek,
+            ticks,
+        });
     }
     Ok(())
 }
@@ -452,11 +581,20 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
         return Ok((0..scenario.agents.len()).collect());
     }
     let find = |cav: &CavId| {
-        scenario.agents.iter().position(|agent| agent == cav).ok_or_else(|| StreamError::NoAgent {
-            scenario: scenario.name.clone(),
-            asked: cav.clone(),
-            available: scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>().join(", "),
-        })
+        scenario
+            .agents
+            .iter()
+            .position(|agent| agent == cav)
+            .ok_or_else(|| StreamError::NoAgent {
+                scenario: scenario.name.clone(),
+                asked: cav.clone(),
+                available: scenario
+                    .agents
+                    .iter()
+                    .map(CavId::as_str)
+                    .collect::<Vec<_>>()
+                    .join(", "),
+            })
     };
     asked.iter().map(find).collect()
 }

@@ -74,7 +74,10 @@ impl StreamReport {
         tracing::error!(capture_nanos, "a frame is left out: {error}");
         self.unreadable_frames += 1;
         if self.unreadable.len() < KEPT {
-            self.unreadable.push(Unreadable { capture_nanos, error: error.to_string() });
+            self.unreadable.push(Unreadable {
+                capture_nanos,
+                error: error.to_string(),
+            });
         }
     }
 
@@ -119,7 +122,11 @@ impl Lateness {
     }
 
     pub(super) fn sum_up(&mut self) {
-        let ms: Vec<f64> = self.samples.iter().map(|late| late.as_secs_f64() * 1e3).collect();
+        let ms: Vec<f64> = self
+            .samples
+            .iter()
+            .map(|late| late.as_secs_f64() * 1e3)
+            .collect();
         let ms = sorted(&ms);
         let quantile_ms = |q: f64| quantile(&ms, q).unwrap_or(0.0);
         (self.p50_ms, self.p95_ms) = (quantile_ms(0.5), quantile_ms(0.95));
@@ -141,7 +148,8 @@ mod tests {
         }
         ledger.dropped(&published("1/lidar"), DropReason::Superseded);
         ledger.dropped(&published("2/lidar"), DropReason::Superseded);
-        let subscribed = Account::towards("1/detections".parse().unwrap(), &"replay".parse().unwrap());
+        let subscribed =
+            Account::towards("1/detections".parse().unwrap(), &"replay".parse().unwrap());
         ledger.dropped(&subscribed, DropReason::Superseded);
         let mut report = StreamReport::default();
         report.count_unsent(&ledger);
@@ -154,6 +162,14 @@ mod tests {
         let mut lateness = Lateness::default();
         (1..=100).for_each(|ms| lateness.add(Duration::from_millis(ms)));
         lateness.sum_up();
-        assert_eq!((lateness.late_ticks, lateness.p50_ms, lateness.p95_ms, lateness.max_ms), (95, 50.5, 95.05, 100.0));
+        assert_eq!(
+            (
+                lateness.late_ticks,
+                lateness.p50_ms,
+                lateness.p95_ms,
+                lateness.max_ms
+            ),
+            (95, 50.5, 95.05, 100.0)
+        );
     }
 }

@@ -64,14 +64,36 @@ impl Schedule {
     /// Resumes at the state of the previous process instance, with its capture times.
     #[must_use]
     pub fn resumed(self, position: Position) -> Self {
-        let Position { next_tick, left, shift_nanos, last_nanos } = position;
-        Self { next_index: next_tick, left, shift_nanos, last_nanos, ..self }
+        let Position {
+            next_tick,
+            left,
+            shift_nanos,
+            last_nanos,
+        } = position;
+        Self {
+            next_index: next_tick,
+            left,
+            shift_nanos,
+            last_nanos,
+            ..self
+        }
     }
 
     /// Its state.
     pub(super) fn position(&self) -> Position {
-        let Self { next_index: next_tick, left, shift_nanos, last_nanos, .. } = *self;
-        Position { next_tick, left, shift_nanos, last_nanos }
+        let Self {
+            next_index: next_tick,
+            left,
+            shift_nanos,
+            last_nanos,
+            ..
+        } = *self;
+        Position {
+            next_tick,
+            left,
+            shift_nanos,
+            last_nanos,
+        }
     }
 
     /// Continues from tick `index` instead.
@@ -82,13 +104,24 @@ impl Schedule {
     /// The next ticks, at most `count`.
     #[must_use]
     pub fn ahead(&self, count: usize) -> Vec<usize> {
-        self.clone().take(count).map(|planned| planned.tick_index).collect()
+        self.clone()
+            .take(count)
+            .map(|planned| planned.tick_index)
+            .collect()
     }
 
     fn period_nanos(&self) -> u64 {
-        let mut steps: Vec<u64> = self.captures.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).collect();
+        let mut steps: Vec<u64> = self
+            .captures
+            .windows(2)
+            .map(|pair| pair[1].saturating_sub(pair[0]))
+            .collect();
         steps.sort_unstable();
-        steps.get(steps.len() / 2).copied().filter(|step| *step > 0).unwrap_or(SINGLE_TICK_PERIOD)
+        steps
+            .get(steps.len() / 2)
+            .copied()
+            .filter(|step| *step > 0)
+            .unwrap_or(SINGLE_TICK_PERIOD)
     }
 }
 
@@ -107,13 +140,18 @@ impl Iterator for Schedule {
         if let Some(last) = self.last_nanos
             && recorded.saturating_add(self.shift_nanos) <= last
         {
-            self.shift_nanos = last.saturating_add(self.period_nanos()).saturating_sub(recorded);
+            self.shift_nanos = last
+                .saturating_add(self.period_nanos())
+                .saturating_sub(recorded);
         }
         let capture_nanos = recorded.saturating_add(self.shift_nanos);
         self.next_index += 1;
         self.left = self.left.map(|left| left - 1);
         self.last_nanos = Some(capture_nanos);
-        Some(Planned { tick_index, capture_nanos })
+        Some(Planned {
+            tick_index,
+            capture_nanos,
+        })
     }
 }
 
@@ -122,26 +160,48 @@ mod tests {
     use super::*;
 
     fn ticks(captures: &[u64]) -> Vec<Tick> {
-        captures.iter().map(|&capture_nanos| Tick { stem: capture_nanos.to_string(), capture_nanos }).collect()
+        captures
+            .iter()
+            .map(|&capture_nanos| Tick {
+                stem: capture_nanos.to_string(),
+                capture_nanos,
+            })
+            .collect()
     }
 
     fn plan(schedule: impl IntoIterator<Item = Planned>, count: usize) -> Vec<(usize, u64)> {
-        schedule.into_iter().take(count).map(|planned| (planned.tick_index, planned.capture_nanos)).collect()
+        schedule
+            .into_iter()
+            .take(count)
+            .map(|planned| (planned.tick_index, planned.capture_nanos))
+            .collect()
     }
 
     #[test]
     fn a_scene_is_played_once() {
         let schedule = Schedule::new(&ticks(&[100, 200, 300]), 0, None, false);
         assert_eq!(plan(schedule, 9), [(0, 100), (1, 200), (2, 300)]);
-        assert_eq!(plan(Schedule::new(&ticks(&[100, 200, 300]), 1, Some(1), false), 9), [(1, 200)]);
+        assert_eq!(
+            plan(
+                Schedule::new(&ticks(&[100, 200, 300]), 1, Some(1), false),
+                9
+            ),
+            [(1, 200)]
+        );
         assert_eq!(plan(Schedule::new(&[], 0, None, true), 9), []);
     }
 
     #[test]
     fn a_loop_drives_on() {
         let schedule = Schedule::new(&ticks(&[100, 200, 350]), 1, Some(6), true);
-        assert_eq!(plan(schedule, 9), [(1, 200), (2, 350), (0, 500), (1, 600), (2, 750), (0, 900)]);
-        assert_eq!(plan(Schedule::new(&ticks(&[7]), 0, None, true), 2), [(0, 7), (0, 100_000_007)]);
+        assert_eq!(
+            plan(schedule, 9),
+            [(1, 200), (2, 350), (0, 500), (1, 600), (2, 750), (0, 900)]
+        );
+        assert_eq!(
+            plan(Schedule::new(&ticks(&[7]), 0, None, true), 2),
+            [(0, 7), (0, 100_000_007)]
+        );
     }
 
     #[test]
@@ -158,10 +218,16 @@ mod tests {
     #[test]
     fn a_jump_back_never_repeats_a_time_and_one_ahead_keeps_the_recorded() {
         let mut schedule = Schedule::new(&ticks(&[100, 200, 300, 400]), 0, None, false);
-        assert_eq!(schedule.next().map(|planned| planned.capture_nanos), Some(100));
+        assert_eq!(
+            schedule.next().map(|planned| planned.capture_nanos),
+            Some(100)
+        );
         schedule.seek(2);
         assert_eq!(schedule.ahead(3), [2, 3]);
-        assert_eq!(schedule.next().map(|planned| planned.capture_nanos), Some(300));
+        assert_eq!(
+            schedule.next().map(|planned| planned.capture_nanos),
+            Some(300)
+        );
         schedule.seek(0);
         assert_eq!(plan(schedule, 2), [(0, 400), (1, 500)]);
     }

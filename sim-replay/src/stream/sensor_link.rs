@@ -61,7 +61,12 @@ impl SensorLink {
 
     /// Submits the current frame of vehicle `cav`. Data of all its sensors at a tick are transmitted together.
     pub(super) fn submit(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
-        let Frame { points, radar, cameras, .. } = &held.frame;
+        let Frame {
+            points,
+            radar,
+            cameras,
+            ..
+        } = &held.frame;
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
         let images: usize = cameras.iter().map(|(_, camera)| camera.image.len()).sum();
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64 + images as u64;
@@ -73,24 +78,40 @@ impl SensorLink {
         self.report.submitted += 1;
         self.held.insert(id, held);
         let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
-        self.emulator.submit(Packet { id, from, to, stream, sequence, bytes, submitted_nanos, distance_m: 0.0 });
+        self.emulator.submit(Packet {
+            id,
+            from,
+            to,
+            stream,
+            sequence,
+            bytes,
+            submitted_nanos,
+            distance_m: 0.0,
+        });
     }
 
     /// Time at which the next frame can arrive; `None` while none is in flight.
     pub(super) fn next(&self) -> Option<Instant> {
-        self.emulator.next_nanos().map(|nanos| self.began + Duration::from_nanos(nanos))
+        self.emulator
+            .next_nanos()
+            .map(|nanos| self.began + Duration::from_nanos(nanos))
     }
 
     /// Frames that have arrived by now.
     pub(super) fn arrived(&mut self, now: Instant) -> Vec<DelayedSweep> {
         let mut arrived = Vec::new();
-        for Outcome { packet, delivery, .. } in self.emulator.advance(nanos::between(self.began, now)) {
+        for Outcome {
+            packet, delivery, ..
+        } in self.emulator.advance(nanos::between(self.began, now))
+        {
             match delivery {
                 Delivery::Dropped(reason) => {
                     self.held.remove(&packet.id);
                     *self.report.dropped.entry(reason).or_default() += 1;
                 }
-                Delivery::Arrived { is_repeated: true, .. } => arrived.extend(self.held.get(&packet.id).cloned()),
+                Delivery::Arrived {
+                    is_repeated: true, ..
+                } => arrived.extend(self.held.get(&packet.id).cloned()),
                 Delivery::Arrived { .. } => arrived.extend(self.held.remove(&packet.id)),
             }
         }
@@ -111,22 +132,38 @@ mod tests {
     use link::{CapacityConfig, DelayModel, LossModel};
 
     fn held(cav: &CavId, tick: u64) -> DelayedSweep {
-        let points = PointCloud { xyzi: vec![[0.0; 4]; 1000] };
-        let frame = Frame { points, ..Frame::empty(cav.clone(), tick, Handedness::Right) };
-        DelayedSweep { agent: 0, capture_nanos: tick, frame }
+        let points = PointCloud {
+            xyzi: vec![[0.0; 4]; 1000],
+        };
+        let frame = Frame {
+            points,
+            ..Frame::empty(cav.clone(), tick, Handedness::Right)
+        };
+        DelayedSweep {
+            agent: 0,
+            capture_nanos: tick,
+            frame,
+        }
     }
 
     #[test]
     fn losses_of_a_vehicle_do_not_depend_on_the_others() {
         let [cav, other] = ["7", "8"].map(|cav| CavId::new(cav).unwrap());
-        let lossy = LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() };
+        let lossy = LinkConfig {
+            loss: LossModel::Bernoulli(0.5),
+            ..LinkConfig::default()
+        };
         let arrived = |cavs: &[&CavId]| {
             let mut link_under_test = SensorLink::new(&lossy, 1).unwrap();
             let began = link_under_test.began;
             for tick in 0..100 {
-                cavs.iter().for_each(|cav| link_under_test.submit(cav, held(cav, tick), began));
+                cavs.iter()
+                    .for_each(|cav| link_under_test.submit(cav, held(cav, tick), began));
             }
-            let arrived = link_under_test.arrived(began).into_iter().filter(|held| held.frame.cav == cav);
+            let arrived = link_under_test
+                .arrived(began)
+                .into_iter()
+                .filter(|held| held.frame.cav == cav);
             arrived.map(|held| held.capture_nanos).collect::<Vec<_>>()
         };
         assert_eq!(arrived(&[&other, &cav]), arrived(&[&cav]));
@@ -137,7 +174,10 @@ mod tests {
         let cav = CavId::new("7").unwrap();
         // 16 kB at 16 Mbit/s: 8 ms each, then 100 ms.
         let link = LinkConfig {
-            capacity: CapacityConfig::TokenBucket { rate_mbps: 16.0, burst_bytes: 0 },
+            capacity: CapacityConfig::TokenBucket {
+                rate_mbps: 16.0,
+                burst_bytes: 0,
+            },
             delay: DelayModel::ConstantMs(100.0),
             ..LinkConfig::default()
         };
@@ -148,19 +188,38 @@ mod tests {
         link_under_test.submit(&cav, held(&cav, 1), began);
         assert!(link_under_test.arrived(began + at(107)).is_empty());
         let first = link_under_test.arrived(began + at(110));
-        assert_eq!(first.iter().map(|held| held.capture_nanos).collect::<Vec<_>>(), [0]);
-        assert!(link_under_test.next().is_some_and(|next| next > began + at(110)));
+        assert_eq!(
+            first
+                .iter()
+                .map(|held| held.capture_nanos)
+                .collect::<Vec<_>>(),
+            [0]
+        );
+        assert!(
+            link_under_test
+                .next()
+                .is_some_and(|next| next > began + at(110))
+        );
         assert_eq!(link_under_test.arrived(began + at(120)).len(), 1);
         assert_eq!(link_under_test.next(), None);
 
-        let mut lossy =
-            SensorLink::new(&LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
+        let mut lossy = SensorLink::new(
+            &LinkConfig {
+                loss: LossModel::Bernoulli(0.5),
+                ..LinkConfig::default()
+            },
+            1,
+        )
+        .unwrap();
         let began = lossy.began;
         (0..200).for_each(|tick| lossy.submit(&cav, held(&cav, tick), began));
         let arrived = lossy.arrived(began).len() as u64;
         let report = lossy.report();
         assert!((70..130).contains(&arrived), "{arrived}");
         assert_eq!((report.submitted, report.arrived), (200, arrived));
-        assert_eq!(report.dropped.get(&DropReason::LinkLoss), Some(&(200 - arrived)));
+        assert_eq!(
+            report.dropped.get(&DropReason::LinkLoss),
+            Some(&(200 - arrived))
+        );
     }
 }

@@ -40,37 +40,76 @@ impl SensorPublisher {
         cameras: &[u8],
         is_paced: bool,
     ) -> Result<Self, BusError> {
-        let paced = |options: PublisherOptions| if is_paced { options.lossless(LOSSLESS_PLACES) } else { options };
+        let paced = |options: PublisherOptions| {
+            if is_paced {
+                options.lossless(LOSSLESS_PLACES)
+            } else {
+                options
+            }
+        };
         let sensors = agents.iter().map(|cav| {
-            let publisher = |stream, options| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, paced(options));
+            let publisher = |stream, options| {
+                bus.publisher(
+                    Topic::Stream {
+                        cav: cav.clone(),
+                        stream,
+                    },
+                    paced(options),
+                )
+            };
             Ok(Sensors {
                 // Small messages have other priorities than sweeps: they do not wait for one on its way to a slow receiver.
                 lidar: publisher(Stream::Lidar, PublisherOptions::SENSOR)?,
                 gnss: publisher(Stream::Gnss, PublisherOptions::POSE)?,
                 imu: publisher(Stream::Imu, PublisherOptions::POSE)?,
-                radar: load.radar.then(|| publisher(Stream::Radar, PublisherOptions::RADAR)).transpose()?,
+                radar: load
+                    .radar
+                    .then(|| publisher(Stream::Radar, PublisherOptions::RADAR))
+                    .transpose()?,
                 cameras: cameras
                     .iter()
                     .filter(|_| load.cameras)
-                    .map(|&number| Ok((number, publisher(Stream::Camera(number), PublisherOptions::CAMERA)?)))
+                    .map(|&number| {
+                        Ok((
+                            number,
+                            publisher(Stream::Camera(number), PublisherOptions::CAMERA)?,
+                        ))
+                    })
                     .collect::<Result<_, BusError>>()?,
                 preview: bus.publisher(
-                    Topic::Stream { cav: cav.clone(), stream: Stream::Preview },
+                    Topic::Stream {
+                        cav: cav.clone(),
+                        stream: Stream::Preview,
+                    },
                     PublisherOptions::PREVIEW,
                 )?,
             })
         });
-        let truth = bus.publisher(Topic::Truth, PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES))?;
-        Ok(Self { sensors: sensors.collect::<Result<_, _>>()?, truth, sent: Vec::new() })
+        let truth = bus.publisher(
+            Topic::Truth,
+            PublisherOptions::DETECTIONS.waiting(LOSSLESS_PLACES),
+        )?;
+        Ok(Self {
+            sensors: sensors.collect::<Result<_, _>>()?,
+            truth,
+            sent: Vec::new(),
+        })
     }
 
     /// Submits the data of one vehicle captured at `capture_nanos`.
     pub(super) fn submit(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
-        let Some(sensors) = self.sensors.get(agent) else { return };
+        let Some(sensors) = self.sensors.get(agent) else {
+            return;
+        };
         if let Some(world_from_lidar) = frame.world_from_lidar {
             // The pose is sent first: it is small, and the sweep cannot be used without it.
             let source = GnssSource::Recorded;
-            let gnss = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
+            let gnss = Gnss {
+                world_from_lidar,
+                position_std_m: 0.0,
+                heading_std_rad: 0.0,
+                source,
+            };
             sensors.gnss.submit(capture_nanos, gnss);
             count(&mut self.sent, sensors.gnss.topic());
         }
@@ -78,9 +117,19 @@ impl SensorPublisher {
         sensors.imu.submit(capture_nanos, frame.motion());
         count(&mut self.sent, sensors.imu.topic());
         if sensors.preview.is_wanted() {
-            sensors.preview.submit(capture_nanos, Lidar { points: frame.points.decimate(PREVIEW_POINTS) });
+            sensors.preview.submit(
+                capture_nanos,
+                Lidar {
+                    points: frame.points.decimate(PREVIEW_POINTS),
+                },
+            );
         }
-        sensors.lidar.submit(capture_nanos, Lidar { points: frame.points });
+        sensors.lidar.submit(
+            capture_nanos,
+            Lidar {
+                points: frame.points,
+            },
+        );
         count(&mut self.sent, sensors.lidar.topic());
         if let (Some(publisher), Some(points)) = (&sensors.radar, frame.radar) {
             publisher.submit(capture_nanos, Radar { points });
@@ -91,9 +140,12 @@ impl SensorPublisher {
 
     /// Submits the images of one vehicle.
     fn submit_images(&mut self, agent: usize, capture_nanos: u64, images: Vec<(u8, Camera)>) {
-        let Some(sensors) = self.sensors.get(agent) else { return };
+        let Some(sensors) = self.sensors.get(agent) else {
+            return;
+        };
         for (number, image) in images {
-            if let Some((_, publisher)) = sensors.cameras.iter().find(|(known, _)| *known == number) {
+            if let Some((_, publisher)) = sensors.cameras.iter().find(|(known, _)| *known == number)
+            {
                 publisher.submit(capture_nanos, image);
                 count(&mut self.sent, publisher.topic());
             }
@@ -108,7 +160,15 @@ impl SensorPublisher {
 
     /// Sends queued messages and ends every topic; returns the number of submitted messages by topic.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for Sensors { lidar, gnss, imu, radar, cameras, preview } in self.sensors {
+        for Sensors {
+            lidar,
+            gnss,
+            imu,
+            radar,
+            cameras,
+            preview,
+        } in self.sensors
+        {
             [Some(lidar), Some(gnss), Some(imu), radar, Some(preview)]
                 .into_iter()
                 .flatten()
@@ -123,7 +183,10 @@ impl SensorPublisher {
 fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
     match sent.iter_mut().find(|count| count.topic == *topic) {
         Some(count) => count.messages += 1,
-        None => sent.push(TopicCount { topic: topic.clone(), messages: 1 }),
+        None => sent.push(TopicCount {
+            topic: topic.clone(),
+            messages: 1,
+        }),
     }
 }
 
@@ -133,9 +196,17 @@ pub(super) fn truth_of(frames_of_tick: &[&Frame]) -> Vec<AgentTruth> {
     let truth = |(frame, objects): (&&Frame, &[Object])| {
         let world_from_lidar = frame.world_from_lidar?;
         let objects = objects.iter().map(true_object).collect();
-        Some(AgentTruth { cav: frame.cav.clone(), world_from_lidar, objects })
+        Some(AgentTruth {
+            cav: frame.cav.clone(),
+            world_from_lidar,
+            objects,
+        })
     };
-    frames_of_tick.iter().zip(annotations(frames_of_tick)).filter_map(truth).collect()
+    frames_of_tick
+        .iter()
+        .zip(annotations(frames_of_tick))
+        .filter_map(truth)
+        .collect()
 }
 
 fn true_object(object: &Object) -> TrueObject {

@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use bus::bounded_queue::Pop;
 use bus::{
-    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits, PublisherOptions,
-    SharedMemory, open, unix_nanos,
+    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits,
+    PublisherOptions, SharedMemory, open, unix_nanos,
 };
 use protocol::message::Bev;
 use protocol::{
-    Account, BevFeatures, BevGrid, CodecConfig, DropReason, Limits, Pose, PoseEstimate, Principal, RunId, RunScope,
-    Stamp, Topic, encode_features, wire,
+    Account, BevFeatures, BevGrid, CodecConfig, DropReason, Limits, Pose, PoseEstimate, Principal,
+    RunId, RunScope, Stamp, Topic, encode_features, wire,
 };
 use serde::{Deserialize, Serialize};
 use support::statistics;
@@ -74,7 +74,10 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(["part", name, endpoint.as_str()]).arg(keys);
         command.args([setting.shm_mib.to_string(), seconds.to_string()]);
-        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+        let mut child = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()?;
         let mut lines = BufReader::new(child.stdout.take().context("a pipe")?);
         let mut ready = String::new();
         lines.read_line(&mut ready)?;
@@ -86,9 +89,14 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     let router = part("router", 0.0)?;
     let ego = part("ego", seconds)?;
     let honest = part("honest", seconds + 1.0)?;
-    let flooding = FLOODING[..setting.floods].iter().map(|cav| part(&format!("flood-{cav}"), seconds));
+    let flooding = FLOODING[..setting.floods]
+        .iter()
+        .map(|cav| part(&format!("flood-{cav}"), seconds));
     let flooding = flooding.collect::<Result<Vec<_>>>()?;
-    let (ego_id, pids) = (ego.child.id(), [router.child.id(), ego.child.id(), honest.child.id()]);
+    let (ego_id, pids) = (
+        ego.child.id(),
+        [router.child.id(), ego.child.id(), honest.child.id()],
+    );
     thread::sleep(WARM_UP);
     let before = cpu_ms(&pids)?;
     let (mut peaks, until) = ([0.0_f64; 2], Instant::now() + setting.duration);
@@ -141,7 +149,8 @@ impl Drop for Part {
 }
 
 fn cpu_ms(pids: &[u32]) -> Result<f64> {
-    pids.iter().try_fold(0.0, |sum, pid| Ok(sum + machine::cpu_ms(*pid)?))
+    pids.iter()
+        .try_fold(0.0, |sum, pid| Ok(sum + machine::cpu_ms(*pid)?))
 }
 
 /// Without shared memory: that is the size of the pools, which every process maps.
@@ -149,14 +158,17 @@ fn resident_mib(pid: u32) -> f64 {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
     let kib = |name: &str| {
         let line = status.lines().find_map(|line| line.strip_prefix(name));
-        line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok()).unwrap_or(0.0)
+        line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok())
+            .unwrap_or(0.0)
     };
     (kib("RssAnon:") + kib("RssFile:")) / 1024.0
 }
 
 /// Runs one process.
 pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
-    let [name, endpoint, keys, shm_mib, seconds] = arguments else { bail!("part NAME ENDPOINT KEYS SHM_MIB SECONDS") };
+    let [name, endpoint, keys, shm_mib, seconds] = arguments else {
+        bail!("part NAME ENDPOINT KEYS SHM_MIB SECONDS")
+    };
     let place = Place {
         endpoint: Endpoint::new(endpoint)?,
         keys: (!keys.is_empty()).then(|| PathBuf::from(keys)),
@@ -182,12 +194,19 @@ struct Place {
 
 impl Place {
     fn with_memory(&self, options: BusOptions) -> BusOptions {
-        BusOptions { shared_memory: self.shm, ..options }
+        BusOptions {
+            shared_memory: self.shm,
+            ..options
+        }
     }
 
     fn join(&self, principal: &str) -> Result<Bus> {
         let known: Principal = principal.parse()?;
-        let identity = Identity { run: RunId::new("flood")?, process: known.name(), cav: known.cav };
+        let identity = Identity {
+            run: RunId::new("flood")?,
+            process: known.name(),
+            cav: known.cav,
+        };
         let options = self.with_memory(BusOptions::client(self.endpoint.clone()));
         let options = match &self.keys {
             Some(keys) => options.with_credentials(Credentials::read(&keys.join(principal))?),
@@ -200,8 +219,13 @@ impl Place {
         let mut options = self.with_memory(BusOptions::router(self.endpoint.clone()));
         if let Some(keys) = &self.keys {
             let credentials = Credentials::read(&keys.join("router"))?;
-            let guard = AccessControl { members: credentials.members()?, runs: RunScope::Any };
-            options = options.with_credentials(credentials).with_access_control(guard);
+            let guard = AccessControl {
+                members: credentials.members()?,
+                runs: RunScope::Any,
+            };
+            options = options
+                .with_credentials(credentials)
+                .with_access_control(guard);
         }
         let session = open(&options)?;
         print("ready")?;
@@ -213,16 +237,24 @@ impl Place {
         let ego = self.join("ego-9")?;
         let inbox = ego.limited_inbox(4, 16, InboxLimits::PEERS);
         let flooding = FLOODING.map(bev);
-        let subscriptions = HONEST.iter().chain(&FLOODING).map(|cav| ego.subscribe(bev(cav), &inbox));
+        let subscriptions = HONEST
+            .iter()
+            .chain(&FLOODING)
+            .map(|cav| ego.subscribe(bev(cav), &inbox));
         let subscriptions = subscriptions.collect::<Result<Vec<_>, _>>()?;
         print("ready")?;
         let (began, mut measured) = (Instant::now(), Measured::default());
         let until = began + duration;
         while Instant::now() < until {
-            let Pop::Item(topic, Event::Message(arrival)) = inbox.take(Some(until)) else { continue };
-            let Some(map) = inbox.decode::<Bev>(&arrival, &Limits::DEFAULT) else { continue };
+            let Pop::Item(topic, Event::Message(arrival)) = inbox.take(Some(until)) else {
+                continue;
+            };
+            let Some(map) = inbox.decode::<Bev>(&arrival, &Limits::DEFAULT) else {
+                continue;
+            };
             map.features.decode(&Limits::DEFAULT)?;
-            let took_ms = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos) as f64 / 1e6;
+            let took_ms =
+                unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos) as f64 / 1e6;
             ego.stats().received(&topic);
             if flooding.contains(&topic) {
                 measured.decoded += 1;
@@ -233,7 +265,9 @@ impl Place {
         let ledger = ego.stats().ledger();
         for topic in flooding {
             let here = Account::towards(topic, &ego.identity().process);
-            let refused = ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit));
+            let refused = ledger
+                .get(&here)
+                .and_then(|counts| counts.dropped.get(&DropReason::RateLimit));
             measured.refused += refused.copied().unwrap_or(0);
         }
         print(&serde_json::to_string(&measured)?)?;
@@ -242,8 +276,14 @@ impl Place {
     }
 
     fn send_maps(&self, duration: Duration) -> Result<()> {
-        let buses = HONEST.iter().map(|cav| self.join(&format!("agent-{cav}"))).collect::<Result<Vec<_>>>()?;
-        let publishers = buses.iter().zip(HONEST).map(|(bus, cav)| bus.publisher(bev(cav), PublisherOptions::FEATURES));
+        let buses = HONEST
+            .iter()
+            .map(|cav| self.join(&format!("agent-{cav}")))
+            .collect::<Result<Vec<_>>>()?;
+        let publishers = buses
+            .iter()
+            .zip(HONEST)
+            .map(|(bus, cav)| bus.publisher(bev(cav), PublisherOptions::FEATURES));
         let publishers = publishers.collect::<Result<Vec<_>, _>>()?;
         print("ready")?;
         let (began, pose) = (Instant::now(), PoseEstimate::new(Pose::IDENTITY, 1.0));
@@ -257,11 +297,19 @@ impl Place {
             let index = turn as usize % HONEST.len();
             let map = maps[index].clone();
             publishers[index].submit_encoded(u64::from(turn), move |stamp| {
-                wire::encode(stamp, Bev { pose, features: encode_features(map, &CodecConfig::default(), None)? })
+                wire::encode(
+                    stamp,
+                    Bev {
+                        pose,
+                        features: encode_features(map, &CodecConfig::default(), None)?,
+                    },
+                )
             });
         }
         drop(publishers);
-        buses.into_iter().try_for_each(|bus| Ok(bus.leave(TIMEOUT)?))
+        buses
+            .into_iter()
+            .try_for_each(|bus| Ok(bus.leave(TIMEOUT)?))
     }
 
     /// Valid messages of its own vehicle, as many as the network takes.
@@ -274,13 +322,27 @@ impl Place {
         let began = Instant::now();
         let mut sent = 0_u64;
         while began.elapsed() < duration {
-            let stamp =
-                Stamp { cav: cav.parse()?, epoch: 1, sequence: sent, capture_nanos: sent, publish_nanos: unix_nanos() };
-            let encoded = wire::encode(&stamp, Bev { pose, features: features.clone() })?;
+            let stamp = Stamp {
+                cav: cav.parse()?,
+                epoch: 1,
+                sequence: sent,
+                capture_nanos: sent,
+                publish_nanos: unix_nanos(),
+            };
+            let encoded = wire::encode(
+                &stamp,
+                Bev {
+                    pose,
+                    features: features.clone(),
+                },
+            )?;
             let mut bytes = ZBytes::writer();
             bytes.append(encoded.head.into());
             bytes.append(encoded.body.as_bytes().to_vec().into());
-            let put = bus.session().put(&key, bytes.finish()).congestion_control(CongestionControl::Block);
+            let put = bus
+                .session()
+                .put(&key, bytes.finish())
+                .congestion_control(CongestionControl::Block);
             put.wait().map_err(anyhow::Error::from_boxed)?;
             sent += 1;
             let due = FLOOD_PERIOD * u32::try_from(sent)?;
@@ -297,10 +359,27 @@ fn bev(cav: &str) -> Topic {
 
 /// A feature map of 1.6 MB (`rows` 64: 100 x 64 cells of 64 channels), or one of 1 MiB (`rows` 0).
 fn map_of(rows: u32) -> BevFeatures {
-    let (channels, width, height) = if rows == 0 { (64, 64, 64) } else { (64, 100, rows) };
-    let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width, height };
-    let values = (0..channels * width * height).map(|index| (index % 1009) as f32 * 0.01).collect();
-    BevFeatures { grid, channels, code_of: None, values }
+    let (channels, width, height) = if rows == 0 {
+        (64, 64, 64)
+    } else {
+        (64, 100, rows)
+    };
+    let grid = BevGrid {
+        x_min_m: -51.2,
+        y_min_m: -38.4,
+        cell_m: 0.8,
+        width,
+        height,
+    };
+    let values = (0..channels * width * height)
+        .map(|index| (index % 1009) as f32 * 0.01)
+        .collect();
+    BevFeatures {
+        grid,
+        channels,
+        code_of: None,
+        values,
+    }
 }
 
 fn print(line: &str) -> Result<()> {

@@ -51,7 +51,9 @@ fn bench(arguments: &[String]) -> Result<bool> {
     let (mut seconds, mut shm_mib, mut floods, mut out) = (20.0, 0, 1, None);
     let mut arguments = arguments.iter().filter(|argument| *argument != "--bench");
     while let Some(name) = arguments.next() {
-        let value = arguments.next().with_context(|| format!("{name} needs a value"))?;
+        let value = arguments
+            .next()
+            .with_context(|| format!("{name} needs a value"))?;
         match name.as_str() {
             "--seconds" => seconds = value.parse()?,
             "--shm-mib" => shm_mib = value.parse()?,
@@ -63,7 +65,9 @@ fn bench(arguments: &[String]) -> Result<bool> {
     }
     let folder = tempfile::tempdir()?;
     let agents = (1..=7).map(|cav| format!("agent-{cav}"));
-    let principals = agents.chain(["ego-9".into(), "replay".into()]).map(|principal| principal.parse());
+    let principals = agents
+        .chain(["ego-9".into(), "replay".into()])
+        .map(|principal| principal.parse());
     let principals = principals.collect::<Result<_, _>>()?;
     make(&KeyPlan::new(folder.path(), principals, 1))?;
     let mut rows = Vec::new();
@@ -72,12 +76,25 @@ fn bench(arguments: &[String]) -> Result<bool> {
         for (secured, flood) in [(false, false), (true, false), (false, true), (true, true)] {
             let keys = secured.then(|| folder.path().to_path_buf());
             let floods = if flood { floods } else { 0 };
-            let setting = Setting { keys, floods, shm_mib, duration: Duration::from_secs_f64(seconds) };
+            let setting = Setting {
+                keys,
+                floods,
+                shm_mib,
+                duration: Duration::from_secs_f64(seconds),
+            };
             rows.push((secured, flood, fleet::measure(&setting)?));
         }
     }
-    let memory = if shm_mib == 0 { "no shared memory".into() } else { format!("{shm_mib} MiB of shared memory each") };
-    report(&rows, &format!("{seconds} s for each line, {memory}, {floods} flooding"), out.as_ref())
+    let memory = if shm_mib == 0 {
+        "no shared memory".into()
+    } else {
+        format!("{shm_mib} MiB of shared memory each")
+    };
+    report(
+        &rows,
+        &format!("{seconds} s for each line, {memory}, {floods} flooding"),
+        out.as_ref(),
+    )
 }
 
 fn report(rows: &[(bool, bool, Measured)], how: &str, out: Option<&PathBuf>) -> Result<bool> {
@@ -85,7 +102,15 @@ fn report(rows: &[(bool, bool, Measured)], how: &str, out: Option<&PathBuf>) -> 
     text += "| link | flood | maps | p50 ms | p99 ms | CPU a map, ms | ego MiB | router MiB | flood: sent | refused | decoded |\n";
     text += "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n";
     for (secured, flood, measured) in rows {
-        let Measured { latencies_ms, cpu_ms, ego_mib, router_mib, sent, refused, decoded } = measured;
+        let Measured {
+            latencies_ms,
+            cpu_ms,
+            ego_mib,
+            router_mib,
+            sent,
+            refused,
+            decoded,
+        } = measured;
         let [p50, p99] = [0.50, 0.99].map(|quantile| fleet::quantile(latencies_ms, quantile));
         let (link, maps) = (if *secured { "QUIC" } else { "TCP" }, latencies_ms.len());
         writeln!(
@@ -97,11 +122,17 @@ fn report(rows: &[(bool, bool, Measured)], how: &str, out: Option<&PathBuf>) -> 
     }
     let p99 = |secured: bool, flood: bool| {
         let all = rows.iter().filter(|row| (row.0, row.1) == (secured, flood));
-        let all: Vec<f64> = all.flat_map(|row| row.2.latencies_ms.iter().copied()).collect();
+        let all: Vec<f64> = all
+            .flat_map(|row| row.2.latencies_ms.iter().copied())
+            .collect();
         fleet::quantile(&all, 0.99)
     };
     let ratios = [false, true].map(|secured| p99(secured, true) / p99(secured, false));
-    writeln!(text, "\np99 under the flood over p99 without: TCP {:.2}, QUIC {:.2}", ratios[0], ratios[1])?;
+    writeln!(
+        text,
+        "\np99 under the flood over p99 without: TCP {:.2}, QUIC {:.2}",
+        ratios[0], ratios[1]
+    )?;
     print!("{text}");
     if let Some(path) = out {
         std::fs::write(path, &text).with_context(|| path.display().to_string())?;

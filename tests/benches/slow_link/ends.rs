@@ -8,12 +8,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use bus::shutdown::Stop;
-use bus::{Barrier, Bus, BusOptions, Endpoint, Event, Identity, PublisherOptions, Route, open, unix_nanos};
+use bus::{
+    Barrier, Bus, BusOptions, Endpoint, Event, Identity, PublisherOptions, Route, open, unix_nanos,
+};
 use link::{CapacityConfig, LinkConfig, LinkEmulator, QueueConfig};
 use protocol::message::Bev;
 use protocol::{
-    BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
-    Topic, encode_features,
+    BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, ProcessId, Role,
+    RunId, Stream, Topic, encode_features,
 };
 use serde::{Deserialize, Serialize};
 use sim_replay::link_node::{self, NodeOptions};
@@ -54,7 +56,10 @@ pub(crate) struct Arrived {
 
 /// Topic of the agent's feature map.
 pub(crate) fn sent_topic() -> Topic {
-    Topic::Stream { cav: cav("7"), stream: Stream::Bev }
+    Topic::Stream {
+        cav: cav("7"),
+        stream: Stream::Bev,
+    }
 }
 
 pub(crate) fn cav(text: &str) -> CavId {
@@ -66,7 +71,10 @@ pub(crate) fn cav(text: &str) -> CavId {
 pub(crate) fn over_link(cell: &Cell) -> Result<Measurement> {
     let endpoint = Endpoint::loopback(free_port());
     let mut router = Command::new(std::env::current_exe()?);
-    let router = router.args(["router", endpoint.as_str()]).stdin(Stdio::piped()).spawn()?;
+    let router = router
+        .args(["router", endpoint.as_str()])
+        .stdin(Stdio::piped())
+        .spawn()?;
     let seen = between(cell, &endpoint);
     // The end of its input ends it.
     router.wait_with_output()?;
@@ -75,28 +83,52 @@ pub(crate) fn over_link(cell: &Cell) -> Result<Measurement> {
 
 fn between(cell: &Cell, router: &Endpoint) -> Result<Measurement> {
     let join = |name, cav| join(router, name, cav);
-    let (agent, link, ego) = (join("agent-7", "7")?, join("link-9", "9")?, join("ego-9", "9")?);
+    let (agent, link, ego) = (
+        join("agent-7", "7")?,
+        join("link-9", "9")?,
+        join("ego-9", "9")?,
+    );
     let config = LinkConfig {
-        capacity: CapacityConfig::TokenBucket { rate_mbps: cell.rate_mbps, burst_bytes: 0 },
-        queue: QueueConfig { keep_last: true, ..QueueConfig::default() },
+        capacity: CapacityConfig::TokenBucket {
+            rate_mbps: cell.rate_mbps,
+            burst_bytes: 0,
+        },
+        queue: QueueConfig {
+            keep_last: true,
+            ..QueueConfig::default()
+        },
         ..LinkConfig::default()
     };
     let emulator = LinkEmulator::new(config, Path::new("."), 1)?;
     let options = NodeOptions::new(cav("9"), vec![Stream::Bev]);
-    let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Bev };
+    let received = Topic::Received {
+        ego: cav("9"),
+        cav: cav("7"),
+        stream: Stream::Bev,
+    };
     let stop = Stop::new();
     let (submissions, arrivals) = thread::scope(|scope| {
         let carrying = scope.spawn(|| link_node::run(&link, emulator, &options, &stop));
         let receiving = scope.spawn(|| receive(&ego, &received));
-        let submissions = send(&agent, cell, &[(sent_topic(), "link-9"), (received.clone(), "ego-9")]);
+        let submissions = send(
+            &agent,
+            cell,
+            &[(sent_topic(), "link-9"), (received.clone(), "ego-9")],
+        );
         // Messages in flight are counted as such without waiting for them.
         stop.request();
         carrying.join().expect("no panic")?;
         anyhow::Ok((submissions?, receiving.join().expect("no panic")?))
     })?;
     let mut ledger = Ledger::default();
-    [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.stats().ledger()));
-    Ok(Measurement { submissions, arrivals, ledger })
+    [&agent, &link, &ego]
+        .iter()
+        .for_each(|bus| ledger.merge(&bus.stats().ledger()));
+    Ok(Measurement {
+        submissions,
+        arrivals,
+        ledger,
+    })
 }
 
 /// Routes messages until its input ends.
@@ -108,7 +140,11 @@ pub(crate) fn route(endpoint: &str) -> Result<()> {
 
 /// A client in the run of this benchmark.
 pub(crate) fn join(router: &Endpoint, process: &str, cav: &str) -> Result<Bus> {
-    let identity = Identity { run: RunId::new("slow-link")?, process: ProcessId::new(process)?, cav: self::cav(cav) };
+    let identity = Identity {
+        run: RunId::new("slow-link")?,
+        process: ProcessId::new(process)?,
+        cav: self::cav(cav),
+    };
     Ok(Bus::join(&BusOptions::client(router.clone()), identity)?)
 }
 
@@ -116,8 +152,15 @@ pub(crate) fn join(router: &Endpoint, process: &str, cav: &str) -> Result<Bus> {
 pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result<Vec<Submission>> {
     let presence = agent.announce(Role::Agent)?;
     let publisher = agent.publisher(sent_topic(), PublisherOptions::FEATURES)?;
-    let routes = routes.iter().map(|(topic, receiver)| Ok(Route { topic: topic.clone(), receiver: receiver.parse()? }));
-    Barrier::new(routes.collect::<Result<Vec<_>>>()?).await_routes(agent)?.wait(TIMEOUT)?;
+    let routes = routes.iter().map(|(topic, receiver)| {
+        Ok(Route {
+            topic: topic.clone(),
+            receiver: receiver.parse()?,
+        })
+    });
+    Barrier::new(routes.collect::<Result<Vec<_>>>()?)
+        .await_routes(agent)?
+        .wait(TIMEOUT)?;
     let map = features(cell.bytes);
     let submissions = at_10_hz(
         cell,
@@ -125,7 +168,13 @@ pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result
         |capture_nanos, map| {
             publisher.submit_encoded(capture_nanos, move |stamp| {
                 let features = encode_features(map, &CodecConfig::default(), None)?;
-                protocol::wire::encode(stamp, Bev { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), features })
+                protocol::wire::encode(
+                    stamp,
+                    Bev {
+                        pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
+                        features,
+                    },
+                )
             });
         },
     );
@@ -143,7 +192,11 @@ pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
         if inbox.decode::<Bev>(&arrival, &Limits::DEFAULT).is_some() {
             ego.stats().received(topic);
             let capture_nanos = arrival.header.stamp.capture_nanos;
-            arrivals.push(Arrived { capture_nanos, nanos: unix_nanos(), bytes: arrival.wire_bytes() });
+            arrivals.push(Arrived {
+                capture_nanos,
+                nanos: unix_nanos(),
+                bytes: arrival.wire_bytes(),
+            });
         }
     }
     Ok(arrivals)
@@ -153,8 +206,16 @@ const PLAIN_KEY: &str = "v2v/plain";
 
 /// The same with bare zenoh: the capture time and zeros.
 pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Submission>> {
-    let publisher = session.declare_publisher(PLAIN_KEY).wait().map_err(anyhow::Error::from_boxed)?;
-    tests::bus::wait_for("a route", || publisher.matching_status().wait().is_ok_and(|status| status.matching()));
+    let publisher = session
+        .declare_publisher(PLAIN_KEY)
+        .wait()
+        .map_err(anyhow::Error::from_boxed)?;
+    tests::bus::wait_for("a route", || {
+        publisher
+            .matching_status()
+            .wait()
+            .is_ok_and(|status| status.matching())
+    });
     let bytes = cell.bytes;
     let submissions = at_10_hz(
         cell,
@@ -174,13 +235,21 @@ pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Submissio
 pub(crate) fn receive_plain(session: &Session, is_over: impl Fn() -> bool) -> Result<Vec<Arrived>> {
     let arrivals = std::sync::Arc::new(Mutex::new(Vec::new()));
     let collected = std::sync::Arc::clone(&arrivals);
-    let subscriber = session.declare_subscriber(PLAIN_KEY).callback(move |sample| {
-        let nanos = unix_nanos();
-        let payload = sample.payload().to_bytes();
-        let Some(capture) = payload.first_chunk() else { return };
-        let arrived = Arrived { capture_nanos: u64::from_le_bytes(*capture), nanos, bytes: payload.len() as u64 };
-        collected.lock().expect("no panic").push(arrived);
-    });
+    let subscriber = session
+        .declare_subscriber(PLAIN_KEY)
+        .callback(move |sample| {
+            let nanos = unix_nanos();
+            let payload = sample.payload().to_bytes();
+            let Some(capture) = payload.first_chunk() else {
+                return;
+            };
+            let arrived = Arrived {
+                capture_nanos: u64::from_le_bytes(*capture),
+                nanos,
+                bytes: payload.len() as u64,
+            };
+            collected.lock().expect("no panic").push(arrived);
+        });
     let _subscriber = subscriber.wait().map_err(anyhow::Error::from_boxed)?;
     let (mut count, mut since) = (0, Instant::now());
     while !is_over() || since.elapsed() < SILENCE {
@@ -195,7 +264,11 @@ pub(crate) fn receive_plain(session: &Session, is_over: impl Fn() -> bool) -> Re
 }
 
 /// Calls `submit` at the rate of a LiDAR, with a feature map made before.
-fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut submit: impl FnMut(u64, M)) -> Vec<Submission> {
+fn at_10_hz<M>(
+    cell: &Cell,
+    make: impl Fn() -> M,
+    mut submit: impl FnMut(u64, M),
+) -> Vec<Submission> {
     let began = Instant::now();
     let count = (cell.duration.as_secs_f64() / PERIOD.as_secs_f64()).round() as u32;
     let ticks = (0..count).map(|tick| {
@@ -203,7 +276,10 @@ fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut submit: impl FnMut(u64, M)
         thread::sleep((began + tick * PERIOD).saturating_duration_since(Instant::now()));
         let (capture_nanos, called) = (unix_nanos(), Instant::now());
         submit(capture_nanos, map);
-        Submission { capture_nanos, waited_nanos: called.elapsed().as_nanos() as u64 }
+        Submission {
+            capture_nanos,
+            waited_nanos: called.elapsed().as_nanos() as u64,
+        }
     });
     ticks.collect()
 }
@@ -212,8 +288,20 @@ fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut submit: impl FnMut(u64, M)
 fn features(bytes: usize) -> BevFeatures {
     let (channels, cells) = (64, bytes / 4 / 64);
     let width = cells.isqrt().next_power_of_two();
-    let grid =
-        BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: width as u32, height: (cells / width) as u32 };
-    let values = (0..channels * cells).map(|index| (index % 1009) as f32 * 0.01).collect();
-    BevFeatures { grid, channels: channels as u32, code_of: None, values }
+    let grid = BevGrid {
+        x_min_m: -51.2,
+        y_min_m: -38.4,
+        cell_m: 0.8,
+        width: width as u32,
+        height: (cells / width) as u32,
+    };
+    let values = (0..channels * cells)
+        .map(|index| (index % 1009) as f32 * 0.01)
+        .collect();
+    BevFeatures {
+        grid,
+        channels: channels as u32,
+        code_of: None,
+        values,
+    }
 }

@@ -66,7 +66,11 @@ struct Cell {
 
 impl Cell {
     fn new(rate_mbps: f64, bytes: usize, seconds: Option<f64>) -> Self {
-        let mut cell = Self { rate_mbps, bytes, duration: Duration::ZERO };
+        let mut cell = Self {
+            rate_mbps,
+            bytes,
+            duration: Duration::ZERO,
+        };
         let seconds = seconds.unwrap_or_else(|| (2.5 * cell.on_the_wire_ms() / 1e3).max(10.0));
         cell.duration = Duration::from_secs_f64(seconds);
         cell
@@ -102,13 +106,22 @@ fn wanted(arguments: &[String]) -> Result<Wanted> {
     };
     let mut arguments = arguments.iter().filter(|argument| *argument != "--bench");
     while let Some(name) = arguments.next() {
-        let value = arguments.next().with_context(|| format!("{name} needs a value"))?;
+        let value = arguments
+            .next()
+            .with_context(|| format!("{name} needs a value"))?;
         let parts = || value.split(',');
         match name.as_str() {
             // cargo runs benches in the folder of their package.
-            "--out" => wanted.out = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("..").join(value),
+            "--out" => {
+                wanted.out = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+                    .join("..")
+                    .join(value)
+            }
             "--ways" => {
-                wanted.ways = Way::ALL.into_iter().filter(|way| parts().any(|part| part == way.name())).collect()
+                wanted.ways = Way::ALL
+                    .into_iter()
+                    .filter(|way| parts().any(|part| part == way.name()))
+                    .collect()
             }
             "--rates" => wanted.rates_mbps = parts().map(str::parse).collect::<Result<_, _>>()?,
             "--sizes" => wanted.sizes = parts().map(str::parse).collect::<Result<_, _>>()?,
@@ -157,6 +170,13 @@ fn main() -> Result<ExitCode> {
     let wanted = wanted(&arguments)?;
     let rows = measure(&wanted)?;
     table::write(&wanted.out, &arguments.join(" "), &rows)?;
-    let missed = rows.iter().filter(|row| row.way == Way::Link.name() && !row.is_on_target()).count();
-    Ok(if missed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    let missed = rows
+        .iter()
+        .filter(|row| row.way == Way::Link.name() && !row.is_on_target())
+        .count();
+    Ok(if missed == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
 }

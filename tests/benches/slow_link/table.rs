@@ -38,10 +38,17 @@ pub(crate) struct Row {
 impl Row {
     pub(crate) fn of(cell: &Cell, way: Way, seen: &Measurement) -> Self {
         let ages = ages_ms(seen);
-        let took = seen.arrivals.iter().map(|arrival| millis(arrival.capture_nanos, arrival.nanos));
+        let took = seen
+            .arrivals
+            .iter()
+            .map(|arrival| millis(arrival.capture_nanos, arrival.nanos));
         let dropped = seen.ledger.total().dropped;
-        let on_the_way: u64 =
-            seen.ledger.iter().filter(|(account, _)| account.to.is_none()).map(|(_, c)| c.in_flight).sum();
+        let on_the_way: u64 = seen
+            .ledger
+            .iter()
+            .filter(|(account, _)| account.to.is_none())
+            .map(|(_, c)| c.in_flight)
+            .sum();
         let unexplained = if seen.ledger.is_empty() {
             // zenoh reports no drops.
             seen.submissions.len() as i64 - seen.arrivals.len() as i64
@@ -59,7 +66,11 @@ impl Row {
             arrived: seen.arrivals.len(),
             dropped,
             unexplained,
-            submit_max_ms: seen.submissions.iter().map(|submit| submit.waited_nanos as f64 / 1e6).fold(0.0, f64::max),
+            submit_max_ms: seen
+                .submissions
+                .iter()
+                .map(|submit| submit.waited_nanos as f64 / 1e6)
+                .fold(0.0, f64::max),
             transport_p50_ms: quantile(&took.collect::<Vec<_>>(), 0.5),
             age_p50_ms: quantile(&ages, 0.5),
             age_p95_ms: quantile(&ages, 0.95),
@@ -70,18 +81,26 @@ impl Row {
 
     /// True if no message is missing, no call blocked and the newest feature map is new enough.
     pub(crate) fn is_on_target(&self) -> bool {
-        self.unexplained == 0 && self.submit_max_ms <= SUBMIT_TARGET_MS && self.age_p95_ms <= self.age_target_ms
+        self.unexplained == 0
+            && self.submit_max_ms <= SUBMIT_TARGET_MS
+            && self.age_p95_ms <= self.age_target_ms
     }
 
     pub(crate) fn markdown(&self) -> String {
-        let reasons: Vec<String> = self.dropped.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
+        let reasons: Vec<String> = self
+            .dropped
+            .iter()
+            .map(|(reason, count)| format!("{reason} {count}"))
+            .collect();
         let unexplained = match self.unexplained {
             0 => String::new(),
             i64::MAX => "**ledger does not balance**".to_owned(),
             count => format!("**unknown {count}**"),
         };
-        let reasons: Vec<String> =
-            reasons.into_iter().chain(Some(unexplained).filter(|text| !text.is_empty())).collect();
+        let reasons: Vec<String> = reasons
+            .into_iter()
+            .chain(Some(unexplained).filter(|text| !text.is_empty()))
+            .collect();
         format!(
             "| {} | {} | {} | {:.0} | {} of {} | {} | {:.2} | {:.1} | {:.1} | {:.1} | {:.1} | {:.2} | {} |",
             self.rate_mbps,
@@ -90,7 +109,11 @@ impl Row {
             self.seconds,
             self.arrived,
             self.submitted,
-            if reasons.is_empty() { "-".to_owned() } else { reasons.join(", ") },
+            if reasons.is_empty() {
+                "-".to_owned()
+            } else {
+                reasons.join(", ")
+            },
             self.submit_max_ms,
             self.transport_p50_ms,
             self.age_p50_ms,
@@ -103,8 +126,14 @@ impl Row {
 
     fn csv(&self) -> String {
         let dropped = |reason| self.dropped.get(&reason).copied().unwrap_or(0);
-        let is_own_column = |reason: &&DropReason| ![DropReason::Superseded, DropReason::Stale].contains(reason);
-        let other: u64 = self.dropped.keys().filter(is_own_column).map(|reason| dropped(*reason)).sum();
+        let is_own_column =
+            |reason: &&DropReason| ![DropReason::Superseded, DropReason::Stale].contains(reason);
+        let other: u64 = self
+            .dropped
+            .keys()
+            .filter(is_own_column)
+            .map(|reason| dropped(*reason))
+            .sum();
         format!(
             "{},{},{},{:.1},{},{},{},{},{},{},{:.3},{:.1},{:.1},{:.1},{:.1},{:.3},{}",
             self.way,
@@ -152,11 +181,17 @@ pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> 
 
 /// Age of the newest feature map at every millisecond from the first arrival to the last submission.
 fn ages_ms(seen: &Measurement) -> Vec<f64> {
-    let end_nanos = seen.submissions.last().map_or(0, |submit| submit.capture_nanos);
+    let end_nanos = seen
+        .submissions
+        .last()
+        .map_or(0, |submit| submit.capture_nanos);
     let mut arrivals = seen.arrivals.iter().peekable();
     let mut newest_nanos = 0;
     let mut ages = Vec::new();
-    let mut nanos = seen.arrivals.first().map_or(u64::MAX, |arrival| arrival.nanos);
+    let mut nanos = seen
+        .arrivals
+        .first()
+        .map_or(u64::MAX, |arrival| arrival.nanos);
     while nanos <= end_nanos {
         while let Some(arrival) = arrivals.next_if(|arrival| arrival.nanos <= nanos) {
             newest_nanos = newest_nanos.max(arrival.capture_nanos);
@@ -169,10 +204,16 @@ fn ages_ms(seen: &Measurement) -> Vec<f64> {
 
 /// Between the first arrival and the last.
 fn throughput_mbps(seen: &Measurement) -> f64 {
-    let [Some(first), Some(last)] = [seen.arrivals.first(), seen.arrivals.last()] else { return 0.0 };
+    let [Some(first), Some(last)] = [seen.arrivals.first(), seen.arrivals.last()] else {
+        return 0.0;
+    };
     let bytes: u64 = seen.arrivals[1..].iter().map(|arrival| arrival.bytes).sum();
     let ms = millis(first.nanos, last.nanos);
-    if ms > 0.0 { bytes as f64 * 8e-3 / ms } else { 0.0 }
+    if ms > 0.0 {
+        bytes as f64 * 8e-3 / ms
+    } else {
+        0.0
+    }
 }
 
 fn millis(from_nanos: u64, to_nanos: u64) -> f64 {
@@ -185,5 +226,9 @@ fn quantile(values: &[f64], quantile: f64) -> f64 {
 }
 
 fn size(bytes: usize) -> String {
-    if bytes >= 1 << 20 { format!("{} MiB", bytes >> 20) } else { format!("{} KiB", bytes >> 10) }
+    if bytes >= 1 << 20 {
+        format!("{} MiB", bytes >> 20)
+    } else {
+        format!("{} KiB", bytes >> 10)
+    }
 }

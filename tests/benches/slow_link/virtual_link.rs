@@ -43,15 +43,28 @@ pub(crate) fn over_virtual_link(cell: &Cell, way: Way) -> Result<Measurement> {
 }
 
 fn start(host: &str, way: Way, cell: &Cell) -> Result<Child> {
-    let numbers = [cell.rate_mbps.to_string(), cell.bytes.to_string(), cell.duration.as_secs_f64().to_string()];
+    let numbers = [
+        cell.rate_mbps.to_string(),
+        cell.bytes.to_string(),
+        cell.duration.as_secs_f64().to_string(),
+    ];
     let mut command = Command::new("ip");
-    command.args(["netns", "exec", host]).arg(std::env::current_exe()?).args(["end", host, way.name()]).args(numbers);
-    Ok(command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?)
+    command
+        .args(["netns", "exec", host])
+        .arg(std::env::current_exe()?)
+        .args(["end", host, way.name()])
+        .args(numbers);
+    Ok(command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()?)
 }
 
 /// Runs the process of one end: prints its observations.
 pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
-    let [host, way, rate_mbps, bytes, seconds] = arguments else { bail!("end HOST WAY RATE BYTES SECONDS") };
+    let [host, way, rate_mbps, bytes, seconds] = arguments else {
+        bail!("end HOST WAY RATE BYTES SECONDS")
+    };
     let cell = Cell::new(rate_mbps.parse()?, bytes.parse()?, Some(seconds.parse()?));
     let seen = match (host == EGO, way == Way::Plain.name()) {
         (true, true) => plain_ego()?,
@@ -60,16 +73,25 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
             let session = plain_session("client")?;
             let submissions = ends::send_plain(&session, &cell)?;
             // Time for the messages in buffers.
-            thread::sleep(Duration::from_secs_f64((cell.on_the_wire_ms() / 1e3).min(20.0)));
+            thread::sleep(Duration::from_secs_f64(
+                (cell.on_the_wire_ms() / 1e3).min(20.0),
+            ));
             session.close().wait().map_err(anyhow::Error::from_boxed)?;
-            Measurement { submissions, ..Measurement::default() }
+            Measurement {
+                submissions,
+                ..Measurement::default()
+            }
         }
         (false, false) => {
             let agent = ends::join(&Endpoint::new(ROUTER)?, "agent-7", "7")?;
             let submissions = ends::send(&agent, &cell, &[(ends::sent_topic(), "ego-9")])?;
             let ledger = agent.stats().ledger();
             agent.leave(Duration::from_secs(20))?;
-            Measurement { submissions, ledger, ..Measurement::default() }
+            Measurement {
+                submissions,
+                ledger,
+                ..Measurement::default()
+            }
         }
     };
     println!("{}", serde_json::to_string(&seen)?);
@@ -81,7 +103,11 @@ fn ego() -> Result<Measurement> {
     let ego = ends::join(&Endpoint::new(ROUTER)?, "ego-9", "9")?;
     print_ready()?;
     let arrivals = ends::receive(&ego, &ends::sent_topic())?;
-    Ok(Measurement { arrivals, ledger: ego.stats().ledger(), ..Measurement::default() })
+    Ok(Measurement {
+        arrivals,
+        ledger: ego.stats().ledger(),
+        ..Measurement::default()
+    })
 }
 
 fn plain_ego() -> Result<Measurement> {
@@ -108,7 +134,11 @@ fn print_ready() -> Result<()> {
 
 /// zenoh with its default settings, except for endpoints and the restriction to TCP.
 fn plain_session(mode: &str) -> Result<Session> {
-    let (listen, connect) = if mode == "router" { (vec![ROUTER], vec![]) } else { (vec![], vec![ROUTER]) };
+    let (listen, connect) = if mode == "router" {
+        (vec![ROUTER], vec![])
+    } else {
+        (vec![], vec![ROUTER])
+    };
     let mut config = Config::default();
     for (key, value) in [
         ("mode", serde_json::json!(mode)),
@@ -117,9 +147,13 @@ fn plain_session(mode: &str) -> Result<Session> {
         ("scouting/multicast/enabled", serde_json::json!(false)),
         ("transport/shared_memory/enabled", serde_json::json!(false)),
     ] {
-        config.insert_json5(key, &value.to_string()).map_err(anyhow::Error::from_boxed)?;
+        config
+            .insert_json5(key, &value.to_string())
+            .map_err(anyhow::Error::from_boxed)?;
     }
-    zenoh::open(config).wait().map_err(anyhow::Error::from_boxed)
+    zenoh::open(config)
+        .wait()
+        .map_err(anyhow::Error::from_boxed)
 }
 
 /// Two hosts and their virtual link; removed when dropped.
@@ -134,14 +168,20 @@ impl VirtualLink {
             ip(&format!("netns add {host}"))?;
             ip(&format!("-n {host} link set lo up"))?;
         }
-        ip(&format!("link add slow0 netns {EGO} type veth peer name slow1 netns {AGENT}"))?;
-        for (host, end, address) in [(EGO, "slow0", "10.77.1.1/24"), (AGENT, "slow1", "10.77.1.2/24")] {
+        ip(&format!(
+            "link add slow0 netns {EGO} type veth peer name slow1 netns {AGENT}"
+        ))?;
+        for (host, end, address) in [
+            (EGO, "slow0", "10.77.1.1/24"),
+            (AGENT, "slow1", "10.77.1.2/24"),
+        ] {
             ip(&format!("-n {host} address add {address} dev {end}"))?;
             ip(&format!("-n {host} link set {end} up"))?;
         }
         // A queue of 50 ms, as in routers; the burst is the size that a token bucket needs at 1 Gbit/s.
-        let shape =
-            format!("netns exec {AGENT} tc qdisc add dev slow1 root tbf rate {rate_mbps}mbit burst 64kb latency 50ms");
+        let shape = format!(
+            "netns exec {AGENT} tc qdisc add dev slow1 root tbf rate {rate_mbps}mbit burst 64kb latency 50ms"
+        );
         ip(&shape)?;
         Ok(link)
     }
@@ -150,15 +190,24 @@ impl VirtualLink {
 impl Drop for VirtualLink {
     fn drop(&mut self) {
         for host in [AGENT, EGO] {
-            let _ = Command::new("ip").args(["netns", "del", host]).stderr(Stdio::null()).status();
+            let _ = Command::new("ip")
+                .args(["netns", "del", host])
+                .stderr(Stdio::null())
+                .status();
         }
     }
 }
 
 fn ip(arguments: &str) -> Result<()> {
-    let output = Command::new("ip").args(arguments.split(' ')).output().context("iproute2 is needed")?;
+    let output = Command::new("ip")
+        .args(arguments.split(' '))
+        .output()
+        .context("iproute2 is needed")?;
     if !output.status.success() {
-        bail!("ip {arguments}: {}", String::from_utf8_lossy(&output.stderr).trim());
+        bail!(
+            "ip {arguments}: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
+        );
     }
     Ok(())
 }

@@ -68,8 +68,16 @@ pub fn cold_start(folder: &Path, is_secured: bool) -> ColdStart {
     signal(up.pid(), "INT");
     up.wait();
     let stop = asked.elapsed();
-    let left = pids.values().filter(|pid| crate::fleet::is_running(**pid)).count();
-    ColdStart { first_fused_ms: published_ms - began_ms, lost_before: index - first as u64, stop, left }
+    let left = pids
+        .values()
+        .filter(|pid| crate::fleet::is_running(**pid))
+        .count();
+    ColdStart {
+        first_fused_ms: published_ms - began_ms,
+        lost_before: index - first as u64,
+        stop,
+        left,
+    }
 }
 
 /// Measurements of a long run.
@@ -92,7 +100,11 @@ pub struct Soak {
 /// # Panics
 /// When a process crashes.
 #[must_use]
-pub fn soak(folder: &Path, lasts: Duration, mut on_reading: impl FnMut(Duration, &[(String, Usage)])) -> Soak {
+pub fn soak(
+    folder: &Path,
+    lasts: Duration,
+    mut on_reading: impl FnMut(Duration, &[(String, Usage)]),
+) -> Soak {
     let scenario = write_scenario(folder, "link: {model: ideal}");
     let mut up = Up::start(folder, &scenario);
     let mut results = Results::of(&up.folder);
@@ -103,9 +115,17 @@ pub fn soak(folder: &Path, lasts: Duration, mut on_reading: impl FnMut(Duration,
         std::thread::sleep(READING_PERIOD.min(lasts / 20));
         let own = [("v2vloc".to_owned(), up.pid())];
         let usage_of = |(name, pid)| Usage::of(pid).map(|usage| (name, usage));
-        let usage: Vec<(String, Usage)> = up.pids().into_iter().chain(own).filter_map(usage_of).collect();
+        let usage: Vec<(String, Usage)> = up
+            .pids()
+            .into_iter()
+            .chain(own)
+            .filter_map(usage_of)
+            .collect();
         let status = RunStatus::read(&up.folder).expect("a run writes its status");
-        let crashed = status.processes.iter().find(|process| process.state == State::Down || process.restarts > 0);
+        let crashed = status
+            .processes
+            .iter()
+            .find(|process| process.state == State::Down || process.restarts > 0);
         assert!(crashed.is_none(), "{crashed:?}");
         on_reading(began.elapsed(), &usage);
         readings.push((began.elapsed().as_secs_f64() / 60.0, usage));
@@ -115,18 +135,27 @@ pub fn soak(folder: &Path, lasts: Duration, mut on_reading: impl FnMut(Duration,
     let frames = results.update().len();
     let table = fs::read_to_string(up.folder.join("frames.csv")).expect("a table");
     let ended_ms = began_ms + lasts.as_millis() as u64;
-    let published: Vec<u64> = results.update().iter().map(|result| result.published_ms).collect();
+    let published: Vec<u64> = results
+        .update()
+        .iter()
+        .map(|result| result.published_ms)
+        .collect();
     let latencies = latencies(&table, &published);
     let sixth = (ended_ms - began_ms) / 6;
     let p99_within = |from: u64, to: u64| {
-        let within = latencies.iter().filter(|(at, _)| (from..to).contains(at)).map(|(_, ms)| *ms);
+        let within = latencies
+            .iter()
+            .filter(|(at, _)| (from..to).contains(at))
+            .map(|(_, ms)| *ms);
         p99(within.collect())
     };
     let warm_ms = began_ms + (WARM_UP * (ended_ms - began_ms) as f64) as u64;
     let ledger = fs::read_to_string(up.folder.join("ledger.json")).expect("a ledger");
     let ledger: serde_json::Value = serde_json::from_str(&ledger).expect("JSON");
-    let warm: Vec<_> =
-        readings.into_iter().filter(|(minutes, _)| *minutes * 60.0 > WARM_UP * lasts.as_secs_f64()).collect();
+    let warm: Vec<_> = readings
+        .into_iter()
+        .filter(|(minutes, _)| *minutes * 60.0 > WARM_UP * lasts.as_secs_f64())
+        .collect();
     Soak {
         frames,
         memory: each(&warm, |usage| usage.resident_mib)
@@ -136,12 +165,16 @@ pub fn soak(folder: &Path, lasts: Duration, mut on_reading: impl FnMut(Duration,
                 (name, [first, last, slope(&points)])
             })
             .collect(),
-        p99_ms: [p99_within(warm_ms, warm_ms + sixth), p99_within(ended_ms - sixth, ended_ms)],
+        p99_ms: [
+            p99_within(warm_ms, warm_ms + sixth),
+            p99_within(ended_ms - sixth, ended_ms),
+        ],
         handles: each(&warm, |usage| usage.descriptors.map(|count| count as f64))
             .into_iter()
             .zip(each(&warm, |usage| usage.threads.map(|count| count as f64)))
             .map(|((name, descriptors), (_, threads))| {
-                let ends = |points: &[(f64, f64)]| [points[0].1 as u64, points[points.len() - 1].1 as u64];
+                let ends =
+                    |points: &[(f64, f64)]| [points[0].1 as u64, points[points.len() - 1].1 as u64];
                 let ([d0, d1], [t0, t1]) = (ends(&descriptors), ends(&threads));
                 (name, [d0, d1, t0, t1])
             })
@@ -155,7 +188,10 @@ fn each(
     readings: &[(f64, Vec<(String, Usage)>)],
     value: impl Fn(&Usage) -> Option<f64>,
 ) -> Vec<(String, Vec<(f64, f64)>)> {
-    let names = readings.first().into_iter().flat_map(|(_, usage)| usage.iter().map(|(name, _)| name.clone()));
+    let names = readings
+        .first()
+        .into_iter()
+        .flat_map(|(_, usage)| usage.iter().map(|(name, _)| name.clone()));
     names
         .map(|name| {
             let at = |(minutes, usage): &(f64, Vec<(String, Usage)>)| {
@@ -172,21 +208,33 @@ fn each(
 /// Latency and time of each result, from `frames.csv`; its lines are those of the results.
 fn latencies(table: &str, published_ms: &[u64]) -> Vec<(u64, f64)> {
     let latency = |line: &str| line.split(',').nth(3)?.parse().ok();
-    published_ms.iter().copied().zip(table.lines().skip(1).filter_map(latency)).collect()
+    published_ms
+        .iter()
+        .copied()
+        .zip(table.lines().skip(1).filter_map(latency))
+        .collect()
 }
 
 fn p99(mut values: Vec<f64>) -> f64 {
     values.sort_unstable_by(f64::total_cmp);
-    values.get((values.len() * 99).div_ceil(100).saturating_sub(1)).copied().unwrap_or(0.0)
+    values
+        .get((values.len() * 99).div_ceil(100).saturating_sub(1))
+        .copied()
+        .unwrap_or(0.0)
 }
 
 /// Slope of the straight line through points, by least squares.
 fn slope(points: &[(f64, f64)]) -> f64 {
     let count = points.len() as f64;
-    let (mean_x, mean_y) =
-        (points.iter().map(|(x, _)| x).sum::<f64>() / count, points.iter().map(|(_, y)| y).sum::<f64>() / count);
+    let (mean_x, mean_y) = (
+        points.iter().map(|(x, _)| x).sum::<f64>() / count,
+        points.iter().map(|(_, y)| y).sum::<f64>() / count,
+    );
     let spread: f64 = points.iter().map(|(x, _)| (x - mean_x).powi(2)).sum();
-    let together: f64 = points.iter().map(|(x, y)| (x - mean_x) * (y - mean_y)).sum();
+    let together: f64 = points
+        .iter()
+        .map(|(x, y)| (x - mean_x) * (y - mean_y))
+        .sum();
     if spread > 0.0 { together / spread } else { 0.0 }
 }
 
@@ -199,7 +247,8 @@ mod tests {
         assert!((slope(&[(0.0, 1.0), (1.0, 3.0), (2.0, 5.0)]) - 2.0).abs() < 1e-12);
         assert_eq!(slope(&[(1.0, 4.0)]), 0.0);
         assert_eq!(p99((1..=200).map(f64::from).collect()), 198.0);
-        let table = "tick,agent_frame,capture_nanos,latency_ms\n0,0,0,12.5\n1,1,100,\n2,2,200,14.0\n";
+        let table =
+            "tick,agent_frame,capture_nanos,latency_ms\n0,0,0,12.5\n1,1,100,\n2,2,200,14.0\n";
         assert_eq!(latencies(table, &[10, 20]), [(10, 12.5), (20, 14.0)]);
     }
 }

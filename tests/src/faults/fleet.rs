@@ -99,7 +99,9 @@ impl FaultyFleet {
             usage: BTreeMap::new(),
             findings: Findings::default(),
         };
-        fleet.settle(0, None, "the start").expect("a fleet that starts");
+        fleet
+            .settle(0, None, "the start")
+            .expect("a fleet that starts");
         fleet
     }
 
@@ -108,7 +110,11 @@ impl FaultyFleet {
     /// # Panics
     /// When the fleet does not recover.
     #[must_use]
-    pub fn suffer(mut self, faults: &[Fault], mut on_recovery: impl FnMut(usize, &Fault, u64)) -> Report {
+    pub fn suffer(
+        mut self,
+        faults: &[Fault],
+        mut on_recovery: impl FnMut(usize, &Fault, u64),
+    ) -> Report {
         let mut slowest = (0, String::new());
         let mut settled_ms = unix_ms();
         for (number, fault) in faults.iter().enumerate() {
@@ -118,7 +124,9 @@ impl FaultyFleet {
             self.act(fault, &before);
             let ended_ms = unix_ms();
             let gone = match (&fault.target, fault.kind) {
-                (Target::Process(name), Kind::Kill | Kind::End) => Some((name.as_str(), before[name])),
+                (Target::Process(name), Kind::Kill | Kind::End) => {
+                    Some((name.as_str(), before[name]))
+                }
                 _ => None,
             };
             if let Err(problem) = self.settle(ended_ms, gone, &fault.to_string()) {
@@ -130,10 +138,20 @@ impl FaultyFleet {
             }
             let results = self.results.update();
             if !fault.silences_ego() {
-                self.findings.add_gaps(results, [settled_ms, now_ms], PERIOD_MS, &fault.to_string());
+                self.findings.add_gaps(
+                    results,
+                    [settled_ms, now_ms],
+                    PERIOD_MS,
+                    &fault.to_string(),
+                );
             }
-            let first_messages = self.first_messages.lock().unwrap_or_else(PoisonError::into_inner);
-            let new = first_messages.iter().filter(|((cav, _), at)| **at >= began_ms && cav != VEHICLES[0]);
+            let first_messages = self
+                .first_messages
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner);
+            let new = first_messages
+                .iter()
+                .filter(|((cav, _), at)| **at >= began_ms && cav != VEHICLES[0]);
             let new: BTreeMap<String, u64> = new.map(|((cav, _), at)| (cav.clone(), *at)).collect();
             self.findings.add_returns(results, &new);
             drop(first_messages);
@@ -177,25 +195,37 @@ impl FaultyFleet {
 
     /// Waits until results published after `after_ms` have every vehicle's data again; `gone` is a process that has to
     /// be restarted, with its previous id.
-    fn settle(&mut self, after_ms: u64, gone: Option<(&str, u32)>, what: &str) -> std::result::Result<(), String> {
+    fn settle(
+        &mut self,
+        after_ms: u64,
+        gone: Option<(&str, u32)>,
+        what: &str,
+    ) -> std::result::Result<(), String> {
         let deadline = Instant::now() + TIMEOUT;
         loop {
-            let is_back = gone.is_none_or(|(name, pid)| self.up.pids().get(name).is_some_and(|now| *now != pid));
+            let is_back = gone
+                .is_none_or(|(name, pid)| self.up.pids().get(name).is_some_and(|now| *now != pid));
             // A feature map of the previous instance may be recent enough for a while.
             let after_ms = match gone {
-                Some((name, _)) => name.strip_prefix("agent-").map_or(Some(after_ms), |cav| self.back(cav, after_ms)),
+                Some((name, _)) => name
+                    .strip_prefix("agent-")
+                    .map_or(Some(after_ms), |cav| self.back(cav, after_ms)),
                 None => Some(after_ms),
             };
             let results = self.results.update();
             let newest = &results[results.len().saturating_sub(SETTLED)..];
             let is_whole = newest.len() == SETTLED
                 && after_ms.is_some_and(|after_ms| newest[0].published_ms > after_ms)
-                && newest.iter().all(|result| result.fused.len() == VEHICLES.len() - 1);
+                && newest
+                    .iter()
+                    .all(|result| result.fused.len() == VEHICLES.len() - 1);
             if is_back && is_whole {
                 return Ok(());
             }
             if Instant::now() > deadline {
-                return Err(format!("after {what} not all are fused again; the last results: {newest:?}"));
+                return Err(format!(
+                    "after {what} not all are fused again; the last results: {newest:?}"
+                ));
             }
             thread::sleep(Duration::from_millis(20));
         }
@@ -203,8 +233,15 @@ impl FaultyFleet {
 
     /// Time of the first message of a vehicle's instance that began after `after_ms`.
     fn back(&self, cav: &str, after_ms: u64) -> Option<u64> {
-        let first_messages = self.first_messages.lock().unwrap_or_else(PoisonError::into_inner);
-        first_messages.iter().filter(|((known, _), at)| known == cav && **at >= after_ms).map(|(_, at)| *at).max()
+        let first_messages = self
+            .first_messages
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        first_messages
+            .iter()
+            .filter(|((known, _), at)| known == cav && **at >= after_ms)
+            .map(|(_, at)| *at)
+            .max()
     }
 
     fn read_usage(&mut self) {
@@ -212,7 +249,9 @@ impl FaultyFleet {
         let own = [("v2vloc".to_owned(), self.up.pid())];
         for (name, pid) in self.up.pids().into_iter().chain(own) {
             let (_, since, usage) = self.usage.entry(pid).or_insert((name, now, None));
-            if let Some(found) = Usage::of(pid).filter(|_| now.duration_since(*since) >= SETTLED_AGE) {
+            if let Some(found) =
+                Usage::of(pid).filter(|_| now.duration_since(*since) >= SETTLED_AGE)
+            {
                 usage.get_or_insert([found; 2])[1] = found;
             }
         }
@@ -232,7 +271,11 @@ impl FaultyFleet {
                 let [first, last] = (*usage)?;
                 Some((field(&last)? as i64 - field(&first)? as i64, name.clone()))
             };
-            self.usage.values().filter_map(growth).max().unwrap_or_default()
+            self.usage
+                .values()
+                .filter_map(growth)
+                .max()
+                .unwrap_or_default()
         };
         Report {
             findings: self.findings.clone(),
@@ -241,9 +284,19 @@ impl FaultyFleet {
             discrepancies: ledger["balance"].to_string(),
             exempted: ledger["exempted"].as_u64().unwrap_or(0),
             stop,
-            left_over: shared_memory().difference(&self.shared_memory).cloned().collect(),
-            growth: [growth_of(|usage| usage.descriptors), growth_of(|usage| usage.threads)],
-            restarts: status.processes.iter().map(|process| u64::from(process.restarts)).sum(),
+            left_over: shared_memory()
+                .difference(&self.shared_memory)
+                .cloned()
+                .collect(),
+            growth: [
+                growth_of(|usage| usage.descriptors),
+                growth_of(|usage| usage.threads),
+            ],
+            restarts: status
+                .processes
+                .iter()
+                .map(|process| u64::from(process.restarts))
+                .sum(),
         }
     }
 }
@@ -256,20 +309,29 @@ fn route(endpoint: &Endpoint) -> std::result::Result<Session, BusError> {
 fn observe(router: &Endpoint, first_messages: &Arc<Mutex<FirstMessages>>) -> Session {
     let session = open(&BusOptions::client(router.clone())).expect("the router is there");
     let first_messages = Arc::clone(first_messages);
-    let subscriber = session.declare_subscriber("v2v/test/*/pose").callback(move |sample| {
-        let bytes = sample.payload().to_bytes();
-        let header =
-            bytes.get(..HEADER_LEN).and_then(|bytes| protocol::Header::from_bytes(bytes.try_into().ok()?).ok());
-        if let Some(stamp) = header.map(|header| header.stamp) {
-            let mut first_messages = first_messages.lock().unwrap_or_else(PoisonError::into_inner);
-            first_messages.entry((stamp.cav.to_string(), stamp.epoch)).or_insert(stamp.publish_nanos / 1_000_000);
-        }
-    });
+    let subscriber = session
+        .declare_subscriber("v2v/test/*/pose")
+        .callback(move |sample| {
+            let bytes = sample.payload().to_bytes();
+            let header = bytes
+                .get(..HEADER_LEN)
+                .and_then(|bytes| protocol::Header::from_bytes(bytes.try_into().ok()?).ok());
+            if let Some(stamp) = header.map(|header| header.stamp) {
+                let mut first_messages = first_messages
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner);
+                first_messages
+                    .entry((stamp.cav.to_string(), stamp.epoch))
+                    .or_insert(stamp.publish_nanos / 1_000_000);
+            }
+        });
     subscriber.background().wait().expect("a subscriber");
     session
 }
 
 fn shared_memory() -> BTreeSet<String> {
     let entries = fs::read_dir("/dev/shm").into_iter().flatten().flatten();
-    entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect()
+    entries
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .collect()
 }

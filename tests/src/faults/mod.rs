@@ -64,7 +64,11 @@ impl Fault {
     /// True if no results can be expected of the ego meanwhile: its inputs are hit, or the connection to the scorer.
     #[must_use]
     pub(crate) fn silences_ego(&self) -> bool {
-        let own = [format!("agent-{}", VEHICLES[0]), format!("ego-{}", VEHICLES[0]), "replay".into()];
+        let own = [
+            format!("agent-{}", VEHICLES[0]),
+            format!("ego-{}", VEHICLES[0]),
+            "replay".into(),
+        ];
         match &self.target {
             Target::Router => true,
             Target::Process(name) => own.contains(name),
@@ -75,7 +79,9 @@ impl Fault {
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = self.lasts.as_secs_f64();
-        let Target::Process(target) = &self.target else { return write!(f, "the router gone for {seconds:.1} s") };
+        let Target::Process(target) = &self.target else {
+            return write!(f, "the router gone for {seconds:.1} s");
+        };
         match self.kind {
             Kind::Kill => write!(f, "{target} killed"),
             Kind::End => write!(f, "{target} ended"),
@@ -89,25 +95,51 @@ impl fmt::Display for Fault {
 /// `count` faults, the same for the same seed: all kinds, on all processes of the fleet and on its router.
 #[must_use]
 pub fn plan(seed: u64, count: usize) -> Vec<Fault> {
-    let draw = |number: usize, what: u64, below: u64| derive_seed(seed, &[number as u64, what]) % below;
+    let draw =
+        |number: usize, what: u64, below: u64| derive_seed(seed, &[number as u64, what]) % below;
     let mut targets: Vec<String> = VEHICLES.iter().map(|cav| format!("agent-{cav}")).collect();
-    targets.extend([format!("ego-{}", VEHICLES[0]), format!("link-{}", VEHICLES[0]), "replay".into()]);
+    targets.extend([
+        format!("ego-{}", VEHICLES[0]),
+        format!("link-{}", VEHICLES[0]),
+        "replay".into(),
+    ]);
     let fault = |number: usize| {
         let after = Duration::from_millis(draw(number, 0, 400));
         let long = draw(number, 1, 50) == 0;
-        let lasts = Duration::from_millis(if long { 10_000 } else { 100 + draw(number, 2, 1900) });
+        let lasts = Duration::from_millis(if long {
+            10_000
+        } else {
+            100 + draw(number, 2, 1900)
+        });
         let place = draw(number, 3, targets.len() as u64 + 1) as usize;
         let Some(name) = targets.get(place).cloned() else {
-            return Fault { kind: Kind::Stop, target: Target::Router, lasts: lasts.min(Duration::from_secs(2)), after };
+            return Fault {
+                kind: Kind::Stop,
+                target: Target::Router,
+                lasts: lasts.min(Duration::from_secs(2)),
+                after,
+            };
         };
         // The replay is the clock of the run: a requested end of it, other than a crash, ends the run.
         let kinds: &[Kind] = if name == "replay" {
             &[Kind::Kill, Kind::Stop, Kind::Cut, Kind::Silence]
         } else {
-            &[Kind::Kill, Kind::Kill, Kind::End, Kind::Stop, Kind::Cut, Kind::Silence]
+            &[
+                Kind::Kill,
+                Kind::Kill,
+                Kind::End,
+                Kind::Stop,
+                Kind::Cut,
+                Kind::Silence,
+            ]
         };
         let kind = kinds[draw(number, 4, kinds.len() as u64) as usize];
-        Fault { kind, target: Target::Process(name), lasts, after }
+        Fault {
+            kind,
+            target: Target::Process(name),
+            lasts,
+            after,
+        }
     };
     (0..count).map(fault).collect()
 }
@@ -124,9 +156,16 @@ mod tests {
         assert_eq!(faults, plan(1, 500));
         assert_eq!(faults[..20], plan(1, 20));
         assert_ne!(faults, plan(2, 500));
-        let hit: BTreeSet<_> = faults.iter().map(|fault| (&fault.target, fault.kind)).collect();
+        let hit: BTreeSet<_> = faults
+            .iter()
+            .map(|fault| (&fault.target, fault.kind))
+            .collect();
         // Six processes in five ways, the replay in four, the router.
         assert_eq!(hit.len(), 6 * 5 + 4 + 1);
-        assert!(faults.iter().all(|fault| fault.lasts <= Duration::from_secs(10)));
+        assert!(
+            faults
+                .iter()
+                .all(|fault| fault.lasts <= Duration::from_secs(10))
+        );
     }
 }

@@ -38,36 +38,55 @@ impl Proxy {
     #[must_use]
     pub(crate) fn open(router_port: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
-        let port = listener.local_addr().expect("a bound socket has an address").port();
+        let port = listener
+            .local_addr()
+            .expect("a bound socket has an address")
+            .port();
         let links = Arc::<Mutex<Vec<VirtualLink>>>::default();
         let laid = Arc::clone(&links);
         thread::spawn(move || {
             for process in listener.incoming().flatten() {
                 // Without a router the connection is closed; the process will try again.
-                let Ok(router) = TcpStream::connect(("127.0.0.1", router_port)) else { continue };
+                let Ok(router) = TcpStream::connect(("127.0.0.1", router_port)) else {
+                    continue;
+                };
                 if let Some(link) = lay(process, router) {
                     let mut laid = laid.lock().unwrap_or_else(PoisonError::into_inner);
                     laid.push(link);
                 }
             }
         });
-        Self { endpoint: Endpoint::loopback(port), port, links }
+        Self {
+            endpoint: Endpoint::loopback(port),
+            port,
+            links,
+        }
     }
 
     /// Cuts the links of a process; returns their number.
     pub(crate) fn cut(&self, pid: u32) -> usize {
-        self.each(pid, |link| link.ends.iter().for_each(|end| drop(end.shutdown(Shutdown::Both))))
+        self.each(pid, |link| {
+            link.ends
+                .iter()
+                .for_each(|end| drop(end.shutdown(Shutdown::Both)))
+        })
     }
 
     /// Silences a process's links, or ends that; returns their number.
     pub(crate) fn silence(&self, pid: u32, is_silent: bool) -> usize {
-        self.each(pid, |link| link.is_silent.store(is_silent, Ordering::Relaxed))
+        self.each(pid, |link| {
+            link.is_silent.store(is_silent, Ordering::Relaxed)
+        })
     }
 
     fn each(&self, pid: u32, act: impl Fn(&VirtualLink)) -> usize {
         let ports = ports_of(pid, self.port);
         let links = self.links.lock().unwrap_or_else(PoisonError::into_inner);
-        links.iter().filter(|link| ports.contains(&link.port)).map(act).count()
+        links
+            .iter()
+            .filter(|link| ports.contains(&link.port))
+            .map(act)
+            .count()
     }
 }
 
@@ -79,10 +98,18 @@ fn lay(process: TcpStream, router: TcpStream) -> Option<VirtualLink> {
     }
     let ways = [(&process, &router), (&router, &process)];
     for (from, to) in ways {
-        let (from, to, is_silent) = (from.try_clone().ok()?, to.try_clone().ok()?, Arc::clone(&is_silent));
+        let (from, to, is_silent) = (
+            from.try_clone().ok()?,
+            to.try_clone().ok()?,
+            Arc::clone(&is_silent),
+        );
         thread::spawn(move || pass_on(from, to, &is_silent));
     }
-    Some(VirtualLink { port, ends: [process, router], is_silent })
+    Some(VirtualLink {
+        port,
+        ends: [process, router],
+        is_silent,
+    })
 }
 
 /// One direction, until either end is closed.
@@ -105,10 +132,20 @@ fn pass_on(mut from: TcpStream, mut to: TcpStream, is_silent: &AtomicBool) {
 
 /// Own ports of a process's connections to `port` of this machine.
 fn ports_of(pid: u32, port: u16) -> BTreeSet<u16> {
-    let links = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
+    let links = fs::read_dir(format!("/proc/{pid}/fd"))
+        .into_iter()
+        .flatten()
+        .flatten();
     let sockets: BTreeSet<String> = links
         .filter_map(|entry| fs::read_link(entry.path()).ok())
-        .filter_map(|link| Some(link.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?.to_owned()))
+        .filter_map(|link| {
+            Some(
+                link.to_str()?
+                    .strip_prefix("socket:[")?
+                    .strip_suffix(']')?
+                    .to_owned(),
+            )
+        })
         .collect();
     let table = fs::read_to_string(format!("/proc/{pid}/net/tcp")).unwrap_or_default();
     let port_of = |address: &str| u16::from_str_radix(address.split_once(':')?.1, 16).ok();
@@ -150,10 +187,14 @@ mod tests {
         let own = std::process::id();
         assert_eq!((proxy.silence(own, true), proxy.silence(1, true)), (1, 0));
         client.write_all(b"ho").unwrap();
-        client.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
+        client
+            .set_read_timeout(Some(Duration::from_millis(100)))
+            .unwrap();
         assert!(client.read_exact(&mut answer).is_err());
         proxy.silence(own, false);
-        client.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        client
+            .set_read_timeout(Some(Duration::from_secs(20)))
+            .unwrap();
         client.read_exact(&mut answer).unwrap();
         assert_eq!(&answer, b"ho");
         assert_eq!(proxy.cut(own), 1);

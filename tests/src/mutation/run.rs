@@ -33,17 +33,36 @@ pub struct Report {
 #[must_use]
 pub fn messages(cases: u64, seed: u64, meter: &PeakAlloc) -> Report {
     let damage = wire_target::damage_message;
-    one(("messages", &seeds::messages()), cases, seed, meter, damage, &wire_target::read)
+    one(
+        ("messages", &seeds::messages()),
+        cases,
+        seed,
+        meter,
+        damage,
+        &wire_target::read,
+    )
 }
 
 /// Runs damaged files of every format from `seed` on, one format after the other as reports are requested.
 ///
 /// # Panics
 /// As [`messages`].
-pub fn files(scratch: &Path, cases: u64, seed: u64, meter: &PeakAlloc) -> impl Iterator<Item = Report> {
+pub fn files(
+    scratch: &Path,
+    cases: u64,
+    seed: u64,
+    meter: &PeakAlloc,
+) -> impl Iterator<Item = Report> {
     readers::all(scratch).into_iter().map(move |reader| {
         let read = |bytes: &[u8]| reader.try_read(bytes);
-        one((reader.name, &reader.seeds), cases, seed, meter, damage, &read)
+        one(
+            (reader.name, &reader.seeds),
+            cases,
+            seed,
+            meter,
+            damage,
+            &read,
+        )
     })
 }
 
@@ -53,8 +72,12 @@ pub fn files(scratch: &Path, cases: u64, seed: u64, meter: &PeakAlloc) -> impl I
 /// When a file cannot be written.
 #[must_use]
 pub fn formats(scratch: &Path) -> Vec<(&'static str, Vec<Vec<u8>>)> {
-    let files = readers::all(scratch).into_iter().map(|reader| (reader.name, reader.seeds));
-    std::iter::once(("messages", seeds::messages())).chain(files).collect()
+    let files = readers::all(scratch)
+        .into_iter()
+        .map(|reader| (reader.name, reader.seeds));
+    std::iter::once(("messages", seeds::messages()))
+        .chain(files)
+        .collect()
 }
 
 fn one(
@@ -81,5 +104,12 @@ fn one(
         }
         peak_bytes = peak_bytes.max(meter.peak_usage().saturating_sub(held));
     }
-    Report { name, cases, accepted, panics, peak_bytes, took: begun.elapsed() }
+    Report {
+        name,
+        cases,
+        accepted,
+        panics,
+        peak_bytes,
+        took: begun.elapsed(),
+    }
 }

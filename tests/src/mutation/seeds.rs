@@ -16,9 +16,16 @@ mod sample;
 /// Never: the samples are valid.
 #[must_use]
 pub fn messages() -> Vec<Vec<u8>> {
-    let maps = sample::every_codec().into_iter().map(|config| protocol::Message::Bev(sample::bev(&config)));
+    let maps = sample::every_codec()
+        .into_iter()
+        .map(|config| protocol::Message::Bev(sample::bev(&config)));
     let all = sample::every_kind().into_iter().chain(maps);
-    all.map(|message| wire::encode_any(&sample::stamp(), message).expect("a sound message").to_vec()).collect()
+    all.map(|message| {
+        wire::encode_any(&sample::stamp(), message)
+            .expect("a sound message")
+            .to_vec()
+    })
+    .collect()
 }
 
 /// Sweeps as text, binary and compressed, with and without colours, and as PCL writes them: organised, and padded.
@@ -26,8 +33,12 @@ pub fn messages() -> Vec<Vec<u8>> {
 pub fn clouds() -> Vec<Vec<u8>> {
     let kinds = [Encoding::Ascii, Encoding::Binary]
         .into_iter()
-        .flat_map(|encoding| [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field)));
-    let mut files: Vec<Vec<u8>> = kinds.map(|(encoding, field)| encode(&sample::points(), encoding, field)).collect();
+        .flat_map(|encoding| {
+            [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field))
+        });
+    let mut files: Vec<Vec<u8>> = kinds
+        .map(|(encoding, field)| encode(&sample::points(), encoding, field))
+        .collect();
     let packed = compressed();
     files.push(packed.clone());
     files.push([&packed[..], &[0; 300]].concat());
@@ -44,11 +55,15 @@ pub const PLY: &str = "ply\nformat ascii 1.0\ncomment seed\nelement sensor 1\npr
 pub fn npy() -> Vec<u8> {
     let header = "{'descr': '<f4', 'fortran_order': False, 'shape': (2, 4), }\n";
     let numbers = (1..9_u8).flat_map(|number| f32::from(number).to_le_bytes());
-    [b"\x93NUMPY\x01\x00", &[header.len() as u8, 0][..], header.as_bytes()]
-        .concat()
-        .into_iter()
-        .chain(numbers)
-        .collect()
+    [
+        b"\x93NUMPY\x01\x00",
+        &[header.len() as u8, 0][..],
+        header.as_bytes(),
+    ]
+    .concat()
+    .into_iter()
+    .chain(numbers)
+    .collect()
 }
 
 /// Three points with the padding of a message, some of it of no bytes, and more bytes after them than stated.
@@ -57,7 +72,11 @@ fn padded() -> Vec<u8> {
         TYPE F F F U U U U U\nCOUNT 1 1 1 4 1 0 1 9\nWIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA binary\n"
         .to_vec();
     for number in 0..3_u8 {
-        file.extend([1.5, -2.0, f32::from(number)].into_iter().flat_map(f32::to_le_bytes));
+        file.extend(
+            [1.5, -2.0, f32::from(number)]
+                .into_iter()
+                .flat_map(f32::to_le_bytes),
+        );
         file.extend([9, 9, 9, 9, 100 * number, number, 0]);
         file.extend([7; 9]);
     }
@@ -71,8 +90,13 @@ const SPARSE: &str = "# points\nCOLUMNS x y z reflectivity\nSIZE 4 4 8 2\nTYPE F
 
 /// Four points, compressed by LZF as literals only.
 fn compressed() -> Vec<u8> {
-    let body: Vec<u8> = (0..16).flat_map(|number| (number as f32).to_le_bytes()).collect();
-    let packed: Vec<u8> = body.chunks(32).flat_map(|run| [&[run.len() as u8 - 1][..], run].concat()).collect();
+    let body: Vec<u8> = (0..16)
+        .flat_map(|number| (number as f32).to_le_bytes())
+        .collect();
+    let packed: Vec<u8> = body
+        .chunks(32)
+        .flat_map(|run| [&[run.len() as u8 - 1][..], run].concat())
+        .collect();
     let mut file =
         b"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\n\
                      VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA binary_compressed\n"
@@ -89,17 +113,32 @@ fn compressed() -> Vec<u8> {
 /// Never: the sample is valid.
 #[must_use]
 pub fn ros2_cloud() -> Vec<u8> {
-    let topic = Topic::Stream { cav: CavId::new("4279").expect("an identifier"), stream: Stream::Lidar };
-    let message = Message::Lidar(Lidar { points: sample::points() });
+    let topic = Topic::Stream {
+        cav: CavId::new("4279").expect("an identifier"),
+        stream: Stream::Lidar,
+    };
+    let message = Message::Lidar(Lidar {
+        points: sample::points(),
+    });
     let mut translator = Translator::new(&RunId::new("test").expect("an identifier"));
-    translator.translate(&topic, 1_500_000_000, &message).remove(0).cdr
+    translator
+        .translate(&topic, 1_500_000_000, &message)
+        .remove(0)
+        .cdr
 }
 
 /// A motion as `nav_msgs/Odometry`, `geometry_msgs/TwistStamped` and `sensor_msgs/Imu`, each behind a byte with the number
 /// of its type.
 #[must_use]
 pub fn ros2_motions() -> Vec<Vec<u8>> {
-    let text = |text: &str| [&(text.len() as u32 + 1).to_le_bytes(), text.as_bytes(), &[0]].concat();
+    let text = |text: &str| {
+        [
+            &(text.len() as u32 + 1).to_le_bytes(),
+            text.as_bytes(),
+            &[0],
+        ]
+        .concat()
+    };
     let message = |number: u8, texts: &[&str], values: &[f64]| {
         let mut body = [7_u32, 8].map(u32::to_le_bytes).concat();
         for value in texts {
@@ -125,11 +164,23 @@ pub fn ros2_motions() -> Vec<Vec<u8>> {
 pub fn recording(scratch: &Path) -> Vec<u8> {
     let path = scratch.join("seed.mcap");
     let _ = std::fs::remove_file(&path);
-    let mut writer = RecordingWriter::create(&path, RecordingOptions::default()).expect("a writable folder");
+    let mut writer =
+        RecordingWriter::create(&path, RecordingOptions::default()).expect("a writable folder");
     let run = RunId::new("test").expect("an identifier");
     for (number, bytes) in messages().iter().enumerate() {
-        let topic = ["4279/bev", "4279/lidar", "truth", "4288/pose"][number % 4].parse().expect("a topic");
-        writer.write(&Key { run: run.clone(), topic }, 1_000 * number as u64, bytes).expect("a writable folder");
+        let topic = ["4279/bev", "4279/lidar", "truth", "4288/pose"][number % 4]
+            .parse()
+            .expect("a topic");
+        writer
+            .write(
+                &Key {
+                    run: run.clone(),
+                    topic,
+                },
+                1_000 * number as u64,
+                bytes,
+            )
+            .expect("a writable folder");
     }
     writer.finish().expect("a writable folder");
     std::fs::read(&path).expect("it was written")
@@ -186,7 +237,8 @@ pub const TABLES: &str = "dataset: scenes\nweights: weights\ndtype: f16\nframes:
     - {name: noisy, poses: {noisy: {mode: independent, position_std_m: 1, heading_std_deg: 1}}}\n";
 
 /// A trace of a link.
-pub(crate) const TRACE: &str = "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
+pub(crate) const TRACE: &str =
+    "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
 
 /// Departure times of packets, milliseconds.
 pub(crate) const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
@@ -201,4 +253,5 @@ pub(crate) const POSES: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,
     town,1000,3100000000,,,,,,,,,low_confidence,12\n";
 
 /// Errors of poses.
-pub(crate) const ERRORS: &str = "x_m,y_m,z_m,yaw_deg,confidence\n0.5,-0.25,0.1,1.5,0.9\n-1,2,0,-3,0.4\n";
+pub(crate) const ERRORS: &str =
+    "x_m,y_m,z_m,yaw_deg,confidence\n0.5,-0.25,0.1,1.5,0.9\n-1,2,0,-3,0.4\n";

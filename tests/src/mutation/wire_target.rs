@@ -43,10 +43,18 @@ pub fn reseal(bytes: &mut [u8], lengths: bool) {
 /// When an accepted message has a wrong checksum, or values that are not finite.
 pub fn read(bytes: &[u8]) -> bool {
     let whole: Result<(Header, Message), WireError> = wire::decode_any([bytes], &LIMITS);
-    let Ok((_, message)) = whole else { return false };
+    let Ok((_, message)) = whole else {
+        return false;
+    };
     let sealed = |at: usize, over: &[u8]| bytes[at..at + 4] == crc32fast::hash(over).to_le_bytes();
-    assert!(sealed(84, &bytes[HEADER_LEN..]), "accepted with a wrong checksum of the payload");
-    assert!(sealed(HEADER_LEN - 4, &bytes[..HEADER_LEN - 4]), "accepted with a wrong checksum of the header");
+    assert!(
+        sealed(84, &bytes[HEADER_LEN..]),
+        "accepted with a wrong checksum of the payload"
+    );
+    assert!(
+        sealed(HEADER_LEN - 4, &bytes[..HEADER_LEN - 4]),
+        "accepted with a wrong checksum of the header"
+    );
     match message {
         Message::Bev(bev) => match bev.features.decode(&LIMITS) {
             Ok(map) => {
@@ -65,6 +73,9 @@ pub fn read(bytes: &[u8]) -> bool {
 }
 
 fn are_finite(points: &[[f32; 4]]) -> bool {
-    assert!(points.iter().flatten().all(|value| value.is_finite()), "points with values that are not finite");
+    assert!(
+        points.iter().flatten().all(|value| value.is_finite()),
+        "points with values that are not finite"
+    );
     true
 }

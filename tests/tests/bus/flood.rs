@@ -16,12 +16,23 @@ fn topic(text: &str) -> Topic {
 }
 
 fn sweep(points: usize) -> Lidar {
-    Lidar { points: PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]; points] } }
+    Lidar {
+        points: PointCloud {
+            xyzi: vec![[1.0, 2.0, 3.0, 0.5]; points],
+        },
+    }
 }
 
 fn connect(sender: &Bus, ego: &Bus, topic: &Topic) {
-    let route = Route { topic: topic.clone(), receiver: ego.identity().process.clone() };
-    Barrier::new([route]).await_routes(sender).unwrap().wait(TIMEOUT).unwrap();
+    let route = Route {
+        topic: topic.clone(),
+        receiver: ego.identity().process.clone(),
+    };
+    Barrier::new([route])
+        .await_routes(sender)
+        .unwrap()
+        .wait(TIMEOUT)
+        .unwrap();
 }
 
 /// Receives until every message of the honest sender has arrived; the number of both senders' messages.
@@ -44,18 +55,27 @@ fn receive(inbox: &Inbox, bus: &Bus) -> [u64; 2] {
 #[test]
 fn a_flood_from_one_peer_costs_the_others_nothing() {
     let router = TestRouter::open();
-    let [honest, flooding, ego] = [("agent-1", "1"), ("agent-2", "2"), ("ego-9", "9")].map(|(p, c)| router.join(p, c));
-    let limits = InboxLimits { messages_per_s: 20.0, ..InboxLimits::PEERS };
+    let [honest, flooding, ego] =
+        [("agent-1", "1"), ("agent-2", "2"), ("ego-9", "9")].map(|(p, c)| router.join(p, c));
+    let limits = InboxLimits {
+        messages_per_s: 20.0,
+        ..InboxLimits::PEERS
+    };
     let inbox = ego.limited_inbox(64, 4, limits);
     let [good, bad] = ["1/lidar", "2/lidar"].map(topic);
     let _subscriptions = [&good, &bad].map(|topic| ego.subscribe(topic.clone(), &inbox).unwrap());
     let [calm, flood] = [(&honest, &good), (&flooding, &bad)].map(|(bus, topic)| {
-        let publisher = bus.publisher(topic.clone(), PublisherOptions::FEATURES.lossless(4)).unwrap();
+        let publisher = bus
+            .publisher(topic.clone(), PublisherOptions::FEATURES.lossless(4))
+            .unwrap();
         connect(bus, &ego, topic);
         publisher
     });
 
-    let (is_over, sent) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+    let (is_over, sent) = (
+        Arc::new(AtomicBool::new(false)),
+        Arc::new(AtomicU64::new(0)),
+    );
     let pouring = std::thread::spawn({
         let (is_over, sent) = (Arc::clone(&is_over), Arc::clone(&sent));
         move || {
@@ -84,11 +104,22 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
 
     assert_eq!(calm, HONEST, "every message of the honest peer");
     let allowed = 20.0 * (seconds + 2.0 + 1.0);
-    assert!((stormy as f64) < allowed, "{stormy} of {} were decoded in {seconds} s", sent.load(Ordering::Relaxed));
+    assert!(
+        (stormy as f64) < allowed,
+        "{stormy} of {} were decoded in {seconds} s",
+        sent.load(Ordering::Relaxed)
+    );
     let ledger = ego.stats().ledger();
-    let counts = |topic| ledger.get(&Account::towards(topic, &ego.identity().process)).unwrap();
+    let counts = |topic| {
+        ledger
+            .get(&Account::towards(topic, &ego.identity().process))
+            .unwrap()
+    };
     assert_eq!(counts(good).dropped_total(), 0);
-    assert!(counts(bad).dropped[&DropReason::RateLimit] > 100, "counted by its name");
+    assert!(
+        counts(bad).dropped[&DropReason::RateLimit] > 100,
+        "counted by its name"
+    );
 }
 
 #[test]
@@ -96,18 +127,32 @@ fn what_waits_is_bounded_in_bytes() {
     let router = TestRouter::open();
     let (sender, ego) = (router.join("agent-1", "1"), router.join("ego-9", "9"));
     // Room for 64 messages, and bytes for two and a half.
-    let limits = InboxLimits { waiting_bytes: 160_000, ..InboxLimits::NONE };
+    let limits = InboxLimits {
+        waiting_bytes: 160_000,
+        ..InboxLimits::NONE
+    };
     let inbox = ego.limited_inbox(64, 4, limits);
     let topic = topic("1/lidar");
     let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
-    let publisher = sender.publisher(topic.clone(), PublisherOptions::FEATURES.lossless(4)).unwrap();
+    let publisher = sender
+        .publisher(topic.clone(), PublisherOptions::FEATURES.lossless(4))
+        .unwrap();
     connect(&sender, &ego, &topic);
     (0..10).for_each(|tick| publisher.submit(tick, sweep(4096)));
     publisher.finish();
     let here = Account::towards(topic, &ego.identity().process);
-    let dropped = || ego.stats().ledger().get(&here).map_or(0, |counts| counts.dropped_total());
+    let dropped = || {
+        ego.stats()
+            .ledger()
+            .get(&here)
+            .map_or(0, |counts| counts.dropped_total())
+    };
     wait_for("refusals", || dropped() == 8);
-    assert!(inbox.waiting_bytes() <= 160_000, "{}", inbox.waiting_bytes());
+    assert!(
+        inbox.waiting_bytes() <= 160_000,
+        "{}",
+        inbox.waiting_bytes()
+    );
     let taken = std::iter::from_fn(|| match inbox.take(Some(Instant::now())) {
         Pop::Item(_, event) => Some(matches!(event, Event::Message(_))),
         _ => None,

@@ -18,13 +18,28 @@ fn record_late_messages(out: std::path::PathBuf) -> RecordReport {
     let bus = router.join("recorder", "recorder");
     let replay = router.join("replay", "replay");
     let topic: Topic = "7/gnss".parse().unwrap();
-    let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+    let publisher = replay
+        .publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8))
+        .unwrap();
     let recording = RecordingOptions::default();
-    let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
+    let options = RecorderOptions {
+        out,
+        recording,
+        without: Vec::new(),
+        keeps_running: true,
+    };
     std::thread::scope(|scope| {
-        let recorder = scope.spawn(|| recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap());
-        let route = Route { topic, receiver: "recorder".parse().unwrap() };
-        Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
+        let recorder =
+            scope.spawn(|| recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap());
+        let route = Route {
+            topic,
+            receiver: "recorder".parse().unwrap(),
+        };
+        Barrier::new([route])
+            .await_routes(&replay)
+            .unwrap()
+            .wait(TIMEOUT)
+            .unwrap();
         stop.request();
         (0..LATE).for_each(|tick| publisher.submit(tick, gnss(tick as f64)));
         recorder.join().unwrap()
@@ -35,5 +50,8 @@ fn record_late_messages(out: std::path::PathBuf) -> RecordReport {
 fn messages_under_way_when_a_recorder_is_asked_to_stop_are_recorded() {
     let folder = tempfile::tempdir().unwrap();
     let report = record_late_messages(folder.path().join("late.mcap"));
-    assert!(report.messages >= LATE && report.is_complete(), "{report:?}");
+    assert!(
+        report.messages >= LATE && report.is_complete(),
+        "{report:?}"
+    );
 }

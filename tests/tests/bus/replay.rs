@@ -20,7 +20,10 @@ fn scenario(dir: &Path) -> Scenario {
 }
 
 fn topic(cav: &str, stream: Stream) -> Topic {
-    Topic::Stream { cav: CavId::new(cav).unwrap(), stream }
+    Topic::Stream {
+        cav: CavId::new(cav).unwrap(),
+        stream,
+    }
 }
 
 /// Subscriber to everything a replay publishes, under the names of the agents it waits for.
@@ -32,7 +35,10 @@ struct Listener {
 
 impl Listener {
     fn new(router: &TestRouter) -> Self {
-        let buses: Vec<Bus> = AGENTS.iter().map(|cav| router.join(&format!("agent-{cav}"), cav)).collect();
+        let buses: Vec<Bus> = AGENTS
+            .iter()
+            .map(|cav| router.join(&format!("agent-{cav}"), cav))
+            .collect();
         let inbox = buses[0].inbox(1000, 16);
         let mut subscriptions = vec![buses[0].subscribe(Topic::Truth, &inbox).unwrap()];
         for (bus, cav) in buses.iter().zip(AGENTS) {
@@ -40,7 +46,11 @@ impl Listener {
                 subscriptions.push(bus.subscribe(topic(cav, stream), &inbox).unwrap());
             }
         }
-        Self { buses, inbox, _subscriptions: subscriptions }
+        Self {
+            buses,
+            inbox,
+            _subscriptions: subscriptions,
+        }
     }
 
     /// Capture times by topic, once every topic has ended.
@@ -50,7 +60,10 @@ impl Listener {
         while ended < 7 {
             match next_event(&self.inbox) {
                 (topic, Event::Message(arrival)) => {
-                    captures.entry(topic).or_default().push(arrival.header.stamp.capture_nanos);
+                    captures
+                        .entry(topic)
+                        .or_default()
+                        .push(arrival.header.stamp.capture_nanos);
                 }
                 (_, Event::End { .. }) => ended += 1,
             }
@@ -63,7 +76,12 @@ fn play(router: &TestRouter, scenario: &Scenario, options: StreamOptions) -> Str
     play_until(router, scenario, options, &Stop::new())
 }
 
-fn play_until(router: &TestRouter, scenario: &Scenario, options: StreamOptions, stop: &Stop) -> StreamReport {
+fn play_until(
+    router: &TestRouter,
+    scenario: &Scenario,
+    options: StreamOptions,
+    stop: &Stop,
+) -> StreamReport {
     let bus = router.join("replay", "replay");
     let replay = Replay::prepare(&bus, scenario, options, stop).unwrap();
     replay.wait_until_ready().unwrap();
@@ -78,8 +96,19 @@ fn every_tick_reaches_every_agent_in_order() {
     scene::write(folder.path(), &AGENTS, 6);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let listener = Listener::new(&router);
-    let report = play(&router, &scenario, StreamOptions { rate: 0.0, ..StreamOptions::default() });
-    let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let report = play(
+        &router,
+        &scenario,
+        StreamOptions {
+            rate: 0.0,
+            ..StreamOptions::default()
+        },
+    );
+    let recorded: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
     let captures = listener.captures();
     assert_eq!(captures.len(), 7);
     for (topic, captures) in captures {
@@ -96,12 +125,22 @@ fn what_is_published_is_what_was_recorded() {
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let listener = Listener::new(&router);
     play(&router, &scenario, StreamOptions::default());
-    let frame = scenario.load(1, 0, &dataset::LoadOptions::default()).unwrap();
+    let frame = scenario
+        .load(1, 0, &dataset::LoadOptions::default())
+        .unwrap();
     let (mut seen, inbox) = (0, &listener.inbox);
     while seen < 3 {
-        let (found, Event::Message(arrival)) = next_event(&listener.inbox) else { continue };
+        let (found, Event::Message(arrival)) = next_event(&listener.inbox) else {
+            continue;
+        };
         if found == topic("20", Stream::Lidar) {
-            assert_eq!(inbox.decode::<Lidar>(&arrival, &Limits::DEFAULT).unwrap().points, frame.points);
+            assert_eq!(
+                inbox
+                    .decode::<Lidar>(&arrival, &Limits::DEFAULT)
+                    .unwrap()
+                    .points,
+                frame.points
+            );
             seen += 1;
         } else if found == topic("20", Stream::Gnss) {
             let gnss: Gnss = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
@@ -123,12 +162,21 @@ fn previews_are_published_for_viewers_only() {
     scene::write(folder.path(), &AGENTS, 6);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let bus = router.join("replay", "replay");
-    let preview = bus.publisher(topic("10", Stream::Preview), PublisherOptions::PREVIEW).unwrap();
+    let preview = bus
+        .publisher(topic("10", Stream::Preview), PublisherOptions::PREVIEW)
+        .unwrap();
     let recorder = router.join("recorder", "recorder");
-    let everything = recorder.tap(&[KeyExpr::run(&recorder.identity().run)], 64).unwrap();
+    let everything = recorder
+        .tap(&[KeyExpr::run(&recorder.identity().run)], 64)
+        .unwrap();
     assert!(!preview.is_wanted(), "a recorder has whole sweeps");
     let viewer = router.join("viewer", "viewer");
-    let viewing = viewer.tap(&[KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 64).unwrap();
+    let viewing = viewer
+        .tap(
+            &[KeyExpr::stream(&viewer.identity().run, Stream::Preview)],
+            64,
+        )
+        .unwrap();
     wait_for("a subscriber to previews", || preview.is_wanted());
     let _listener = Listener::new(&router);
     play(&router, &scenario, StreamOptions::default());
@@ -136,18 +184,43 @@ fn previews_are_published_for_viewers_only() {
     let at_once = || Some(Instant::now());
     let mut previews = 0;
     while let Pop::Item(found, preview) = viewing.take(at_once()) {
-        assert!(matches!(found, Topic::Stream { stream: Stream::Preview, .. }), "{found}");
-        let (header, Lidar { points }) = wire::decode([preview.bytes().as_ref()], &Limits::DEFAULT).unwrap();
-        let agent = AGENTS.iter().position(|cav| header.stamp.cav.as_str() == *cav).unwrap();
-        let tick = scenario.ticks.iter().position(|tick| tick.capture_nanos == header.stamp.capture_nanos).unwrap();
-        let frame = scenario.load(agent, tick, &dataset::LoadOptions::default()).unwrap();
+        assert!(
+            matches!(
+                found,
+                Topic::Stream {
+                    stream: Stream::Preview,
+                    ..
+                }
+            ),
+            "{found}"
+        );
+        let (header, Lidar { points }) =
+            wire::decode([preview.bytes().as_ref()], &Limits::DEFAULT).unwrap();
+        let agent = AGENTS
+            .iter()
+            .position(|cav| header.stamp.cav.as_str() == *cav)
+            .unwrap();
+        let tick = scenario
+            .ticks
+            .iter()
+            .position(|tick| tick.capture_nanos == header.stamp.capture_nanos)
+            .unwrap();
+        let frame = scenario
+            .load(agent, tick, &dataset::LoadOptions::default())
+            .unwrap();
         assert_eq!(points, frame.points.decimate(4_000));
         previews += 1;
     }
     assert!((1..=12).contains(&previews), "{previews}");
     let mut recorded = 0;
     while let Pop::Item(found, _) = everything.take(at_once()) {
-        assert!(!matches!(found, Topic::Stream { stream: Stream::Preview, .. }));
+        assert!(!matches!(
+            found,
+            Topic::Stream {
+                stream: Stream::Preview,
+                ..
+            }
+        ));
         recorded += 1;
     }
     assert!(recorded > 12, "{recorded}");
@@ -161,7 +234,14 @@ fn the_pace_is_the_recorded_one_times_the_rate() {
     scene::write(folder.path(), &AGENTS, 11);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let listener = Listener::new(&router);
-    let report = play(&router, &scenario, StreamOptions { rate: 2.0, ..StreamOptions::default() });
+    let report = play(
+        &router,
+        &scenario,
+        StreamOptions {
+            rate: 2.0,
+            ..StreamOptions::default()
+        },
+    );
     // Ten steps of 100 ms at twice the speed.
     assert!((0.5..1.5).contains(&report.seconds), "{} s", report.seconds);
     assert_eq!(listener.captures()[&Topic::Truth].len(), 11);
@@ -180,10 +260,17 @@ fn pause_step_seek_and_resume_steer_the_clock() {
             return (truth.tick, arrival.header.stamp.capture_nanos);
         }
     };
-    let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let recorded: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
     std::thread::scope(|scope| {
         let playing = scope.spawn(|| {
-            let options = StreamOptions { repeats: true, ..StreamOptions::default() };
+            let options = StreamOptions {
+                repeats: true,
+                ..StreamOptions::default()
+            };
             play_until(&router, &scenario, options, &stop)
         });
         // While ticks arrive, the replay receives: its subscriptions were sent before them.
@@ -220,7 +307,11 @@ fn a_restarted_replay_resumes_and_does_not_wait_for_offline_agents() {
     scene::write(folder.path(), &AGENTS, 12);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let checkpoint = folder.path().join("replay.json");
-    let options = StreamOptions { rate: 4.0, checkpoint: Some(checkpoint.clone()), ..StreamOptions::default() };
+    let options = StreamOptions {
+        rate: 4.0,
+        checkpoint: Some(checkpoint.clone()),
+        ..StreamOptions::default()
+    };
     let (listener, stop) = (Listener::new(&router), Stop::new());
     let next_truth = || loop {
         if let (Topic::Truth, Event::Message(arrival)) = next_event(&listener.inbox) {
@@ -238,16 +329,37 @@ fn a_restarted_replay_resumes_and_does_not_wait_for_offline_agents() {
     });
     // A route that never exists: the first instance would wait for it for a minute.
     let missing = "99/lidar>agent-99".parse().unwrap();
-    let report = play(&router, &scenario, StreamOptions { expect: vec![missing], ..options.clone() });
+    let report = play(
+        &router,
+        &scenario,
+        StreamOptions {
+            expect: vec![missing],
+            ..options.clone()
+        },
+    );
     seen.resize_with(12, next_truth);
-    let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let recorded: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
     assert_eq!((seen, report.ticks), (recorded, 12));
-    assert_eq!(play(&router, &scenario, options.clone()).ticks, 12, "there is nothing left to play");
+    assert_eq!(
+        play(&router, &scenario, options.clone()).ticks,
+        12,
+        "there is nothing left to play"
+    );
 
     std::fs::write(&checkpoint, "{}").unwrap();
     let bus = router.join("replay", "replay");
-    let error = Replay::prepare(&bus, &scenario, options, &Stop::new()).err().unwrap().to_string();
-    assert!(error.contains("replay.json: not a replay checkpoint: missing field"), "{error}");
+    let error = Replay::prepare(&bus, &scenario, options, &Stop::new())
+        .err()
+        .unwrap()
+        .to_string();
+    assert!(
+        error.contains("replay.json: not a replay checkpoint: missing field"),
+        "{error}"
+    );
 }
 
 #[test]
@@ -257,14 +369,18 @@ fn an_agent_that_does_not_come_is_named() {
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let agent = router.join("agent-10", "10");
     let inbox = agent.inbox(8, 8);
-    let _subscriptions =
-        [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
+    let _subscriptions = [Stream::Lidar, Stream::Gnss, Stream::Imu]
+        .map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
     let bus = router.join("replay", "replay");
-    let options = StreamOptions { ready_timeout: Duration::from_millis(400), ..StreamOptions::default() };
+    let options = StreamOptions {
+        ready_timeout: Duration::from_millis(400),
+        ..StreamOptions::default()
+    };
     let replay = Replay::prepare(&bus, &scenario, options, &Stop::new()).unwrap();
     let error = replay.wait_until_ready().unwrap_err().to_string();
     assert!(
-        error.contains("20/lidar>agent-20, 20/gnss>agent-20, 20/imu>agent-20") && !error.contains("10/"),
+        error.contains("20/lidar>agent-20, 20/gnss>agent-20, 20/imu>agent-20")
+            && !error.contains("10/"),
         "{error}"
     );
 }
@@ -275,12 +391,41 @@ fn what_the_scene_does_not_have_is_named() {
     scene::write(folder.path(), &AGENTS, 2);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let bus = router.join("replay", "replay");
-    let refused = |options| Replay::prepare(&bus, &scenario, options, &Stop::new()).err().unwrap();
-    let error = refused(StreamOptions { agents: vec![CavId::new("30").unwrap()], ..StreamOptions::default() });
-    assert!(error.to_string().contains("no agent 30; it has 10, 20"), "{error}");
-    let error = refused(StreamOptions { seek: 2, ..StreamOptions::default() });
-    assert!(matches!(error, StreamError::NoTick { asked: 2, ticks: 2, .. }), "{error}");
-    assert!(matches!(refused(StreamOptions { rate: f64::NAN, ..StreamOptions::default() }), StreamError::Rate(_)));
+    let refused = |options| {
+        Replay::prepare(&bus, &scenario, options, &Stop::new())
+            .err()
+            .unwrap()
+    };
+    let error = refused(StreamOptions {
+        agents: vec![CavId::new("30").unwrap()],
+        ..StreamOptions::default()
+    });
+    assert!(
+        error.to_string().contains("no agent 30; it has 10, 20"),
+        "{error}"
+    );
+    let error = refused(StreamOptions {
+        seek: 2,
+        ..StreamOptions::default()
+    });
+    assert!(
+        matches!(
+            error,
+            StreamError::NoTick {
+                asked: 2,
+                ticks: 2,
+                ..
+            }
+        ),
+        "{error}"
+    );
+    assert!(matches!(
+        refused(StreamOptions {
+            rate: f64::NAN,
+            ..StreamOptions::default()
+        }),
+        StreamError::Rate(_)
+    ));
 }
 
 #[test]
@@ -292,9 +437,23 @@ fn an_unreadable_frame_is_named_and_the_rest_goes_on() {
     std::fs::write(&broken, &bytes[..bytes.len() / 2]).unwrap();
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let listener = Listener::new(&router);
-    let report = play(&router, &scenario, StreamOptions { rate: 0.0, ..StreamOptions::default() });
-    assert_eq!((report.ticks, report.unreadable_frames, report.is_complete()), (3, 1, false));
-    assert!(report.unreadable[0].error.contains("000062.pcd"), "{}", report.unreadable[0].error);
+    let report = play(
+        &router,
+        &scenario,
+        StreamOptions {
+            rate: 0.0,
+            ..StreamOptions::default()
+        },
+    );
+    assert_eq!(
+        (report.ticks, report.unreadable_frames, report.is_complete()),
+        (3, 1, false)
+    );
+    assert!(
+        report.unreadable[0].error.contains("000062.pcd"),
+        "{}",
+        report.unreadable[0].error
+    );
     let captures = listener.captures();
     assert_eq!(captures[&topic("10", Stream::Lidar)].len(), 3);
     assert_eq!(captures[&topic("20", Stream::Lidar)].len(), 2);
@@ -309,14 +468,21 @@ fn a_request_to_stop_ends_a_loop_without_end() {
     let listener = Listener::new(&router);
     let stop = Stop::new();
     let bus = router.join("replay", "replay");
-    let options = StreamOptions { repeats: true, rate: 10.0, ..StreamOptions::default() };
+    let options = StreamOptions {
+        repeats: true,
+        rate: 10.0,
+        ..StreamOptions::default()
+    };
     let replay = Replay::prepare(&bus, &scenario, options, &stop).unwrap();
     replay.wait_until_ready().unwrap();
     let report = std::thread::scope(|scope| {
         let playing = scope.spawn(|| replay.play());
         let mut truths = 0;
         while truths < 5 {
-            truths += u32::from(matches!(next_event(&listener.inbox), (Topic::Truth, Event::Message(_))));
+            truths += u32::from(matches!(
+                next_event(&listener.inbox),
+                (Topic::Truth, Event::Message(_))
+            ));
         }
         let asked = Instant::now();
         stop.request();
@@ -327,7 +493,10 @@ fn a_request_to_stop_ends_a_loop_without_end() {
     assert!(report.ticks >= 5);
     // Capture times increase over every loop.
     let mut last = 0;
-    while let Pop::Item(found, event) = listener.inbox.take(Some(Instant::now() + Duration::from_millis(200))) {
+    while let Pop::Item(found, event) = listener
+        .inbox
+        .take(Some(Instant::now() + Duration::from_millis(200)))
+    {
         if let (Topic::Truth, Event::Message(arrival)) = (found, event) {
             assert!(arrival.header.stamp.capture_nanos > last);
             last = arrival.header.stamp.capture_nanos;

@@ -10,8 +10,8 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Event, PublisherOptions};
 use deploy::ros::{MotionSource, NodeOptions, NodeReport, RosSession, run};
 use protocol::{
-    Box3d, CavId, Detection, Detections, EgoMotion, Lidar, Limits, PlanarCovariance, PointCloud, Pose, PoseEstimate,
-    Role, Stream, Topic,
+    Box3d, CavId, Detection, Detections, EgoMotion, Lidar, Limits, PlanarCovariance, PointCloud,
+    Pose, PoseEstimate, Role, Stream, Topic,
 };
 use re_cdr::{CdrReader, CdrWriter, LittleEndian};
 use ros2::endpoint::Attachment;
@@ -68,7 +68,8 @@ const TF_HASH: &str = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d
 const CLOCK: &str = "rosgraph_msgs::msg::dds_::Clock_";
 const CLOCK_HASH: &str = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564";
 const DETECTIONS: &str = "vision_msgs::msg::dds_::Detection3DArray_";
-const DETECTIONS_HASH: &str = "RIHS01_793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018";
+const DETECTIONS_HASH: &str =
+    "RIHS01_793f5eab9595ac1c0da07873cc859db42eae51f0ee76056db8562515d830e018";
 
 /// Body and attachment of the messages on a key.
 struct Subscriber {
@@ -79,12 +80,17 @@ struct Subscriber {
 impl Subscriber {
     fn open(session: &Session, key: &str) -> Self {
         let (sender, messages) = channel();
-        let subscriber = session.declare_subscriber(key.to_owned()).callback(move |sample| {
-            let attachment = sample.attachment().expect("rmw_zenoh needs one").to_bytes();
-            let attachment = Attachment::from_bytes(&attachment).expect("33 bytes");
-            let _ = sender.send((sample.payload().to_bytes().into_owned(), attachment));
-        });
-        Self { messages, _subscriber: subscriber.wait().unwrap() }
+        let subscriber = session
+            .declare_subscriber(key.to_owned())
+            .callback(move |sample| {
+                let attachment = sample.attachment().expect("rmw_zenoh needs one").to_bytes();
+                let attachment = Attachment::from_bytes(&attachment).expect("33 bytes");
+                let _ = sender.send((sample.payload().to_bytes().into_owned(), attachment));
+            });
+        Self {
+            messages,
+            _subscriber: subscriber.wait().unwrap(),
+        }
     }
 
     fn next(&self) -> (Vec<u8>, Attachment) {
@@ -122,21 +128,50 @@ impl<'a> Fields<'a> {
 const AT: u64 = 2_300_000_000;
 
 fn planar() -> PlanarCovariance {
-    PlanarCovariance { xx_m2: 0.25, xy_m2: 0.0, yy_m2: 0.5, yaw_rad2: 0.125 }
+    PlanarCovariance {
+        xx_m2: 0.25,
+        xy_m2: 0.0,
+        yy_m2: 0.5,
+        yaw_rad2: 0.125,
+    }
 }
 
 /// What a vehicle publishes at one time.
 fn publish(bus: &Bus) {
     let publisher = |stream, options| bus.publisher(topic(stream), options).unwrap();
     let imu = publisher(Stream::Imu, PublisherOptions::POSE);
-    imu.submit(AT, EgoMotion { speed_mps: Some(8.0), yaw_rate_rad_s: Some(0.25) });
+    imu.submit(
+        AT,
+        EgoMotion {
+            speed_mps: Some(8.0),
+            yaw_rate_rad_s: Some(0.25),
+        },
+    );
     let pose = publisher(Stream::Pose, PublisherOptions::POSE);
     let world_from_cav = Pose::from_xyz_yaw([10.0, 20.0, 1.5], 0.0);
-    pose.submit(AT, PoseEstimate::Pose { world_from_cav, confidence: 0.9, covariance: Some(planar()) });
+    pose.submit(
+        AT,
+        PoseEstimate::Pose {
+            world_from_cav,
+            confidence: 0.9,
+            covariance: Some(planar()),
+        },
+    );
     let lidar = publisher(Stream::Lidar, PublisherOptions::SENSOR);
-    lidar.submit(AT, Lidar { points: PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]; 3] } });
+    lidar.submit(
+        AT,
+        Lidar {
+            points: PointCloud {
+                xyzi: vec![[1.0, 2.0, 3.0, 0.5]; 3],
+            },
+        },
+    );
     let detections = publisher(Stream::Detections, PublisherOptions::DETECTIONS);
-    let box3d = Box3d { center_m: [5.0, 6.0, 0.5], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 };
+    let box3d = Box3d {
+        center_m: [5.0, 6.0, 0.5],
+        size_m: [4.0, 2.0, 1.5],
+        heading_rad: 0.0,
+    };
     detections.submit(
         AT,
         Detections {
@@ -144,21 +179,39 @@ fn publish(bus: &Bus) {
             agent_frame: 0,
             method: "late".into(),
             pose: PoseEstimate::new(world_from_cav, 0.9),
-            detections: vec![Detection { box3d, score: 0.75, source: None }],
+            detections: vec![Detection {
+                box3d,
+                score: 0.75,
+                source: None,
+            }],
             fused: Vec::new(),
             skipped: Vec::new(),
             neighbours: Vec::new(),
             stages: Vec::new(),
         },
     );
-    [imu, pose, lidar, detections].into_iter().for_each(bus::Publisher::finish);
+    [imu, pose, lidar, detections]
+        .into_iter()
+        .for_each(bus::Publisher::finish);
 }
 
 /// Tokens on the network that match `selector`.
 fn tokens(session: &Session, selector: &str) -> BTreeSet<String> {
-    let replies = session.liveliness().get(selector).timeout(TIMEOUT).wait().unwrap();
+    let replies = session
+        .liveliness()
+        .get(selector)
+        .timeout(TIMEOUT)
+        .wait()
+        .unwrap();
     let replies = std::iter::from_fn(|| replies.recv().ok());
-    replies.filter_map(|reply| reply.result().ok().map(|sample| sample.key_expr().to_string())).collect()
+    replies
+        .filter_map(|reply| {
+            reply
+                .result()
+                .ok()
+                .map(|sample| sample.key_expr().to_string())
+        })
+        .collect()
 }
 
 #[test]
@@ -167,7 +220,10 @@ fn nodes_of_ros_see_and_hear_the_run() {
     let vehicle = router.join("agent-1000", "1000");
     std::thread::scope(|scope| {
         let mount = "1.5,0,2".parse().unwrap();
-        let options = NodeOptions { mount, ..NodeOptions::default() };
+        let options = NodeOptions {
+            mount,
+            ..NodeOptions::default()
+        };
         let node = start(scope, &router, (Distribution::Jazzy, options), &stop);
         let other = other_node(&router);
         let topics = [
@@ -177,20 +233,26 @@ fn nodes_of_ros_see_and_hear_the_run() {
             ("cav_1000/points", POINTS, POINTS_HASH),
             ("cav_1000/detections", DETECTIONS, DETECTIONS_HASH),
         ];
-        let [clock, tf, pose, points, detections] =
-            topics.map(|(topic, ros_type, hash)| Subscriber::open(&other, &key(topic, ros_type, hash)));
+        let [clock, tf, pose, points, detections] = topics
+            .map(|(topic, ros_type, hash)| Subscriber::open(&other, &key(topic, ros_type, hash)));
         let _alive = [Role::Agent, Role::Ego].map(|role| vehicle.announce(role).unwrap());
         // Its topics appear with the vehicle, before any message.
         let has = |kind: &str, what: &str| {
             let found = tokens(&other, &format!("@ros2_lv/{DOMAIN}/**"));
-            found.iter().any(|token| token.contains(kind) && token.contains(what))
+            found
+                .iter()
+                .any(|token| token.contains(kind) && token.contains(what))
         };
         for (topic, ros_type, hash) in topics {
             let end = format!("/%{}/{ros_type}/{hash}/", topic.replace('/', "%"));
             wait_for(&end, || has("/MP/%/%/v2vloc/", &end));
         }
         assert!(has("/0/0/NN/%/%/v2vloc", ""));
-        assert!(has("/MP/", "%cav_1000%points") && has("/MP/", "/2::,5:,:,:,,") && has("/MP/", "/:1:,1:,:,:,,"));
+        assert!(
+            has("/MP/", "%cav_1000%points")
+                && has("/MP/", "/2::,5:,:,:,,")
+                && has("/MP/", "/:1:,1:,:,:,,")
+        );
 
         // The node subscribes to sweeps when it knows of the subscriber: published until one has arrived.
         let deadline = Instant::now() + TIMEOUT;
@@ -202,9 +264,16 @@ fn nodes_of_ros_see_and_hear_the_run() {
             }
         };
         assert_eq!(attachment.sequence, 1);
-        assert!(tokens(&other, "@ros2_lv/**").iter().any(|token| ros2::endpoint::gid(token) == attachment.gid));
+        assert!(
+            tokens(&other, "@ros2_lv/**")
+                .iter()
+                .any(|token| ros2::endpoint::gid(token) == attachment.gid)
+        );
         let mut fields = Fields::of(&cloud);
-        assert_eq!((fields.nanos(), fields.text().as_str()), (AT, "cav_1000/lidar"));
+        assert_eq!(
+            (fields.nanos(), fields.text().as_str()),
+            (AT, "cav_1000/lidar")
+        );
         assert_eq!([fields.u32(), fields.u32(), fields.u32()], [1, 3, 4]);
 
         let (message, first) = pose.next();
@@ -212,19 +281,37 @@ fn nodes_of_ros_see_and_hear_the_run() {
         assert_eq!((fields.nanos(), fields.text().as_str()), (AT, "map"));
         assert_eq!(fields.f64s(), [10.0, 20.0, 1.5, 0.0, 0.0, 0.0, 1.0]);
         let covariance: [f64; 36] = fields.f64s();
-        assert_eq!([covariance[0], covariance[7], covariance[35]], [0.25, 0.5, 0.125]);
+        assert_eq!(
+            [covariance[0], covariance[7], covariance[35]],
+            [0.25, 0.5, 0.125]
+        );
         assert_eq!(first.sequence, 1);
 
         let (message, _) = tf.next();
         let mut fields = Fields::of(&message);
-        assert_eq!((fields.u32(), fields.nanos(), fields.text().as_str()), (1, AT, "map"));
-        assert_eq!((fields.text().as_str(), fields.f64s()), ("cav_1000/lidar", [10.0, 20.0, 1.5]));
+        assert_eq!(
+            (fields.u32(), fields.nanos(), fields.text().as_str()),
+            (1, AT, "map")
+        );
+        assert_eq!(
+            (fields.text().as_str(), fields.f64s()),
+            ("cav_1000/lidar", [10.0, 20.0, 1.5])
+        );
 
         let (message, _) = detections.next();
         let mut fields = Fields::of(&message);
-        assert_eq!((fields.nanos(), fields.text().as_str(), fields.u32()), (AT, "cav_1000/lidar", 1));
-        assert_eq!((fields.nanos(), fields.text().as_str(), fields.u32()), (AT, "cav_1000/lidar", 1));
-        assert_eq!((fields.text().as_str(), fields.f64s()), ("vehicle", [0.75, 5.0, 6.0, 0.5]));
+        assert_eq!(
+            (fields.nanos(), fields.text().as_str(), fields.u32()),
+            (AT, "cav_1000/lidar", 1)
+        );
+        assert_eq!(
+            (fields.nanos(), fields.text().as_str(), fields.u32()),
+            (AT, "cav_1000/lidar", 1)
+        );
+        assert_eq!(
+            (fields.text().as_str(), fields.f64s()),
+            ("vehicle", [0.75, 5.0, 6.0, 0.5])
+        );
 
         let (message, _) = clock.next();
         assert_eq!(Fields::of(&message).nanos(), AT, "one time base");
@@ -234,7 +321,11 @@ fn nodes_of_ros_see_and_hear_the_run() {
         let late = other_node(&router);
         let _late = late
             .declare_subscriber(key("tf_static", TF, TF_HASH))
-            .history(HistoryConfig::default().detect_late_publishers().max_samples(1))
+            .history(
+                HistoryConfig::default()
+                    .detect_late_publishers()
+                    .max_samples(1),
+            )
             .subscriber_detection()
             .callback(move |sample| {
                 assert!(Attachment::from_bytes(&sample.attachment().unwrap().to_bytes()).is_some());
@@ -244,15 +335,24 @@ fn nodes_of_ros_see_and_hear_the_run() {
             .unwrap();
         let message = latched.recv_timeout(TIMEOUT).unwrap();
         let mut fields = Fields::of(&message);
-        assert_eq!((fields.u32(), fields.nanos(), fields.text().as_str()), (1, 0, "cav_1000/lidar"));
-        assert_eq!((fields.text().as_str(), fields.f64s()), ("cav_1000/base_link", [-1.5, 0.0, -2.0]));
+        assert_eq!(
+            (fields.u32(), fields.nanos(), fields.text().as_str()),
+            (1, 0, "cav_1000/lidar")
+        );
+        assert_eq!(
+            (fields.text().as_str(), fields.f64s()),
+            ("cav_1000/base_link", [-1.5, 0.0, -2.0])
+        );
 
         // A vehicle that has left leaves no topics.
         drop(_alive);
         wait_for("a farewell", || !has("/MP/", "%cav_1000%pose"));
         stop.request();
         let report = node.join().unwrap();
-        assert!(report.published["/cav_1000/pose"] >= 1 && report.left_out == 0, "{report:?}");
+        assert!(
+            report.published["/cav_1000/pose"] >= 1 && report.left_out == 0,
+            "{report:?}"
+        );
     });
 }
 
@@ -275,7 +375,13 @@ fn driver_cloud(nanos: u64, point_step: u32) -> Vec<u8> {
     cdr.write_bool(false);
     cdr.write_u32(point_step);
     cdr.write_u32(2 * point_step);
-    let point = |x: f32| [&[x, 2.0, 3.0].map(f32::to_le_bytes).concat()[..], &[51, 0, 0, 0]].concat();
+    let point = |x: f32| {
+        [
+            &[x, 2.0, 3.0].map(f32::to_le_bytes).concat()[..],
+            &[51, 0, 0, 0],
+        ]
+        .concat()
+    };
     cdr.write_bytes(&[point(1.0), point(-1.0)].concat());
     cdr.write_bool(true);
     bytes
@@ -326,8 +432,14 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
         let inbox = agent.inbox(4, 1);
         let _subscription = agent.subscribe(topic(Stream::Lidar), &inbox).unwrap();
         std::thread::scope(|scope| {
-            let lidars = ["/velodyne/points=1000", "/broken=2000"].map(|text| text.parse().unwrap()).into();
-            let options = NodeOptions { lidars, max_intensity: 255.0, ..NodeOptions::default() };
+            let lidars = ["/velodyne/points=1000", "/broken=2000"]
+                .map(|text| text.parse().unwrap())
+                .into();
+            let options = NodeOptions {
+                lidars,
+                max_intensity: 255.0,
+                ..NodeOptions::default()
+            };
             let node = start(scope, &router, (distribution, options), &stop);
             let driver = other_node(&router);
             let _node = announce(&driver);
@@ -338,8 +450,16 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
             });
             let hash = RosType::PointCloud2.hash(distribution);
             let put = |topic: &str, cloud: Vec<u8>| {
-                let attachment = Attachment { sequence: 1, source_nanos: 1, gid: [7; 16] };
-                driver.put(key(topic, POINTS, &hash), cloud).attachment(attachment.to_bytes()).wait().unwrap();
+                let attachment = Attachment {
+                    sequence: 1,
+                    source_nanos: 1,
+                    gid: [7; 16],
+                };
+                driver
+                    .put(key(topic, POINTS, &hash), cloud)
+                    .attachment(attachment.to_bytes())
+                    .wait()
+                    .unwrap();
             };
             put("broken", driver_cloud(AT, 12));
             let mut sent = 0;
@@ -355,10 +475,17 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
             let capture = arrival.header.stamp.capture_nanos;
             assert!((AT + 1..=AT + sent).contains(&capture), "{capture}");
             let lidar: Lidar = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
-            assert_eq!(lidar.points.xyzi, [[1.0, 2.0, 3.0, 0.2], [-1.0, 2.0, 3.0, 0.2]]);
+            assert_eq!(
+                lidar.points.xyzi,
+                [[1.0, 2.0, 3.0, 0.2], [-1.0, 2.0, 3.0, 0.2]]
+            );
             stop.request();
             let report = node.join().unwrap().lidar;
-            assert_eq!((report.unreadable, report.is_complete()), (1, false), "{report:?}");
+            assert_eq!(
+                (report.unreadable, report.is_complete()),
+                (1, false),
+                "{report:?}"
+            );
             assert!(report.sweeps >= 1, "{report:?}");
             // The agent is told that nothing follows.
             while !matches!(next_event(&inbox), (_, Event::End { .. })) {}
@@ -373,21 +500,45 @@ fn the_odometry_of_a_robot_is_the_motion_of_its_agent_at_every_sweep() {
     let inbox = agent.inbox(4, 1);
     let _subscription = agent.subscribe(topic(Stream::Imu), &inbox).unwrap();
     std::thread::scope(|scope| {
-        let of = |motion_type, topic: &str| MotionSource { motion_type, source: topic.parse().unwrap() };
-        let motions = vec![of(MotionType::Odometry, "/odom=1000"), of(MotionType::Imu, "/imu=1000")];
+        let of = |motion_type, topic: &str| MotionSource {
+            motion_type,
+            source: topic.parse().unwrap(),
+        };
+        let motions = vec![
+            of(MotionType::Odometry, "/odom=1000"),
+            of(MotionType::Imu, "/imu=1000"),
+        ];
         let lidars = vec!["/points=1000".parse().unwrap()];
-        let options = NodeOptions { lidars, motions, ..NodeOptions::default() };
+        let options = NodeOptions {
+            lidars,
+            motions,
+            ..NodeOptions::default()
+        };
         let node = start(scope, &router, (Distribution::Jazzy, options), &stop);
         let robot = other_node(&router);
         let _node = announce(&robot);
         wait_for("the subscriptions", || {
             let tokens = tokens(&robot, &format!("@ros2_lv/{DOMAIN}/*/0/*/MS/**"));
-            ["/%points/", "/%odom/", "/%imu/"].iter().all(|topic| tokens.iter().any(|token| token.contains(topic)))
+            ["/%points/", "/%odom/", "/%imu/"]
+                .iter()
+                .all(|topic| tokens.iter().any(|token| token.contains(topic)))
         });
         let put = |topic: &str, ros_type: RosType, message: Vec<u8>| {
-            let attachment = Attachment { sequence: 1, source_nanos: 1, gid: [7; 16] };
-            let key = key(topic, &ros_type.dds_name(), &ros_type.hash(Distribution::Jazzy));
-            robot.put(key, message).attachment(attachment.to_bytes()).wait().unwrap();
+            let attachment = Attachment {
+                sequence: 1,
+                source_nanos: 1,
+                gid: [7; 16],
+            };
+            let key = key(
+                topic,
+                &ros_type.dds_name(),
+                &ros_type.hash(Distribution::Jazzy),
+            );
+            robot
+                .put(key, message)
+                .attachment(attachment.to_bytes())
+                .wait()
+                .unwrap();
         };
         let mut sent = 0;
         let arrival = loop {
@@ -398,7 +549,11 @@ fn the_odometry_of_a_robot_is_the_motion_of_its_agent_at_every_sweep() {
                 put("odom", RosType::Odometry, odometry(nanos, speed_mps, 3.0));
                 put("imu", RosType::Imu, imu(nanos, -0.5));
             }
-            put("odom", RosType::Odometry, odometry(sweep + 60_000_000, f64::NAN, 0.0));
+            put(
+                "odom",
+                RosType::Odometry,
+                odometry(sweep + 60_000_000, f64::NAN, 0.0),
+            );
             put("points", RosType::PointCloud2, driver_cloud(sweep, 16));
             match inbox.take(Some(Instant::now() + Duration::from_millis(100))) {
                 Pop::Item(_, Event::Message(arrival)) => break arrival,
@@ -407,15 +562,28 @@ fn the_odometry_of_a_robot_is_the_motion_of_its_agent_at_every_sweep() {
             }
         };
         let capture = arrival.header.stamp.capture_nanos;
-        assert!(capture > AT && (capture - AT).is_multiple_of(1_000_000_000), "the time of a sweep, {capture}");
+        assert!(
+            capture > AT && (capture - AT).is_multiple_of(1_000_000_000),
+            "the time of a sweep, {capture}"
+        );
         let motion: EgoMotion = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
-        let (speed_mps, yaw_rate_rad_s) = (motion.speed_mps.unwrap(), motion.yaw_rate_rad_s.unwrap());
-        assert!((speed_mps - 5.0).abs() < 1e-9 && (yaw_rate_rad_s + 0.5).abs() < 1e-9, "{motion:?}");
+        let (speed_mps, yaw_rate_rad_s) =
+            (motion.speed_mps.unwrap(), motion.yaw_rate_rad_s.unwrap());
+        assert!(
+            (speed_mps - 5.0).abs() < 1e-9 && (yaw_rate_rad_s + 0.5).abs() < 1e-9,
+            "{motion:?}"
+        );
         stop.request();
         let report = node.join().unwrap();
         let [odom, imu] = ["/odom", "/imu"].map(|topic| report.motion[topic]);
-        assert!(odom.read >= 2 && odom.unreadable >= 1 && imu.read >= 2 && imu.unreadable == 0, "{report:?}");
-        assert!(!report.is_complete() && report.lidar.is_complete(), "{report:?}");
+        assert!(
+            odom.read >= 2 && odom.unreadable >= 1 && imu.read >= 2 && imu.unreadable == 0,
+            "{report:?}"
+        );
+        assert!(
+            !report.is_complete() && report.lidar.is_complete(),
+            "{report:?}"
+        );
         while !matches!(next_event(&inbox), (_, Event::End { .. })) {}
     });
 }

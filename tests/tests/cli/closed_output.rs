@@ -26,10 +26,21 @@ fn every_program_comes_to_its_quiet_end() {
     let (scene, keys) = (scene.to_str().unwrap(), keys.to_str().unwrap());
     let weights = folder.path().join("weights.safetensors");
     write_weights(&weights);
-    let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
+    let free = TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap();
     let listen = format!("tcp/{free}");
     // Its supervisor has ended, so that it joins, prints its report, and ends.
-    let agent = ["run", "--run=t", "--cav=4279", "--supervised", "--listen", &listen, "--weights"];
+    let agent = [
+        "run",
+        "--run=t",
+        "--cav=4279",
+        "--supervised",
+        "--listen",
+        &listen,
+        "--weights",
+    ];
     let agent = [&agent[..], &[weights.to_str().unwrap()]].concat();
     let commands: [(&str, &[&str]); 6] = [
         ("sim-replay", &["inspect", scene]),
@@ -40,17 +51,37 @@ fn every_program_comes_to_its_quiet_end() {
         ("v2vloc", &["keys", "--out", keys, "--agents", "4279"]),
     ];
     for (program, arguments) in commands {
-        assert_eq!(code_unread(program, arguments, false), Some(0), "{program} {arguments:?}");
+        assert_eq!(
+            code_unread(program, arguments, false),
+            Some(0),
+            "{program} {arguments:?}"
+        );
     }
 }
 
 #[test]
 fn an_error_without_a_reader_keeps_its_exit_code() {
     for (program, arguments, code) in [
-        ("sim-replay", ["recover", "/no/recording.mcap", "--out=/no/whole.mcap"], 2),
-        ("ego-fuser", ["eval", "--weights=/no/weights.safetensors", "--dataset=/no/scene"], 2),
+        (
+            "sim-replay",
+            ["recover", "/no/recording.mcap", "--out=/no/whole.mcap"],
+            2,
+        ),
+        (
+            "ego-fuser",
+            [
+                "eval",
+                "--weights=/no/weights.safetensors",
+                "--dataset=/no/scene",
+            ],
+            2,
+        ),
         ("v2vloc", ["status", "/no/run", "--json"], 2),
     ] {
-        assert_eq!(code_unread(program, &arguments, true), Some(code), "{program} {arguments:?}");
+        assert_eq!(
+            code_unread(program, &arguments, true),
+            Some(code),
+            "{program} {arguments:?}"
+        );
     }
 }

@@ -14,7 +14,13 @@ use tests::locks::exclusive_lock;
 const FRAMES: usize = 3;
 
 fn shared(name: &str) -> String {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy").join(name).canonicalize().unwrap().display().to_string()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../deploy")
+        .join(name)
+        .canonicalize()
+        .unwrap()
+        .display()
+        .to_string()
 }
 
 fn script() -> String {
@@ -22,60 +28,130 @@ fn script() -> String {
 }
 
 fn v2vloc(arguments: &[&str]) -> Output {
-    Command::new(programs().join("v2vloc")).args(arguments).output().unwrap()
+    Command::new(programs().join("v2vloc"))
+        .args(arguments)
+        .output()
+        .unwrap()
 }
 
 fn lines(file: PathBuf) -> Vec<Value> {
-    fs::read_to_string(file).unwrap().lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    fs::read_to_string(file)
+        .unwrap()
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
 }
 
 #[test]
 fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_frames() {
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("scene");
-    let options = SynthOptions { frames: FRAMES, ..SynthOptions::new(Subset::V2vdet, 905, scene.clone()) };
+    let options = SynthOptions {
+        frames: FRAMES,
+        ..SynthOptions::new(Subset::V2vdet, 905, scene.clone())
+    };
     generate(&options, &|_| {}).unwrap();
     let out = folder.path().join("out");
-    let [script, weights, out_text, scene] =
-        [script(), shared("weights"), out.display().to_string(), scene.display().to_string()];
-    let arguments = ["eval", "--dataset", &scene, "--weights", &weights, "--json", "--out", &out_text];
+    let [script, weights, out_text, scene] = [
+        script(),
+        shared("weights"),
+        out.display().to_string(),
+        scene.display().to_string(),
+    ];
+    let arguments = [
+        "eval",
+        "--dataset",
+        &scene,
+        "--weights",
+        &weights,
+        "--json",
+        "--out",
+        &out_text,
+    ];
     let output = v2vloc(&[&arguments[..], &["--method", &script, "attention"]].concat());
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    assert_eq!(
+        output.status.code(),
+        Some(0),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let all: Vec<Value> = serde_json::from_slice(&output.stdout).unwrap();
     let precision = |metrics: &Value, iou: &str| metrics["ap_global"][iou].as_f64().unwrap();
     for iou in ["0.3", "0.5", "0.7"] {
         let [of_script, built_in] = [0, 1].map(|index| precision(&all[index], iou));
-        assert!((of_script - built_in).abs() < 1e-4 && built_in > 0.1, "{iou}: {of_script} and {built_in}");
+        assert!(
+            (of_script - built_in).abs() < 1e-4 && built_in > 0.1,
+            "{iou}: {of_script} and {built_in}"
+        );
     }
 
     let frames = out.join("attention");
-    let (detections, truth) = (lines(frames.join("detections.jsonl")), lines(frames.join("truth.jsonl")));
+    let (detections, truth) = (
+        lines(frames.join("detections.jsonl")),
+        lines(frames.join("truth.jsonl")),
+    );
     assert_eq!((detections.len(), truth.len()), (FRAMES, FRAMES));
     let mut scorer = Scorer::default();
     for (found, wanted) in detections.iter().zip(&truth) {
-        assert_eq!((&found["tick"], &found["scenario"]), (&wanted["tick"], &wanted["scenario"]));
+        assert_eq!(
+            (&found["tick"], &found["scenario"]),
+            (&wanted["tick"], &wanted["scenario"])
+        );
         let found: Vec<Detection> = serde_json::from_value(found["detections"].clone()).unwrap();
         let wanted: Vec<Box3d> = serde_json::from_value(wanted["boxes"].clone()).unwrap();
         scorer.add(&found, &wanted);
     }
-    for (computed, iou) in scorer.average_precisions(Ordering::Global).iter().zip(["0.3", "0.5", "0.7"]) {
-        assert!((computed - precision(&all[1], iou)).abs() < 1e-9, "{iou}: {computed}");
+    for (computed, iou) in scorer
+        .average_precisions(Ordering::Global)
+        .iter()
+        .zip(["0.3", "0.5", "0.7"])
+    {
+        assert!(
+            (computed - precision(&all[1], iou)).abs() < 1e-9,
+            "{iou}: {computed}"
+        );
     }
     let rows = fs::read_to_string(frames.join("frames.csv")).unwrap();
-    assert!(rows.starts_with("scenario,tick,") && rows.lines().count() == 1 + FRAMES, "{rows}");
+    assert!(
+        rows.starts_with("scenario,tick,") && rows.lines().count() == 1 + FRAMES,
+        "{rows}"
+    );
     let curve = fs::read_to_string(frames.join("precision_recall.csv")).unwrap();
-    let boxes: usize = detections.iter().map(|line| line["detections"].as_array().unwrap().len()).sum();
-    assert_eq!(curve.lines().count(), 1 + 3 * boxes, "a point per detection and threshold");
+    let boxes: usize = detections
+        .iter()
+        .map(|line| line["detections"].as_array().unwrap().len())
+        .sum();
+    assert_eq!(
+        curve.lines().count(),
+        1 + 3 * boxes,
+        "a point per detection and threshold"
+    );
 
     let again = v2vloc(&[&arguments[..], &["--method", "attention"]].concat());
     let text = String::from_utf8_lossy(&again.stderr).into_owned();
-    assert!(again.status.code() == Some(2) && text.contains("attention"), "files are not overwritten: {text}");
-    let slow = ["--method", "attention", "--bandwidth", "27", "--latency", "100", "--deadline-ms", "200"];
+    assert!(
+        again.status.code() == Some(2) && text.contains("attention"),
+        "files are not overwritten: {text}"
+    );
+    let slow = [
+        "--method",
+        "attention",
+        "--bandwidth",
+        "27",
+        "--latency",
+        "100",
+        "--deadline-ms",
+        "200",
+    ];
     let slow = v2vloc(&[&arguments[..6], &slow[..]].concat());
     let metrics: Value = serde_json::from_slice(&slow.stdout).unwrap();
     assert_eq!(metrics["clock"], "stepped");
     // 1.5 MB take 466 ms at 27 Mbit/s: nothing is in time.
-    assert_eq!(metrics["contribution"]["fused_per_frame"].as_f64(), Some(0.0), "{metrics}");
+    assert_eq!(
+        metrics["contribution"]["fused_per_frame"].as_f64(),
+        Some(0.0),
+        "{metrics}"
+    );
 }
 
 #[test]
@@ -83,21 +159,46 @@ fn a_script_gives_the_precision_of_the_built_in_method_live() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let [scene, runs] = ["scene", "runs"].map(|name| folder.path().join(name));
-    let options = SynthOptions { frames: FRAMES, ..SynthOptions::new(Subset::V2vdet, 905, scene.clone()) };
+    let options = SynthOptions {
+        frames: FRAMES,
+        ..SynthOptions::new(Subset::V2vdet, 905, scene.clone())
+    };
     generate(&options, &|_| {}).unwrap();
-    let [scenario, scene, runs] =
-        [shared("scenarios/demo.yaml"), scene.display().to_string(), runs.display().to_string()];
+    let [scenario, scene, runs] = [
+        shared("scenarios/demo.yaml"),
+        scene.display().to_string(),
+        runs.display().to_string(),
+    ];
     let precision = |name: &str, method: &str| {
-        let arguments = ["up", &scenario, "--scene", &scene, "--runs", &runs, "--name", name, "--method", method];
-        let set = ["--set", "scene.lockstep=true", "--set", "agents.pose=recorded", "--json"];
+        let arguments = [
+            "up", &scenario, "--scene", &scene, "--runs", &runs, "--name", name, "--method", method,
+        ];
+        let set = [
+            "--set",
+            "scene.lockstep=true",
+            "--set",
+            "agents.pose=recorded",
+            "--json",
+        ];
         let output = v2vloc(&[&arguments[..], &set[..]].concat());
-        assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+        assert_eq!(
+            output.status.code(),
+            Some(0),
+            "{}",
+            String::from_utf8_lossy(&output.stderr)
+        );
         let metrics: Value = serde_json::from_slice(&output.stdout).unwrap();
         ["0.3", "0.5", "0.7"].map(|iou| metrics["ap_global"][iou].as_f64().unwrap())
     };
-    let [of_script, built_in] = [precision("script", &script()), precision("built-in", "attention")];
+    let [of_script, built_in] = [
+        precision("script", &script()),
+        precision("built-in", "attention"),
+    ];
     for (of_script, built_in) in of_script.into_iter().zip(built_in) {
-        assert!((of_script - built_in).abs() < 1e-4 && built_in > 0.1, "{of_script} and {built_in}");
+        assert!(
+            (of_script - built_in).abs() < 1e-4 && built_in > 0.1,
+            "{of_script} and {built_in}"
+        );
     }
 }
 
@@ -107,19 +208,35 @@ fn a_script_runs_live_and_what_is_wrong_with_it_is_said_before_the_start() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", "");
     let text = fs::read_to_string(&scenario).unwrap();
-    let with =
-        |method: &str| fs::write(&scenario, text.replace("method: max", &format!("method: \"{method}\""))).unwrap();
+    let with = |method: &str| {
+        fs::write(
+            &scenario,
+            text.replace("method: max", &format!("method: \"{method}\"")),
+        )
+        .unwrap()
+    };
     with(&script());
     let mut up = Up::start(folder.path(), &scenario);
     assert_eq!(up.wait().code(), Some(0));
     let fused = results(&up.folder);
     assert_eq!(fused.len(), 4);
-    assert!(fused.iter().all(|result| result["method"] == script().as_str()), "{}", fused[0]);
+    assert!(
+        fused
+            .iter()
+            .all(|result| result["method"] == script().as_str()),
+        "{}",
+        fused[0]
+    );
 
     let broken = folder.path().join("broken.pt");
     fs::write(&broken, b"no module").unwrap();
     with(&format!("script:{}", broken.display()));
-    let output = v2vloc(&["up", scenario.to_str().unwrap(), "--runs", folder.path().join("other").to_str().unwrap()]);
+    let output = v2vloc(&[
+        "up",
+        scenario.to_str().unwrap(),
+        "--runs",
+        folder.path().join("other").to_str().unwrap(),
+    ]);
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(message.contains("broken.pt"), "{message}");
     assert_ne!(output.status.code(), Some(0));

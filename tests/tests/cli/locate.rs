@@ -12,23 +12,38 @@ use tests::fleet::programs;
 
 /// Weights of the repository.
 fn weights(name: &str) -> String {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights").join(name).display().to_string()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../deploy/weights")
+        .join(name)
+        .display()
+        .to_string()
 }
 
 fn agent(arguments: &[&str]) -> Output {
-    Command::new(programs().join("agent")).args(arguments).output().unwrap()
+    Command::new(programs().join("agent"))
+        .args(arguments)
+        .output()
+        .unwrap()
 }
 
 /// A short drive through a town of [`Subset::Town1loc`].
 fn drive(out: &Path, frames: usize, period_s: f64) -> PathBuf {
-    let options =
-        SynthOptions { traversals: 1, frames, period_s, ..SynthOptions::new(Subset::Town1loc, 903, out.to_owned()) };
+    let options = SynthOptions {
+        traversals: 1,
+        frames,
+        period_s,
+        ..SynthOptions::new(Subset::Town1loc, 903, out.to_owned())
+    };
     generate(&options, &|_| {}).unwrap();
     out.to_owned()
 }
 
 fn little_endian(points: &[[f32; 4]]) -> Vec<u8> {
-    points.iter().flatten().flat_map(|number| number.to_le_bytes()).collect()
+    points
+        .iter()
+        .flatten()
+        .flat_map(|number| number.to_le_bytes())
+        .collect()
 }
 
 /// The same points in every format; the returned files are named by their endings.
@@ -48,8 +63,12 @@ fn write_all(folder: &Path, points: &[[f32; 4]]) -> Vec<PathBuf> {
         },
     );
     let npy = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({count}, 4), }}\n");
-    let npy_head =
-        [b"\x93NUMPY\x01\x00", &u16::try_from(npy.len()).unwrap().to_le_bytes()[..], npy.as_bytes()].concat();
+    let npy_head = [
+        b"\x93NUMPY\x01\x00",
+        &u16::try_from(npy.len()).unwrap().to_le_bytes()[..],
+        npy.as_bytes(),
+    ]
+    .concat();
     let body = little_endian(points);
     let files = [
         ("sweep.bin", body.clone()),
@@ -65,7 +84,10 @@ fn write_all(folder: &Path, points: &[[f32; 4]]) -> Vec<PathBuf> {
 
 /// One JSON object per line.
 fn objects(output: &Output) -> Vec<Value> {
-    String::from_utf8_lossy(&output.stdout).lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
 }
 
 #[test]
@@ -83,18 +105,40 @@ fn the_same_sweep_has_the_same_pose_in_every_format_and_a_foreign_cloud_has_none
     write_all(&clouds, &points);
     let head = weights("pgc-town1.safetensors");
     let whole = scenario.points_path(0, 1, None).unwrap();
-    let located = agent(&["locate", clouds.to_str().unwrap(), whole.to_str().unwrap(), "--head", &head, "--json"]);
-    assert_eq!(located.status.code(), Some(0), "{}", String::from_utf8_lossy(&located.stderr));
+    let located = agent(&[
+        "locate",
+        clouds.to_str().unwrap(),
+        whole.to_str().unwrap(),
+        "--head",
+        &head,
+        "--json",
+    ]);
+    assert_eq!(
+        located.status.code(),
+        Some(0),
+        "{}",
+        String::from_utf8_lossy(&located.stderr)
+    );
     let objects_found = objects(&located);
     assert_eq!(objects_found.len(), 5, "{objects_found:?}");
     for object in &objects_found[..4] {
-        let position: [f64; 3] = serde_json::from_value(object["pose"]["position_m"].clone()).unwrap();
-        let off: f64 = (0..3).map(|axis| (position[axis] - truth.translation_m[axis]).powi(2)).sum::<f64>().sqrt();
+        let position: [f64; 3] =
+            serde_json::from_value(object["pose"]["position_m"].clone()).unwrap();
+        let off: f64 = (0..3)
+            .map(|axis| (position[axis] - truth.translation_m[axis]).powi(2))
+            .sum::<f64>()
+            .sqrt();
         assert!(off < 1.0, "{object}: {:?}", truth.translation_m);
         assert_eq!(object["pose"], objects_found[0]["pose"]);
-        assert_eq!((&object["points_left_out"], &object["is_mirrored"]), (&Value::from(2), &Value::from(false)));
+        assert_eq!(
+            (&object["points_left_out"], &object["is_mirrored"]),
+            (&Value::from(2), &Value::from(false))
+        );
         let yaw = object["pose"]["roll_pitch_yaw_deg"][2].as_f64().unwrap();
-        assert!((yaw - truth.yaw_rad().to_degrees()).abs() < 1.0 && object["map"] == "town1", "{object}");
+        assert!(
+            (yaw - truth.yaw_rad().to_degrees()).abs() < 1.0 && object["map"] == "town1",
+            "{object}"
+        );
     }
     // The file of the data set is left-handed; the one of the same points alone is found with y negated.
     let alone = folder.path().join("alone.pcd");
@@ -102,13 +146,31 @@ fn the_same_sweep_has_the_same_pose_in_every_format_and_a_foreign_cloud_has_none
     let located = agent(&["locate", alone.to_str().unwrap(), "--head", &head, "--json"]);
     assert_eq!(objects(&located)[0]["is_mirrored"], true);
 
-    let foreign: Vec<[f32; 4]> =
-        (0..4000).map(|k| [(k % 50) as f32 * 0.2 + 3.0, 5.1, (k / 50) as f32 * 0.05 - 1.5, 0.1]).collect();
+    let foreign: Vec<[f32; 4]> = (0..4000)
+        .map(|k| {
+            [
+                (k % 50) as f32 * 0.2 + 3.0,
+                5.1,
+                (k / 50) as f32 * 0.05 - 1.5,
+                0.1,
+            ]
+        })
+        .collect();
     fs::write(folder.path().join("foreign.bin"), little_endian(&foreign)).unwrap();
     let foreign = folder.path().join("foreign.bin");
-    let located = agent(&["locate", foreign.to_str().unwrap(), alone.to_str().unwrap(), "--head", &head]);
+    let located = agent(&[
+        "locate",
+        foreign.to_str().unwrap(),
+        alone.to_str().unwrap(),
+        "--head",
+        &head,
+    ]);
     let text = String::from_utf8_lossy(&located.stdout).into_owned();
-    assert_eq!((located.status.code(), text.lines().count()), (Some(3), 2), "{text}");
+    assert_eq!(
+        (located.status.code(), text.lines().count()),
+        (Some(3), 2),
+        "{text}"
+    );
     assert!(text.contains("foreign.bin: no pose, "), "{text}");
 }
 
@@ -116,18 +178,49 @@ fn the_same_sweep_has_the_same_pose_in_every_format_and_a_foreign_cloud_has_none
 fn a_bad_cloud_is_named_and_the_others_are_located() {
     let folder = tempfile::tempdir().unwrap();
     let scene = drive(&folder.path().join("drive"), 1, 3.0);
-    let whole = dataset::open(&scene).unwrap().scenarios[0].points_path(0, 0, None).unwrap();
+    let whole = dataset::open(&scene).unwrap().scenarios[0]
+        .points_path(0, 0, None)
+        .unwrap();
     let bad = folder.path().join("bad.ply");
-    fs::write(&bad, "ply\nformat ascii 1.0\nelement vertex 2\nend_header\n").unwrap();
+    fs::write(
+        &bad,
+        "ply\nformat ascii 1.0\nelement vertex 2\nend_header\n",
+    )
+    .unwrap();
     let head = weights("pgc-town1.safetensors");
-    let located = agent(&["locate", bad.to_str().unwrap(), whole.to_str().unwrap(), "--head", &head]);
-    let (out, err) = (String::from_utf8_lossy(&located.stdout), String::from_utf8_lossy(&located.stderr));
-    assert_eq!((located.status.code(), out.lines().count()), (Some(2), 1), "{out}{err}");
-    assert!(err.contains("bad.ply: element vertex has no property x") && err.contains("1 cannot be read"), "{err}");
-    let none = agent(&["locate", whole.to_str().unwrap(), "--head", "town-that-nobody-drove"]);
+    let located = agent(&[
+        "locate",
+        bad.to_str().unwrap(),
+        whole.to_str().unwrap(),
+        "--head",
+        &head,
+    ]);
+    let (out, err) = (
+        String::from_utf8_lossy(&located.stdout),
+        String::from_utf8_lossy(&located.stderr),
+    );
+    assert_eq!(
+        (located.status.code(), out.lines().count()),
+        (Some(2), 1),
+        "{out}{err}"
+    );
+    assert!(
+        err.contains("bad.ply: element vertex has no property x")
+            && err.contains("1 cannot be read"),
+        "{err}"
+    );
+    let none = agent(&[
+        "locate",
+        whole.to_str().unwrap(),
+        "--head",
+        "town-that-nobody-drove",
+    ]);
     let err = String::from_utf8_lossy(&none.stderr);
     assert_eq!(none.status.code(), Some(2));
-    assert!(err.contains("--head town-that-nobody-drove: no such file or released head"), "{err}");
+    assert!(
+        err.contains("--head town-that-nobody-drove: no such file or released head"),
+        "{err}"
+    );
 }
 
 #[test]
@@ -137,7 +230,17 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
     let out = folder.path().join("my place");
     let (scene_text, out_text) = (scene.to_str().unwrap(), out.to_str().unwrap());
     let encoder = weights("pgc-encoder.safetensors");
-    let arguments = ["map", scene_text, "--out", out_text, "--encoder", &encoder, "--minutes", "1", "--json"];
+    let arguments = [
+        "map",
+        scene_text,
+        "--out",
+        out_text,
+        "--encoder",
+        &encoder,
+        "--minutes",
+        "1",
+        "--json",
+    ];
     let made = agent(&arguments);
     let err = String::from_utf8_lossy(&made.stderr);
     assert_eq!(made.status.code(), Some(0), "{err}");
@@ -147,24 +250,43 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
         (&Value::from("my place"), &Value::from(4)),
         "{report}"
     );
-    assert!(report["held_out"]["under_3m"].as_f64().unwrap() >= 0.25, "{report}");
-    assert_eq!(report["coverage"]["sweeps"], report["training_sweeps"], "{report}");
+    assert!(
+        report["held_out"]["under_3m"].as_f64().unwrap() >= 0.25,
+        "{report}"
+    );
+    assert_eq!(
+        report["coverage"]["sweeps"], report["training_sweeps"],
+        "{report}"
+    );
     let card = fs::read_to_string(out.join("model-card.md")).unwrap();
-    assert!(card.contains("Roads that were not driven give no pose"), "{card}");
+    assert!(
+        card.contains("Roads that were not driven give no pose"),
+        "{card}"
+    );
     // The folder is all that is needed.
-    let whole = dataset::open(&scene).unwrap().scenarios[0].points_path(0, 3, None).unwrap();
+    let whole = dataset::open(&scene).unwrap().scenarios[0]
+        .points_path(0, 3, None)
+        .unwrap();
     let located = agent(&["locate", whole.to_str().unwrap(), "--head", out_text]);
-    assert_eq!(located.status.code(), Some(0), "{}", String::from_utf8_lossy(&located.stdout));
+    assert_eq!(
+        located.status.code(),
+        Some(0),
+        "{}",
+        String::from_utf8_lossy(&located.stdout)
+    );
     assert!(!String::from_utf8_lossy(&located.stderr).contains("another LiDAR"));
     // One of fewer lasers.
-    let frame = dataset::open(&scene).unwrap().scenarios[0].load(0, 3, &LoadOptions::default()).unwrap();
+    let frame = dataset::open(&scene).unwrap().scenarios[0]
+        .load(0, 3, &LoadOptions::default())
+        .unwrap();
     let sparse = folder.path().join("sparse.bin");
     let points: Vec<[f32; 4]> = frame.points.xyzi.iter().copied().step_by(4).collect();
     fs::write(&sparse, little_endian(&points)).unwrap();
     let located = agent(&["locate", sparse.to_str().unwrap(), "--head", out_text]);
     let err = String::from_utf8_lossy(&located.stderr);
     assert!(
-        err.contains(&format!("the sweeps have {} points", points.len())) && err.contains("another LiDAR"),
+        err.contains(&format!("the sweeps have {} points", points.len()))
+            && err.contains("another LiDAR"),
         "{err}"
     );
     let again = agent(&arguments);

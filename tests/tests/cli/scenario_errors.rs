@@ -11,8 +11,17 @@ use tests::locks::exclusive_lock;
 
 /// Runs `v2vloc up` and returns exit code and standard error.
 fn up(program: &Path, folder: &Path, scenario: &Path) -> (Option<i32>, String) {
-    let output = Command::new(program).arg("up").arg(scenario).arg("--runs").arg(folder.join("runs")).output().unwrap();
-    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+    let output = Command::new(program)
+        .arg("up")
+        .arg(scenario)
+        .arg("--runs")
+        .arg(folder.join("runs"))
+        .output()
+        .unwrap();
+    (
+        output.status.code(),
+        String::from_utf8_lossy(&output.stderr).into_owned(),
+    )
 }
 
 /// Like [`up`], with the program under test.
@@ -26,17 +35,30 @@ fn a_misspelt_field_is_named_with_file_and_line() {
     let scenario = write_scenario(folder.path(), 1, "", "ego:\n  dedline_ms: 5");
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains("scenario.yaml:6") && stderr.contains("dedline_ms"), "{stderr}");
+    assert!(
+        stderr.contains("scenario.yaml:6") && stderr.contains("dedline_ms"),
+        "{stderr}"
+    );
 }
 
 #[test]
 fn options_of_a_protocol_that_other_fields_choose_are_named() {
     let folder = tempfile::tempdir().unwrap();
     for (option, value) in [("max_agents", "3"), ("ego", "unit"), ("agents", "vehicles")] {
-        let scenario = write_scenario(folder.path(), 1, "", &format!("protocol:\n  {option}: {value}"));
+        let scenario = write_scenario(
+            folder.path(),
+            1,
+            "",
+            &format!("protocol:\n  {option}: {value}"),
+        );
         let (code, stderr) = refused(folder.path(), &scenario);
         assert_eq!(code, Some(2), "{stderr}");
-        assert!(stderr.contains(&format!("{option}: choose by scene.agents and ego.id instead")), "{stderr}");
+        assert!(
+            stderr.contains(&format!(
+                "{option}: choose by scene.agents and ego.id instead"
+            )),
+            "{stderr}"
+        );
     }
 }
 
@@ -47,7 +69,10 @@ fn missing_weights_are_named() {
     fs::remove_file(folder.path().join("weights.safetensors")).unwrap();
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains("models.weights") && stderr.contains("weights.safetensors does not exist"), "{stderr}");
+    assert!(
+        stderr.contains("models.weights") && stderr.contains("weights.safetensors does not exist"),
+        "{stderr}"
+    );
 }
 
 #[test]
@@ -59,7 +84,10 @@ fn cut_off_weights_are_named() {
     fs::write(&weights, &whole[..whole.len() / 2]).unwrap();
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains("weights.safetensors: not a complete safetensors file"), "{stderr}");
+    assert!(
+        stderr.contains("weights.safetensors: not a complete safetensors file"),
+        "{stderr}"
+    );
 }
 
 #[test]
@@ -73,7 +101,10 @@ fn a_scene_without_frames_is_refused() {
     }
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains(&folder.path().join("scene").display().to_string()), "{stderr}");
+    assert!(
+        stderr.contains(&folder.path().join("scene").display().to_string()),
+        "{stderr}"
+    );
 }
 
 #[test]
@@ -82,7 +113,10 @@ fn a_vehicle_that_is_not_there_is_named() {
     let scenario = write_scenario(folder.path(), 1, "agents: ['4279', '77']", "");
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains("scene.agents names vehicle 77") && stderr.contains("4288"), "{stderr}");
+    assert!(
+        stderr.contains("scene.agents names vehicle 77") && stderr.contains("4288"),
+        "{stderr}"
+    );
 }
 
 #[test]
@@ -90,12 +124,23 @@ fn a_port_in_use_is_named() {
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let endpoint = format!("tcp/{}", taken.local_addr().unwrap());
     let folder = tempfile::tempdir().unwrap();
-    let scenario = write_scenario(folder.path(), 1, "", &format!("network: {{listen: \"{endpoint}\"}}"));
+    let scenario = write_scenario(
+        folder.path(),
+        1,
+        "",
+        &format!("network: {{listen: \"{endpoint}\"}}"),
+    );
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(2), "{stderr}");
-    assert!(stderr.contains(&endpoint) && stderr.contains("in use"), "{stderr}");
+    assert!(
+        stderr.contains(&endpoint) && stderr.contains("in use"),
+        "{stderr}"
+    );
     assert!(!stderr.contains("WARN"), "{stderr}");
-    assert!(!folder.path().join("runs/test").exists(), "the name is free for the next attempt");
+    assert!(
+        !folder.path().join("runs/test").exists(),
+        "the name is free for the next attempt"
+    );
 }
 
 #[test]
@@ -108,7 +153,8 @@ fn a_missing_program_is_named() {
     let (code, stderr) = up(&folder.path().join("v2vloc"), folder.path(), &scenario);
     assert_eq!(code, Some(1), "{stderr}");
     assert!(
-        stderr.contains(&folder.path().join("agent").display().to_string()) && stderr.contains("is missing"),
+        stderr.contains(&folder.path().join("agent").display().to_string())
+            && stderr.contains("is missing"),
         "{stderr}"
     );
 }
@@ -120,17 +166,38 @@ fn a_device_that_is_missing_is_named_before_anything_starts() {
     // The weights do not exist: where there is a device, that is what is refused.
     for [program, vehicle] in [["agent", "--cav"], ["ego-fuser", "--ego"]] {
         let mut command = Command::new(programs().join(program));
-        command.args(["run", "--run", "test", vehicle, "1", "--weights", "w", "--device", "cuda"]);
+        command.args([
+            "run",
+            "--run",
+            "test",
+            vehicle,
+            "1",
+            "--weights",
+            "w",
+            "--device",
+            "cuda",
+        ]);
         let output = command.output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{program}");
-        assert_eq!(String::from_utf8_lossy(&output.stderr).contains(missing), is_missing, "{program}");
+        assert_eq!(
+            String::from_utf8_lossy(&output.stderr).contains(missing),
+            is_missing,
+            "{program}"
+        );
     }
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 1, "", "");
     let text = fs::read_to_string(&scenario).unwrap();
-    fs::write(&scenario, text.replace("weights.safetensors", "missing.safetensors, device: cuda")).unwrap();
+    fs::write(
+        &scenario,
+        text.replace("weights.safetensors", "missing.safetensors, device: cuda"),
+    )
+    .unwrap();
     let (code, stderr) = refused(folder.path(), &scenario);
-    assert!(code == Some(2) && stderr.contains("scenario.yaml"), "{code:?} {stderr}");
+    assert!(
+        code == Some(2) && stderr.contains("scenario.yaml"),
+        "{code:?} {stderr}"
+    );
     assert_eq!(stderr.contains(missing), is_missing, "{stderr}");
     assert!(!folder.path().join("runs/test").exists());
 }
@@ -153,5 +220,8 @@ fn an_agent_that_never_comes_is_named() {
     let scenario = write_scenario(folder.path(), 1, "", rest);
     let (code, stderr) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(1), "{stderr}");
-    assert!(stderr.contains("not ready") && stderr.contains("agent-4288"), "{stderr}");
+    assert!(
+        stderr.contains("not ready") && stderr.contains("agent-4288"),
+        "{stderr}"
+    );
 }

@@ -22,16 +22,26 @@ use tests::fleet::programs;
 /// Difference between two motions, metres and degrees.
 fn off(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> (f64, f64) {
     let off = truth.inv_mul(found);
-    (off.translation.vector.norm(), off.rotation.angle().to_degrees())
+    (
+        off.translation.vector.norm(),
+        off.rotation.angle().to_degrees(),
+    )
 }
 
 /// Number of voxels of 0.2 m of `target` in which a moved `source` has points too.
 fn overlap(target: &PointCloud, source: &PointCloud, target_from_source: &Isometry3<f64>) -> usize {
     let voxels = |cloud: &PointCloud, motion: &Isometry3<f64>| -> HashSet<[i64; 3]> {
         let moved = |&[x, y, z, _]: &[f32; 4]| motion * Point3::new(x, y, z).cast();
-        cloud.xyzi.iter().map(moved).map(|p: Point3<f64>| [p.x, p.y, p.z].map(|v| (v / 0.2).floor() as i64)).collect()
+        cloud
+            .xyzi
+            .iter()
+            .map(moved)
+            .map(|p: Point3<f64>| [p.x, p.y, p.z].map(|v| (v / 0.2).floor() as i64))
+            .collect()
     };
-    voxels(target, &Isometry3::identity()).intersection(&voxels(source, target_from_source)).count()
+    voxels(target, &Isometry3::identity())
+        .intersection(&voxels(source, target_from_source))
+        .count()
 }
 
 /// Registers a sweep with one taken shortly before. Their known motion has an error of some decimetres itself, so the
@@ -40,9 +50,14 @@ fn follow(target: &PointCloud, source: &PointCloud, known: &Isometry3<f64>) {
     let config = IcpConfig::default();
     let planes = IcpTarget::of_sweep(&target.xyzi, &config);
     let decimate = IcpSource::of_sweep(&source.xyzi, &config);
-    let found = icp::register(&decimate, &planes, &Isometry3::identity(), &config).unwrap().target_from_source;
+    let found = icp::register(&decimate, &planes, &Isometry3::identity(), &config)
+        .unwrap()
+        .target_from_source;
     let (metres, degrees) = off(known, &found);
-    assert!(metres < 0.25 && degrees < 0.6, "{metres} m, {degrees} degrees");
+    assert!(
+        metres < 0.25 && degrees < 0.6,
+        "{metres} m, {degrees} degrees"
+    );
     let [before, by_known, by_found] =
         [&Isometry3::identity(), known, &found].map(|motion| overlap(target, source, motion));
     assert!(
@@ -55,11 +70,23 @@ fn follow(target: &PointCloud, source: &PointCloud, known: &Isometry3<f64>) {
 #[ignore = "needs V2V_DATA"]
 fn icp_places_two_real_scans_as_another_registration_did() {
     let folder = data("fast_gicp-pair");
-    let [target, source] = ["251370668.pcd", "251371071.pcd"]
-        .map(|name| pcd::decode(&std::fs::read(folder.join(name)).unwrap()).unwrap().points);
+    let [target, source] = ["251370668.pcd", "251371071.pcd"].map(|name| {
+        pcd::decode(&std::fs::read(folder.join(name)).unwrap())
+            .unwrap()
+            .points
+    });
     let text = std::fs::read_to_string(folder.join("relative.txt")).unwrap();
-    let numbers: Vec<f64> = text.split_whitespace().map(|number| number.parse().unwrap()).collect();
-    follow(&target, &source, &Pose::from_matrix(&Matrix4::from_row_slice(&numbers)).unwrap().isometry());
+    let numbers: Vec<f64> = text
+        .split_whitespace()
+        .map(|number| number.parse().unwrap())
+        .collect();
+    follow(
+        &target,
+        &source,
+        &Pose::from_matrix(&Matrix4::from_row_slice(&numbers))
+            .unwrap()
+            .isometry(),
+    );
 }
 
 #[test]
@@ -67,11 +94,16 @@ fn icp_places_two_real_scans_as_another_registration_did() {
 fn icp_follows_a_real_drive() {
     let folder = data("kitti-odometry-00");
     let scenario = dataset::open(&folder).unwrap().scenarios.remove(0);
-    let frames: Vec<_> =
-        (0..scenario.ticks.len()).map(|tick| scenario.load(0, tick, &LoadOptions::default()).unwrap()).collect();
+    let frames: Vec<_> = (0..scenario.ticks.len())
+        .map(|tick| scenario.load(0, tick, &LoadOptions::default()).unwrap())
+        .collect();
     let mut pairs = 0;
     for pair in frames.windows(2) {
-        let known = pair[0].world_from_lidar.unwrap().from_world(&pair[1].world_from_lidar.unwrap()).isometry();
+        let known = pair[0]
+            .world_from_lidar
+            .unwrap()
+            .from_world(&pair[1].world_from_lidar.unwrap())
+            .isometry();
         if known.translation.vector.norm() < 5.0 {
             follow(&pair[0].points, &pair[1].points, &known);
             pairs += 1;
@@ -85,8 +117,14 @@ fn outcomes(folder: &std::path::Path, methods: &[AlignmentSpec]) -> Vec<PairOutc
     let mut found = Vec::new();
     for scenario in dataset::open(folder).unwrap().scenarios {
         let ticks = 0..scenario.ticks.len();
-        alignment::run(methods, &mut BoxSource::Annotated, &scenario, ticks, &mut |outcome| found.push(outcome))
-            .unwrap();
+        alignment::run(
+            methods,
+            &mut BoxSource::Annotated,
+            &scenario,
+            ticks,
+            &mut |outcome| found.push(outcome),
+        )
+        .unwrap();
     }
     found
 }
@@ -96,7 +134,16 @@ fn approaches_meet_on_generated_scenes() {
     let folder = tempfile::tempdir().unwrap();
     let scenes = folder.path().join("scenes");
     let options = SynthOptions::new(Subset::V2vdet, 7, scenes.clone());
-    generate(&SynthOptions { frames: 3, agents: 2..=2, scenes: 2, ..options }, &|_| {}).unwrap();
+    generate(
+        &SynthOptions {
+            frames: 3,
+            agents: 2..=2,
+            scenes: 2,
+            ..options
+        },
+        &|_| {},
+    )
+    .unwrap();
     // A point cloud map of the scenes themselves: exact, so that any error is one of the registration.
     let config = IcpConfig::default();
     no_map_of_nothing(folder.path());
@@ -106,7 +153,9 @@ fn approaches_meet_on_generated_scenes() {
     let methods = [
         Poses::spec("true", Measured::True, || Ok(Box::new(RecordedPose))),
         Poses::spec("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose))),
-        Poses::spec("icp-map", Measured::Gnss, move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>)),
+        Poses::spec("icp-map", Measured::Gnss, move || {
+            Ok(Box::new(source.clone()) as Box<dyn PoseSource>)
+        }),
         CloudIcp::spec(config.clone(), false),
         CloudIcp::spec(config, true),
         BoxIcp::spec(),
@@ -116,20 +165,36 @@ fn approaches_meet_on_generated_scenes() {
     let rows: Vec<_> = (methods.iter().enumerate())
         .map(|(number, method)| {
             let mut tally = Tally::default();
-            found.iter().filter(|outcome| outcome.method == number).for_each(|outcome| tally.add(outcome));
+            found
+                .iter()
+                .filter(|outcome| outcome.method == number)
+                .for_each(|outcome| tally.add(outcome));
             tally.row(&method.name)
         })
         .collect();
-    let [exact, gnss, map, icp, icp_gnss, box_icp, free_align] = &rows[..] else { panic!("{rows:?}") };
-    assert!(rows.iter().all(|row| row.pairs == exact.pairs && row.pairs > 0));
-    assert!(exact.success_1m == 1.0 && exact.mean_m.unwrap() < 1e-6, "{exact:?}");
+    let [exact, gnss, map, icp, icp_gnss, box_icp, free_align] = &rows[..] else {
+        panic!("{rows:?}")
+    };
+    assert!(
+        rows.iter()
+            .all(|row| row.pairs == exact.pairs && row.pairs > 0)
+    );
+    assert!(
+        exact.success_1m == 1.0 && exact.mean_m.unwrap() < 1e-6,
+        "{exact:?}"
+    );
     // Poses have some dozen bytes, boxes some hundred, sweeps some ten thousand.
     assert!(
-        exact.log2_bytes < 7.0 && (6.0..13.0).contains(&free_align.log2_bytes) && icp.log2_bytes > 14.0,
+        exact.log2_bytes < 7.0
+            && (6.0..13.0).contains(&free_align.log2_bytes)
+            && icp.log2_bytes > 14.0,
         "{rows:?}"
     );
     assert!(map.success_1m > 0.9 && map.p50_m < gnss.p50_m, "{rows:?}");
-    assert!(icp_gnss.success_3m >= icp.success_3m && box_icp.not_aligned <= free_align.not_aligned, "{rows:?}");
+    assert!(
+        icp_gnss.success_3m >= icp.success_3m && box_icp.not_aligned <= free_align.not_aligned,
+        "{rows:?}"
+    );
 }
 
 fn no_map_of_nothing(folder: &std::path::Path) {
@@ -144,11 +209,23 @@ fn the_command_compares_recorded_vehicles() {
     let scene = data("v2xset-scene");
     let folder = tempfile::tempdir().unwrap();
     let source = folder.path().join("noisy.yaml");
-    std::fs::write(&source, "noisy:\n  mode: independent\n  position_std_m: 0.1\n  heading_std_deg: 0.1\n").unwrap();
+    std::fs::write(
+        &source,
+        "noisy:\n  mode: independent\n  position_std_m: 0.1\n  heading_std_deg: 0.1\n",
+    )
+    .unwrap();
     let run = |arguments: &[&str]| {
-        let output = Command::new(programs().join("ego-fuser")).arg("align").args(arguments).output().unwrap();
+        let output = Command::new(programs().join("ego-fuser"))
+            .arg("align")
+            .args(arguments)
+            .output()
+            .unwrap();
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-        (output.status.code(), text(&output.stdout), text(&output.stderr))
+        (
+            output.status.code(),
+            text(&output.stdout),
+            text(&output.stderr),
+        )
     };
     let scene = scene.to_str().unwrap();
     let named = format!("noisy={}", source.display());
@@ -169,16 +246,42 @@ fn the_command_compares_recorded_vehicles() {
     let of = |method: &str| rows.iter().find(|row| row["method"] == method).unwrap();
     assert_eq!((rows.len(), of("noisy")["pairs"].as_u64()), (3, Some(1)));
     assert_eq!(of("noisy")["success_1m"], 1.0, "{stdout}");
-    assert!(of("icp-gnss")["log2_bytes"].as_f64().unwrap() > 14.0, "{stdout}");
+    assert!(
+        of("icp-gnss")["log2_bytes"].as_f64().unwrap() > 14.0,
+        "{stdout}"
+    );
 
     let (code, _, error) = run(&["--dataset", scene, "--method", "free-align"]);
     assert_eq!(code, Some(2), "{error}");
     assert!(error.contains("--weights"), "{error}");
-    let (code, _, error) = run(&["--dataset", scene, "--method", "icp-map", "--boxes", "annotated"]);
+    let (code, _, error) = run(&[
+        "--dataset",
+        scene,
+        "--method",
+        "icp-map",
+        "--boxes",
+        "annotated",
+    ]);
     assert!(code == Some(2) && error.contains("--map"), "{error}");
-    let (code, _, error) = run(&["--dataset", folder.path().join("none").to_str().unwrap(), "--boxes", "annotated"]);
+    let (code, _, error) = run(&[
+        "--dataset",
+        folder.path().join("none").to_str().unwrap(),
+        "--boxes",
+        "annotated",
+    ]);
     assert!(code == Some(2) && error.contains("none"), "{error}");
-    let (code, table, error) = run(&["--dataset", scene, "--boxes", "annotated", "--method", "gnss", "box-icp"]);
+    let (code, table, error) = run(&[
+        "--dataset",
+        scene,
+        "--boxes",
+        "annotated",
+        "--method",
+        "gnss",
+        "box-icp",
+    ]);
     assert_eq!(code, Some(0), "{error}");
-    assert!(table.starts_with("| method | time, s |") && table.contains("| box-icp |"), "{table}");
+    assert!(
+        table.starts_with("| method | time, s |") && table.contains("| box-icp |"),
+        "{table}"
+    );
 }

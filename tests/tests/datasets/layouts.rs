@@ -34,7 +34,10 @@ fn average_precision(scene: &Path, method: Method) -> Value {
         dataset: scene.to_owned(),
         weights: WEIGHTS.into(),
         // One protocol for all: each layout has its own otherwise.
-        protocol: ProtocolConfig { preset: Some("opv2v".into()), ..ProtocolConfig::default() },
+        protocol: ProtocolConfig {
+            preset: Some("opv2v".into()),
+            ..ProtocolConfig::default()
+        },
         ..EvaluationOptions::default()
     };
     let metrics = evaluate(&options, method, &mut || {}).unwrap();
@@ -49,14 +52,36 @@ fn every_layout_gives_the_same_average_precision() {
     for (layout, found) in LAYOUTS {
         let folder = tempfile::tempdir().unwrap();
         let options = SynthOptions::new(Subset::V2vdet, 1007, folder.path().to_owned());
-        generate(&SynthOptions { layout, frames: 4, agents: 2..=2, ..options }, &|_| {}).unwrap();
+        generate(
+            &SynthOptions {
+                layout,
+                frames: 4,
+                agents: 2..=2,
+                ..options
+            },
+            &|_| {},
+        )
+        .unwrap();
         let dataset = dataset::open(folder.path()).unwrap();
-        assert!(dataset.layout == found && dataset.problems.is_empty(), "{layout:?}: {:?}", dataset.problems);
-        let found: Vec<Value> = METHODS.map(|method| average_precision(folder.path(), method)).to_vec();
+        assert!(
+            dataset.layout == found && dataset.problems.is_empty(),
+            "{layout:?}: {:?}",
+            dataset.problems
+        );
+        let found: Vec<Value> = METHODS
+            .map(|method| average_precision(folder.path(), method))
+            .to_vec();
         if expected.is_empty() {
             // Equality of zeros would show nothing.
-            let at_30 = |precision: &Value| precision[0]["0.3"].as_f64().unwrap_or_else(|| panic!("{precision}"));
-            assert!(found.iter().all(|precision| at_30(precision) > 0.3), "{found:?}");
+            let at_30 = |precision: &Value| {
+                precision[0]["0.3"]
+                    .as_f64()
+                    .unwrap_or_else(|| panic!("{precision}"))
+            };
+            assert!(
+                found.iter().all(|precision| at_30(precision) > 0.3),
+                "{found:?}"
+            );
             assert_ne!(found[0], found[1]);
             expected = found;
         } else {
@@ -73,7 +98,10 @@ fn rewrite_sweeps(folder: &Path, write: &dyn Fn(PointCloud) -> Vec<u8>) {
             rewrite_sweeps(&path, write);
         } else if path.extension().is_some_and(|kind| kind == "pcd") {
             let mut cloud = pcd::decode(&fs::read(&path).unwrap()).unwrap().points;
-            cloud.xyzi.iter_mut().for_each(|point| point[3] = (point[3] * 255.0).round());
+            cloud
+                .xyzi
+                .iter_mut()
+                .for_each(|point| point[3] = (point[3] * 255.0).round());
             fs::write(path, write(cloud)).unwrap();
         }
     }
@@ -89,16 +117,32 @@ fn intensity_in_three_spellings_gives_the_same_average_precision() {
     let byte = |cloud: PointCloud| pcd::encode(&cloud, Encoding::Binary, IntensityField::Intensity);
     let other_name = |cloud: PointCloud| {
         let file = byte(cloud);
-        let at = file.windows(9).position(|window| window == b"intensity").unwrap();
+        let at = file
+            .windows(9)
+            .position(|window| window == b"intensity")
+            .unwrap();
         [&file[..at], b"Intensity", &file[at + 9..]].concat()
     };
     let spellings: [&dyn Fn(PointCloud) -> Vec<u8>; 3] = [&unit, &byte, &other_name];
     let found = spellings.map(|write| {
         let folder = tempfile::tempdir().unwrap();
         let options = SynthOptions::new(Subset::V2vdet, 1007, folder.path().to_owned());
-        generate(&SynthOptions { frames: 4, agents: 2..=2, ..options }, &|_| {}).unwrap();
+        generate(
+            &SynthOptions {
+                frames: 4,
+                agents: 2..=2,
+                ..options
+            },
+            &|_| {},
+        )
+        .unwrap();
         rewrite_sweeps(folder.path(), write);
-        let report = inspect(folder.path(), &OpenOptions::default(), &ProtocolConfig::default(), &|_, _| {});
+        let report = inspect(
+            folder.path(),
+            &OpenOptions::default(),
+            &ProtocolConfig::default(),
+            &|_, _| {},
+        );
         assert!(report.problems.is_empty(), "{:?}", report.problems);
         METHODS.map(|method| average_precision(folder.path(), method))
     });

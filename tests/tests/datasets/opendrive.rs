@@ -41,21 +41,52 @@ const MAPS: [Expected; 2] = [
 fn maps_are_read_as_their_readme_counts_them() {
     let folder = fixtures::data("opendrive");
     for expected in MAPS {
-        let network = opendrive::read(&std::fs::read_to_string(folder.join(expected.file)).unwrap()).unwrap();
+        let network =
+            opendrive::read(&std::fs::read_to_string(folder.join(expected.file)).unwrap()).unwrap();
         let length = |outside: bool| -> f64 {
-            let roads = network.roads.iter().filter(|road| !outside || road.junction.is_none());
+            let roads = network
+                .roads
+                .iter()
+                .filter(|road| !outside || road.junction.is_none());
             roads.map(|road| road.length_m).sum()
         };
-        assert_eq!((network.roads.len(), network.junctions.len()), (expected.roads, expected.junctions));
+        assert_eq!(
+            (network.roads.len(), network.junctions.len()),
+            (expected.roads, expected.junctions)
+        );
         assert_eq!(network.findings, [], "{}", expected.file);
-        assert!((length(false) - expected.length_m).abs() < 1.0, "{}: {}", expected.file, length(false));
-        assert!((length(true) - expected.outside_junctions_m).abs() < 1.0, "{}: {}", expected.file, length(true));
+        assert!(
+            (length(false) - expected.length_m).abs() < 1.0,
+            "{}: {}",
+            expected.file,
+            length(false)
+        );
+        assert!(
+            (length(true) - expected.outside_junctions_m).abs() < 1.0,
+            "{}: {}",
+            expected.file,
+            length(true)
+        );
         check_reference_lines(expected.file, &network);
         let (graph, counts) = lane_graph(&network);
-        assert_eq!((counts.refused, counts.findings), (0, vec![]), "{}", expected.file);
+        assert_eq!(
+            (counts.refused, counts.findings),
+            (0, vec![]),
+            "{}",
+            expected.file
+        );
         check_links(expected.file, &graph);
-        let highest = graph.lanes.iter().flat_map(|lane| &lane.centerline).map(|p| p[2]).fold(0.0, f64::max);
-        assert!((highest - expected.highest_m).abs() < 0.1, "{}: highest lane at {highest} m", expected.file);
+        let highest = graph
+            .lanes
+            .iter()
+            .flat_map(|lane| &lane.centerline)
+            .map(|p| p[2])
+            .fold(0.0, f64::max);
+        assert!(
+            (highest - expected.highest_m).abs() < 0.1,
+            "{}: highest lane at {highest} m",
+            expected.file
+        );
     }
 }
 
@@ -64,9 +95,18 @@ fn check_reference_lines(file: &str, network: &RoadNetwork) {
     for road in &network.roads {
         for pair in road.plan_view.windows(2) {
             let (end, start) = (pair[0].end(), pair[1].start);
-            assert!(end.distance_m(&start) < 0.02, "{file}: road {} breaks by {}", road.id, end.distance_m(&start));
+            assert!(
+                end.distance_m(&start) < 0.02,
+                "{file}: road {} breaks by {}",
+                road.id,
+                end.distance_m(&start)
+            );
             let turn = (end.heading_rad - start.heading_rad).sin();
-            assert!(turn.abs() < 0.02, "{file}: road {} bends by {turn}", road.id);
+            assert!(
+                turn.abs() < 0.02,
+                "{file}: road {} bends by {turn}",
+                road.id
+            );
         }
     }
 }
@@ -77,9 +117,17 @@ fn check_links(file: &str, graph: &LaneGraph) {
         let end = lane.centerline[lane.centerline.len() - 1];
         for &next in &lane.successors {
             let next = graph.lane(next);
-            let gap = (0..3).map(|axis| (end[axis] - next.centerline[0][axis]).powi(2)).sum::<f64>().sqrt();
+            let gap = (0..3)
+                .map(|axis| (end[axis] - next.centerline[0][axis]).powi(2))
+                .sum::<f64>()
+                .sqrt();
             let turn = (next.start_heading_rad() - lane.end_heading_rad()).sin();
-            assert!(gap < 0.5 && turn.abs() < 0.2, "{file}: {:?} to {:?}: {gap} m, {turn} rad", lane.id, next.id);
+            assert!(
+                gap < 0.5 && turn.abs() < 0.2,
+                "{file}: {:?} to {:?}: {gap} m, {turn} rad",
+                lane.id,
+                next.id
+            );
         }
     }
     let far = graph.lanes.iter().filter(|lane| {
@@ -92,7 +140,10 @@ fn check_links(file: &str, graph: &LaneGraph) {
         driven >= DRIVE_M
     });
     let share = far.count() as f64 / graph.lanes.len() as f64;
-    assert!(share > 0.97, "{file}: only from {share} of the lanes one can drive {DRIVE_M} m");
+    assert!(
+        share > 0.97,
+        "{file}: only from {share} of the lanes one can drive {DRIVE_M} m"
+    );
 }
 
 #[test]
@@ -104,12 +155,24 @@ fn maps_become_models_with_free_lanes_the_same_every_time() {
         let (map_model, again) = (build(&source, 3).unwrap(), build(&source, 3).unwrap());
         assert!(map_model == again, "{} differs from itself", expected.file);
         let found = map_model.obstructions();
-        let first = found.first().map(|&(lane, solid)| (lane, map_model.solids[solid]));
-        assert!(found.is_empty(), "{}: {} lanes obstructed, such as {first:?}", expected.file, found.len());
+        let first = found
+            .first()
+            .map(|&(lane, solid)| (lane, map_model.solids[solid]));
+        assert!(
+            found.is_empty(),
+            "{}: {} lanes obstructed, such as {first:?}",
+            expected.file,
+            found.len()
+        );
         assert!(map_model.solids.len() > 2000 && map_model.parking.len() > 50);
         // The ground meets the lanes, except where they pass above it.
         let (mut below, mut points) = (0u32, 0u32);
-        for point in map_model.lanes.lanes.iter().flat_map(|lane| &lane.centerline) {
+        for point in map_model
+            .lanes
+            .lanes
+            .iter()
+            .flat_map(|lane| &lane.centerline)
+        {
             let ground = map_model.ground.height_m(point[0], point[1]);
             assert!(
                 ground < point[2] + 0.3,
@@ -120,6 +183,10 @@ fn maps_become_models_with_free_lanes_the_same_every_time() {
             below += u32::from(ground < point[2] - 0.3);
             points += 1;
         }
-        assert!(f64::from(below) < 0.05 * f64::from(points), "{}: {below} of {points} points hang", expected.file);
+        assert!(
+            f64::from(below) < 0.05 * f64::from(points),
+            "{}: {below} of {points} points hang",
+            expected.file
+        );
     }
 }

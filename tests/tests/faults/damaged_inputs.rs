@@ -13,9 +13,23 @@ use crate::MEMORY;
 fn check(reports: impl IntoIterator<Item = Report>) {
     for report in reports {
         eprintln!("{report:?}");
-        assert!(report.panics.is_empty(), "{}: cases {:?} panicked", report.name, report.panics);
-        assert!(report.accepted < report.cases, "{}: nothing is refused", report.name);
-        assert!(report.peak_bytes as u64 <= 2 * LIMITS.max_body_bytes, "{}: {} bytes", report.name, report.peak_bytes);
+        assert!(
+            report.panics.is_empty(),
+            "{}: cases {:?} panicked",
+            report.name,
+            report.panics
+        );
+        assert!(
+            report.accepted < report.cases,
+            "{}: nothing is refused",
+            report.name
+        );
+        assert!(
+            report.peak_bytes as u64 <= 2 * LIMITS.max_body_bytes,
+            "{}: {} bytes",
+            report.name,
+            report.peak_bytes
+        );
     }
 }
 
@@ -52,11 +66,22 @@ fn every_format_has_a_fuzz_target_with_sound_seeds() {
     let readers = all_readers(scratch.path());
     for (name, seeds) in formats(scratch.path()) {
         let target = name.replace(' ', "_");
-        assert!(targets.contains(&format!("name = \"{target}\"\n")), "{target} is no target");
+        assert!(
+            targets.contains(&format!("name = \"{target}\"\n")),
+            "{target} is no target"
+        );
         for number in 0..seeds.len() {
-            let bytes = std::fs::read(fuzz.join("seeds").join(&target).join(format!("{number:02}"))).unwrap();
+            let bytes = std::fs::read(
+                fuzz.join("seeds")
+                    .join(&target)
+                    .join(format!("{number:02}")),
+            )
+            .unwrap();
             let reader = readers.iter().find(|reader| reader.name == name);
-            let is_sound = reader.map_or_else(|| wire_target::read(&bytes), |reader| reader.try_read(&bytes));
+            let is_sound = reader.map_or_else(
+                || wire_target::read(&bytes),
+                |reader| reader.try_read(&bytes),
+            );
             assert!(is_sound, "{target} {number}");
         }
     }

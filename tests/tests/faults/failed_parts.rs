@@ -12,13 +12,30 @@ use tests::locks::exclusive_lock;
 
 /// Runs `program` to its end; exit code and both outputs.
 fn outcome(command: &mut Command) -> (Option<i32>, String) {
-    let Output { status, stdout, stderr } = command.stdin(Stdio::null()).output().unwrap();
-    (status.code(), [stdout, stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat())
+    let Output {
+        status,
+        stdout,
+        stderr,
+    } = command.stdin(Stdio::null()).output().unwrap();
+    (
+        status.code(),
+        [stdout, stderr]
+            .map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
+            .concat(),
+    )
 }
 
 fn up(folder: &Path, scenario: &Path, name: &str) -> (Option<i32>, String) {
     let mut command = Command::new(programs().join("v2vloc"));
-    outcome(command.arg("up").arg(scenario).arg("--name").arg(name).arg("--runs").arg(folder.join("runs")))
+    outcome(
+        command
+            .arg("up")
+            .arg(scenario)
+            .arg("--name")
+            .arg(name)
+            .arg("--runs")
+            .arg(folder.join("runs")),
+    )
 }
 
 #[test]
@@ -29,12 +46,19 @@ fn a_cut_recording_is_reported_by_report_status_and_exit_code() {
     let scenario = write_scenario(folder.path(), 14, "rate: 0.2", "record: {without: [bev]}");
     let limited = "ulimit -f 3000; trap '' XFSZ; exec \"$0\" \"$@\"";
     let mut command = Command::new("/bin/sh");
-    command.args(["-c", limited]).arg(programs().join("v2vloc")).arg("up").arg(&scenario);
+    command
+        .args(["-c", limited])
+        .arg(programs().join("v2vloc"))
+        .arg("up")
+        .arg(&scenario);
     let (code, output) = outcome(command.arg("--runs").arg(folder.path().join("runs")));
     assert_eq!(code, Some(3), "{output}");
     let run = folder.path().join("runs/test");
     let recording = run.join("recording.mcap");
-    let advice = format!("messages missing; sim-replay recover {} --out ", recording.display());
+    let advice = format!(
+        "messages missing; sim-replay recover {} --out ",
+        recording.display()
+    );
     for text in ["recorder: recording cut at ", " s: ", &advice] {
         assert_eq!(
             output.matches(text).count(),
@@ -43,12 +67,27 @@ fn a_cut_recording_is_reported_by_report_status_and_exit_code() {
         );
     }
     assert_eq!(results(&run).len(), 14, "the run goes on");
-    let (code, status) = outcome(Command::new(programs().join("v2vloc")).arg("status").arg(&run));
-    assert!(code == Some(1) && status.contains("recorder is") && status.contains("recording cut at"), "{status}");
+    let (code, status) = outcome(
+        Command::new(programs().join("v2vloc"))
+            .arg("status")
+            .arg(&run),
+    );
+    assert!(
+        code == Some(1) && status.contains("recorder is") && status.contains("recording cut at"),
+        "{status}"
+    );
     let whole = run.join("whole.mcap");
-    let recover = ["recover".as_ref(), recording.as_os_str(), "--out".as_ref(), whole.as_os_str()];
+    let recover = [
+        "recover".as_ref(),
+        recording.as_os_str(),
+        "--out".as_ref(),
+        whole.as_os_str(),
+    ];
     let (code, output) = outcome(Command::new(programs().join("sim-replay")).args(recover));
-    assert!(code == Some(3) && output.contains("ends without an index"), "{output}");
+    assert!(
+        code == Some(3) && output.contains("ends without an index"),
+        "{output}"
+    );
     let [cut, whole] = [&recording, &whole].map(|file| Recording::open(file).unwrap());
     assert!(!whole.entries().is_empty() && whole.entries().len() == cut.entries().len());
     assert_eq!(whole.damage(), []);
@@ -58,16 +97,33 @@ fn a_cut_recording_is_reported_by_report_status_and_exit_code() {
 fn a_second_fleet_of_the_same_name_is_refused_and_the_first_goes_on() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-    let scenario = write_scenario(folder.path(), 3, "loop: true", &format!("network: {{listen: tcp/{free}}}"));
+    let free = TcpListener::bind("127.0.0.1:0")
+        .unwrap()
+        .local_addr()
+        .unwrap();
+    let scenario = write_scenario(
+        folder.path(),
+        3,
+        "loop: true",
+        &format!("network: {{listen: tcp/{free}}}"),
+    );
     let joining = folder.path().join("joining.yaml");
-    fs::write(&joining, fs::read_to_string(&scenario).unwrap().replace("listen:", "connect:")).unwrap();
+    fs::write(
+        &joining,
+        fs::read_to_string(&scenario)
+            .unwrap()
+            .replace("listen:", "connect:"),
+    )
+    .unwrap();
     let mut first = Up::start(folder.path(), &scenario);
     first.wait_for_results("a result", |results| !results.is_empty());
     let others = folder.path().join("others");
     let (code, output) = up(&others, &joining, "test");
     assert_eq!(code, Some(2), "{output}");
-    assert!(output.contains(&format!("run test is already live on tcp/{free}")), "{output}");
+    assert!(
+        output.contains(&format!("run test is already live on tcp/{free}")),
+        "{output}"
+    );
     for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "scorer"] {
         assert!(output.contains(process), "{process}: {output}");
     }
@@ -81,11 +137,16 @@ fn a_second_fleet_of_the_same_name_is_refused_and_the_first_goes_on() {
 /// Removes the poses from all files of the scene.
 fn without_poses(scene: &Path) {
     for agent in fs::read_dir(scene).unwrap() {
-        for file in fs::read_dir(agent.unwrap().path()).unwrap().map(|file| file.unwrap().path()) {
+        for file in fs::read_dir(agent.unwrap().path())
+            .unwrap()
+            .map(|file| file.unwrap().path())
+        {
             if file.extension().is_some_and(|kind| kind == "yaml") {
                 let text = fs::read_to_string(&file).unwrap();
-                let kept: Vec<&str> =
-                    text.lines().filter(|line| !line.contains("_pose:") && !line.contains("_pos:")).collect();
+                let kept: Vec<&str> = text
+                    .lines()
+                    .filter(|line| !line.contains("_pose:") && !line.contains("_pos:"))
+                    .collect();
                 fs::write(&file, kept.join("\n")).unwrap();
             }
         }
@@ -101,7 +162,8 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
     let (code, output) = up(folder.path(), &recorded, "recorded");
     assert_eq!(code, Some(2), "{output}");
     assert!(
-        output.contains("vehicle 4279: pose is recorded, but scenario") && output.contains("pose: pgc"),
+        output.contains("vehicle 4279: pose is recorded, but scenario")
+            && output.contains("pose: pgc"),
         "{output}"
     );
     assert!(!folder.path().join("runs/recorded").exists());
@@ -115,14 +177,23 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
     // Untrained networks find no pose, and feature maps without one cannot be used.
     assert!(matches!(code, Some(0 | 3)), "{output}");
     let results = results(&folder.path().join("runs/finding"));
-    let ticks: Vec<_> = results.iter().map(|result| result["tick"].as_u64()).collect();
+    let ticks: Vec<_> = results
+        .iter()
+        .map(|result| result["tick"].as_u64())
+        .collect();
     assert_eq!(ticks, [0, 1, 2, 3].map(Some), "every tick is answered");
 
     let weights = folder.path().join("weights.safetensors");
     let mut eval = Command::new(programs().join("v2vloc"));
-    eval.args(["eval", "--method", "max", "--dataset"]).arg(folder.path().join("scene")).arg("--weights").arg(weights);
+    eval.args(["eval", "--method", "max", "--dataset"])
+        .arg(folder.path().join("scene"))
+        .arg("--weights")
+        .arg(weights);
     let (code, output) = outcome(&mut eval);
-    assert!(code == Some(2) && output.contains("no true poses of the ego 4279"), "{output}");
+    assert!(
+        code == Some(2) && output.contains("no true poses of the ego 4279"),
+        "{output}"
+    );
 }
 
 #[test]
@@ -131,24 +202,40 @@ fn sweeps_without_poses_are_localised_and_no_sweep_is_an_error() {
     tests::scene::write(folder.path(), &["4279"], 2);
     let (encoder, head) = tests::localizer::write(folder.path(), 3);
     let scene = folder.path().join("scene");
-    for file in fs::read_dir(scene.join("4279")).unwrap().map(|file| file.unwrap().path()) {
+    for file in fs::read_dir(scene.join("4279"))
+        .unwrap()
+        .map(|file| file.unwrap().path())
+    {
         if file.extension().is_some_and(|kind| kind == "yaml") {
             fs::remove_file(file).unwrap();
         }
     }
     let agent = |command: &str, scene: &Path| {
         let mut agent = Command::new(programs().join("agent"));
-        agent.arg(command).arg("--scene").arg(scene).arg("--encoder").arg(&encoder).arg("--head").arg(&head);
+        agent
+            .arg(command)
+            .arg("--scene")
+            .arg(scene)
+            .arg("--encoder")
+            .arg(&encoder)
+            .arg("--head")
+            .arg(&head);
         agent
     };
     let table = folder.path().join("poses.csv");
     let (code, output) = outcome(agent("localize", &scene).arg("--out").arg(&table));
     assert!(code == Some(0) && output.contains("2 sweeps, "), "{output}");
     let (code, output) = outcome(&mut agent("eval", &scene));
-    assert!(code == Some(2) && output.contains("no true pose to compare with"), "{output}");
+    assert!(
+        code == Some(2) && output.contains("no true pose to compare with"),
+        "{output}"
+    );
     let empty = folder.path().join("empty/1");
     fs::create_dir_all(&empty).unwrap();
-    let (code, output) =
-        outcome(agent("localize", empty.parent().unwrap()).arg("--out").arg(folder.path().join("none.csv")));
+    let (code, output) = outcome(
+        agent("localize", empty.parent().unwrap())
+            .arg("--out")
+            .arg(folder.path().join("none.csv")),
+    );
     assert_eq!(code, Some(2), "{output}");
 }

@@ -17,13 +17,21 @@ fn a_fleet_gets_over_a_dozen_faults() {
     for fault in &mut faults {
         fault.lasts = fault.lasts.min(Duration::from_millis(500));
     }
-    let report = FaultyFleet::start(folder.path())
-        .suffer(&faults, |number, fault, ms| eprintln!("{number}: {fault}, as before after {ms} ms"));
+    let report = FaultyFleet::start(folder.path()).suffer(&faults, |number, fault, ms| {
+        eprintln!("{number}: {fault}, as before after {ms} ms")
+    });
     assert!(report.balances, "{}", report.discrepancies);
     assert!(report.left_over.is_empty(), "{:?}", report.left_over);
     assert!(report.restarts > 0, "{report:?}");
     // `u64::MAX` stands for never. Times are measured by `cargo bench -p tests --bench faults`.
-    assert!(report.findings.fused_again_ms.iter().all(|ms| *ms < u64::MAX), "{report:?}");
+    assert!(
+        report
+            .findings
+            .fused_again_ms
+            .iter()
+            .all(|ms| *ms < u64::MAX),
+        "{report:?}"
+    );
 }
 
 #[test]
@@ -41,9 +49,15 @@ fn a_fleet_that_lasts_opens_nothing_more_and_more() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let soak = soak(folder.path(), Duration::from_secs(12), |_, _| {});
-    assert!(soak.balances && soak.frames > 20 && soak.memory.len() == 8, "{soak:?}");
+    assert!(
+        soak.balances && soak.frames > 20 && soak.memory.len() == 8,
+        "{soak:?}"
+    );
     for (name, [before, after, threads_before, threads_after]) in &soak.handles {
-        assert!(*after <= before + 8 && *threads_after <= threads_before + 4, "{name}: {soak:?}");
+        assert!(
+            *after <= before + 8 && *threads_after <= threads_before + 4,
+            "{name}: {soak:?}"
+        );
     }
 }
 
@@ -54,8 +68,14 @@ impl SmallDisk {
     fn mount(at: &Path, kib: u32) -> Self {
         std::fs::create_dir(at).unwrap();
         let mut mount = Command::new("mount");
-        mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]).arg(at);
-        assert!(mount.status().unwrap().success(), "{} cannot be mounted", at.display());
+        mount
+            .args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"])
+            .arg(at);
+        assert!(
+            mount.status().unwrap().success(),
+            "{} cannot be mounted",
+            at.display()
+        );
         Self(at.to_path_buf())
     }
 }
@@ -73,17 +93,43 @@ fn a_full_disk_ends_no_run_and_takes_no_result_with_it() {
     let folder = tempfile::tempdir().unwrap();
     let disk = SmallDisk::mount(&folder.path().join("runs"), 24);
     let scenario = write_scenario(folder.path(), 60, "rate: 2", "");
-    let run = Command::new(programs().join("v2vloc")).arg("up").arg(&scenario).arg("--runs").arg(&disk.0).output();
+    let run = Command::new(programs().join("v2vloc"))
+        .arg("up")
+        .arg(&scenario)
+        .arg("--runs")
+        .arg(&disk.0)
+        .output();
     let output = run.unwrap();
-    let [stdout, stderr] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
+    let [stdout, stderr] =
+        [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
     assert_eq!(output.status.code(), Some(3), "{stdout}{stderr}");
-    assert!(stdout.contains("every message is accounted for"), "{stdout}{stderr}");
+    assert!(
+        stdout.contains("every message is accounted for"),
+        "{stdout}{stderr}"
+    );
     assert!(
         stdout.contains("unwritten cannot write") && stdout.contains("metrics.json: No space left"),
         "{stdout}{stderr}"
     );
-    let answered = stdout.lines().nth(1).and_then(|row| row.split_whitespace().nth(2)?.split_once('/')?.0.parse().ok());
-    assert!(answered.is_some_and(|answered: u32| answered > 40), "{stdout}{stderr}");
-    assert_eq!(stderr.matches("detections.jsonl waits").count(), 1, "reported once: {stderr}");
-    assert!(!disk.0.join("test/metrics.json").exists(), "half a file is worse than none");
+    let answered = stdout.lines().nth(1).and_then(|row| {
+        row.split_whitespace()
+            .nth(2)?
+            .split_once('/')?
+            .0
+            .parse()
+            .ok()
+    });
+    assert!(
+        answered.is_some_and(|answered: u32| answered > 40),
+        "{stdout}{stderr}"
+    );
+    assert_eq!(
+        stderr.matches("detections.jsonl waits").count(),
+        1,
+        "reported once: {stderr}"
+    );
+    assert!(
+        !disk.0.join("test/metrics.json").exists(),
+        "half a file is worse than none"
+    );
 }

@@ -34,7 +34,9 @@ impl Recorder {
             .stdout(Stdio::piped())
             .spawn()
             .expect("sim-replay runs");
-        wait_for("a recorded message", || fs::metadata(&file).is_ok_and(|file| file.len() > 10_000));
+        wait_for("a recorded message", || {
+            fs::metadata(&file).is_ok_and(|file| file.len() > 10_000)
+        });
         Self { child, file }
     }
 
@@ -48,7 +50,9 @@ impl Recorder {
     fn end(mut self) -> (Value, Option<i32>) {
         signal(self.child.id(), "CONT");
         let size = fs::metadata(&self.file).expect("its file").len();
-        wait_for("a message after the stop", || fs::metadata(&self.file).is_ok_and(|file| file.len() > size + 10_000));
+        wait_for("a message after the stop", || {
+            fs::metadata(&self.file).is_ok_and(|file| file.len() > size + 10_000)
+        });
         thread::sleep(Duration::from_secs(2));
         signal(self.child.id(), "INT");
         let stdout = self.child.stdout.take().expect("a pipe");
@@ -70,14 +74,21 @@ fn fleet(folder: &Path) -> (Up, String) {
     let scenario = write_scenario(folder, "");
     let mut up = Up::start(folder, &scenario);
     let line = up.wait_for_line("run test at ");
-    let router = line.split_whitespace().nth(3).expect("an endpoint").trim_end_matches(':').to_owned();
+    let router = line
+        .split_whitespace()
+        .nth(3)
+        .expect("an endpoint")
+        .trim_end_matches(':')
+        .to_owned();
     wait_until_complete(&mut up);
     (up, router)
 }
 
 fn wait_until_complete(up: &mut Up) {
     up.wait_for_results("fused results", |results| {
-        results.last().is_some_and(|result| tests::fleet::fused(result) == VEHICLES.len() - 1)
+        results
+            .last()
+            .is_some_and(|result| tests::fleet::fused(result) == VEHICLES.len() - 1)
     });
 }
 
@@ -86,15 +97,23 @@ fn results_during(up: &Up, period: impl FnOnce()) -> (usize, u64) {
     let mut results = Results::of(&up.folder);
     let before = results.update().len();
     period();
-    let published: Vec<u64> = results.update()[before..].iter().map(|result| result.published_ms).collect();
-    let longest = published.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).max().unwrap_or(u64::MAX);
+    let published: Vec<u64> = results.update()[before..]
+        .iter()
+        .map(|result| result.published_ms)
+        .collect();
+    let longest = published
+        .windows(2)
+        .map(|pair| pair[1].saturating_sub(pair[0]))
+        .max()
+        .unwrap_or(u64::MAX);
     (published.len(), longest)
 }
 
 fn ends_balanced(mut up: Up) {
     signal(up.pid(), "INT");
     assert!(matches!(up.wait().code(), Some(0 | 3)));
-    let ledger: Value = serde_json::from_str(&fs::read_to_string(up.folder.join("ledger.json")).unwrap()).unwrap();
+    let ledger: Value =
+        serde_json::from_str(&fs::read_to_string(up.folder.join("ledger.json")).unwrap()).unwrap();
     assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
 }
 
@@ -120,7 +139,12 @@ fn stopped_receivers_stop_nobody_and_know_what_they_missed() {
     let recorder = Recorder::stopped(&router, file("d.mcap"));
     thread::sleep(Duration::from_secs(8));
     let (report, code) = recorder.end();
-    assert!(report["undelivered"].as_u64().is_some_and(|messages| messages > 0), "{report}");
+    assert!(
+        report["undelivered"]
+            .as_u64()
+            .is_some_and(|messages| messages > 0),
+        "{report}"
+    );
     assert_eq!(code, Some(3), "a recording with gaps: {report}");
     ends_balanced(up);
 }
@@ -135,12 +159,15 @@ fn a_vehicle_that_is_cut_off_or_stopped_stops_no_other() {
         lasts: Duration::from_secs(6),
         after: Duration::from_millis(500),
     };
-    let report = FaultyFleet::start(folder.path())
-        .suffer(&[fault(Kind::Silence), fault(Kind::Stop)], |_, fault, ms| {
-            eprintln!("{fault}, as before after {ms} ms")
-        });
+    let report = FaultyFleet::start(folder.path()).suffer(
+        &[fault(Kind::Silence), fault(Kind::Stop)],
+        |_, fault, ms| eprintln!("{fault}, as before after {ms} ms"),
+    );
     eprintln!("{} ms between two results", report.findings.longest_gap_ms);
-    assert!(report.findings.longest_gap_ms <= LONGEST_GAP_MS, "{report:?}");
+    assert!(
+        report.findings.longest_gap_ms <= LONGEST_GAP_MS,
+        "{report:?}"
+    );
     assert!(report.balances, "{}", report.discrepancies);
 }
 
@@ -153,14 +180,26 @@ fn a_cut_cable_to_a_vehicle_stops_no_other() {
     let far = VEHICLES[3];
     let network = format!("network: {{listen: 'tcp/0.0.0.0:7447'}}\nremote_agents: ['{far}']");
     let scenario = write_scenario(folder.path(), &network);
-    let mut up = Up::by(hosts.command("router", &programs().join("v2vloc")), folder.path(), &scenario);
+    let mut up = Up::by(
+        hosts.command("router", &programs().join("v2vloc")),
+        folder.path(),
+        &scenario,
+    );
     up.wait_for_line("run test at ");
     let mut agent = hosts
         .command("vehicle", &programs().join("agent"))
-        .args(["run", "--run=test", "--keep-running", "--connect-timeout-s=60"])
+        .args([
+            "run",
+            "--run=test",
+            "--keep-running",
+            "--connect-timeout-s=60",
+        ])
         .arg(format!("--cav={far}"))
         .arg(format!("--connect=tcp/{}:7447", router_address(0)))
-        .arg(format!("--weights={}", folder.path().join("weights.safetensors").display()))
+        .arg(format!(
+            "--weights={}",
+            folder.path().join("weights.safetensors").display()
+        ))
         .spawn()
         .expect("ip runs");
     wait_until_complete(&mut up);

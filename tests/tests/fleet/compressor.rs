@@ -20,7 +20,10 @@ use perception::detector::Detector;
 use perception::model_config::DetectorConfig;
 use perception::weights::{self, Precision};
 use protocol::message::Bev;
-use protocol::{CavId, DecodedFeatures, Detection, Detections, DropReason, HEADER_LEN, Ledger, Limits, Stream, Topic};
+use protocol::{
+    CavId, DecodedFeatures, Detection, Detections, DropReason, HEADER_LEN, Ledger, Limits, Stream,
+    Topic,
+};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::{Device, Kind, Tensor, no_grad};
 use tests::bus::{TIMEOUT, TestRouter};
@@ -36,24 +39,35 @@ fn cav(name: &str) -> CavId {
 }
 
 fn topic(name: &str, stream: Stream) -> Topic {
-    Topic::Stream { cav: cav(name), stream }
+    Topic::Stream {
+        cav: cav(name),
+        stream,
+    }
 }
 
 /// A weights file of a network that detects vehicles everywhere, the same in everything but its compressor.
 fn weights_file(folder: &Path, compress_ratio: Option<i64>) -> PathBuf {
     let lidar_range_m = [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0];
-    let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
+    let config = DetectorConfig {
+        lidar_range_m,
+        compress_ratio,
+        ..DetectorConfig::lean()
+    };
     let fusion = Method::MAX.default_fusion(&config);
     let model = CooperativeModel::with_fusion(&config, Method::MAX, &fusion, Device::Cpu).unwrap();
     for (name, mut variable) in model.variables.variables() {
         // Values from the shape only.
         let count = variable.numel() as i64;
-        let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
+        let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7)
+            .sin()
+            .view(variable.size().as_slice());
         let new = match name.as_str() {
             "cls_head.bias" => wave * 0.1 + 0.3,
             "cls_head.weight" => wave * 0.01,
             "reg_head.weight" | "reg_head.bias" => wave * 0.0,
-            _ if variable.dim() > 1 => wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt()),
+            _ if variable.dim() > 1 => {
+                wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt())
+            }
             _ => continue,
         };
         no_grad(|| variable.copy_(&new));
@@ -65,7 +79,11 @@ fn weights_file(folder: &Path, compress_ratio: Option<i64>) -> PathBuf {
 }
 
 fn agent(name: &str, weights: &Path) -> Agent {
-    Agent::new(cav(name), Box::new(RecordedPose), Detector::load(weights, Device::Cpu).unwrap())
+    Agent::new(
+        cav(name),
+        Box::new(RecordedPose),
+        Detector::load(weights, Device::Cpu).unwrap(),
+    )
 }
 
 /// Without any network: boxes of every tick, and the bytes of a neighbour's feature map.
@@ -88,8 +106,16 @@ fn offline(folder: &Path, weights: &Path) -> (Vec<Vec<Detection>>, u64) {
                 let output = agent.process(&input).unwrap();
                 let features = output.perception.features;
                 bytes = 4 * features.values.len() as u64;
-                let content = Content::Features(DecodedFeatures { features, sent: None });
-                View { cav: agent.cav().clone(), pose: output.pose, capture_nanos: frame.capture_nanos, content }
+                let content = Content::Features(DecodedFeatures {
+                    features,
+                    sent: None,
+                });
+                View {
+                    cav: agent.cav().clone(),
+                    pose: output.pose,
+                    capture_nanos: frame.capture_nanos,
+                    content,
+                }
             })
             .collect();
         let output = ego.detect(&views[0], &views[1..]).unwrap();
@@ -106,7 +132,9 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
     std::thread::scope(|scope| {
         let scorer = router.join("scorer", "scorer");
         let inbox = scorer.inbox(100, 1);
-        let _listening = scorer.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
+        let _listening = scorer
+            .subscribe(topic("10", Stream::Detections), &inbox)
+            .unwrap();
         for (name, weights) in AGENTS.into_iter().zip([weights, of_neighbour]) {
             let (router, stop, agent) = (&router, stop.clone(), agent(name, weights));
             scope.spawn(move || {
@@ -119,7 +147,10 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
         let router = &router;
         let ego = scope.spawn(move || {
             let bus = router.join("ego-10", "10");
-            let options = ego_node::NodeOptions { deadline: TIMEOUT, ..ego_node::NodeOptions::default() };
+            let options = ego_node::NodeOptions {
+                deadline: TIMEOUT,
+                ..ego_node::NodeOptions::default()
+            };
             ego_node::run(&bus, &cav("10"), ego, &options, &own_stop).unwrap();
             let stats = bus.stats().clone();
             bus.leave(TIMEOUT).unwrap();
@@ -127,9 +158,16 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
         });
         let replay = router.join("replay", "replay");
         let to_ego = AGENTS.map(|name| (topic(name, Stream::Bev), "ego-10"));
-        let routes = to_ego.into_iter().chain([(topic("10", Stream::Detections), "scorer")]);
+        let routes = to_ego
+            .into_iter()
+            .chain([(topic("10", Stream::Detections), "scorer")]);
         let options = StreamOptions {
-            expect: routes.map(|(topic, receiver)| Route { topic, receiver: receiver.parse().unwrap() }).collect(),
+            expect: routes
+                .map(|(topic, receiver)| Route {
+                    topic,
+                    receiver: receiver.parse().unwrap(),
+                })
+                .collect(),
             lockstep: vec![cav("10")],
             agents: AGENTS.map(cav).into(),
             ..StreamOptions::default()
@@ -140,7 +178,8 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
         replay.leave(TIMEOUT).unwrap();
         let mut results = Vec::new();
         while results.len() < TICKS
-            && let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now() + TIMEOUT))
+            && let Pop::Item(_, Event::Message(arrival)) =
+                inbox.take(Some(Instant::now() + TIMEOUT))
         {
             results.push(inbox.decode(&arrival, &Limits::DEFAULT).unwrap());
         }
@@ -162,9 +201,16 @@ fn the_code_is_transmitted_and_offline_and_live_detect_the_same_boxes() {
         assert_eq!((live.len(), ledger.total().dropped_total()), (TICKS, 0));
         for (live, offline) in live.iter().zip(&offline) {
             assert!(!live.detections.is_empty());
-            assert_eq!(&live.detections, offline, "ratio {compress_ratio:?}, frame {}", live.agent_frame);
+            assert_eq!(
+                &live.detections, offline,
+                "ratio {compress_ratio:?}, frame {}",
+                live.agent_frame
+            );
             let metadata = live.fused[0].payload_bytes - expected_bytes;
-            assert!((60..200).contains(&metadata), "{metadata} bytes beside the map");
+            assert!(
+                (60..200).contains(&metadata),
+                "{metadata} bytes beside the map"
+            );
         }
     }
 }
@@ -178,7 +224,11 @@ fn a_map_of_another_compressor_is_left_out_by_its_shape() {
     let (results, ledger) = live(folder.path(), &own, &of_neighbour);
     assert!(results.iter().all(|result| result.fused.is_empty()));
     let dropped = ledger.total().dropped;
-    assert_eq!(dropped.get(&DropReason::Shape).copied(), Some(TICKS as u64), "{dropped:?}");
+    assert_eq!(
+        dropped.get(&DropReason::Shape).copied(),
+        Some(TICKS as u64),
+        "{dropped:?}"
+    );
 }
 
 #[test]
@@ -187,15 +237,32 @@ fn the_message_of_a_code_names_its_channels() {
     let folder = tempfile::tempdir().unwrap();
     let mut agent = agent("10", &weights_file(folder.path(), Some(16)));
     let seen = agent.perceive(&protocol::PointCloud::default()).unwrap();
-    let features = agent.write_map(seen.features, &seen.confidence, &Default::default(), 0).unwrap();
-    let (grid, pose) = (features.grid, protocol::PoseEstimate::new(protocol::Pose::IDENTITY, 1.0));
-    let stamp = protocol::Stamp { cav: cav("10"), epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
-    let bytes = protocol::wire::encode(&stamp, Bev { pose, features }).unwrap().to_vec();
+    let features = agent
+        .write_map(seen.features, &seen.confidence, &Default::default(), 0)
+        .unwrap();
+    let (grid, pose) = (
+        features.grid,
+        protocol::PoseEstimate::new(protocol::Pose::IDENTITY, 1.0),
+    );
+    let stamp = protocol::Stamp {
+        cav: cav("10"),
+        epoch: 0,
+        sequence: 0,
+        capture_nanos: 0,
+        publish_nanos: 0,
+    };
+    let bytes = protocol::wire::encode(&stamp, Bev { pose, features })
+        .unwrap()
+        .to_vec();
     assert!(bytes.len() as u64 - WHOLE_BYTES / 16 < 200 + HEADER_LEN as u64);
-    let (_, message): (_, Bev) = protocol::wire::decode([bytes.as_slice()], &Limits::DEFAULT).unwrap();
+    let (_, message): (_, Bev) =
+        protocol::wire::decode([bytes.as_slice()], &Limits::DEFAULT).unwrap();
     assert_eq!(message.features.check_shape(&grid, 4, Some(64)), Ok(()));
     for (channels, code_of) in [(4, None), (4, Some(128)), (64, None)] {
-        let error = message.features.check_shape(&grid, channels, code_of).unwrap_err();
+        let error = message
+            .features
+            .check_shape(&grid, channels, code_of)
+            .unwrap_err();
         assert_eq!(error.drop_reason(), DropReason::Shape, "{error}");
     }
 }

@@ -24,7 +24,8 @@ use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
 use protocol::message::{Descriptor, ModelHash};
 use protocol::{
-    Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason, Stream, Topic,
+    Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason,
+    Stream, Topic,
 };
 use recording::{Recording, RecordingOptions};
 use sim_replay::recorder::{self, RecordReport, RecorderOptions};
@@ -44,7 +45,10 @@ pub(super) fn cav(text: &str) -> CavId {
 }
 
 pub(super) fn topic(cav_id: &str, stream: Stream) -> Topic {
-    Topic::Stream { cav: cav(cav_id), stream }
+    Topic::Stream {
+        cav: cav(cav_id),
+        stream,
+    }
 }
 
 /// Builds a network with the same random parameters every time.
@@ -57,10 +61,17 @@ fn seeded<T>(build: impl FnOnce() -> T) -> T {
 
 /// A network with a head that detects vehicles everywhere.
 fn network() -> Detector {
-    let config = DetectorConfig { lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0], ..DetectorConfig::lean() };
+    let config = DetectorConfig {
+        lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0],
+        ..DetectorConfig::lean()
+    };
     let network = VarStore::new(Device::Cpu);
     let pillars = PointPillars::new(&network.root(), &config).unwrap();
-    let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.3));
+    let _ = tch::no_grad(|| {
+        network.variables()["cls_head.bias"]
+            .shallow_clone()
+            .fill_(0.3)
+    });
     Detector::from_network(pillars)
 }
 
@@ -97,7 +108,11 @@ fn run_agent<'scope>(
     let stop = stop.clone();
     scope.spawn(move || {
         let bus = router.join(&format!("agent-{cav_id}"), cav_id);
-        let options = agent_node::NodeOptions { publish: vec![stream], rate, ..agent_node::NodeOptions::default() };
+        let options = agent_node::NodeOptions {
+            publish: vec![stream],
+            rate,
+            ..agent_node::NodeOptions::default()
+        };
         let report = agent_node::run(&bus, agent(cav_id), &options, &stop).unwrap();
         assert_eq!(report.failed, 0);
         leave(bus)
@@ -118,7 +133,9 @@ fn collect<'scope>(
 ) -> ScopedJoinHandle<'scope, (Vec<(u64, Detections)>, Ledger)> {
     let bus = router.join("scorer", "scorer");
     let inbox = bus.inbox(1000, 2);
-    let subscription = bus.subscribe(topic(ego, Stream::Detections), &inbox).unwrap();
+    let subscription = bus
+        .subscribe(topic(ego, Stream::Detections), &inbox)
+        .unwrap();
     scope.spawn(move || {
         let mut results = Vec::new();
         loop {
@@ -139,12 +156,20 @@ fn collect<'scope>(
 
 /// Vehicles with a part in a method: ego-only methods need no other.
 fn taking_part(method: Method) -> &'static [&'static str] {
-    if method == Method::NONE { &AGENTS[..1] } else { &AGENTS }
+    if method == Method::NONE {
+        &AGENTS[..1]
+    } else {
+        &AGENTS
+    }
 }
 
 /// Plays the scene in step with the ego, whose neighbours keep within `rate`; returns the ego's results and the sum of
 /// all ledgers.
-fn play_in_lockstep(dir: &Path, method: Method, rate: RateConfig) -> (Vec<(u64, Detections)>, Ledger) {
+fn play_in_lockstep(
+    dir: &Path,
+    method: Method,
+    rate: RateConfig,
+) -> (Vec<(u64, Detections)>, Ledger) {
     play_and_record(dir, method, rate, None)
 }
 
@@ -159,7 +184,12 @@ fn record<'scope>(
     scope.spawn(move || {
         let bus = router.join("recorder", "recorder");
         let recording = RecordingOptions::default();
-        let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
+        let options = RecorderOptions {
+            out,
+            recording,
+            without: Vec::new(),
+            keeps_running: true,
+        };
         let report = recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap();
         bus.leave(TIMEOUT).unwrap();
         report
@@ -181,33 +211,60 @@ fn play_and_record(
         let (recorded, ending) = (Stop::new(), Stop::new());
         let recorder = file.map(|file| record(scope, &router, file, &recorded));
         let start = |cav_id: &&'static str| {
-            let rate = if *cav_id == "10" { RateConfig::default() } else { rate };
+            let rate = if *cav_id == "10" {
+                RateConfig::default()
+            } else {
+                rate
+            };
             run_agent(scope, &router, cav_id, stream, rate, &stop)
         };
         let agents: Vec<_> = taking_part(method).iter().map(start).collect();
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
-            let options = ego_node::NodeOptions { deadline: TIMEOUT, ..ego_node::NodeOptions::default() };
+            let options = ego_node::NodeOptions {
+                deadline: TIMEOUT,
+                ..ego_node::NodeOptions::default()
+            };
             let report = ego_node::run(&bus, &cav("10"), ego(method), &options, &stop).unwrap();
-            assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
+            assert_eq!(
+                (report.frames, report.at_deadline, report.failed),
+                (TICKS as u64, 0, 0)
+            );
             leave(bus)
         });
         let replay = router.join("replay", "replay");
-        let route = |cav_id: &&str| Route { topic: topic(cav_id, stream), receiver: "ego-10".parse().unwrap() };
+        let route = |cav_id: &&str| Route {
+            topic: topic(cav_id, stream),
+            receiver: "ego-10".parse().unwrap(),
+        };
         let expect = taking_part(method).iter().map(route);
-        let scorer = Route { topic: topic("10", Stream::Detections), receiver: "scorer".parse().unwrap() };
+        let scorer = Route {
+            topic: topic("10", Stream::Detections),
+            receiver: "scorer".parse().unwrap(),
+        };
         let options = StreamOptions {
-            expect: expect.chain([scorer]).chain(file.iter().flat_map(|_| to_recorder(method, stream))).collect(),
+            expect: expect
+                .chain([scorer])
+                .chain(file.iter().flat_map(|_| to_recorder(method, stream)))
+                .collect(),
             lockstep: vec![cav("10")],
-            agents: taking_part(method).iter().map(|cav_id| cav(cav_id)).collect(),
+            agents: taking_part(method)
+                .iter()
+                .map(|cav_id| cav(cav_id))
+                .collect(),
             ..StreamOptions::default()
         };
         let playing = Replay::prepare(&replay, &scenario, options, &ending).unwrap();
         playing.wait_until_ready().unwrap();
         let report = playing.play();
-        assert!(report.is_complete() && report.ticks == TICKS as u64, "{report:?}");
+        assert!(
+            report.is_complete() && report.ticks == TICKS as u64,
+            "{report:?}"
+        );
         let mut ledger = leave(replay);
-        agents.into_iter().for_each(|agent| ledger.merge(&agent.join().unwrap()));
+        agents
+            .into_iter()
+            .for_each(|agent| ledger.merge(&agent.join().unwrap()));
         ledger.merge(&ego.join().unwrap());
         let (results, ledger_of_scorer) = listening.join().unwrap();
         ledger.merge(&ledger_of_scorer);
@@ -222,9 +279,16 @@ fn play_and_record(
 /// The routes to a recorder that must receive everything from the beginning.
 fn to_recorder(method: Method, stream: Stream) -> Vec<Route> {
     let streams = [Stream::Lidar, Stream::Gnss, Stream::Pose, stream];
-    let vehicles = taking_part(method).iter().flat_map(|cav_id| streams.map(|stream| topic(cav_id, stream)));
+    let vehicles = taking_part(method)
+        .iter()
+        .flat_map(|cav_id| streams.map(|stream| topic(cav_id, stream)));
     let topics = vehicles.chain([Topic::Truth, topic("10", Stream::Detections)]);
-    topics.map(|topic| Route { topic, receiver: "recorder".parse().unwrap() }).collect()
+    topics
+        .map(|topic| Route {
+            topic,
+            receiver: "recorder".parse().unwrap(),
+        })
+        .collect()
 }
 
 #[test]
@@ -233,18 +297,38 @@ fn a_recorded_run_replayed_gives_the_same_detections() {
     scene::write(folder.path(), &AGENTS, TICKS);
     for method in [Method::MAX, Method::LATE] {
         let file = folder.path().join(format!("{method}.mcap"));
-        let (live, ledger) = play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
-        assert!(ledger.balance().is_exact(), "{method}: a recorder is outside the accounting");
+        let (live, ledger) =
+            play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
+        assert!(
+            ledger.balance().is_exact(),
+            "{method}: a recorder is outside the accounting"
+        );
         let recording = Recording::open(&file).unwrap();
         assert_eq!(recording.damage(), []);
-        let recorded =
-            |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
-        assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(recorded), [TICKS; 3], "{method}");
+        let recorded = |stream| {
+            recording
+                .entries()
+                .iter()
+                .filter(|entry| entry.key.topic == topic("10", stream))
+                .count()
+        };
+        assert_eq!(
+            [Stream::Lidar, Stream::Pose, Stream::Detections].map(recorded),
+            [TICKS; 3],
+            "{method}"
+        );
         let (again, _) = play_in_lockstep(&file, method, RateConfig::default());
         assert_eq!(live.len(), again.len(), "{method}");
-        assert!(live.iter().any(|(_, result)| !result.detections.is_empty()), "{method}: nothing to compare");
+        assert!(
+            live.iter().any(|(_, result)| !result.detections.is_empty()),
+            "{method}: nothing to compare"
+        );
         for ((capture, live), (again_capture, again)) in live.iter().zip(&again) {
-            assert_eq!((capture, live.pose), (again_capture, again.pose), "{method}");
+            assert_eq!(
+                (capture, live.pose),
+                (again_capture, again.pose),
+                "{method}"
+            );
             assert_eq!(live.detections, again.detections, "{method} at {capture}");
         }
     }
@@ -258,7 +342,9 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
     for (tick_index, tick) in scenario.ticks.iter().enumerate() {
         let views: Vec<View> = (agents.iter_mut().enumerate())
             .map(|(index, agent)| {
-                let frame = scenario.load(index, tick_index, &LoadOptions::default()).unwrap();
+                let frame = scenario
+                    .load(index, tick_index, &LoadOptions::default())
+                    .unwrap();
                 let input = AgentInput {
                     capture_nanos: tick.capture_nanos,
                     cloud: &frame.points,
@@ -268,12 +354,20 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                 let output = agent.process(&input).unwrap();
                 let content = match method.own_content() {
                     Exchange::Boxes => Content::Boxes(output.perception.detections),
-                    Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&frame.points)),
-                    Exchange::Features | Exchange::Nothing => {
-                        Content::Features(DecodedFeatures { features: output.perception.features, sent: None })
+                    Exchange::Points => {
+                        Content::Points(agent.detector().crop().without_own_body(&frame.points))
                     }
+                    Exchange::Features | Exchange::Nothing => Content::Features(DecodedFeatures {
+                        features: output.perception.features,
+                        sent: None,
+                    }),
                 };
-                View { cav: agent.cav().clone(), pose: output.pose, capture_nanos: tick.capture_nanos, content }
+                View {
+                    cav: agent.cav().clone(),
+                    pose: output.pose,
+                    capture_nanos: tick.capture_nanos,
+                    content,
+                }
             })
             .collect();
         let detected = ego.detect(&views[0], &views[1..]).unwrap();
@@ -290,18 +384,35 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_ledgers_balance() {
     for method in Method::ALL {
         let (live, ledger) = play_in_lockstep(folder.path(), method, RateConfig::default());
         let offline = play_offline(&scenario, method);
-        assert!(offline.iter().any(|(_, detections)| !detections.is_empty()), "{method}: nothing to compare");
+        assert!(
+            offline.iter().any(|(_, detections)| !detections.is_empty()),
+            "{method}: nothing to compare"
+        );
         assert_eq!(live.len(), offline.len(), "{method}");
-        for (tick, ((live_capture, live), (capture, offline))) in live.iter().zip(&offline).enumerate() {
+        for (tick, ((live_capture, live), (capture, offline))) in
+            live.iter().zip(&offline).enumerate()
+        {
             assert_eq!(live.agent_frame, tick as u64, "{method}");
-            assert_eq!((live_capture, live.detections.len()), (capture, offline.len()), "{method}");
+            assert_eq!(
+                (live_capture, live.detections.len()),
+                (capture, offline.len()),
+                "{method}"
+            );
             for (live, offline) in live.detections.iter().zip(offline) {
                 assert_eq!(live, offline, "{method} at {capture}");
             }
         }
         let expected = taking_part(method).len() - 1;
-        assert!(live.iter().all(|(_, result)| result.fused.len() == expected && result.skipped.is_empty()), "{method}");
-        assert!(live.iter().all(|(_, result)| result.fused.iter().all(|fused| fused.age_nanos == 0)), "{method}");
+        assert!(
+            live.iter()
+                .all(|(_, result)| result.fused.len() == expected && result.skipped.is_empty()),
+            "{method}"
+        );
+        assert!(
+            live.iter()
+                .all(|(_, result)| result.fused.iter().all(|fused| fused.age_nanos == 0)),
+            "{method}"
+        );
 
         let balance = ledger.balance();
         assert!(balance.is_exact(), "{method}: {balance:?}");
@@ -318,9 +429,15 @@ fn maps_within_a_limit_are_fused_and_counted_with_the_reason() {
     let values: i64 = detector().map_shape().iter().product();
     // Half of the bytes of the feature map at a byte per value.
     let limit = values as u64 / 2;
-    let rate = RateConfig { message_bytes: Some(limit), ..RateConfig::default() };
+    let rate = RateConfig {
+        message_bytes: Some(limit),
+        ..RateConfig::default()
+    };
     let (live, ledger) = play_in_lockstep(folder.path(), Method::MAX, rate);
-    assert!(live.iter().all(|(_, result)| result.fused.len() == AGENTS.len() - 1 && result.skipped.is_empty()));
+    assert!(
+        live.iter()
+            .all(|(_, result)| result.fused.len() == AGENTS.len() - 1 && result.skipped.is_empty())
+    );
     for fused in live.iter().flat_map(|(_, result)| &result.fused) {
         let bytes = fused.payload_bytes + protocol::HEADER_LEN as u64;
         assert!(bytes <= limit && bytes > limit / 2, "{bytes} of {limit}");
@@ -330,9 +447,18 @@ fn maps_within_a_limit_are_fused_and_counted_with_the_reason() {
         let account = Account::published(topic(cav_id, Stream::Bev));
         ledger.get(&account).unwrap().adapted.clone()
     };
-    assert!(adapted("10").is_empty(), "the messages of the ego's own agent are not transmitted over the link");
+    assert!(
+        adapted("10").is_empty(),
+        "the messages of the ego's own agent are not transmitted over the link"
+    );
     let fewer = BTreeMap::from([(RateReason::SizeFewerCells, TICKS as u64)]);
-    assert!(AGENTS.iter().filter(|cav_id| **cav_id != "10").all(|cav_id| adapted(cav_id) == fewer), "{ledger:?}");
+    assert!(
+        AGENTS
+            .iter()
+            .filter(|cav_id| **cav_id != "10")
+            .all(|cav_id| adapted(cav_id) == fewer),
+        "{ledger:?}"
+    );
 }
 
 /// An agent whose messages the test sends, so that the test decides which are late, wrong or missing.
@@ -347,15 +473,27 @@ struct ScriptedAgent {
 impl ScriptedAgent {
     fn new(router: &TestRouter, index: usize) -> Self {
         let bus = router.join(&format!("agent-{}", AGENTS[index]), AGENTS[index]);
-        let publisher =
-            bus.publisher(topic(AGENTS[index], Stream::Bev), PublisherOptions::FEATURES.lossless(8)).unwrap();
+        let publisher = bus
+            .publisher(
+                topic(AGENTS[index], Stream::Bev),
+                PublisherOptions::FEATURES.lossless(8),
+            )
+            .unwrap();
         let presence = bus.announce(protocol::Role::Agent).unwrap();
-        Self { bus, publisher, agent: agent(AGENTS[index]), index, _presence: presence }
+        Self {
+            bus,
+            publisher,
+            agent: agent(AGENTS[index]),
+            index,
+            _presence: presence,
+        }
     }
 
     fn send(&mut self, scenario: &Scenario, tick_index: usize) {
         let tick = &scenario.ticks[tick_index];
-        let frame = scenario.load(self.index, tick_index, &LoadOptions::default()).unwrap();
+        let frame = scenario
+            .load(self.index, tick_index, &LoadOptions::default())
+            .unwrap();
         let input = AgentInput {
             capture_nanos: tick.capture_nanos,
             cloud: &frame.points,
@@ -364,16 +502,27 @@ impl ScriptedAgent {
         };
         let output = self.agent.process(&input).unwrap();
         let pose = output.pose;
-        self.publisher.submit_encoded(tick.capture_nanos, move |stamp| {
-            let features =
-                protocol::encode_features(output.perception.features, &protocol::CodecConfig::default(), None)?;
-            protocol::wire::encode(stamp, protocol::message::Bev { pose, features })
-        });
+        self.publisher
+            .submit_encoded(tick.capture_nanos, move |stamp| {
+                let features = protocol::encode_features(
+                    output.perception.features,
+                    &protocol::CodecConfig::default(),
+                    None,
+                )?;
+                protocol::wire::encode(stamp, protocol::message::Bev { pose, features })
+            });
     }
 
     fn wait_for_route(&self, receiver: &str) {
-        let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
-        bus::Barrier::new([route]).await_routes(&self.bus).unwrap().wait(TIMEOUT).unwrap();
+        let route = Route {
+            topic: self.publisher.topic().clone(),
+            receiver: receiver.parse().unwrap(),
+        };
+        bus::Barrier::new([route])
+            .await_routes(&self.bus)
+            .unwrap()
+            .wait(TIMEOUT)
+            .unwrap();
     }
 }
 
@@ -388,19 +537,31 @@ impl Results {
     fn of_10(router: &TestRouter) -> Self {
         let bus = router.join("scorer", "scorer");
         let inbox = bus.inbox(100, 1);
-        let subscription = bus.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
-        Self { inbox, _subscription: subscription, _bus: bus }
+        let subscription = bus
+            .subscribe(topic("10", Stream::Detections), &inbox)
+            .unwrap();
+        Self {
+            inbox,
+            _subscription: subscription,
+            _bus: bus,
+        }
     }
 
     fn next(&self) -> Detections {
-        let (_, Event::Message(arrival)) = next_event(&self.inbox) else { panic!("an end") };
+        let (_, Event::Message(arrival)) = next_event(&self.inbox) else {
+            panic!("an end")
+        };
         self.inbox.decode(&arrival, &Limits::DEFAULT).unwrap()
     }
 }
 
 /// Neighbours that a result was fused from.
 fn fused(result: &Detections) -> Vec<&str> {
-    result.fused.iter().map(|fused| fused.cav.as_str()).collect()
+    result
+        .fused
+        .iter()
+        .map(|fused| fused.cav.as_str())
+        .collect()
 }
 
 #[test]
@@ -410,7 +571,9 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let router = TestRouter::open();
     let stop = Stop::new();
-    let mut fleet: Vec<ScriptedAgent> = (0..3).map(|index| ScriptedAgent::new(&router, index)).collect();
+    let mut fleet: Vec<ScriptedAgent> = (0..3)
+        .map(|index| ScriptedAgent::new(&router, index))
+        .collect();
     let results = Results::of_10(&router);
 
     let ledger = std::thread::scope(|scope| {
@@ -425,7 +588,9 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
             ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             leave(bus)
         });
-        fleet.iter().for_each(|agent| agent.wait_for_route("ego-10"));
+        fleet
+            .iter()
+            .for_each(|agent| agent.wait_for_route("ego-10"));
 
         // All present.
         for index in [1, 2, 0] {
@@ -445,11 +610,19 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
         fleet[0].send(&scenario, 2);
         let result = results.next();
         assert_eq!(fused(&result), ["20"]);
-        assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("30", None));
+        assert_eq!(
+            (result.skipped[0].cav.as_str(), result.skipped[0].reason),
+            ("30", None)
+        );
 
         // 20 sends garbage under its own name: counted, and the ego goes on without it.
         let key = fleet[1].bus.key(topic("20", Stream::Bev)).to_string();
-        fleet[1].bus.session().put(&key, vec![0xAB; 4096]).wait().unwrap();
+        fleet[1]
+            .bus
+            .session()
+            .put(&key, vec![0xAB; 4096])
+            .wait()
+            .unwrap();
         fleet[2].send(&scenario, 3);
         fleet[0].send(&scenario, 3);
         let result = results.next();
@@ -466,11 +639,21 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
         stop.request();
         ego.join().unwrap()
     });
-    let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let from_20 = ledger.get(&Account::towards(
+        topic("20", Stream::Bev),
+        &process_id(protocol::Role::Ego, &cav("10")),
+    ));
     let from_20 = from_20.unwrap();
-    assert_eq!(from_20.dropped.get(&DropReason::Decode), Some(&1), "{from_20:?}");
+    assert_eq!(
+        from_20.dropped.get(&DropReason::Decode),
+        Some(&1),
+        "{from_20:?}"
+    );
     assert_eq!(from_20.received, 3);
-    let own = ledger.get(&Account::towards(topic("10", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let own = ledger.get(&Account::towards(
+        topic("10", Stream::Bev),
+        &process_id(protocol::Role::Ego, &cav("10")),
+    ));
     assert_eq!(own.unwrap().received, 6);
 }
 
@@ -480,7 +663,9 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
     scene::write(folder.path(), &AGENTS, TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
-    let mut fleet: Vec<ScriptedAgent> = (0..3).map(|index| ScriptedAgent::new(&router, index)).collect();
+    let mut fleet: Vec<ScriptedAgent> = (0..3)
+        .map(|index| ScriptedAgent::new(&router, index))
+        .collect();
     let results = Results::of_10(&router);
     let own = Descriptor {
         model_hash: detector().model_hash(),
@@ -493,29 +678,54 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             // A frame that waited for an excluded neighbour would take for ever.
-            let options = ego_node::NodeOptions { deadline: TIMEOUT, keeps_running: true, ..Default::default() };
-            let report = ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
+            let options = ego_node::NodeOptions {
+                deadline: TIMEOUT,
+                keeps_running: true,
+                ..Default::default()
+            };
+            let report =
+                ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
         });
-        fleet.iter().for_each(|agent| agent.wait_for_route("ego-10"));
+        fleet
+            .iter()
+            .for_each(|agent| agent.wait_for_route("ego-10"));
         let describe = |agent: &ScriptedAgent, descriptor: Descriptor| {
-            let publisher = agent.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
+            let publisher = agent
+                .bus
+                .publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE)
+                .unwrap();
             publisher.submit(0, descriptor);
             // It is transmitted before the next map is.
             publisher.finish();
         };
-        let send_all = |fleet: &mut [ScriptedAgent], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
+        let send_all = |fleet: &mut [ScriptedAgent], tick| {
+            [1, 2, 0].map(|index| fleet[index].send(&scenario, tick))
+        };
 
         send_all(&mut fleet, 0);
-        assert_eq!(fused(&results.next()), ["20", "30"], "no descriptor has arrived");
+        assert_eq!(
+            fused(&results.next()),
+            ["20", "30"],
+            "no descriptor has arrived"
+        );
 
-        describe(&fleet[1], Descriptor { model_hash: ModelHash([9; 32]), ..own.clone() });
+        describe(
+            &fleet[1],
+            Descriptor {
+                model_hash: ModelHash([9; 32]),
+                ..own.clone()
+            },
+        );
         for tick in 1..3 {
             send_all(&mut fleet, tick);
             let result = results.next();
             assert_eq!(fused(&result), ["30"]);
-            assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("20", Some(DropReason::Shape)));
+            assert_eq!(
+                (result.skipped[0].cav.as_str(), result.skipped[0].reason),
+                ("20", Some(DropReason::Shape))
+            );
         }
 
         // It was restarted, with the right weights.
@@ -529,10 +739,22 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         stop.request();
         ego.join().unwrap()
     });
-    let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let from_20 = ledger.get(&Account::towards(
+        topic("20", Stream::Bev),
+        &process_id(protocol::Role::Ego, &cav("10")),
+    ));
     let from_20 = from_20.unwrap();
-    assert_eq!((from_20.received, from_20.dropped.get(&DropReason::Shape)), (2, Some(&2)), "{from_20:?}");
-    assert!(ledger.iter().all(|(account, _)| account.topic != topic("20", Stream::Descriptor)), "not counted");
+    assert_eq!(
+        (from_20.received, from_20.dropped.get(&DropReason::Shape)),
+        (2, Some(&2)),
+        "{from_20:?}"
+    );
+    assert!(
+        ledger
+            .iter()
+            .all(|(account, _)| account.topic != topic("20", Stream::Descriptor)),
+        "not counted"
+    );
 }
 
 #[test]
@@ -542,17 +764,47 @@ fn an_agent_receives_its_own_sensors_only_and_reports_a_missing_pose() {
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
     let ledger = std::thread::scope(|scope| {
-        let running = run_agent(scope, &router, "20", Stream::Bev, RateConfig::default(), &stop);
+        let running = run_agent(
+            scope,
+            &router,
+            "20",
+            Stream::Bev,
+            RateConfig::default(),
+            &stop,
+        );
         let replay = router.join("replay", "replay");
-        let lidar =
-            |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();
+        let lidar = |cav_id| {
+            replay
+                .publisher(
+                    topic(cav_id, Stream::Lidar),
+                    PublisherOptions::SENSOR.lossless(8),
+                )
+                .unwrap()
+        };
         let (own, other) = (lidar("20"), lidar("10"));
-        let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
-        bus::Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
+        let route = Route {
+            topic: topic("20", Stream::Lidar),
+            receiver: "agent-20".parse().unwrap(),
+        };
+        bus::Barrier::new([route])
+            .await_routes(&replay)
+            .unwrap()
+            .wait(TIMEOUT)
+            .unwrap();
         let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
         // A sweep without a pose.
-        other.submit(1, protocol::Lidar { points: frame.points.clone() });
-        own.submit(1, protocol::Lidar { points: frame.points });
+        other.submit(
+            1,
+            protocol::Lidar {
+                points: frame.points.clone(),
+            },
+        );
+        own.submit(
+            1,
+            protocol::Lidar {
+                points: frame.points,
+            },
+        );
         other.finish();
         own.finish();
         running.join().unwrap()
@@ -564,9 +816,19 @@ fn an_agent_receives_its_own_sensors_only_and_reports_a_missing_pose() {
     assert_eq!(
         received,
         BTreeMap::from(
-            ["20/gnss", "20/imu", "20/lidar"].map(|topic| (topic.to_owned(), u64::from(topic == "20/lidar")))
+            ["20/gnss", "20/imu", "20/lidar"]
+                .map(|topic| (topic.to_owned(), u64::from(topic == "20/lidar")))
         )
     );
-    let sent = |stream| ledger.get(&Account::published(topic("20", stream))).unwrap().sent;
-    assert_eq!((sent(Stream::Pose), sent(Stream::Bev)), (1, 1), "it reports that it has none");
+    let sent = |stream| {
+        ledger
+            .get(&Account::published(topic("20", stream)))
+            .unwrap()
+            .sent
+    };
+    assert_eq!(
+        (sent(Stream::Pose), sent(Stream::Bev)),
+        (1, 1),
+        "it reports that it has none"
+    );
 }

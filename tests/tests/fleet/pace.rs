@@ -26,26 +26,54 @@ struct Sweeps {
 impl Sweeps {
     fn open(replay: &Bus, agent: &MessageStats) -> Self {
         let receiver: ProcessId = "agent-10".parse().unwrap();
-        let route = Route { topic: topic("10", Stream::Lidar), receiver: receiver.clone() };
-        let lidar = replay.publisher(route.topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+        let route = Route {
+            topic: topic("10", Stream::Lidar),
+            receiver: receiver.clone(),
+        };
+        let lidar = replay
+            .publisher(route.topic.clone(), PublisherOptions::SENSOR.lossless(8))
+            .unwrap();
         let account = Account::towards(route.topic.clone(), &receiver);
-        Barrier::new([route]).await_routes(replay).unwrap().wait(TIMEOUT).unwrap();
-        Self { lidar, agent: agent.clone(), account, next: 0 }
+        Barrier::new([route])
+            .await_routes(replay)
+            .unwrap()
+            .wait(TIMEOUT)
+            .unwrap();
+        Self {
+            lidar,
+            agent: agent.clone(),
+            account,
+            next: 0,
+        }
     }
 
     /// Sweeps of vehicle 10 that were computed, and those that were left out.
     fn handled(&self) -> [u64; 2] {
         let ledger = self.agent.ledger();
         let counts = ledger.get(&self.account).cloned().unwrap_or_default();
-        [counts.received, counts.dropped.get(&DropReason::Paced).copied().unwrap_or_default()]
+        [
+            counts.received,
+            counts
+                .dropped
+                .get(&DropReason::Paced)
+                .copied()
+                .unwrap_or_default(),
+        ]
     }
 
     /// Publishes the sweeps of one interval of the slow ego one after another; which of them were computed.
     fn interval(&mut self) -> Vec<u64> {
         let publish = |sweep: u64| {
             let [computed, left_out] = self.handled();
-            self.lidar.submit((self.next + sweep) * PERIOD_NANOS, Lidar { points: PointCloud::default() });
-            wait_for("the sweep", || self.handled().iter().sum::<u64>() > computed + left_out);
+            self.lidar.submit(
+                (self.next + sweep) * PERIOD_NANOS,
+                Lidar {
+                    points: PointCloud::default(),
+                },
+            );
+            wait_for("the sweep", || {
+                self.handled().iter().sum::<u64>() > computed + left_out
+            });
             self.handled()[0] > computed
         };
         let computed = (0..SWEEPS).filter(|&sweep| publish(sweep)).collect();
@@ -58,12 +86,17 @@ impl Sweeps {
 fn an_agent_serves_the_faster_of_two_egos_and_forgets_those_that_leave() {
     let router = TestRouter::open();
     let (stop, fast_stop) = (Stop::new(), Stop::new());
-    let (agent_bus, replay) = (router.join("agent-10", "10"), router.join("replay", "replay"));
+    let (agent_bus, replay) = (
+        router.join("agent-10", "10"),
+        router.join("replay", "replay"),
+    );
     let agent_stats = agent_bus.stats().clone();
     std::thread::scope(|scope| {
         let own_stop = stop.clone();
         let running = scope.spawn(move || {
-            let report = agent_node::run(&agent_bus, agent("10"), &NodeOptions::default(), &own_stop).unwrap();
+            let report =
+                agent_node::run(&agent_bus, agent("10"), &NodeOptions::default(), &own_stop)
+                    .unwrap();
             agent_bus.leave(TIMEOUT).unwrap();
             report
         });
@@ -72,11 +105,19 @@ fn an_agent_serves_the_faster_of_two_egos_and_forgets_those_that_leave() {
         assert_eq!(sweeps.interval(), all, "there is no pace");
 
         let slow_bus = router.join("ego-30", "30");
-        let slow = slow_bus.publisher(topic("30", Stream::Pace), PublisherOptions::POSE).unwrap();
+        let slow = slow_bus
+            .publisher(topic("30", Stream::Pace), PublisherOptions::POSE)
+            .unwrap();
         // Repeated, as an ego does.
         let mut becomes = |what: &str, expected: &[u64]| {
             wait_for(what, || {
-                slow.submit(0, Pace { interval_nanos: SWEEPS * PERIOD_NANOS, phase_nanos: 0 });
+                slow.submit(
+                    0,
+                    Pace {
+                        interval_nanos: SWEEPS * PERIOD_NANOS,
+                        phase_nanos: 0,
+                    },
+                );
                 sweeps.interval() == expected
             });
         };
@@ -85,13 +126,23 @@ fn an_agent_serves_the_faster_of_two_egos_and_forgets_those_that_leave() {
         // An ego that keeps up: its own agent publishes nothing, so no frame is late.
         let fast = scope.spawn(|| {
             let bus = router.join("ego-20", "20");
-            ego_node::run(&bus, &cav("20"), ego(Method::MAX), &ego_node::NodeOptions::default(), &fast_stop).unwrap();
+            ego_node::run(
+                &bus,
+                &cav("20"),
+                ego(Method::MAX),
+                &ego_node::NodeOptions::default(),
+                &fast_stop,
+            )
+            .unwrap();
             bus.leave(TIMEOUT).unwrap();
         });
         becomes("the faster ego is served", &all);
         fast_stop.request();
         fast.join().unwrap();
-        becomes("the faster ego has left, the slow one sets the pace again", &[0]);
+        becomes(
+            "the faster ego has left, the slow one sets the pace again",
+            &[0],
+        );
 
         // The slow one hangs: it says nothing, not even that it leaves.
         wait_for("the slow ego is forgotten", || sweeps.interval() == all);

@@ -18,7 +18,12 @@ fn json(path: &std::path::Path) -> Value {
 fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    let scenario = write_scenario(folder.path(), 8, "lockstep: true, seek: 2", "record: {without: [bev]}");
+    let scenario = write_scenario(
+        folder.path(),
+        8,
+        "lockstep: true, seek: 2",
+        "record: {without: [bev]}",
+    );
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();
     let run = &up.folder;
@@ -27,34 +32,72 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
 
     let metrics = json(&run.join("metrics.json"));
-    assert_eq!((&metrics["frames"], &metrics["method"], &metrics["clock"]), (&6.into(), &"max".into(), &"wall".into()));
+    assert_eq!(
+        (&metrics["frames"], &metrics["method"], &metrics["clock"]),
+        (&6.into(), &"max".into(), &"wall".into())
+    );
     assert_eq!(metrics["pose"]["success_3m"], 1.0);
-    assert!(metrics["latency_ms"]["capture_to_detection"]["p50"].as_f64().unwrap() > 0.0);
+    assert!(
+        metrics["latency_ms"]["capture_to_detection"]["p50"]
+            .as_f64()
+            .unwrap()
+            > 0.0
+    );
     // An f32 feature map of 8 channels on 64 x 64 cells, and a little more.
     let payload = metrics["comm"]["payload_bytes_mean"].as_f64().unwrap();
     assert!((131_072.0..140_000.0).contains(&payload), "{payload}");
 
     let results = results(run);
     assert_eq!(results.len(), 6);
-    assert!(results.iter().all(|result| fused(result) == 1), "in lockstep no message is late");
-    let ticks: Vec<_> =
-        results.iter().map(|result| (result["tick"].as_u64(), result["agent_frame"].as_u64())).collect();
-    assert_eq!(ticks, (0..6).map(|frame| (Some(frame + 2), Some(frame))).collect::<Vec<_>>());
+    assert!(
+        results.iter().all(|result| fused(result) == 1),
+        "in lockstep no message is late"
+    );
+    let ticks: Vec<_> = results
+        .iter()
+        .map(|result| (result["tick"].as_u64(), result["agent_frame"].as_u64()))
+        .collect();
+    assert_eq!(
+        ticks,
+        (0..6)
+            .map(|frame| (Some(frame + 2), Some(frame)))
+            .collect::<Vec<_>>()
+    );
     let frames = fs::read_to_string(run.join("frames.csv")).unwrap();
-    let of_table: Vec<_> = frames.lines().skip(1).map(|line| line.split(',').take(3).collect::<Vec<_>>()).collect();
-    let of_results = |result: &Value| ["tick", "agent_frame", "capture_nanos"].map(|name| result[name].to_string());
-    assert_eq!(of_table, results.iter().map(of_results).collect::<Vec<_>>(), "both files count alike");
+    let of_table: Vec<_> = frames
+        .lines()
+        .skip(1)
+        .map(|line| line.split(',').take(3).collect::<Vec<_>>())
+        .collect();
+    let of_results = |result: &Value| {
+        ["tick", "agent_frame", "capture_nanos"].map(|name| result[name].to_string())
+    };
+    assert_eq!(
+        of_table,
+        results.iter().map(of_results).collect::<Vec<_>>(),
+        "both files count alike"
+    );
     assert!(fs::metadata(run.join("frame.png")).unwrap().len() > 1_000);
     let recording = Recording::open(&run.join("recording.mcap")).unwrap();
     assert_eq!(recording.damage(), []);
     let recorded = |stream| {
         let is_it = |topic: &Topic| matches!(topic, Topic::Stream { stream: known, .. } if *known == stream);
-        recording.entries().iter().filter(|entry| is_it(&entry.key.topic)).count()
+        recording
+            .entries()
+            .iter()
+            .filter(|entry| is_it(&entry.key.topic))
+            .count()
     };
-    assert_eq!([Stream::Lidar, Stream::Detections, Stream::Bev].map(recorded), [12, 6, 0]);
+    assert_eq!(
+        [Stream::Lidar, Stream::Detections, Stream::Bev].map(recorded),
+        [12, 6, 0]
+    );
     for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "recorder"] {
         assert!(run.join(format!("log/{process}.log")).exists(), "{process}");
-        assert!(run.join(format!("config/{process}.yaml")).exists(), "{process}");
+        assert!(
+            run.join(format!("config/{process}.yaml")).exists(),
+            "{process}"
+        );
     }
     let resolved = Scenario::load(&run.join("scenario.yaml")).unwrap();
     assert_eq!(resolved.scene.agents.len(), 2);
@@ -77,10 +120,18 @@ fn a_fleet_runs_over_an_emulated_link() {
     assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
     assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
     let results = results(run);
-    assert!(results.len() == 4 && results.iter().all(|result| fused(result) == 1), "all maps came through");
+    assert!(
+        results.len() == 4 && results.iter().all(|result| fused(result) == 1),
+        "all maps came through"
+    );
     let metrics = json(&run.join("metrics.json"));
-    let latency_ms = metrics["latency_ms"]["capture_to_detection"]["p50"].as_f64().unwrap();
-    assert!(latency_ms > 82.0, "{latency_ms} ms are less than the link takes");
+    let latency_ms = metrics["latency_ms"]["capture_to_detection"]["p50"]
+        .as_f64()
+        .unwrap();
+    assert!(
+        latency_ms > 82.0,
+        "{latency_ms} ms are less than the link takes"
+    );
     assert!(run.join("log/link-4279.log").exists());
 }
 
@@ -97,11 +148,18 @@ fn ctrl_c_ends_everything_within_five_seconds() {
     let asked = Instant::now();
     signal(up.pid(), "INT");
     let status = up.wait();
-    assert!(asked.elapsed() < Duration::from_secs(5), "{:?}", asked.elapsed());
+    assert!(
+        asked.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        asked.elapsed()
+    );
     assert!(matches!(status.code(), Some(0 | 3)), "{status}");
     assert!(pids.values().all(|pid| !is_running(*pid)), "{pids:?}");
     let metrics = json(&up.folder.join("metrics.json"));
-    assert!(metrics["frames"].as_u64().unwrap() >= 5, "the run is written all the same: {metrics}");
+    assert!(
+        metrics["frames"].as_u64().unwrap() >= 5,
+        "the run is written all the same: {metrics}"
+    );
 }
 
 #[test]
@@ -111,14 +169,24 @@ fn a_killed_agent_is_started_again_and_fused_again() {
     let scenario = write_scenario(folder.path(), 3, "loop: true", "");
     let mut up = Up::start(folder.path(), &scenario);
     let is_fused = |result: &Value| fused(result) == 1;
-    up.wait_for_results("a fused result", |results| results.last().is_some_and(is_fused));
+    up.wait_for_results("a fused result", |results| {
+        results.last().is_some_and(is_fused)
+    });
     signal(up.pids()["agent-4288"], "KILL");
-    up.wait_for_results("the ego going on without it", |results| results.last().is_some_and(|last| !is_fused(last)));
+    up.wait_for_results("the ego going on without it", |results| {
+        results.last().is_some_and(|last| !is_fused(last))
+    });
     let crashed = up.wait_for_line("agent-4288 was ended by signal 9");
     assert!(crashed.contains("starting it again"), "{crashed}");
-    up.wait_for_results("the agent being fused again", |results| results.last().is_some_and(is_fused));
+    up.wait_for_results("the agent being fused again", |results| {
+        results.last().is_some_and(is_fused)
+    });
     signal(up.pid(), "INT");
-    assert_eq!(up.wait().code(), Some(3), "what was lost with the agent is not hidden");
+    assert_eq!(
+        up.wait().code(),
+        Some(3),
+        "what was lost with the agent is not hidden"
+    );
 }
 
 #[test]
@@ -134,12 +202,26 @@ fn a_killed_replay_goes_on_where_it_was() {
     assert!(crashed.contains("starting it again"), "{crashed}");
     let code = up.wait().code();
     // The tick in transit at the crash may be lost; then that is reported.
-    let judged = json(&up.folder.join("metrics.json"))["frames"].as_u64().unwrap();
-    assert!(judged == 40 && matches!(code, Some(0 | 3)) || judged == 39 && code == Some(3), "{judged}, {code:?}");
+    let judged = json(&up.folder.join("metrics.json"))["frames"]
+        .as_u64()
+        .unwrap();
+    assert!(
+        judged == 40 && matches!(code, Some(0 | 3)) || judged == 39 && code == Some(3),
+        "{judged}, {code:?}"
+    );
     let results = results(&up.folder);
     let capture = |result: &Value| result["capture_nanos"].as_u64().unwrap();
-    assert!(results.len() > before && results.windows(2).all(|pair| capture(&pair[0]) < capture(&pair[1])));
-    assert_eq!(results.last().unwrap()["tick"], 39, "to the end of the scene, which is the run's");
+    assert!(
+        results.len() > before
+            && results
+                .windows(2)
+                .all(|pair| capture(&pair[0]) < capture(&pair[1]))
+    );
+    assert_eq!(
+        results.last().unwrap()["tick"],
+        39,
+        "to the end of the scene, which is the run's"
+    );
     let ledger = json(&up.folder.join("ledger.json"));
     assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
 }

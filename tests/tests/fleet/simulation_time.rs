@@ -37,8 +37,18 @@ fn config(link: LinkConfig) -> SteppedConfig {
 }
 
 /// The frames of a scene in `folder`, and the ledger.
-fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
-    evaluate_with(folder, stepped, CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() })
+fn evaluate(
+    folder: &Path,
+    stepped: Option<SteppedConfig>,
+) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
+    evaluate_with(
+        folder,
+        stepped,
+        CodecConfig {
+            dtype: Dtype::F16,
+            ..CodecConfig::default()
+        },
+    )
 }
 
 fn evaluate_with(
@@ -57,7 +67,10 @@ fn evaluate_with(
     if let Some(stepped) = stepped {
         evaluator = evaluator.with_link(stepped);
     }
-    let scenario = dataset::open(&folder.join("scene")).unwrap().scenarios.remove(0);
+    let scenario = dataset::open(&folder.join("scene"))
+        .unwrap()
+        .scenarios
+        .remove(0);
     let mut frames = Vec::new();
     let _ = evaluator
         .run(&scenario, &mut |frame| {
@@ -77,7 +90,12 @@ fn scene() -> tempfile::TempDir {
 }
 
 fn ages_ms(frame: &EvaluatedFrame) -> Vec<i64> {
-    frame.result.fused.iter().map(|neighbour| neighbour.age_nanos / MS as i64).collect()
+    frame
+        .result
+        .fused
+        .iter()
+        .map(|neighbour| neighbour.age_nanos / MS as i64)
+        .collect()
 }
 
 #[test]
@@ -89,24 +107,44 @@ fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
     for (offline, stepped) in offline.iter().zip(&stepped) {
         assert!(!offline.result.detections.is_empty());
         assert_eq!(offline.result.detections, stepped.result.detections);
-        assert_eq!((&offline.result.fused, &offline.objects), (&stepped.result.fused, &stepped.objects));
+        assert_eq!(
+            (&offline.result.fused, &offline.objects),
+            (&stepped.result.fused, &stepped.objects)
+        );
     }
-    assert!(nothing.is_empty() && ledger.balance().is_exact(), "{:?}", ledger.balance());
+    assert!(
+        nothing.is_empty() && ledger.balance().is_exact(),
+        "{:?}",
+        ledger.balance()
+    );
     // Two neighbours with a pose and a map each per tick.
-    assert_eq!((ledger.total().sent, ledger.total().received), (4 * TICKS as u64, 4 * TICKS as u64));
+    assert_eq!(
+        (ledger.total().sent, ledger.total().received),
+        (4 * TICKS as u64, 4 * TICKS as u64)
+    );
 }
 
 /// Cells that the ego masks out for others are present in its own map, over a link and without one.
 #[test]
 fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
     let folder = scene();
-    let codec = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(4000), ..CodecConfig::default() };
+    let codec = CodecConfig {
+        dtype: Dtype::F16,
+        budget_bytes: Some(4000),
+        ..CodecConfig::default()
+    };
     let (offline, _) = evaluate_with(folder.path(), None, codec);
     let (stepped, _) = evaluate_with(folder.path(), Some(config(LinkConfig::default())), codec);
     assert_eq!(offline.len(), TICKS);
     for (offline, stepped) in offline.iter().zip(&stepped) {
         // A complete feature map has 65 kB.
-        assert!(offline.result.fused.iter().all(|neighbour| neighbour.payload_bytes < 20_000));
+        assert!(
+            offline
+                .result
+                .fused
+                .iter()
+                .all(|neighbour| neighbour.payload_bytes < 20_000)
+        );
         assert!(!offline.result.detections.is_empty());
         assert_eq!(offline.result.detections, stepped.result.detections);
     }
@@ -115,27 +153,58 @@ fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
 #[test]
 fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
     let folder = scene();
-    for (delay_ms, compute_ms, age_ms, first_tick) in
-        [(0.0, 100.0, 0, 0), (0.0, 80.0, 0, 0), (30.0, 80.0, 100, 1), (120.0, 80.0, 100, 1), (250.0, 0.0, 200, 2)]
-    {
-        let link = LinkConfig { delay: DelayModel::ConstantMs(delay_ms), ..LinkConfig::default() };
-        let compute =
-            ComputeTimes { pose_ms: 20.0f64.min(compute_ms), map_ms: (compute_ms - 20.0).max(0.0), fuse_ms: 5.0 };
-        let (frames, ledger) = evaluate(folder.path(), Some(SteppedConfig { compute, ..config(link) }));
+    for (delay_ms, compute_ms, age_ms, first_tick) in [
+        (0.0, 100.0, 0, 0),
+        (0.0, 80.0, 0, 0),
+        (30.0, 80.0, 100, 1),
+        (120.0, 80.0, 100, 1),
+        (250.0, 0.0, 200, 2),
+    ] {
+        let link = LinkConfig {
+            delay: DelayModel::ConstantMs(delay_ms),
+            ..LinkConfig::default()
+        };
+        let compute = ComputeTimes {
+            pose_ms: 20.0f64.min(compute_ms),
+            map_ms: (compute_ms - 20.0).max(0.0),
+            fuse_ms: 5.0,
+        };
+        let (frames, ledger) = evaluate(
+            folder.path(),
+            Some(SteppedConfig {
+                compute,
+                ..config(link)
+            }),
+        );
         for (tick, frame) in frames.iter().enumerate() {
-            let expected = if tick < first_tick { vec![] } else { vec![age_ms; 2] };
+            let expected = if tick < first_tick {
+                vec![]
+            } else {
+                vec![age_ms; 2]
+            };
             assert_eq!(ages_ms(frame), expected, "delay {delay_ms} ms, tick {tick}");
             // A complete frame is not delayed.
             let took_ms = (frame.stamp.publish_nanos - frame.stamp.capture_nanos) / MS;
-            let expected = if age_ms == 0 { compute_ms as u64 + 5 } else { 105 };
+            let expected = if age_ms == 0 {
+                compute_ms as u64 + 5
+            } else {
+                105
+            };
             assert_eq!(took_ms, expected, "delay {delay_ms} ms, tick {tick}");
         }
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     }
     // Older than the age limit of the fusion.
-    let link = LinkConfig { delay: DelayModel::ConstantMs(450.0), ..LinkConfig::default() };
+    let link = LinkConfig {
+        delay: DelayModel::ConstantMs(450.0),
+        ..LinkConfig::default()
+    };
     let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
-    assert!(frames.iter().all(|frame| frame.result.fused.is_empty() && frame.result.skipped.len() == 2));
+    assert!(
+        frames
+            .iter()
+            .all(|frame| frame.result.fused.is_empty() && frame.result.skipped.len() == 2)
+    );
     assert!(ledger.total().dropped[&DropReason::Stale] > 0 && ledger.balance().is_exact());
 }
 
@@ -148,8 +217,18 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
         // 5 ms a frame.
         (0.0, -5e4, [10, 15, 20]),
     ] {
-        let clock = DeviceClock { offset_ms, drift_ppm, step: None };
-        let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
+        let clock = DeviceClock {
+            offset_ms,
+            drift_ppm,
+            step: None,
+        };
+        let (frames, ledger) = evaluate(
+            folder.path(),
+            Some(config(LinkConfig {
+                clock,
+                ..LinkConfig::default()
+            })),
+        );
         // The scene begins at 0, and no clock is below that.
         for (frame, age_ms) in frames[2..].iter().zip(ages_in_ms) {
             assert_eq!(ages_ms(frame), [age_ms; 2], "{clock:?}");
@@ -162,9 +241,21 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
 fn a_clock_that_is_set_costs_only_its_vehicle() {
     let folder = scene();
     let run = |by_ms| {
-        let clock = DeviceClock { step: Some(ClockStep { at_s: 0.2, by_ms }), ..DeviceClock::default() };
-        let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
-        assert!(frames.len() == TICKS && ledger.balance().is_exact(), "by {by_ms} ms: {ledger:?}");
+        let clock = DeviceClock {
+            step: Some(ClockStep { at_s: 0.2, by_ms }),
+            ..DeviceClock::default()
+        };
+        let (frames, ledger) = evaluate(
+            folder.path(),
+            Some(config(LinkConfig {
+                clock,
+                ..LinkConfig::default()
+            })),
+        );
+        assert!(
+            frames.len() == TICKS && ledger.balance().is_exact(),
+            "by {by_ms} ms: {ledger:?}"
+        );
         (frames.iter().map(ages_ms).collect::<Vec<_>>(), ledger)
     };
     let (ages_ms, ledger) = run(10_000.0);
@@ -173,19 +264,36 @@ fn a_clock_that_is_set_costs_only_its_vehicle() {
     assert_eq!(ages_ms[..5], expected);
     assert!(ages_ms[5..].iter().all(Vec::is_empty), "{ages_ms:?}");
     // Its later messages wait for a time after the end of the scene.
-    assert_eq!(ledger.total().in_flight, 2 * (TICKS as u64 - 2), "{ledger:?}");
+    assert_eq!(
+        ledger.total().in_flight,
+        2 * (TICKS as u64 - 2),
+        "{ledger:?}"
+    );
     let (ages_ms, _) = run(-30.0);
-    assert!(ages_ms[..2].iter().all(|ages| ages == &[0, 0]), "{ages_ms:?}");
-    assert!(ages_ms[2..].iter().all(|ages| ages == &[30, 30]), "{ages_ms:?}");
+    assert!(
+        ages_ms[..2].iter().all(|ages| ages == &[0, 0]),
+        "{ages_ms:?}"
+    );
+    assert!(
+        ages_ms[2..].iter().all(|ages| ages == &[30, 30]),
+        "{ages_ms:?}"
+    );
 }
 
 #[test]
 fn fewer_vehicles_leave_the_truth_as_it_is() {
     let folder = scene();
-    let crew = |count| SteppedConfig { crew: AgentPool::First(count), ..config(LinkConfig::default()) };
+    let crew = |count| SteppedConfig {
+        crew: AgentPool::First(count),
+        ..config(LinkConfig::default())
+    };
     let (all, _) = evaluate(folder.path(), Some(crew(3)));
     let (two, _) = evaluate(folder.path(), Some(crew(2)));
-    assert!(all.iter().zip(&two).all(|(all, two)| all.objects == two.objects));
+    assert!(
+        all.iter()
+            .zip(&two)
+            .all(|(all, two)| all.objects == two.objects)
+    );
     assert!(all.iter().all(|frame| frame.result.fused.len() == 2));
     assert!(two.iter().all(|frame| frame.result.fused.len() == 1));
 }
@@ -193,18 +301,44 @@ fn fewer_vehicles_leave_the_truth_as_it_is() {
 #[test]
 fn losses_are_counted_and_come_from_the_seed() {
     let folder = scene();
-    let link = LinkConfig { loss: LossModel::Bernoulli(0.4), duplicate: 0.3, ..LinkConfig::default() };
-    let run = |seed| evaluate(folder.path(), Some(SteppedConfig { seed, ..config(link.clone()) }));
+    let link = LinkConfig {
+        loss: LossModel::Bernoulli(0.4),
+        duplicate: 0.3,
+        ..LinkConfig::default()
+    };
+    let run = |seed| {
+        evaluate(
+            folder.path(),
+            Some(SteppedConfig {
+                seed,
+                ..config(link.clone())
+            }),
+        )
+    };
     let ((frames, ledger), (again, same)) = (run(1), run(1));
     assert_eq!(ledger, same);
-    assert!(frames.iter().zip(&again).all(|(one, other)| one.result == other.result && one.stamp == other.stamp));
+    assert!(
+        frames
+            .iter()
+            .zip(&again)
+            .all(|(one, other)| one.result == other.result && one.stamp == other.stamp)
+    );
     let total = ledger.total();
-    assert!(total.dropped[&DropReason::LinkLoss] > 0 && total.dropped[&DropReason::Duplicate] > 0, "{total:?}");
+    assert!(
+        total.dropped[&DropReason::LinkLoss] > 0 && total.dropped[&DropReason::Duplicate] > 0,
+        "{total:?}"
+    );
     assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     assert_ne!(run(2).1, ledger);
 }
 
-const FILES: [&str; 5] = ["metrics.json", "frames.csv", "ledger.json", "detections.jsonl", "truth.jsonl"];
+const FILES: [&str; 5] = [
+    "metrics.json",
+    "frames.csv",
+    "ledger.json",
+    "detections.jsonl",
+    "truth.jsonl",
+];
 
 fn assert_same_bytes(one: &RunResult, other: &RunResult) {
     for name in FILES {
@@ -214,7 +348,11 @@ fn assert_same_bytes(one: &RunResult, other: &RunResult) {
 }
 
 fn run_up(folder: &Path, scenario: &Path, runs: &str) -> RunResult {
-    let options = RunOptions { runs: folder.join(runs), programs: programs().to_owned(), prefix: "up" };
+    let options = RunOptions {
+        runs: folder.join(runs),
+        programs: programs().to_owned(),
+        prefix: "up",
+    };
     run_scenario(&Scenario::load(scenario).unwrap(), &options).unwrap()
 }
 
@@ -226,14 +364,29 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
     let rest = "clock: stepped\nstepped: {compute: {pose_ms: 10, map_ms: 40, fuse_ms: 20}}\n\
         link: {model: link.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5}}}}";
     let scenario = write_scenario(folder.path(), TICKS, "seek: 1", rest);
-    let (one, two) = (run_up(folder.path(), &scenario, "one"), run_up(folder.path(), &scenario, "two"));
+    let (one, two) = (
+        run_up(folder.path(), &scenario, "one"),
+        run_up(folder.path(), &scenario, "two"),
+    );
     assert_same_bytes(&one, &two);
-    assert!(one.balance.is_exact() && one.metrics.clock == "stepped" && one.metrics.frames == TICKS as u64 - 1);
+    assert!(
+        one.balance.is_exact()
+            && one.metrics.clock == "stepped"
+            && one.metrics.frames == TICKS as u64 - 1
+    );
     let latency = &one.metrics.latency_ms.capture_to_detection;
-    assert_eq!((latency.p50, latency.p99), (Some(120.0), Some(120.0)), "the deadline, and the fusion");
+    assert_eq!(
+        (latency.p50, latency.p99),
+        (Some(120.0), Some(120.0)),
+        "the deadline, and the fusion"
+    );
     assert!(one.metrics.age_ms.p50.unwrap() >= 100.0 && one.metrics.pose.mean_m.unwrap() > 0.05);
     let frames = fs::read_to_string(one.folder.file("frames.csv")).unwrap();
-    assert!(frames.starts_with("tick,agent_frame,") && frames.lines().nth(1).unwrap().starts_with("1,0,"), "{frames}");
+    assert!(
+        frames.starts_with("tick,agent_frame,")
+            && frames.lines().nth(1).unwrap().starts_with("1,0,"),
+        "{frames}"
+    );
     assert_eq!(results(one.folder.path()).len(), TICKS - 1);
 }
 
@@ -251,7 +404,10 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
             "max",
             "agents: {codec: {dtype: i8, budget_bytes: 4000}}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5, mode: autoregressive}}}}",
         ),
-        ("late", "agents: {pose: {noisy: {position_std_m: 0.3, heading_std_deg: 1, mode: independent}}}"),
+        (
+            "late",
+            "agents: {pose: {noisy: {position_std_m: 0.3, heading_std_deg: 1, mode: independent}}}",
+        ),
         ("none", ""),
     ] {
         let run = |processes| {
@@ -266,7 +422,11 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
         };
         let (one, many) = (run(false), run(true));
         assert_same_bytes(&one, &many);
-        assert!(results(one.folder.path()).iter().any(|result| !result["detections"].as_array().unwrap().is_empty()));
+        assert!(
+            results(one.folder.path())
+                .iter()
+                .any(|result| !result["detections"].as_array().unwrap().is_empty())
+        );
         let logs = fs::read_dir(many.folder.log_dir()).unwrap().count();
         assert_eq!((logs, many.killed.len()), (3, 0), "one process a vehicle");
     }
@@ -277,12 +437,19 @@ fn compute_times_are_measured_once_and_written_down() {
     let folder = tempfile::tempdir().unwrap();
     let scenario = write_scenario(folder.path(), 3, "", "clock: stepped");
     // On a busy machine the compute times may exceed a frame: then the run is refused with a message.
-    let options = RunOptions { runs: folder.path().join("runs"), programs: programs().to_owned(), prefix: "up" };
+    let options = RunOptions {
+        runs: folder.path().join("runs"),
+        programs: programs().to_owned(),
+        prefix: "up",
+    };
     match run_scenario(&Scenario::load(&scenario).unwrap(), &options) {
         Ok(run) => {
             let resolved = Scenario::load(&run.folder.file("scenario.yaml")).unwrap();
             let compute = resolved.stepped.unwrap().compute.unwrap();
-            assert!(compute.map_ms >= 1.0 && compute.map_ms <= 100.0, "{compute:?}");
+            assert!(
+                compute.map_ms >= 1.0 && compute.map_ms <= 100.0,
+                "{compute:?}"
+            );
         }
         Err(error) => assert!(error.to_string().contains("every 100 ms"), "{error}"),
     }
@@ -291,7 +458,11 @@ fn compute_times_are_measured_once_and_written_down() {
 fn sweep(folder: &Path, out: &str, jobs: &str, more: &[&str]) -> Output {
     let program = programs().join("v2vloc");
     let mut command = Command::new(program);
-    command.arg("sweep").arg(folder.join("experiment.yaml")).arg("--out").arg(folder.join(out));
+    command
+        .arg("sweep")
+        .arg(folder.join("experiment.yaml"))
+        .arg("--out")
+        .arg(folder.join(out));
     command.args(["--jobs", jobs]).args(more).output().unwrap()
 }
 
@@ -309,57 +480,126 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
         seed: [1]\n";
     fs::write(folder.path().join("experiment.yaml"), text).unwrap();
     let dry = sweep(folder.path(), "dry", "2", &["--dry-run"]);
-    assert!(dry.status.success() && dry.stdout.is_empty(), "{}", text_of(&dry));
     assert!(
-        text_of(&dry).contains("3 method x 2 codec x 2 latency_ms x 2 bandwidth_mbps = 24 runs of 4 frames"),
+        dry.status.success() && dry.stdout.is_empty(),
         "{}",
         text_of(&dry)
     );
-    assert!(text_of(&dry).contains("minutes for 24 runs with 2 jobs"), "{}", text_of(&dry));
+    assert!(
+        text_of(&dry)
+            .contains("3 method x 2 codec x 2 latency_ms x 2 bandwidth_mbps = 24 runs of 4 frames"),
+        "{}",
+        text_of(&dry)
+    );
+    assert!(
+        text_of(&dry).contains("minutes for 24 runs with 2 jobs"),
+        "{}",
+        text_of(&dry)
+    );
 
     let foreign = folder.path().join("one/maps/of-another-program.maps");
     fs::create_dir_all(foreign.parent().unwrap()).unwrap();
     fs::write(&foreign, b"").unwrap();
     let [one, many] = [("one", "1", [].as_slice()), ("many", "3", &["--keep-maps"])]
         .map(|(out, jobs, more)| sweep(folder.path(), out, jobs, more));
-    assert!(one.status.success() && many.status.success(), "{}\n{}", text_of(&one), text_of(&many));
-    let read = |out: &str, name: &str| fs::read_to_string(folder.path().join(out).join(name)).unwrap();
-    let maps = |out: &str| fs::read_dir(folder.path().join(out).join("maps")).unwrap().count();
-    assert!(maps("one") == 1 && foreign.exists(), "only the sweep's own maps are removed");
+    assert!(
+        one.status.success() && many.status.success(),
+        "{}\n{}",
+        text_of(&one),
+        text_of(&many)
+    );
+    let read =
+        |out: &str, name: &str| fs::read_to_string(folder.path().join(out).join(name)).unwrap();
+    let maps = |out: &str| {
+        fs::read_dir(folder.path().join(out).join("maps"))
+            .unwrap()
+            .count()
+    };
+    assert!(
+        maps("one") == 1 && foreign.exists(),
+        "only the sweep's own maps are removed"
+    );
     assert!(maps("many") > 0, "maps are kept on request");
     let csv = read("one", "e.csv");
     assert_eq!(csv, read("many", "e.csv"));
     let table = String::from_utf8_lossy(&one.stdout).into_owned();
-    assert!(table.starts_with("method  dtype  keep  latency_ms  bandwidth_mbps  ap_global_30"), "{table}");
+    assert!(
+        table.starts_with("method  dtype  keep  latency_ms  bandwidth_mbps  ap_global_30"),
+        "{table}"
+    );
     // Random weights detect nothing, so no run is said to be the best.
-    assert!(table.lines().count() == 25 && table.lines().all(|line| line.len() <= 120), "{table}");
+    assert!(
+        table.lines().count() == 25 && table.lines().all(|line| line.len() <= 120),
+        "{table}"
+    );
     assert_eq!(read("one", "report.html"), read("many", "report.html"));
     let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
-    assert!(lines.len() == 25 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");
+    assert!(
+        lines.len() == 25 && lines.iter().all(|line| line.len() == lines[0].len()),
+        "{csv}"
+    );
     let column = |line: usize, name: &str| {
-        let place = lines[0].iter().position(|column| *column == name).unwrap_or_else(|| panic!("{name}"));
+        let place = lines[0]
+            .iter()
+            .position(|column| *column == name)
+            .unwrap_or_else(|| panic!("{name}"));
         lines[line][place]
     };
-    assert_eq!((column(1, "method"), column(1, "sent"), column(1, "frames_used")), ("none", "0", "0"));
-    let dense =
-        (17..25).find(|&line| column(line, "dtype") == "f16" && !column(line, "payload_bytes").is_empty()).unwrap();
-    let sparse =
-        (17..25).find(|&line| column(line, "keep") == "0.25" && !column(line, "payload_bytes").is_empty()).unwrap();
+    assert_eq!(
+        (
+            column(1, "method"),
+            column(1, "sent"),
+            column(1, "frames_used")
+        ),
+        ("none", "0", "0")
+    );
+    let dense = (17..25)
+        .find(|&line| column(line, "dtype") == "f16" && !column(line, "payload_bytes").is_empty())
+        .unwrap();
+    let sparse = (17..25)
+        .find(|&line| column(line, "keep") == "0.25" && !column(line, "payload_bytes").is_empty())
+        .unwrap();
     let bytes = |line| column(line, "payload_bytes").parse::<f64>().unwrap();
-    assert!(bytes(sparse) < 0.2 * bytes(dense), "{} {}", bytes(sparse), bytes(dense));
-    for name in ["ap_latency.svg", "ap_latency.png", "ap_bandwidth.svg", "ap_bytes.png", "report.html"] {
+    assert!(
+        bytes(sparse) < 0.2 * bytes(dense),
+        "{} {}",
+        bytes(sparse),
+        bytes(dense)
+    );
+    for name in [
+        "ap_latency.svg",
+        "ap_latency.png",
+        "ap_bandwidth.svg",
+        "ap_bytes.png",
+        "report.html",
+    ] {
         assert!(folder.path().join("one").join(name).exists(), "{name}");
     }
     let page = read("one", "report.html");
-    assert!(page.contains("A &lt; B") && page.contains("<svg") && !page.contains("src="), "self-contained");
+    assert!(
+        page.contains("A &lt; B") && page.contains("<svg") && !page.contains("src="),
+        "self-contained"
+    );
 
     // Completed runs are not repeated; the key is the content of the sweep.
     let again = sweep(folder.path(), "one", "2", &[]);
-    assert!(again.status.success() && text_of(&again).contains("24 done before"), "{}", text_of(&again));
+    assert!(
+        again.status.success() && text_of(&again).contains("24 done before"),
+        "{}",
+        text_of(&again)
+    );
     assert_eq!(again.stdout, one.stdout);
-    fs::write(folder.path().join("experiment.yaml"), text.replace("seed: [1]", "seed: [1, 2]")).unwrap();
+    fs::write(
+        folder.path().join("experiment.yaml"),
+        text.replace("seed: [1]", "seed: [1, 2]"),
+    )
+    .unwrap();
     let more = sweep(folder.path(), "one", "2", &["--dry-run"]);
-    assert!(text_of(&more).contains("48 runs of 4 frames, 24 done before"), "{}", text_of(&more));
+    assert!(
+        text_of(&more).contains("48 runs of 4 frames, 24 done before"),
+        "{}",
+        text_of(&more)
+    );
 }
 
 #[test]
@@ -367,17 +607,31 @@ fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
     let folder = scene();
     let rest = "dataset: scene\nweights: weights.safetensors\n";
     for (text, message) in [
-        ("grid: {method: [max], agents: [4]}", "grid.agents is 4, but scenario scene has 3 vehicles"),
-        ("link: dsrc\ngrid: {method: [max], loss: [0.1]}", "grid.loss and the loss of link dsrc contradict"),
+        (
+            "grid: {method: [max], agents: [4]}",
+            "grid.agents is 4, but scenario scene has 3 vehicles",
+        ),
+        (
+            "link: dsrc\ngrid: {method: [max], loss: [0.1]}",
+            "grid.loss and the loss of link dsrc contradict",
+        ),
         ("grid: {method: [max], latencies: [1]}", "latencies"),
         (
             "compute: {pose_ms: 60, map_ms: 60, fuse_ms: 0}\ngrid: {method: [max]}",
             "takes 120 ms, but the scene has a frame",
         ),
     ] {
-        fs::write(folder.path().join("experiment.yaml"), format!("name: e\n{rest}{text}\n")).unwrap();
+        fs::write(
+            folder.path().join("experiment.yaml"),
+            format!("name: e\n{rest}{text}\n"),
+        )
+        .unwrap();
         let output = sweep(folder.path(), "out", "1", &[]);
-        assert!(output.status.code() == Some(2) && text_of(&output).contains(message), "{text}: {}", text_of(&output));
+        assert!(
+            output.status.code() == Some(2) && text_of(&output).contains(message),
+            "{text}: {}",
+            text_of(&output)
+        );
     }
 }
 
@@ -385,7 +639,16 @@ fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
 fn an_evaluation_crosses_a_link() {
     let folder = scene();
     let output = Command::new(programs().join("v2vloc"))
-        .args(["eval", "--method", "max", "--json", "--link", "opencood-sim", "--deadline-ms", "0"])
+        .args([
+            "eval",
+            "--method",
+            "max",
+            "--json",
+            "--link",
+            "opencood-sim",
+            "--deadline-ms",
+            "0",
+        ])
         .args(["--max-age-ms", "300", "--seed", "1", "--dataset"])
         .arg(folder.path().join("scene"))
         .arg("--weights")
@@ -394,5 +657,8 @@ fn an_evaluation_crosses_a_link() {
         .unwrap();
     assert!(output.status.success(), "{}", text_of(&output));
     let metrics: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!((&metrics["clock"], &metrics["age_ms"]["p50"]), (&"stepped".into(), &100.0.into()));
+    assert_eq!(
+        (&metrics["clock"], &metrics["age_ms"]["p50"]),
+        (&"stepped".into(), &100.0.into())
+    );
 }

@@ -33,10 +33,20 @@ const RTOL: f64 = 1e-4;
 fn convert(state: &Path, arguments: &[&str]) -> Result<(PathBuf, String), String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/tools/convert_opencood.py");
     let out = state.with_extension("converted.safetensors");
-    let run = Command::new("python3").arg(script).arg(state).args(arguments).arg("--out").arg(&out).output();
+    let run = Command::new("python3")
+        .arg(script)
+        .arg(state)
+        .args(arguments)
+        .arg("--out")
+        .arg(&out)
+        .output();
     let output = run.unwrap_or_else(|error| panic!("python3: {error}"));
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    if output.status.success() { Ok((out, text(&output.stdout))) } else { Err(text(&output.stderr)) }
+    if output.status.success() {
+        Ok((out, text(&output.stdout)))
+    } else {
+        Err(text(&output.stderr))
+    }
 }
 
 /// A copy of a golden archive, beside which files may be written.
@@ -51,28 +61,52 @@ fn copied(name: &str, folder: &Path) -> (Golden, PathBuf) {
 fn golden_converted_multi_scale_networks_answer_as_the_reference() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
-    for (name, model) in
-        [("c6_e2e_coalign", "point_pillar_coalign"), ("c6_e2e_where2comm_multi", "point_pillar_where2comm")]
-    {
+    for (name, model) in [
+        ("c6_e2e_coalign", "point_pillar_coalign"),
+        ("c6_e2e_where2comm_multi", "point_pillar_where2comm"),
+    ] {
         let (golden, state) = copied(name, folder.path());
         let slots = golden.f32("in.voxel_features").0[1].to_string();
         let (path, _) = convert(&state, &["--model", model, "--max-points", &slots]).unwrap();
         let network = MultiScaleNetwork::load(&path, Device::Cpu).unwrap();
         let (sweeps, _) = pillars(&golden);
-        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.network().pillar_grid());
-        let [width, height, _] = network.network().config.pillar_grid().map(|count| count as i64);
+        let batch = PillarBatch::new(
+            &sweeps.iter().collect::<Vec<_>>(),
+            network.network().pillar_grid(),
+        );
+        let [width, height, _] = network
+            .network()
+            .config
+            .pillar_grid()
+            .map(|count| count as i64);
         let cell_m = number(&golden.config()["voxel_size"][0]);
-        let normalized = coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, cell_m).unwrap();
+        let normalized =
+            coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, cell_m).unwrap();
         let samples: Vec<Placement> = (0..)
             .zip(golden.i64("in.record_len").1)
             .map(|(sample, agents)| {
                 let theta = normalized.get(sample).get(0).narrow(0, 0, agents);
-                Placement { agents, theta: (!network.config().one_frame).then_some(theta) }
+                Placement {
+                    agents,
+                    theta: (!network.config().one_frame).then_some(theta),
+                }
             })
             .collect();
         let heads = no_grad(|| network.forward(&batch, &samples)).unwrap().heads;
-        assert_close(name, &values(&heads.scores), &golden.f32("out.psm").1, ATOL, RTOL);
-        assert_close(name, &values(&heads.offsets), &golden.f32("out.rm").1, ATOL, RTOL);
+        assert_close(
+            name,
+            &values(&heads.scores),
+            &golden.f32("out.psm").1,
+            ATOL,
+            RTOL,
+        );
+        assert_close(
+            name,
+            &values(&heads.offsets),
+            &golden.f32("out.rm").1,
+            ATOL,
+            RTOL,
+        );
     }
 }
 
@@ -87,30 +121,63 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     assert!(output.contains(&format!("--gate {threshold}")), "{output}");
     let weights = Weights::load(&path).unwrap();
     let config: DetectorConfig = weights.config().unwrap();
-    assert_eq!((config.y_axis, config.blocks), (YAxis::Right, BlockKind::Plain));
-    assert_eq!(config.num_filters, tests::tensors::integers(&golden.config()["base_bev_backbone"]["num_filters"]));
+    assert_eq!(
+        (config.y_axis, config.blocks),
+        (YAxis::Right, BlockKind::Plain)
+    );
+    assert_eq!(
+        config.num_filters,
+        tests::tensors::integers(&golden.config()["base_bev_backbone"]["num_filters"])
+    );
     let shrink = &golden.config()["shrink_header"];
     let (channels, stride) = (integer(&shrink["dim"][0]), integer(&shrink["stride"][0]));
-    assert_eq!(config.shrink, Some(ShrinkConfig::DoubleConv { channels, stride }));
+    assert_eq!(
+        config.shrink,
+        Some(ShrinkConfig::DoubleConv { channels, stride })
+    );
     let fusion: FusionConfig = weights.metadata_json("fusion").unwrap();
-    let expected = Where2commConfig { aggregation: where2comm::Aggregation::Attention, missing: Missing::Zero };
+    let expected = Where2commConfig {
+        aggregation: where2comm::Aggregation::Attention,
+        missing: Missing::Zero,
+    };
     assert_eq!(fusion, FusionConfig::new(expected));
-    assert_eq!(Ego::load(&path, None, Device::Cpu).unwrap().method(), Method::WHERE2COMM);
+    assert_eq!(
+        Ego::load(&path, None, Device::Cpu).unwrap().method(),
+        Method::WHERE2COMM
+    );
 }
 
 /// Two vehicles with overlapping views of the same street.
 fn frames(mirrored: bool) -> [Frame; 2] {
     [0, 1].map(|place| {
-        let mut frame = Frame::empty(CavId::new(&format!("{place}")).unwrap(), 0, Handedness::Right);
-        let pose = Pose::from_xyz_yaw([100.0 + 6.0 * f64::from(place), 50.0 - 2.0 * f64::from(place), 1.9], 0.5);
+        let mut frame = Frame::empty(
+            CavId::new(&format!("{place}")).unwrap(),
+            0,
+            Handedness::Right,
+        );
+        let pose = Pose::from_xyz_yaw(
+            [
+                100.0 + 6.0 * f64::from(place),
+                50.0 - 2.0 * f64::from(place),
+                1.9,
+            ],
+            0.5,
+        );
         let turned = Pose::from_xyz_yaw([0.0; 3], 0.3 * f64::from(place));
         let pose: Pose = (pose.isometry() * turned.isometry()).into();
         frame.world_from_lidar = Some(if mirrored { pose.mirrored_y() } else { pose });
         let point = |k: i32| {
             let y = (k % 31) as f32 * 0.4 - 6.1;
-            [(k % 57) as f32 * 0.43 - 12.0, if mirrored { -y } else { y }, (k % 7) as f32 * 0.3 - 1.8, 0.3]
+            [
+                (k % 57) as f32 * 0.43 - 12.0,
+                if mirrored { -y } else { y },
+                (k % 7) as f32 * 0.3 - 1.8,
+                0.3,
+            ]
         };
-        frame.points = PointCloud { xyzi: (40 * place..1800 + 90 * place).map(point).collect() };
+        frame.points = PointCloud {
+            xyzi: (40 * place..1800 + 90 * place).map(point).collect(),
+        };
         frame
     })
 }
@@ -119,9 +186,10 @@ fn frames(mirrored: bool) -> [Frame; 2] {
 fn golden_converted_networks_detect_offline_in_either_world() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
-    for (name, model) in
-        [("c6_e2e_coalign", "point_pillar_coalign"), ("c6_e2e_where2comm_multi", "point_pillar_where2comm")]
-    {
+    for (name, model) in [
+        ("c6_e2e_coalign", "point_pillar_coalign"),
+        ("c6_e2e_where2comm_multi", "point_pillar_where2comm"),
+    ] {
         let (_, state) = copied(name, folder.path());
         let mut found = Vec::new();
         for (y_axis, mirrored) in [("left", false), ("right", true)] {
@@ -131,14 +199,22 @@ fn golden_converted_networks_detect_offline_in_either_world() {
             let (together, bytes) = detector.detect(&frames).unwrap();
             // 16 channels on 16 x 32 cells in `f32`; if cells are left out, a bit for each.
             let whole = 4 * 16 * 16 * 32;
-            let fewest = if model == "point_pillar_where2comm" { 64 } else { whole };
+            let fewest = if model == "point_pillar_where2comm" {
+                64
+            } else {
+                whole
+            };
             assert!(
                 bytes.len() == 1 && (fewest..=whole).contains(&bytes[0]) && bytes[0] % 64 == 0,
                 "{name}: {bytes:?}"
             );
             let (ego_only, bytes) = detector.detect(&frames[..1]).unwrap();
             assert!(bytes.is_empty(), "{name}");
-            assert!(!together.is_empty() && together != ego_only, "{name}: {} boxes", together.len());
+            assert!(
+                !together.is_empty() && together != ego_only,
+                "{name}: {} boxes",
+                together.len()
+            );
             found.push(together);
         }
         // The output of a network of the mirrored frame for the mirrored street is the mirror image.
@@ -146,19 +222,30 @@ fn golden_converted_networks_detect_offline_in_either_world() {
         for (here, there) in found[0].iter().zip(&found[1]) {
             let there = there.box3d.mirrored_y();
             let off = (0..3).map(|axis| (here.box3d.center_m[axis] - there.center_m[axis]).abs());
-            assert!(off.fold(0.0, f64::max) < 1e-3, "{name}: {:?} {there:?}", here.box3d);
+            assert!(
+                off.fold(0.0, f64::max) < 1e-3,
+                "{name}: {:?} {there:?}",
+                here.box3d
+            );
         }
     }
 }
 
 /// A state dictionary with the names of the reference around a fusion of this project, as no small ones are published.
-fn state_of(folder: &Path, method: Method, fusion: &FusionConfig) -> (PathBuf, BTreeMap<String, Tensor>) {
+fn state_of(
+    folder: &Path,
+    method: Method,
+    fusion: &FusionConfig,
+) -> (PathBuf, BTreeMap<String, Tensor>) {
     let detector = DetectorConfig {
         lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
         layer_nums: vec![1, 1, 1],
         num_filters: vec![8, 12, 16],
         num_upsample_filters: vec![8; 3],
-        shrink: Some(ShrinkConfig::DoubleConv { channels: 16, stride: 2 }),
+        shrink: Some(ShrinkConfig::DoubleConv {
+            channels: 16,
+            stride: 2,
+        }),
         compress_ratio: Some(4),
         ..DetectorConfig::full()
     };
@@ -206,13 +293,23 @@ fn hypes(model: &str, more: Value) -> Value {
 fn fusions_with_parameters_come_back_with_every_one() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
-    let v2vnet = V2vNetConfig { aggregation: Aggregation::Max, ..V2vNetConfig::full(16) };
+    let v2vnet = V2vNetConfig {
+        aggregation: Aggregation::Max,
+        ..V2vNetConfig::full(16)
+    };
     let v2vnet_args = json!({"v2vfusion": {
         "num_iteration": 2, "in_channels": 16, "gru_flag": true, "agg_operator": "max",
         "conv_gru": {"H": 16, "W": 32, "num_layers": 1, "kernel_size": [[3, 3]]}
     }});
-    let disconet = DiscoNetConfig { channels: 16, hidden: [24, 12, 6] };
-    let v2xvit = V2xVitConfig { blocks: 2, hidden: 24, ..V2xVitConfig::lean(16) };
+    let disconet = DiscoNetConfig {
+        channels: 16,
+        hidden: [24, 12, 6],
+    };
+    let v2xvit = V2xVitConfig {
+        blocks: 2,
+        hidden: 24,
+        ..V2xVitConfig::lean(16)
+    };
     let v2xvit_args = json!({"transformer": {"encoder": {
         "num_blocks": 2, "depth": v2xvit.depth,
         "cav_att_config": {
@@ -227,16 +324,36 @@ fn fusions_with_parameters_come_back_with_every_one() {
         },
         "feed_forward": {"mlp_dim": 24}
     }}});
-    let cobevt = SwapFusionConfig { count_missing: true, hidden: 20, ..SwapFusionConfig::lean(16) };
+    let cobevt = SwapFusionConfig {
+        count_missing: true,
+        hidden: 20,
+        ..SwapFusionConfig::lean(16)
+    };
     let cobevt_args = json!({"fax_fusion": {
         "mask": true, "depth": cobevt.depth, "agent_size": cobevt.slots, "window_size": cobevt.window,
         "dim_head": cobevt.head_channels, "mlp_dim": 20, "drop_out": cobevt.dropout
     }});
     for (method, fusion, hypes) in [
-        (Method::V2XVIT, FusionConfig::new(v2xvit), hypes("point_pillar_transformer", v2xvit_args)),
-        (Method::COBEVT, FusionConfig::new(cobevt), hypes("point_pillar_cobevt", cobevt_args)),
-        (Method::V2VNET, FusionConfig::new(v2vnet), hypes("point_pillar_v2vnet", v2vnet_args)),
-        (Method::DISCONET, FusionConfig::new(disconet), hypes("point_pillar_disconet", json!({}))),
+        (
+            Method::V2XVIT,
+            FusionConfig::new(v2xvit),
+            hypes("point_pillar_transformer", v2xvit_args),
+        ),
+        (
+            Method::COBEVT,
+            FusionConfig::new(cobevt),
+            hypes("point_pillar_cobevt", cobevt_args),
+        ),
+        (
+            Method::V2VNET,
+            FusionConfig::new(v2vnet),
+            hypes("point_pillar_v2vnet", v2vnet_args),
+        ),
+        (
+            Method::DISCONET,
+            FusionConfig::new(disconet),
+            hypes("point_pillar_disconet", json!({})),
+        ),
     ] {
         let (state, variables) = state_of(folder.path(), method, &fusion);
         let config = folder.path().join("config.json");
@@ -245,18 +362,31 @@ fn fusions_with_parameters_come_back_with_every_one() {
         let (path, output) = convert(&state, &arguments).unwrap();
         assert!(output.contains("4 of 16 channels"), "{output}");
         let weights = Weights::load(&path).unwrap();
-        assert_eq!(weights.metadata_json::<FusionConfig>("fusion").unwrap(), fusion, "{method}");
+        assert_eq!(
+            weights.metadata_json::<FusionConfig>("fusion").unwrap(),
+            fusion,
+            "{method}"
+        );
         let detector: DetectorConfig = weights.config().unwrap();
-        assert_eq!((detector.max_points_per_pillar, detector.max_pillars), (20, 5000));
+        assert_eq!(
+            (detector.max_points_per_pillar, detector.max_pillars),
+            (20, 5000)
+        );
         assert_eq!(detector.anchors.size_lwh_m, [4.5, 2.0, 1.6]);
         let model = CooperativeModel::load(&path, None, Device::Cpu).unwrap();
         assert_eq!(model.method, method);
         for (name, found) in model.variables.variables() {
-            assert!(name == "steering.weight" || found.equal(&variables[&name]), "{method}: {name}");
+            assert!(
+                name == "steering.weight" || found.equal(&variables[&name]),
+                "{method}: {name}"
+            );
         }
         let ego = Ego::load(&path, None, Device::Cpu).unwrap();
         let (sent, code_of) = (ego.detector().sent_shape(), ego.detector().code_of());
-        assert_eq!((ego.method(), sent, code_of), (method, [4, 8, 16], Some(16)));
+        assert_eq!(
+            (ego.method(), sent, code_of),
+            (method, [4, 8, 16], Some(16))
+        );
     }
 }
 
@@ -272,12 +402,21 @@ fn what_is_not_understood_is_refused_with_its_name() {
     };
     let empty = b"\x02\0\0\0\0\0\0\0{}";
     let message = with(&hypes("point_pillar_fpvrcnn", json!({})), empty);
-    assert!(message.contains("config.json") && message.contains("point_pillar_fpvrcnn"), "{message}");
+    assert!(
+        message.contains("config.json") && message.contains("point_pillar_fpvrcnn"),
+        "{message}"
+    );
     let message = with(&hypes("point_pillar", json!({})), empty);
     assert!(message.contains("pillar encoder"), "{message}");
     let message = with(&hypes("point_pillar", json!({})), &[255; 12]);
-    assert!(message.contains("broken.safetensors") && message.contains("neither torch nor safetensors"), "{message}");
-    let message = with(&hypes("point_pillar", json!({})), b"\xff\xff\xff\x7f\0\0\0\0{}");
+    assert!(
+        message.contains("broken.safetensors") && message.contains("neither torch nor safetensors"),
+        "{message}"
+    );
+    let message = with(
+        &hypes("point_pillar", json!({})),
+        b"\xff\xff\xff\x7f\0\0\0\0{}",
+    );
     assert!(message.contains("claims"), "{message}");
     let message = with(&json!({"model": {"core_method": "x"}}), empty);
     assert!(message.contains("args"), "{message}");

@@ -23,13 +23,29 @@ fn golden_c1_pointpillar() {
     let case = EncoderCase::new(&golden);
     let (_, expected) = golden.f32("out.pillar_features");
     let pillar_features = tch::no_grad(|| case.encoder.forward(&case.batch, false));
-    let rows = case.row_of_pillar.iter().map(|&row| row as i64).collect::<Vec<_>>();
+    let rows = case
+        .row_of_pillar
+        .iter()
+        .map(|&row| row as i64)
+        .collect::<Vec<_>>();
     let in_file_order = pillar_features.index_select(0, &Tensor::from_slice(&rows));
-    assert_close("pillar_features", &values(&in_file_order), &expected, ATOL, RTOL);
+    assert_close(
+        "pillar_features",
+        &values(&in_file_order),
+        &expected,
+        ATOL,
+        RTOL,
+    );
 
     let canvas = case.batch.scatter(&pillar_features, &case.pillar_grid);
     let (_, expected) = golden.f32("out.spatial_features_ch0_7");
-    assert_close("spatial_features", &values(&canvas.narrow(1, 0, 8)), &expected, ATOL, RTOL);
+    assert_close(
+        "spatial_features",
+        &values(&canvas.narrow(1, 0, 8)),
+        &expected,
+        ATOL,
+        RTOL,
+    );
 
     // The detector's own pillar encoder works without tensors, sweep by sweep.
     let projection = PillarProjection::new(&case.encoder);
@@ -38,8 +54,16 @@ fn golden_c1_pointpillar() {
     for (pillars, canvas) in case.sweeps.iter().zip(canvases.chunks_exact_mut(size)) {
         projection.scatter(pillars, &case.pillar_grid, canvas);
     }
-    let projected = Tensor::from_slice(&canvases).reshape(canvas.permute([0, 2, 3, 1]).size()).permute([0, 3, 1, 2]);
-    assert_close("projected", &values(&projected.narrow(1, 0, 8)), &expected, ATOL, RTOL);
+    let projected = Tensor::from_slice(&canvases)
+        .reshape(canvas.permute([0, 2, 3, 1]).size())
+        .permute([0, 3, 1, 2]);
+    assert_close(
+        "projected",
+        &values(&projected.narrow(1, 0, 8)),
+        &expected,
+        ATOL,
+        RTOL,
+    );
 
     for backbone in [None, Some(case.backbone.folded())] {
         let backbone = backbone.as_ref().unwrap_or(&case.backbone);
@@ -52,10 +76,14 @@ fn golden_c1_intermediate_attfuse() {
     let golden = golden("c1_intermediate_attfuse");
     let case = EncoderCase::new(&golden);
     let (_, record_len) = golden.i64("in.record_len");
-    let canvas = case.batch.scatter(&tch::no_grad(|| case.encoder.forward(&case.batch, false)), &case.pillar_grid);
+    let canvas = case.batch.scatter(
+        &tch::no_grad(|| case.encoder.forward(&case.batch, false)),
+        &case.pillar_grid,
+    );
     for backbone in [None, Some(case.backbone.folded())] {
         let backbone = backbone.as_ref().unwrap_or(&case.backbone);
-        let features = tch::no_grad(|| backbone.forward_fused(&canvas, &record_len, false)).unwrap();
+        let features =
+            tch::no_grad(|| backbone.forward_fused(&canvas, &record_len, false)).unwrap();
         case.check_from_2d(&golden, &features);
     }
 }
@@ -65,22 +93,40 @@ fn golden_c1_shrink_compress() {
     let golden = golden("c1_shrink_compress");
     let config = golden.config();
     let (input, channels) = (integer(&config["input_dim"]), integer(&config["dim"][0]));
-    let shrink_config = ShrinkConfig::DoubleConv { channels, stride: integer(&config["stride"][0]) };
+    let shrink_config = ShrinkConfig::DoubleConv {
+        channels,
+        stride: integer(&config["stride"][0]),
+    };
     let network = VarStore::new(Device::Cpu);
     let shrink = Shrink::new(&(network.root() / "shrink"), input, &shrink_config);
-    let compressor = Compressor::new(&(network.root() / "compress"), channels, integer(&config["compress_ratio"]));
+    let compressor = Compressor::new(
+        &(network.root() / "compress"),
+        channels,
+        integer(&config["compress_ratio"]),
+    );
     load(&network, &golden, "");
     let x = tensor(&golden, "in.x");
-    for (shrink, compressor) in [(&shrink, &compressor), (&shrink.folded(), &compressor.folded())] {
+    for (shrink, compressor) in [
+        (&shrink, &compressor),
+        (&shrink.folded(), &compressor.folded()),
+    ] {
         let (reduced, code, decoded) = tch::no_grad(|| {
             let reduced = shrink.forward(&x, false);
             let code = compressor.encode(&reduced, false);
             let decoded = compressor.decode(&code, false);
             (reduced, code, decoded)
         });
-        for (name, actual) in [("out.shrink", reduced), ("out.code", code), ("out.decoded", decoded)] {
+        for (name, actual) in [
+            ("out.shrink", reduced),
+            ("out.code", code),
+            ("out.decoded", decoded),
+        ] {
             let (shape, expected) = golden.f32(name);
-            assert_eq!(actual.size(), shape.iter().map(|&size| size as i64).collect::<Vec<_>>(), "{name}");
+            assert_eq!(
+                actual.size(),
+                shape.iter().map(|&size| size as i64).collect::<Vec<_>>(),
+                "{name}"
+            );
             assert_close(name, &values(&actual), &expected, ATOL, RTOL);
         }
     }
@@ -89,20 +135,36 @@ fn golden_c1_shrink_compress() {
 #[test]
 fn golden_c2_voxelise() {
     let golden = golden("c2_voxelise");
-    let config = golden.config().as_object().expect("one configuration per cloud");
+    let config = golden
+        .config()
+        .as_object()
+        .expect("one configuration per cloud");
     assert!(!config.is_empty());
     for (name, config) in config {
         let grid: [usize; 3] = array(&config["grid"]).map(|count| count as usize);
-        let caps = [&config["max_points_per_voxel"], &config["max_voxels"]].map(|cap| integer(cap) as usize);
-        let mut voxeliser =
-            Voxeliser::new(array(&config["lidar_range"]), array(&config["voxel_size"]), grid, caps[0], caps[1]);
+        let caps = [&config["max_points_per_voxel"], &config["max_voxels"]]
+            .map(|cap| integer(cap) as usize);
+        let mut voxeliser = Voxeliser::new(
+            array(&config["lidar_range"]),
+            array(&config["voxel_size"]),
+            grid,
+            caps[0],
+            caps[1],
+        );
         let (_, points) = golden.f32(&format!("{name}.in.points"));
         let points: Vec<[f32; 4]> = points.as_chunks().0.to_vec();
         let pillars = voxeliser.voxelise(&points);
         let (_, coords) = golden.i32(&format!("{name}.out.voxel_coords"));
         assert_eq!(pillars.coords.as_flattened(), coords, "{name}: coordinates");
         let (_, counts) = golden.i32(&format!("{name}.out.voxel_num_points"));
-        assert!(pillars.counts.iter().zip(&counts).all(|(&a, &b)| i64::from(a) == i64::from(b)), "{name}: counts");
+        assert!(
+            pillars
+                .counts
+                .iter()
+                .zip(&counts)
+                .all(|(&a, &b)| i64::from(a) == i64::from(b)),
+            "{name}: counts"
+        );
         let (_, features) = golden.f32(&format!("{name}.out.voxel_features_packed"));
         assert_eq!(pillars.points.as_flattened(), features, "{name}: points");
     }
@@ -134,7 +196,15 @@ impl EncoderCase {
         let pillar_grid = PillarGrid::new(&config);
         let (sweeps, row_of_pillar) = pillars(golden);
         let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &pillar_grid);
-        Self { pillar_grid, sweeps, batch, row_of_pillar, encoder, backbone, head }
+        Self {
+            pillar_grid,
+            sweeps,
+            batch,
+            row_of_pillar,
+            encoder,
+            backbone,
+            head,
+        }
     }
 
     /// Compares the concatenated levels and the heads.
@@ -144,17 +214,36 @@ impl EncoderCase {
         let part = features.index_select(1, &Tensor::from_slice(&every_8th));
         assert_close("spatial_features_2d", &values(&part), &expected, ATOL, RTOL);
         let heads = tch::no_grad(|| self.head.forward(features)).unwrap();
-        assert_close("psm", &values(&heads.scores), &golden.f32("out.psm").1, ATOL, RTOL);
-        assert_close("rm", &values(&heads.offsets), &golden.f32("out.rm").1, ATOL, RTOL);
+        assert_close(
+            "psm",
+            &values(&heads.scores),
+            &golden.f32("out.psm").1,
+            ATOL,
+            RTOL,
+        );
+        assert_close(
+            "rm",
+            &values(&heads.offsets),
+            &golden.f32("out.rm").1,
+            ATOL,
+            RTOL,
+        );
     }
 }
 
 /// The sizes of the network, from the configuration and the shapes of the weights.
 fn encoder_config(golden: &Golden) -> DetectorConfig {
     let config = golden.config();
-    let layer_nums: Vec<usize> = integers(&config["layer_nums"]).iter().map(|&count| count as usize).collect();
+    let layer_nums: Vec<usize> = integers(&config["layer_nums"])
+        .iter()
+        .map(|&count| count as usize)
+        .collect();
     let levels = layer_nums.len();
-    let deblock = |level: usize| golden.f32(&format!("w.backbone.deblocks.{level}.0.weight")).0;
+    let deblock = |level: usize| {
+        golden
+            .f32(&format!("w.backbone.deblocks.{level}.0.weight"))
+            .0
+    };
     DetectorConfig {
         name: "golden".into(),
         lidar_range_m: array(&config["lidar_range"]),

@@ -19,7 +19,10 @@ fn golden_c3_targets() {
     let (_, objects) = golden.f64("in.gt");
     let (_, mask) = golden.f64("in.mask");
     let threshold = |name: &str| config[name].as_f64().unwrap() as f32;
-    let rule = TargetRule { positive_iou: threshold("pos_threshold"), negative_iou: threshold("neg_threshold") };
+    let rule = TargetRule {
+        positive_iou: threshold("pos_threshold"),
+        negative_iou: threshold("neg_threshold"),
+    };
     assert_eq!(config["order"], "hwl");
     let anchors: Vec<Box3d> = anchors.as_chunks().0.iter().map(box_of_hwl).collect();
     let assigner = TargetAssigner::new(anchors, [shape[0], shape[1], shape[2]], rule).unwrap();
@@ -36,16 +39,30 @@ fn golden_c3_targets() {
     let (_, positive) = golden.f64("out.pos_equal_one");
     let (_, negative) = golden.f64("out.neg_equal_one");
     let (_, targets) = golden.f64("out.targets");
-    let found: Vec<usize> = labels.positives.iter().map(|positive| positive.anchor).collect();
-    let expected: Vec<usize> = (0..positive.len()).filter(|&index| positive[index] == 1.0).collect();
+    let found: Vec<usize> = labels
+        .positives
+        .iter()
+        .map(|positive| positive.anchor)
+        .collect();
+    let expected: Vec<usize> = (0..positive.len())
+        .filter(|&index| positive[index] == 1.0)
+        .collect();
     assert_eq!(found, expected, "positive anchors");
-    assert!(!expected.is_empty(), "a case without positives tests nothing");
-    let unassigned: Vec<usize> =
-        (0..positive.len()).filter(|&index| positive[index] == 0.0 && negative[index] == 0.0).collect();
-    assert_eq!(labels.unassigned, unassigned, "anchors of the band between the thresholds");
+    assert!(
+        !expected.is_empty(),
+        "a case without positives tests nothing"
+    );
+    let unassigned: Vec<usize> = (0..positive.len())
+        .filter(|&index| positive[index] == 0.0 && negative[index] == 0.0)
+        .collect();
+    assert_eq!(
+        labels.unassigned, unassigned,
+        "anchors of the band between the thresholds"
+    );
     let mut dense = vec![0.0; targets.len()];
     for positive in &labels.positives {
-        dense[positive.anchor * BOX_CODE..(positive.anchor + 1) * BOX_CODE].copy_from_slice(&positive.code);
+        dense[positive.anchor * BOX_CODE..(positive.anchor + 1) * BOX_CODE]
+            .copy_from_slice(&positive.code);
     }
     assert_close("targets", &dense, &targets, 1e-10, 1e-10);
 }
@@ -54,12 +71,22 @@ fn golden_c3_targets() {
 fn golden_c4_average_precision() {
     let golden = golden("c4_ap");
     let config = golden.config();
-    let thresholds: Vec<f64> = config["thresholds"].as_array().unwrap().iter().map(|t| t.as_f64().unwrap()).collect();
+    let thresholds: Vec<f64> = config["thresholds"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|t| t.as_f64().unwrap())
+        .collect();
     let mut scorer = Scorer::new(&thresholds);
     for frame in 0..config["frames"].as_u64().unwrap() {
         let footprints = |name: &str| {
             let (_, corners) = golden.f32(&format!("in.{frame:02}.{name}"));
-            corners.as_chunks::<24>().0.iter().map(footprint_of_corners).collect::<Vec<_>>()
+            corners
+                .as_chunks::<24>()
+                .0
+                .iter()
+                .map(footprint_of_corners)
+                .collect::<Vec<_>>()
         };
         let (_, scores) = golden.f32(&format!("in.{frame:02}.det_scores"));
         let found: Vec<_> = footprints("det_corners").into_iter().zip(scores).collect();
@@ -68,19 +95,64 @@ fn golden_c4_average_precision() {
     for (tally, threshold) in scorer.tallies().iter().zip(&thresholds) {
         let prefix = format!("out.{:02.0}", threshold * 100.0);
         let lists = |pick: fn(bool) -> bool| -> Vec<i64> {
-            tally.matched.iter().map(|entry| i64::from(pick(entry.is_true))).collect()
+            tally
+                .matched
+                .iter()
+                .map(|entry| i64::from(pick(entry.is_true)))
+                .collect()
         };
-        assert_eq!(lists(|is_true| is_true), golden.i64(&format!("{prefix}.tp")).1, "{prefix}.tp");
-        assert_eq!(lists(|is_true| !is_true), golden.i64(&format!("{prefix}.fp")).1, "{prefix}.fp");
+        assert_eq!(
+            lists(|is_true| is_true),
+            golden.i64(&format!("{prefix}.tp")).1,
+            "{prefix}.tp"
+        );
+        assert_eq!(
+            lists(|is_true| !is_true),
+            golden.i64(&format!("{prefix}.fp")).1,
+            "{prefix}.fp"
+        );
         let scores: Vec<f32> = tally.matched.iter().map(|entry| entry.score).collect();
-        assert_eq!(scores, golden.f32(&format!("{prefix}.score")).1, "{prefix}.score");
-        assert_eq!(tally.objects as i64, golden.i64(&format!("{prefix}.gt")).1[0], "{prefix}.gt");
-        for (ordering, name) in [(Ordering::Frame, "frame_order"), (Ordering::Global, "global")] {
-            let Curve { average_precision, recall, precision } = tally.curve(ordering);
+        assert_eq!(
+            scores,
+            golden.f32(&format!("{prefix}.score")).1,
+            "{prefix}.score"
+        );
+        assert_eq!(
+            tally.objects as i64,
+            golden.i64(&format!("{prefix}.gt")).1[0],
+            "{prefix}.gt"
+        );
+        for (ordering, name) in [
+            (Ordering::Frame, "frame_order"),
+            (Ordering::Global, "global"),
+        ] {
+            let Curve {
+                average_precision,
+                recall,
+                precision,
+            } = tally.curve(ordering);
             let stored = |what: &str| golden.f64(&format!("{prefix}.{name}.{what}")).1;
-            assert_close(&format!("{prefix}.{name}.ap"), &[average_precision], &stored("ap"), 1e-9, 0.0);
-            assert_close(&format!("{prefix}.{name}.mrec"), &recall, &stored("mrec"), 1e-9, 0.0);
-            assert_close(&format!("{prefix}.{name}.mpre"), &precision, &stored("mpre"), 1e-9, 0.0);
+            assert_close(
+                &format!("{prefix}.{name}.ap"),
+                &[average_precision],
+                &stored("ap"),
+                1e-9,
+                0.0,
+            );
+            assert_close(
+                &format!("{prefix}.{name}.mrec"),
+                &recall,
+                &stored("mrec"),
+                1e-9,
+                0.0,
+            );
+            assert_close(
+                &format!("{prefix}.{name}.mpre"),
+                &precision,
+                &stored("mpre"),
+                1e-9,
+                0.0,
+            );
         }
     }
 }
@@ -94,7 +166,11 @@ fn golden_c5_warp_opencood() {
     let transforms = tensor(&golden, "in.matrix4");
     let present = tensor(&golden, "in.cav_mask");
     let close = |name: &str, found: &Tensor, atol: f64| {
-        assert_eq!(found.size(), tensor(&golden, name).size(), "shape of {name}");
+        assert_eq!(
+            found.size(),
+            tensor(&golden, name).size(),
+            "shape of {name}"
+        );
         assert_close(name, &values(found), &golden.f32(name).1, atol, 0.0);
     };
 
@@ -104,18 +180,44 @@ fn golden_c5_warp_opencood() {
     let centred = opencood::about_centre(&flat, height, width).unwrap();
     close("out.centre_matrix", &centred, 1e-4);
     let warp = |matrix: &Tensor, mode| opencood::warp_affine(&features, matrix, mode).unwrap();
-    close("out.warp_affine", &warp(&centred, Interpolation::Bilinear), 1e-4);
-    close("out.warp_affine_nearest", &warp(&centred, Interpolation::Nearest), 0.0);
-    close("out.warp_affine_no_centre", &warp(&flat, Interpolation::Bilinear), 1e-4);
+    close(
+        "out.warp_affine",
+        &warp(&centred, Interpolation::Bilinear),
+        1e-4,
+    );
+    close(
+        "out.warp_affine_nearest",
+        &warp(&centred, Interpolation::Nearest),
+        0.0,
+    );
+    close(
+        "out.warp_affine_no_centre",
+        &warp(&flat, Interpolation::Bilinear),
+        1e-4,
+    );
 
     let mask = opencood::roi_mask(&transforms, &present, height, width, pixel_m).unwrap();
-    close("out.roi_and_cav_mask", &mask.permute([0, 2, 3, 1]).unsqueeze(3), 0.0);
+    close(
+        "out.roi_and_cav_mask",
+        &mask.permute([0, 2, 3, 1]).unsqueeze(3),
+        0.0,
+    );
     let no_centre = opencood::rotated_extent(&flat, height, width).unwrap();
     let (batch, agents) = present.size2().unwrap();
-    close("out.roi_no_centre", &no_centre.view([batch, agents, 1, height, width]), 0.0);
+    close(
+        "out.roi_no_centre",
+        &no_centre.view([batch, agents, 1, height, width]),
+        0.0,
+    );
 
-    let channels_last = features.view([batch, agents, -1, height, width]).permute([0, 1, 3, 4, 2]);
-    close("out.sttf", &opencood::spatial_correction(&channels_last, &transforms, pixel_m).unwrap(), 1e-4);
+    let channels_last = features
+        .view([batch, agents, -1, height, width])
+        .permute([0, 1, 3, 4, 2]);
+    close(
+        "out.sttf",
+        &opencood::spatial_correction(&channels_last, &transforms, pixel_m).unwrap(),
+        1e-4,
+    );
 }
 
 #[test]
@@ -124,20 +226,45 @@ fn golden_c5_warp_coalign() {
     let size = |name: &str| golden.config()[name].as_i64().unwrap();
     let ratio = number(&golden, "discrete_ratio");
     let pairwise = tensor(&golden, "in.pairwise");
-    let downsampled =
-        coalign::normalized(&pairwise, size("H"), size("W"), ratio * number(&golden, "downsample_rate")).unwrap();
-    assert_close("downsampled", &values(&downsampled), &golden.f32("out.normalized_downsampled").1, 1e-4, 1e-5);
+    let downsampled = coalign::normalized(
+        &pairwise,
+        size("H"),
+        size("W"),
+        ratio * number(&golden, "downsample_rate"),
+    )
+    .unwrap();
+    assert_close(
+        "downsampled",
+        &values(&downsampled),
+        &golden.f32("out.normalized_downsampled").1,
+        1e-4,
+        1e-5,
+    );
     let full = coalign::normalized(&pairwise, size("H0"), size("W0"), ratio).unwrap();
-    assert_close("full resolution", &values(&full), &golden.f32("out.normalized_full_res").1, 1e-4, 1e-5);
+    assert_close(
+        "full resolution",
+        &values(&full),
+        &golden.f32("out.normalized_full_res").1,
+        1e-4,
+        1e-5,
+    );
 
     let features = tensor(&golden, "in.x");
     let expected = tensor(&golden, "out.warp_affine_simple");
     let [samples, agents] = [features.size()[0], features.size()[1]];
     for sample in 0..samples {
         for ego in 0..agents {
-            let warped = coalign::warp_affine(&features.get(sample), &downsampled.get(sample).get(ego)).unwrap();
+            let warped =
+                coalign::warp_affine(&features.get(sample), &downsampled.get(sample).get(ego))
+                    .unwrap();
             let expected = expected.get(sample).get(ego);
-            assert_close(&format!("warp {sample} {ego}"), &values(&warped), &values(&expected), 1e-4, 0.0);
+            assert_close(
+                &format!("warp {sample} {ego}"),
+                &values(&warped),
+                &values(&expected),
+                1e-4,
+                0.0,
+            );
         }
     }
 }
@@ -162,13 +289,20 @@ fn golden_c5_warp_in_metres_agrees_with_coalign() {
     for sample in 0..features.size()[0] {
         for ego in 0..features.size()[1] {
             // P[ego, cav] transforms points of the ego to the frame of the CAV; only its planar part enters a warp.
-            let poses: Vec<Pose> =
-                (0..features.size()[1]).map(|cav| planar_inverse(&pairwise.get(sample).get(ego).get(cav))).collect();
+            let poses: Vec<Pose> = (0..features.size()[1])
+                .map(|cav| planar_inverse(&pairwise.get(sample).get(ego).get(cav)))
+                .collect();
             let warped = warp_to_ego(&features.get(sample), None, &poses, &grid).unwrap();
             let expected = expected.get(sample).get(ego) * &warped.mask;
             // The reference scales sheared planar parts of tilted poses; this project's warp keeps them rigid.
-            let difference = (&warped.features - expected).abs().mean(Kind::Float).double_value(&[]);
-            assert!(difference < 2e-2, "sample {sample}, ego {ego}: {difference}");
+            let difference = (&warped.features - expected)
+                .abs()
+                .mean(Kind::Float)
+                .double_value(&[]);
+            assert!(
+                difference < 2e-2,
+                "sample {sample}, ego {ego}: {difference}"
+            );
         }
     }
 }
@@ -179,12 +313,26 @@ fn golden_c5_pairwise_coalign() {
     let pairwise = tensor(&golden, "out.pairwise_torch6");
     let mut cases = 0;
     for name in golden.names() {
-        let Some(case) = name.strip_prefix("out.normalized_") else { continue };
+        let Some(case) = name.strip_prefix("out.normalized_") else {
+            continue;
+        };
         // The name has the parameters: <rows>x<columns>_r<voxel size>_d<down-sampling>.
         let mut parts = case.split('_');
         let (rows, columns) = parts.next().unwrap().split_once('x').unwrap();
-        let ratio: f64 = parts.next().unwrap().strip_prefix('r').unwrap().parse().unwrap();
-        let down: f64 = parts.next().unwrap().strip_prefix('d').unwrap().parse().unwrap();
+        let ratio: f64 = parts
+            .next()
+            .unwrap()
+            .strip_prefix('r')
+            .unwrap()
+            .parse()
+            .unwrap();
+        let down: f64 = parts
+            .next()
+            .unwrap()
+            .strip_prefix('d')
+            .unwrap()
+            .parse()
+            .unwrap();
         let (height, width) = (rows.parse().unwrap(), columns.parse().unwrap());
         let found = coalign::normalized(&pairwise, height, width, ratio * down).unwrap();
         assert_close(&name, &values(&found), &golden.f32(&name).1, 1e-4, 1e-5);
@@ -200,9 +348,17 @@ fn golden_c6_att_max() {
     let (_, agents) = golden.i64("in.record_len");
     check_fusion(&golden, "out.att", &AttentionFusion, &features, &agents);
     check_fusion(&golden, "out.max", &MaxFusion, &features, &agents);
-    let (groups, mask) = regroup(&features, &agents, golden.config()["max_cav"].as_i64().unwrap()).unwrap();
+    let (groups, mask) = regroup(
+        &features,
+        &agents,
+        golden.config()["max_cav"].as_i64().unwrap(),
+    )
+    .unwrap();
     assert_eq!(groups, tensor(&golden, "out.regroup"));
-    assert_eq!(Vec::<i64>::try_from(mask.to_kind(Kind::Int64).view(-1)).unwrap(), golden.i64("out.regroup_mask").1);
+    assert_eq!(
+        Vec::<i64>::try_from(mask.to_kind(Kind::Int64).view(-1)).unwrap(),
+        golden.i64("out.regroup_mask").1
+    );
 }
 
 #[test]
@@ -213,17 +369,39 @@ fn golden_c6_coalign_att_max() {
     let (_, agents) = golden.i64("in.record_len");
     // The reference's two inputs, raw pairwise transforms and normalised ones, lead to the same result.
     let full_size = golden.config()["full_size"][0].as_f64().unwrap();
-    let [.., height, width] = features.size()[..] else { panic!("features have four dimensions") };
+    let [.., height, width] = features.size()[..] else {
+        panic!("features have four dimensions")
+    };
     let pixel_m = number(&golden, "discrete_ratio") * full_size / height as f64;
-    let from_raw = coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, pixel_m).unwrap();
-    assert_close("normalized", &values(&from_raw), &values(&normalized), 1e-4, 1e-5);
+    let from_raw =
+        coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, pixel_m).unwrap();
+    assert_close(
+        "normalized",
+        &values(&from_raw),
+        &values(&normalized),
+        1e-4,
+        1e-5,
+    );
     let mut warped = Vec::new();
-    for (sample, views) in features.split_with_sizes(agents.as_slice(), 0).into_iter().enumerate() {
-        let matrices = normalized.get(sample as i64).get(0).narrow(0, 0, views.size()[0]);
+    for (sample, views) in features
+        .split_with_sizes(agents.as_slice(), 0)
+        .into_iter()
+        .enumerate()
+    {
+        let matrices = normalized
+            .get(sample as i64)
+            .get(0)
+            .narrow(0, 0, views.size()[0]);
         warped.push(coalign::warp_affine(&views, &matrices).unwrap());
     }
     let warped = Tensor::cat(&warped, 0);
-    assert_close("warped", &values(&warped), &golden.f32("out.warped_to_ego").1, 1e-4, 0.0);
+    assert_close(
+        "warped",
+        &values(&warped),
+        &golden.f32("out.warped_to_ego").1,
+        1e-4,
+        0.0,
+    );
     check_fusion(&golden, "out.att", &AttentionFusion, &warped, &agents);
     check_fusion(&golden, "out.att_raw", &AttentionFusion, &warped, &agents);
     check_fusion(&golden, "out.max", &MaxFusion, &warped, &agents);
@@ -253,55 +431,129 @@ fn golden_c7_loss() {
     };
     let labels = LabelTensors::gather(&labels, config.unassigned, Device::Cpu);
     let loss = detection_loss(&scores, &boxes, &labels, &config).unwrap();
-    assert_close("conf", &values(&loss.score), &golden.f32("out.conf").1, 0.0, 1e-5);
-    assert_close("reg", &values(&loss.boxes), &golden.f32("out.reg").1, 0.0, 1e-5);
-    assert_close("total", &values(&loss.total()), &golden.f32("out.total").1, 0.0, 1e-5);
+    assert_close(
+        "conf",
+        &values(&loss.score),
+        &golden.f32("out.conf").1,
+        0.0,
+        1e-5,
+    );
+    assert_close(
+        "reg",
+        &values(&loss.boxes),
+        &golden.f32("out.reg").1,
+        0.0,
+        1e-5,
+    );
+    assert_close(
+        "total",
+        &values(&loss.total()),
+        &golden.f32("out.total").1,
+        0.0,
+        1e-5,
+    );
     loss.total().backward();
-    assert_close("grad_psm", &values(&scores.grad()), &golden.f32("out.grad_psm").1, 1e-6, 1e-4);
-    assert_close("grad_rm", &values(&boxes.grad()), &golden.f32("out.grad_rm").1, 1e-6, 1e-4);
+    assert_close(
+        "grad_psm",
+        &values(&scores.grad()),
+        &golden.f32("out.grad_psm").1,
+        1e-6,
+        1e-4,
+    );
+    assert_close(
+        "grad_rm",
+        &values(&boxes.grad()),
+        &golden.f32("out.grad_rm").1,
+        1e-6,
+        1e-4,
+    );
 }
 
-fn check_fusion(golden: &Golden, name: &str, fusion: &dyn Fusion, features: &Tensor, agents: &[i64]) {
+fn check_fusion(
+    golden: &Golden,
+    name: &str,
+    fusion: &dyn Fusion,
+    features: &Tensor,
+    agents: &[i64],
+) {
     let fused: Vec<Tensor> = features
         .split_with_sizes(agents, 0)
         .iter()
         .map(|features| {
-            let [views, _, height, width] = features.size()[..] else { panic!("features have four dimensions") };
+            let [views, _, height, width] = features.size()[..] else {
+                panic!("features have four dimensions")
+            };
             let mask = Tensor::ones([views, 1, height, width], (Kind::Float, Device::Cpu));
-            let facts: Vec<_> = (0..views as usize).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
+            let facts: Vec<_> = (0..views as usize)
+                .map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY))
+                .collect();
             let [width, height] = [width, height].map(|size| size as u32);
-            let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width, height };
+            let grid = BevGrid {
+                x_min_m: 0.0,
+                y_min_m: 0.0,
+                cell_m: 0.4,
+                width,
+                height,
+            };
             let maps = AlignedMaps::newest(features, &mask, &facts, &grid);
             fusion.fuse(&maps).unwrap().map
         })
         .collect();
-    assert_close(name, &values(&Tensor::stack(&fused, 0)), &golden.f32(name).1, 1e-4, 0.0);
+    assert_close(
+        name,
+        &values(&Tensor::stack(&fused, 0)),
+        &golden.f32(name).1,
+        1e-4,
+        0.0,
+    );
 }
 
 fn labels_of_dense(positive: &[f32], targets: &[f32]) -> Labels {
-    let code = |anchor: usize| std::array::from_fn(|component| f64::from(targets[anchor * BOX_CODE + component]));
+    let code = |anchor: usize| {
+        std::array::from_fn(|component| f64::from(targets[anchor * BOX_CODE + component]))
+    };
     let positives = (0..positive.len()).filter(|&anchor| positive[anchor] > 0.0);
-    let positives = positives.map(|anchor| Positive { anchor, code: code(anchor) }).collect();
-    Labels { anchors: positive.len(), positives, unassigned: Vec::new() }
+    let positives = positives
+        .map(|anchor| Positive {
+            anchor,
+            code: code(anchor),
+        })
+        .collect();
+    Labels {
+        anchors: positive.len(),
+        positives,
+        unassigned: Vec::new(),
+    }
 }
 
 fn box_of_hwl(&[x, y, z, h, w, l, yaw]: &[f64; 7]) -> Box3d {
-    Box3d { center_m: [x, y, z], size_m: [l, w, h], heading_rad: yaw }
+    Box3d {
+        center_m: [x, y, z],
+        size_m: [l, w, h],
+        heading_rad: yaw,
+    }
 }
 
 fn footprint_of_corners(corners: &[f32; 24]) -> Polygon {
-    Polygon::new(std::array::from_fn(|corner| [corners[corner * 3], corners[corner * 3 + 1]].map(f64::from)))
+    Polygon::new(std::array::from_fn(|corner| {
+        [corners[corner * 3], corners[corner * 3 + 1]].map(f64::from)
+    }))
 }
 
 /// The inverse of the planar part of a 4x4 transform.
 fn planar_inverse(matrix: &Tensor) -> Pose {
     let entry = |row: i64, column: i64| matrix.double_value(&[row, column]);
     let yaw = entry(1, 0).atan2(entry(0, 0));
-    Pose::from_xyz_yaw([entry(0, 3), entry(1, 3), 0.0], yaw).isometry().inverse().into()
+    Pose::from_xyz_yaw([entry(0, 3), entry(1, 3), 0.0], yaw)
+        .isometry()
+        .inverse()
+        .into()
 }
 
 fn number(golden: &Golden, name: &str) -> f64 {
-    golden.config()[name].as_f64().unwrap_or_else(|| panic!("config has no number {name:?}"))
+    golden.config()[name]
+        .as_f64()
+        .unwrap_or_else(|| panic!("config has no number {name:?}"))
 }
 
 fn tensor(golden: &Golden, name: &str) -> Tensor {

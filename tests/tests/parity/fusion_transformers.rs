@@ -31,19 +31,31 @@ fn check_v2xvit(name: &str) {
     tch::set_num_threads(1);
     let case = EncoderCase::new(&golden, &golden.config()["encoder"], "");
     let (x, prior) = (tensor(&golden, "in.x"), tensor(&golden, "in.prior"));
-    let (present, correction) = (tensor(&golden, "in.mask"), tensor(&golden, "in.spatial_correction"));
-    let &[samples, slots, height, width, _] = &x.size()[..] else { panic!("five dimensions") };
+    let (present, correction) = (
+        tensor(&golden, "in.mask"),
+        tensor(&golden, "in.spatial_correction"),
+    );
+    let &[samples, slots, height, width, _] = &x.size()[..] else {
+        panic!("five dimensions")
+    };
     let features = x.narrow(4, 0, case.config.channels);
 
-    let encoded =
-        Tensor::stack(&(0..samples).map(|b| case.with_delay(&features.get(b), &prior.get(b))).collect::<Vec<_>>(), 0);
+    let encoded = Tensor::stack(
+        &(0..samples)
+            .map(|b| case.with_delay(&features.get(b), &prior.get(b)))
+            .collect::<Vec<_>>(),
+        0,
+    );
     case.close("mid.rte", &encoded);
     let moved = opencood::spatial_correction(&encoded, &correction, case.pixel_m).unwrap();
     case.close("mid.sttf_agent1", &moved.select(1, 1));
     let mask = if case.use_roi_mask {
         opencood::roi_mask(&correction, &present, height, width, case.pixel_m).unwrap()
     } else {
-        present.view([samples, slots, 1, 1]).expand([samples, slots, height, width], false).contiguous()
+        present
+            .view([samples, slots, 1, 1])
+            .expand([samples, slots, height, width], false)
+            .contiguous()
     };
     case.close("mid.com_mask", &mask.permute([0, 2, 3, 1]).unsqueeze(3));
 
@@ -52,21 +64,39 @@ fn check_v2xvit(name: &str) {
         // Slots without an agent are not computed; no output of the ego depends on them.
         let agents = present.get(sample).sum(Kind::Int64).int64_value(&[]);
         let maps = moved.get(sample).narrow(0, 0, agents).permute([0, 3, 1, 2]);
-        let types: Vec<usize> = (0..agents).map(|agent| prior.double_value(&[sample, agent, 2]) as usize).collect();
+        let types: Vec<usize> = (0..agents)
+            .map(|agent| prior.double_value(&[sample, agent, 2]) as usize)
+            .collect();
         let tokens = case.order.tokens(&maps).unwrap();
         let unseen = unseen(&mask.get(sample).narrow(0, 0, agents).unsqueeze(1)).unwrap();
         let unseen = case.order.tokens(&unseen).unwrap().squeeze_dim(2);
         let block = &case.encoder.layers()[0].blocks()[0];
-        let one = block.across_agents(&tokens, Some(&unseen), &types, agents as usize, false).unwrap().get(0);
+        let one = block
+            .across_agents(&tokens, Some(&unseen), &types, agents as usize, false)
+            .unwrap()
+            .get(0);
         let two = block.across_cells(&one, false).unwrap();
-        let all = case.encoder.forward(&tokens, Some(&unseen), &types, false).unwrap();
+        let all = case
+            .encoder
+            .forward(&tokens, Some(&unseen), &types, false)
+            .unwrap();
         let trained = no_grad(|| case.encoder.forward(&tokens, Some(&unseen), &types, true));
         assert!(trained.is_ok(), "the way of training");
         for (stage, tokens) in stages.iter_mut().zip([one, two, all]) {
-            stage.push(case.order.maps(&tokens.unsqueeze(0), height, width).unwrap().get(0).permute([1, 2, 0]));
+            stage.push(
+                case.order
+                    .maps(&tokens.unsqueeze(0), height, width)
+                    .unwrap()
+                    .get(0)
+                    .permute([1, 2, 0]),
+            );
         }
     }
-    let names = ["mid.after_first_hmsa_ego", "mid.after_first_window_ego", "out.y"];
+    let names = [
+        "mid.after_first_hmsa_ego",
+        "mid.after_first_window_ego",
+        "out.y",
+    ];
     for (name, stage) in names.into_iter().zip(stages) {
         case.close(name, &Tensor::stack(&stage, 0));
     }
@@ -78,15 +108,32 @@ fn golden_c6_coalign_v2xvit() {
     tch::set_num_threads(1);
     let case = EncoderCase::new(&golden, &golden.config()["encoder"], "fusion_net.");
     let (x, matrices) = (tensor(&golden, "in.x"), tensor(&golden, "in.normalized"));
-    let [.., height, width] = x.size()[..] else { panic!("four dimensions") };
+    let [.., height, width] = x.size()[..] else {
+        panic!("four dimensions")
+    };
     let (_, agents) = golden.i64("in.record_len");
     let mut fused = Vec::new();
-    for (sample, maps) in x.split_with_sizes(agents.as_slice(), 0).into_iter().enumerate() {
-        let matrices = matrices.get(sample as i64).get(0).narrow(0, 0, maps.size()[0]);
-        let tokens = case.order.tokens(&coalign::warp_affine(&maps, &matrices).unwrap()).unwrap();
+    for (sample, maps) in x
+        .split_with_sizes(agents.as_slice(), 0)
+        .into_iter()
+        .enumerate()
+    {
+        let matrices = matrices
+            .get(sample as i64)
+            .get(0)
+            .narrow(0, 0, maps.size()[0]);
+        let tokens = case
+            .order
+            .tokens(&coalign::warp_affine(&maps, &matrices).unwrap())
+            .unwrap();
         let types = vec![0; maps.size()[0] as usize];
         let ego = case.encoder.forward(&tokens, None, &types, false).unwrap();
-        fused.push(case.order.maps(&ego.unsqueeze(0), height, width).unwrap().get(0));
+        fused.push(
+            case.order
+                .maps(&ego.unsqueeze(0), height, width)
+                .unwrap()
+                .get(0),
+        );
     }
     case.close("out.y", &Tensor::stack(&fused, 0));
 }
@@ -109,29 +156,70 @@ fn golden_c6_hmsa_mswin() {
         integer(&config["hmsa_dim_head"]),
         0.0,
     );
-    let cells = WindowAttention::new(&(&root / "mswin"), channels, &windows, Merge::SplitAttention, &order, 0.0);
+    let cells = WindowAttention::new(
+        &(&root / "mswin"),
+        channels,
+        &windows,
+        Merge::SplitAttention,
+        &order,
+        0.0,
+    );
     load(&variables, &golden, "");
-    let (x, prior, mask) = (tensor(&golden, "in.x"), tensor(&golden, "in.prior"), tensor(&golden, "in.mask"));
-    let &[samples, slots, height, width, _] = &x.size()[..] else { panic!("five dimensions") };
+    let (x, prior, mask) = (
+        tensor(&golden, "in.x"),
+        tensor(&golden, "in.prior"),
+        tensor(&golden, "in.mask"),
+    );
+    let &[samples, slots, height, width, _] = &x.size()[..] else {
+        panic!("five dimensions")
+    };
     let mut found: [Vec<Tensor>; 3] = Default::default();
     for sample in 0..samples {
         let tokens = order.tokens(&x.get(sample).permute([0, 3, 1, 2])).unwrap();
         let mask = mask.get(sample).permute([3, 2, 0, 1]);
-        let unseen = order.tokens(&unseen(&mask).unwrap()).unwrap().squeeze_dim(2);
-        let types: Vec<usize> = (0..slots).map(|slot| prior.double_value(&[sample, slot, 0, 0, 2]) as usize).collect();
-        let all = agents.forward(&tokens, Some(&unseen), &types, types.len(), false).unwrap();
-        let ego = agents.forward(&tokens, Some(&unseen), &types, 1, false).unwrap();
-        assert_close("ego-only", &values(&ego.get(0)), &values(&all.get(0)), 1e-5, 0.0);
+        let unseen = order
+            .tokens(&unseen(&mask).unwrap())
+            .unwrap()
+            .squeeze_dim(2);
+        let types: Vec<usize> = (0..slots)
+            .map(|slot| prior.double_value(&[sample, slot, 0, 0, 2]) as usize)
+            .collect();
+        let all = agents
+            .forward(&tokens, Some(&unseen), &types, types.len(), false)
+            .unwrap();
+        let ego = agents
+            .forward(&tokens, Some(&unseen), &types, 1, false)
+            .unwrap();
+        assert_close(
+            "ego-only",
+            &values(&ego.get(0)),
+            &values(&all.get(0)),
+            1e-5,
+            0.0,
+        );
         let each = |step: &dyn Fn(&Tensor) -> Tensor| {
-            Tensor::stack(&(0..slots).map(|slot| step(&tokens.get(slot))).collect::<Vec<_>>(), 0)
+            Tensor::stack(
+                &(0..slots)
+                    .map(|slot| step(&tokens.get(slot)))
+                    .collect::<Vec<_>>(),
+                0,
+            )
         };
         let merged = each(&|x| cells.forward(x, false).unwrap());
         let branch = each(&|x| cells.branches()[1].forward(x).unwrap());
         for (found, tokens) in found.iter_mut().zip([all, merged, branch]) {
-            found.push(order.maps(&tokens, height, width).unwrap().permute([0, 2, 3, 1]));
+            found.push(
+                order
+                    .maps(&tokens, height, width)
+                    .unwrap()
+                    .permute([0, 2, 3, 1]),
+            );
         }
     }
-    for (name, found) in ["out.hmsa", "out.mswin", "out.window_branch1"].into_iter().zip(found) {
+    for (name, found) in ["out.hmsa", "out.mswin", "out.window_branch1"]
+        .into_iter()
+        .zip(found)
+    {
         close(&golden, name, &Tensor::stack(&found, 0), ATOL, RTOL);
     }
 }
@@ -181,7 +269,13 @@ fn check_swap_fusion(name: &str) {
         fused.push(fusion.forward(&maps, slots, false).unwrap());
         trained.push(no_grad(|| fusion.forward(&maps, slots, true)).unwrap());
     }
-    close(&golden, "out.first_block_ego", &Tensor::stack(&first, 0), 1e-4, 0.0);
+    close(
+        &golden,
+        "out.first_block_ego",
+        &Tensor::stack(&first, 0),
+        1e-4,
+        0.0,
+    );
     close(&golden, "out.y", &Tensor::stack(&fused, 0), 1e-4, 0.0);
     close(&golden, "out.y", &Tensor::stack(&trained, 0), 1e-4, 0.0);
 }
@@ -209,9 +303,15 @@ impl<'a> EncoderCase<'a> {
             agent_heads: integer(&agents["heads"]),
             agent_head_channels: integer(&agents["dim_head"]),
             windows: windows(&cells["heads"], &cells["dim_head"], &cells["window_size"]),
-            merge: if cells["fusion_method"] == "naive" { Merge::Naive } else { Merge::SplitAttention },
+            merge: if cells["fusion_method"] == "naive" {
+                Merge::Naive
+            } else {
+                Merge::SplitAttention
+            },
             hidden: integer(&encoder["feed_forward"]["mlp_dim"]),
-            temporal_encoding: agents["use_RTE"].as_bool().expect("use_RTE is true or false"),
+            temporal_encoding: agents["use_RTE"]
+                .as_bool()
+                .expect("use_RTE is true or false"),
             dropout: 0.0,
         };
         config.validate().unwrap();
@@ -233,10 +333,13 @@ impl<'a> EncoderCase<'a> {
 
     /// `[L, H, W, C]` with the code of each slot's delay.
     fn with_delay(&self, features: &Tensor, prior: &Tensor) -> Tensor {
-        let Some(temporal) = self.encoder.temporal() else { return features.shallow_clone() };
+        let Some(temporal) = self.encoder.temporal() else {
+            return features.shallow_clone();
+        };
         let slots = features.size()[0];
-        let rows: Vec<f64> =
-            (0..slots).map(|slot| prior.double_value(&[slot, 1]).trunc() * self.rows_per_step).collect();
+        let rows: Vec<f64> = (0..slots)
+            .map(|slot| prior.double_value(&[slot, 1]).trunc() * self.rows_per_step)
+            .collect();
         features + temporal.encode(&rows).unwrap().view([slots, 1, 1, -1])
     }
 
@@ -246,8 +349,17 @@ impl<'a> EncoderCase<'a> {
 }
 
 fn windows(heads: &Value, head_channels: &Value, edges: &Value) -> Vec<WindowConfig> {
-    let sizes = integers(edges).into_iter().zip(integers(heads)).zip(integers(head_channels));
-    sizes.map(|((edge, heads), head_channels)| WindowConfig { edge, heads, head_channels }).collect()
+    let sizes = integers(edges)
+        .into_iter()
+        .zip(integers(heads))
+        .zip(integers(head_channels));
+    sizes
+        .map(|((edge, heads), head_channels)| WindowConfig {
+            edge,
+            heads,
+            head_channels,
+        })
+        .collect()
 }
 
 /// Copies the weights of a case, all of them, into variables without `prefix` in their names.
@@ -255,17 +367,26 @@ fn load(variables: &VarStore, golden: &Golden, prefix: &str) {
     let mut variables = variables.variables();
     let prefix = format!("w.{prefix}");
     for name in golden.names() {
-        let Some(short) = name.strip_prefix(&prefix) else { continue };
+        let Some(short) = name.strip_prefix(&prefix) else {
+            continue;
+        };
         match variables.remove(short) {
             Some(mut variable) => {
                 let source = tensor(golden, &name);
                 assert_eq!(source.size(), variable.size(), "{name}");
                 no_grad(|| variable.copy_(&source));
             }
-            None => assert!(UNUSED.iter().any(|unused| short.contains(unused)), "nothing takes {name}"),
+            None => assert!(
+                UNUSED.iter().any(|unused| short.contains(unused)),
+                "nothing takes {name}"
+            ),
         }
     }
-    assert!(variables.is_empty(), "not in the archive: {:?}", variables.keys());
+    assert!(
+        variables.is_empty(),
+        "not in the archive: {:?}",
+        variables.keys()
+    );
 }
 
 fn close(golden: &Golden, name: &str, found: &Tensor, atol: f64, rtol: f64) {

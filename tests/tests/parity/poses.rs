@@ -25,7 +25,10 @@ fn rows<const N: usize>(golden: &Golden, name: &str) -> Vec<[f64; N]> {
 }
 
 fn poses(golden: &Golden, name: &str) -> Vec<Pose> {
-    rows::<6>(golden, name).into_iter().map(|six| CarlaPose::from(six).to_pose()).collect()
+    rows::<6>(golden, name)
+        .into_iter()
+        .map(|six| CarlaPose::from(six).to_pose())
+        .collect()
 }
 
 /// A transform as the row-major left-handed matrix of the archives.
@@ -41,9 +44,17 @@ fn to_f32(values: &[f64]) -> Vec<f32> {
 
 /// The integers after `key` in the archive's note.
 fn numbers_after(note: &str, key: &str) -> Vec<f64> {
-    let rest = note.split_once(key).unwrap_or_else(|| panic!("{key:?} is not in the note {note:?}")).1;
-    let end = rest.find(|c: char| !c.is_ascii_digit() && !",-.".contains(c)).unwrap_or(rest.len());
-    rest[..end].split(',').map(|number| number.parse().unwrap()).collect()
+    let rest = note
+        .split_once(key)
+        .unwrap_or_else(|| panic!("{key:?} is not in the note {note:?}"))
+        .1;
+    let end = rest
+        .find(|c: char| !c.is_ascii_digit() && !",-.".contains(c))
+        .unwrap_or(rest.len());
+    rest[..end]
+        .split(',')
+        .map(|number| number.parse().unwrap())
+        .collect()
 }
 
 #[test]
@@ -52,10 +63,25 @@ fn golden_pose_matrices() {
     let (_, expected) = golden.f64("out.x_to_world");
     let raw: Vec<f64> = rows::<6>(&golden, "in.poses")
         .into_iter()
-        .flat_map(|six| CarlaPose::from(six).left_handed_matrix().transpose().as_slice().to_vec())
+        .flat_map(|six| {
+            CarlaPose::from(six)
+                .left_handed_matrix()
+                .transpose()
+                .as_slice()
+                .to_vec()
+        })
         .collect();
-    assert_close("x_to_world before the mirror", &raw, &expected, F64_ATOL, 0.0);
-    let converted: Vec<f64> = poses(&golden, "in.poses").iter().flat_map(left_handed).collect();
+    assert_close(
+        "x_to_world before the mirror",
+        &raw,
+        &expected,
+        F64_ATOL,
+        0.0,
+    );
+    let converted: Vec<f64> = poses(&golden, "in.poses")
+        .iter()
+        .flat_map(left_handed)
+        .collect();
     assert_close("x_to_world", &converted, &expected, F64_ATOL, 0.0);
 }
 
@@ -64,7 +90,9 @@ fn golden_relative_transforms() {
     let golden = golden("c5_poses");
     let poses = poses(&golden, "in.poses");
     let (_, expected) = golden.f64("out.x1_to_x2");
-    let pairs = poses.iter().flat_map(|source| poses.iter().map(move |target| target.from_world(source)));
+    let pairs = poses
+        .iter()
+        .flat_map(|source| poses.iter().map(move |target| target.from_world(source)));
     let actual: Vec<f64> = pairs.flat_map(|pose| left_handed(&pose)).collect();
     assert_close("x1_to_x2", &actual, &expected, F64_ATOL, 0.0);
 }
@@ -74,14 +102,18 @@ fn golden_pairwise_matrices() {
     let golden = golden("c5_poses");
     let all = poses(&golden, "in.poses");
     let note = golden.config()["note"].as_str().unwrap();
-    let cavs: Vec<Pose> =
-        numbers_after(note, "pairwise uses poses ").into_iter().map(|index| all[index as usize]).collect();
+    let cavs: Vec<Pose> = numbers_after(note, "pairwise uses poses ")
+        .into_iter()
+        .map(|index| all[index as usize])
+        .collect();
     let (shape, expected) = golden.f64("out.pairwise_opencood_zero_padded");
     let mut actual = Vec::with_capacity(expected.len());
     for i in 0..shape[0] {
         for j in 0..shape[1] {
             match (cavs.get(i), cavs.get(j)) {
-                (Some(source), Some(target)) => actual.extend(left_handed(&target.from_world(source))),
+                (Some(source), Some(target)) => {
+                    actual.extend(left_handed(&target.from_world(source)))
+                }
                 _ => actual.extend([0.0; 16]),
             }
         }
@@ -90,7 +122,13 @@ fn golden_pairwise_matrices() {
     // Clouds that were projected first need no transform any more.
     let (shape, projected_first) = golden.f64("out.pairwise_opencood_proj_first");
     let identity = left_handed(&Pose::IDENTITY).repeat(shape[0] * shape[1]);
-    assert_close("pairwise, projected first", &identity, &projected_first, 0.0, 0.0);
+    assert_close(
+        "pairwise, projected first",
+        &identity,
+        &projected_first,
+        0.0,
+        0.0,
+    );
 }
 
 #[test]
@@ -99,9 +137,16 @@ fn golden_projected_and_cropped_points() {
     let poses = poses(&golden, "in.poses");
     let note = golden.config()["note"].as_str().unwrap();
     let indices = numbers_after(note, "x1_to_x2[");
-    let ego_from_cav = poses[indices[1] as usize].from_world(&poses[indices[0] as usize]).isometry();
+    let ego_from_cav = poses[indices[1] as usize]
+        .from_world(&poses[indices[0] as usize])
+        .isometry();
     let (_, flat) = golden.f32("in.points");
-    let xyzi: Vec<[f32; 4]> = flat.as_chunks::<4>().0.iter().map(|&[x, y, z, i]| [x, -y, z, i]).collect();
+    let xyzi: Vec<[f32; 4]> = flat
+        .as_chunks::<4>()
+        .0
+        .iter()
+        .map(|&[x, y, z, i]| [x, -y, z, i])
+        .collect();
 
     let projected: Vec<f32> = xyzi
         .iter()
@@ -110,40 +155,93 @@ fn golden_projected_and_cropped_points() {
             mirrored_point(point.into()).map(|value| value as f32)
         })
         .collect();
-    assert_close("projected", &projected, &golden.f32("out.points_projected").1, F32_ATOL, 0.0);
+    assert_close(
+        "projected",
+        &projected,
+        &golden.f32("out.points_projected").1,
+        F32_ATOL,
+        0.0,
+    );
 
     let kept_by = |config: DetectorConfig| {
         let mut kept = Vec::new();
         Crop::for_detector(&config).keep(&xyzi, &mut kept);
-        kept.into_iter().flat_map(|[x, y, z, i]| [x, -y, z, i]).collect::<Vec<f32>>()
+        kept.into_iter()
+            .flat_map(|[x, y, z, i]| [x, -y, z, i])
+            .collect::<Vec<f32>>()
     };
     let everywhere = [-1e6, -1e6, -1e6, 1e6, 1e6, 1e6];
-    let without_body = kept_by(DetectorConfig { lidar_range_m: everywhere, ..DetectorConfig::full() });
-    assert_close("without own body", &without_body, &golden.f32("out.points_ego_masked").1, 0.0, 0.0);
+    let without_body = kept_by(DetectorConfig {
+        lidar_range_m: everywhere,
+        ..DetectorConfig::full()
+    });
+    assert_close(
+        "without own body",
+        &without_body,
+        &golden.f32("out.points_ego_masked").1,
+        0.0,
+        0.0,
+    );
 
     let bounds: [f64; 6] = numbers_after(note, "range mask [").try_into().unwrap();
     // y is mirrored, and with it the lower and upper bounds.
-    let lidar_range_m = [bounds[0], -bounds[4], bounds[2], bounds[3], -bounds[1], bounds[5]];
-    let in_range = kept_by(DetectorConfig { lidar_range_m, own_body_m: None, ..DetectorConfig::full() });
-    assert_close("in range", &in_range, &golden.f32("out.points_range_masked").1, 0.0, 0.0);
+    let lidar_range_m = [
+        bounds[0], -bounds[4], bounds[2], bounds[3], -bounds[1], bounds[5],
+    ];
+    let in_range = kept_by(DetectorConfig {
+        lidar_range_m,
+        own_body_m: None,
+        ..DetectorConfig::full()
+    });
+    assert_close(
+        "in range",
+        &in_range,
+        &golden.f32("out.points_range_masked").1,
+        0.0,
+        0.0,
+    );
 }
 
 #[test]
 fn golden_coalign_poses() {
     let golden = golden("c5_pairwise_coalign");
     let six = rows::<6>(&golden, "in.poses6");
-    let poses: Vec<Pose> = six.iter().map(|&six| CarlaPose::from(six).to_pose()).collect();
+    let poses: Vec<Pose> = six
+        .iter()
+        .map(|&six| CarlaPose::from(six).to_pose())
+        .collect();
     let matrices: Vec<f64> = poses.iter().flat_map(left_handed).collect();
-    assert_close("pose_to_tfm, six numbers", &to_f32(&matrices), &golden.f32("out.pose_to_tfm6").1, F32_ATOL, 0.0);
-    let back: Vec<f64> = poses.iter().flat_map(|pose| <[f64; 6]>::from(CarlaPose::from_pose(pose))).collect();
-    assert_close("tfm_to_pose, six numbers", &to_f32(&back), &golden.f32("out.tfm_to_pose6").1, F32_ATOL, 0.0);
+    assert_close(
+        "pose_to_tfm, six numbers",
+        &to_f32(&matrices),
+        &golden.f32("out.pose_to_tfm6").1,
+        F32_ATOL,
+        0.0,
+    );
+    let back: Vec<f64> = poses
+        .iter()
+        .flat_map(|pose| <[f64; 6]>::from(CarlaPose::from_pose(pose)))
+        .collect();
+    assert_close(
+        "tfm_to_pose, six numbers",
+        &to_f32(&back),
+        &golden.f32("out.tfm_to_pose6").1,
+        F32_ATOL,
+        0.0,
+    );
 
     let planar: Vec<Pose> = rows::<3>(&golden, "in.poses3")
         .into_iter()
         .map(|[x, y, yaw]| CarlaPose::from([x, y, 0.0, 0.0, yaw, 0.0]).to_pose())
         .collect();
     let matrices: Vec<f64> = planar.iter().flat_map(left_handed).collect();
-    assert_close("pose_to_tfm, three numbers", &to_f32(&matrices), &golden.f32("out.pose_to_tfm3").1, F32_ATOL, 0.0);
+    assert_close(
+        "pose_to_tfm, three numbers",
+        &to_f32(&matrices),
+        &golden.f32("out.pose_to_tfm3").1,
+        F32_ATOL,
+        0.0,
+    );
     let back: Vec<f64> = planar
         .iter()
         .flat_map(|pose| {
@@ -151,10 +249,25 @@ fn golden_coalign_poses() {
             [x, y, yaw]
         })
         .collect();
-    assert_close("tfm_to_pose, three numbers", &to_f32(&back), &golden.f32("out.tfm_to_pose3").1, F32_ATOL, 0.0);
+    assert_close(
+        "tfm_to_pose, three numbers",
+        &to_f32(&back),
+        &golden.f32("out.tfm_to_pose3").1,
+        F32_ATOL,
+        0.0,
+    );
 
-    let relative: Vec<f64> = poses.iter().flat_map(|pose| left_handed(&poses[0].from_world(pose))).collect();
-    assert_close("relative to the first", &relative, &golden.f64("out.relative_to_first").1, F64_ATOL, 0.0);
+    let relative: Vec<f64> = poses
+        .iter()
+        .flat_map(|pose| left_handed(&poses[0].from_world(pose)))
+        .collect();
+    assert_close(
+        "relative to the first",
+        &relative,
+        &golden.f64("out.relative_to_first").1,
+        F64_ATOL,
+        0.0,
+    );
 }
 
 /// `[samples, slots, slots]` matrices, entry `i, j` from frame `i` to frame `j`, identity where there is no agent.
@@ -167,7 +280,8 @@ fn padded_pairwise(poses: &[Pose], record_len: &[i64], slots: usize) -> Vec<f64>
         for i in 0..slots {
             for j in 0..slots {
                 let pair = sample.get(i).zip(sample.get(j));
-                let pose = pair.map_or(Pose::IDENTITY, |(source, target)| target.from_world(source));
+                let pose =
+                    pair.map_or(Pose::IDENTITY, |(source, target)| target.from_world(source));
                 matrices.extend(left_handed(&pose));
             }
         }
@@ -182,15 +296,33 @@ fn golden_coalign_pairwise() {
     let (shape, expected) = golden.f32("out.pairwise_torch6");
     let six = poses(&golden, "in.poses6");
     let actual = padded_pairwise(&six, &record_len, shape[1]);
-    assert_close("pairwise, six numbers", &to_f32(&actual), &expected, F32_ATOL, 0.0);
+    assert_close(
+        "pairwise, six numbers",
+        &to_f32(&actual),
+        &expected,
+        F32_ATOL,
+        0.0,
+    );
     let first = padded_pairwise(&six, &record_len[..1], shape[1]);
-    assert_close("pairwise of the first sample", &first, &golden.f64("out.pairwise_np_first_sample").1, F64_ATOL, 0.0);
+    assert_close(
+        "pairwise of the first sample",
+        &first,
+        &golden.f64("out.pairwise_np_first_sample").1,
+        F64_ATOL,
+        0.0,
+    );
     let planar: Vec<Pose> = rows::<3>(&golden, "in.poses3")
         .into_iter()
         .map(|[x, y, yaw]| CarlaPose::from([x, y, 0.0, 0.0, yaw, 0.0]).to_pose())
         .collect();
     let actual = padded_pairwise(&planar, &record_len, shape[1]);
-    assert_close("pairwise, three numbers", &to_f32(&actual), &golden.f32("out.pairwise_torch3").1, F32_ATOL, 0.0);
+    assert_close(
+        "pairwise, three numbers",
+        &to_f32(&actual),
+        &golden.f32("out.pairwise_torch3").1,
+        F32_ATOL,
+        0.0,
+    );
 }
 
 fn range(config: &Value) -> [f64; 6] {
@@ -200,16 +332,19 @@ fn range(config: &Value) -> [f64; 6] {
 #[test]
 fn golden_world_objects() {
     let golden = golden("c3_world_objects");
-    let objects = rows::<12>(&golden, "in.objects").into_iter().enumerate().map(|(id, columns)| {
-        let part = |first: usize| [columns[first], columns[first + 1], columns[first + 2]];
-        Object {
-            id: id as i64,
-            class: ObjectClass::Car,
-            world_from_object: CarlaPose::of_box(part(0), part(3), part(6)).to_pose(),
-            size_m: part(9).map(|half| 2.0 * half),
-            speed_mps: None,
-        }
-    });
+    let objects = rows::<12>(&golden, "in.objects")
+        .into_iter()
+        .enumerate()
+        .map(|(id, columns)| {
+            let part = |first: usize| [columns[first], columns[first + 1], columns[first + 2]];
+            Object {
+                id: id as i64,
+                class: ObjectClass::Car,
+                world_from_object: CarlaPose::of_box(part(0), part(3), part(6)).to_pose(),
+                size_m: part(9).map(|half| 2.0 * half),
+                speed_mps: None,
+            }
+        });
     let ego = Frame {
         world_from_lidar: Some(poses(&golden, "in.lidar_pose")[0]),
         objects: objects.collect(),
@@ -228,10 +363,20 @@ fn golden_world_objects() {
     for ((id, box3d), expected) in merged.iter().zip(rows::<7>(&golden, "out.boxes_hwl")) {
         let [x, y, z] = mirrored_point(box3d.center_m);
         let [l, w, h] = box3d.size_m;
-        assert_close(&format!("object {id}"), &[x, y, z, h, w, l], &expected[..6], F32_ATOL, 0.0);
+        assert_close(
+            &format!("object {id}"),
+            &[x, y, z, h, w, l],
+            &expected[..6],
+            F32_ATOL,
+            0.0,
+        );
         let yaw = -box3d.heading_rad;
         // Within 1e-6 of half a turn the reference's average of four angles may result in 0.
         let reference_is_torn = std::f64::consts::PI - yaw.abs() < 1e-6;
-        assert!(reference_is_torn || (yaw - expected[6]).abs() <= 1e-5, "object {id}: {yaw} is not {}", expected[6]);
+        assert!(
+            reference_is_torn || (yaw - expected[6]).abs() <= 1e-5,
+            "object {id}: {yaw} is not {}",
+            expected[6]
+        );
     }
 }

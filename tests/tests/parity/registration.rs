@@ -36,24 +36,53 @@ fn golden_c8_kabsch() {
             for ((source, target), &weight) in source.iter().zip(&target).zip(weights) {
                 moments.add(&source.cast(), &target.cast(), f64::from(weight_of(weight)));
             }
-            moments.fit_biased(epsilon).unwrap_or_else(|error| panic!("set {set}: {error}"))
+            moments
+                .fit_biased(epsilon)
+                .unwrap_or_else(|error| panic!("set {set}: {error}"))
         };
         let check = |name: &str, found: &Isometry3<f64>| {
             let (_, expected) = golden.f32(name);
-            assert_close(&format!("{name}, set {set}"), &rows(found), &expected[set * 16..(set + 1) * 16], 1e-4, 0.0);
+            assert_close(
+                &format!("{name}, set {set}"),
+                &rows(found),
+                &expected[set * 16..(set + 1) * 16],
+                1e-4,
+                0.0,
+            );
         };
         let unweighted = fit(&|_| 1.0);
         check("out.unweighted", &unweighted);
         check("out.weighted", &fit(&|weight| weight));
-        for name in golden.names().iter().filter(|name| name.starts_with("out.weighted_thr")) {
-            let threshold: f32 = name["out.weighted_thr".len()..].parse().expect("a threshold");
-            check(name, &fit(&|weight| if weight < threshold { 0.0 } else { weight }));
+        for name in golden
+            .names()
+            .iter()
+            .filter(|name| name.starts_with("out.weighted_thr"))
+        {
+            let threshold: f32 = name["out.weighted_thr".len()..]
+                .parse()
+                .expect("a threshold");
+            check(
+                name,
+                &fit(&|weight| if weight < threshold { 0.0 } else { weight }),
+            );
         }
         let moved: Vec<f32> = (source.iter())
-            .flat_map(|point| (unweighted * Point3::from(point.cast::<f64>())).coords.map(|x| x as f32).data.0[0])
+            .flat_map(|point| {
+                (unweighted * Point3::from(point.cast::<f64>()))
+                    .coords
+                    .map(|x| x as f32)
+                    .data
+                    .0[0]
+            })
             .collect();
         let (_, expected) = golden.f32("out.transformed");
-        assert_close("transformed", &moved, &expected[set * count * 3..(set + 1) * count * 3], 1e-4, 0.0);
+        assert_close(
+            "transformed",
+            &moved,
+            &expected[set * count * 3..(set + 1) * count * 3],
+            1e-4,
+            0.0,
+        );
     }
 }
 
@@ -65,25 +94,71 @@ fn golden_c8_sc2pcr() {
     for (name, case) in &cases {
         let pairs = correspondences(&golden, name);
         let config = config(case);
-        let found = sc2pcr::consensus(&pairs, &config).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let found =
+            sc2pcr::consensus(&pairs, &config).unwrap_or_else(|error| panic!("{name}: {error}"));
 
         let (_, confidence) = golden.f32(&format!("{name}.out.confidence"));
-        assert_close(&format!("{name}: confidence"), &found.confidence, &confidence, 1e-4, 0.0);
-        check_seeds(name, &found.seeds, &golden.i64(&format!("{name}.out.seeds")).1, &confidence);
-        assert_eq!(found.inlier_count as i64, golden.i64(&format!("{name}.out.inlier_count")).1[0], "{name}");
+        assert_close(
+            &format!("{name}: confidence"),
+            &found.confidence,
+            &confidence,
+            1e-4,
+            0.0,
+        );
+        check_seeds(
+            name,
+            &found.seeds,
+            &golden.i64(&format!("{name}.out.seeds")).1,
+            &confidence,
+        );
+        assert_eq!(
+            found.inlier_count as i64,
+            golden.i64(&format!("{name}.out.inlier_count")).1[0],
+            "{name}"
+        );
         let (_, reference) = golden.f32(&format!("{name}.out.transform"));
-        let reference = motion(&reference.iter().map(|&entry| f64::from(entry)).collect::<Vec<_>>());
+        let reference = motion(
+            &reference
+                .iter()
+                .map(|&entry| f64::from(entry))
+                .collect::<Vec<_>>(),
+        );
         let truth = motion(&golden.f64(&format!("{name}.in.ground_truth")).1);
-        assert_near(&format!("{name}: truth"), &found.target_from_source, &truth, TRUTH_TOLERANCE);
-        assert_near(&format!("{name}: reference"), &found.target_from_source, &reference, TIE_TOLERANCE);
+        assert_near(
+            &format!("{name}: truth"),
+            &found.target_from_source,
+            &truth,
+            TRUTH_TOLERANCE,
+        );
+        assert_near(
+            &format!("{name}: reference"),
+            &found.target_from_source,
+            &reference,
+            TIE_TOLERANCE,
+        );
 
-        let refinement = Refinement { threshold_m: REFINEMENT_M, rounds: 20 };
+        let refinement = Refinement {
+            threshold_m: REFINEMENT_M,
+            rounds: 20,
+        };
         let (_, expected) = golden.f32(&format!("{name}.out.transform_refined"));
         let refined = sc2pcr::refine(&pairs, &reference, &refinement);
-        assert_close(&format!("{name}: refined"), &rows(&refined), &expected, 1e-4, 0.0);
+        assert_close(
+            &format!("{name}: refined"),
+            &rows(&refined),
+            &expected,
+            1e-4,
+            0.0,
+        );
         // From the project's own start the weights differ a little, and with them the result.
         let refined = sc2pcr::refine(&pairs, &found.target_from_source, &refinement);
-        assert_close(&format!("{name}: refined from our start"), &rows(&refined), &expected, 2e-3, 0.0);
+        assert_close(
+            &format!("{name}: refined from our start"),
+            &rows(&refined),
+            &expected,
+            2e-3,
+            0.0,
+        );
     }
 }
 
@@ -94,21 +169,35 @@ fn ransac_solves_the_golden_problems() {
     for (name, case) in golden.config().as_object().expect("cases") {
         let pairs = correspondences(&golden, name);
         let threshold_m = number(&case["inlier_threshold"]).min(REFINEMENT_M);
-        let config = RansacConfig { min_edge_m: 1.0, ..RansacConfig::any_rotation(threshold_m) };
-        let found = ransac::solve(&pairs, &config).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let config = RansacConfig {
+            min_edge_m: 1.0,
+            ..RansacConfig::any_rotation(threshold_m)
+        };
+        let found =
+            ransac::solve(&pairs, &config).unwrap_or_else(|error| panic!("{name}: {error}"));
         let truth = motion(&golden.f64(&format!("{name}.in.ground_truth")).1);
         assert_near(name, &found.target_from_source, &truth, TRUTH_TOLERANCE);
     }
 }
 
-fn assert_near(what: &str, found: &Isometry3<f64>, expected: &Isometry3<f64>, (metres, degrees): (f64, f64)) {
+fn assert_near(
+    what: &str,
+    found: &Isometry3<f64>,
+    expected: &Isometry3<f64>,
+    (metres, degrees): (f64, f64),
+) {
     let apart_m = (found.translation.vector - expected.translation.vector).norm();
     let apart_deg = found.rotation.angle_to(&expected.rotation).to_degrees();
-    assert!(apart_m < metres && apart_deg < degrees, "{what}: {apart_m} m, {apart_deg} degrees apart");
+    assert!(
+        apart_m < metres && apart_deg < degrees,
+        "{what}: {apart_m} m, {apart_deg} degrees apart"
+    );
 }
 
 fn motion(rows: &[f64]) -> Isometry3<f64> {
-    Pose::from_matrix(&Matrix4::from_row_slice(rows)).expect("a motion").isometry()
+    Pose::from_matrix(&Matrix4::from_row_slice(rows))
+        .expect("a motion")
+        .isometry()
 }
 
 /// Seeds must be the same, or have the same confidence: rounding decides the order of nearly equal values.
@@ -117,12 +206,17 @@ fn check_seeds(name: &str, seeds: &[usize], expected: &[i64], confidence: &[f32]
     for (place, (&seed, &reference)) in seeds.iter().zip(expected).enumerate() {
         let reference = usize::try_from(reference).expect("a place");
         let apart = (confidence[seed] - confidence[reference]).abs();
-        assert!(apart <= 2e-6, "{name}: seed {place} is {seed}, not {reference}: confidences {apart:.1e} apart");
+        assert!(
+            apart <= 2e-6,
+            "{name}: seed {place} is {seed}, not {reference}: confidences {apart:.1e} apart"
+        );
     }
 }
 
 fn config(case: &Value) -> Sc2PcrConfig {
-    let count = |name: &str| usize::try_from(case[name].as_u64().unwrap_or_else(|| panic!("{name}"))).expect("a count");
+    let count = |name: &str| {
+        usize::try_from(case[name].as_u64().unwrap_or_else(|| panic!("{name}"))).expect("a count")
+    };
     Sc2PcrConfig {
         inlier_threshold_m: number(&case["inlier_threshold"]),
         distance_threshold_m: number(&case["d_thre"]),
@@ -140,18 +234,40 @@ fn config(case: &Value) -> Sc2PcrConfig {
 fn correspondences(golden: &Golden, case: &str) -> Vec<Correspondence> {
     let (_, source) = golden.f32(&format!("{case}.in.src"));
     let (_, target) = golden.f32(&format!("{case}.in.dst"));
-    let pairs = source.as_chunks::<3>().0.iter().zip(target.as_chunks::<3>().0);
-    pairs.map(|(&source_m, &target_m)| Correspondence { source_m, target_m, weight: 1.0 }).collect()
+    let pairs = source
+        .as_chunks::<3>()
+        .0
+        .iter()
+        .zip(target.as_chunks::<3>().0);
+    pairs
+        .map(|(&source_m, &target_m)| Correspondence {
+            source_m,
+            target_m,
+            weight: 1.0,
+        })
+        .collect()
 }
 
 fn points(values: &[f32]) -> Vec<Vector3<f32>> {
-    values.as_chunks::<3>().0.iter().map(|&point| Vector3::from(point)).collect()
+    values
+        .as_chunks::<3>()
+        .0
+        .iter()
+        .map(|&point| Vector3::from(point))
+        .collect()
 }
 
 fn rows(motion: &Isometry3<f64>) -> Vec<f32> {
-    motion.to_homogeneous().transpose().iter().map(|&entry| entry as f32).collect()
+    motion
+        .to_homogeneous()
+        .transpose()
+        .iter()
+        .map(|&entry| entry as f32)
+        .collect()
 }
 
 fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
+    value
+        .as_f64()
+        .unwrap_or_else(|| panic!("{value} is no number"))
 }

@@ -4,10 +4,15 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use bus::{self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route, unix_nanos};
+use bus::{
+    self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route,
+    unix_nanos,
+};
 use deploy::operate::keys::{KeyPlan, make};
 use protocol::message::Points;
-use protocol::{Gnss, GnssSource, Lidar, Limits, PointCloud, Pose, PoseEstimate, Stamp, Stream, Topic, wire};
+use protocol::{
+    Gnss, GnssSource, Lidar, Limits, PointCloud, Pose, PoseEstimate, Stamp, Stream, Topic, wire,
+};
 use tests::bus::{TIMEOUT, next_event, wait_for};
 use tests::keys::{GuardedRouter, TRIED_FOR, keys_for, unauthorised_peer};
 use zenoh::qos::CongestionControl;
@@ -23,25 +28,37 @@ fn estimate() -> PoseEstimate {
 
 /// A valid message of vehicle `cav`, as its own agent would send it.
 fn forged_pose(cav: &str) -> Vec<u8> {
-    let stamp =
-        Stamp { cav: cav.parse().unwrap(), epoch: 1, sequence: 0, capture_nanos: 1, publish_nanos: unix_nanos() };
+    let stamp = Stamp {
+        cav: cav.parse().unwrap(),
+        epoch: 1,
+        sequence: 0,
+        capture_nanos: 1,
+        publish_nanos: unix_nanos(),
+    };
     let encoded = wire::encode(&stamp, estimate()).unwrap();
     [encoded.head.to_vec(), encoded.body.as_bytes().to_vec()].concat()
 }
 
 /// Keys of all messages that pass a router, as its own session receives them.
-fn captured_keys(router: &Session) -> (Arc<Mutex<BTreeSet<String>>>, zenoh::pubsub::Subscriber<()>) {
+fn captured_keys(
+    router: &Session,
+) -> (Arc<Mutex<BTreeSet<String>>>, zenoh::pubsub::Subscriber<()>) {
     let keys = Arc::<Mutex<BTreeSet<String>>>::default();
     let captured = Arc::clone(&keys);
     let subscriber = router.declare_subscriber("v2v/**").callback(move |sample| {
-        captured.lock().unwrap().insert(sample.key_expr().to_string());
+        captured
+            .lock()
+            .unwrap()
+            .insert(sample.key_expr().to_string());
     });
     (keys, subscriber.wait().unwrap())
 }
 
 /// Sends poses until one has arrived: the route is up.
 fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
-    let publisher = sender.publisher(topic(topic_text), PublisherOptions::POSE).unwrap();
+    let publisher = sender
+        .publisher(topic(topic_text), PublisherOptions::POSE)
+        .unwrap();
     let deadline = Instant::now() + TIMEOUT;
     loop {
         assert!(Instant::now() < deadline, "nothing comes on {topic_text}");
@@ -50,7 +67,10 @@ fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
             receiver.take(Some(Instant::now() + Duration::from_millis(100)))
             && came == topic(topic_text)
         {
-            assert_eq!(arrival.decode::<PoseEstimate>(&Limits::DEFAULT).unwrap(), estimate());
+            assert_eq!(
+                arrival.decode::<PoseEstimate>(&Limits::DEFAULT).unwrap(),
+                estimate()
+            );
             return publisher.finish();
         }
     }
@@ -59,12 +79,17 @@ fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
 #[test]
 fn a_fleet_with_keys_performs_all_its_operations() {
     let folder = tempfile::tempdir().unwrap();
-    let keys =
-        keys_for(folder.path(), &["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"]);
+    let keys = keys_for(
+        folder.path(),
+        &[
+            "agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2",
+        ],
+    );
     let router = GuardedRouter::open(&keys);
-    let [agent, ego, link, replay, scorer, recorder, viewer, ros2] =
-        ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"]
-            .map(|principal| router.join(principal));
+    let [agent, ego, link, replay, scorer, recorder, viewer, ros2] = [
+        "agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2",
+    ]
+    .map(|principal| router.join(principal));
     let subscribe = |bus: &Bus, text: &str| {
         let inbox = bus.inbox(64, 4);
         let subscription = bus.subscribe(topic(text), &inbox).unwrap();
@@ -72,7 +97,11 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     };
     // Each process receives its topics.
     for (sender, text, receivers) in [
-        (&agent, "1/pose", [&ego, &link, &scorer, &viewer, &ros2].as_slice()),
+        (
+            &agent,
+            "1/pose",
+            [&ego, &link, &scorer, &viewer, &ros2].as_slice(),
+        ),
         (&link, "rx/1/2/pose", &[&ego, &viewer]),
     ] {
         for receiver in receivers {
@@ -80,11 +109,22 @@ fn a_fleet_with_keys_performs_all_its_operations() {
             reaches(sender, text, &inbox);
         }
     }
-    let tap = recorder.tap(&[protocol::KeyExpr::run(&recorder.identity().run)], 64).unwrap();
+    let tap = recorder
+        .tap(&[protocol::KeyExpr::run(&recorder.identity().run)], 64)
+        .unwrap();
     let (inbox, _subscription) = subscribe(&agent, "1/gnss");
-    let publisher = replay.publisher(topic("1/gnss"), PublisherOptions::SENSOR).unwrap();
-    let route = Route { topic: topic("1/gnss"), receiver: agent.identity().process.clone() };
-    Barrier::new([route]).await_routes(&replay).unwrap().wait(TIMEOUT).unwrap();
+    let publisher = replay
+        .publisher(topic("1/gnss"), PublisherOptions::SENSOR)
+        .unwrap();
+    let route = Route {
+        topic: topic("1/gnss"),
+        receiver: agent.identity().process.clone(),
+    };
+    Barrier::new([route])
+        .await_routes(&replay)
+        .unwrap()
+        .wait(TIMEOUT)
+        .unwrap();
     let measured = Gnss {
         world_from_lidar: Pose::IDENTITY,
         position_std_m: 0.0,
@@ -92,7 +132,9 @@ fn a_fleet_with_keys_performs_all_its_operations() {
         source: GnssSource::Recorded,
     };
     publisher.submit(3, measured);
-    let (_, Event::Message(_)) = next_event(&inbox) else { panic!("an end before the message") };
+    let (_, Event::Message(_)) = next_event(&inbox) else {
+        panic!("an end before the message")
+    };
     // The flush barrier does not cover passive subscribers: their route may come up later.
     let is_gnss = |taken| matches!(taken, bus::bounded_queue::Pop::Item(found, _) if found == topic("1/gnss"));
     wait_for("the recorder", || {
@@ -102,19 +144,34 @@ fn a_fleet_with_keys_performs_all_its_operations() {
     publisher.finish();
 
     // The replay detects the subscriber to previews.
-    let viewing = viewer.tap(&[protocol::KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 4).unwrap();
-    let preview = replay.publisher(topic("1/@preview"), PublisherOptions::PREVIEW).unwrap();
+    let viewing = viewer
+        .tap(
+            &[protocol::KeyExpr::stream(
+                &viewer.identity().run,
+                Stream::Preview,
+            )],
+            4,
+        )
+        .unwrap();
+    let preview = replay
+        .publisher(topic("1/@preview"), PublisherOptions::PREVIEW)
+        .unwrap();
     wait_for("an onlooker", || preview.is_wanted());
     wait_for("a preview", || {
         preview.submit(3, Lidar::default());
-        matches!(viewing.take(Some(Instant::now())), bus::bounded_queue::Pop::Item(..))
+        matches!(
+            viewing.take(Some(Instant::now())),
+            bus::bounded_queue::Pop::Item(..)
+        )
     });
     preview.finish();
     drop(viewing);
 
     // A LiDAR of a ROS 2 network is that of an agent.
     let (inbox, _subscription) = subscribe(&agent, "1/lidar");
-    let lidar = ros2.publisher(topic("1/lidar"), PublisherOptions::SENSOR).unwrap();
+    let lidar = ros2
+        .publisher(topic("1/lidar"), PublisherOptions::SENSOR)
+        .unwrap();
     wait_for("a sweep", || {
         lidar.submit(3, Lidar::default());
         let taken = inbox.take(Some(Instant::now() + Duration::from_millis(10)));
@@ -129,13 +186,26 @@ fn a_fleet_with_keys_performs_all_its_operations() {
         move |event| seen.lock().unwrap().push(format!("{event:?}"))
     });
     let presence = agent.announce(protocol::Role::Agent).unwrap();
-    wait_for("a liveliness event", || seen.lock().unwrap().iter().any(|text| text.starts_with("Joined")));
+    wait_for("a liveliness event", || {
+        seen.lock()
+            .unwrap()
+            .iter()
+            .any(|text| text.starts_with("Joined"))
+    });
     presence.withdraw().unwrap();
-    wait_for("a farewell", || seen.lock().unwrap().iter().any(|text| text.starts_with("Left")));
+    wait_for("a farewell", || {
+        seen.lock()
+            .unwrap()
+            .iter()
+            .any(|text| text.starts_with("Left"))
+    });
 
     // And no process published anything that was refused.
-    for principal in ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2"] {
-        let refused = ["put", "query", "declare", "interest"].map(|message| router.refused(principal, message));
+    for principal in [
+        "agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2",
+    ] {
+        let refused = ["put", "query", "declare", "interest"]
+            .map(|message| router.refused(principal, message));
         assert_eq!(refused, [0; 4], "{principal}");
     }
     for bus in [agent, ego, link, replay, scorer, recorder, viewer, ros2] {
@@ -183,17 +253,47 @@ fn a_certificate_is_valid_for_its_own_vehicle_only() {
     session.delete("v2v/test/2/pose").wait().unwrap();
     wait_for("a delete", || router.refused("agent-1", "delete") > 0);
     // Another run is another fleet.
-    session.put("v2v/other/1/pose", forged_pose("1")).wait().unwrap();
+    session
+        .put("v2v/other/1/pose", forged_pose("1"))
+        .wait()
+        .unwrap();
     // A queryable where no query is allowed, a subscriber to the truth, a liveliness token of another process.
-    let _queryable = session.declare_queryable("v2v/test/undeclared").callback(|_| panic!("queried")).wait().unwrap();
-    let _truth = session.declare_subscriber("v2v/test/truth").callback(|_| panic!("received")).wait().unwrap();
-    let _presence = session.liveliness().declare_token("v2v/test/alive/agent/2").wait().unwrap();
+    let _queryable = session
+        .declare_queryable("v2v/test/undeclared")
+        .callback(|_| panic!("queried"))
+        .wait()
+        .unwrap();
+    let _truth = session
+        .declare_subscriber("v2v/test/truth")
+        .callback(|_| panic!("received"))
+        .wait()
+        .unwrap();
+    let _presence = session
+        .liveliness()
+        .declare_token("v2v/test/alive/agent/2")
+        .wait()
+        .unwrap();
     wait_for("declarations", || router.refused("agent-1", "declare") >= 3);
-    let tokens = router.session.liveliness().get("v2v/test/alive/**").wait().unwrap();
+    let tokens = router
+        .session
+        .liveliness()
+        .get("v2v/test/alive/**")
+        .wait()
+        .unwrap();
     assert!(tokens.recv().is_err(), "no process has declared itself");
-    let answers = session.get(format!("@/{}/**", router.session.zid())).timeout(TRIED_FOR).wait().unwrap();
-    let answered: Vec<_> = answers.iter().filter_map(|answer| answer.into_result().ok()).collect();
-    assert!(answered.is_empty(), "the router discloses its configuration: {answered:?}");
+    let answers = session
+        .get(format!("@/{}/**", router.session.zid()))
+        .timeout(TRIED_FOR)
+        .wait()
+        .unwrap();
+    let answered: Vec<_> = answers
+        .iter()
+        .filter_map(|answer| answer.into_result().ok())
+        .collect();
+    assert!(
+        answered.is_empty(),
+        "the router discloses its configuration: {answered:?}"
+    );
 
     reaches(&honest, "2/pose", &inbox);
     reaches(&attacker, "1/pose", &{
@@ -203,12 +303,28 @@ fn a_certificate_is_valid_for_its_own_vehicle_only() {
     });
     let captured = captured.lock().unwrap().clone();
     let own = |key: &String| {
-        ["v2v/test/1/", "v2v/test/2/", "v2v/test/stats/", "v2v/test/ready/"].iter().any(|own| key.starts_with(own))
+        [
+            "v2v/test/1/",
+            "v2v/test/2/",
+            "v2v/test/stats/",
+            "v2v/test/ready/",
+        ]
+        .iter()
+        .any(|own| key.starts_with(own))
     };
     assert!(captured.iter().all(own), "{captured:?}");
-    assert!(!captured.contains("v2v/test/1/detections") && !captured.contains("v2v/test/1/lidar"), "{captured:?}");
-    assert!(!captured.contains("v2v/test/stats/agent-1"), "it claimed to be agent-2: {captured:?}");
-    assert_eq!(router.refused("agent-2", "put") + router.refused("ego-1", "put"), 0);
+    assert!(
+        !captured.contains("v2v/test/1/detections") && !captured.contains("v2v/test/1/lidar"),
+        "{captured:?}"
+    );
+    assert!(
+        !captured.contains("v2v/test/stats/agent-1"),
+        "it claimed to be agent-2: {captured:?}"
+    );
+    assert_eq!(
+        router.refused("agent-2", "put") + router.refused("ego-1", "put"),
+        0
+    );
 }
 
 #[test]
@@ -219,11 +335,18 @@ fn a_header_under_another_name_is_counted_as_such() {
     let inbox = ego.inbox(64, 4);
     let _subscription = ego.subscribe(topic("1/pose"), &inbox).unwrap();
     reaches(&agent, "1/pose", &inbox);
-    agent.session().put("v2v/test/1/pose", forged_pose("2")).wait().unwrap();
+    agent
+        .session()
+        .put("v2v/test/1/pose", forged_pose("2"))
+        .wait()
+        .unwrap();
     let here = protocol::Account::towards(topic("1/pose"), &ego.identity().process);
     let reason = protocol::DropReason::Identity;
     wait_for("a refusal", || {
-        ego.stats().ledger().get(&here).is_some_and(|counts| counts.dropped.get(&reason) == Some(&1))
+        ego.stats()
+            .ledger()
+            .get(&here)
+            .is_some_and(|counts| counts.dropped.get(&reason) == Some(&1))
     });
 }
 
@@ -234,14 +357,20 @@ fn unknown_clients_are_refused() {
     let theirs = keys_for(&folder.path().join("theirs"), &["agent-1"]);
     // Of the same authority, and for a few seconds only.
     let plan = KeyPlan::new(&keys, vec!["agent-3".parse().unwrap()], 1);
-    make(&KeyPlan { lifetime: Duration::from_secs(1), ..plan }).unwrap();
+    make(&KeyPlan {
+        lifetime: Duration::from_secs(1),
+        ..plan
+    })
+    .unwrap();
     let router = GuardedRouter::open(&keys);
     let (agent, ego) = (router.join("agent-1"), router.join("ego-1"));
     let inbox = ego.inbox(64, 4);
     let _subscription = ego.subscribe(topic("1/pose"), &inbox).unwrap();
     std::thread::sleep(Duration::from_millis(2100));
 
-    let expired = Credentials::read(&keys.join("agent-3")).unwrap_err().to_string();
+    let expired = Credentials::read(&keys.join("agent-3"))
+        .unwrap_err()
+        .to_string();
     assert!(expired.contains("agent-3 expired"), "{expired}");
     let plain = || {
         // Without the bus's own check of endpoints: the same port, of TCP.
@@ -251,21 +380,43 @@ fn unknown_clients_are_refused() {
         bus::open(&options)
     };
     std::thread::scope(|scope| {
-        let other_authority =
-            scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), Some(&theirs.join("agent-1"))));
-        let expired =
-            scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), Some(&keys.join("agent-3"))));
-        let no_certificate = scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), None));
+        let other_authority = scope.spawn(|| {
+            unauthorised_peer(
+                &router.endpoint,
+                &keys.join("agent-1"),
+                Some(&theirs.join("agent-1")),
+            )
+        });
+        let expired = scope.spawn(|| {
+            unauthorised_peer(
+                &router.endpoint,
+                &keys.join("agent-1"),
+                Some(&keys.join("agent-3")),
+            )
+        });
+        let no_certificate =
+            scope.spawn(|| unauthorised_peer(&router.endpoint, &keys.join("agent-1"), None));
         let plain = scope.spawn(plain);
         // Nor does a client connect to a router of another authority.
-        let our_side =
-            scope.spawn(|| unauthorised_peer(&router.endpoint, &theirs.join("agent-1"), Some(&theirs.join("agent-1"))));
-        for (what, tried) in
-            [("other", other_authority), ("expired", expired), ("none", no_certificate), ("our side", our_side)]
-        {
+        let our_side = scope.spawn(|| {
+            unauthorised_peer(
+                &router.endpoint,
+                &theirs.join("agent-1"),
+                Some(&theirs.join("agent-1")),
+            )
+        });
+        for (what, tried) in [
+            ("other", other_authority),
+            ("expired", expired),
+            ("none", no_certificate),
+            ("our side", our_side),
+        ] {
             assert!(tried.join().unwrap().is_err(), "{what}");
         }
-        assert!(matches!(plain.join().unwrap(), Err(BusError::Unreachable { .. })));
+        assert!(matches!(
+            plain.join().unwrap(),
+            Err(BusError::Unreachable { .. })
+        ));
         // Meanwhile the fleet goes on.
         reaches(&agent, "1/pose", &inbox);
     });
@@ -276,19 +427,31 @@ fn a_certificate_that_runs_out_ends_its_connection() {
     let folder = tempfile::tempdir().unwrap();
     let keys = keys_for(folder.path(), &["ego-1"]);
     let plan = KeyPlan::new(&keys, vec!["agent-3".parse().unwrap()], 1);
-    make(&KeyPlan { lifetime: Duration::from_secs(15), ..plan }).unwrap();
+    make(&KeyPlan {
+        lifetime: Duration::from_secs(15),
+        ..plan
+    })
+    .unwrap();
     let router = GuardedRouter::open(&keys);
     let ego = router.join("ego-1");
     let inbox = ego.inbox(64, 4);
     let _subscription = ego.subscribe(topic("3/pose"), &inbox).unwrap();
-    let agent = router.join_as("agent-3", "agent-3", "3").expect("a connection while the certificate holds");
+    let agent = router
+        .join_as("agent-3", "agent-3", "3")
+        .expect("a connection while the certificate holds");
     let watched = Arc::<Mutex<Vec<String>>>::default();
     let _watch = ego.watch(protocol::Role::Agent, {
         let watched = Arc::clone(&watched);
         move |event| watched.lock().unwrap().push(format!("{event:?}"))
     });
     let _presence = agent.announce(protocol::Role::Agent).unwrap();
-    wait_for("the end of a certificate", || watched.lock().unwrap().iter().any(|text| text.starts_with("Left")));
+    wait_for("the end of a certificate", || {
+        watched
+            .lock()
+            .unwrap()
+            .iter()
+            .any(|text| text.starts_with("Left"))
+    });
 }
 
 #[test]
@@ -299,11 +462,27 @@ fn large_messages_come_whole_and_in_order() {
     let [agent, ego] = ["agent-1", "ego-1"].map(|principal| router.join(principal));
     let inbox = ego.inbox(64, 8);
     // 8 MiB each. A peer that has received the second subscription has received the first.
-    let cloud = |tick: u64| PointCloud { xyzi: vec![[tick as f32, 2.0, 3.0, 0.5]; 1 << 19] };
-    let _subscriptions = ["1/points", "1/pose"].map(|text| ego.subscribe(topic(text), &inbox).unwrap());
+    let cloud = |tick: u64| PointCloud {
+        xyzi: vec![[tick as f32, 2.0, 3.0, 0.5]; 1 << 19],
+    };
+    let _subscriptions =
+        ["1/points", "1/pose"].map(|text| ego.subscribe(topic(text), &inbox).unwrap());
     reaches(&agent, "1/pose", &inbox);
-    let publisher = agent.publisher(topic("1/points"), PublisherOptions::FEATURES.lossless(COUNT as usize)).unwrap();
-    (0..COUNT).for_each(|tick| publisher.submit(tick, Points { pose: estimate(), points: cloud(tick) }));
+    let publisher = agent
+        .publisher(
+            topic("1/points"),
+            PublisherOptions::FEATURES.lossless(COUNT as usize),
+        )
+        .unwrap();
+    (0..COUNT).for_each(|tick| {
+        publisher.submit(
+            tick,
+            Points {
+                pose: estimate(),
+                points: cloud(tick),
+            },
+        )
+    });
     for tick in 0..COUNT {
         let arrival = loop {
             match next_event(&inbox) {
@@ -311,7 +490,10 @@ fn large_messages_come_whole_and_in_order() {
                 _ => {}
             }
         };
-        assert!(arrival.decode::<Points>(&Limits::DEFAULT).unwrap().points == cloud(tick), "{tick}");
+        assert!(
+            arrival.decode::<Points>(&Limits::DEFAULT).unwrap().points == cloud(tick),
+            "{tick}"
+        );
     }
     publisher.finish();
 }
@@ -320,7 +502,8 @@ fn large_messages_come_whole_and_in_order() {
 fn a_message_over_the_size_limit_is_refused_and_others_are_not_affected() {
     let folder = tempfile::tempdir().unwrap();
     let router = GuardedRouter::open(&keys_for(folder.path(), &["agent-1", "agent-2", "ego-1"]));
-    let [agent, honest, ego] = ["agent-1", "agent-2", "ego-1"].map(|principal| router.join(principal));
+    let [agent, honest, ego] =
+        ["agent-1", "agent-2", "ego-1"].map(|principal| router.join(principal));
     let inbox = ego.inbox(64, 8);
     let topics = ["1/pose", "2/pose", "1/bev"];
     let _subscriptions = topics.map(|text| ego.subscribe(topic(text), &inbox).unwrap());
@@ -335,13 +518,24 @@ fn a_message_over_the_size_limit_is_refused_and_others_are_not_affected() {
     }
     reaches(&honest, "2/pose", &inbox);
     reaches(&agent, "1/pose", &inbox);
-    assert_eq!(router.refused("agent-1", "put"), 1, "the pose; the map was never complete");
+    assert_eq!(
+        router.refused("agent-1", "put"),
+        1,
+        "the pose; the map was never complete"
+    );
     let unsound = |text| {
         let here = protocol::Account::towards(topic(text), &ego.identity().process);
-        ego.stats()
-            .ledger()
-            .get(&here)
-            .map_or(0, |counts| counts.dropped.get(&protocol::DropReason::Decode).copied().unwrap_or(0))
+        ego.stats().ledger().get(&here).map_or(0, |counts| {
+            counts
+                .dropped
+                .get(&protocol::DropReason::Decode)
+                .copied()
+                .unwrap_or(0)
+        })
     };
-    assert_eq!((unsound("1/bev"), unsound("1/pose")), (0, 0), "not even the ego's own limits had to see it");
+    assert_eq!(
+        (unsound("1/bev"), unsound("1/pose")),
+        (0, 0),
+        "not even the ego's own limits had to see it"
+    );
 }

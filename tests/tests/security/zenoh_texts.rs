@@ -39,12 +39,20 @@ impl RouterProcess {
         let endpoint = Endpoint::loopback(port).secured();
         let log = folder.join("router.log");
         let child = Command::new(programs().join("v2vloc"))
-            .args(["router", "--run=test", &format!("--listen=quic/0.0.0.0:{port}")])
+            .args([
+                "router",
+                "--run=test",
+                &format!("--listen=quic/0.0.0.0:{port}"),
+            ])
             .arg(format!("--keys={}", keys.join("router").display()))
             .stderr(File::create(&log).unwrap())
             .spawn()
             .unwrap();
-        let router = Self { child, endpoint, log };
+        let router = Self {
+            child,
+            endpoint,
+            log,
+        };
         wait_for("a router", || router.log().contains("routing at"));
         router
     }
@@ -58,7 +66,13 @@ impl RouterProcess {
         let log = self.log();
         let count = |line: &str| {
             let (refusal, count) = line.split_once("peer=")?.1.rsplit_once(" count=")?;
-            Some((refusal.replace(" reason=", " ").replace(" what=", " ").replace('"', ""), count.parse().ok()?))
+            Some((
+                refusal
+                    .replace(" reason=", " ")
+                    .replace(" what=", " ")
+                    .replace('"', ""),
+                count.parse().ok()?,
+            ))
         };
         log.lines().filter_map(count).collect()
     }
@@ -101,13 +115,22 @@ fn each_failed_handshake_is_counted_once_under_its_cause() {
     let keys = keys_for(&folder.path().join("ours"), &["agent-1"]);
     let theirs = keys_for(&folder.path().join("theirs"), &["agent-1"]).join("agent-1");
     let plan = KeyPlan::new(&keys, vec!["agent-3".parse().unwrap()], 1);
-    make(&KeyPlan { lifetime: Duration::from_secs(1), ..plan }).unwrap();
+    make(&KeyPlan {
+        lifetime: Duration::from_secs(1),
+        ..plan
+    })
+    .unwrap();
     let (ours, expired) = (keys.join("agent-1"), keys.join("agent-3"));
     let router = RouterProcess::start(folder.path(), &keys);
     // Certificates count in whole seconds.
     std::thread::sleep(Duration::from_millis(2100));
     let relay = first_datagram_only(&router.endpoint);
-    let elsewhere: Endpoint = router.endpoint.as_str().replace("127.0.0.1", "127.0.0.2").parse().unwrap();
+    let elsewhere: Endpoint = router
+        .endpoint
+        .as_str()
+        .replace("127.0.0.1", "127.0.0.2")
+        .parse()
+        .unwrap();
     for (endpoint, authority, own) in [
         (&router.endpoint, &ours, Some(expired.as_path())),
         (&router.endpoint, &ours, Some(theirs.as_path())),
@@ -117,7 +140,10 @@ fn each_failed_handshake_is_counted_once_under_its_cause() {
         // Last: zenoh takes one handshake after the other, and the incomplete one keeps it half a minute.
         (&relay, &ours, Some(ours.as_path())),
     ] {
-        assert!(unauthorised_peer(endpoint, authority, own).is_err(), "{own:?} is admitted at {endpoint}");
+        assert!(
+            unauthorised_peer(endpoint, authority, own).is_err(),
+            "{own:?} is admitted at {endpoint}"
+        );
     }
     let causes = [
         "begun and not finished",
@@ -138,16 +164,37 @@ fn each_refused_message_is_counted_once_under_its_peer_and_reason() {
     let router = RouterProcess::start(folder.path(), &keys);
     let credentials = Credentials::read(&keys.join("agent-1")).unwrap();
     let options = BusOptions::client(router.endpoint.clone()).with_credentials(credentials);
-    let identity =
-        Identity { run: "test".parse().unwrap(), process: "agent-1".parse().unwrap(), cav: "1".parse().unwrap() };
+    let identity = Identity {
+        run: "test".parse().unwrap(),
+        process: "agent-1".parse().unwrap(),
+        cav: "1".parse().unwrap(),
+    };
     let bus = Bus::join(&options, identity).unwrap();
     let session = bus.session();
     // Of another vehicle, and on its own key more than a pose ever has.
-    session.put("v2v/test/2/pose", vec![7_u8; 64]).wait().unwrap();
-    session.put("v2v/test/1/pose", vec![7_u8; 1 << 20]).wait().unwrap();
+    session
+        .put("v2v/test/2/pose", vec![7_u8; 64])
+        .wait()
+        .unwrap();
+    session
+        .put("v2v/test/1/pose", vec![7_u8; 1 << 20])
+        .wait()
+        .unwrap();
     session.delete("v2v/test/2/pose").wait().unwrap();
-    let _queryable = session.declare_queryable("v2v/test/undeclared").callback(|_| ()).wait().unwrap();
+    let _queryable = session
+        .declare_queryable("v2v/test/undeclared")
+        .callback(|_| ())
+        .wait()
+        .unwrap();
     wait_for("four refusals", || router.counts().len() >= 4);
-    let expected = ["access-control declare", "access-control delete", "access-control put", "low-pass put"];
-    assert_eq!(router.end(), BTreeMap::from(expected.map(|refusal| (format!("agent-1 {refusal}"), 1))));
+    let expected = [
+        "access-control declare",
+        "access-control delete",
+        "access-control put",
+        "low-pass put",
+    ];
+    assert_eq!(
+        router.end(),
+        BTreeMap::from(expected.map(|refusal| (format!("agent-1 {refusal}"), 1)))
+    );
 }

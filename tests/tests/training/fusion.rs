@@ -25,8 +25,16 @@ fn begin() -> (MutexGuard<'static, ()>, TempDir, PathBuf) {
 /// Five steps from one validation to the next.
 fn config(scene: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
     let config = training::config(scene, out, method, steps);
-    let run = RunConfig { loader_threads: 2, ..config.run };
-    TrainConfig { validation: vec![scene.to_owned()], validate_every: 5, run, ..config }
+    let run = RunConfig {
+        loader_threads: 2,
+        ..config.run
+    };
+    TrainConfig {
+        validation: vec![scene.to_owned()],
+        validate_every: 5,
+        run,
+        ..config
+    }
 }
 
 fn run(config: &TrainConfig) -> (Summary, Ear) {
@@ -35,8 +43,16 @@ fn run(config: &TrainConfig) -> (Summary, Ear) {
 }
 
 fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
-    let codec = CodecConfig { dtype, ..CodecConfig::default() };
-    let config = EvaluateConfig { weights, method: Some(method), codec, ..EvaluateConfig::default() };
+    let codec = CodecConfig {
+        dtype,
+        ..CodecConfig::default()
+    };
+    let config = EvaluateConfig {
+        weights,
+        method: Some(method),
+        codec,
+        ..EvaluateConfig::default()
+    };
     let mut evaluator = Evaluator::new(config).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {
@@ -57,20 +73,48 @@ fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
     // The learning rate follows the completed fraction, so an early stop is a checkpoint of the whole length.
     let uninterrupted = config(&scene, whole.path(), Method::ATTENTION, 10);
     let (summary, ear) = run(&uninterrupted);
-    assert_eq!((summary.trained.steps, ear.validations.as_slice()), (10, [5, 10].as_slice()));
-    assert!(ear.losses.iter().all(|loss| loss.is_finite() && *loss > 0.0));
+    assert_eq!(
+        (summary.trained.steps, ear.validations.as_slice()),
+        (10, [5, 10].as_slice())
+    );
+    assert!(
+        ear.losses
+            .iter()
+            .all(|loss| loss.is_finite() && *loss > 0.0)
+    );
 
-    let first = TrainConfig { validation: vec![], ..config(&scene, parts.path(), Method::ATTENTION, 10) };
+    let first = TrainConfig {
+        validation: vec![],
+        ..config(&scene, parts.path(), Method::ATTENTION, 10)
+    };
     let stopped = train_until_checkpoint(&first);
-    let again = RunConfig { resume: true, loader_threads: 1, ..first.run.clone() };
-    let (resumed, _) = run(&TrainConfig { run: again, ..first });
+    let again = RunConfig {
+        resume: true,
+        loader_threads: 1,
+        ..first.run.clone()
+    };
+    let (resumed, _) = run(&TrainConfig {
+        run: again,
+        ..first
+    });
     assert_eq!((stopped, resumed.trained.steps), (5, 10));
-    assert_eq!(resumed.trained.sha256, summary.trained.sha256, "the same weights, byte for byte");
+    assert_eq!(
+        resumed.trained.sha256, summary.trained.sha256,
+        "the same weights, byte for byte"
+    );
     let card = std::fs::read_to_string(whole.path().join("model-card.md")).unwrap();
-    assert!(card.contains(&summary.trained.sha256) && card.contains("a test") && card.contains("attention"), "{card}");
+    assert!(
+        card.contains(&summary.trained.sha256)
+            && card.contains("a test")
+            && card.contains("attention"),
+        "{card}"
+    );
     let curve = std::fs::read_to_string(whole.path().join("curve.csv")).unwrap();
     let columns: Vec<usize> = curve.lines().map(|line| line.split(',').count()).collect();
-    assert_eq!(columns, [12; 4], "a header, one report, two validations:\n{curve}");
+    assert_eq!(
+        columns, [12; 4],
+        "a header, one report, two validations:\n{curve}"
+    );
 }
 
 /// Trains and interrupts in the first report after the first checkpoint; the steps of that checkpoint.
@@ -85,7 +129,9 @@ fn train_until_checkpoint(config: &TrainConfig) -> u64 {
         fn validated(&mut self, _: u64, _: &Accuracy) {}
     }
     let mut plug = Plug(config.run.out.join("checkpoint.safetensors"));
-    let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| train::run(config, &mut plug)));
+    let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+        train::run(config, &mut plug)
+    }));
     assert!(outcome.is_err());
     5
 }
@@ -98,16 +144,28 @@ fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
     let (base, _) = run(&none);
     for method in [Method::EARLY, Method::MAX, Method::ATTENTION] {
         let out = folder.path().join(method.name());
-        let (summary, _) =
-            run(&TrainConfig { init: Some(base.trained.weights.clone()), ..config(&scene, &out, method, 5) });
+        let (summary, _) = run(&TrainConfig {
+            init: Some(base.trained.weights.clone()),
+            ..config(&scene, &out, method, 5)
+        });
         let frames = evaluate(summary.trained.weights.clone(), &scene, method, Dtype::F32);
         let again = evaluate(summary.trained.weights, &scene, method, Dtype::F32);
         assert_eq!(frames.len(), 1, "{method}");
-        assert_eq!(frames[0].result.detections, again[0].result.detections, "{method}");
-        assert_eq!(frames[0].result.fused.len(), 1, "{method}: the scene has one neighbour");
+        assert_eq!(
+            frames[0].result.detections, again[0].result.detections,
+            "{method}"
+        );
+        assert_eq!(
+            frames[0].result.fused.len(),
+            1,
+            "{method}: the scene has one neighbour"
+        );
         assert!(frames[0].result.fused[0].payload_bytes > 0, "{method}");
     }
-    let late = TrainConfig { method: Method::LATE, ..none };
+    let late = TrainConfig {
+        method: Method::LATE,
+        ..none
+    };
     assert!(
         matches!(train::run(&late, &mut Ear::default()), Err(TrainError::NotTrained(method)) if method == Method::LATE)
     );
@@ -118,11 +176,18 @@ fn half_precision_takes_half_the_bytes_of_a_message() {
     let (_generator, _scenes, scene) = begin();
     let folder = tempfile::tempdir().unwrap();
     let (summary, _) = run(&config(&scene, folder.path(), Method::NONE, 5));
-    let bytes =
-        |dtype| evaluate(summary.trained.weights.clone(), &scene, Method::MAX, dtype)[0].result.fused[0].payload_bytes;
+    let bytes = |dtype| {
+        evaluate(summary.trained.weights.clone(), &scene, Method::MAX, dtype)[0]
+            .result
+            .fused[0]
+            .payload_bytes
+    };
     let (single, half) = (bytes(Dtype::F32), bytes(Dtype::F16));
     let values = 16 * 64 * 44;
-    assert!(single >= 4 * values && single < 4 * values + 256, "{single}");
+    assert!(
+        single >= 4 * values && single < 4 * values + 256,
+        "{single}"
+    );
     assert!(half >= 2 * values && half < 2 * values + 256, "{half}");
 }
 
@@ -132,12 +197,33 @@ fn a_checkpoint_of_another_training_is_refused_with_both_values() {
     let folder = tempfile::tempdir().unwrap();
     let first = config(&scene, folder.path(), Method::NONE, 5);
     run(&first);
-    let again = RunConfig { resume: true, seed: 4, length: Length::Steps(9), ..first.run.clone() };
-    let other = TrainConfig { run: again, ..first };
-    let message = train::run(&other, &mut Ear::default()).unwrap_err().to_string();
-    assert!(message.contains("seed 3") && message.contains('4'), "{message}");
-    let elsewhere = RunConfig { out: folder.path().join("elsewhere"), ..other.run.clone() };
-    let missing = TrainConfig { run: elsewhere, ..other };
-    let message = train::run(&missing, &mut Ear::default()).unwrap_err().to_string();
+    let again = RunConfig {
+        resume: true,
+        seed: 4,
+        length: Length::Steps(9),
+        ..first.run.clone()
+    };
+    let other = TrainConfig {
+        run: again,
+        ..first
+    };
+    let message = train::run(&other, &mut Ear::default())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        message.contains("seed 3") && message.contains('4'),
+        "{message}"
+    );
+    let elsewhere = RunConfig {
+        out: folder.path().join("elsewhere"),
+        ..other.run.clone()
+    };
+    let missing = TrainConfig {
+        run: elsewhere,
+        ..other
+    };
+    let message = train::run(&missing, &mut Ear::default())
+        .unwrap_err()
+        .to_string();
     assert!(message.contains("checkpoint.safetensors"), "{message}");
 }

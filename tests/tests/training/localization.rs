@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use agent_offline::training::{
-    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderTrainConfig, LocalizerTrainError, RedundancyConfig,
-    SceneReport, SceneTrainConfig, SgLocReport, SgLocTrainConfig, SweepAugmentation, train_diffloc, train_encoder,
-    train_scene, train_sgloc,
+    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderTrainConfig, LocalizerTrainError,
+    RedundancyConfig, SceneReport, SceneTrainConfig, SgLocReport, SgLocTrainConfig,
+    SweepAugmentation, train_diffloc, train_encoder, train_scene, train_sgloc,
 };
 use dataset::{self, LoadOptions};
 use localization::baselines::diffloc::{DiffLocConfig, RangeImageConfig};
@@ -38,7 +38,11 @@ fn drives(out: &Path) -> PathBuf {
 }
 
 fn run(out: &Path, steps: u64) -> RunConfig {
-    RunConfig { seed: 5, loader_threads: 2, ..RunConfig::new(Length::Steps(steps), out) }
+    RunConfig {
+        seed: 5,
+        loader_threads: 2,
+        ..RunConfig::new(Length::Steps(steps), out)
+    }
 }
 
 fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
@@ -46,7 +50,11 @@ fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
         scenes: vec![scenes.to_owned()],
         validation: vec![scenes.to_owned()],
         encoder: small_encoder(),
-        run: RunConfig { batch: 2, learning_rate: 3e-3, ..run(out, steps) },
+        run: RunConfig {
+            batch: 2,
+            learning_rate: 3e-3,
+            ..run(out, steps)
+        },
         validate_every: 10,
     }
 }
@@ -64,9 +72,17 @@ fn scene_config(scenes: &Path, encoder: &Path, out: &Path, steps: u64) -> SceneT
         width: 64,
         blocks: 1,
         refiner: true,
-        augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
+        augmentation: SweepAugmentation {
+            copies: 1,
+            turn_rad: 0.1,
+            keep: 0.8,
+        },
         redundancy: Some(RedundancyConfig::default()),
-        run: RunConfig { batch: 512, learning_rate: 4e-3, ..run(out, steps) },
+        run: RunConfig {
+            batch: 512,
+            learning_rate: 4e-3,
+            ..run(out, steps)
+        },
         validate_every: Duration::from_secs(3600),
     }
 }
@@ -83,7 +99,11 @@ fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
     let summary = train_encoder(&config, &mut observe).unwrap();
     assert_eq!((summary.trained.steps, validations), (40, 4));
     assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
-    assert!(summary.accuracy.unwrap().top1 > 0.005, "chance is below one in five hundred: {:?}", summary.accuracy);
+    assert!(
+        summary.accuracy.unwrap().top1 > 0.005,
+        "chance is below one in five hundred: {:?}",
+        summary.accuracy
+    );
     summary.trained.weights
 }
 
@@ -103,28 +123,57 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     })
     .unwrap();
     assert!(errors.last().unwrap() < &(0.3 * errors[0]), "{errors:?}");
-    assert!(summary.accuracy.unwrap().success_3m > 0.5, "{:?}", summary.accuracy);
+    assert!(
+        summary.accuracy.unwrap().success_3m > 0.5,
+        "{:?}",
+        summary.accuracy
+    );
 
-    let localizer = Localizer::load(&encoder, &summary.trained.weights, Inference::default()).unwrap();
+    let localizer =
+        Localizer::load(&encoder, &summary.trained.weights, Inference::default()).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
     let mut found = 0;
     for tick in 0..12 {
-        let frame = dataset.scenarios[0].load(0, 2 * tick, &LoadOptions::default()).unwrap();
+        let frame = dataset.scenarios[0]
+            .load(0, 2 * tick, &LoadOptions::default())
+            .unwrap();
         let answer = localizer.localize(&frame.points).unwrap();
-        let Some(pose) = answer.estimate.world_from_cav() else { continue };
-        let off = pose.isometry().translation.vector - frame.world_from_lidar.unwrap().isometry().translation.vector;
+        let Some(pose) = answer.estimate.world_from_cav() else {
+            continue;
+        };
+        let off = pose.isometry().translation.vector
+            - frame
+                .world_from_lidar
+                .unwrap()
+                .isometry()
+                .translation
+                .vector;
         found += usize::from(off.norm() < 3.0);
         assert!((0.0..=1.0).contains(&answer.estimate.confidence()));
-        assert_eq!(localizer.localize(&frame.points).unwrap().estimate, answer.estimate, "same sweep, same answer");
+        assert_eq!(
+            localizer.localize(&frame.points).unwrap().estimate,
+            answer.estimate,
+            "same sweep, same answer"
+        );
     }
     assert!(found >= 7, "{found} of 12");
 
     // A sweep that cannot be localised has a reason and no pose.
-    let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
-    let few = PointCloud { xyzi: (0..10).map(|k| [k as f32, 3.0, 0.5, 0.1]).collect() };
+    let nan = PointCloud {
+        xyzi: vec![[f32::NAN; 4]; 5000],
+    };
+    let few = PointCloud {
+        xyzi: (0..10).map(|k| [k as f32, 3.0, 0.5, 0.1]).collect(),
+    };
     for cloud in [PointCloud::default(), nan, few] {
         let estimate = localizer.localize(&cloud).unwrap().estimate;
-        assert_eq!(estimate, PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 });
+        assert_eq!(
+            estimate,
+            PoseEstimate::NoPose {
+                reason: NoPoseReason::TooFewPoints,
+                inlier_count: 0
+            }
+        );
     }
 
     // A head belongs to one encoder.
@@ -132,12 +181,24 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     let mut config = encoder_config(&scenes, &other, 1);
     config.run.seed = 6;
     train_encoder(&config, &mut |_| ()).unwrap();
-    let error = Localizer::load(&other.join("weights.safetensors"), &summary.trained.weights, Inference::default())
-        .unwrap_err();
-    assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
+    let error = Localizer::load(
+        &other.join("weights.safetensors"),
+        &summary.trained.weights,
+        Inference::default(),
+    )
+    .unwrap_err();
+    assert!(
+        matches!(error, LocalizerError::OtherEncoder { .. }),
+        "{error}"
+    );
     // And an encoder is no head.
-    let message = Localizer::load(&encoder, &encoder, Inference::default()).unwrap_err().to_string();
-    assert!(message.contains("weights.safetensors") && message.contains("\"scene encoder\""), "{message}");
+    let message = Localizer::load(&encoder, &encoder, Inference::default())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        message.contains("weights.safetensors") && message.contains("\"scene encoder\""),
+        "{message}"
+    );
 }
 
 #[test]
@@ -145,13 +206,21 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
     let _generator = random_generator_lock();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());
-    let encoder = train_encoder(&encoder_config(&scenes, &dir.path().join("encoder"), 1), &mut |_| ()).unwrap();
+    let encoder = train_encoder(
+        &encoder_config(&scenes, &dir.path().join("encoder"), 1),
+        &mut |_| (),
+    )
+    .unwrap();
     let encoder = encoder.trained.weights;
     let config = |steps| SgLocTrainConfig {
         scenes: vec![scenes.clone()],
         scene_name: "small".into(),
         encoder: encoder.clone(),
-        run: RunConfig { batch: 2, learning_rate: 3e-3, ..run(&dir.path().join("sgloc"), steps) },
+        run: RunConfig {
+            batch: 2,
+            learning_rate: 3e-3,
+            ..run(&dir.path().join("sgloc"), steps)
+        },
     };
     let (mut errors, mut encoded) = (Vec::new(), 0);
     let trained = train_sgloc(&config(150), &mut |report| match report {
@@ -159,7 +228,10 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
         SgLocReport::Stepped { error_m, .. } => errors.push(*error_m),
     })
     .unwrap();
-    assert!(encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]), "{errors:?}");
+    assert!(
+        encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]),
+        "{errors:?}"
+    );
 
     // The file holds the trained head, after the unchanged encoder.
     let written: SgLocConfig = Weights::load(&trained.weights).unwrap().config().unwrap();
@@ -168,7 +240,10 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
     SceneEncoder::new(&before.root(), &small_encoder()).unwrap();
     SceneEncoder::new(&(after.root() / "encoder"), &small_encoder()).unwrap();
     Weights::load(&encoder).unwrap().copy_into(&before).unwrap();
-    Weights::load(&trained.weights).unwrap().copy_into(&after).unwrap();
+    Weights::load(&trained.weights)
+        .unwrap()
+        .copy_into(&after)
+        .unwrap();
     let kept = after.variables();
     for (name, tensor) in before.variables() {
         assert!(tensor.equal(&kept[&format!("encoder.{name}")]), "{name}");
@@ -188,7 +263,11 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
         scenes: vec![scenes.clone()],
         validation: vec![scenes.clone()],
         network: DiffLocConfig {
-            image: RangeImageConfig { rows: 8, columns: 64, ..RangeImageConfig::default() },
+            image: RangeImageConfig {
+                rows: 8,
+                columns: 64,
+                ..RangeImageConfig::default()
+            },
             patch: [2, 8],
             stem: [4, 8],
             width: 32,
@@ -200,12 +279,18 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
         },
         turn_rad: 0.5,
         shift_m: 0.5,
-        run: RunConfig { batch: 24, learning_rate: 5e-3, ..run(&dir.path().join("diffloc"), steps) },
+        run: RunConfig {
+            batch: 24,
+            learning_rate: 5e-3,
+            ..run(&dir.path().join("diffloc"), steps)
+        },
     };
     let (mut poses_l1, mut found_m) = (Vec::new(), Vec::new());
     let summary = train_diffloc(&config(200), &mut |report| match report {
         DiffLocReport::Imaging(..) => {}
-        DiffLocReport::Stepped { pose_l1, accuracy, .. } => {
+        DiffLocReport::Stepped {
+            pose_l1, accuracy, ..
+        } => {
             poses_l1.push(*pose_l1);
             found_m.push(accuracy.p50_m);
         }
@@ -213,22 +298,41 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
     })
     .unwrap();
     assert_eq!(summary.sweeps, 48);
-    assert!(poses_l1.last().unwrap() < &(0.7 * poses_l1[0]), "{poses_l1:?} {found_m:?} {:?}", summary.validation);
+    assert!(
+        poses_l1.last().unwrap() < &(0.7 * poses_l1[0]),
+        "{poses_l1:?} {found_m:?} {:?}",
+        summary.validation
+    );
     // Far too short to find places: the error is only measured.
     assert!(summary.validation.unwrap().p50_m.is_finite());
 
-    let mut localizer = load_baseline(&summary.trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+    let mut localizer =
+        load_baseline(&summary.trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
-    let frame = dataset.scenarios[0].load(0, 3, &LoadOptions::default()).unwrap();
+    let frame = dataset.scenarios[0]
+        .load(0, 3, &LoadOptions::default())
+        .unwrap();
     let first = localizer.localize(&frame.points).unwrap().estimate;
-    assert_eq!(localizer.localize(&frame.points).unwrap().estimate, first, "same sweep, same answer");
-    let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
-    let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };
+    assert_eq!(
+        localizer.localize(&frame.points).unwrap().estimate,
+        first,
+        "same sweep, same answer"
+    );
+    let nan = PointCloud {
+        xyzi: vec![[f32::NAN; 4]; 5000],
+    };
+    let none = PoseEstimate::NoPose {
+        reason: NoPoseReason::TooFewPoints,
+        inlier_count: 0,
+    };
     assert_eq!(localizer.localize(&nan).unwrap().estimate, none);
 
     let mut resumed = config(203);
     resumed.run.resume = true;
-    assert_eq!(train_diffloc(&resumed, &mut |_| ()).unwrap().trained.steps, 203);
+    assert_eq!(
+        train_diffloc(&resumed, &mut |_| ()).unwrap().trained.steps,
+        203
+    );
 }
 
 #[test]
@@ -236,7 +340,11 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     let _generator = random_generator_lock();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());
-    let whole = train_encoder(&encoder_config(&scenes, &dir.path().join("a"), 20), &mut |_| ()).unwrap();
+    let whole = train_encoder(
+        &encoder_config(&scenes, &dir.path().join("a"), 20),
+        &mut |_| (),
+    )
+    .unwrap();
     let b = dir.path().join("b");
     // Stopped at the second validation, whose checkpoint is then not yet written.
     let mut validations = 0;
@@ -260,12 +368,20 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     other.run.seed = 9;
     let error = train_encoder(&other, &mut |_| ()).unwrap_err();
     assert!(
-        matches!(error, LocalizerTrainError::Training(TrainingError::OtherTraining { field: "seed", .. })),
+        matches!(
+            error,
+            LocalizerTrainError::Training(TrainingError::OtherTraining { field: "seed", .. })
+        ),
         "{error}"
     );
     let checkpoint = b.join("checkpoint.safetensors");
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
-    let message = train_encoder(&going_on(30), &mut |_| ()).unwrap_err().to_string();
-    assert!(message.contains("checkpoint.safetensors") && message.contains("not a complete"), "{message}");
+    let message = train_encoder(&going_on(30), &mut |_| ())
+        .unwrap_err()
+        .to_string();
+    assert!(
+        message.contains("checkpoint.safetensors") && message.contains("not a complete"),
+        "{message}"
+    );
 }

@@ -13,7 +13,9 @@ use dataset::{self, IntensityScale, LoadOptions, Scenario};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
 use fusion::pastat::{Part, ablated};
-use localization::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
+use localization::pose_source::{
+    CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable,
+};
 use perception::inference::Inference;
 use perception::weights::Weights;
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
@@ -29,7 +31,11 @@ const TICKS: usize = 7;
 fn begin(folder: &Path) -> (PathBuf, PathBuf) {
     let data = folder.join("data");
     scene::write(&data, &AGENTS, TICKS);
-    let summary = train::run(&config(&data, &folder.join("none"), Method::NONE, 5), &mut Ear::default()).unwrap();
+    let summary = train::run(
+        &config(&data, &folder.join("none"), Method::NONE, 5),
+        &mut Ear::default(),
+    )
+    .unwrap();
     (data, summary.trained.weights)
 }
 
@@ -49,13 +55,30 @@ fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
         limit_bytes: 1 << 30,
         intensity_scale: IntensityScale::AUTO,
     });
-    config.samples.moments = Moments { frames: 1, gap: 2, max_delay_nanos: 300_000_000 };
-    config.samples.poses = SamplePoses { noise: Some(noise), noise_share: 0.5, ..SamplePoses::default() };
+    config.samples.moments = Moments {
+        frames: 1,
+        gap: 2,
+        max_delay_nanos: 300_000_000,
+    };
+    config.samples.poses = SamplePoses {
+        noise: Some(noise),
+        noise_share: 0.5,
+        ..SamplePoses::default()
+    };
     config
 }
 
-fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u64, maps: bool) -> Vec<EvaluatedFrame> {
-    let codec = CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() };
+fn evaluate(
+    weights: &Path,
+    data: &Path,
+    poses: PoseSourceConfig,
+    delay_nanos: u64,
+    maps: bool,
+) -> Vec<EvaluatedFrame> {
+    let codec = CodecConfig {
+        dtype: Dtype::F16,
+        ..CodecConfig::default()
+    };
     let config = EvaluateConfig {
         weights: weights.to_owned(),
         method: Some(Method::PASTAT),
@@ -69,7 +92,12 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
     if maps {
         let weights = Arc::new(Weights::load(weights).unwrap());
         let folder = data.join("../evaluation-maps");
-        let kept = KeptMaps { folder, dtype: Dtype::F16, limit_bytes: u64::MAX, intensity_scale: IntensityScale::AUTO };
+        let kept = KeptMaps {
+            folder,
+            dtype: Dtype::F16,
+            limit_bytes: u64::MAX,
+            intensity_scale: IntensityScale::AUTO,
+        };
         let store = FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| {}).unwrap();
         evaluator = evaluator.with_maps(MapSource::new(store.into(), weights));
     }
@@ -85,7 +113,12 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
 }
 
 fn ages_ms(frame: &EvaluatedFrame) -> Vec<i64> {
-    frame.result.fused.iter().map(|fused| fused.age_nanos / 1_000_000).collect()
+    frame
+        .result
+        .fused
+        .iter()
+        .map(|fused| fused.age_nanos / 1_000_000)
+        .collect()
 }
 
 #[test]
@@ -97,22 +130,36 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let mut ear = Ear::default();
     let summary = train::run(&first, &mut ear).unwrap();
     assert_eq!(ear.encoded, AGENTS.len() * TICKS, "every sweep once");
-    assert!(ear.losses.iter().all(|loss| loss.is_finite() && *loss > 0.0));
+    assert!(
+        ear.losses
+            .iter()
+            .all(|loss| loss.is_finite() && *loss > 0.0)
+    );
     let before = Weights::load(&init).unwrap();
     let after = Weights::load(&summary.trained.weights).unwrap();
-    assert_eq!(before.sha256_of(is_encoder), after.sha256_of(is_encoder), "the encoder is as it was");
+    assert_eq!(
+        before.sha256_of(is_encoder),
+        after.sha256_of(is_encoder),
+        "the encoder is as it was"
+    );
     assert_ne!(
         before.sha256_of(|name| name.starts_with("cls_head")),
         after.sha256_of(|name| name.starts_with("cls_head"))
     );
     assert!(after.names().any(|name| name.starts_with("fusion.fsa.")));
     let card = fs::read_to_string(first.run.out.join("model-card.md")).unwrap();
-    assert!(card.contains("frozen") && card.contains("3 frames") && card.contains("0.3 s late"), "{card}");
+    assert!(
+        card.contains("frozen") && card.contains("3 frames") && card.contains("0.3 s late"),
+        "{card}"
+    );
 
     // The same again, with its maps cached: the same weights.
     let mut again = Ear::default();
     let repeated = train::run(&pastat(folder.path(), &data, &init, "again"), &mut again).unwrap();
-    assert_eq!((again.encoded, repeated.trained.sha256), (0, summary.trained.sha256));
+    assert_eq!(
+        (again.encoded, repeated.trained.sha256),
+        (0, summary.trained.sha256)
+    );
 
     let weights = &summary.trained.weights;
     let frames = evaluate(weights, &data, PoseSourceConfig::Recorded, 0, false);
@@ -126,7 +173,13 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
         assert_eq!(frame.result.fused, kept.result.fused);
         assert_eq!(frame.result.detections.len(), kept.result.detections.len());
     }
-    let late = evaluate(weights, &data, PoseSourceConfig::Recorded, 200_000_000, false);
+    let late = evaluate(
+        weights,
+        &data,
+        PoseSourceConfig::Recorded,
+        200_000_000,
+        false,
+    );
     let ages: Vec<Vec<i64>> = late.iter().map(ages_ms).collect();
     assert_eq!(ages[..3], [vec![], vec![], vec![200, 200]]);
 }
@@ -146,11 +199,16 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
             intensity_scale: IntensityScale::AUTO,
         };
         let mut encoded = 0;
-        let store = FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| encoded += 1).unwrap();
+        let store =
+            FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| encoded += 1).unwrap();
         (store, encoded)
     };
     let (few, encoded) = open(1);
-    assert_eq!((few.sweeps(), encoded), ((1, AGENTS.len() * TICKS), 1), "no more once the limit is passed");
+    assert_eq!(
+        (few.sweeps(), encoded),
+        ((1, AGENTS.len() * TICKS), 1),
+        "no more once the limit is passed"
+    );
     assert!(few.map(0, 0, 0).unwrap().is_some() && few.map(0, 2, 3).unwrap().is_none());
     // A map that is not cached is encoded when it is needed.
     let mut maps = MapSource::new(few.into(), Weights::load(&init).unwrap().into());
@@ -159,9 +217,19 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     assert_eq!(encoded, AGENTS.len() * TICKS - 1);
     let kept = whole.map(0, 2, 3).unwrap().unwrap();
     assert!(kept.allclose(&live, 1e-3, 1e-3, false));
-    let file = fs::read_dir(folder.path().join("maps")).unwrap().next().unwrap().unwrap().path();
+    let file = fs::read_dir(folder.path().join("maps"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
     let length = fs::metadata(&file).unwrap().len();
-    fs::OpenOptions::new().write(true).open(&file).unwrap().set_len(length - 5).unwrap();
+    fs::OpenOptions::new()
+        .write(true)
+        .open(&file)
+        .unwrap()
+        .set_len(length - 5)
+        .unwrap();
     let (mended, encoded) = open(u64::MAX);
     assert_eq!((encoded, mended.sweeps().0), (1, AGENTS.len() * TICKS));
     assert!(mended.map(0, 2, TICKS - 1).unwrap().is_some());
@@ -169,7 +237,11 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     let last = bytes.len() - 3;
     bytes[last] ^= 0x55;
     fs::write(&file, bytes).unwrap();
-    let message = open(u64::MAX).0.map(0, 2, TICKS - 1).unwrap_err().to_string();
+    let message = open(u64::MAX)
+        .0
+        .map(0, 2, TICKS - 1)
+        .unwrap_err()
+        .to_string();
     assert!(message.contains(".maps"), "{message}");
 }
 
@@ -183,10 +255,28 @@ fn parts_are_left_out_by_the_configuration_and_stay_out() {
     config.fusion = Some(ablated(&usual, &[Part::Ce, Part::Fsa, Part::Te], Some(1)).unwrap());
     let summary = train::run(&config, &mut Ear::default()).unwrap();
     let weights = Weights::load(&summary.trained.weights).unwrap();
-    assert!(!weights.names().any(|name| name.contains(".fsa.") || name.contains(".ce.")));
-    assert!(!evaluate(&summary.trained.weights, &data, PoseSourceConfig::Recorded, 0, false).is_empty());
+    assert!(
+        !weights
+            .names()
+            .any(|name| name.contains(".fsa.") || name.contains(".ce."))
+    );
+    assert!(
+        !evaluate(
+            &summary.trained.weights,
+            &data,
+            PoseSourceConfig::Recorded,
+            0,
+            false
+        )
+        .is_empty()
+    );
     let max = Method::MAX.default_fusion(&small());
-    assert!(ablated(&max, &[Part::Ce], None).unwrap_err().to_string().contains("pastat"));
+    assert!(
+        ablated(&max, &[Part::Ce], None)
+            .unwrap_err()
+            .to_string()
+            .contains("pastat")
+    );
 }
 
 /// A table of the true poses, except for one vehicle without a pose at tick 3.
@@ -197,11 +287,18 @@ fn poses(file: &Path, scenario: &Scenario) {
             let frame = scenario.load(agent, tick, &LoadOptions::default()).unwrap();
             let lost = agent == 1 && tick == 3;
             let estimate = if lost {
-                PoseEstimate::NoPose { reason: NoPoseReason::LowConfidence, inlier_count: 3 }
+                PoseEstimate::NoPose {
+                    reason: NoPoseReason::LowConfidence,
+                    inlier_count: 3,
+                }
             } else {
                 PoseEstimate::new(frame.world_from_lidar.unwrap(), 0.75)
             };
-            rows.push(PoseRow { cav, capture_nanos: frame.capture_nanos, estimate });
+            rows.push(PoseRow {
+                cav,
+                capture_nanos: frame.capture_nanos,
+                estimate,
+            });
         }
     }
     PoseTable::append(file, &scenario.name, &rows).unwrap();
@@ -217,15 +314,40 @@ fn poses_that_were_found_once_serve_training_and_evaluation() {
     let mut config = pastat(folder.path(), &data, &init, "found");
     config.samples.poses.tables = vec![PoseTable::read(&file).unwrap().into()];
     let summary = train::run(&config, &mut Ear::default()).unwrap();
-    let source = PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: None });
+    let source = PoseSourceConfig::Cached(CachedPoseConfig {
+        file: file.clone(),
+        scenario: None,
+    });
     let frames = evaluate(&summary.trained.weights, &data, source, 0, true);
-    let fused: Vec<usize> = frames.iter().map(|frame| frame.result.fused.len()).collect();
-    assert_eq!(fused, [2, 2, 2, 1, 2, 2, 2], "a vehicle without a pose is left out");
-    assert!(frames[0].result.fused.iter().all(|fused| fused.confidence == 0.75));
+    let fused: Vec<usize> = frames
+        .iter()
+        .map(|frame| frame.result.fused.len())
+        .collect();
+    assert_eq!(
+        fused,
+        [2, 2, 2, 1, 2, 2, 2],
+        "a vehicle without a pose is left out"
+    );
+    assert!(
+        frames[0]
+            .result
+            .fused
+            .iter()
+            .all(|fused| fused.confidence == 0.75)
+    );
 
     fs::write(&file, "scenario,cav\n").unwrap();
-    let source = PoseSourceConfig::Cached(CachedPoseConfig { file, scenario: None });
-    assert!(source.build(Inference::default()).unwrap_err().to_string().contains("poses.csv:1"));
+    let source = PoseSourceConfig::Cached(CachedPoseConfig {
+        file,
+        scenario: None,
+    });
+    assert!(
+        source
+            .build(Inference::default())
+            .unwrap_err()
+            .to_string()
+            .contains("poses.csv:1")
+    );
 }
 
 #[derive(Default)]
@@ -236,7 +358,11 @@ struct Cells {
 
 impl TableObserver for Cells {
     fn cell(&mut self, _: &str, _: &str, _: &str, known: bool) {
-        if known { self.known += 1 } else { self.computed += 1 }
+        if known {
+            self.known += 1
+        } else {
+            self.computed += 1
+        }
     }
     fn frame(&mut self) {}
 }
@@ -261,13 +387,26 @@ fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
     let mut first = Cells::default();
     table::run(&spec(""), &out, &mut first).unwrap();
     assert_eq!((first.known, first.computed), (0, 2));
-    let row = format!("  - {{name: best, method: max, weights: [{}, {}]}}\n", init.display(), init.display());
+    let row = format!(
+        "  - {{name: best, method: max, weights: [{}, {}]}}\n",
+        init.display(),
+        init.display()
+    );
     let mut second = Cells::default();
     let filled = table::run(&spec(&row), &out, &mut second).unwrap();
     // The second training is the same file: its cells are those of the first.
     assert_eq!((second.known, second.computed), (4, 2));
     assert_eq!(filled[0].rows[1].cells[0].len(), 2);
     let text = fs::read_to_string(out.join("noise.md")).unwrap();
-    assert!(text.contains("| best |") && text.contains("1 m") && text.contains("Frames: 3."), "{text}");
-    assert_eq!(fs::read_to_string(out.join("noise.csv")).unwrap().lines().count(), 1 + 2 + 4);
+    assert!(
+        text.contains("| best |") && text.contains("1 m") && text.contains("Frames: 3."),
+        "{text}"
+    );
+    assert_eq!(
+        fs::read_to_string(out.join("noise.csv"))
+            .unwrap()
+            .lines()
+            .count(),
+        1 + 2 + 4
+    );
 }

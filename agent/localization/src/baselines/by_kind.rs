@@ -16,7 +16,11 @@ use crate::pgc::{Localize, LocalizerError};
 /// # Errors
 /// [`LocalizerError`] when the file is missing, truncated or of no baseline, or its tensors are not those of its
 /// configuration.
-pub fn load_baseline(path: &Path, device: Device, solver: PoseSolver) -> Result<Box<dyn Localize>, LocalizerError> {
+pub fn load_baseline(
+    path: &Path,
+    device: Device,
+    solver: PoseSolver,
+) -> Result<Box<dyn Localize>, LocalizerError> {
     match Weights::load(path)?.metadata(KIND_KEY) {
         Some(DiffLocLocalizer::KIND) => Ok(Box::new(DiffLocLocalizer::load(path, device)?)),
         Some(HypLiLocLocalizer::KIND) => Ok(Box::new(HypLiLocLocalizer::load(path, device)?)),

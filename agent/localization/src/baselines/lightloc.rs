@@ -25,7 +25,10 @@ impl LightLoc {
 }
 
 impl Localize for LightLoc {
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(
+        &mut self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<Localization, LocalizerError> {
         let (mut coordinates, mut times) = self.localizer.scene_coordinates(sweep)?;
         coordinates.epsilon_m.fill(0.0);
         let start = Instant::now();

@@ -9,12 +9,20 @@ use crate::pgc::{Localization, LocalizerTimes};
 pub(super) const FULL_CONFIDENCE: f32 = 1.0;
 
 pub(super) fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
-    Localization::from_estimate(PoseEstimate::NoPose { reason, inlier_count: 0 }, times)
+    Localization::from_estimate(
+        PoseEstimate::NoPose {
+            reason,
+            inlier_count: 0,
+        },
+        times,
+    )
 }
 
 /// Position relative to the origin, cosine and sine of the heading; `None` if that is no pose.
 pub(super) fn upright(answer: &[f32], origin_m: [f64; 3]) -> Option<Isometry3<f64>> {
-    let &[x, y, z, cosine, sine] = answer else { return None };
+    let &[x, y, z, cosine, sine] = answer else {
+        return None;
+    };
     let [x, y, z, cosine, sine] = [x, y, z, cosine, sine].map(f64::from);
     // Cosine and sine have length 1, unless the network gives no heading.
     let is_pose = [x, y, z].iter().all(|axis| axis.is_finite()) && cosine.hypot(sine) > 0.5;

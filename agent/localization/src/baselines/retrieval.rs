@@ -7,7 +7,9 @@ use std::time::Instant;
 use nalgebra::Isometry3;
 use protocol::{NoPoseReason, PoseEstimate};
 
-use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput, LocalizerTimes};
+use crate::pgc::{
+    Localization, Localize, Localizer, LocalizerError, LocalizerInput, LocalizerTimes,
+};
 
 /// Smallest deviation of a channel: constant ones are scaled as if they had this one.
 const LEAST_DEVIATION: f32 = 1e-4;
@@ -35,15 +37,36 @@ impl SweepDatabase {
     /// A database of descriptors of equal length; `None` if there is none or they are empty.
     #[must_use]
     pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
-        let channels = sweeps.first().map(|sweep| sweep.descriptor.len()).filter(|&channels| channels > 0)?;
+        let channels = sweeps
+            .first()
+            .map(|sweep| sweep.descriptor.len())
+            .filter(|&channels| channels > 0)?;
         let count = sweeps.len() as f32;
-        let mean_of =
-            |value: &dyn Fn(&[f32]) -> f32| sweeps.iter().map(|sweep| value(&sweep.descriptor)).sum::<f32>() / count;
-        let mean: Vec<f32> = (0..channels).map(|channel| mean_of(&|of| of[channel])).collect();
+        let mean_of = |value: &dyn Fn(&[f32]) -> f32| {
+            sweeps
+                .iter()
+                .map(|sweep| value(&sweep.descriptor))
+                .sum::<f32>()
+                / count
+        };
+        let mean: Vec<f32> = (0..channels)
+            .map(|channel| mean_of(&|of| of[channel]))
+            .collect();
         let variance = |channel: usize| mean_of(&|of| (of[channel] - mean[channel]).powi(2));
-        let scale = (0..channels).map(|channel| 1.0 / variance(channel).sqrt().max(LEAST_DEVIATION)).collect();
-        let mut database = Self { mean, scale, descriptors: Vec::new(), world_from_sensor: Vec::new() };
-        for DescribedSweep { descriptor, world_from_sensor } in sweeps {
+        let scale = (0..channels)
+            .map(|channel| 1.0 / variance(channel).sqrt().max(LEAST_DEVIATION))
+            .collect();
+        let mut database = Self {
+            mean,
+            scale,
+            descriptors: Vec::new(),
+            world_from_sensor: Vec::new(),
+        };
+        for DescribedSweep {
+            descriptor,
+            world_from_sensor,
+        } in sweeps
+        {
             let normalised = database.normalise(descriptor);
             database.descriptors.extend(normalised);
             database.world_from_sensor.push(*world_from_sensor);
@@ -55,15 +78,25 @@ impl SweepDatabase {
     #[must_use]
     pub fn nearest(&self, descriptor: &[f32]) -> Isometry3<f64> {
         let wanted = self.normalise(descriptor);
-        let distance = |stored: &[f32]| stored.iter().zip(&wanted).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+        let distance = |stored: &[f32]| {
+            stored
+                .iter()
+                .zip(&wanted)
+                .map(|(a, b)| (a - b).powi(2))
+                .sum::<f32>()
+        };
         let distances = self.descriptors.chunks_exact(self.mean.len()).map(distance);
-        let nearest = distances.enumerate().min_by(|(_, a), (_, b)| a.total_cmp(b));
+        let nearest = distances
+            .enumerate()
+            .min_by(|(_, a), (_, b)| a.total_cmp(b));
         nearest.map_or_else(Isometry3::identity, |(row, _)| self.world_from_sensor[row])
     }
 
     fn normalise(&self, descriptor: &[f32]) -> Vec<f32> {
         let channels = descriptor.iter().zip(&self.mean).zip(&self.scale);
-        channels.map(|((value, mean), scale)| (value - mean) * scale).collect()
+        channels
+            .map(|((value, mean), scale)| (value - mean) * scale)
+            .collect()
     }
 }
 
@@ -78,23 +111,35 @@ impl Retrieval {
     /// Retrieval from a database of descriptors of the same localizer ([`Localizer::sweep_features`]).
     #[must_use]
     pub fn new(localizer: Localizer, database: SweepDatabase) -> Self {
-        Self { localizer, database }
+        Self {
+            localizer,
+            database,
+        }
     }
 }
 
 impl Localize for Retrieval {
     /// Every pose has full confidence: nothing tells a good one from a bad one.
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(
+        &mut self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let Some(descriptor) = self.localizer.sweep_features(cloud, &mut times)? else {
-            let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };
+            let none = PoseEstimate::NoPose {
+                reason: NoPoseReason::TooFewPoints,
+                inlier_count: 0,
+            };
             return Ok(Localization::from_estimate(none, times));
         };
         let start = Instant::now();
         let pose = self.database.nearest(&descriptor);
         times.solve = start.elapsed();
-        Ok(Localization::from_estimate(PoseEstimate::new(pose.into(), 1.0), times))
+        Ok(Localization::from_estimate(
+            PoseEstimate::new(pose.into(), 1.0),
+            times,
+        ))
     }
 }
 
@@ -105,12 +150,20 @@ mod tests {
     #[test]
     fn the_nearest_descriptor_is_found_whatever_the_scale_of_a_channel() {
         let place = |x: f64| Isometry3::translation(x, 0.0, 0.0);
-        let sweep =
-            |descriptor: &[f32], x: f64| DescribedSweep { descriptor: descriptor.into(), world_from_sensor: place(x) };
-        let sweeps = [sweep(&[0.0, 1000.0], 1.0), sweep(&[1.0, 1001.0], 2.0), sweep(&[0.5, 3000.0], 3.0)];
+        let sweep = |descriptor: &[f32], x: f64| DescribedSweep {
+            descriptor: descriptor.into(),
+            world_from_sensor: place(x),
+        };
+        let sweeps = [
+            sweep(&[0.0, 1000.0], 1.0),
+            sweep(&[1.0, 1001.0], 2.0),
+            sweep(&[0.5, 3000.0], 3.0),
+        ];
         let database = SweepDatabase::new(&sweeps).unwrap();
         assert_eq!(database.nearest(&[0.9, 1300.0]), place(2.0));
         assert_eq!(database.nearest(&[0.9, 2900.0]), place(3.0));
-        assert!(SweepDatabase::new(&[]).is_none() && SweepDatabase::new(&[sweep(&[], 0.0)]).is_none());
+        assert!(
+            SweepDatabase::new(&[]).is_none() && SweepDatabase::new(&[sweep(&[], 0.0)]).is_none()
+        );
     }
 }

@@ -16,18 +16,28 @@ impl Dense {
     pub(crate) fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64, gain: f64) -> Self {
         let stdev = gain * (2.0 / inputs as f64).sqrt();
         Self {
-            weight: path.var("weight", &[inputs, outputs], Init::Randn { mean: 0.0, stdev }),
+            weight: path.var(
+                "weight",
+                &[inputs, outputs],
+                Init::Randn { mean: 0.0, stdev },
+            ),
             bias: path.var("bias", &[outputs], Init::Const(0.0)),
         }
     }
 
     /// `[N, inputs]` to `[N, outputs]`.
     pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        self.bias.to_kind(x.kind()).f_addmm(x, &self.weight.to_kind(x.kind()))
+        self.bias
+            .to_kind(x.kind())
+            .f_addmm(x, &self.weight.to_kind(x.kind()))
     }
 
     /// The same in integers.
     pub(crate) fn int8(&self, format: LayerFormat) -> Result<Int8Linear, TchError> {
-        Int8Linear::new(&self.weight.f_tr()?.f_contiguous()?, Some(&self.bias), format)
+        Int8Linear::new(
+            &self.weight.f_tr()?.f_contiguous()?,
+            Some(&self.bias),
+            format,
+        )
     }
 }

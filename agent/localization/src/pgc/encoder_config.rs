@@ -118,19 +118,31 @@ impl SceneEncoderConfig {
     /// Edge of the cells that scene coordinates are regressed for, metres.
     #[must_use]
     pub fn cell_m(&self) -> f64 {
-        if self.fine_cells { 0.5 * self.coarse_cell_m() } else { self.coarse_cell_m() }
+        if self.fine_cells {
+            0.5 * self.coarse_cell_m()
+        } else {
+            self.coarse_cell_m()
+        }
     }
 
     /// Channels of the last level.
     #[must_use]
     pub(crate) fn coarse_channels(&self) -> i64 {
-        self.residual_widths.last().or(self.widths.last()).copied().unwrap_or(0)
+        self.residual_widths
+            .last()
+            .or(self.widths.last())
+            .copied()
+            .unwrap_or(0)
     }
 
     /// Channels of a cell before its surroundings are added.
     #[must_use]
     pub fn local_channels(&self) -> i64 {
-        let fine = if self.fine_cells { self.widths[self.levels() - 2] } else { 0 };
+        let fine = if self.fine_cells {
+            self.widths[self.levels() - 2]
+        } else {
+            0
+        };
         fine + self.coarse_channels()
     }
 
@@ -158,23 +170,45 @@ impl SceneEncoderConfig {
         };
         positive("voxel_m", self.voxel_m)?;
         positive("range_m", self.range_m)?;
-        self.context_m.iter().try_for_each(|&edge| positive("context_m", edge))?;
-        if self.height_m.iter().any(|height| !height.is_finite()) || self.height_m[0] >= self.height_m[1] {
+        self.context_m
+            .iter()
+            .try_for_each(|&edge| positive("context_m", edge))?;
+        if self.height_m.iter().any(|height| !height.is_finite())
+            || self.height_m[0] >= self.height_m[1]
+        {
             return Err(format!("height_m is {:?}, must rise", self.height_m));
         }
         if !(2..=6).contains(&self.levels()) {
-            return Err(format!("widths has {} entries, must have 2 to 6", self.levels()));
+            return Err(format!(
+                "widths has {} entries, must have 2 to 6",
+                self.levels()
+            ));
         }
-        for (name, entries) in [("residual_widths", self.residual_widths.len()), ("context_m", self.context_m.len())] {
+        for (name, entries) in [
+            ("residual_widths", self.residual_widths.len()),
+            ("context_m", self.context_m.len()),
+        ] {
             if entries > MAX_ENTRIES {
-                return Err(format!("{name} has {entries} entries, must have {MAX_ENTRIES} at most"));
+                return Err(format!(
+                    "{name} has {entries} entries, must have {MAX_ENTRIES} at most"
+                ));
             }
         }
         let channels = self.widths.iter().chain(&self.residual_widths);
-        match channels.copied().find(|channels| !(1..=4096).contains(channels)) {
-            Some(channels) => Err(format!("a layer has {channels} channels, must have 1 to 4096")),
-            None if self.range_m / self.voxel_m > 10_000.0 || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS => {
-                Err(format!("range_m is {} with voxel_m {}: too many voxels", self.range_m, self.voxel_m))
+        match channels
+            .copied()
+            .find(|channels| !(1..=4096).contains(channels))
+        {
+            Some(channels) => Err(format!(
+                "a layer has {channels} channels, must have 1 to 4096"
+            )),
+            None if self.range_m / self.voxel_m > 10_000.0
+                || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS =>
+            {
+                Err(format!(
+                    "range_m is {} with voxel_m {}: too many voxels",
+                    self.range_m, self.voxel_m
+                ))
             }
             // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
             None if self.parameters() > MAX_PARAMETERS => Err(format!(
@@ -192,8 +226,16 @@ impl SceneEncoderConfig {
         let group = |from: i64, to: i64| (from + to) * to;
         let before_last = self.widths[self.levels() - 2];
         let mut products = self.input.channels() * self.widths[0];
-        products += self.widths.windows(2).map(|pair| pair[0] * pair[1]).sum::<i64>();
-        products += if self.fine_cells { group(before_last, before_last) } else { 0 };
+        products += self
+            .widths
+            .windows(2)
+            .map(|pair| pair[0] * pair[1])
+            .sum::<i64>();
+        products += if self.fine_cells {
+            group(before_last, before_last)
+        } else {
+            0
+        };
         let mut channels = self.widths[self.levels() - 1];
         for &width in &self.residual_widths {
             products += group(channels, width);
@@ -210,7 +252,10 @@ mod tests {
     #[test]
     fn presets_match_their_names() {
         let full = SceneEncoderConfig::full(1.0);
-        assert_eq!((full.cell_m(), full.cell_channels(), full.sweep_channels()), (2.0, 512, 1024));
+        assert_eq!(
+            (full.cell_m(), full.cell_channels(), full.sweep_channels()),
+            (2.0, 512, 1024)
+        );
         let lean = SceneEncoderConfig::lean();
         assert_eq!((lean.cell_m(), lean.coarse_cell_m()), (2.0, 4.0));
         assert_eq!((lean.local_channels(), lean.cell_channels()), (192, 448));
@@ -220,14 +265,52 @@ mod tests {
 
     #[test]
     fn absurd_configurations_are_rejected_by_name() {
-        let refused = |config: SceneEncoderConfig, field: &str| config.validate().unwrap_err().contains(field);
-        assert!(refused(SceneEncoderConfig { voxel_m: 0.0, ..SceneEncoderConfig::lean() }, "voxel_m"));
-        assert!(refused(SceneEncoderConfig { voxel_m: 1e-6, ..SceneEncoderConfig::lean() }, "too many"));
-        assert!(refused(SceneEncoderConfig { widths: vec![4], ..SceneEncoderConfig::lean() }, "widths"));
-        assert!(refused(SceneEncoderConfig { height_m: [2.0, 1.0], ..SceneEncoderConfig::lean() }, "height_m"));
-        assert!(refused(SceneEncoderConfig { context_m: vec![9.0; 17], ..SceneEncoderConfig::lean() }, "context_m"));
+        let refused = |config: SceneEncoderConfig, field: &str| {
+            config.validate().unwrap_err().contains(field)
+        };
+        assert!(refused(
+            SceneEncoderConfig {
+                voxel_m: 0.0,
+                ..SceneEncoderConfig::lean()
+            },
+            "voxel_m"
+        ));
+        assert!(refused(
+            SceneEncoderConfig {
+                voxel_m: 1e-6,
+                ..SceneEncoderConfig::lean()
+            },
+            "too many"
+        ));
+        assert!(refused(
+            SceneEncoderConfig {
+                widths: vec![4],
+                ..SceneEncoderConfig::lean()
+            },
+            "widths"
+        ));
+        assert!(refused(
+            SceneEncoderConfig {
+                height_m: [2.0, 1.0],
+                ..SceneEncoderConfig::lean()
+            },
+            "height_m"
+        ));
+        assert!(refused(
+            SceneEncoderConfig {
+                context_m: vec![9.0; 17],
+                ..SceneEncoderConfig::lean()
+            },
+            "context_m"
+        ));
         for residual_widths in [vec![1; 17], vec![4096; 9]] {
-            assert!(refused(SceneEncoderConfig { residual_widths, ..SceneEncoderConfig::lean() }, "residual_widths"));
+            assert!(refused(
+                SceneEncoderConfig {
+                    residual_widths,
+                    ..SceneEncoderConfig::lean()
+                },
+                "residual_widths"
+            ));
         }
     }
 }

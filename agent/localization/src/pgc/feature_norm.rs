@@ -16,7 +16,10 @@ pub(crate) struct FeatureNorm {
 impl FeatureNorm {
     /// Identity until [`Self::fit`].
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        Self { mean: path.zeros_no_train("mean", &[channels]), scale: path.ones_no_train("scale", &[channels]) }
+        Self {
+            mean: path.zeros_no_train("mean", &[channels]),
+            scale: path.ones_no_train("scale", &[channels]),
+        }
     }
 
     /// Sets mean and deviation of `[N, channels]`.
@@ -24,8 +27,10 @@ impl FeatureNorm {
         let features = features.f_to_kind(Kind::Float)?;
         let deviation = features.f_std_dim(0_i64, false, false)?;
         no_grad(|| {
-            self.mean.f_copy_(&features.f_mean_dim(0_i64, false, Kind::Float)?)?;
-            self.scale.f_copy_(&deviation.f_clamp_min(LEAST_DEVIATION)?.f_reciprocal()?)
+            self.mean
+                .f_copy_(&features.f_mean_dim(0_i64, false, Kind::Float)?)?;
+            self.scale
+                .f_copy_(&deviation.f_clamp_min(LEAST_DEVIATION)?.f_reciprocal()?)
         })
     }
 

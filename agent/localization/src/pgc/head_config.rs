@@ -78,10 +78,12 @@ impl RefinerConfig {
     pub fn cropped(&self, low_m: [f64; 2], high_m: [f64; 2]) -> (Self, Vec<i64>) {
         let whole = self.corners();
         let step = |axis: usize, place_m: f64| (place_m - self.low_m[axis]) / self.spacing_m;
-        let first: [i64; 2] =
-            std::array::from_fn(|axis| (step(axis, low_m[axis]).floor() as i64).clamp(0, whole[axis] - 1));
-        let last: [i64; 2] =
-            std::array::from_fn(|axis| (step(axis, high_m[axis]).ceil() as i64).clamp(first[axis], whole[axis] - 1));
+        let first: [i64; 2] = std::array::from_fn(|axis| {
+            (step(axis, low_m[axis]).floor() as i64).clamp(0, whole[axis] - 1)
+        });
+        let last: [i64; 2] = std::array::from_fn(|axis| {
+            (step(axis, high_m[axis]).ceil() as i64).clamp(first[axis], whole[axis] - 1)
+        });
         let at = |axis: usize, step: i64| self.low_m[axis] + step as f64 * self.spacing_m;
         let cropped = Self {
             low_m: [at(0, first[0]), at(1, first[1])],
@@ -90,8 +92,12 @@ impl RefinerConfig {
             ..self.clone()
         };
         let [columns, rows] = cropped.corners();
-        let row = |x: i64, y: i64| (first[1] + y).min(whole[1] - 1) * whole[0] + (first[0] + x).min(whole[0] - 1);
-        let kept = (0..rows).flat_map(|y| (0..columns).map(move |x| row(x, y))).collect();
+        let row = |x: i64, y: i64| {
+            (first[1] + y).min(whole[1] - 1) * whole[0] + (first[0] + x).min(whole[0] - 1)
+        };
+        let kept = (0..rows)
+            .flat_map(|y| (0..columns).map(move |x| row(x, y)))
+            .collect();
         (cropped, kept)
     }
 
@@ -100,20 +106,36 @@ impl RefinerConfig {
     /// # Errors
     /// Field and value that are wrong.
     pub fn validate(&self) -> Result<(), String> {
-        let sizes = [("local_channels", self.local_channels), ("keys", self.keys), ("width", self.width)];
-        if let Some((name, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
+        let sizes = [
+            ("local_channels", self.local_channels),
+            ("keys", self.keys),
+            ("width", self.width),
+        ];
+        if let Some((name, size)) = sizes
+            .into_iter()
+            .find(|(_, size)| !(1..=4096).contains(size))
+        {
             return Err(format!("refiner: {name} is {size}, must be 1 to 4096"));
         }
         // The size of the neighbourhood of every cell grows with its square.
         if !(1..=MAX_REACH).contains(&self.reach) {
-            return Err(format!("refiner: reach is {}, must be 1 to {MAX_REACH}", self.reach));
+            return Err(format!(
+                "refiner: reach is {}, must be 1 to {MAX_REACH}",
+                self.reach
+            ));
         }
         let mut edges = (0..2).map(|axis| self.high_m[axis] - self.low_m[axis]);
         if edges.any(|edge| !(edge > 0.0 && edge < 1e5)) {
-            return Err(format!("refiner: from {:?} to {:?} is no area", self.low_m, self.high_m));
+            return Err(format!(
+                "refiner: from {:?} to {:?} is no area",
+                self.low_m, self.high_m
+            ));
         }
         if !(0.1..=100.0).contains(&self.spacing_m) {
-            return Err(format!("refiner: spacing_m is {}, must be 0.1 to 100", self.spacing_m));
+            return Err(format!(
+                "refiner: spacing_m is {}, must be 0.1 to 100",
+                self.spacing_m
+            ));
         }
         let [columns, rows] = self.corners();
         // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
@@ -142,7 +164,10 @@ impl SceneHeadConfig {
             ("blocks", self.blocks as i64),
             ("max_cells", self.max_cells as i64),
         ];
-        match sizes.into_iter().find(|(_, size)| !(1..=16_384).contains(size)) {
+        match sizes
+            .into_iter()
+            .find(|(_, size)| !(1..=16_384).contains(size))
+        {
             Some((name, size)) => Err(format!("{name} is {size}, must be 1 to 16384")),
             None if self.origin_m.iter().any(|axis| !axis.is_finite()) => {
                 Err(format!("origin_m is {:?}, must be finite", self.origin_m))
@@ -180,9 +205,20 @@ mod tests {
             width: 8,
         };
         let message = huge.validate().unwrap_err();
-        assert!(message.contains("33335 x 33335") && message.contains("4096 keys"), "{message}");
-        let far = RefinerConfig { reach: 4096, high_m: [50.0; 2], keys: 4, ..huge };
-        assert_eq!(far.validate(), Err("refiner: reach is 4096, must be 1 to 16".to_owned()));
+        assert!(
+            message.contains("33335 x 33335") && message.contains("4096 keys"),
+            "{message}"
+        );
+        let far = RefinerConfig {
+            reach: 4096,
+            high_m: [50.0; 2],
+            keys: 4,
+            ..huge
+        };
+        assert_eq!(
+            far.validate(),
+            Err("refiner: reach is 4096, must be 1 to 16".to_owned())
+        );
     }
 
     #[test]
@@ -202,8 +238,17 @@ mod tests {
             sweep_points: None,
         };
         assert_eq!(head.validate(), Ok(()));
-        let message = SceneHeadConfig { width: 16_384, blocks: 16_384, ..head }.validate().unwrap_err();
-        assert!(message.contains("width is 16384") && message.contains("256000000"), "{message}");
+        let message = SceneHeadConfig {
+            width: 16_384,
+            blocks: 16_384,
+            ..head
+        }
+        .validate()
+        .unwrap_err();
+        assert!(
+            message.contains("width is 16384") && message.contains("256000000"),
+            "{message}"
+        );
     }
 
     #[test]
@@ -223,7 +268,10 @@ mod tests {
         assert_eq!(rows.len() as i64, cropped_columns * cropped_rows);
         assert!(cropped.low_m[0] <= -20.2 && cropped.high_m[0] >= 30.0 && rows.len() < 1000);
         for (place, &row) in rows.iter().enumerate() {
-            let (x, y) = (place as i64 % cropped_columns, place as i64 / cropped_columns);
+            let (x, y) = (
+                place as i64 % cropped_columns,
+                place as i64 / cropped_columns,
+            );
             for (axis, step, of_whole) in [(0, x, row % columns), (1, y, row / columns)] {
                 let here = cropped.low_m[axis] + step as f64 * cropped.spacing_m;
                 let there = whole.low_m[axis] + of_whole as f64 * whole.spacing_m;

@@ -24,7 +24,11 @@ pub(super) struct Int8Levels {
 impl Int8Levels {
     /// Features of the fine cells, if there are such, and of the coarse cells, `f32`, from the output of the first
     /// convolution.
-    pub(super) fn forward(&self, first: &Tensor, batch: &VoxelBatch) -> Result<(Option<Tensor>, Tensor), TchError> {
+    pub(super) fn forward(
+        &self,
+        first: &Tensor,
+        batch: &VoxelBatch,
+    ) -> Result<(Option<Tensor>, Tensor), TchError> {
         let mut x = self.first.quantise(first)?;
         let mut fine = None;
         for (level, conv) in self.down.iter().enumerate() {

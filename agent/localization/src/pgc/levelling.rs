@@ -22,7 +22,10 @@ const FLOOR_M: f64 = 0.1;
 /// The pose with height, roll and pitch of a weighted fit to the cells; unchanged if these do not constrain them.
 ///
 /// `origin_from_sensor` and the scene coordinates are relative to the head's origin.
-pub(super) fn level(coordinates: &SceneCoordinates, origin_from_sensor: &Isometry3<f64>) -> Isometry3<f64> {
+pub(super) fn level(
+    coordinates: &SceneCoordinates,
+    origin_from_sensor: &Isometry3<f64>,
+) -> Isometry3<f64> {
     let mut pose = *origin_from_sensor;
     for scale_m in SCALES_M {
         match step(coordinates, &pose, scale_m) {
@@ -33,9 +36,17 @@ pub(super) fn level(coordinates: &SceneCoordinates, origin_from_sensor: &Isometr
     pose
 }
 
-fn step(coordinates: &SceneCoordinates, pose: &Isometry3<f64>, scale_m: f64) -> Option<Isometry3<f64>> {
+fn step(
+    coordinates: &SceneCoordinates,
+    pose: &Isometry3<f64>,
+    scale_m: f64,
+) -> Option<Isometry3<f64>> {
     let (mut information, mut moment, mut count) = (Matrix3::zeros(), Vector3::zeros(), 0);
-    let cells = coordinates.sensor_m.iter().zip(&coordinates.world_m).zip(&coordinates.epsilon_m);
+    let cells = coordinates
+        .sensor_m
+        .iter()
+        .zip(&coordinates.world_m)
+        .zip(&coordinates.epsilon_m);
     for ((&sensor_m, &world_m), &epsilon_m) in cells {
         let arm = pose.rotation * Point3::from(sensor_m.map(f64::from)).coords;
         let off = Vector3::from(world_m.map(f64::from)) - (pose.translation.vector + arm);
@@ -44,7 +55,8 @@ fn step(coordinates: &SceneCoordinates, pose: &Isometry3<f64>, scale_m: f64) -> 
         if !is_usable {
             continue;
         }
-        let weight = forgiveness(off.z.abs(), scale_m) / (FLOOR_M.powi(2) + f64::from(epsilon_m).powi(2));
+        let weight =
+            forgiveness(off.z.abs(), scale_m) / (FLOOR_M.powi(2) + f64::from(epsilon_m).powi(2));
         // d(z) = dz + wx * y - wy * x, for a small rotation about the sensor.
         let gradient = Vector3::new(1.0, arm.y, -arm.x);
         information += gradient * gradient.transpose() * weight;
@@ -57,7 +69,10 @@ fn step(coordinates: &SceneCoordinates, pose: &Isometry3<f64>, scale_m: f64) -> 
     let [dz, roll, pitch] = (information.try_inverse()? * moment).data.0[0];
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(roll, pitch, 0.0)) * pose.rotation;
     let position = pose.translation.vector + Vector3::new(0.0, 0.0, dz);
-    Some(Isometry3::from_parts(Translation3::from(position), rotation))
+    Some(Isometry3::from_parts(
+        Translation3::from(position),
+        rotation,
+    ))
 }
 
 #[cfg(test)]
@@ -67,7 +82,10 @@ mod tests {
 
     #[test]
     fn height_and_tilt_are_found_and_the_plane_is_left_alone() {
-        let scene = SyntheticScene { cells: 200, ..SyntheticScene::default() };
+        let scene = SyntheticScene {
+            cells: 200,
+            ..SyntheticScene::default()
+        };
         let coordinates = scene.coordinates(1);
         let mut truth = scene.world_from_sensor(1);
         truth.translation.vector -= Vector3::from(coordinates.origin_m);
@@ -76,7 +94,10 @@ mod tests {
         let start = Isometry3::from_parts(Translation3::from(position), tilt * truth.rotation);
         let levelled = level(&coordinates, &start);
         let off = levelled.translation.vector - truth.translation.vector;
-        assert!(off.z.abs() < 0.1 && (off.xy() - Vector3::new(0.2, -0.1, 0.0).xy()).norm() < 1e-9, "{off}");
+        assert!(
+            off.z.abs() < 0.1 && (off.xy() - Vector3::new(0.2, -0.1, 0.0).xy()).norm() < 1e-9,
+            "{off}"
+        );
         assert!(levelled.rotation.angle_to(&truth.rotation) < 0.01);
     }
 
@@ -85,7 +106,10 @@ mod tests {
         let start = Isometry3::identity();
         assert_eq!(level(&SceneCoordinates::default(), &start), start);
         let mut coordinates = SyntheticScene::default().coordinates(1);
-        coordinates.world_m.iter_mut().for_each(|point| point[2] = f32::NAN);
+        coordinates
+            .world_m
+            .iter_mut()
+            .for_each(|point| point[2] = f32::NAN);
         assert_eq!(level(&coordinates, &start), start);
     }
 }

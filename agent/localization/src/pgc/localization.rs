@@ -60,14 +60,34 @@ impl Localization {
     #[must_use]
     pub fn from_estimate(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
         let (found, inlier_count) = match estimate {
-            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
+            PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            } => {
                 let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
-                let (evidence, cell_covariance) = (PoseEvidence::none(), PoseStd::UNBOUNDED.covariance);
-                (Some(FoundPose { world_from_sensor, evidence, cell_covariance, sigma, is_rejected: false }), 0)
+                let (evidence, cell_covariance) =
+                    (PoseEvidence::none(), PoseStd::UNBOUNDED.covariance);
+                (
+                    Some(FoundPose {
+                        world_from_sensor,
+                        evidence,
+                        cell_covariance,
+                        sigma,
+                        is_rejected: false,
+                    }),
+                    0,
+                )
             }
             PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
         };
-        Self { estimate, found, inlier_count, inlier_ratio: 0.0, times }
+        Self {
+            estimate,
+            found,
+            inlier_count,
+            inlier_ratio: 0.0,
+            times,
+        }
     }
 }
 
@@ -75,7 +95,13 @@ impl LocalizerTimes {
     /// Stages by name, in their order.
     #[must_use]
     pub fn stages(&self) -> Vec<StageTiming> {
-        let Self { voxelise, encode, regress, solve, refine } = *self;
+        let Self {
+            voxelise,
+            encode,
+            regress,
+            solve,
+            refine,
+        } = *self;
         [
             ("pose voxelise", voxelise),
             ("pose encode", encode),

@@ -70,7 +70,10 @@ impl<'a> LocalizerInput<'a> {
     /// A sweep of which nothing is computed yet.
     #[must_use]
     pub fn of(cloud: &'a PointCloud) -> Self {
-        Self { cloud, levels: None }
+        Self {
+            cloud,
+            levels: None,
+        }
     }
 }
 
@@ -81,7 +84,8 @@ pub trait Localize: std::fmt::Debug + Send {
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails. A sweep that cannot be localized is no error but a
     /// result: [`protocol::PoseEstimate::NoPose`].
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError>;
+    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>)
+    -> Result<Localization, LocalizerError>;
 
     /// Localizes one sweep of which nothing is computed yet.
     ///
@@ -139,11 +143,19 @@ impl Localizer {
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn load_without_confidence(encoder: &Path, head: &Path, inference: Inference) -> Result<Self, LocalizerError> {
+    pub fn load_without_confidence(
+        encoder: &Path,
+        head: &Path,
+        inference: Inference,
+    ) -> Result<Self, LocalizerError> {
         Ok(Self::open(encoder, head, inference)?.0)
     }
 
-    fn open(encoder: &Path, head: &Path, inference: Inference) -> Result<(Self, Weights), LocalizerError> {
+    fn open(
+        encoder: &Path,
+        head: &Path,
+        inference: Inference,
+    ) -> Result<(Self, Weights), LocalizerError> {
         let Inference { device, precision } = inference;
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
@@ -162,29 +174,52 @@ impl Localizer {
         weights.copy_into(&variables)?;
         variables.freeze();
         if let Some(scales) = weights.activation_scales()? {
-            let quantised = network.quantise(&scales).and_then(|()| scene_head.quantise(&scales));
+            let quantised = network
+                .quantise(&scales)
+                .and_then(|()| scene_head.quantise(&scales));
             quantised.map_err(|error| weights.quantise_error(error))?;
         }
         let sha256 = [encoder_sha256, weights.sha256().to_owned()];
         let solver = PoseSolver::default();
-        Ok((Self { encoder: network, head: scene_head, solver, most_parts: MOST_PARTS, device, sha256 }, weights))
+        Ok((
+            Self {
+                encoder: network,
+                head: scene_head,
+                solver,
+                most_parts: MOST_PARTS,
+                device,
+                sha256,
+            },
+            weights,
+        ))
     }
 
     /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
     ///
     /// # Errors
     /// [`LocalizerError::Tensor`] when the tensor library fails.
-    pub fn observe(&self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<(), LocalizerError> {
+    pub fn observe(
+        &self,
+        cloud: &PointCloud,
+        search: &mut ScaleSearch,
+    ) -> Result<(), LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Some(EncodedSweep { sweep, features, .. }) = self.encode(LocalizerInput::of(cloud), &mut times)? else {
+        let Some(EncodedSweep {
+            sweep, features, ..
+        }) = self.encode(LocalizerInput::of(cloud), &mut times)?
+        else {
             return Ok(());
         };
         self.encoder.observe(&sweep, search)?;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
         let cells = self.pick(&sweep, &features, &chosen)?.features;
         no_grad(|| {
-            let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
-            self.head.observe(&self.head.normalise(&cells)?, &logits, search)
+            let logits = self
+                .head
+                .classify(&features.sweeps, false)?
+                .f_expand([chosen.len() as i64, -1], false)?;
+            self.head
+                .observe(&self.head.normalise(&cells)?, &logits, search)
         })?;
         Ok(())
     }
@@ -211,7 +246,9 @@ impl Localizer {
     ) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
         let mut times = LocalizerTimes::default();
         let coordinates = match self.encode(sweep, &mut times)? {
-            Some(encoded) => self.regress(&encoded, CELLS, &self.classify(&encoded)?, &mut times)?,
+            Some(encoded) => {
+                self.regress(&encoded, CELLS, &self.classify(&encoded)?, &mut times)?
+            }
             None => SceneCoordinates::default(),
         };
         Ok((coordinates, times))
@@ -226,8 +263,16 @@ impl Localizer {
         cloud: &PointCloud,
         times: &mut LocalizerTimes,
     ) -> Result<Option<Vec<f32>>, LocalizerError> {
-        let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else { return Ok(None) };
-        Ok(Some(Vec::try_from(&encoded.features.sweeps.f_reshape([-1])?.f_to_device(Device::Cpu)?)?))
+        let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else {
+            return Ok(None);
+        };
+        Ok(Some(Vec::try_from(
+            &encoded
+                .features
+                .sweeps
+                .f_reshape([-1])?
+                .f_to_device(Device::Cpu)?,
+        )?))
     }
 
     /// Cells and features; `None` for a sweep without cells.
@@ -247,7 +292,11 @@ impl Localizer {
         let features = self.encoder.encode_one(&sweep, input.levels)?;
         let refinement_cells = self.pick(&sweep, &features, &refined)?;
         times.encode = start.elapsed();
-        Ok(Some(EncodedSweep { sweep, features, refinement_cells }))
+        Ok(Some(EncodedSweep {
+            sweep,
+            features,
+            refinement_cells,
+        }))
     }
 
     /// Logits `[1, classes]` of the parts of the scene.
@@ -264,23 +313,47 @@ impl Localizer {
         logits: &Tensor,
         times: &mut LocalizerTimes,
     ) -> Result<SceneCoordinates, LocalizerError> {
-        let EncodedSweep { sweep, features, .. } = encoded;
+        let EncodedSweep {
+            sweep, features, ..
+        } = encoded;
         let start = Instant::now();
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
-        let SweepCells { features: cells, sensor_m } = self.pick(sweep, features, &chosen)?;
+        let SweepCells {
+            features: cells,
+            sensor_m,
+        } = self.pick(sweep, features, &chosen)?;
         let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
             let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
-            let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
-            let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
-            Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
+            let regression =
+                self.head
+                    .regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
+            let world = Vec::try_from(
+                &regression
+                    .coordinates_m
+                    .f_reshape([-1])?
+                    .f_to_device(Device::Cpu)?,
+            )?;
+            Ok((
+                world,
+                Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?,
+            ))
         })?;
         times.regress += start.elapsed();
         let origin_m = self.head.config().origin_m;
-        Ok(SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m })
+        Ok(SceneCoordinates {
+            sensor_m,
+            world_m: world.as_chunks().0.to_vec(),
+            epsilon_m,
+            origin_m,
+        })
     }
 
     /// Pose from the sweep alone.
-    fn search(&self, encoded: &EncodedSweep, mut times: LocalizerTimes) -> Result<Localization, LocalizerError> {
+    fn search(
+        &self,
+        encoded: &EncodedSweep,
+        mut times: LocalizerTimes,
+    ) -> Result<Localization, LocalizerError> {
         let mut spent = SearchTimes::default();
         let best = self.best_pose(encoded, &mut times, &mut spent)?;
         times.solve = spent.solve;
@@ -296,7 +369,11 @@ impl Localizer {
         times: &mut LocalizerTimes,
         spent: &mut SearchTimes,
     ) -> Result<Attempt, LocalizerError> {
-        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
+        let search = PoseSearch {
+            head: &self.head,
+            solver: &self.solver,
+            kind: Kind::Float,
+        };
         let cells = &encoded.refinement_cells;
         let logits = self.classify(encoded)?;
         let mut coordinates = self.regress(encoded, CELLS, &logits, times)?;
@@ -330,17 +407,34 @@ impl Localizer {
         let few = self.regress(encoded, levelling::CELLS, &self.classify(encoded)?, times)?;
         let start = Instant::now();
         let origin_from_sensor = levelling::level(&few, &origin_from_sensor);
-        let refined =
-            pose_refinement::refine(&self.head, &encoded.refinement_cells, &origin_from_sensor, false, Kind::Float)?;
+        let refined = pose_refinement::refine(
+            &self.head,
+            &encoded.refinement_cells,
+            &origin_from_sensor,
+            false,
+            Kind::Float,
+        )?;
         times.refine = start.elapsed();
-        Ok(refined.and_then(|refined| pose_solver::confirm(&refined, &origin_from_sensor, &origin_m)))
+        Ok(refined
+            .and_then(|refined| pose_solver::confirm(&refined, &origin_from_sensor, &origin_m)))
     }
 
-    fn pick(&self, sweep: &PreparedSweep, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
+    fn pick(
+        &self,
+        sweep: &PreparedSweep,
+        features: &SceneFeatures,
+        chosen: &[usize],
+    ) -> Result<SweepCells, TchError> {
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
         let features = no_grad(|| features.cells.f_index_select(0, &rows))?;
-        Ok(SweepCells { features, sensor_m: chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect() })
+        Ok(SweepCells {
+            features,
+            sensor_m: chosen
+                .iter()
+                .map(|&cell| sweep.cells()[cell].centroid_m)
+                .collect(),
+        })
     }
 
     /// Search and confidence.
@@ -372,18 +466,26 @@ impl Localizer {
         let mut times = LocalizerTimes::default();
         match self.encode(sweep, &mut times)? {
             Some(encoded) => self.search(&encoded, times),
-            None => Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
+            None => Ok(Localization::new(
+                &self.solver.solve(&SceneCoordinates::default()),
+                times,
+            )),
         }
     }
 }
 
 impl Localize for Localizer {
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(
+        &mut self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<Localization, LocalizerError> {
         self.localize_globally(sweep)
     }
 
     fn detector_encoder(&self) -> Option<&str> {
-        self.encoder.takes_levels().then_some(self.sha256[0].as_str())
+        self.encoder
+            .takes_levels()
+            .then_some(self.sha256[0].as_str())
     }
 
     fn localize_near(
@@ -393,7 +495,10 @@ impl Localize for Localizer {
     ) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
         let Some(encoded) = self.encode(sweep, &mut times)? else {
-            return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times));
+            return Ok(Localization::new(
+                &self.solver.solve(&SceneCoordinates::default()),
+                times,
+            ));
         };
         match self.refine(&encoded, world_from_sensor, &mut times)? {
             Some(found) => Ok(Localization::new(&Ok(found), times)),
@@ -408,7 +513,11 @@ impl SceneCoordinates {
     pub fn correspondences(&self) -> Vec<Correspondence> {
         let places = self.sensor_m.iter().zip(&self.world_m).zip(&self.epsilon_m);
         places
-            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence { source_m, target_m, weight: sigma(epsilon_m) })
+            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
+                source_m,
+                target_m,
+                weight: sigma(epsilon_m),
+            })
             .collect()
     }
 }
@@ -420,7 +529,9 @@ fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
     }
     let model: ConfidenceModel = weights.metadata_json(CONFIDENCE_KEY)?;
     let head = weights.path().display().to_string();
-    model.check().map_err(|reason| LocalizerError::Confidence { head, reason })?;
+    model
+        .check()
+        .map_err(|reason| LocalizerError::Confidence { head, reason })?;
     Ok(Confidence::Calibrated(model))
 }
 
@@ -432,7 +543,8 @@ pub fn sigma(epsilon_m: f32) -> f32 {
 
 /// Up to `count` cells, evenly over the sweep, flat ground no more than its share.
 pub(crate) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
-    let (flat, high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
+    let (flat, high): (Vec<usize>, Vec<usize>) =
+        (0..cells.len()).partition(|&cell| cells[cell].is_flat());
     let mut chosen = every_nth(&high, (count as f64 * (1.0 - FLAT_SHARE)) as usize);
     // A share of the chosen cells: a sweep with little but ground must not be localized by its ground.
     let flat_count = chosen.len() as f64 * FLAT_SHARE / (1.0 - FLAT_SHARE);
@@ -442,7 +554,9 @@ pub(crate) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
 
 fn every_nth(rows: &[usize], count: usize) -> Vec<usize> {
     let kept = count.min(rows.len());
-    (0..kept).map(|place| rows[place * rows.len() / kept]).collect()
+    (0..kept)
+        .map(|place| rows[place * rows.len() / kept])
+        .collect()
 }
 
 #[cfg(test)]
@@ -460,14 +574,24 @@ mod tests {
     fn town1_sweep() -> (PointCloud, Isometry3<f64>) {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("scene");
-        generate(&SynthOptions { frames: 1, ..SynthOptions::new(Subset::Town1loc, 450, out.clone()) }, &|_| ())
+        generate(
+            &SynthOptions {
+                frames: 1,
+                ..SynthOptions::new(Subset::Town1loc, 450, out.clone())
+            },
+            &|_| (),
+        )
+        .unwrap();
+        let frame = dataset::open(&out).unwrap().scenarios[0]
+            .load(0, 0, &LoadOptions::default())
             .unwrap();
-        let frame = dataset::open(&out).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
         (frame.points, frame.world_from_lidar.unwrap().isometry())
     }
 
     fn released(name: &str) -> std::path::PathBuf {
-        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/weights").join(name)
+        Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("../../deploy/weights")
+            .join(name)
     }
 
     #[test]
@@ -477,21 +601,43 @@ mod tests {
         let localizer = Localizer::load(&files[0], &files[1], Inference::default()).unwrap();
         let (cloud, truth) = town1_sweep();
         let mut times = LocalizerTimes::default();
-        let encoded = localizer.encode(LocalizerInput::of(&cloud), &mut times).unwrap().unwrap();
+        let encoded = localizer
+            .encode(LocalizerInput::of(&cloud), &mut times)
+            .unwrap()
+            .unwrap();
         let logits = localizer.classify(&encoded).unwrap();
-        let coordinates = localizer.regress(&encoded, CELLS, &logits, &mut times).unwrap();
+        let coordinates = localizer
+            .regress(&encoded, CELLS, &logits, &mut times)
+            .unwrap();
         let (head, solver) = (&localizer.head, &localizer.solver);
-        let search = PoseSearch { head, solver, kind: Kind::Float };
+        let search = PoseSearch {
+            head,
+            solver,
+            kind: Kind::Float,
+        };
         let mut origin_from_sensor = truth;
         origin_from_sensor.translation.vector -= Vector3::from(coordinates.origin_m);
         let mut times = SearchTimes::default();
         for (ahead_m, is_mended) in [(-8.0, true), (9.0, true), (40.0, false)] {
-            let wrong = solver.registration_at(&coordinates, origin_from_sensor * Translation3::new(ahead_m, 0.0, 0.0));
+            let wrong = solver.registration_at(
+                &coordinates,
+                origin_from_sensor * Translation3::new(ahead_m, 0.0, 0.0),
+            );
             let inlier_ratio = wrong.inlier_ratio;
             let solved = Ok(solver.judge(&coordinates, &wrong, None));
-            let wrong = Attempt { solved, inlier_ratio };
-            let found = search.run_along(wrong, &coordinates, &encoded.refinement_cells, &mut times).unwrap();
-            assert_eq!(found.is_sufficient(), is_mended, "{ahead_m} m ahead: {}", found.inlier_ratio);
+            let wrong = Attempt {
+                solved,
+                inlier_ratio,
+            };
+            let found = search
+                .run_along(wrong, &coordinates, &encoded.refinement_cells, &mut times)
+                .unwrap();
+            assert_eq!(
+                found.is_sufficient(),
+                is_mended,
+                "{ahead_m} m ahead: {}",
+                found.inlier_ratio
+            );
             let pose = found.into_solved().unwrap().world_from_sensor;
             let off_m = (pose.translation.vector - truth.translation.vector).norm();
             assert_eq!(off_m < 0.3, is_mended, "{ahead_m} m ahead: {off_m} m");
@@ -503,28 +649,62 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let stored = |model: &ConfidenceModel| {
             let path = folder.path().join("head.safetensors");
-            let metadata: BTreeMap<_, _> = [(CONFIDENCE_KEY.to_owned(), serde_json::to_string(model).unwrap())].into();
-            weights::save(&path, &VarStore::new(Device::Cpu), &metadata, Precision::Single).unwrap();
+            let metadata: BTreeMap<_, _> = [(
+                CONFIDENCE_KEY.to_owned(),
+                serde_json::to_string(model).unwrap(),
+            )]
+            .into();
+            weights::save(
+                &path,
+                &VarStore::new(Device::Cpu),
+                &metadata,
+                Precision::Single,
+            )
+            .unwrap();
             stored_confidence(&Weights::load(&path).unwrap())
         };
         let model = ConfidenceModel::example();
-        assert_eq!(stored(&model).unwrap(), Confidence::Calibrated(model.clone()));
-        let message = stored(&ConfidenceModel { bias: -1e308, ..model }).unwrap_err().to_string();
-        assert!(message.contains("head.safetensors") && message.contains("bias"), "{message}");
+        assert_eq!(
+            stored(&model).unwrap(),
+            Confidence::Calibrated(model.clone())
+        );
+        let message = stored(&ConfidenceModel {
+            bias: -1e308,
+            ..model
+        })
+        .unwrap_err()
+        .to_string();
+        assert!(
+            message.contains("head.safetensors") && message.contains("bias"),
+            "{message}"
+        );
     }
 
     #[test]
     fn ground_is_never_more_than_its_share() {
         let cells = |high: usize, flat: usize| -> Vec<Cell> {
-            let cell = |extent_m| Cell { extent_m, ..Cell::default() };
-            std::iter::repeat_n(cell(2.0), high).chain(std::iter::repeat_n(cell(0.1), flat)).collect()
+            let cell = |extent_m| Cell {
+                extent_m,
+                ..Cell::default()
+            };
+            std::iter::repeat_n(cell(2.0), high)
+                .chain(std::iter::repeat_n(cell(0.1), flat))
+                .collect()
         };
-        for (high, flat, expected) in [(1000, 1000, 256), (60, 1000, 80), (1000, 10, 202), (0, 500, 0)] {
+        for (high, flat, expected) in [
+            (1000, 1000, 256),
+            (60, 1000, 80),
+            (1000, 10, 202),
+            (0, 500, 0),
+        ] {
             let cells = cells(high, flat);
             let chosen = choose_evenly(&cells, 256);
             let ground = chosen.iter().filter(|&&cell| cells[cell].is_flat()).count();
             assert_eq!(chosen.len(), expected);
-            assert!(ground as f64 <= FLAT_SHARE * chosen.len() as f64, "{ground} of {expected}");
+            assert!(
+                ground as f64 <= FLAT_SHARE * chosen.len() as f64,
+                "{ground} of {expected}"
+            );
         }
     }
 }

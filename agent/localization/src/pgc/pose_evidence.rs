@@ -71,10 +71,13 @@ impl PoseEvidence {
             rms_m: registration.rms_m,
             inlier_epsilon_m: mean_over(&registration.inliers, &coordinates.epsilon_m, f64::from),
             median_epsilon_m: median(&coordinates.epsilon_m),
-            inlier_sigma: mean_over(&registration.inliers, &coordinates.epsilon_m, |epsilon| f64::from(sigma(epsilon))),
+            inlier_sigma: mean_over(&registration.inliers, &coordinates.epsilon_m, |epsilon| {
+                f64::from(sigma(epsilon))
+            }),
             position_std_m: std.position_m,
             rotation_std_rad: std.rotation_rad,
-            second: second.map(|second| RefinementEvidence::gather(&registration.target_from_source, second)),
+            second: second
+                .map(|second| RefinementEvidence::gather(&registration.target_from_source, second)),
         }
     }
 
@@ -87,7 +90,11 @@ impl PoseEvidence {
             inliers: refined.registration.inliers.len(),
             inlier_ratio: second.inlier_ratio,
             rms_m: second.rms_m,
-            inlier_epsilon_m: mean_over(&refined.registration.inliers, &refined.epsilon_m, f64::from),
+            inlier_epsilon_m: mean_over(
+                &refined.registration.inliers,
+                &refined.epsilon_m,
+                f64::from,
+            ),
             median_epsilon_m: second.median_epsilon_m,
             inlier_sigma: second.inlier_sigma,
             position_std_m: refined.std.position_m,
@@ -117,20 +124,30 @@ impl PoseEvidence {
     /// the first one.
     #[must_use]
     pub(crate) fn plain_sigma(&self) -> f64 {
-        let inlier_sigma = self.second.map_or(self.inlier_sigma, |second| second.inlier_sigma);
+        let inlier_sigma = self
+            .second
+            .map_or(self.inlier_sigma, |second| second.inlier_sigma);
         (inlier_sigma * self.inlier_ratio).clamp(0.0, 1.0)
     }
 }
 
 impl RefinementEvidence {
     fn gather(start: &Isometry3<f64>, second: &RefinedPose) -> Self {
-        let RefinedPose { registration, epsilon_m, residual_quartile_m, std, information_per_m2 } = second;
+        let RefinedPose {
+            registration,
+            epsilon_m,
+            residual_quartile_m,
+            std,
+            information_per_m2,
+        } = second;
         let moved = registration.target_from_source.translation.vector - start.translation.vector;
         Self {
             inlier_ratio: registration.inlier_ratio,
             rms_m: registration.rms_m,
             median_epsilon_m: median(epsilon_m),
-            inlier_sigma: mean_over(&registration.inliers, epsilon_m, |epsilon| f64::from(sigma(epsilon))),
+            inlier_sigma: mean_over(&registration.inliers, epsilon_m, |epsilon| {
+                f64::from(sigma(epsilon))
+            }),
             moved_m: moved.norm(),
             residual_quartile_m: *residual_quartile_m,
             information_per_m2: *information_per_m2,
@@ -141,7 +158,10 @@ impl RefinementEvidence {
 
 /// Mean over some cells; 0 for none.
 fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f64 {
-    let values = cells.iter().filter_map(|&cell| epsilon_m.get(cell as usize)).map(|&epsilon| value(epsilon));
+    let values = cells
+        .iter()
+        .filter_map(|&cell| epsilon_m.get(cell as usize))
+        .map(|&epsilon| value(epsilon));
     values.sum::<f64>() / cells.len().max(1) as f64
 }
 
@@ -149,7 +169,11 @@ fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f6
 fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
     let middle = sorted.len() / 2;
-    if sorted.is_empty() { 0.0 } else { f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1) }
+    if sorted.is_empty() {
+        0.0
+    } else {
+        f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
 }
 
 /// Standard deviations of a pose: of the refined one, if there is one.
@@ -164,8 +188,14 @@ pub(super) fn std_of(
 /// Standard deviation of a coarse pose: its inliers are weighted by their confidences.
 fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> PoseStd {
     let pairs = coordinates.correspondences();
-    let inliers = registration.inliers.iter().filter_map(|&cell| pairs.get(cell as usize));
-    PoseStd::of(&registration.target_from_source, inliers.map(|pair| (pair, f64::from(pair.weight))))
+    let inliers = registration
+        .inliers
+        .iter()
+        .filter_map(|&cell| pairs.get(cell as usize));
+    PoseStd::of(
+        &registration.target_from_source,
+        inliers.map(|pair| (pair, f64::from(pair.weight))),
+    )
 }
 
 #[cfg(test)]
@@ -183,10 +213,20 @@ mod tests {
     #[test]
     fn worse_cells_leave_worse_evidence() {
         let good = evidence(&SyntheticScene::default());
-        let bad = evidence(&SyntheticScene { outliers: 0.7, noise_m: 0.6, ..SyntheticScene::default() });
+        let bad = evidence(&SyntheticScene {
+            outliers: 0.7,
+            noise_m: 0.6,
+            ..SyntheticScene::default()
+        });
         assert!(good.inlier_ratio > bad.inlier_ratio && good.rms_m < bad.rms_m);
-        assert!(good.position_std_m < bad.position_std_m && good.rotation_std_rad < bad.rotation_std_rad);
-        assert!(good.inlier_epsilon_m < bad.inlier_epsilon_m && good.median_epsilon_m < bad.median_epsilon_m);
+        assert!(
+            good.position_std_m < bad.position_std_m
+                && good.rotation_std_rad < bad.rotation_std_rad
+        );
+        assert!(
+            good.inlier_epsilon_m < bad.inlier_epsilon_m
+                && good.median_epsilon_m < bad.median_epsilon_m
+        );
         assert!(good.plain_sigma() > bad.plain_sigma() && bad.plain_sigma() > 0.0);
         // 300 cells with residuals of 0.2 m per axis: about 0.2 / sqrt(300) m for each of three axes.
         assert!((0.01..0.05).contains(&good.position_std_m), "{good:?}");
@@ -216,6 +256,9 @@ mod tests {
         let coordinates = SceneCoordinates::default();
         let nothing = Registration::judge(&[], nalgebra::Isometry3::identity(), 1.0);
         let evidence = PoseEvidence::gather(&coordinates, &nothing, None);
-        assert_eq!((evidence.position_std_m, evidence.plain_sigma()), (PoseStd::UNBOUNDED.position_m, 0.0));
+        assert_eq!(
+            (evidence.position_std_m, evidence.plain_sigma()),
+            (PoseStd::UNBOUNDED.position_m, 0.0)
+        );
     }
 }

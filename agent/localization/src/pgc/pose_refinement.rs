@@ -57,7 +57,9 @@ pub(super) fn refine(
     is_wide: bool,
     kind: Kind,
 ) -> Result<Option<RefinedPose>, TchError> {
-    let Some(refiner) = head.refiner() else { return Ok(None) };
+    let Some(refiner) = head.refiner() else {
+        return Ok(None);
+    };
     let sensor_m = &cells.sensor_m;
     let cells = head.normalise(&cells.features)?;
     let device = cells.device();
@@ -67,15 +69,31 @@ pub(super) fn refine(
     for scales_m in std::iter::repeat_n(WIDE_ROUND_M, wide_rounds).chain(ROUNDS_M) {
         let assumed: Vec<f32> = sensor_m
             .iter()
-            .flat_map(|point| (pose * Point3::from(point.map(f64::from))).coords.map(|axis| axis as f32).data.0[0])
+            .flat_map(|point| {
+                (pose * Point3::from(point.map(f64::from)))
+                    .coords
+                    .map(|axis| axis as f32)
+                    .data
+                    .0[0]
+            })
             .collect();
         let ahead = pose.rotation * Vector3::x();
         let norm = ahead.xy().norm().max(1e-6);
         let heading = Tensor::f_from_slice(&[(ahead.x / norm) as f32, (ahead.y / norm) as f32])?;
-        let heading = heading.f_to_device(device)?.f_view([1, 2])?.f_expand([sensor_m.len() as i64, -1], false)?;
-        let assumed = Tensor::f_from_slice(&assumed)?.f_view([-1, 3])?.f_to_device(device)?;
+        let heading = heading
+            .f_to_device(device)?
+            .f_view([1, 2])?
+            .f_expand([sensor_m.len() as i64, -1], false)?;
+        let assumed = Tensor::f_from_slice(&assumed)?
+            .f_view([-1, 3])?
+            .f_to_device(device)?;
         let seen = no_grad(|| refiner.look(&cells, &assumed, &heading, kind))?;
-        let world: Vec<f32> = Vec::try_from(&seen.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
+        let world: Vec<f32> = Vec::try_from(
+            &seen
+                .coordinates_m
+                .f_reshape([-1])?
+                .f_to_device(Device::Cpu)?,
+        )?;
         let epsilon_m: Vec<f32> = Vec::try_from(&seen.epsilon_m.f_to_device(Device::Cpu)?)?;
         let pairs: Vec<Correspondence> = (sensor_m.iter().zip(world.as_chunks().0).zip(&epsilon_m))
             .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
@@ -87,33 +105,58 @@ pub(super) fn refine(
         let usable = pairs.iter().filter(|pair| pair.usable());
         let fits = usable.map(|pair| {
             let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
-            (point(pair.source_m), point(pair.target_m), f64::from(pair.weight))
+            (
+                point(pair.source_m),
+                point(pair.target_m),
+                f64::from(pair.weight),
+            )
         });
         match reweighted(&fits.collect::<Vec<_>>(), &pose, scales_m.iter().copied()) {
             Ok(fitted) => pose = fitted,
             Err(_) => return Ok(None),
         }
         let scale_m = scales_m.last().copied().unwrap_or(INLIER_M);
-        let weigh = |pair: &Correspondence| f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m);
-        let weighted: Vec<_> = pairs.iter().filter(|pair| pair.usable()).map(|pair| (pair, weigh(pair))).collect();
+        let weigh = |pair: &Correspondence| {
+            f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m)
+        };
+        let weighted: Vec<_> = pairs
+            .iter()
+            .filter(|pair| pair.usable())
+            .map(|pair| (pair, weigh(pair)))
+            .collect();
         let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
         let std = PoseStd::of(&pose, weighted.into_iter());
         let registration = Registration::judge(&pairs, pose, INLIER_M);
-        let residual_quartile_m = lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
-        answer = Some(RefinedPose { registration, epsilon_m, residual_quartile_m, std, information_per_m2 });
+        let residual_quartile_m =
+            lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
+        answer = Some(RefinedPose {
+            registration,
+            epsilon_m,
+            residual_quartile_m,
+            std,
+            information_per_m2,
+        });
     }
     Ok(answer)
 }
 
 /// Distance between a predicted position and the one of its cell under a pose, metres; infinite if it is not finite.
 fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
-    if pair.usable() { pair.residual_m(pose) } else { f64::INFINITY }
+    if pair.usable() {
+        pair.residual_m(pose)
+    } else {
+        f64::INFINITY
+    }
 }
 
 /// Lower quartile of the values; infinite if there are none. The fitted confidence model depends on this rule.
 fn lower_quartile(mut values: Vec<f64>) -> f64 {
     let quarter = values.len() / 4;
-    if values.is_empty() { f64::INFINITY } else { *values.select_nth_unstable_by(quarter, f64::total_cmp).1 }
+    if values.is_empty() {
+        f64::INFINITY
+    } else {
+        *values.select_nth_unstable_by(quarter, f64::total_cmp).1
+    }
 }
 
 /// Weight of a prediction: the inverse of its expected squared error.
@@ -131,7 +174,11 @@ mod tests {
         assert_eq!(lower_quartile(values), 25.0);
         assert_eq!(lower_quartile(vec![3.0]), 3.0);
         assert_eq!(lower_quartile(Vec::new()), f64::INFINITY);
-        let nowhere = Correspondence { source_m: [1.0; 3], target_m: [f32::NAN; 3], weight: 1.0 };
+        let nowhere = Correspondence {
+            source_m: [1.0; 3],
+            target_m: [f32::NAN; 3],
+            weight: 1.0,
+        };
         assert_eq!(distance_m(&nowhere, &Isometry3::identity()), f64::INFINITY);
     }
 }

@@ -50,7 +50,10 @@ pub struct Attempt {
 
 impl Attempt {
     fn failed(none: NoRegistration) -> Self {
-        Self { solved: Err(none), inlier_ratio: -1.0 }
+        Self {
+            solved: Err(none),
+            inlier_ratio: -1.0,
+        }
     }
 
     /// True if no further search is needed.
@@ -68,7 +71,11 @@ impl Attempt {
     /// The one with more inliers; the first of equal ones.
     #[must_use]
     pub(super) fn or_better(self, other: Self) -> Self {
-        if other.is_better_than(&self) { other } else { self }
+        if other.is_better_than(&self) {
+            other
+        } else {
+            self
+        }
     }
 
     /// The pose.
@@ -126,7 +133,9 @@ impl PoseSearch<'_> {
         refinement_cells: &SweepCells,
         times: &mut SearchTimes,
     ) -> Result<Attempt, TchError> {
-        let Ok(found) = &best.solved else { return Ok(best) };
+        let Ok(found) = &best.solved else {
+            return Ok(best);
+        };
         let mut origin_from_sensor = found.world_from_sensor;
         origin_from_sensor.translation.vector -= Vector3::from(coordinates.origin_m);
         for ahead_m in AHEAD_M {
@@ -135,7 +144,8 @@ impl PoseSearch<'_> {
             }
             let start = origin_from_sensor * Translation3::new(ahead_m, 0.0, 0.0);
             let start = self.solver.registration_at(coordinates, start);
-            best = best.or_better(self.refined(coordinates, &start, refinement_cells, true, times)?);
+            best =
+                best.or_better(self.refined(coordinates, &start, refinement_cells, true, times)?);
         }
         Ok(best)
     }
@@ -168,10 +178,21 @@ impl PoseSearch<'_> {
         times: &mut SearchTimes,
     ) -> Result<Attempt, TchError> {
         let start = Instant::now();
-        let refined = refine(self.head, refinement_cells, &coarse.target_from_source, is_wide, self.kind)?;
+        let refined = refine(
+            self.head,
+            refinement_cells,
+            &coarse.target_from_source,
+            is_wide,
+            self.kind,
+        )?;
         let solved = Ok(self.solver.judge(coordinates, coarse, refined.as_ref()));
-        let inlier_ratio = refined.map_or(coarse.inlier_ratio, |refined| refined.registration.inlier_ratio);
+        let inlier_ratio = refined.map_or(coarse.inlier_ratio, |refined| {
+            refined.registration.inlier_ratio
+        });
         times.refine += start.elapsed();
-        Ok(Attempt { solved, inlier_ratio })
+        Ok(Attempt {
+            solved,
+            inlier_ratio,
+        })
     }
 }

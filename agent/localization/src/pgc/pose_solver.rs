@@ -64,7 +64,8 @@ impl PoseSolver {
     /// # Errors
     /// [`NoRegistration`] when there are too few cells or too few inliers.
     pub fn solve(&self, coordinates: &SceneCoordinates) -> Solved {
-        self.search(coordinates).map(|registration| self.judge(coordinates, &registration, None))
+        self.search(coordinates)
+            .map(|registration| self.judge(coordinates, &registration, None))
     }
 
     /// First step: the pose relative to the origin of `coordinates`.
@@ -87,18 +88,36 @@ impl PoseSolver {
         let pairs = coordinates.correspondences();
         if pairs.len() < MIN_CELLS {
             let (usable, given) = (pairs.len(), pairs.len());
-            return Err(NoRegistration::TooFewCorrespondences { usable, given, required: MIN_CELLS });
+            return Err(NoRegistration::TooFewCorrespondences {
+                usable,
+                given,
+                required: MIN_CELLS,
+            });
         }
         let (found, threshold_m) = match &self.solver {
-            Solver::Ransac(config) => (ransac::solve(&pairs, &config.wider(factor))?, config.inlier_threshold_m),
-            Solver::Sc2Pcr(config) => (sc2pcr::solve(&pairs, &config.wider(factor))?, config.inlier_threshold_m),
+            Solver::Ransac(config) => (
+                ransac::solve(&pairs, &config.wider(factor))?,
+                config.inlier_threshold_m,
+            ),
+            Solver::Sc2Pcr(config) => (
+                sc2pcr::solve(&pairs, &config.wider(factor))?,
+                config.inlier_threshold_m,
+            ),
         };
         let is_wider = factor > 1.0;
-        Ok(if is_wider { Registration::judge(&pairs, found.target_from_source, threshold_m) } else { found })
+        Ok(if is_wider {
+            Registration::judge(&pairs, found.target_from_source, threshold_m)
+        } else {
+            found
+        })
     }
 
     /// A given pose relative to the origin of `coordinates`, with its inliers as in [`Self::search`].
-    pub(super) fn registration_at(&self, coordinates: &SceneCoordinates, pose: Isometry3<f64>) -> Registration {
+    pub(super) fn registration_at(
+        &self,
+        coordinates: &SceneCoordinates,
+        pose: Isometry3<f64>,
+    ) -> Registration {
         let threshold_m = match &self.solver {
             Solver::Ransac(config) => config.inlier_threshold_m,
             Solver::Sc2Pcr(config) => config.inlier_threshold_m,
@@ -120,7 +139,13 @@ impl PoseSolver {
         world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
         let cell_covariance = std_of(coordinates, registration, second).covariance;
         let is_rejected = self.confidence.rejects(sigma);
-        FoundPose { world_from_sensor, evidence, cell_covariance, sigma, is_rejected }
+        FoundPose {
+            world_from_sensor,
+            evidence,
+            cell_covariance,
+            sigma,
+            is_rejected,
+        }
     }
 }
 
@@ -133,7 +158,11 @@ const LEAST_ERROR_M: f64 = 0.04;
 
 /// The refined pose of a sweep whose pose was predicted as `start`, both relative to the head's origin; `None` if too
 /// few cells agree with it. Sigma follows from the standard deviation of the pose by Eq. 6.
-pub(super) fn confirm(refined: &RefinedPose, start: &Isometry3<f64>, origin_m: &Vector3<f64>) -> Option<FoundPose> {
+pub(super) fn confirm(
+    refined: &RefinedPose,
+    start: &Isometry3<f64>,
+    origin_m: &Vector3<f64>,
+) -> Option<FoundPose> {
     let is_confirmed = refined.registration.inlier_ratio >= CONFIRMING_RATIO;
     is_confirmed.then(|| {
         let error_m = LEAST_ERROR_M.hypot(CORRELATION_FACTOR * refined.std.position_m);
@@ -176,11 +205,16 @@ mod tests {
     fn a_sweep_is_localized_far_from_the_origin_of_the_world() {
         let scene = SyntheticScene::default();
         for solver in [Solver::default(), Solver::Sc2Pcr(Sc2PcrConfig::default())] {
-            let solver = PoseSolver { solver, ..PoseSolver::default() };
+            let solver = PoseSolver {
+                solver,
+                ..PoseSolver::default()
+            };
             for seed in 0..5 {
                 let solved = solver.solve(&scene.coordinates(seed));
                 let found = solved.as_ref().unwrap();
-                let off = scene.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
+                let off = scene
+                    .world_from_sensor(seed)
+                    .inv_mul(&found.world_from_sensor);
                 assert!(off.translation.vector.norm() < 0.1, "{off}");
                 assert_eq!(estimate(&solved).confidence(), found.sigma as f32);
                 assert!(found.sigma > 0.5);
@@ -190,54 +224,117 @@ mod tests {
 
     #[test]
     fn cells_that_are_metres_off_are_found_by_a_wider_search() {
-        let scene = SyntheticScene { noise_m: 2.5, outliers: 0.3, ..SyntheticScene::default() };
+        let scene = SyntheticScene {
+            noise_m: 2.5,
+            outliers: 0.3,
+            ..SyntheticScene::default()
+        };
         let solver = PoseSolver::default();
         let off_m = |factor| {
-            let errors = (0..6).map(|seed| match solver.search_wider(&scene.coordinates(seed), factor) {
-                Ok(found) => {
-                    let truth = scene.world_from_sensor(seed).translation.vector
-                        - Vector3::from(scene.coordinates(seed).origin_m);
-                    (found.target_from_source.translation.vector - truth).norm()
-                }
-                Err(_) => f64::INFINITY,
-            });
+            let errors =
+                (0..6).map(
+                    |seed| match solver.search_wider(&scene.coordinates(seed), factor) {
+                        Ok(found) => {
+                            let truth = scene.world_from_sensor(seed).translation.vector
+                                - Vector3::from(scene.coordinates(seed).origin_m);
+                            (found.target_from_source.translation.vector - truth).norm()
+                        }
+                        Err(_) => f64::INFINITY,
+                    },
+                );
             errors.fold(0.0, f64::max)
         };
-        assert!(off_m(4.0) < 1.5 && off_m(4.0) < off_m(1.0), "{} {}", off_m(4.0), off_m(1.0));
+        assert!(
+            off_m(4.0) < 1.5 && off_m(4.0) < off_m(1.0),
+            "{} {}",
+            off_m(4.0),
+            off_m(1.0)
+        );
     }
 
     #[test]
     fn thin_evidence_gives_no_pose_but_a_reason() {
-        let reason = |scene: &SyntheticScene| match estimate(&PoseSolver::default().solve(&scene.coordinates(3))) {
+        let reason = |scene: &SyntheticScene| match estimate(
+            &PoseSolver::default().solve(&scene.coordinates(3)),
+        ) {
             PoseEstimate::NoPose { reason, .. } => Some(reason),
             PoseEstimate::Pose { .. } => None,
         };
         let scene = SyntheticScene::default();
         assert_eq!(reason(&scene), None);
-        assert_eq!(reason(&SyntheticScene { cells: 0, ..scene.clone() }), Some(NoPoseReason::TooFewPoints));
-        assert_eq!(reason(&SyntheticScene { cells: 10, ..scene.clone() }), Some(NoPoseReason::TooFewPoints));
-        assert_eq!(reason(&SyntheticScene { outliers: 1.0, ..scene }), Some(NoPoseReason::TooFewInliers));
+        assert_eq!(
+            reason(&SyntheticScene {
+                cells: 0,
+                ..scene.clone()
+            }),
+            Some(NoPoseReason::TooFewPoints)
+        );
+        assert_eq!(
+            reason(&SyntheticScene {
+                cells: 10,
+                ..scene.clone()
+            }),
+            Some(NoPoseReason::TooFewPoints)
+        );
+        assert_eq!(
+            reason(&SyntheticScene {
+                outliers: 1.0,
+                ..scene
+            }),
+            Some(NoPoseReason::TooFewInliers)
+        );
     }
 
     #[test]
     fn nan_gives_no_pose() {
         let mut coordinates = SyntheticScene::default().coordinates(1);
-        coordinates.world_m.iter_mut().for_each(|point| point[1] = f32::NAN);
+        coordinates
+            .world_m
+            .iter_mut()
+            .for_each(|point| point[1] = f32::NAN);
         let none = estimate(&PoseSolver::default().solve(&coordinates));
-        assert!(matches!(none, PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, .. }));
+        assert!(matches!(
+            none,
+            PoseEstimate::NoPose {
+                reason: NoPoseReason::TooFewPoints,
+                ..
+            }
+        ));
         let mut coordinates = SyntheticScene::default().coordinates(1);
-        coordinates.epsilon_m.iter_mut().for_each(|epsilon| *epsilon = f32::NAN);
+        coordinates
+            .epsilon_m
+            .iter_mut()
+            .for_each(|epsilon| *epsilon = f32::NAN);
         assert!(PoseSolver::default().solve(&coordinates).is_err());
     }
 
     #[test]
     fn a_pose_with_little_evidence_is_rejected_with_its_inliers() {
-        let strict = ConfidenceModel { reject_below: 0.99, ..ConfidenceModel::example() };
-        let solver = PoseSolver { confidence: Confidence::Calibrated(strict), ..PoseSolver::default() };
-        let scene = SyntheticScene { outliers: 0.8, noise_m: 0.6, ..SyntheticScene::default() };
+        let strict = ConfidenceModel {
+            reject_below: 0.99,
+            ..ConfidenceModel::example()
+        };
+        let solver = PoseSolver {
+            confidence: Confidence::Calibrated(strict),
+            ..PoseSolver::default()
+        };
+        let scene = SyntheticScene {
+            outliers: 0.8,
+            noise_m: 0.6,
+            ..SyntheticScene::default()
+        };
         let solved = solver.solve(&scene.coordinates(1));
         let found = solved.as_ref().unwrap();
-        let PoseEstimate::NoPose { reason, inlier_count } = estimate(&solved) else { panic!("{solved:?}") };
-        assert_eq!((reason, inlier_count as usize), (NoPoseReason::LowConfidence, found.evidence.inliers));
+        let PoseEstimate::NoPose {
+            reason,
+            inlier_count,
+        } = estimate(&solved)
+        else {
+            panic!("{solved:?}")
+        };
+        assert_eq!(
+            (reason, inlier_count as usize),
+            (NoPoseReason::LowConfidence, found.evidence.inliers)
+        );
     }
 }

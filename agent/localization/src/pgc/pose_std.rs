@@ -19,8 +19,12 @@ pub(super) struct PoseStd {
 
 impl PoseStd {
     /// Value for cells that do not constrain the pose.
-    pub(super) const UNBOUNDED: Self =
-        Self { position_m: 1e3, worst_axis_m: 1e3, rotation_rad: 1e3, covariance: diagonal(1e6) };
+    pub(super) const UNBOUNDED: Self = Self {
+        position_m: 1e3,
+        worst_axis_m: 1e3,
+        rotation_rad: 1e3,
+        covariance: diagonal(1e6),
+    };
 
     /// Standard deviations of the weighted fit of `target_from_source` to pairs, each with its weight there.
     ///
@@ -33,17 +37,25 @@ impl PoseStd {
     ) -> Self {
         let (mut information, mut gradients) = (Matrix6::zeros(), Matrix6::zeros());
         for (pair, weight) in pairs {
-            let arm = target_from_source.rotation * Point3::from(pair.source_m.map(f64::from)).coords;
-            let residual = arm + target_from_source.translation.vector - Vector3::from(pair.target_m.map(f64::from));
+            let arm =
+                target_from_source.rotation * Point3::from(pair.source_m.map(f64::from)).coords;
+            let residual = arm + target_from_source.translation.vector
+                - Vector3::from(pair.target_m.map(f64::from));
             // d(residual) = dt + dw x arm, for a small rotation dw about the sensor.
             let mut jacobian = SMatrix::<f64, 3, 6>::zeros();
-            jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
-            jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-arm.cross_matrix()));
+            jacobian
+                .fixed_view_mut::<3, 3>(0, 0)
+                .copy_from(&Matrix3::identity());
+            jacobian
+                .fixed_view_mut::<3, 3>(0, 3)
+                .copy_from(&(-arm.cross_matrix()));
             information += jacobian.transpose() * jacobian * weight;
             let gradient = jacobian.transpose() * residual * weight;
             gradients += gradient * gradient.transpose();
         }
-        let Some(inverse) = information.try_inverse() else { return Self::UNBOUNDED };
+        let Some(inverse) = information.try_inverse() else {
+            return Self::UNBOUNDED;
+        };
         let covariance = inverse * gradients * inverse;
         let bounded = |variance: f64, most: f64| {
             let std = variance.sqrt();
@@ -62,7 +74,9 @@ impl PoseStd {
             worst_axis_m: bounded(worst_axis, Self::UNBOUNDED.worst_axis_m),
             rotation_rad: bounded(variance(3), Self::UNBOUNDED.rotation_rad),
             covariance: match covariance.iter().all(|entry| entry.is_finite()) {
-                true => std::array::from_fn(|row| std::array::from_fn(|column| covariance[(row, column)])),
+                true => std::array::from_fn(|row| {
+                    std::array::from_fn(|column| covariance[(row, column)])
+                }),
                 false => Self::UNBOUNDED.covariance,
             },
         }
@@ -90,7 +104,13 @@ mod tests {
     fn it_matches_the_spread_of_fits() {
         let (mut square_m, mut expected_m) = (0.0_f64, 0.0_f64);
         for seed in 0..200 {
-            let problem = Problem { count: 80, outliers: 0.0, noise_m: 0.3, ..Problem::default() }.drawn(seed);
+            let problem = Problem {
+                count: 80,
+                outliers: 0.0,
+                noise_m: 0.3,
+                ..Problem::default()
+            }
+            .drawn(seed);
             let mut moments = PairMoments::default();
             for pair in &problem.pairs {
                 let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
@@ -99,7 +119,9 @@ mod tests {
             let fitted = moments.fit().unwrap();
             let (off_m, _) = problem.error(&fitted);
             square_m += off_m * off_m / 200.0;
-            expected_m += PoseStd::of(&fitted, problem.pairs.iter().map(|pair| (pair, 1.0))).position_m / 200.0;
+            expected_m += PoseStd::of(&fitted, problem.pairs.iter().map(|pair| (pair, 1.0)))
+                .position_m
+                / 200.0;
         }
         let ratio = expected_m / square_m.sqrt();
         assert!((0.75..1.25).contains(&ratio), "{ratio}");
@@ -110,22 +132,43 @@ mod tests {
         let std = |noise_m: [f64; 3]| {
             let pairs: Vec<Correspondence> = (0..200)
                 .map(|k| {
-                    let source_m = [(k % 10) as f32 * 4.0 - 18.0, (k / 10) as f32 * 3.0 - 28.0, (k % 7) as f32];
-                    let sign = |bit: i32| if ((k * 2_654_435) >> bit) & 1 == 0 { -1.0 } else { 1.0 };
-                    let target_m =
-                        std::array::from_fn(|axis| source_m[axis] + (sign(axis as i32 + 4) * noise_m[axis]) as f32);
-                    Correspondence { source_m, target_m, weight: 1.0 }
+                    let source_m = [
+                        (k % 10) as f32 * 4.0 - 18.0,
+                        (k / 10) as f32 * 3.0 - 28.0,
+                        (k % 7) as f32,
+                    ];
+                    let sign = |bit: i32| {
+                        if ((k * 2_654_435) >> bit) & 1 == 0 {
+                            -1.0
+                        } else {
+                            1.0
+                        }
+                    };
+                    let target_m = std::array::from_fn(|axis| {
+                        source_m[axis] + (sign(axis as i32 + 4) * noise_m[axis]) as f32
+                    });
+                    Correspondence {
+                        source_m,
+                        target_m,
+                        weight: 1.0,
+                    }
                 })
                 .collect();
             PoseStd::of(&Isometry3::identity(), pairs.iter().map(|pair| (pair, 1.0)))
         };
         let (even, long) = (std([0.2; 3]), std([0.8, 0.2, 0.2]));
         assert!(even.worst_axis_m < even.position_m && long.worst_axis_m < long.position_m);
-        assert!(long.worst_axis_m > 2.5 * even.worst_axis_m, "{even:?} {long:?}");
+        assert!(
+            long.worst_axis_m > 2.5 * even.worst_axis_m,
+            "{even:?} {long:?}"
+        );
     }
 
     #[test]
     fn no_pairs_constrain_nothing() {
-        assert_eq!(PoseStd::of(&Isometry3::identity(), std::iter::empty()), PoseStd::UNBOUNDED);
+        assert_eq!(
+            PoseStd::of(&Isometry3::identity(), std::iter::empty()),
+            PoseStd::UNBOUNDED
+        );
     }
 }

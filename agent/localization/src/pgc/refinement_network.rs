@@ -40,10 +40,22 @@ impl Refiner {
         config.validate().map_err(LocalizerError::Config)?;
         let [columns, rows] = config.corners();
         let corners = columns * rows;
-        let RefinerConfig { local_channels, keys, width, .. } = *config;
+        let RefinerConfig {
+            local_channels,
+            keys,
+            width,
+            ..
+        } = *config;
         Ok(Self {
             config: config.clone(),
-            keys: path.var("keys", &[corners, keys], Init::Randn { mean: 0.0, stdev: 0.2 }),
+            keys: path.var(
+                "keys",
+                &[corners, keys],
+                Init::Randn {
+                    mean: 0.0,
+                    stdev: 0.2,
+                },
+            ),
             heights: path.var("heights", &[corners, 1], Init::Const(0.0)),
             sharpness: path.var("sharpness", &[1], Init::Const(FIRST_SHARPNESS)),
             inward: Dense::new(&(path / "inward"), local_channels + 3, width, 1.0),
@@ -82,18 +94,31 @@ impl Refiner {
         let height = assumed_m.f_narrow(1, 2, 1)? / 10.0;
         let input = Tensor::f_cat(&[&local, heading, &height], 1)?.f_to_kind(kind)?;
         let hidden = self.inward.forward(&input)?.f_relu()?;
-        let query = self.query.forward(&hidden)?.f_to_kind(Kind::Float)?.f_unsqueeze(2)?;
+        let query = self
+            .query
+            .forward(&hidden)?
+            .f_to_kind(Kind::Float)?
+            .f_unsqueeze(2)?;
 
         let window = self.window(assumed_m)?;
-        let similarity = gather(&self.keys, &window.corners)?.f_bmm(&query)?.f_squeeze_dim(2)? * &self.sharpness;
+        let similarity = gather(&self.keys, &window.corners)?
+            .f_bmm(&query)?
+            .f_squeeze_dim(2)?
+            * &self.sharpness;
         let shares = similarity.f_softmax(1, Kind::Float)?.f_unsqueeze(1)?;
         let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
-        let floor_m = shares.f_bmm(&gather(&self.heights, &window.corners)?)?.f_squeeze_dim(1)?;
+        let floor_m = shares
+            .f_bmm(&gather(&self.heights, &window.corners)?)?
+            .f_squeeze_dim(1)?;
         let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
         // The spread of the attention weights and the largest of them indicate the error of the prediction.
-        let square = shares.f_bmm(&window.places_m.f_square()?)?.f_squeeze_dim(1)?;
-        let spread =
-            (square - plane_m.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_clamp_min(1e-6)?.f_sqrt()?;
+        let square = shares
+            .f_bmm(&window.places_m.f_square()?)?
+            .f_squeeze_dim(1)?;
+        let spread = (square - plane_m.f_square()?)
+            .f_sum_dim_intlist(1_i64, true, Kind::Float)?
+            .f_clamp_min(1e-6)?
+            .f_sqrt()?;
         let largest = shares.f_amax([2_i64], false)?;
         let evidence = Tensor::f_cat(&[hidden.f_to_kind(Kind::Float)?, spread, largest], 1)?;
         let epsilon = self.epsilon[1].forward(&self.epsilon[0].forward(&evidence)?.f_relu()?)?;
@@ -105,22 +130,36 @@ impl Refiner {
 
     /// The corners around each position.
     fn window(&self, assumed_m: &Tensor) -> Result<Window, TchError> {
-        let RefinerConfig { spacing_m, reach, low_m, .. } = &self.config;
+        let RefinerConfig {
+            spacing_m,
+            reach,
+            low_m,
+            ..
+        } = &self.config;
         let [columns, rows] = self.config.corners();
         let device = assumed_m.device();
         let axis = |axis: usize, size: i64| {
-            let steps = ((assumed_m.f_select(1, axis as i64)? - low_m[axis]) / *spacing_m).f_round()?;
+            let steps =
+                ((assumed_m.f_select(1, axis as i64)? - low_m[axis]) / *spacing_m).f_round()?;
             steps.f_clamp(*reach as f64, (size - 1 - reach) as f64)
         };
         let (column, row) = (axis(0, columns)?, axis(1, rows)?);
-        let middle = [&column * *spacing_m + low_m[0], &row * *spacing_m + low_m[1]];
-        let first = (row * columns as f64 + column).f_to_kind(Kind::Int64)?.f_unsqueeze(1)?;
+        let middle = [
+            &column * *spacing_m + low_m[0],
+            &row * *spacing_m + low_m[1],
+        ];
+        let first = (row * columns as f64 + column)
+            .f_to_kind(Kind::Int64)?
+            .f_unsqueeze(1)?;
         let around = || (-reach..=*reach).flat_map(move |y| (-reach..=*reach).map(move |x| (x, y)));
         let shifts: Vec<i64> = around().map(|(x, y)| y * columns + x).collect();
-        let places: Vec<f32> =
-            around().flat_map(|(x, y)| [(x as f64 * spacing_m) as f32, (y as f64 * spacing_m) as f32]).collect();
+        let places: Vec<f32> = around()
+            .flat_map(|(x, y)| [(x as f64 * spacing_m) as f32, (y as f64 * spacing_m) as f32])
+            .collect();
         let count = assumed_m.size()[0];
-        let places_m = Tensor::f_from_slice(&places)?.f_view([1, -1, 2])?.f_to_device(device)?;
+        let places_m = Tensor::f_from_slice(&places)?
+            .f_view([1, -1, 2])?
+            .f_to_device(device)?;
         Ok(Window {
             corners: first + Tensor::f_from_slice(&shifts)?.f_to_device(device)?,
             places_m: places_m.f_expand([count, -1, -1], false)?,
@@ -143,7 +182,8 @@ struct Window {
 fn gather(rows: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
     let channels = rows.size()[1];
     let flat = index.f_reshape([-1, 1])?.f_expand([-1, channels], false)?;
-    rows.f_gather(0, &flat, false)?.f_view([index.size()[0], index.size()[1], channels])
+    rows.f_gather(0, &flat, false)?
+        .f_view([index.size()[0], index.size()[1], channels])
 }
 
 #[cfg(test)]
@@ -179,8 +219,14 @@ mod tests {
         let assumed = Tensor::from_slice(&[1.3f32, 2.2, 3.0, -7.9, 11.0, 0.0]).view([2, 3]);
         let cells = Tensor::randn([2, 6], (Kind::Float, Device::Cpu)) * 5.0;
         let heading = Tensor::from_slice(&[1.0f32, 0.0, 0.0, 1.0]).view([2, 2]);
-        let answer = refiner.look(&cells, &assumed, &heading, Kind::Float).unwrap();
-        let off = (answer.coordinates_m - assumed).narrow(1, 0, 2).abs().max().double_value(&[]);
+        let answer = refiner
+            .look(&cells, &assumed, &heading, Kind::Float)
+            .unwrap();
+        let off = (answer.coordinates_m - assumed)
+            .narrow(1, 0, 2)
+            .abs()
+            .max()
+            .double_value(&[]);
         assert!(off <= 5.0, "{off}");
         assert!(answer.epsilon_m.min().double_value(&[]) > 0.0);
     }
@@ -190,9 +236,16 @@ mod tests {
         let (_network, refiner) = refiner();
         let assumed = Tensor::from_slice(&[0.2f32, 0.1, 0.0]).view([1, 3]);
         let window = refiner.window(&assumed).unwrap();
-        assert_eq!(Vec::<f32>::try_from(window.middle_m.view([-1])).unwrap(), [0.0, 0.0]);
+        assert_eq!(
+            Vec::<f32>::try_from(window.middle_m.view([-1])).unwrap(),
+            [0.0, 0.0]
+        );
         let corner: i64 = window.corners.int64_value(&[0, 2 * 5 + 3]);
-        assert_eq!(window.corners.int64_value(&[0, 12]) + 1, corner, "one step along x");
+        assert_eq!(
+            window.corners.int64_value(&[0, 12]) + 1,
+            corner,
+            "one step along x"
+        );
         let places: Vec<f32> = Vec::try_from(window.places_m.get(0).get(13)).unwrap();
         assert_eq!(places, [2.0, 0.0]);
     }
@@ -200,9 +253,13 @@ mod tests {
     #[test]
     fn positions_outside_are_clamped_to_the_edge() {
         let (_network, refiner) = refiner();
-        let assumed = Tensor::from_slice(&[1e4f32, -1e4, 0.0, f32::MAX, f32::MIN, 0.0]).view([2, 3]);
+        let assumed =
+            Tensor::from_slice(&[1e4f32, -1e4, 0.0, f32::MAX, f32::MIN, 0.0]).view([2, 3]);
         let window = refiner.window(&assumed).unwrap();
         let [columns, rows] = config().corners();
-        assert!(window.corners.min().int64_value(&[]) >= 0 && window.corners.max().int64_value(&[]) < columns * rows);
+        assert!(
+            window.corners.min().int64_value(&[]) >= 0
+                && window.corners.max().int64_value(&[]) < columns * rows
+        );
     }
 }

@@ -57,7 +57,11 @@ impl ResidualGroup {
         let kind = x.kind();
         let inner = self.inward.forward(x, index)?.f_relu()?;
         on_activation(&inward_activation(name), &inner)?;
-        let inner = self.middle_bias.to_kind(kind).f_addmm(&inner, &self.middle.to_kind(kind))?.f_relu()?;
+        let inner = self
+            .middle_bias
+            .to_kind(kind)
+            .f_addmm(&inner, &self.middle.to_kind(kind))?
+            .f_relu()?;
         on_activation(&middle_activation(name), &inner)?;
         let inner = self.outward.forward(&inner, index)?;
         match &self.skip {
@@ -73,18 +77,37 @@ impl ResidualGroup {
         name: &str,
         scales: &ActivationScales,
     ) -> Result<Int8ResidualGroup, QuantiseError> {
-        let (inward, middle) = (scales.get(&inward_activation(name))?, scales.get(&middle_activation(name))?);
-        let hidden = |input, output: Quantisation| LayerFormat { input, output: Some(output.scale), relu: true };
-        let last = |input| LayerFormat { input, output: None, relu: false };
+        let (inward, middle) = (
+            scales.get(&inward_activation(name))?,
+            scales.get(&middle_activation(name))?,
+        );
+        let hidden = |input, output: Quantisation| LayerFormat {
+            input,
+            output: Some(output.scale),
+            relu: true,
+        };
+        let last = |input| LayerFormat {
+            input,
+            output: None,
+            relu: false,
+        };
         let linear = |weight: &Tensor, bias: Option<&Tensor>, format| {
             Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
         };
         Ok(Int8ResidualGroup {
             input,
             inward: self.inward.int8(hidden(input, inward))?,
-            middle: linear(&self.middle, Some(&self.middle_bias), hidden(inward, middle))?,
+            middle: linear(
+                &self.middle,
+                Some(&self.middle_bias),
+                hidden(inward, middle),
+            )?,
             outward: self.outward.int8(last(middle))?,
-            skip: self.skip.as_ref().map(|skip| linear(skip, None, last(input))).transpose()?,
+            skip: self
+                .skip
+                .as_ref()
+                .map(|skip| linear(skip, None, last(input)))
+                .transpose()?,
         })
     }
 }
@@ -97,7 +120,10 @@ impl Int8ResidualGroup {
             Some(skip) => skip.forward(x)?,
             None => self.input.dequantise(x)?,
         };
-        self.outward.forward(&inner, index)?.f_add_(&skipped)?.f_relu_()
+        self.outward
+            .forward(&inner, index)?
+            .f_add_(&skipped)?
+            .f_relu_()
     }
 }
 

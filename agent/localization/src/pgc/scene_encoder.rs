@@ -56,16 +56,31 @@ impl SceneEncoder {
         let widths = &config.widths;
         let level = |level: usize| path / "levels" / level;
         let first = SparseConv::new(&level(0), config.input.channels(), widths[0]);
-        let down = (1..widths.len()).map(|to| SparseConv::new(&level(to), widths[to - 1], widths[to])).collect();
+        let down = (1..widths.len())
+            .map(|to| SparseConv::new(&level(to), widths[to - 1], widths[to]))
+            .collect();
         let before_last = widths[widths.len() - 2];
-        let fine = config.fine_cells.then(|| ResidualGroup::new(&(path / "fine"), before_last, before_last));
+        let fine = config
+            .fine_cells
+            .then(|| ResidualGroup::new(&(path / "fine"), before_last, before_last));
         let mut coarse = Vec::new();
         let mut channels = widths[widths.len() - 1];
         for (group, &width) in config.residual_widths.iter().enumerate() {
-            coarse.push(ResidualGroup::new(&(path / "residual" / group), channels, width));
+            coarse.push(ResidualGroup::new(
+                &(path / "residual" / group),
+                channels,
+                width,
+            ));
             channels = width;
         }
-        Ok(Self { config: config.clone(), first, down, fine, coarse, int8: None })
+        Ok(Self {
+            config: config.clone(),
+            first,
+            down,
+            fine,
+            coarse,
+            int8: None,
+        })
     }
 
     /// Reads an encoder from a weights file that contains its configuration, frozen. Returns the file's SHA-256 beside
@@ -75,7 +90,10 @@ impl SceneEncoder {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
     pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
         let weights = Weights::load(path)?;
-        Ok((Self::from_weights(&weights, device)?, weights.sha256().to_owned()))
+        Ok((
+            Self::from_weights(&weights, device)?,
+            weights.sha256().to_owned(),
+        ))
     }
 
     /// The encoder of a file already read, frozen.
@@ -111,7 +129,12 @@ impl SceneEncoder {
     /// # Errors
     /// Those of the tensor library.
     pub fn observe(&self, batch: &VoxelBatch, search: &mut ScaleSearch) -> Result<(), TchError> {
-        no_grad(|| self.local_with(batch, Kind::Float, &mut |name, values| search.observe(name, values)).map(drop))
+        no_grad(|| {
+            self.local_with(batch, Kind::Float, &mut |name, values| {
+                search.observe(name, values)
+            })
+            .map(drop)
+        })
     }
 
     fn local_with(
@@ -120,7 +143,10 @@ impl SceneEncoder {
         kind: Kind,
         on_activation: &mut OnActivation<'_>,
     ) -> Result<LocalFeatures, TchError> {
-        let mut x = self.first.forward(&batch.input.to_kind(kind), &batch.first)?.f_relu()?;
+        let mut x = self
+            .first
+            .forward(&batch.input.to_kind(kind), &batch.first)?
+            .f_relu()?;
         on_activation(&level_activation(0), &x)?;
         let mut fine = None;
         for (level, conv) in self.down.iter().enumerate() {
@@ -149,17 +175,34 @@ impl SceneEncoder {
         let mut down = Vec::with_capacity(self.down.len());
         for (level, conv) in self.down.iter().enumerate() {
             let output = scales.get(&level_activation(level + 1))?;
-            down.push(conv.int8(LayerFormat { input, output: Some(output.scale), relu: true })?);
+            down.push(conv.int8(LayerFormat {
+                input,
+                output: Some(output.scale),
+                relu: true,
+            })?);
             (before, input) = (input, output);
         }
-        let fine = self.fine.as_ref().map(|group| group.int8(before, FINE, scales)).transpose()?;
+        let fine = self
+            .fine
+            .as_ref()
+            .map(|group| group.int8(before, FINE, scales))
+            .transpose()?;
         let last = input;
         let mut coarse = Vec::with_capacity(self.coarse.len());
         for (number, group) in self.coarse.iter().enumerate() {
-            coarse.push((group.int8(input, &coarse_activation(number), scales)?, input));
+            coarse.push((
+                group.int8(input, &coarse_activation(number), scales)?,
+                input,
+            ));
             input = scales.get(&coarse_activation(number))?;
         }
-        self.int8 = Some(Int8Levels { first, down, fine, coarse, last });
+        self.int8 = Some(Int8Levels {
+            first,
+            down,
+            fine,
+            coarse,
+            last,
+        });
         Ok(())
     }
 
@@ -167,7 +210,11 @@ impl SceneEncoder {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn complete(&self, local: &LocalFeatures, batch: &VoxelBatch) -> Result<SceneFeatures, TchError> {
+    pub fn complete(
+        &self,
+        local: &LocalFeatures,
+        batch: &VoxelBatch,
+    ) -> Result<SceneFeatures, TchError> {
         let mut parts = vec![local.cells.shallow_clone()];
         if !self.config.context_m.is_empty() {
             let plane = Plane::new(&local.coarse, batch)?;
@@ -175,18 +222,37 @@ impl SceneEncoder {
                 // Odd, so that the cell is in the centre.
                 let window = 2 * (edge_m / self.config.coarse_cell_m() / 2.0).round() as i64 + 1;
                 let context = rows(&plane.mean_over(window)?, &batch.columns)?;
-                parts.push(rows(&context.to_kind(local.cells.kind()), &batch.coarse_of_cell)?);
+                parts.push(rows(
+                    &context.to_kind(local.cells.kind()),
+                    &batch.coarse_of_cell,
+                )?);
             }
         }
         let sweep = |rows: &std::ops::Range<i64>| {
-            let own = local.coarse.f_narrow(0, rows.start, rows.end - rows.start)?.f_to_kind(Kind::Float)?;
+            let own = local
+                .coarse
+                .f_narrow(0, rows.start, rows.end - rows.start)?
+                .f_to_kind(Kind::Float)?;
             if own.size()[0] == 0 {
                 return own.f_new_zeros([2 * own.size()[1]], (Kind::Float, own.device()));
             }
-            Tensor::f_cat(&[own.f_mean_dim(0_i64, false, Kind::Float)?, own.f_amax([0_i64], false)?], 0)
+            Tensor::f_cat(
+                &[
+                    own.f_mean_dim(0_i64, false, Kind::Float)?,
+                    own.f_amax([0_i64], false)?,
+                ],
+                0,
+            )
         };
-        let sweeps: Vec<Tensor> = batch.coarse_rows.iter().map(sweep).collect::<Result<_, _>>()?;
-        Ok(SceneFeatures { cells: Tensor::f_cat(&parts, 1)?, sweeps: Tensor::f_stack(&sweeps, 0)? })
+        let sweeps: Vec<Tensor> = batch
+            .coarse_rows
+            .iter()
+            .map(sweep)
+            .collect::<Result<_, _>>()?;
+        Ok(SceneFeatures {
+            cells: Tensor::f_cat(&parts, 1)?,
+            sweeps: Tensor::f_stack(&sweeps, 0)?,
+        })
     }
 
     /// Both steps without gradients; in integers once [quantised](Self::quantise), otherwise in `kind`.
@@ -232,7 +298,11 @@ fn coarse_activation(group: usize) -> String {
 
 /// Rows of `x` by index; its gradient is fast because the index is expanded, not written out.
 fn rows(x: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
-    x.f_gather(0, &index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?, false)
+    x.f_gather(
+        0,
+        &index.f_unsqueeze(1)?.f_expand([-1, x.size()[1]], false)?,
+        false,
+    )
 }
 
 /// Coarse features summed over height into the plane of each sweep.
@@ -248,13 +318,25 @@ impl Plane {
         let (sweeps, edge) = (batch.sweeps(), batch.plane_edge);
         let spread = |values: &Tensor| {
             let channels = values.size()[1];
-            let empty = values.f_new_zeros([sweeps * edge * edge, channels], (Kind::Float, values.device()))?;
-            let index = batch.columns.f_unsqueeze(1)?.f_expand([-1, channels], false)?;
-            empty.f_scatter_add(0, &index, values)?.f_view([sweeps, edge, edge, channels])?.f_permute([0, 3, 1, 2])
+            let empty = values.f_new_zeros(
+                [sweeps * edge * edge, channels],
+                (Kind::Float, values.device()),
+            )?;
+            let index = batch
+                .columns
+                .f_unsqueeze(1)?
+                .f_expand([-1, channels], false)?;
+            empty
+                .f_scatter_add(0, &index, values)?
+                .f_view([sweeps, edge, edge, channels])?
+                .f_permute([0, 3, 1, 2])
         };
         let coarse = coarse.f_to_kind(Kind::Float)?;
         let ones = coarse.f_new_ones([coarse.size()[0], 1], (Kind::Float, coarse.device()))?;
-        Ok(Self { sum: spread(&coarse)?, count: spread(&ones)? })
+        Ok(Self {
+            sum: spread(&coarse)?,
+            count: spread(&ones)?,
+        })
     }
 
     /// `[sweeps * edge * edge, channels]`: mean over the coarse cells in a square window.
@@ -276,8 +358,15 @@ mod tests {
     use crate::pgc::voxelise::SweepVoxels;
 
     fn sweep(shift: f32) -> Vec<[f32; 3]> {
-        let wall = (0..3000).map(move |k| [(k % 60) as f32 * 0.3 - 9.0, 6.0 + shift, (k / 60) as f32 * 0.1 - 2.0]);
-        wall.chain((0..400).map(|k| [(k % 20) as f32 - 10.0, (k / 20) as f32 - 10.0, -1.9])).collect()
+        let wall = (0..3000).map(move |k| {
+            [
+                (k % 60) as f32 * 0.3 - 9.0,
+                6.0 + shift,
+                (k / 60) as f32 * 0.1 - 2.0,
+            ]
+        });
+        wall.chain((0..400).map(|k| [(k % 20) as f32 - 10.0, (k / 20) as f32 - 10.0, -1.9]))
+            .collect()
     }
 
     fn encoder(config: &SceneEncoderConfig) -> (VarStore, SceneEncoder) {
@@ -292,27 +381,54 @@ mod tests {
     fn shapes_are_those_of_the_configuration_and_sweeps_stay_apart() {
         for config in [SceneEncoderConfig::lean(), SceneEncoderConfig::full(0.125)] {
             let (_network, encoder) = encoder(&config);
-            let (a, b) = (SweepVoxels::new(sweep(0.0), &config), SweepVoxels::new(sweep(3.0), &config));
+            let (a, b) = (
+                SweepVoxels::new(sweep(0.0), &config),
+                SweepVoxels::new(sweep(3.0), &config),
+            );
             let both = VoxelBatch::new(&[&a, &b], &config, Device::Cpu).unwrap();
             let features = encoder.encode(&both, Kind::Float).unwrap();
-            assert_eq!(features.cells.size(), [(a.cells().len() + b.cells().len()) as i64, config.cell_channels()]);
+            assert_eq!(
+                features.cells.size(),
+                [
+                    (a.cells().len() + b.cells().len()) as i64,
+                    config.cell_channels()
+                ]
+            );
             assert_eq!(features.sweeps.size(), [2, config.sweep_channels()]);
             let alone = VoxelBatch::new(&[&b], &config, Device::Cpu).unwrap();
             let alone = encoder.encode(&alone, Kind::Float).unwrap();
             let rows = both.cell_rows(1);
             let same = features.cells.narrow(0, rows.start, rows.end - rows.start);
             assert!(same.allclose(&alone.cells, 1e-4, 1e-4, false));
-            assert!(features.sweeps.get(1).allclose(&alone.sweeps.get(0), 1e-4, 1e-4, false));
+            assert!(
+                features
+                    .sweeps
+                    .get(1)
+                    .allclose(&alone.sweeps.get(0), 1e-4, 1e-4, false)
+            );
         }
     }
 
     #[test]
     fn features_do_not_change_when_the_world_moves_by_whole_coarse_cells() {
-        let config = SceneEncoderConfig { context_m: vec![], ..SceneEncoderConfig::lean() };
+        let config = SceneEncoderConfig {
+            context_m: vec![],
+            ..SceneEncoderConfig::lean()
+        };
         let (_network, encoder) = encoder(&config);
         let here = SweepVoxels::new(sweep(0.0), &config);
-        let there = SweepVoxels::new(sweep(0.0).into_iter().map(|[x, y, z]| [x + 8.0, y - 4.0, z]), &config);
-        let encode = |sweep| encoder.encode(&VoxelBatch::new(&[sweep], &config, Device::Cpu).unwrap(), Kind::Float);
+        let there = SweepVoxels::new(
+            sweep(0.0)
+                .into_iter()
+                .map(|[x, y, z]| [x + 8.0, y - 4.0, z]),
+            &config,
+        );
+        let encode = |sweep| {
+            encoder.encode(
+                &VoxelBatch::new(&[sweep], &config, Device::Cpu).unwrap(),
+                Kind::Float,
+            )
+        };
         let (here, there) = (encode(&here).unwrap(), encode(&there).unwrap());
         assert!(here.cells.allclose(&there.cells, 1e-3, 1e-3, false));
     }
@@ -328,9 +444,19 @@ mod tests {
             encoder.observe(&batch, &mut search).unwrap();
             no_grad(|| encoder.quantise(&search.scales())).unwrap();
             let found = encoder.encode(&batch, Kind::Float).unwrap();
-            for (found, expected) in [(found.cells, expected.cells), (found.sweeps, expected.sweeps)] {
-                let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
-                assert!(error > 0.0 && error < 0.1 * expected.std(true).double_value(&[]), "{error}");
+            for (found, expected) in [
+                (found.cells, expected.cells),
+                (found.sweeps, expected.sweeps),
+            ] {
+                let error = (&found - &expected)
+                    .square()
+                    .mean(Kind::Float)
+                    .sqrt()
+                    .double_value(&[]);
+                assert!(
+                    error > 0.0 && error < 0.1 * expected.std(true).double_value(&[]),
+                    "{error}"
+                );
             }
         }
     }
@@ -352,9 +478,18 @@ mod tests {
         let (network, encoder) = encoder(&config);
         let sweep = SweepVoxels::new(sweep(0.0), &config);
         let batch = VoxelBatch::new(&[&sweep], &config, Device::Cpu).unwrap();
-        encoder.local(&batch, Kind::BFloat16).unwrap().cells.square().mean(Kind::Float).backward();
+        encoder
+            .local(&batch, Kind::BFloat16)
+            .unwrap()
+            .cells
+            .square()
+            .mean(Kind::Float)
+            .backward();
         for (name, parameter) in network.variables() {
-            assert!(parameter.grad().defined() && parameter.grad().abs().max().double_value(&[]) > 0.0, "{name}");
+            assert!(
+                parameter.grad().defined() && parameter.grad().abs().max().double_value(&[]) > 0.0,
+                "{name}"
+            );
         }
     }
 }

@@ -17,7 +17,10 @@ const LEAD: f64 = 10.0;
 /// # Errors
 /// Those of the tensor library.
 pub(super) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>, TchError> {
-    let (probabilities, order) = logits.f_softmax(1, Kind::Float)?.f_reshape([-1])?.f_sort(0, true)?;
+    let (probabilities, order) = logits
+        .f_softmax(1, Kind::Float)?
+        .f_reshape([-1])?
+        .f_sort(0, true)?;
     let probabilities: Vec<f64> = Vec::try_from(&probabilities.f_to_kind(Kind::Double)?)?;
     let (highest, mut lowered) = (logits.f_max()?, logits.shallow_clone());
     let (mut parts, mut total) = (Vec::new(), 0.0);
@@ -28,7 +31,8 @@ pub(super) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>
         total += probability;
         let class = order.f_narrow(0, rank as i64, 1)?;
         parts.push(lowered.f_index_copy(1, &class, &(&highest + LEAD).f_view([1, 1])?)?);
-        lowered = lowered.f_index_add(1, &class, &(highest.f_zeros_like()? - LEAD).f_view([1, 1])?)?;
+        lowered =
+            lowered.f_index_add(1, &class, &(highest.f_zeros_like()? - LEAD).f_view([1, 1])?)?;
     }
     Ok(parts)
 }
@@ -42,24 +46,35 @@ mod tests {
         let before = logits.copy();
         let parts = logits_by_part(&logits, most).unwrap();
         assert_eq!(logits, before);
-        parts.iter().map(|part| part.argmax(1, false).int64_value(&[0])).collect()
+        parts
+            .iter()
+            .map(|part| part.argmax(1, false).int64_value(&[0]))
+            .collect()
     }
 
     #[test]
     fn parts_come_in_the_order_of_their_probability() {
         assert_eq!(first_choices(&[1.0, 3.0, 2.0, 0.0], 3), [1, 2, 0]);
-        assert_eq!(first_choices(&[1.0, 3.0, 2.0, 0.0], 9), [1, 2, 0], "the three have 0.97");
+        assert_eq!(
+            first_choices(&[1.0, 3.0, 2.0, 0.0], 9),
+            [1, 2, 0],
+            "the three have 0.97"
+        );
         assert_eq!(first_choices(&[0.0, 20.0, 0.0], 3), [1]);
         assert!(first_choices(&[1.0, 2.0], 0).is_empty());
     }
 
     #[test]
     fn a_part_leads_and_more_likely_ones_are_lowered() {
-        let parts = logits_by_part(&Tensor::from_slice(&[1.0_f32, 3.0, 2.5]).view([1, -1]), 2).unwrap();
+        let parts =
+            logits_by_part(&Tensor::from_slice(&[1.0_f32, 3.0, 2.5]).view([1, -1]), 2).unwrap();
         assert_eq!(
             parts,
-            [Tensor::from_slice(&[1.0_f32, 13.0, 2.5]), Tensor::from_slice(&[1.0_f32, -7.0, 13.0])]
-                .map(|row| row.view([1, -1]))
+            [
+                Tensor::from_slice(&[1.0_f32, 13.0, 2.5]),
+                Tensor::from_slice(&[1.0_f32, -7.0, 13.0])
+            ]
+            .map(|row| row.view([1, -1]))
         );
     }
 }

@@ -63,9 +63,18 @@ impl SceneHead {
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &SceneHeadConfig) -> Result<Self, LocalizerError> {
         config.validate().map_err(LocalizerError::Config)?;
-        let SceneHeadConfig { cell_channels, sweep_channels, classes, centres, width, blocks, .. } = *config;
+        let SceneHeadConfig {
+            cell_channels,
+            sweep_channels,
+            classes,
+            centres,
+            width,
+            blocks,
+            ..
+        } = *config;
         let block = |number: usize| {
-            let layer = |layer: usize| Dense::new(&(path / "blocks" / number / layer), width, width, 1.0);
+            let layer =
+                |layer: usize| Dense::new(&(path / "blocks" / number / layer), width, width, 1.0);
             [layer(0), layer(1), layer(2)]
         };
         Ok(Self {
@@ -77,7 +86,11 @@ impl SceneHead {
             inward: Dense::new(&(path / "inward"), cell_channels + classes, width, 1.0),
             blocks: (0..blocks).map(block).collect(),
             outward: Dense::new(&(path / "outward"), width, centres + 4, 0.1),
-            refiner: config.refiner.as_ref().map(|config| Refiner::new(&(path / "refiner"), config)).transpose()?,
+            refiner: config
+                .refiner
+                .as_ref()
+                .map(|config| Refiner::new(&(path / "refiner"), config))
+                .transpose()?,
             int8: None,
         })
     }
@@ -107,7 +120,8 @@ impl SceneHead {
     /// # Errors
     /// Those of the tensor library.
     pub fn classify(&self, sweeps: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        self.classifier.forward(&self.sweep_norm.forward(sweeps)?, train)
+        self.classifier
+            .forward(&self.sweep_norm.forward(sweeps)?, train)
     }
 
     /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep of
@@ -115,7 +129,12 @@ impl SceneHead {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn regress(&self, cells: &Tensor, logits: &Tensor, kind: Kind) -> Result<Regression, TchError> {
+    pub fn regress(
+        &self,
+        cells: &Tensor,
+        logits: &Tensor,
+        kind: Kind,
+    ) -> Result<Regression, TchError> {
         Ok(self.regress_among_centres(cells, logits, kind)?.0)
     }
 
@@ -132,20 +151,37 @@ impl SceneHead {
         let input = self.input(cells, logits)?;
         let inward = self.inward.forward(&input.f_to_kind(kind)?)?.f_relu()?;
         let hidden = match &self.int8 {
-            Some(blocks) => blocks.iter().try_fold(inward, |x, block| block.forward(&x))?,
+            Some(blocks) => blocks
+                .iter()
+                .try_fold(inward, |x, block| block.forward(&x))?,
             None => self.hidden(inward, &mut |_, _| Ok(()))?,
         };
         let output = self.outward.forward(&hidden)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
-        let log_shares = output.f_narrow(1, 0, centres)?.f_log_softmax(1, Kind::Float)?;
+        let log_shares = output
+            .f_narrow(1, 0, centres)?
+            .f_log_softmax(1, Kind::Float)?;
         let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
         let coordinates_m = log_shares.f_exp()?.f_matmul(&self.centres)? + offset;
-        let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?.f_softplus()?;
-        Ok((Regression { coordinates_m, epsilon_m }, log_shares))
+        let epsilon_m = output
+            .f_narrow(1, centres + 3, 1)?
+            .f_squeeze_dim(1)?
+            .f_softplus()?;
+        Ok((
+            Regression {
+                coordinates_m,
+                epsilon_m,
+            },
+            log_shares,
+        ))
     }
 
     /// Residual blocks in floating point, from the output of the first layer on.
-    fn hidden(&self, inward: Tensor, on_activation: &mut OnActivation<'_>) -> Result<Tensor, TchError> {
+    fn hidden(
+        &self,
+        inward: Tensor,
+        on_activation: &mut OnActivation<'_>,
+    ) -> Result<Tensor, TchError> {
         on_activation(INWARD, &inward)?;
         let mut x = inward;
         for (number, [first, second, third]) in self.blocks.iter().enumerate() {
@@ -163,9 +199,15 @@ impl SceneHead {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn observe(&self, cells: &Tensor, logits: &Tensor, search: &mut ScaleSearch) -> Result<(), TchError> {
+    pub fn observe(
+        &self,
+        cells: &Tensor,
+        logits: &Tensor,
+        search: &mut ScaleSearch,
+    ) -> Result<(), TchError> {
         let inward = self.inward.forward(&self.input(cells, logits)?)?.f_relu()?;
-        self.hidden(inward, &mut |name, values| search.observe(name, values)).map(drop)
+        self.hidden(inward, &mut |name, values| search.observe(name, values))
+            .map(drop)
     }
 
     /// Computes the residual blocks in integers from here on.
@@ -173,8 +215,16 @@ impl SceneHead {
     /// # Errors
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
-        let hidden = |input, output: Quantisation| LayerFormat { input, output: Some(output.scale), relu: true };
-        let last = |input| LayerFormat { input, output: None, relu: false };
+        let hidden = |input, output: Quantisation| LayerFormat {
+            input,
+            output: Some(output.scale),
+            relu: true,
+        };
+        let last = |input| LayerFormat {
+            input,
+            output: None,
+            relu: false,
+        };
         let (mut before, mut blocks) = (scales.get(INWARD)?, Vec::with_capacity(self.blocks.len()));
         for (number, [first, second, third]) in self.blocks.iter().enumerate() {
             let of = |part| scales.get(&block_activation(number, part));
@@ -184,7 +234,10 @@ impl SceneHead {
                 second.int8(hidden(inner, innermost))?,
                 third.int8(last(innermost))?,
             ];
-            blocks.push(Int8Block { input: before, layers });
+            blocks.push(Int8Block {
+                input: before,
+                layers,
+            });
             before = output;
         }
         self.int8 = Some(blocks);
@@ -193,7 +246,11 @@ impl SceneHead {
 
     /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
     fn input(&self, cells: &Tensor, logits: &Tensor) -> Result<Tensor, TchError> {
-        let norm = logits.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
+        let norm = logits
+            .f_square()?
+            .f_sum_dim_intlist(1_i64, true, Kind::Float)?
+            .f_add_scalar(1e-12)?
+            .f_sqrt()?;
         Tensor::f_cat(&[cells, &(logits / norm)], 1)
     }
 
@@ -207,7 +264,12 @@ impl SceneHead {
     ///
     /// # Errors
     /// Those of the tensor library, when shapes do not fit.
-    pub fn set_statistics(&mut self, cells: &Tensor, sweeps: &Tensor, centres: &Tensor) -> Result<(), TchError> {
+    pub fn set_statistics(
+        &mut self,
+        cells: &Tensor,
+        sweeps: &Tensor,
+        centres: &Tensor,
+    ) -> Result<(), TchError> {
         self.cell_norm.fit(cells)?;
         self.sweep_norm.fit(sweeps)?;
         tch::no_grad(|| self.centres.f_copy_(centres))
@@ -225,7 +287,8 @@ struct Classifier {
 impl Classifier {
     fn new(path: &nn::Path<'_>, inputs: i64, classes: i64) -> Self {
         let [first, second] = CLASSIFIER_WIDTHS;
-        let linear = |layer: usize, from, to| nn::linear(path / layer, from, to, LinearConfig::default());
+        let linear =
+            |layer: usize, from, to| nn::linear(path / layer, from, to, LinearConfig::default());
         let norm = |layer: usize, width| Norm::with_defaults(&(path / "norms" / layer), width);
         Self {
             layers: [linear(0, inputs, first), linear(1, first, second)],
@@ -237,7 +300,10 @@ impl Classifier {
     fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let mut x = x.shallow_clone();
         for (layer, norm) in self.layers.iter().zip(&self.norms) {
-            x = norm.forward(&layer.forward(&x), train).f_relu()?.f_dropout(DROPOUT, train)?;
+            x = norm
+                .forward(&layer.forward(&x), train)
+                .f_relu()?
+                .f_dropout(DROPOUT, train)?;
         }
         Ok(self.last.forward(&x))
     }

@@ -30,7 +30,13 @@ pub struct SyntheticScene {
 
 impl Default for SyntheticScene {
     fn default() -> Self {
-        Self { cells: 300, outliers: 0.2, twins: 0.0, noise_m: 0.2, next_seed: 0 }
+        Self {
+            cells: 300,
+            outliers: 0.2,
+            twins: 0.0,
+            noise_m: 0.2,
+            next_seed: 0,
+        }
     }
 }
 
@@ -47,7 +53,10 @@ impl SyntheticScene {
         let pose = local_pose(seed);
         let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
         let noise = Normal::new(0.0, self.noise_m).expect("a standard deviation");
-        let mut coordinates = SceneCoordinates { origin_m: ORIGIN_M, ..SceneCoordinates::default() };
+        let mut coordinates = SceneCoordinates {
+            origin_m: ORIGIN_M,
+            ..SceneCoordinates::default()
+        };
         for _ in 0..self.cells {
             let mut within = |reach: f64| random.random_range(-reach..reach);
             let sensor = Point3::new(within(50.0), within(50.0), within(5.0));
@@ -63,9 +72,15 @@ impl SyntheticScene {
                 predicted + Vector3::from_fn(|_, _| noise.sample(&mut random))
             };
             let off_m = (world - predicted).abs().sum().min(10.0);
-            coordinates.epsilon_m.push((off_m * random.random_range(0.5..1.5)) as f32);
-            coordinates.sensor_m.push(sensor.coords.map(|axis| axis as f32).into());
-            coordinates.world_m.push(world.coords.map(|axis| axis as f32).into());
+            coordinates
+                .epsilon_m
+                .push((off_m * random.random_range(0.5..1.5)) as f32);
+            coordinates
+                .sensor_m
+                .push(sensor.coords.map(|axis| axis as f32).into());
+            coordinates
+                .world_m
+                .push(world.coords.map(|axis| axis as f32).into());
         }
         coordinates
     }

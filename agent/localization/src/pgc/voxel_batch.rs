@@ -33,26 +33,46 @@ impl VoxelBatch {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn new(sweeps: &[&SweepVoxels], config: &SceneEncoderConfig, device: Device) -> Result<Self, TchError> {
-        let input: Vec<f32> = sweeps.iter().flat_map(|sweep| &sweep.input).copied().collect();
-        let input = Tensor::f_from_slice(&input)?.f_view([-1, config.input.channels()])?.f_to_device(device)?;
-        let stacked = |book: fn(&SweepVoxels) -> &Rulebook| Rulebook::stacked(sweeps.iter().map(|s| book(s)), device);
+    pub fn new(
+        sweeps: &[&SweepVoxels],
+        config: &SceneEncoderConfig,
+        device: Device,
+    ) -> Result<Self, TchError> {
+        let input: Vec<f32> = sweeps
+            .iter()
+            .flat_map(|sweep| &sweep.input)
+            .copied()
+            .collect();
+        let input = Tensor::f_from_slice(&input)?
+            .f_view([-1, config.input.channels()])?
+            .f_to_device(device)?;
+        let stacked = |book: fn(&SweepVoxels) -> &Rulebook| {
+            Rulebook::stacked(sweeps.iter().map(|s| book(s)), device)
+        };
         let down = (0..config.levels() - 1)
             .map(|level| Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.down[level]), device))
             .collect::<Result<_, _>>()?;
         let fine = match config.fine_cells {
-            true => Some(Rulebook::stacked(sweeps.iter().filter_map(|sweep| sweep.fine.as_ref()), device)?),
+            true => Some(Rulebook::stacked(
+                sweeps.iter().filter_map(|sweep| sweep.fine.as_ref()),
+                device,
+            )?),
             false => None,
         };
         let edge = i64::from(plane_edge(config));
         let coarse_rows = ranges(sweeps, |sweep| sweep.columns.len());
         let shifted = |values: fn(&SweepVoxels) -> &[u32], shifts: Vec<i64>| {
             let rows = sweeps.iter().zip(shifts);
-            let rows: Vec<i64> =
-                rows.flat_map(|(sweep, shift)| values(sweep).iter().map(move |&row| shift + i64::from(row))).collect();
+            let rows: Vec<i64> = rows
+                .flat_map(|(sweep, shift)| {
+                    values(sweep).iter().map(move |&row| shift + i64::from(row))
+                })
+                .collect();
             Tensor::f_from_slice(&rows)?.f_to_device(device)
         };
-        let planes = (0..sweeps.len() as i64).map(|sweep| sweep * edge * edge).collect();
+        let planes = (0..sweeps.len() as i64)
+            .map(|sweep| sweep * edge * edge)
+            .collect();
         Ok(Self {
             input,
             first: stacked(|sweep| &sweep.first)?,

@@ -56,8 +56,11 @@ impl SweepVoxels {
         let inside = points.into_iter().filter(|point| is_inside(point, config));
         let points: Vec<[f32; 3]> = inside.collect();
         let voxel_m = config.voxel_m as f32;
-        let (voxels, voxel_of_point) =
-            Sites::collect(points.iter().map(|point| point.map(|axis| (axis / voxel_m).floor() as i32)));
+        let (voxels, voxel_of_point) = Sites::collect(
+            points
+                .iter()
+                .map(|point| point.map(|axis| (axis / voxel_m).floor() as i32)),
+        );
         let input = describe(&points, &voxel_of_point, &voxels, config);
 
         let first = Rulebook::submanifold(&voxels);
@@ -71,7 +74,9 @@ impl SweepVoxels {
             let (halved, parents) = sites.halved();
             down.push(Rulebook::strided(&sites, &halved));
             if level <= cell_level {
-                cell_of_point.iter_mut().for_each(|row| *row = parents[*row as usize]);
+                cell_of_point
+                    .iter_mut()
+                    .for_each(|row| *row = parents[*row as usize]);
             } else {
                 fine = Some(Rulebook::submanifold(&sites));
                 coarse_of_cell = parents;
@@ -83,7 +88,16 @@ impl SweepVoxels {
         }
         let cells = cells(&points, &cell_of_point, coarse_of_cell.len());
         let columns = columns(&sites, config);
-        Self { input, first, down, fine, coarse: Rulebook::submanifold(&sites), coarse_of_cell, columns, cells }
+        Self {
+            input,
+            first,
+            down,
+            fine,
+            coarse: Rulebook::submanifold(&sites),
+            coarse_of_cell,
+            columns,
+            cells,
+        }
     }
 
     /// The cells, in the order of the encoder's rows.
@@ -111,7 +125,12 @@ fn is_inside([x, y, z]: &[f32; 3], config: &SceneEncoderConfig) -> bool {
         && f64::from(*z) <= config.height_m[1]
 }
 
-fn describe(points: &[[f32; 3]], rows: &[u32], voxels: &Sites, config: &SceneEncoderConfig) -> Vec<f32> {
+fn describe(
+    points: &[[f32; 3]],
+    rows: &[u32],
+    voxels: &Sites,
+    config: &SceneEncoderConfig,
+) -> Vec<f32> {
     let mut sums = vec![[0.0_f32; 4]; voxels.len()];
     for (point, &row) in points.iter().zip(rows) {
         let sum = &mut sums[row as usize];
@@ -160,7 +179,15 @@ mod tests {
     use super::*;
 
     fn wall() -> Vec<[f32; 3]> {
-        (0..4000).map(|k| [(k % 50) as f32 * 0.2 + 3.0, 5.1, (k / 50) as f32 * 0.05 - 1.5]).collect()
+        (0..4000)
+            .map(|k| {
+                [
+                    (k % 50) as f32 * 0.2 + 3.0,
+                    5.1,
+                    (k / 50) as f32 * 0.05 - 1.5,
+                ]
+            })
+            .collect()
     }
 
     #[test]
@@ -168,16 +195,42 @@ mod tests {
         for config in [SceneEncoderConfig::lean(), SceneEncoderConfig::full(0.5)] {
             let mut points = wall();
             let count = points.len() as u32;
-            points.extend([[f32::NAN, 0.0, 0.0], [500.0, 0.0, 0.0], [1.0, 1.0, f32::INFINITY], [1.0, 1.0, -50.0]]);
+            points.extend([
+                [f32::NAN, 0.0, 0.0],
+                [500.0, 0.0, 0.0],
+                [1.0, 1.0, f32::INFINITY],
+                [1.0, 1.0, -50.0],
+            ]);
             let sweep = SweepVoxels::new(points, &config);
-            assert_eq!(sweep.cells().iter().map(|cell| cell.points).sum::<u32>(), count);
+            assert_eq!(
+                sweep.cells().iter().map(|cell| cell.points).sum::<u32>(),
+                count
+            );
             let half = config.cell_m() as f32;
-            assert!(sweep.cells().iter().all(|cell| cell.extent_m <= half && (cell.centroid_m[1] - 5.1).abs() < 1e-3));
+            assert!(
+                sweep
+                    .cells()
+                    .iter()
+                    .all(|cell| cell.extent_m <= half && (cell.centroid_m[1] - 5.1).abs() < 1e-3)
+            );
             assert_eq!(sweep.coarse_of_cell.len(), sweep.cells.len());
-            assert!(sweep.coarse_of_cell.iter().all(|&row| (row as usize) < sweep.columns.len()));
-            assert_eq!(sweep.input.len(), sweep.voxels() * config.input.channels() as usize);
+            assert!(
+                sweep
+                    .coarse_of_cell
+                    .iter()
+                    .all(|&row| (row as usize) < sweep.columns.len())
+            );
+            assert_eq!(
+                sweep.input.len(),
+                sweep.voxels() * config.input.channels() as usize
+            );
             let edge = plane_edge(&config);
-            assert!(sweep.columns.iter().all(|&column| column < (edge * edge) as u32));
+            assert!(
+                sweep
+                    .columns
+                    .iter()
+                    .all(|&column| column < (edge * edge) as u32)
+            );
         }
     }
 
@@ -185,7 +238,9 @@ mod tests {
     fn a_cell_has_the_mean_of_its_points() {
         let points = [[10.1, 0.3, 0.2], [10.3, 0.5, 1.2]];
         let sweep = SweepVoxels::new(points, &SceneEncoderConfig::lean());
-        let [cell] = sweep.cells() else { panic!("{:?}", sweep.cells()) };
+        let [cell] = sweep.cells() else {
+            panic!("{:?}", sweep.cells())
+        };
         assert!((cell.centroid_m[0] - 10.2).abs() < 1e-5 && (cell.extent_m - 1.0).abs() < 1e-5);
     }
 

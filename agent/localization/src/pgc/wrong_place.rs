@@ -15,7 +15,12 @@ const LEAST_RATIO: f64 = 0.6;
 pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> String {
     let place = Weights::load(head).and_then(|weights| weights.config::<SceneHeadConfig>());
     let place = place.ok().map(|config| config.scene_name);
-    hint(sweeps, &head.display().to_string(), place.as_deref(), scene_map)
+    hint(
+        sweeps,
+        &head.display().to_string(),
+        place.as_deref(),
+        scene_map,
+    )
 }
 
 /// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of
@@ -41,7 +46,9 @@ fn hint(sweeps: u64, head: &str, place: Option<&str>, scene_map: Option<&str>) -
         (None, Some(map)) => format!(" The scene is of {map}"),
         (None, None) => String::new(),
     };
-    format!("no vehicle found itself in {sweeps} sweeps: is {head} the head of this place and this LiDAR?{known}")
+    format!(
+        "no vehicle found itself in {sweeps} sweeps: is {head} the head of this place and this LiDAR?{known}"
+    )
 }
 
 #[cfg(test)]
@@ -65,8 +72,18 @@ mod tests {
     fn sweeps_of_another_density_are_named_with_both_numbers() {
         let hint = |own: &[usize], of_head| other_lidar_hint(of_head, own);
         let text = hint(&[21_000, 22_000, 400], Some(57_000)).unwrap();
-        assert!(text.contains("21000 points") && text.contains("57000"), "{text}");
+        assert!(
+            text.contains("21000 points") && text.contains("57000"),
+            "{text}"
+        );
         assert!(hint(&[150_000], Some(57_000)).is_some());
-        assert_eq!([hint(&[40_000], Some(57_000)), hint(&[], Some(57_000)), hint(&[9], None)], [None, None, None]);
+        assert_eq!(
+            [
+                hint(&[40_000], Some(57_000)),
+                hint(&[], Some(57_000)),
+                hint(&[9], None)
+            ],
+            [None, None, None]
+        );
     }
 }

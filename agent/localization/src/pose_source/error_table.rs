@@ -56,8 +56,17 @@ impl ErrorTable {
     /// # Errors
     /// [`ErrorTableError`] names the file, the line and the column.
     pub fn read(path: &Path) -> Result<Self, ErrorTableError> {
-        let rows = CsvFile::read(path, HEADER, MAX_BYTES)?.rows().map(parse_row).collect::<Result<Vec<_>, _>>()?;
-        if rows.is_empty() { Err(ErrorTableError::Empty { path: path.to_owned() }) } else { Ok(Self { rows }) }
+        let rows = CsvFile::read(path, HEADER, MAX_BYTES)?
+            .rows()
+            .map(parse_row)
+            .collect::<Result<Vec<_>, _>>()?;
+        if rows.is_empty() {
+            Err(ErrorTableError::Empty {
+                path: path.to_owned(),
+            })
+        } else {
+            Ok(Self { rows })
+        }
     }
 
     /// The row of a step if the first step has row `start`; after the last row comes the first one.
@@ -75,9 +84,17 @@ fn parse_row(row: CsvRow<'_>) -> Result<TableRow, CsvError> {
     let row = row.complete()?;
     let metres = |column| row.number(column, -MAX_ERROR_M..=MAX_ERROR_M, "metres within 100 km");
     let position_m = [metres(0)?, metres(1)?, metres(2)?];
-    let yaw_rad = row.number(3, -360.0..=360.0, "degrees within a turn")?.to_radians();
+    let yaw_rad = row
+        .number(3, -360.0..=360.0, "degrees within a turn")?
+        .to_radians();
     let confidence = row.number(4, 0.0..=1.0, "0 to 1")? as f32;
-    Ok(TableRow::Pose { error: PlanarError { position_m, yaw_rad }, confidence })
+    Ok(TableRow::Pose {
+        error: PlanarError {
+            position_m,
+            yaw_rad,
+        },
+        confidence,
+    })
 }
 
 #[cfg(test)]
@@ -94,7 +111,9 @@ mod tests {
     #[test]
     fn rows_repeat_after_the_last() {
         let table = read("x_m,y_m,z_m,yaw_deg,confidence\n0.1,0,0,180,0.5\nno_pose\n\n").unwrap();
-        let TableRow::Pose { error, confidence } = table.row(1, 1) else { panic!("{table:?}") };
+        let TableRow::Pose { error, confidence } = table.row(1, 1) else {
+            panic!("{table:?}")
+        };
         assert!((error.yaw_rad - std::f64::consts::PI).abs() < 1e-12 && confidence == 0.5);
         assert_eq!(table.row(0, 1), TableRow::NoPose);
         assert_eq!(table.row(u64::MAX, u64::MAX), table.row(0, 0));
@@ -106,14 +125,22 @@ mod tests {
         for (text, parts) in [
             ("a,b\n".to_owned(), ["errors.csv:1", "a,b"]),
             (format!("{header}1,2,3\n"), ["errors.csv:2", "1,2,3"]),
-            (format!("{header}0,0,0,0,1\n0,NaN,0,0,1\n"), ["errors.csv:3", "y_m is \"NaN\""]),
-            (format!("{header}0,0,0,0,1.5\n"), ["errors.csv:2", "confidence is \"1.5\""]),
+            (
+                format!("{header}0,0,0,0,1\n0,NaN,0,0,1\n"),
+                ["errors.csv:3", "y_m is \"NaN\""],
+            ),
+            (
+                format!("{header}0,0,0,0,1.5\n"),
+                ["errors.csv:2", "confidence is \"1.5\""],
+            ),
             (header.to_owned(), ["errors.csv", "no row"]),
         ] {
             let message = read(&text).unwrap_err().to_string();
             assert!(parts.iter().all(|part| message.contains(part)), "{message}");
         }
-        let message = ErrorTable::read(Path::new("/nowhere/errors.csv")).unwrap_err().to_string();
+        let message = ErrorTable::read(Path::new("/nowhere/errors.csv"))
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("/nowhere/errors.csv"), "{message}");
     }
 }

@@ -72,7 +72,10 @@ impl LocalizedPose {
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn baseline(config: &BaselinePoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
+    pub fn baseline(
+        config: &BaselinePoseConfig,
+        inference: Inference,
+    ) -> Result<Self, LocalizerError> {
         let localizer = load_baseline(&config.weights, inference.device, PoseSolver::default())?;
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
@@ -80,7 +83,11 @@ impl LocalizedPose {
     /// The same with another localizer.
     #[must_use]
     pub fn new(localizer: Box<dyn Localize>, motion_gate: MotionGateConfig) -> Self {
-        Self { localizer, motion_gate: MotionGate::new(motion_gate), times: Vec::new() }
+        Self {
+            localizer,
+            motion_gate: MotionGate::new(motion_gate),
+            times: Vec::new(),
+        }
     }
 }
 
@@ -95,13 +102,25 @@ impl PoseSource for LocalizedPose {
             }
             Err(error) => {
                 tracing::error!(cav = %input.cav, capture_nanos = input.capture_nanos, "no pose: {error}");
-                return PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
+                return PoseEstimate::NoPose {
+                    reason: NoPoseReason::Failed,
+                    inlier_count: 0,
+                };
             }
         };
         match estimate {
-            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
-                let verdict = self.motion_gate.judge(input.capture_nanos, &world_from_cav.isometry());
-                PoseEstimate::new(world_from_cav, confidence * self.motion_gate.factor(verdict) as f32)
+            PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            } => {
+                let verdict = self
+                    .motion_gate
+                    .judge(input.capture_nanos, &world_from_cav.isometry());
+                PoseEstimate::new(
+                    world_from_cav,
+                    confidence * self.motion_gate.factor(verdict) as f32,
+                )
             }
             none @ PoseEstimate::NoPose { .. } => none,
         }
@@ -145,7 +164,9 @@ mod tests {
             measured: Some(&measured),
             motion: EgoMotion::default(),
         };
-        (0..count).map(|step| source.estimate(&input(step))).collect()
+        (0..count)
+            .map(|step| source.estimate(&input(step)))
+            .collect()
     }
 
     #[test]
@@ -154,7 +175,9 @@ mod tests {
         let mut source = LocalizedPose::new(Box::new(scene.clone()), MotionGateConfig::default());
         let found = estimates(&mut source, 2);
         for (seed, estimate) in found.iter().enumerate() {
-            let off = scene.world_from_sensor(seed as u64).inv_mul(&estimate.world_from_cav().unwrap().isometry());
+            let off = scene
+                .world_from_sensor(seed as u64)
+                .inv_mul(&estimate.world_from_cav().unwrap().isometry());
             assert!(off.translation.vector.norm() < 0.2);
         }
         // Two random places of a scene, a tenth of a second apart.
@@ -167,22 +190,44 @@ mod tests {
     struct Broken;
 
     impl Localize for Broken {
-        fn localize_sweep(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        fn localize_sweep(
+            &mut self,
+            _: LocalizerInput<'_>,
+        ) -> Result<Localization, LocalizerError> {
             Err(LocalizerError::Config("broken".into()))
         }
     }
 
     #[test]
     fn a_localizer_that_fails_gives_no_pose() {
-        let none = PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
-        assert_eq!(estimates(&mut LocalizedPose::new(Box::new(Broken), MotionGateConfig::default()), 1), [none]);
+        let none = PoseEstimate::NoPose {
+            reason: NoPoseReason::Failed,
+            inlier_count: 0,
+        };
+        assert_eq!(
+            estimates(
+                &mut LocalizedPose::new(Box::new(Broken), MotionGateConfig::default()),
+                1
+            ),
+            [none]
+        );
         assert_eq!(LocalizerTimes::default().stages().len(), 5);
     }
 
     #[test]
     fn no_pose_remains_no_pose() {
-        let empty = SyntheticScene { cells: 0, ..SyntheticScene::default() };
-        let found = estimates(&mut LocalizedPose::new(Box::new(empty), MotionGateConfig::default()), 3);
-        assert!(found.iter().all(|estimate| estimate.world_from_cav().is_none()));
+        let empty = SyntheticScene {
+            cells: 0,
+            ..SyntheticScene::default()
+        };
+        let found = estimates(
+            &mut LocalizedPose::new(Box::new(empty), MotionGateConfig::default()),
+            3,
+        );
+        assert!(
+            found
+                .iter()
+                .all(|estimate| estimate.world_from_cav().is_none())
+        );
     }
 }

@@ -54,7 +54,10 @@ impl<'a> PoseInput<'a> {
     /// Input of a localizer.
     #[must_use]
     pub(crate) fn sweep(&self) -> LocalizerInput<'a> {
-        LocalizerInput { cloud: self.cloud, levels: self.levels }
+        LocalizerInput {
+            cloud: self.cloud,
+            levels: self.levels,
+        }
     }
 }
 
@@ -105,7 +108,10 @@ impl PoseSource for RecordedPose {
 }
 
 /// Result if there is no measured pose.
-pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose {
+    reason: NoPoseReason::NoSource,
+    inlier_count: 0,
+};
 
 /// A pose source and its settings.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -131,13 +137,26 @@ pub enum PoseSourceConfig {
 #[serde(default, deny_unknown_fields)]
 pub struct NoisyPoseConfig {
     /// Correlation of the errors of successive frames (pose source noisy).
-    #[arg(id = "noise_mode", long = "noise-mode", value_name = "MODE", value_enum)]
+    #[arg(
+        id = "noise_mode",
+        long = "noise-mode",
+        value_name = "MODE",
+        value_enum
+    )]
     pub mode: NoiseMode,
     /// Standard deviation of x, y and z, metres (pose source noisy).
-    #[arg(id = "noise_position_std_m", long = "noise-position-std-m", value_name = "M")]
+    #[arg(
+        id = "noise_position_std_m",
+        long = "noise-position-std-m",
+        value_name = "M"
+    )]
     pub position_std_m: f64,
     /// Standard deviation of yaw, degrees (pose source noisy).
-    #[arg(id = "noise_heading_std_deg", long = "noise-heading-std-deg", value_name = "DEG")]
+    #[arg(
+        id = "noise_heading_std_deg",
+        long = "noise-heading-std-deg",
+        value_name = "DEG"
+    )]
     pub heading_std_deg: f64,
     /// Seed of the errors (pose source noisy).
     #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]
@@ -180,16 +199,20 @@ impl NoisyPoseConfig {
         // The upper bound keeps the sum over past innovations short: seven decay times.
         within("noisy.decay_s", self.decay_s, 0.0, 1e3 * self.step_s)?;
         match (self.mode, &self.table) {
-            (NoiseMode::Replayed, None) => {
-                Err(FieldError::new("noisy.table", "absent", "must name the table of errors (--noise-table)"))
-            }
+            (NoiseMode::Replayed, None) => Err(FieldError::new(
+                "noisy.table",
+                "absent",
+                "must name the table of errors (--noise-table)",
+            )),
             _ => Ok(()),
         }
     }
 }
 
 /// Kinds of pose error.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseMode {
     /// One offset for all agents and frames, as in the reference code, which resets its seed at every call. There the
@@ -239,9 +262,10 @@ impl PoseSourceConfig {
     #[must_use]
     pub fn for_scenario(&self, name: &str) -> Self {
         match self {
-            Self::Cached(config) => {
-                Self::Cached(CachedPoseConfig { scenario: Some(name.to_owned()), ..config.clone() })
-            }
+            Self::Cached(config) => Self::Cached(CachedPoseConfig {
+                scenario: Some(name.to_owned()),
+                ..config.clone()
+            }),
             other => other.clone(),
         }
     }
@@ -250,9 +274,10 @@ impl PoseSourceConfig {
     #[must_use]
     pub fn with_turn(self, turn: u32) -> Self {
         match self {
-            Self::Tracked(config) => {
-                Self::Tracked(TrackedPoseConfig { phase: config.phase.saturating_add(turn), ..config })
-            }
+            Self::Tracked(config) => Self::Tracked(TrackedPoseConfig {
+                phase: config.phase.saturating_add(turn),
+                ..config
+            }),
             other => other,
         }
     }
@@ -261,7 +286,10 @@ impl PoseSourceConfig {
     #[must_use]
     pub fn measuring_every_sweep(self) -> Self {
         match self {
-            Self::Tracked(config) => Self::Tracked(TrackedPoseConfig { measure_every: 1, ..config }),
+            Self::Tracked(config) => Self::Tracked(TrackedPoseConfig {
+                measure_every: 1,
+                ..config
+            }),
             other => other,
         }
     }
@@ -284,14 +312,17 @@ impl PoseSourceConfig {
             if !file.as_os_str().is_empty() {
                 return Ok(());
             }
-            Err(FieldError::new(format!("{}.{field}", self.name()), "empty", format!("must name a file ({option})")))
+            Err(FieldError::new(
+                format!("{}.{field}", self.name()),
+                "empty",
+                format!("must name a file ({option})"),
+            ))
         };
         match self {
             Self::Recorded => Ok(()),
             Self::Noisy(noise) => noise.validate(),
-            Self::Pgc(pgc) => {
-                named("encoder", "--encoder", &pgc.encoder).and_then(|()| named("head", "--head", &pgc.head))
-            }
+            Self::Pgc(pgc) => named("encoder", "--encoder", &pgc.encoder)
+                .and_then(|()| named("head", "--head", &pgc.head)),
             Self::Tracked(tracked) => {
                 named("encoder", "--encoder", &tracked.encoder)?;
                 named("head", "--head", &tracked.head)?;
@@ -370,7 +401,9 @@ mod tests {
             measured: Some(&pose),
             motion: EgoMotion::default(),
         };
-        let mut source = PoseSourceConfig::default().build(Inference::default()).unwrap();
+        let mut source = PoseSourceConfig::default()
+            .build(Inference::default())
+            .unwrap();
         assert_eq!(source.estimate(&input), PoseEstimate::new(pose, 1.0));
         input.measured = None;
         assert_eq!(source.estimate(&input), NO_SOURCE);
@@ -379,18 +412,34 @@ mod tests {
     #[test]
     fn a_scenario_file_names_the_source() {
         let config: PoseSourceConfig =
-            serde_saphyr::from_str("noisy:\n  mode: autoregressive\n  position_std_m: 0.5\n").unwrap();
-        let PoseSourceConfig::Noisy(noisy) = &config else { panic!("{config:?}") };
-        assert_eq!((noisy.mode, noisy.position_std_m, noisy.seed), (NoiseMode::Autoregressive, 0.5, 25));
-        assert_eq!(serde_saphyr::from_str::<PoseSourceConfig>("recorded").unwrap(), PoseSourceConfig::Recorded);
-        assert!(serde_saphyr::from_str::<PoseSourceConfig>("noisy:\n  posision_std_m: 0.5\n").is_err());
+            serde_saphyr::from_str("noisy:\n  mode: autoregressive\n  position_std_m: 0.5\n")
+                .unwrap();
+        let PoseSourceConfig::Noisy(noisy) = &config else {
+            panic!("{config:?}")
+        };
+        assert_eq!(
+            (noisy.mode, noisy.position_std_m, noisy.seed),
+            (NoiseMode::Autoregressive, 0.5, 25)
+        );
+        assert_eq!(
+            serde_saphyr::from_str::<PoseSourceConfig>("recorded").unwrap(),
+            PoseSourceConfig::Recorded
+        );
+        assert!(
+            serde_saphyr::from_str::<PoseSourceConfig>("noisy:\n  posision_std_m: 0.5\n").is_err()
+        );
         let config: PoseSourceConfig =
-            serde_saphyr::from_str("pgc:\n  encoder: e.safetensors\n  head: h.safetensors\n").unwrap();
+            serde_saphyr::from_str("pgc:\n  encoder: e.safetensors\n  head: h.safetensors\n")
+                .unwrap();
         assert_eq!(config.name(), "pgc");
         let message = config.build(Inference::default()).unwrap_err().to_string();
         assert!(message.starts_with("e.safetensors"), "{message}");
-        let config: PoseSourceConfig = serde_saphyr::from_str("baseline:\n  weights: w.safetensors\n").unwrap();
+        let config: PoseSourceConfig =
+            serde_saphyr::from_str("baseline:\n  weights: w.safetensors\n").unwrap();
         let message = config.build(Inference::default()).unwrap_err().to_string();
-        assert!(config.name() == "baseline" && message.starts_with("w.safetensors"), "{message}");
+        assert!(
+            config.name() == "baseline" && message.starts_with("w.safetensors"),
+            "{message}"
+        );
     }
 }

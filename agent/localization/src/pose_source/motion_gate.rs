@@ -85,7 +85,12 @@ impl MotionGate {
     /// Gate without any pose.
     #[must_use]
     pub(crate) fn new(config: MotionGateConfig) -> Self {
-        Self { config, accepted: VecDeque::new(), elsewhere: Vec::new(), jumps: 0 }
+        Self {
+            config,
+            accepted: VecDeque::new(),
+            elsewhere: Vec::new(),
+            jumps: 0,
+        }
     }
 
     /// Number of jumps so far.
@@ -104,9 +109,20 @@ impl MotionGate {
     }
 
     /// Classifies a pose and stores it.
-    pub(crate) fn judge(&mut self, capture_nanos: u64, world_from_lidar: &Isometry3<f64>) -> Verdict {
-        let pose = TimedPose { capture_nanos, world_from_lidar: *world_from_lidar };
-        let last = self.accepted.back().copied().filter(|last| self.remembers(last, &pose));
+    pub(crate) fn judge(
+        &mut self,
+        capture_nanos: u64,
+        world_from_lidar: &Isometry3<f64>,
+    ) -> Verdict {
+        let pose = TimedPose {
+            capture_nanos,
+            world_from_lidar: *world_from_lidar,
+        };
+        let last = self
+            .accepted
+            .back()
+            .copied()
+            .filter(|last| self.remembers(last, &pose));
         let Some(last) = last else {
             // There is no pose yet, or the scene restarted.
             self.accepted.clear();
@@ -118,10 +134,9 @@ impl MotionGate {
             return Verdict::Reachable;
         }
         self.jumps += 1;
-        let follows = self
-            .elsewhere
-            .last()
-            .is_some_and(|before| self.remembers(before, &pose) && self.can_reach(before, &pose, None));
+        let follows = self.elsewhere.last().is_some_and(|before| {
+            self.remembers(before, &pose) && self.can_reach(before, &pose, None)
+        });
         if !follows {
             self.elsewhere.clear();
         }
@@ -136,7 +151,11 @@ impl MotionGate {
     fn accept(&mut self, pose: TimedPose) {
         self.elsewhere.clear();
         self.accepted.push_back(pose);
-        while self.accepted.front().is_some_and(|first| seconds(first, &pose) > SPEED_WINDOW_S) {
+        while self
+            .accepted
+            .front()
+            .is_some_and(|first| seconds(first, &pose) > SPEED_WINDOW_S)
+        {
             self.accepted.pop_front();
         }
     }
@@ -162,7 +181,11 @@ impl MotionGate {
             speed + config.position_slack_m / SPEED_WINDOW_S + config.max_acceleration_mps2 * time_s
         });
         let reach_m = config.position_slack_m + fastest.min(config.max_speed_mps) * time_s;
-        let turn_deg = from.world_from_lidar.rotation.angle_to(&to.world_from_lidar.rotation).to_degrees();
+        let turn_deg = from
+            .world_from_lidar
+            .rotation
+            .angle_to(&to.world_from_lidar.rotation)
+            .to_degrees();
         let may_turn_deg = config.rotation_slack_deg + config.max_turn_deg_per_s * time_s;
         distance_m(from, to) <= reach_m && turn_deg <= may_turn_deg
     }
@@ -192,7 +215,11 @@ mod tests {
     /// Verdicts on poses a tenth of a second apart.
     fn verdicts(motion_gate: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
         let capture = |step: usize| step as u64 * TENTH_NANOS;
-        poses.iter().enumerate().map(|(step, pose)| motion_gate.judge(capture(step), pose)).collect()
+        poses
+            .iter()
+            .enumerate()
+            .map(|(step, pose)| motion_gate.judge(capture(step), pose))
+            .collect()
     }
 
     #[test]
@@ -201,13 +228,24 @@ mod tests {
         // 15 m/s, 30 degrees a second, with errors of half a metre.
         let drive: Vec<_> = (0..80)
             .map(|step| {
-                let (time_s, shake) = (f64::from(step) * 0.1, if step % 2 == 0 { 0.5 } else { -0.5 });
+                let (time_s, shake) = (
+                    f64::from(step) * 0.1,
+                    if step % 2 == 0 { 0.5 } else { -0.5 },
+                );
                 let angle = 30.0_f64.to_radians() * time_s;
                 let radius = 15.0 / 30.0_f64.to_radians();
-                at(radius * angle.sin() + shake, radius * (1.0 - angle.cos()), angle.to_degrees())
+                at(
+                    radius * angle.sin() + shake,
+                    radius * (1.0 - angle.cos()),
+                    angle.to_degrees(),
+                )
             })
             .collect();
-        assert!(verdicts(&mut motion_gate, &drive).iter().all(|&verdict| verdict == Verdict::Reachable));
+        assert!(
+            verdicts(&mut motion_gate, &drive)
+                .iter()
+                .all(|&verdict| verdict == Verdict::Reachable)
+        );
         assert_eq!(motion_gate.jumps(), 0);
     }
 
@@ -219,11 +257,18 @@ mod tests {
         drive[9] = at(9.0, 0.0, 180.0);
         let verdicts = verdicts(&mut motion_gate, &drive);
         for (step, verdict) in verdicts.into_iter().enumerate() {
-            let expected = if step == 6 || step == 9 { Verdict::Jump } else { Verdict::Reachable };
+            let expected = if step == 6 || step == 9 {
+                Verdict::Jump
+            } else {
+                Verdict::Reachable
+            };
             assert_eq!(verdict, expected, "step {step}");
         }
         assert_eq!(motion_gate.jumps(), 2);
-        assert!(motion_gate.factor(Verdict::Jump) < 0.5 && motion_gate.factor(Verdict::Reachable) == 1.0);
+        assert!(
+            motion_gate.factor(Verdict::Jump) < 0.5
+                && motion_gate.factor(Verdict::Reachable) == 1.0
+        );
     }
 
     #[test]
@@ -232,16 +277,32 @@ mod tests {
         let mut drive = vec![at(500.0, 0.0, 0.0)];
         drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
         use Verdict::{Jump, NewPlace, Reachable};
-        assert_eq!(verdicts(&mut motion_gate, &drive), [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]);
+        assert_eq!(
+            verdicts(&mut motion_gate, &drive),
+            [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]
+        );
     }
 
     #[test]
     fn jumps_that_do_not_agree_are_never_accepted() {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
-        let anywhere = (0..20).map(|step| at(f64::from((step * 7919) % 400), 100.0 + f64::from(step * 60), 0.0));
+        let anywhere = (0..20).map(|step| {
+            at(
+                f64::from((step * 7919) % 400),
+                100.0 + f64::from(step * 60),
+                0.0,
+            )
+        });
         let drive: Vec<_> = std::iter::once(at(0.0, 0.0, 0.0)).chain(anywhere).collect();
-        assert!(verdicts(&mut motion_gate, &drive)[1..].iter().all(|&verdict| verdict == Verdict::Jump));
-        assert_eq!(motion_gate.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)), Verdict::Reachable);
+        assert!(
+            verdicts(&mut motion_gate, &drive)[1..]
+                .iter()
+                .all(|&verdict| verdict == Verdict::Jump)
+        );
+        assert_eq!(
+            motion_gate.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)),
+            Verdict::Reachable
+        );
     }
 
     #[test]
@@ -250,14 +311,26 @@ mod tests {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
         verdicts(&mut motion_gate, &standing);
         // A car at 50 m/s could be there, one that stood a moment ago cannot.
-        assert_eq!(motion_gate.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)), Verdict::Jump);
+        assert_eq!(
+            motion_gate.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)),
+            Verdict::Jump
+        );
     }
 
     #[test]
     fn a_restarted_scene_or_a_long_gap_resets_the_gate() {
         let mut motion_gate = MotionGate::new(MotionGateConfig::default());
-        assert_eq!(motion_gate.judge(90_000_000_000, &at(0.0, 0.0, 0.0)), Verdict::Reachable);
-        assert_eq!(motion_gate.judge(0, &at(900.0, 0.0, 0.0)), Verdict::Reachable);
-        assert_eq!(motion_gate.judge(60_000_000_000, &at(0.0, 0.0, 90.0)), Verdict::Reachable);
+        assert_eq!(
+            motion_gate.judge(90_000_000_000, &at(0.0, 0.0, 0.0)),
+            Verdict::Reachable
+        );
+        assert_eq!(
+            motion_gate.judge(0, &at(900.0, 0.0, 0.0)),
+            Verdict::Reachable
+        );
+        assert_eq!(
+            motion_gate.judge(60_000_000_000, &at(0.0, 0.0, 90.0)),
+            Verdict::Reachable
+        );
     }
 }

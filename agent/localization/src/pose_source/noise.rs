@@ -29,7 +29,8 @@ impl PlanarError {
     #[must_use]
     pub(crate) fn added_in_world(&self, pose: &Pose) -> Pose {
         let exact = pose.isometry();
-        let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw_rad) * exact.rotation;
+        let rotation =
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw_rad) * exact.rotation;
         let translation = exact.translation.vector + Vector3::from(self.position_m);
         Isometry3::from_parts(Translation3::from(translation), rotation).into()
     }
@@ -60,7 +61,11 @@ impl PoseNoise {
     /// Errors with these standard deviations, metres per axis and radians.
     #[must_use]
     pub(crate) fn new(position_std_m: f64, yaw_std_rad: f64, seed: u64) -> Self {
-        Self { position_std_m, yaw_std_rad, seed }
+        Self {
+            position_std_m,
+            yaw_std_rad,
+            seed,
+        }
     }
 
     /// The constant error of all vehicles: to the digit the draw of OpenCOOD with this seed at every call. Of six
@@ -85,7 +90,11 @@ impl PoseNoise {
     #[must_use]
     pub(crate) fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
         let random = self.random(cav);
-        let depth = if rho > 0.0 { (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64 } else { 0 };
+        let depth = if rho > 0.0 {
+            (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64
+        } else {
+            0
+        };
         let mut sum = [0.0; 4];
         let mut weight = (1.0 - rho * rho).sqrt();
         for back in 0..=depth {
@@ -138,14 +147,24 @@ mod tests {
     fn correlation(pairs: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
         let pairs: Vec<_> = pairs.collect();
         let variance = pairs.iter().map(|(a, _)| a * a).sum::<f64>();
-        (pairs.iter().map(|(a, b)| a * b).sum::<f64>() / variance, (variance / pairs.len() as f64).sqrt())
+        (
+            pairs.iter().map(|(a, b)| a * b).sum::<f64>() / variance,
+            (variance / pairs.len() as f64).sqrt(),
+        )
     }
 
     #[test]
     fn the_fixed_error_is_that_of_opencood() {
         let error = PoseNoise::new(1.0, 1f64.to_radians(), 20).fixed();
-        let off = error.position_m.iter().zip([0.884, 0.196, 0.358]).map(|(found, known)| (found - known).abs());
-        assert!(off.fold(0.0, f64::max) < 1e-3 && (error.yaw_rad.to_degrees() + 1.085).abs() < 1e-3, "{error:?}");
+        let off = error
+            .position_m
+            .iter()
+            .zip([0.884, 0.196, 0.358])
+            .map(|(found, known)| (found - known).abs());
+        assert!(
+            off.fold(0.0, f64::max) < 1e-3 && (error.yaw_rad.to_degrees() + 1.085).abs() < 1e-3,
+            "{error:?}"
+        );
     }
 
     #[test]
@@ -160,7 +179,10 @@ mod tests {
         let noise = PoseNoise::new(0.5, 0.02, 1);
         let x = |step| noise.independent(&cav("a"), step).position_m[0];
         let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
-        assert!((spread - 0.5).abs() < 0.03 && correlation.abs() < 0.05, "{spread} {correlation}");
+        assert!(
+            (spread - 0.5).abs() < 0.03 && correlation.abs() < 0.05,
+            "{spread} {correlation}"
+        );
         assert_ne!(x(7), noise.independent(&cav("b"), 7).position_m[0]);
     }
 
@@ -169,7 +191,10 @@ mod tests {
         let noise = PoseNoise::new(0.5, 0.02, 1);
         let x = |step| noise.autoregressive(&cav("a"), step, 0.9).position_m[0];
         let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
-        assert!((spread - 0.5).abs() < 0.06 && (correlation - 0.9).abs() < 0.03, "{spread} {correlation}");
+        assert!(
+            (spread - 0.5).abs() < 0.06 && (correlation - 0.9).abs() < 0.03,
+            "{spread} {correlation}"
+        );
         let forgetful = noise.autoregressive(&cav("a"), 3, 0.0);
         assert_eq!(forgetful, noise.independent(&cav("a"), 3));
     }
@@ -177,9 +202,15 @@ mod tests {
     #[test]
     fn errors_in_the_vehicle_turn_with_it() {
         let pose = Pose::from_xyz_yaw([10.0, 0.0, 0.0], std::f64::consts::FRAC_PI_2);
-        let error = PlanarError { position_m: [1.0, 0.0, 0.0], yaw_rad: 0.1 };
+        let error = PlanarError {
+            position_m: [1.0, 0.0, 0.0],
+            yaw_rad: 0.1,
+        };
         let forward = error.added_in_vehicle(&pose);
-        assert!((forward.translation_m[0] - 10.0).abs() < 1e-9 && (forward.translation_m[1] - 1.0).abs() < 1e-9);
+        assert!(
+            (forward.translation_m[0] - 10.0).abs() < 1e-9
+                && (forward.translation_m[1] - 1.0).abs() < 1e-9
+        );
         let east = error.added_in_world(&pose);
         assert!((east.translation_m[0] - 11.0).abs() < 1e-9);
         assert!((east.yaw_rad() - pose.yaw_rad() - 0.1).abs() < 1e-9);

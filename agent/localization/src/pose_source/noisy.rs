@@ -35,14 +35,24 @@ impl NoisyPose {
     /// [`PoseSourceError`] names the field or the file.
     pub fn new(config: &NoisyPoseConfig) -> Result<Self, PoseSourceError> {
         config.validate()?;
-        let noise = PoseNoise::new(config.position_std_m, config.heading_std_deg.to_radians(), config.seed);
+        let noise = PoseNoise::new(
+            config.position_std_m,
+            config.heading_std_deg.to_radians(),
+            config.seed,
+        );
         let kind = match config.mode {
             NoiseMode::Fixed => Kind::Fixed(noise),
             NoiseMode::Independent => Kind::Independent(noise),
             NoiseMode::Autoregressive => Kind::Autoregressive(noise, correlation(config)),
-            NoiseMode::Replayed => Kind::Replayed(ErrorTable::read(config.table.as_deref().unwrap_or(Path::new("")))?),
+            NoiseMode::Replayed => Kind::Replayed(ErrorTable::read(
+                config.table.as_deref().unwrap_or(Path::new("")),
+            )?),
         };
-        Ok(Self { seed: config.seed, step_nanos: config.step_s * 1e9, kind })
+        Ok(Self {
+            seed: config.seed,
+            step_nanos: config.step_s * 1e9,
+            kind,
+        })
     }
 
     /// The pose of a vehicle at a capture time when the true one is `pose`.
@@ -76,14 +86,23 @@ impl PoseSource for NoisyPose {
 
 fn replayed(row: TableRow, pose: &Pose) -> PoseEstimate {
     match row {
-        TableRow::Pose { error, confidence } => PoseEstimate::new(error.added_in_vehicle(pose), confidence),
-        TableRow::NoPose => PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 0 },
+        TableRow::Pose { error, confidence } => {
+            PoseEstimate::new(error.added_in_vehicle(pose), confidence)
+        }
+        TableRow::NoPose => PoseEstimate::NoPose {
+            reason: NoPoseReason::TooFewInliers,
+            inlier_count: 0,
+        },
     }
 }
 
 /// Correlation of an error with that of the previous step.
 fn correlation(config: &NoisyPoseConfig) -> f64 {
-    if config.decay_s > 0.0 { (-config.step_s / config.decay_s).exp() } else { 0.0 }
+    if config.decay_s > 0.0 {
+        (-config.step_s / config.decay_s).exp()
+    } else {
+        0.0
+    }
 }
 
 /// Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
@@ -95,10 +114,18 @@ fn confidence(error: &PlanarError) -> f32 {
 mod tests {
     use super::*;
 
-    const TRUE_POSE: Pose = Pose { translation_m: [100.0, -50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+    const TRUE_POSE: Pose = Pose {
+        translation_m: [100.0, -50.0, 2.0],
+        rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+    };
 
     fn source(mode: NoiseMode) -> NoisyPose {
-        NoisyPose::new(&NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() }).unwrap()
+        NoisyPose::new(&NoisyPoseConfig {
+            mode,
+            position_std_m: 1.0,
+            ..NoisyPoseConfig::default()
+        })
+        .unwrap()
     }
 
     fn cav(name: &str) -> CavId {
@@ -107,8 +134,9 @@ mod tests {
 
     #[test]
     fn modes_differ_in_what_the_error_depends_on() {
-        let at =
-            |mode, name: &str, seconds: u64| source(mode).disturbed(&cav(name), seconds * 1_000_000_000, &TRUE_POSE);
+        let at = |mode, name: &str, seconds: u64| {
+            source(mode).disturbed(&cav(name), seconds * 1_000_000_000, &TRUE_POSE)
+        };
         assert_eq!(at(NoiseMode::Fixed, "a", 1), at(NoiseMode::Fixed, "b", 2));
         for mode in [NoiseMode::Independent, NoiseMode::Autoregressive] {
             assert_eq!(at(mode, "a", 1), at(mode, "a", 1), "{mode:?}");
@@ -120,12 +148,20 @@ mod tests {
     #[test]
     fn a_large_error_has_a_low_confidence() {
         for step in 0..20 {
-            let PoseEstimate::Pose { world_from_cav, confidence, .. } =
-                source(NoiseMode::Independent).disturbed(&cav("a"), step * 100_000_000, &TRUE_POSE)
+            let PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            } = source(NoiseMode::Independent).disturbed(&cav("a"), step * 100_000_000, &TRUE_POSE)
             else {
                 panic!("a measured pose gives a pose")
             };
-            let off = TRUE_POSE.from_world(&world_from_cav).isometry().translation.vector.norm();
+            let off = TRUE_POSE
+                .from_world(&world_from_cav)
+                .isometry()
+                .translation
+                .vector
+                .norm();
             assert!((f64::from(confidence) - 1.0 / (1.0 + off * off)).abs() < 1e-6);
         }
     }
@@ -134,24 +170,57 @@ mod tests {
     fn replayed_errors_come_from_the_table_and_may_be_none() {
         let folder = tempfile::tempdir().unwrap();
         let table = folder.path().join("errors.csv");
-        std::fs::write(&table, "x_m,y_m,z_m,yaw_deg,confidence\n0.5,0,0,0,0.8\nno_pose\n").unwrap();
-        let config = NoisyPoseConfig { mode: NoiseMode::Replayed, table: Some(table), ..NoisyPoseConfig::default() };
+        std::fs::write(
+            &table,
+            "x_m,y_m,z_m,yaw_deg,confidence\n0.5,0,0,0,0.8\nno_pose\n",
+        )
+        .unwrap();
+        let config = NoisyPoseConfig {
+            mode: NoiseMode::Replayed,
+            table: Some(table),
+            ..NoisyPoseConfig::default()
+        };
         let source = NoisyPose::new(&config).unwrap();
-        let estimates: Vec<_> = (0..2).map(|k| source.disturbed(&cav("a"), k * 100_000_000, &TRUE_POSE)).collect();
-        assert_eq!(estimates.iter().filter(|estimate| estimate.world_from_cav().is_none()).count(), 1);
-        let pose = estimates.iter().find_map(PoseEstimate::world_from_cav).unwrap();
+        let estimates: Vec<_> = (0..2)
+            .map(|k| source.disturbed(&cav("a"), k * 100_000_000, &TRUE_POSE))
+            .collect();
+        assert_eq!(
+            estimates
+                .iter()
+                .filter(|estimate| estimate.world_from_cav().is_none())
+                .count(),
+            1
+        );
+        let pose = estimates
+            .iter()
+            .find_map(PoseEstimate::world_from_cav)
+            .unwrap();
         assert!((pose.translation_m[0] - 100.5).abs() < 1e-9);
-        let config = NoisyPoseConfig { table: None, ..config };
+        let config = NoisyPoseConfig {
+            table: None,
+            ..config
+        };
         let message = NoisyPose::new(&config).unwrap_err().to_string();
         assert!(message.contains("noisy.table is absent"), "{message}");
     }
 
     #[test]
     fn invalid_numbers_are_named() {
-        let config = NoisyPoseConfig { position_std_m: f64::NAN, ..NoisyPoseConfig::default() };
+        let config = NoisyPoseConfig {
+            position_std_m: f64::NAN,
+            ..NoisyPoseConfig::default()
+        };
         let message = NoisyPose::new(&config).unwrap_err().to_string();
         assert!(message.contains("position_std_m is NaN"), "{message}");
-        let config = NoisyPoseConfig { step_s: 0.0, ..NoisyPoseConfig::default() };
-        assert!(NoisyPose::new(&config).unwrap_err().to_string().contains("step_s is 0"));
+        let config = NoisyPoseConfig {
+            step_s: 0.0,
+            ..NoisyPoseConfig::default()
+        };
+        assert!(
+            NoisyPose::new(&config)
+                .unwrap_err()
+                .to_string()
+                .contains("step_s is 0")
+        );
     }
 }

@@ -21,9 +21,15 @@ impl NumpyNormals {
         words[0] = seed as u32;
         for index in 1..WORDS {
             let before = words[index - 1];
-            words[index] = 1_812_433_253_u32.wrapping_mul(before ^ (before >> 30)).wrapping_add(index as u32);
+            words[index] = 1_812_433_253_u32
+                .wrapping_mul(before ^ (before >> 30))
+                .wrapping_add(index as u32);
         }
-        Self { words, next: WORDS, second: None }
+        Self {
+            words,
+            next: WORDS,
+            second: None,
+        }
     }
 
     /// A normal number of mean 0 and deviation 1: Marsaglia's polar method, the second of a pair first.
@@ -62,7 +68,8 @@ impl NumpyNormals {
 
     fn turn(&mut self) {
         for index in 0..WORDS {
-            let mixed = (self.words[index] & 0x8000_0000) | (self.words[(index + 1) % WORDS] & 0x7fff_ffff);
+            let mixed =
+                (self.words[index] & 0x8000_0000) | (self.words[(index + 1) % WORDS] & 0x7fff_ffff);
             let odd = if mixed & 1 == 1 { 0x9908_b0df } else { 0 };
             self.words[index] = self.words[(index + SHIFT) % WORDS] ^ (mixed >> 1) ^ odd;
         }
@@ -77,7 +84,14 @@ mod tests {
     #[test]
     fn numbers_are_those_of_numpy() {
         // `numpy.random.seed(20); numpy.random.normal(size=6)`.
-        let expected = [0.883_893_11, 0.195_865_02, 0.357_536_52, -2.343_261_91, -1.084_832_59, 0.559_696_29];
+        let expected = [
+            0.883_893_11,
+            0.195_865_02,
+            0.357_536_52,
+            -2.343_261_91,
+            -1.084_832_59,
+            0.559_696_29,
+        ];
         let mut random = NumpyNormals::new(20);
         for value in expected {
             assert!((random.normal() - value).abs() < 1e-8);

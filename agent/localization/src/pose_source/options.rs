@@ -3,7 +3,10 @@
 use clap::{ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use protocol::config::{document, options_of};
 
-use super::{BaselinePoseConfig, CachedPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig, TrackedPoseConfig};
+use super::{
+    BaselinePoseConfig, CachedPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
+    TrackedPoseConfig,
+};
 
 /// Option that chooses the source.
 #[derive(Debug, clap::Args)]
@@ -73,8 +76,11 @@ impl FromArgMatches for PoseSourceConfig {
             Self::Noisy(noise) => noise.update_from_arg_matches(matches),
             Self::Pgc(networks) => networks.update_from_arg_matches(matches),
             Self::Tracked(tracked) => {
-                let mut networks =
-                    PgcConfig { encoder: tracked.encoder.clone(), head: tracked.head.clone(), ..Default::default() };
+                let mut networks = PgcConfig {
+                    encoder: tracked.encoder.clone(),
+                    head: tracked.head.clone(),
+                    ..Default::default()
+                };
                 networks.update_from_arg_matches(matches)?;
                 (tracked.encoder, tracked.head) = (networks.encoder, networks.head);
                 tracked.update_from_arg_matches(matches)
@@ -120,29 +126,69 @@ mod tests {
     }
 
     fn parsed(words: &[&str]) -> PoseSourceConfig {
-        Cli::try_parse_from([&["program"], words].concat()).unwrap().pose.0
+        Cli::try_parse_from([&["program"], words].concat())
+            .unwrap()
+            .pose
+            .0
     }
 
     #[test]
     fn options_choose_a_source_and_set_it_up() {
         assert_eq!(parsed(&[]), PoseSourceConfig::Recorded);
-        let noisy = parsed(&["--pose-source=noisy", "--noise-mode=autoregressive", "--noise-position-std-m=0.5"]);
-        let expected = NoisyPoseConfig { mode: NoiseMode::Autoregressive, position_std_m: 0.5, ..Default::default() };
+        let noisy = parsed(&[
+            "--pose-source=noisy",
+            "--noise-mode=autoregressive",
+            "--noise-position-std-m=0.5",
+        ]);
+        let expected = NoisyPoseConfig {
+            mode: NoiseMode::Autoregressive,
+            position_std_m: 0.5,
+            ..Default::default()
+        };
         assert_eq!(noisy, PoseSourceConfig::Noisy(expected));
-        let PoseSourceConfig::Pgc(pgc) = parsed(&["--pose-source=pgc", "--encoder=e", "--head=h"]) else { panic!() };
-        assert_eq!((pgc.encoder.to_str(), pgc.head.to_str()), (Some("e"), Some("h")));
-        let message = parsed(&["--pose-source=pgc", "--encoder=e"]).validate().unwrap_err().to_string();
-        assert!(message.contains("pgc.head is empty") && message.contains("--head"), "{message}");
-        assert!(parsed(&["--pose-source=baseline", "--baseline=w"]).validate().is_ok());
-        assert!(parsed(&["--pose-source=cached", "--poses=p.csv"]).validate().is_ok());
+        let PoseSourceConfig::Pgc(pgc) = parsed(&["--pose-source=pgc", "--encoder=e", "--head=h"])
+        else {
+            panic!()
+        };
+        assert_eq!(
+            (pgc.encoder.to_str(), pgc.head.to_str()),
+            (Some("e"), Some("h"))
+        );
+        let message = parsed(&["--pose-source=pgc", "--encoder=e"])
+            .validate()
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("pgc.head is empty") && message.contains("--head"),
+            "{message}"
+        );
+        assert!(
+            parsed(&["--pose-source=baseline", "--baseline=w"])
+                .validate()
+                .is_ok()
+        );
+        assert!(
+            parsed(&["--pose-source=cached", "--poses=p.csv"])
+                .validate()
+                .is_ok()
+        );
     }
 
     #[test]
     fn an_option_changes_one_setting_of_a_source_that_is_set_up() {
-        let mut source = PoseSourceConfig::Noisy(NoisyPoseConfig { seed: 3, decay_s: 2.0, ..Default::default() });
-        let matches = PoseSourceConfig::augment_args(Command::new("p")).get_matches_from(["p", "--noise-seed=4"]);
+        let mut source = PoseSourceConfig::Noisy(NoisyPoseConfig {
+            seed: 3,
+            decay_s: 2.0,
+            ..Default::default()
+        });
+        let matches = PoseSourceConfig::augment_args(Command::new("p"))
+            .get_matches_from(["p", "--noise-seed=4"]);
         source.update_from_arg_matches(&matches).unwrap();
-        let expected = NoisyPoseConfig { seed: 4, decay_s: 2.0, ..Default::default() };
+        let expected = NoisyPoseConfig {
+            seed: 4,
+            decay_s: 2.0,
+            ..Default::default()
+        };
         assert_eq!(source, PoseSourceConfig::Noisy(expected));
     }
 }

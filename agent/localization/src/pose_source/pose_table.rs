@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 use support::csv_file::{CsvError, CsvFile, CsvRow, CsvText};
 
 /// The first line of a table.
-const HEADER: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
+const HEADER: &str =
+    "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
 /// Largest file that is read, bytes: two million sweeps.
 const MAX_BYTES: u64 = 256 << 20;
 
@@ -77,11 +78,17 @@ impl PoseTable {
     /// # Errors
     /// [`PoseTableError`] names the file and the line.
     pub fn read(path: &Path) -> Result<Self, PoseTableError> {
-        let mut table = Self { path: path.to_owned(), ..Self::default() };
+        let mut table = Self {
+            path: path.to_owned(),
+            ..Self::default()
+        };
         for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
             let row = row.complete()?;
             let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
-            if of_scenario.insert(sweep_key(&row)?, estimate(&row)?).is_some() {
+            if of_scenario
+                .insert(sweep_key(&row)?, estimate(&row)?)
+                .is_some()
+            {
                 return Err(row.fault("duplicate row of the sweep").into());
             }
         }
@@ -109,7 +116,9 @@ impl PoseTable {
     /// Estimate of a sweep.
     #[must_use]
     pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
-        self.scenarios.get(last_part(scenario))?.get(&(cav.clone(), capture_nanos))
+        self.scenarios
+            .get(last_part(scenario))?
+            .get(&(cav.clone(), capture_nanos))
     }
 
     /// Appends the rows of a scenario to a file, which gets its header where it is new.
@@ -117,26 +126,52 @@ impl PoseTable {
     /// # Errors
     /// [`PoseTableError::Write`] when the file cannot be written.
     pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<(), PoseTableError> {
-        let mut text = if path.exists() { CsvText::headless() } else { CsvText::new(HEADER) };
-        rows.iter().for_each(|row| text.row(fields(last_part(scenario), row)));
+        let mut text = if path.exists() {
+            CsvText::headless()
+        } else {
+            CsvText::new(HEADER)
+        };
+        rows.iter()
+            .for_each(|row| text.row(fields(last_part(scenario), row)));
         let text = text.finish();
-        let append = |path: &Path| OpenOptions::new().create(true).append(true).open(path)?.write_all(text.as_bytes());
-        append(path).map_err(|source| PoseTableError::Write { path: path.to_owned(), source })
+        let append = |path: &Path| {
+            OpenOptions::new()
+                .create(true)
+                .append(true)
+                .open(path)?
+                .write_all(text.as_bytes())
+        };
+        append(path).map_err(|source| PoseTableError::Write {
+            path: path.to_owned(),
+            source,
+        })
     }
 
     /// The poses of one scenario: the requested one, or the only one there is.
     ///
     /// # Errors
     /// [`PoseTableError`] when there is none, or several and none is requested.
-    fn of_scenario(mut self, scenario: Option<&str>) -> Result<HashMap<SweepKey, PoseEstimate>, PoseTableError> {
+    fn of_scenario(
+        mut self,
+        scenario: Option<&str>,
+    ) -> Result<HashMap<SweepKey, PoseEstimate>, PoseTableError> {
         let path = self.path.clone();
         match scenario {
-            Some(name) => self
-                .scenarios
-                .remove(last_part(name))
-                .ok_or_else(|| PoseTableError::NoScenario { path, scenario: name.to_owned() }),
-            None if self.scenarios.len() == 1 => Ok(self.scenarios.into_values().next().unwrap_or_default()),
-            None => Err(PoseTableError::WhichScenario { path, count: self.scenarios.len() }),
+            Some(name) => {
+                self.scenarios
+                    .remove(last_part(name))
+                    .ok_or_else(|| PoseTableError::NoScenario {
+                        path,
+                        scenario: name.to_owned(),
+                    })
+            }
+            None if self.scenarios.len() == 1 => {
+                Ok(self.scenarios.into_values().next().unwrap_or_default())
+            }
+            None => Err(PoseTableError::WhichScenario {
+                path,
+                count: self.scenarios.len(),
+            }),
         }
     }
 }
@@ -166,14 +201,19 @@ impl CachedPose {
     /// # Errors
     /// [`PoseTableError`] names the file and what is wrong with it.
     pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
-        Ok(Self { poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())? })
+        Ok(Self {
+            poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())?,
+        })
     }
 }
 
 impl super::PoseSource for CachedPose {
     /// Ignores sweep and measured pose; a sweep that is not in the table has no source.
     fn estimate(&mut self, input: &super::PoseInput<'_>) -> PoseEstimate {
-        self.poses.get(&(input.cav.clone(), input.capture_nanos)).copied().unwrap_or(super::NO_SOURCE)
+        self.poses
+            .get(&(input.cav.clone(), input.capture_nanos))
+            .copied()
+            .unwrap_or(super::NO_SOURCE)
     }
 }
 
@@ -183,18 +223,41 @@ fn last_part(scenario: &str) -> &str {
 }
 
 fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
-    let PoseRow { cav, capture_nanos, estimate } = row;
+    let PoseRow {
+        cav,
+        capture_nanos,
+        estimate,
+    } = row;
     let mut fields: [String; 13] = Default::default();
-    fields[..3].clone_from_slice(&[scenario.to_owned(), cav.to_string(), capture_nanos.to_string()]);
+    fields[..3].clone_from_slice(&[
+        scenario.to_owned(),
+        cav.to_string(),
+        capture_nanos.to_string(),
+    ]);
     match estimate {
-        PoseEstimate::Pose { world_from_cav: Pose { translation_m, rotation_wxyz }, confidence, .. } => {
+        PoseEstimate::Pose {
+            world_from_cav:
+                Pose {
+                    translation_m,
+                    rotation_wxyz,
+                },
+            confidence,
+            ..
+        } => {
             fields[3..6].clone_from_slice(&translation_m.map(|metres| format!("{metres:.5}")));
             fields[6..10].clone_from_slice(&rotation_wxyz.map(|part| format!("{part:.9}")));
             fields[10] = format!("{confidence:.6}");
         }
-        PoseEstimate::NoPose { reason, inlier_count } => {
+        PoseEstimate::NoPose {
+            reason,
+            inlier_count,
+        } => {
             let reason = serde_json::to_value(reason).ok();
-            fields[11] = reason.as_ref().and_then(serde_json::Value::as_str).unwrap_or_default().to_owned();
+            fields[11] = reason
+                .as_ref()
+                .and_then(serde_json::Value::as_str)
+                .unwrap_or_default()
+                .to_owned();
             fields[12] = inlier_count.to_string();
         }
     }
@@ -203,28 +266,49 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
 
 fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, CsvError> {
     let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
-    Ok((cav, row.field(2).parse().map_err(|_| row.wrong(2, "integer nanoseconds"))?))
+    Ok((
+        cav,
+        row.field(2)
+            .parse()
+            .map_err(|_| row.wrong(2, "integer nanoseconds"))?,
+    ))
 }
 
 fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
-    if row.field(11).is_empty() { pose(row) } else { no_pose(row) }
+    if row.field(11).is_empty() {
+        pose(row)
+    } else {
+        no_pose(row)
+    }
 }
 
 fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
     let number = |column| row.number(column, f64::MIN..=f64::MAX, "a finite number");
     let translation_m = [number(3)?, number(4)?, number(5)?];
     let rotation_wxyz = [number(6)?, number(7)?, number(8)?, number(9)?];
-    let world_from_cav = Pose { translation_m, rotation_wxyz };
-    world_from_cav.validate().map_err(|error| row.fault(error))?;
+    let world_from_cav = Pose {
+        translation_m,
+        rotation_wxyz,
+    };
+    world_from_cav
+        .validate()
+        .map_err(|error| row.fault(error))?;
     let confidence = row.number(10, 0.0..=1.0, "0 to 1")?;
     Ok(PoseEstimate::new(world_from_cav, confidence as f32))
 }
 
 fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
-    let reason: NoPoseReason = serde_json::from_value(serde_json::Value::String(row.field(11).to_owned()))
-        .map_err(|_| row.wrong(11, "a reason for no pose"))?;
-    let inlier_count = row.field(12).parse().map_err(|_| row.wrong(12, "a count"))?;
-    Ok(PoseEstimate::NoPose { reason, inlier_count })
+    let reason: NoPoseReason =
+        serde_json::from_value(serde_json::Value::String(row.field(11).to_owned()))
+            .map_err(|_| row.wrong(11, "a reason for no pose"))?;
+    let inlier_count = row
+        .field(12)
+        .parse()
+        .map_err(|_| row.wrong(12, "a count"))?;
+    Ok(PoseEstimate::NoPose {
+        reason,
+        inlier_count,
+    })
 }
 
 #[cfg(test)]
@@ -244,28 +328,59 @@ mod tests {
         PoseEstimate::new(Pose::from_xyz_yaw([101.25, -7.5, 1.9], 0.7), 0.875)
     }
 
-    const LOST: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::LowConfidence, inlier_count: 12 };
+    const LOST: PoseEstimate = PoseEstimate::NoPose {
+        reason: NoPoseReason::LowConfidence,
+        inlier_count: 12,
+    };
 
     #[test]
     fn rows_come_back_by_scenario_vehicle_and_time() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("poses.csv");
         let (a, b) = (cav("a"), cav("b"));
-        let row = |cav, capture_nanos, estimate| PoseRow { cav, capture_nanos, estimate };
-        PoseTable::append(&file, "towns/one", &[row(&a, 100, found()), row(&b, 100, LOST)]).unwrap();
+        let row = |cav, capture_nanos, estimate| PoseRow {
+            cav,
+            capture_nanos,
+            estimate,
+        };
+        PoseTable::append(
+            &file,
+            "towns/one",
+            &[row(&a, 100, found()), row(&b, 100, LOST)],
+        )
+        .unwrap();
         PoseTable::append(&file, "two", &[row(&a, 100, LOST)]).unwrap();
         let table = PoseTable::read(&file).unwrap();
-        assert_eq!((table.len(), table.has("elsewhere/one"), table.has("three")), (3, true, false));
-        let PoseEstimate::Pose { world_from_cav, confidence, .. } = table.get("one", &a, 100).unwrap() else {
+        assert_eq!(
+            (table.len(), table.has("elsewhere/one"), table.has("three")),
+            (3, true, false)
+        );
+        let PoseEstimate::Pose {
+            world_from_cav,
+            confidence,
+            ..
+        } = table.get("one", &a, 100).unwrap()
+        else {
             panic!()
         };
-        let apart = found().world_from_cav().unwrap().from_world(world_from_cav).isometry();
-        assert!(apart.translation.vector.norm() < 1e-4 && apart.rotation.angle() < 1e-6 && *confidence == 0.875);
+        let apart = found()
+            .world_from_cav()
+            .unwrap()
+            .from_world(world_from_cav)
+            .isometry();
+        assert!(
+            apart.translation.vector.norm() < 1e-4
+                && apart.rotation.angle() < 1e-6
+                && *confidence == 0.875
+        );
         assert_eq!(table.get("one", &b, 100), Some(&LOST));
         assert_eq!(table.get("one", &b, 200), None);
 
         let config = |scenario: Option<&str>| {
-            PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: scenario.map(str::to_owned) })
+            PoseSourceConfig::Cached(CachedPoseConfig {
+                file: file.clone(),
+                scenario: scenario.map(str::to_owned),
+            })
         };
         let mut source = config(Some("one")).build(Inference::default()).unwrap();
         let cloud = PointCloud::default();
@@ -279,9 +394,24 @@ mod tests {
                 motion: protocol::EgoMotion::default(),
             })
         };
-        assert_eq!((ask(&b, 100), ask(&b, 300)), (LOST, super::super::NO_SOURCE));
-        assert!(config(None).build(Inference::default()).unwrap_err().to_string().contains("2 scenarios"));
-        assert!(config(Some("three")).build(Inference::default()).unwrap_err().to_string().contains("three"));
+        assert_eq!(
+            (ask(&b, 100), ask(&b, 300)),
+            (LOST, super::super::NO_SOURCE)
+        );
+        assert!(
+            config(None)
+                .build(Inference::default())
+                .unwrap_err()
+                .to_string()
+                .contains("2 scenarios")
+        );
+        assert!(
+            config(Some("three"))
+                .build(Inference::default())
+                .unwrap_err()
+                .to_string()
+                .contains("three")
+        );
         assert_eq!(config(None).for_scenario("two"), config(Some("two")));
     }
 
@@ -292,11 +422,23 @@ mod tests {
         let good = "s,a,1,0,0,0,1,0,0,0,0.5,,";
         for (text, part) in [
             ("a,b\n".to_owned(), "poses.csv:1"),
-            (format!("{HEADER}\n{good}\n{good}\n"), "poses.csv:3: duplicate row of the sweep"),
+            (
+                format!("{HEADER}\n{good}\n{good}\n"),
+                "poses.csv:3: duplicate row of the sweep",
+            ),
             (format!("{HEADER}\ns,a,1,0\n"), "4 columns"),
-            (format!("{HEADER}\ns,a,1,0,0,0,1,0,0,0,1.5,,\n"), "confidence is \"1.5\", must be 0 to 1"),
-            (format!("{HEADER}\ns,a,1,0,0,NaN,1,0,0,0,0.5,,\n"), "poses.csv:2"),
-            (format!("{HEADER}\ns,a,1,0,0,0,9,0,0,0,0.5,,\n"), "poses.csv:2"),
+            (
+                format!("{HEADER}\ns,a,1,0,0,0,1,0,0,0,1.5,,\n"),
+                "confidence is \"1.5\", must be 0 to 1",
+            ),
+            (
+                format!("{HEADER}\ns,a,1,0,0,NaN,1,0,0,0,0.5,,\n"),
+                "poses.csv:2",
+            ),
+            (
+                format!("{HEADER}\ns,a,1,0,0,0,9,0,0,0,0.5,,\n"),
+                "poses.csv:2",
+            ),
             (format!("{HEADER}\ns,a,1,,,,,,,,,tired,0\n"), "tired"),
             (format!("{HEADER}\ns,A/b,1,0,0,0,1,0,0,0,0.5,,\n"), "cav"),
         ] {

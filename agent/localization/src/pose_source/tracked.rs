@@ -29,7 +29,11 @@ pub struct TrackedPoseConfig {
     pub head: PathBuf,
     /// Sweeps from one measurement to the next, 1 to 100, of a vehicle that measures its yaw rate; of one without, half
     /// as many (pose source tracked).
-    #[arg(id = "tracking_measure_every", long = "measure-every", value_name = "SWEEPS")]
+    #[arg(
+        id = "tracking_measure_every",
+        long = "measure-every",
+        value_name = "SWEEPS"
+    )]
     #[serde(default = "TrackedPoseConfig::measure_every")]
     pub measure_every: u32,
     /// Number of the first measured sweep: vehicles on one machine take turns (pose source tracked).
@@ -38,7 +42,11 @@ pub struct TrackedPoseConfig {
     pub phase: u32,
     /// Longest time between two measurements by the whole localizer, which uses no prediction, seconds (pose source
     /// tracked).
-    #[arg(id = "tracking_global_period_s", long = "global-period-s", value_name = "S")]
+    #[arg(
+        id = "tracking_global_period_s",
+        long = "global-period-s",
+        value_name = "S"
+    )]
     #[serde(default = "TrackedPoseConfig::global_period_s")]
     pub global_period_s: f64,
     /// Longest time without an accepted measurement, seconds; then the vehicle is lost (pose source tracked).
@@ -77,7 +85,11 @@ impl TrackedPoseConfig {
     /// Sweeps from one measurement to the next of a vehicle with this motion: without yaw rate the prediction lags in
     /// turns.
     pub(super) fn interval(&self, motion: &EgoMotion) -> u32 {
-        if motion.yaw_rate_rad_s.is_some() { self.measure_every } else { self.measure_every.div_ceil(2) }
+        if motion.yaw_rate_rad_s.is_some() {
+            self.measure_every
+        } else {
+            self.measure_every.div_ceil(2)
+        }
     }
 
     /// Checks the values; files are not opened.
@@ -126,7 +138,10 @@ impl TrackedPose {
     /// The same with another localizer.
     #[must_use]
     pub fn new(localizer: Box<dyn Localize>, config: TrackedPoseConfig) -> Self {
-        let limits = TrackerLimits { max_coast_s: config.max_coast_s, max_position_std_m: MAX_POSITION_STD_M };
+        let limits = TrackerLimits {
+            max_coast_s: config.max_coast_s,
+            max_position_std_m: MAX_POSITION_STD_M,
+        };
         let tracker = PoseTracker::new(limits);
         Self {
             localizer,
@@ -141,10 +156,16 @@ impl TrackedPose {
     }
 
     /// Measures a sweep, near the predicted pose if there is one. `None` if the localizer fails.
-    fn measure(&mut self, input: &PoseInput<'_>, predicted: Option<&TrackedState>) -> Option<Localization> {
+    fn measure(
+        &mut self,
+        input: &PoseInput<'_>,
+        predicted: Option<&TrackedState>,
+    ) -> Option<Localization> {
         self.measured_nanos = Some(input.capture_nanos);
         let measured = match predicted {
-            Some(state) => self.localizer.localize_near(input.sweep(), &state.world_from_lidar),
+            Some(state) => self
+                .localizer
+                .localize_near(input.sweep(), &state.world_from_lidar),
             None => {
                 self.global_nanos = Some(input.capture_nanos);
                 self.localizer.localize_sweep(input.sweep())
@@ -165,8 +186,13 @@ impl TrackedPose {
     /// Corrects the tracker by the pose of a sweep, if it has one.
     fn correct(&mut self, capture_nanos: u64, localization: &Localization) {
         let published = localization.estimate.world_from_cav();
-        let Some(found) = published.and(localization.found.as_ref()) else { return };
-        match self.tracker.correct(&PoseMeasurement::new(capture_nanos, found)) {
+        let Some(found) = published.and(localization.found.as_ref()) else {
+            return;
+        };
+        match self
+            .tracker
+            .correct(&PoseMeasurement::new(capture_nanos, found))
+        {
             Correction::Rejected | Correction::Relocated => self.jumps += 1,
             Correction::Started | Correction::Accepted => {}
         }
@@ -175,7 +201,10 @@ impl TrackedPose {
     /// Localizes a vehicle that is lost.
     fn start(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         let Some(localization) = self.measure(input, None) else {
-            return PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
+            return PoseEstimate::NoPose {
+                reason: NoPoseReason::Failed,
+                inlier_count: 0,
+            };
         };
         self.correct(input.capture_nanos, &localization);
         match self.tracker.state() {
@@ -212,7 +241,11 @@ impl PoseSource for TrackedPose {
 
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let is_measured = self.measured_nanos == Some(input.capture_nanos);
-        let Some(state) = self.tracker.state().filter(|_| !is_measured && self.is_due(&input.motion)) else {
+        let Some(state) = self
+            .tracker
+            .state()
+            .filter(|_| !is_measured && self.is_due(&input.motion))
+        else {
             return false;
         };
         let predicted = (!self.is_global_due(input.capture_nanos)).then_some(&state);
@@ -277,14 +310,24 @@ mod tests {
             let sweep = cloud.xyzi.len();
             let aside = if sweep >= self.carried_at { 300.0 } else { 0.0 };
             let pose = Pose::from_xyz_yaw([sweep as f64, aside, 2.0], 0.0);
-            let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 };
-            let estimate = if self.blind.contains(&sweep) { none } else { PoseEstimate::new(pose, 0.99) };
+            let none = PoseEstimate::NoPose {
+                reason: NoPoseReason::TooFewInliers,
+                inlier_count: 3,
+            };
+            let estimate = if self.blind.contains(&sweep) {
+                none
+            } else {
+                PoseEstimate::new(pose, 0.99)
+            };
             Localization::from_estimate(estimate, LocalizerTimes::default())
         }
     }
 
     impl Localize for Road {
-        fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+        fn localize_sweep(
+            &mut self,
+            sweep: LocalizerInput<'_>,
+        ) -> Result<Localization, LocalizerError> {
             self.globals.fetch_add(1, Ordering::Relaxed);
             Ok(self.result(sweep.cloud))
         }
@@ -300,11 +343,21 @@ mod tests {
     }
 
     /// Poses of sweeps, and the numbers of measurements by the whole localizer and near the prediction, without a yaw rate.
-    fn drive(road: Road, config: TrackedPoseConfig, sweeps: usize) -> (Vec<PoseEstimate>, [u64; 2]) {
+    fn drive(
+        road: Road,
+        config: TrackedPoseConfig,
+        sweeps: usize,
+    ) -> (Vec<PoseEstimate>, [u64; 2]) {
         let (globals, nears) = (Arc::clone(&road.globals), Arc::clone(&road.nears));
         let steps = steps(road, config, None).take(sweeps);
         let estimates = steps.map(|(estimate, _)| estimate).collect();
-        (estimates, [globals.load(Ordering::Relaxed), nears.load(Ordering::Relaxed)])
+        (
+            estimates,
+            [
+                globals.load(Ordering::Relaxed),
+                nears.load(Ordering::Relaxed),
+            ],
+        )
     }
 
     /// Each sweep's pose, and whether the sweep was measured afterwards.
@@ -316,16 +369,31 @@ mod tests {
         let mut source = TrackedPose::new(Box::new(road), config);
         let cav = CavId::new("7").unwrap();
         (0usize..).map(move |sweep| {
-            let cloud = PointCloud { xyzi: vec![[0.0; 4]; sweep] };
+            let cloud = PointCloud {
+                xyzi: vec![[0.0; 4]; sweep],
+            };
             let capture_nanos = sweep as u64 * 100_000_000;
-            let motion = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s };
-            let input = PoseInput { cav: &cav, capture_nanos, cloud: &cloud, levels: None, measured: None, motion };
+            let motion = EgoMotion {
+                speed_mps: Some(10.0),
+                yaw_rate_rad_s,
+            };
+            let input = PoseInput {
+                cav: &cav,
+                capture_nanos,
+                cloud: &cloud,
+                levels: None,
+                measured: None,
+                motion,
+            };
             (source.estimate(&input), source.observe(&input))
         })
     }
 
     fn road() -> Road {
-        Road { carried_at: usize::MAX, ..Road::default() }
+        Road {
+            carried_at: usize::MAX,
+            ..Road::default()
+        }
     }
 
     fn x_y(estimate: &PoseEstimate) -> [f64; 2] {
@@ -338,61 +406,138 @@ mod tests {
         let (estimates, [globals, nears]) = drive(road(), TrackedPoseConfig::default(), 41);
         for (sweep, estimate) in estimates.iter().enumerate() {
             let [x, y] = x_y(estimate);
-            assert!((x - sweep as f64).abs() < 0.2 && y.abs() < 0.1, "sweep {sweep}: {x}, {y}");
+            assert!(
+                (x - sweep as f64).abs() < 0.2 && y.abs() < 0.1,
+                "sweep {sweep}: {x}, {y}"
+            );
         }
         // Four seconds: one at the start and one every two seconds.
         assert_eq!((globals, globals + nears), (3, 21));
-        assert!(estimates.iter().all(|estimate| estimate.covariance().is_some() && estimate.confidence() > 0.9));
+        assert!(
+            estimates
+                .iter()
+                .all(|estimate| estimate.covariance().is_some() && estimate.confidence() > 0.9)
+        );
     }
 
     #[test]
     fn vehicles_of_other_phases_measure_other_sweeps() {
-        let (_, [globals, nears]) = drive(road(), TrackedPoseConfig { phase: 1, ..Default::default() }, 41);
-        assert_eq!(globals + nears, 21, "the first sweep, and then those of odd numbers");
+        let (_, [globals, nears]) = drive(
+            road(),
+            TrackedPoseConfig {
+                phase: 1,
+                ..Default::default()
+            },
+            41,
+        );
+        assert_eq!(
+            globals + nears,
+            21,
+            "the first sweep, and then those of odd numbers"
+        );
     }
 
     #[test]
     fn with_a_yaw_rate_every_fourth_sweep_is_measured_and_vehicles_take_turns() {
         let measured = |phase: u32| {
-            let steps = steps(road(), TrackedPoseConfig { phase, ..Default::default() }, Some(0.0));
-            let measured = steps.take(44).enumerate().skip(4).filter(|(_, (_, is_measured))| *is_measured);
+            let steps = steps(
+                road(),
+                TrackedPoseConfig {
+                    phase,
+                    ..Default::default()
+                },
+                Some(0.0),
+            );
+            let measured = steps
+                .take(44)
+                .enumerate()
+                .skip(4)
+                .filter(|(_, (_, is_measured))| *is_measured);
             measured.map(|(sweep, _)| sweep).collect::<Vec<_>>()
         };
         for (phase, turn) in (0u32..8).zip(0usize..) {
-            let expected: Vec<usize> = (4..44).filter(|sweep| (sweep + turn).is_multiple_of(4)).collect();
+            let expected: Vec<usize> = (4..44)
+                .filter(|sweep| (sweep + turn).is_multiple_of(4))
+                .collect();
             assert_eq!(measured(phase), expected, "phase {phase}");
         }
-        let estimates: Vec<_> = steps(road(), TrackedPoseConfig::default(), Some(0.0)).take(44).collect();
+        let estimates: Vec<_> = steps(road(), TrackedPoseConfig::default(), Some(0.0))
+            .take(44)
+            .collect();
         // One pose of this localizer says little of the heading.
         for (sweep, (estimate, _)) in estimates.iter().enumerate().skip(5) {
-            assert!((x_y(estimate)[0] - sweep as f64).abs() < 0.2 && estimate.confidence() > 0.9, "sweep {sweep}");
+            assert!(
+                (x_y(estimate)[0] - sweep as f64).abs() < 0.2 && estimate.confidence() > 0.9,
+                "sweep {sweep}"
+            );
         }
     }
 
     #[test]
     fn a_carried_vehicle_is_noticed_at_once_and_found_within_a_second() {
-        let (estimates, _) = drive(Road { carried_at: 20, ..road() }, TrackedPoseConfig::default(), 40);
+        let (estimates, _) = drive(
+            Road {
+                carried_at: 20,
+                ..road()
+            },
+            TrackedPoseConfig::default(),
+            40,
+        );
         assert!(estimates[22].confidence() < 0.01, "{:?}", estimates[22]);
-        let found = estimates.iter().skip(20).position(|estimate| x_y(estimate)[1] > 299.0).unwrap();
+        let found = estimates
+            .iter()
+            .skip(20)
+            .position(|estimate| x_y(estimate)[1] > 299.0)
+            .unwrap();
         assert!(found <= 10, "{found} sweeps");
     }
 
     #[test]
     fn sweeps_without_a_measurement_are_predicted_for_a_while_and_then_have_none() {
-        let (estimates, _) = drive(Road { blind: 20..80, ..road() }, TrackedPoseConfig::default(), 90);
-        let without: Vec<usize> = (0..90).filter(|&sweep| estimates[sweep].world_from_cav().is_none()).collect();
+        let (estimates, _) = drive(
+            Road {
+                blind: 20..80,
+                ..road()
+            },
+            TrackedPoseConfig::default(),
+            90,
+        );
+        let without: Vec<usize> = (0..90)
+            .filter(|&sweep| estimates[sweep].world_from_cav().is_none())
+            .collect();
         let (first, last) = (without[0], without[without.len() - 1]);
         assert!((25..=50).contains(&first) && last == 79, "{first}, {last}");
-        let lost = PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 3 };
+        let lost = PoseEstimate::NoPose {
+            reason: NoPoseReason::TooFewInliers,
+            inlier_count: 3,
+        };
         assert_eq!(estimates[first], lost);
-        let confidence: Vec<f32> = estimates[21..first].iter().map(PoseEstimate::confidence).collect();
-        assert!(confidence.windows(2).all(|pair| pair[1] < pair[0]), "{confidence:?}");
+        let confidence: Vec<f32> = estimates[21..first]
+            .iter()
+            .map(PoseEstimate::confidence)
+            .collect();
+        assert!(
+            confidence.windows(2).all(|pair| pair[1] < pair[0]),
+            "{confidence:?}"
+        );
     }
 
     #[test]
     fn settings_out_of_range_are_named() {
         let refused = |config: TrackedPoseConfig| config.validate().unwrap_err().to_string();
-        assert!(refused(TrackedPoseConfig { measure_every: 0, ..Default::default() }).contains("measure_every is 0"));
-        assert!(refused(TrackedPoseConfig { max_coast_s: -1.0, ..Default::default() }).contains("max_coast_s"));
+        assert!(
+            refused(TrackedPoseConfig {
+                measure_every: 0,
+                ..Default::default()
+            })
+            .contains("measure_every is 0")
+        );
+        assert!(
+            refused(TrackedPoseConfig {
+                max_coast_s: -1.0,
+                ..Default::default()
+            })
+            .contains("max_coast_s")
+        );
     }
 }

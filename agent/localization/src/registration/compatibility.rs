@@ -5,7 +5,8 @@ const LANES: usize = 16;
 
 /// Distances between all points, row by row, in single precision.
 pub(super) fn distances(points: &[[f32; 3]]) -> Vec<f32> {
-    let [x, y, z] = [0, 1, 2].map(|axis| points.iter().map(|point| point[axis]).collect::<Vec<f32>>());
+    let [x, y, z] =
+        [0, 1, 2].map(|axis| points.iter().map(|point| point[axis]).collect::<Vec<f32>>());
     let mut distances = Vec::with_capacity(points.len() * points.len());
     for &[px, py, pz] in points {
         distances.extend(x.iter().zip(&y).zip(&z).map(|((x, y), z)| {
@@ -25,18 +26,40 @@ pub(super) struct Bits {
 
 impl Bits {
     /// Sets a bit wherever an entry of a `size` by `size` matrix fulfils the condition.
-    pub(super) fn where_true(entries: &[f32], size: usize, condition: impl Fn(f32) -> bool) -> Self {
+    pub(super) fn where_true(
+        entries: &[f32],
+        size: usize,
+        condition: impl Fn(f32) -> bool,
+    ) -> Self {
         let word = |entries: &[f32]| {
-            entries.iter().enumerate().fold(0_u64, |word, (bit, &entry)| word | u64::from(condition(entry)) << bit)
+            entries
+                .iter()
+                .enumerate()
+                .fold(0_u64, |word, (bit, &entry)| {
+                    word | u64::from(condition(entry)) << bit
+                })
         };
-        let words = entries.chunks(size.max(1)).flat_map(|row| row.chunks(64)).map(word).collect();
-        Self { words, words_per_row: size.div_ceil(64) }
+        let words = entries
+            .chunks(size.max(1))
+            .flat_map(|row| row.chunks(64))
+            .map(word)
+            .collect();
+        Self {
+            words,
+            words_per_row: size.div_ceil(64),
+        }
     }
 
     /// Number of bits that two rows share; for a symmetric matrix an entry of its square.
     pub(super) fn common(&self, a: usize, b: usize) -> u32 {
-        let row = |index: usize| &self.words[index * self.words_per_row..(index + 1) * self.words_per_row];
-        row(a).iter().zip(row(b)).map(|(a, b)| (a & b).count_ones()).sum()
+        let row = |index: usize| {
+            &self.words[index * self.words_per_row..(index + 1) * self.words_per_row]
+        };
+        row(a)
+            .iter()
+            .zip(row(b))
+            .map(|(a, b)| (a & b).count_ones())
+            .sum()
     }
 }
 
@@ -46,9 +69,14 @@ pub(super) fn leading_eigenvectors(matrices: &[f32], size: usize, iterations: us
     let mut vectors = vec![1.0_f32; matrices.len() / size.max(1)];
     for _ in 0..iterations {
         let next: Vec<f32> = (matrices.chunks(size * size).zip(vectors.chunks(size)))
-            .flat_map(|(matrix, vector)| normalised(matrix.chunks(size).map(|row| dot(row, vector)).collect()))
+            .flat_map(|(matrix, vector)| {
+                normalised(matrix.chunks(size).map(|row| dot(row, vector)).collect())
+            })
             .collect();
-        let stands_still = next.iter().zip(&vectors).all(|(a, b)| (a - b).abs() <= 1e-8 + 1e-5 * b.abs());
+        let stands_still = next
+            .iter()
+            .zip(&vectors)
+            .all(|(a, b)| (a - b).abs() <= 1e-8 + 1e-5 * b.abs());
         vectors = next;
         if stands_still {
             break;
@@ -82,8 +110,12 @@ mod tests {
     #[test]
     fn common_bits_are_the_square_of_the_matrix() {
         let size = 130;
-        let entry = |row: usize, column: usize| f32::from(u8::from((row * column + row + column).is_multiple_of(3)));
-        let entries: Vec<f32> = (0..size * size).map(|place| entry(place / size, place % size)).collect();
+        let entry = |row: usize, column: usize| {
+            f32::from(u8::from((row * column + row + column).is_multiple_of(3)))
+        };
+        let entries: Vec<f32> = (0..size * size)
+            .map(|place| entry(place / size, place % size))
+            .collect();
         let bits = Bits::where_true(&entries, size, |entry| entry > 0.5);
         for (a, b) in [(0, 0), (1, 129), (64, 65)] {
             let square: f32 = (0..size).map(|k| entry(a, k) * entry(k, b)).sum();
@@ -96,12 +128,26 @@ mod tests {
         // Eigenvectors (1, 1) and (1, 2) belong to the largest eigenvalues.
         let matrices = [2.0, 1.0, 1.0, 2.0, 1.0, 2.0, 2.0, 4.0];
         let vectors = leading_eigenvectors(&matrices, 2, 50);
-        let expected = [0.5_f32.sqrt(), 0.5_f32.sqrt(), 0.2_f32.sqrt(), 0.8_f32.sqrt()];
-        assert!(vectors.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-4), "{vectors:?}");
+        let expected = [
+            0.5_f32.sqrt(),
+            0.5_f32.sqrt(),
+            0.2_f32.sqrt(),
+            0.8_f32.sqrt(),
+        ];
+        assert!(
+            vectors
+                .iter()
+                .zip(expected)
+                .all(|(a, b)| (a - b).abs() < 1e-4),
+            "{vectors:?}"
+        );
     }
 
     #[test]
     fn distances_are_symmetric() {
-        assert_eq!(distances(&[[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]), [0.0, 5.0, 5.0, 0.0]);
+        assert_eq!(
+            distances(&[[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]),
+            [0.0, 5.0, 5.0, 0.0]
+        );
     }
 }

@@ -61,8 +61,19 @@ impl PairMoments {
     /// # Errors
     /// See [`Self::fit`].
     pub fn fit_biased(&self, epsilon: f64) -> Result<Isometry3<f64>, Degenerate> {
-        let Self { weight, source, target, cross } = *self;
-        if !(weight.is_finite() && cross.iter().chain(source.iter()).chain(target.iter()).all(|sum| sum.is_finite())) {
+        let Self {
+            weight,
+            source,
+            target,
+            cross,
+        } = *self;
+        if !(weight.is_finite()
+            && cross
+                .iter()
+                .chain(source.iter())
+                .chain(target.iter())
+                .all(|sum| sum.is_finite()))
+        {
             return Err(Degenerate::NotFinite);
         }
         if weight <= 0.0 {
@@ -70,23 +81,35 @@ impl PairMoments {
         }
         let from = source / (weight + epsilon);
         let to = target / (weight + epsilon);
-        let covariance = cross - from * target.transpose() - source * to.transpose() + from * to.transpose() * weight;
+        let covariance = cross - from * target.transpose() - source * to.transpose()
+            + from * to.transpose() * weight;
         let rotation = rotation_of(&(covariance / weight))?;
         let translation = Translation3::from(to - rotation * from);
-        Ok(Isometry3::from_parts(translation, UnitQuaternion::from_rotation_matrix(&rotation)))
+        Ok(Isometry3::from_parts(
+            translation,
+            UnitQuaternion::from_rotation_matrix(&rotation),
+        ))
     }
 }
 
 impl<'a> Extend<(&'a Vector3<f64>, &'a Vector3<f64>, f64)> for PairMoments {
-    fn extend<T: IntoIterator<Item = (&'a Vector3<f64>, &'a Vector3<f64>, f64)>>(&mut self, pairs: T) {
-        pairs.into_iter().for_each(|(source_m, target_m, weight)| self.add(source_m, target_m, weight));
+    fn extend<T: IntoIterator<Item = (&'a Vector3<f64>, &'a Vector3<f64>, f64)>>(
+        &mut self,
+        pairs: T,
+    ) {
+        pairs
+            .into_iter()
+            .for_each(|(source_m, target_m, weight)| self.add(source_m, target_m, weight));
     }
 }
 
 /// The rotation `R` that maximises `trace(R H)` for the covariance `H` of source and target.
 fn rotation_of(covariance: &Matrix3<f64>) -> Result<Rotation3<f64>, Degenerate> {
-    let svd = SVD::try_new(*covariance, true, true, f64::EPSILON, MAX_SVD_ITERATIONS).ok_or(Degenerate::NotFinite)?;
-    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else { return Err(Degenerate::NotFinite) };
+    let svd = SVD::try_new(*covariance, true, true, f64::EPSILON, MAX_SVD_ITERATIONS)
+        .ok_or(Degenerate::NotFinite)?;
+    let (Some(u), Some(v_t)) = (svd.u, svd.v_t) else {
+        return Err(Degenerate::NotFinite);
+    };
     let mut order = [0, 1, 2];
     order.sort_by(|&a, &b| svd.singular_values[b].total_cmp(&svd.singular_values[a]));
     let [first, second, last] = order;
@@ -119,9 +142,16 @@ mod tests {
     }
 
     fn any_motion() -> impl Strategy<Value = Isometry3<f64>> {
-        (prop::array::uniform3(-1e5..1e5), prop::array::uniform3(-PI..PI)).prop_map(|(t, r)| {
-            Isometry3::from_parts(Translation3::from(t), UnitQuaternion::from_euler_angles(r[0], r[1], r[2]))
-        })
+        (
+            prop::array::uniform3(-1e5..1e5),
+            prop::array::uniform3(-PI..PI),
+        )
+            .prop_map(|(t, r)| {
+                Isometry3::from_parts(
+                    Translation3::from(t),
+                    UnitQuaternion::from_euler_angles(r[0], r[1], r[2]),
+                )
+            })
     }
 
     fn any_points() -> impl Strategy<Value = Vec<(Vector3<f64>, f64)>> {
@@ -152,40 +182,75 @@ mod tests {
 
     /// Corners of a box, no two edges alike.
     fn corners() -> [Vector3<f64>; 4] {
-        [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 1.0]].map(Vector3::from)
+        [
+            [0.0, 0.0, 0.0],
+            [4.0, 0.0, 0.0],
+            [0.0, 2.0, 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+        .map(Vector3::from)
     }
 
     #[test]
     fn a_mirror_image_still_gives_a_rotation() {
         let box_corners = (0..8).map(|corner| {
-            let side = |bit: usize, reach: f64| if corner >> bit & 1 == 0 { -reach } else { reach };
+            let side = |bit: usize, reach: f64| {
+                if corner >> bit & 1 == 0 {
+                    -reach
+                } else {
+                    reach
+                }
+            };
             Vector3::new(side(0, 4.0), side(1, 2.0), side(2, 1.0))
         });
-        let pairs: Vec<_> = box_corners.map(|p| (p, Vector3::new(p.x, p.y, -p.z), 1.0)).collect();
+        let pairs: Vec<_> = box_corners
+            .map(|p| (p, Vector3::new(p.x, p.y, -p.z), 1.0))
+            .collect();
         let motion = fit(&pairs).unwrap();
         assert!((motion.rotation.to_rotation_matrix().matrix().determinant() - 1.0).abs() < 1e-12);
         // The identity is best: the mirrored axis is the shortest.
-        assert!(motion.rotation.angle() < 1e-9, "{}", motion.rotation.angle());
+        assert!(
+            motion.rotation.angle() < 1e-9,
+            "{}",
+            motion.rotation.angle()
+        );
     }
 
     #[test]
     fn a_plane_is_enough_and_a_line_is_not() {
         let turn = UnitQuaternion::from_euler_angles(0.3, -0.2, 1.0);
-        let moved = |points: &[Vector3<f64>]| points.iter().map(|p| (*p, turn * p, 1.0)).collect::<Vec<_>>();
+        let moved = |points: &[Vector3<f64>]| {
+            points
+                .iter()
+                .map(|p| (*p, turn * p, 1.0))
+                .collect::<Vec<_>>()
+        };
         let plane = [[0.0, 0.0, 1.0], [4.0, 0.0, 1.0], [0.0, 2.0, 1.0]].map(Vector3::from);
         assert!((fit(&moved(&plane)).unwrap().rotation.angle_to(&turn)) < 1e-9);
         let line = [0.0, 1.0, 5.0].map(|x| Vector3::new(x, 2.0 * x, 1.0));
         assert!(matches!(fit(&moved(&line)), Err(Degenerate::Collinear(_))));
-        assert!(matches!(fit(&moved(&line[..1])), Err(Degenerate::Collinear(_))));
+        assert!(matches!(
+            fit(&moved(&line[..1])),
+            Err(Degenerate::Collinear(_))
+        ));
     }
 
     #[test]
     fn invalid_pairs_are_an_error() {
         let [a, b, c, _] = corners();
         assert_eq!(fit(&[]), Err(Degenerate::NoWeight(0.0)));
-        assert_eq!(fit(&[(a, a, 0.0), (b, b, 0.0)]), Err(Degenerate::NoWeight(0.0)));
-        assert_eq!(fit(&[(a, a, 1.0), (b, b, f64::NAN), (c, c, 1.0)]), Err(Degenerate::NotFinite));
-        assert_eq!(fit(&[(a, a, 1.0), (b, b * f64::MAX, 1.0), (c, c, 1.0)]), Err(Degenerate::NotFinite));
+        assert_eq!(
+            fit(&[(a, a, 0.0), (b, b, 0.0)]),
+            Err(Degenerate::NoWeight(0.0))
+        );
+        assert_eq!(
+            fit(&[(a, a, 1.0), (b, b, f64::NAN), (c, c, 1.0)]),
+            Err(Degenerate::NotFinite)
+        );
+        assert_eq!(
+            fit(&[(a, a, 1.0), (b, b * f64::MAX, 1.0), (c, c, 1.0)]),
+            Err(Degenerate::NotFinite)
+        );
     }
 
     #[test]

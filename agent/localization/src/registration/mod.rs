@@ -50,8 +50,12 @@ impl Correspondence {
     /// True if it can be used: finite coordinates and a positive finite weight.
     #[must_use]
     pub fn usable(&self) -> bool {
-        let bounded = |point: &[f32; 3]| point.iter().all(|coordinate| coordinate.abs() <= MAX_ABS_M);
-        self.weight > 0.0 && self.weight.is_finite() && bounded(&self.source_m) && bounded(&self.target_m)
+        let bounded =
+            |point: &[f32; 3]| point.iter().all(|coordinate| coordinate.abs() <= MAX_ABS_M);
+        self.weight > 0.0
+            && self.weight.is_finite()
+            && bounded(&self.source_m)
+            && bounded(&self.target_m)
     }
 
     /// Distance between the target and the transformed source, metres.
@@ -78,7 +82,11 @@ pub struct Registration {
 impl Registration {
     /// Counts the inliers of a motion within `threshold_m`.
     #[must_use]
-    pub fn judge(pairs: &[Correspondence], target_from_source: Isometry3<f64>, threshold_m: f64) -> Self {
+    pub fn judge(
+        pairs: &[Correspondence],
+        target_from_source: Isometry3<f64>,
+        threshold_m: f64,
+    ) -> Self {
         let mut inliers = Vec::new();
         let mut squares = 0.0;
         for (index, pair) in pairs.iter().enumerate().filter(|(_, pair)| pair.usable()) {
@@ -90,13 +98,22 @@ impl Registration {
         }
         let count = inliers.len().max(1) as f64;
         let inlier_ratio = inliers.len() as f64 / pairs.len().max(1) as f64;
-        Self { target_from_source, inliers, inlier_ratio, rms_m: (squares / count).sqrt() }
+        Self {
+            target_from_source,
+            inliers,
+            inlier_ratio,
+            rms_m: (squares / count).sqrt(),
+        }
     }
 
     /// Itself if there are at least `required` inliers.
     fn with_at_least(self, required: usize, given: usize) -> Result<Self, NoRegistration> {
         if self.inliers.len() < required {
-            return Err(NoRegistration::TooFewInliers { found: self.inliers.len(), required, given });
+            return Err(NoRegistration::TooFewInliers {
+                found: self.inliers.len(),
+                required,
+                given,
+            });
         }
         Ok(self)
     }
@@ -116,7 +133,9 @@ pub enum NoRegistration {
         required: usize,
     },
     /// Too few are inliers of any motion.
-    #[error("at most {found} of {given} correspondences agree on one motion, at least {required} must")]
+    #[error(
+        "at most {found} of {given} correspondences agree on one motion, at least {required} must"
+    )]
     TooFewInliers {
         /// Largest number of inliers.
         found: usize,
@@ -151,7 +170,11 @@ impl NoRegistration {
 fn check_enough(pairs: &[Correspondence], required: usize) -> Result<(), NoRegistration> {
     let usable = pairs.iter().filter(|pair| pair.usable()).count();
     if usable < required {
-        return Err(NoRegistration::TooFewCorrespondences { usable, given: pairs.len(), required });
+        return Err(NoRegistration::TooFewCorrespondences {
+            usable,
+            given: pairs.len(),
+            required,
+        });
     }
     Ok(())
 }

@@ -49,17 +49,24 @@ impl Pairs {
         usable.shuffle(random);
         usable.sort_by(|a, b| b.weight.total_cmp(&a.weight));
         let mean = |axis: usize| {
-            usable.iter().map(|pair| f64::from(pair.target_m[axis])).sum::<f64>() / usable.len().max(1) as f64
+            usable
+                .iter()
+                .map(|pair| f64::from(pair.target_m[axis]))
+                .sum::<f64>()
+                / usable.len().max(1) as f64
         };
         let origin = Vector3::new(mean(0), mean(1), mean(2));
         let column = |value: &dyn Fn(&Correspondence) -> f32| -> Column {
-            let padded =
-                |block: &[&Correspondence]| std::array::from_fn(|lane| block.get(lane).map_or(0.0, |p| value(p)));
+            let padded = |block: &[&Correspondence]| {
+                std::array::from_fn(|lane| block.get(lane).map_or(0.0, |p| value(p)))
+            };
             usable.chunks(LANES).map(padded).collect()
         };
         Self {
             source: std::array::from_fn(|axis| column(&|pair| pair.source_m[axis])),
-            target: std::array::from_fn(|axis| column(&|pair| (f64::from(pair.target_m[axis]) - origin[axis]) as f32)),
+            target: std::array::from_fn(|axis| {
+                column(&|pair| (f64::from(pair.target_m[axis]) - origin[axis]) as f32)
+            }),
             weight: column(&|pair| pair.weight),
             count: usable.len(),
             origin,
@@ -79,16 +86,24 @@ impl Pairs {
 
     pub(super) fn source(&self, index: usize) -> Vector3<f64> {
         let (block, lane) = (index / LANES, index % LANES);
-        Vector3::from(std::array::from_fn::<_, 3, _>(|axis| f64::from(self.source[axis][block][lane])))
+        Vector3::from(std::array::from_fn::<_, 3, _>(|axis| {
+            f64::from(self.source[axis][block][lane])
+        }))
     }
 
     pub(super) fn target(&self, index: usize) -> Vector3<f64> {
         let (block, lane) = (index / LANES, index % LANES);
-        Vector3::from(std::array::from_fn::<_, 3, _>(|axis| f64::from(self.target[axis][block][lane])))
+        Vector3::from(std::array::from_fn::<_, 3, _>(|axis| {
+            f64::from(self.target[axis][block][lane])
+        }))
     }
 
     /// Source, target and weight of the pairs within `radius_m` of their positions under `motion`.
-    pub(super) fn near(&self, motion: &Isometry3<f64>, radius_m: f64) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
+    pub(super) fn near(
+        &self,
+        motion: &Isometry3<f64>,
+        radius_m: f64,
+    ) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
         let model = Model::new(motion);
         let limit = (radius_m * radius_m) as f32;
         let mut near = Vec::with_capacity(self.count);
@@ -97,7 +112,11 @@ impl Pairs {
             for (lane, squared) in squared.into_iter().enumerate() {
                 let index = block * LANES + lane;
                 if squared < limit && index < self.count {
-                    near.push((self.source(index), self.target(index), f64::from(self.weight[block][lane])));
+                    near.push((
+                        self.source(index),
+                        self.target(index),
+                        f64::from(self.weight[block][lane]),
+                    ));
                 }
             }
         }
@@ -105,7 +124,12 @@ impl Pairs {
     }
 
     /// Score of a motion, or `None` as soon as `best` is clearly better.
-    pub(super) fn gain(&self, motion: &Isometry3<f64>, threshold_m: f64, best: &Gain) -> Option<Gain> {
+    pub(super) fn gain(
+        &self,
+        motion: &Isometry3<f64>,
+        threshold_m: f64,
+        best: &Gain,
+    ) -> Option<Gain> {
         let model = Model::new(motion);
         let scale = (1.0 / (threshold_m * threshold_m)) as f32;
         let blocks = self.weight.len();
@@ -114,7 +138,10 @@ impl Pairs {
             return None;
         }
         let rest = self.block_gain(&model, scale, PREFIX_BLOCKS.min(blocks)..blocks);
-        Some(Gain { prefix, total: prefix + rest })
+        Some(Gain {
+            prefix,
+            total: prefix + rest,
+        })
     }
 
     /// Sum of `w max(0, 1 - r^2 / threshold^2)` over some blocks.
@@ -134,12 +161,22 @@ impl Pairs {
 
     #[inline]
     fn squared_residuals(&self, model: &Model, block: usize) -> [f32; LANES] {
-        let [x, y, z] = [&self.source[0][block], &self.source[1][block], &self.source[2][block]];
+        let [x, y, z] = [
+            &self.source[0][block],
+            &self.source[1][block],
+            &self.source[2][block],
+        ];
         let mut squared = [0.0; LANES];
-        for ((row, shift), target) in model.rotation.iter().zip(model.translation).zip(&self.target) {
+        for ((row, shift), target) in model
+            .rotation
+            .iter()
+            .zip(model.translation)
+            .zip(&self.target)
+        {
             let target = &target[block];
             for lane in 0..LANES {
-                let difference = row[0] * x[lane] + row[1] * y[lane] + row[2] * z[lane] + shift - target[lane];
+                let difference =
+                    row[0] * x[lane] + row[1] * y[lane] + row[2] * z[lane] + shift - target[lane];
                 squared[lane] += difference * difference;
             }
         }
@@ -157,7 +194,9 @@ impl Model {
     fn new(motion: &Isometry3<f64>) -> Self {
         let rotation: Matrix3<f64> = motion.rotation.to_rotation_matrix().into_inner();
         Self {
-            rotation: std::array::from_fn(|row| std::array::from_fn(|column| rotation[(row, column)] as f32)),
+            rotation: std::array::from_fn(|row| {
+                std::array::from_fn(|column| rotation[(row, column)] as f32)
+            }),
             translation: std::array::from_fn(|axis| motion.translation.vector[axis] as f32),
         }
     }
@@ -172,7 +211,13 @@ mod tests {
 
     #[test]
     fn the_gain_is_that_of_the_definition() {
-        let problem = Problem { count: 1001, outliers: 0.4, noise_m: 0.5, ..Problem::default() }.drawn(3);
+        let problem = Problem {
+            count: 1001,
+            outliers: 0.4,
+            noise_m: 0.5,
+            ..Problem::default()
+        }
+        .drawn(3);
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let pairs = Pairs::new(&problem.pairs, &mut random);
         assert_eq!(pairs.len(), 1001);
@@ -180,19 +225,41 @@ mod tests {
         local.translation.vector -= pairs.origin;
         let gain = pairs.gain(&local, 1.5, &Gain::default()).unwrap();
         let expected: f64 = (problem.pairs.iter())
-            .map(|pair| f64::from(pair.weight) * (1.0 - (pair.residual_m(&problem.truth) / 1.5).powi(2)).max(0.0))
+            .map(|pair| {
+                f64::from(pair.weight)
+                    * (1.0 - (pair.residual_m(&problem.truth) / 1.5).powi(2)).max(0.0)
+            })
             .sum();
-        assert!((f64::from(gain.total) / expected - 1.0).abs() < 1e-3, "{gain:?} {expected}");
-        let inliers = problem.pairs.iter().filter(|pair| pair.residual_m(&problem.truth) < 1.5).count();
+        assert!(
+            (f64::from(gain.total) / expected - 1.0).abs() < 1e-3,
+            "{gain:?} {expected}"
+        );
+        let inliers = problem
+            .pairs
+            .iter()
+            .filter(|pair| pair.residual_m(&problem.truth) < 1.5)
+            .count();
         assert!(pairs.near(&local, 1.5).len().abs_diff(inliers) <= 1);
-        assert!(pairs.gain(&Isometry3::translation(0.0, 0.0, 900.0), 1.5, &gain).is_none());
+        assert!(
+            pairs
+                .gain(&Isometry3::translation(0.0, 0.0, 900.0), 1.5, &gain)
+                .is_none()
+        );
     }
 
     #[test]
     fn unusable_pairs_are_ignored() {
-        let good = Correspondence { source_m: [0.0; 3], target_m: [1.0; 3], weight: 0.5 };
-        let bad = [f32::NAN, f32::INFINITY, 1e30].map(|x| Correspondence { source_m: [x, 0.0, 0.0], ..good });
-        let heavy = [f32::NAN, f32::INFINITY, 0.0, -1.0].map(|weight| Correspondence { weight, ..good });
+        let good = Correspondence {
+            source_m: [0.0; 3],
+            target_m: [1.0; 3],
+            weight: 0.5,
+        };
+        let bad = [f32::NAN, f32::INFINITY, 1e30].map(|x| Correspondence {
+            source_m: [x, 0.0, 0.0],
+            ..good
+        });
+        let heavy =
+            [f32::NAN, f32::INFINITY, 0.0, -1.0].map(|weight| Correspondence { weight, ..good });
         let all = [&bad[..], &heavy[..], &[good]].concat();
         let mut random = ChaCha8Rng::seed_from_u64(1);
         assert_eq!(Pairs::new(&all, &mut random).len(), 1);

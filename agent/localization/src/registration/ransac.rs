@@ -137,23 +137,55 @@ impl RansacConfig {
 ///
 /// # Errors
 /// [`NoRegistration`] when there are too few correspondences or too few inliers.
-pub fn solve(correspondences: &[Correspondence], config: &RansacConfig) -> Result<Registration, NoRegistration> {
+pub fn solve(
+    correspondences: &[Correspondence],
+    config: &RansacConfig,
+) -> Result<Registration, NoRegistration> {
     let required = config.min_inliers.max(3);
     check_enough(correspondences, required)?;
     let mut random = ChaCha8Rng::seed_from_u64(config.seed);
     let pairs = Pairs::new(correspondences, &mut random);
-    let Some(best) = Search { pairs: &pairs, config, best: None }.run(&mut random) else {
-        return Err(NoRegistration::TooFewInliers { found: 0, required, given: correspondences.len() });
+    let Some(best) = Search {
+        pairs: &pairs,
+        config,
+        best: None,
+    }
+    .run(&mut random) else {
+        return Err(NoRegistration::TooFewInliers {
+            found: 0,
+            required,
+            given: correspondences.len(),
+        });
     };
     let near = pairs.near(&best, refine::CUTOFF_SCALES * config.refine_scale_m);
     if near.len() < required {
-        return Err(NoRegistration::TooFewInliers { found: near.len(), required, given: correspondences.len() });
+        return Err(NoRegistration::TooFewInliers {
+            found: near.len(),
+            required,
+            given: correspondences.len(),
+        });
     }
-    let refined = refine::converge(&near.iter().copied(), &best, config.refine_scale_m, FINAL_STEPS)
-        .map_err(|reason| NoRegistration::Degenerate { inliers: near.len(), reason })?;
-    let motion = if config.allows_tilt_of(&refined) { refined } else { best };
-    Registration::judge(correspondences, pairs.to_target_frame(&motion), config.inlier_threshold_m)
-        .with_at_least(required, correspondences.len())
+    let refined = refine::converge(
+        &near.iter().copied(),
+        &best,
+        config.refine_scale_m,
+        FINAL_STEPS,
+    )
+    .map_err(|reason| NoRegistration::Degenerate {
+        inliers: near.len(),
+        reason,
+    })?;
+    let motion = if config.allows_tilt_of(&refined) {
+        refined
+    } else {
+        best
+    };
+    Registration::judge(
+        correspondences,
+        pairs.to_target_frame(&motion),
+        config.inlier_threshold_m,
+    )
+    .with_at_least(required, correspondences.len())
 }
 
 /// The draws and the best motion so far.
@@ -172,12 +204,18 @@ impl Search<'_> {
         let mut draw = 0;
         while draw < enough {
             let drawn = match self.config.minimal {
-                MinimalSolver::UprightTwoPoint => sampling::two_points(self.pairs, draw, &test, random),
-                MinimalSolver::ThreePoint => sampling::three_points(self.pairs, draw, &test, random),
+                MinimalSolver::UprightTwoPoint => {
+                    sampling::two_points(self.pairs, draw, &test, random)
+                }
+                MinimalSolver::ThreePoint => {
+                    sampling::three_points(self.pairs, draw, &test, random)
+                }
             };
             draw += 1;
             let Some(motion) = drawn else { continue };
-            let Some(gain) = self.gain(&motion, &best_drawn) else { continue };
+            let Some(gain) = self.gain(&motion, &best_drawn) else {
+                continue;
+            };
             if gain.total > best_drawn.total {
                 best_drawn = gain;
                 if self.optimise(&motion, gain) {
@@ -189,7 +227,8 @@ impl Search<'_> {
     }
 
     fn gain(&self, motion: &Isometry3<f64>, best: &Gain) -> Option<Gain> {
-        self.pairs.gain(motion, self.config.inlier_threshold_m, best)
+        self.pairs
+            .gain(motion, self.config.inlier_threshold_m, best)
     }
 
     /// Optimises a motion on the pairs near it; true if it became the new best.
@@ -201,7 +240,9 @@ impl Search<'_> {
             .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
             .filter(|(optimised, _)| optimised.total > gain.total);
         let candidate = optimised.unwrap_or((gain, *motion));
-        let better = self.best.is_none_or(|(best, _)| candidate.0.total > best.total);
+        let better = self
+            .best
+            .is_none_or(|(best, _)| candidate.0.total > best.total);
         if better {
             self.best = Some(candidate);
         }
@@ -209,7 +250,11 @@ impl Search<'_> {
     }
 
     fn inliers(&self) -> usize {
-        self.best.map_or(0, |(_, motion)| self.pairs.near(&motion, self.config.inlier_threshold_m).len())
+        self.best.map_or(0, |(_, motion)| {
+            self.pairs
+                .near(&motion, self.config.inlier_threshold_m)
+                .len()
+        })
     }
 }
 
@@ -250,35 +295,77 @@ mod tests {
 
     #[test]
     fn any_rotation_is_found_where_it_is_allowed() {
-        let mut problem = Problem { count: 500, outliers: 0.5, noise_m: 0.05, ..Problem::default() };
-        problem = Problem { tilt_rad: 1.5, ..problem }.drawn(11);
+        let mut problem = Problem {
+            count: 500,
+            outliers: 0.5,
+            noise_m: 0.05,
+            ..Problem::default()
+        };
+        problem = Problem {
+            tilt_rad: 1.5,
+            ..problem
+        }
+        .drawn(11);
         let found = solve(&problem.pairs, &RansacConfig::any_rotation(0.5)).unwrap();
         let (metres, degrees) = problem.error(&found.target_from_source);
-        assert!(metres < 0.05 && degrees < 0.05, "{metres} m {degrees} degrees");
-        let tilted = solve(&problem.pairs, &RansacConfig::default()).map(|found| found.inlier_ratio);
-        assert!(tilted.as_ref().map_or(true, |&ratio| ratio < 0.1), "{tilted:?}");
+        assert!(
+            metres < 0.05 && degrees < 0.05,
+            "{metres} m {degrees} degrees"
+        );
+        let tilted =
+            solve(&problem.pairs, &RansacConfig::default()).map(|found| found.inlier_ratio);
+        assert!(
+            tilted.as_ref().map_or(true, |&ratio| ratio < 0.1),
+            "{tilted:?}"
+        );
     }
 
     #[test]
     fn eight_in_a_hundred_suffice() {
         for seed in 0..20 {
-            let problem = Problem { count: 1500, outliers: 0.92, noise_m: 0.5, ..Problem::default() }.drawn(seed);
+            let problem = Problem {
+                count: 1500,
+                outliers: 0.92,
+                noise_m: 0.5,
+                ..Problem::default()
+            }
+            .drawn(seed);
             let found = solve(&problem.pairs, &RansacConfig::default()).unwrap();
             let (metres, degrees) = problem.error(&found.target_from_source);
-            assert!(metres < 0.6 && degrees < 0.6, "seed {seed}: {metres} m {degrees} degrees");
+            assert!(
+                metres < 0.6 && degrees < 0.6,
+                "seed {seed}: {metres} m {degrees} degrees"
+            );
         }
     }
 
     #[test]
     fn the_same_seed_gives_the_same_bits() {
-        let problem = Problem { count: 900, outliers: 0.7, noise_m: 0.5, ..Problem::default() }.drawn(4);
-        let config = RansacConfig { seed: 9, ..RansacConfig::default() };
-        assert_eq!(solve(&problem.pairs, &config), solve(&problem.pairs, &config));
+        let problem = Problem {
+            count: 900,
+            outliers: 0.7,
+            noise_m: 0.5,
+            ..Problem::default()
+        }
+        .drawn(4);
+        let config = RansacConfig {
+            seed: 9,
+            ..RansacConfig::default()
+        };
+        assert_eq!(
+            solve(&problem.pairs, &config),
+            solve(&problem.pairs, &config)
+        );
     }
 
     #[test]
     fn positions_far_from_the_origin_keep_precision() {
-        let mut problem = Problem { count: 400, noise_m: 0.02, ..Problem::default() }.drawn(5);
+        let mut problem = Problem {
+            count: 400,
+            noise_m: 0.02,
+            ..Problem::default()
+        }
+        .drawn(5);
         let far = nalgebra::Vector3::new(16384.0, -8192.0, 128.0);
         problem.truth.translation.vector += far;
         for pair in &mut problem.pairs {
@@ -292,40 +379,107 @@ mod tests {
     fn thin_evidence_is_no_pose() {
         let config = RansacConfig::default();
         let none = solve(&[], &config).unwrap_err();
-        assert_eq!(none, NoRegistration::TooFewCorrespondences { usable: 0, given: 0, required: 12 });
-        let nonsense = Problem { count: 200, outliers: 1.0, ..Problem::default() }.drawn(6);
+        assert_eq!(
+            none,
+            NoRegistration::TooFewCorrespondences {
+                usable: 0,
+                given: 0,
+                required: 12
+            }
+        );
+        let nonsense = Problem {
+            count: 200,
+            outliers: 1.0,
+            ..Problem::default()
+        }
+        .drawn(6);
         let few = solve(&nonsense.pairs, &config).unwrap_err();
-        assert!(matches!(few, NoRegistration::TooFewInliers { found: 0..12, required: 12, given: 200 }), "{few}");
+        assert!(
+            matches!(
+                few,
+                NoRegistration::TooFewInliers {
+                    found: 0..12,
+                    required: 12,
+                    given: 200
+                }
+            ),
+            "{few}"
+        );
         // All at one position: any motion is unconstrained.
-        let pair = Correspondence { source_m: [1.0; 3], target_m: [2.0; 3], weight: 1.0 };
+        let pair = Correspondence {
+            source_m: [1.0; 3],
+            target_m: [2.0; 3],
+            weight: 1.0,
+        };
         assert!(solve(&[pair; 40], &config).is_err());
         // On a line: the rotation about it is unconstrained.
-        let line: Vec<_> = (0..40).map(|k| Correspondence { source_m: [k as f32 * 2.0, 0.0, 0.0], ..pair }).collect();
-        let line: Vec<_> = line.iter().map(|p| Correspondence { target_m: p.source_m, ..*p }).collect();
-        assert!(matches!(solve(&line, &config), Err(NoRegistration::Degenerate { .. })));
+        let line: Vec<_> = (0..40)
+            .map(|k| Correspondence {
+                source_m: [k as f32 * 2.0, 0.0, 0.0],
+                ..pair
+            })
+            .collect();
+        let line: Vec<_> = line
+            .iter()
+            .map(|p| Correspondence {
+                target_m: p.source_m,
+                ..*p
+            })
+            .collect();
+        assert!(matches!(
+            solve(&line, &config),
+            Err(NoRegistration::Degenerate { .. })
+        ));
     }
 
     #[test]
     fn a_mirrored_sweep_is_not_registered_as_a_whole() {
-        let mut problem = Problem { count: 400, ..Problem::default() }.drawn(8);
-        problem.pairs.iter_mut().for_each(|pair| pair.source_m[1] = -pair.source_m[1]);
+        let mut problem = Problem {
+            count: 400,
+            ..Problem::default()
+        }
+        .drawn(8);
+        problem
+            .pairs
+            .iter_mut()
+            .for_each(|pair| pair.source_m[1] = -pair.source_m[1]);
         let found = solve(&problem.pairs, &RansacConfig::default());
-        assert!(found.as_ref().map_or(true, |found| found.inlier_ratio < 0.2), "{found:?}");
+        assert!(
+            found
+                .as_ref()
+                .map_or(true, |found| found.inlier_ratio < 0.2),
+            "{found:?}"
+        );
     }
 
     #[test]
     fn upside_down_is_no_vehicle() {
         let flip = UnitQuaternion::from_euler_angles(std::f64::consts::PI, 0.0, 0.0);
         let motion = Isometry3::from_parts(Translation3::new(5.0, 6.0, 7.0), flip);
-        let problem = Problem { count: 200, ..Problem::default() }.drawn(9);
+        let problem = Problem {
+            count: 200,
+            ..Problem::default()
+        }
+        .drawn(9);
         let pairs: Vec<_> = (problem.pairs.iter())
             .map(|pair| {
                 let target = motion * nalgebra::Point3::from(pair.source_m.map(f64::from));
-                Correspondence { target_m: target.coords.map(|x| x as f32).into(), ..*pair }
+                Correspondence {
+                    target_m: target.coords.map(|x| x as f32).into(),
+                    ..*pair
+                }
             })
             .collect();
-        let config = RansacConfig { minimal: MinimalSolver::ThreePoint, ..RansacConfig::default() };
+        let config = RansacConfig {
+            minimal: MinimalSolver::ThreePoint,
+            ..RansacConfig::default()
+        };
         assert!(solve(&pairs, &config).map_or(true, |found| found.inlier_ratio < 0.2));
-        assert!(solve(&pairs, &RansacConfig::any_rotation(1.0)).unwrap().inlier_ratio > 0.99);
+        assert!(
+            solve(&pairs, &RansacConfig::any_rotation(1.0))
+                .unwrap()
+                .inlier_ratio
+                > 0.99
+        );
     }
 }

@@ -64,7 +64,11 @@ where
 #[must_use]
 pub(crate) fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
     let scaled = residual_m / scale_m;
-    if scaled < CUTOFF_SCALES { (1.0 + scaled * scaled).powi(-2) } else { 0.0 }
+    if scaled < CUTOFF_SCALES {
+        (1.0 + scaled * scaled).powi(-2)
+    } else {
+        0.0
+    }
 }
 
 /// One weighted fit with the weights of the residuals of `motion`.
@@ -94,24 +98,40 @@ mod tests {
 
     fn pairs(problem: &Problem) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
         let vector = |point: [f32; 3]| Vector3::from(point.map(f64::from));
-        problem.pairs.iter().map(|pair| (vector(pair.source_m), vector(pair.target_m), 1.0)).collect()
+        problem
+            .pairs
+            .iter()
+            .map(|pair| (vector(pair.source_m), vector(pair.target_m), 1.0))
+            .collect()
     }
 
     #[test]
     fn a_coarse_motion_is_refined_among_outliers() {
-        let problem = Problem { count: 600, outliers: 0.5, noise_m: 0.2, ..Problem::default() }.drawn(1);
+        let problem = Problem {
+            count: 600,
+            outliers: 0.5,
+            noise_m: 0.2,
+            ..Problem::default()
+        }
+        .drawn(1);
         let off = Isometry3::new(Vector3::new(1.2, -0.8, 0.5), Vector3::new(0.01, 0.0, 0.04));
         let coarse = problem.truth * off;
         let refined = reweighted(&pairs(&problem), &coarse, [4.0, 2.0, 1.0]).unwrap();
         let refined = converge(&pairs(&problem), &refined, 0.5, 20).unwrap();
         let (metres, degrees) = problem.error(&refined);
-        assert!(metres < 0.06 && degrees < 0.1, "{metres} m, {degrees} degrees");
+        assert!(
+            metres < 0.06 && degrees < 0.1,
+            "{metres} m, {degrees} degrees"
+        );
     }
 
     #[test]
     fn no_pair_near_is_an_error() {
         let problem = Problem::default().drawn(2);
         let elsewhere = Isometry3::translation(0.0, 0.0, 1e4);
-        assert_eq!(converge(&pairs(&problem), &elsewhere, 1.0, 5), Err(Degenerate::NoWeight(0.0)));
+        assert_eq!(
+            converge(&pairs(&problem), &elsewhere, 1.0, 5),
+            Err(Degenerate::NoWeight(0.0))
+        );
     }
 }

@@ -66,7 +66,11 @@ pub(super) fn two_points(
         return None;
     }
     let yaw_rad = to.y.atan2(to.x) - from.y.atan2(from.x);
-    Some(motion(Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad), &source, &target))
+    Some(motion(
+        Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad),
+        &source,
+        &target,
+    ))
 }
 
 /// The motion with this rotation that maps one centre to the other.
@@ -76,7 +80,10 @@ fn motion<const N: usize>(
     target: &[Vector3<f64>; N],
 ) -> Isometry3<f64> {
     let [from, to] = [source, target].map(|points| points.iter().sum::<Vector3<f64>>() / N as f64);
-    Isometry3::from_parts(Translation3::from(to - rotation * from), UnitQuaternion::from_rotation_matrix(&rotation))
+    Isometry3::from_parts(
+        Translation3::from(to - rotation * from),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    )
 }
 
 /// Right-handed axes of a triangle, as columns; `None` for a degenerate one.
@@ -89,7 +96,11 @@ fn axes(points: &[Vector3<f64>; 3]) -> Option<Matrix3<f64>> {
         return None;
     }
     let normal = normal.try_normalize(1e-9)?;
-    Some(Matrix3::from_columns(&[first, normal.cross(&first), normal]))
+    Some(Matrix3::from_columns(&[
+        first,
+        normal.cross(&first),
+        normal,
+    ]))
 }
 
 /// `N` distinct indices below `count`; the caller ensures that there are at least `N`.
@@ -117,16 +128,29 @@ mod tests {
 
     #[test]
     fn clean_samples_fix_the_motion() {
-        let problem = Problem { tilt_rad: 0.0, ..Problem::default() }.drawn(7);
+        let problem = Problem {
+            tilt_rad: 0.0,
+            ..Problem::default()
+        }
+        .drawn(7);
         let mut random = ChaCha8Rng::seed_from_u64(2);
         let pairs = Pairs::new(&problem.pairs, &mut random);
-        let test = SampleTest { min_edge_m: 6.0, edge_tolerance_m: 0.1, max_tilt_rad: 0.2 };
+        let test = SampleTest {
+            min_edge_m: 6.0,
+            edge_tolerance_m: 0.1,
+            max_tilt_rad: 0.2,
+        };
         for solver in [two_points, three_points] {
-            let found: Vec<_> = (0..40).filter_map(|draw| solver(&pairs, draw, &test, &mut random)).collect();
+            let found: Vec<_> = (0..40)
+                .filter_map(|draw| solver(&pairs, draw, &test, &mut random))
+                .collect();
             assert!(found.len() > 10);
             for motion in found {
                 let (metres, degrees) = problem.error(&pairs.to_target_frame(&motion));
-                assert!(metres < 0.05 && degrees < 0.05, "{metres} m {degrees} degrees");
+                assert!(
+                    metres < 0.05 && degrees < 0.05,
+                    "{metres} m {degrees} degrees"
+                );
             }
         }
     }

@@ -57,8 +57,10 @@ impl Sc2PcrConfig {
     /// The same for correspondences with `factor` times the error.
     #[must_use]
     pub fn wider(&self, factor: f64) -> Self {
-        let refinement =
-            self.refinement.map(|refinement| Refinement { threshold_m: factor * refinement.threshold_m, ..refinement });
+        let refinement = self.refinement.map(|refinement| Refinement {
+            threshold_m: factor * refinement.threshold_m,
+            ..refinement
+        });
         Self {
             inlier_threshold_m: factor * self.inlier_threshold_m,
             distance_threshold_m: factor * self.distance_threshold_m,
@@ -80,7 +82,10 @@ impl Default for Sc2PcrConfig {
             max_correspondences: 1000,
             first_set: 40,
             second_set: 20,
-            refinement: Some(Refinement { threshold_m: 1.5, rounds: 20 }),
+            refinement: Some(Refinement {
+                threshold_m: 1.5,
+                rounds: 20,
+            }),
             min_inliers: 12,
         }
     }
@@ -104,10 +109,17 @@ pub struct Consensus {
 ///
 /// # Errors
 /// [`NoRegistration`] when there are too few correspondences or too few inliers.
-pub fn solve(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> Result<Registration, NoRegistration> {
+pub fn solve(
+    correspondences: &[Correspondence],
+    config: &Sc2PcrConfig,
+) -> Result<Registration, NoRegistration> {
     let required = config.min_inliers.max(SMALL_SET);
     check_enough(correspondences, required)?;
-    let mut trusted: Vec<Correspondence> = correspondences.iter().copied().filter(Correspondence::usable).collect();
+    let mut trusted: Vec<Correspondence> = correspondences
+        .iter()
+        .copied()
+        .filter(Correspondence::usable)
+        .collect();
     trusted.sort_by(|a, b| b.weight.total_cmp(&a.weight));
     trusted.truncate(config.max_correspondences.max(required));
     let found = consensus(&trusted, config)?;
@@ -124,9 +136,16 @@ pub fn solve(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> Resul
 ///
 /// # Errors
 /// [`NoRegistration`] when there are fewer than four correspondences or no seed constrains a motion.
-pub fn consensus(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> Result<Consensus, NoRegistration> {
+pub fn consensus(
+    correspondences: &[Correspondence],
+    config: &Sc2PcrConfig,
+) -> Result<Consensus, NoRegistration> {
     check_enough(correspondences, SMALL_SET)?;
-    let usable: Vec<_> = correspondences.iter().take(config.max_correspondences).filter(|p| p.usable()).collect();
+    let usable: Vec<_> = correspondences
+        .iter()
+        .take(config.max_correspondences)
+        .filter(|p| p.usable())
+        .collect();
     let points = Points {
         source: usable.iter().map(|pair| pair.source_m).collect(),
         target: usable.iter().map(|pair| pair.target_m).collect(),
@@ -136,7 +155,10 @@ pub fn consensus(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> R
     let source_distances = distances(&points.source);
     let changes = changes(&source_distances, &distances(&points.target));
 
-    let first_order: Vec<f32> = changes.iter().map(|&change| soft(change, threshold)).collect();
+    let first_order: Vec<f32> = changes
+        .iter()
+        .map(|&change| soft(change, threshold))
+        .collect();
     let confidence = leading_eigenvectors(&first_order, count, config.power_iterations);
     let seeds = pick_seeds(&source_distances, &confidence, config);
 
@@ -144,21 +166,43 @@ pub fn consensus(correspondences: &[Correspondence], config: &Sc2PcrConfig) -> R
     let sets: Vec<Vec<usize>> = (seeds.iter())
         .map(|&seed| {
             let row = &changes[seed * count..(seed + 1) * count];
-            let score = |other: usize| if row[other] < threshold { tight.common(seed, other) } else { 0 };
+            let score = |other: usize| {
+                if row[other] < threshold {
+                    tight.common(seed, other)
+                } else {
+                    0
+                }
+            };
             points.consensus_set(&(0..count).map(score).collect::<Vec<u32>>(), config)
         })
         .collect();
     let best = points.best_fit(&sets, config);
     let Some((target_from_source, inlier_count)) = best else {
-        return Err(NoRegistration::TooFewInliers { found: 0, required: SMALL_SET, given: correspondences.len() });
+        return Err(NoRegistration::TooFewInliers {
+            found: 0,
+            required: SMALL_SET,
+            given: correspondences.len(),
+        });
     };
-    Ok(Consensus { confidence, seeds, target_from_source, inlier_count })
+    Ok(Consensus {
+        confidence,
+        seeds,
+        target_from_source,
+        inlier_count,
+    })
 }
 
 /// Re-fits to the inliers, weighted by `1 / (1 + (r/threshold)^2)`, until their number stays the same.
 #[must_use]
-pub fn refine(pairs: &[Correspondence], start: &Isometry3<f64>, refinement: &Refinement) -> Isometry3<f64> {
-    let Refinement { threshold_m, rounds } = *refinement;
+pub fn refine(
+    pairs: &[Correspondence],
+    start: &Isometry3<f64>,
+    refinement: &Refinement,
+) -> Isometry3<f64> {
+    let Refinement {
+        threshold_m,
+        rounds,
+    } = *refinement;
     let mut motion = *start;
     let mut previous = 0;
     for _ in 0..rounds {
@@ -186,7 +230,11 @@ pub fn refine(pairs: &[Correspondence], start: &Isometry3<f64>, refinement: &Ref
 
 /// Absolute differences of two sets of distances.
 fn changes(source: &[f32], target: &[f32]) -> Vec<f32> {
-    source.iter().zip(target).map(|(a, b)| (a - b).abs()).collect()
+    source
+        .iter()
+        .zip(target)
+        .map(|(a, b)| (a - b).abs())
+        .collect()
 }
 
 /// Compatibility between 0 and 1 of two correspondences whose distance changes by this much.
@@ -200,7 +248,8 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
     let radius = config.seed_radius_m as f32;
     let strength = |index: usize| {
         let row = &source_distances[index * count..(index + 1) * count];
-        let is_maximum = (row.iter().zip(confidence)).all(|(&far, &other)| far >= radius || confidence[index] >= other);
+        let is_maximum = (row.iter().zip(confidence))
+            .all(|(&far, &other)| far >= radius || confidence[index] >= other);
         if is_maximum { confidence[index] } else { 0.0 }
     };
     let strengths: Vec<f32> = (0..count).map(strength).collect();
@@ -212,7 +261,11 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
 /// Indices in descending order of value; equal values keep their order.
 fn descending<T: PartialOrd>(values: &[T]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
-    order.sort_by(|&a, &b| values[b].partial_cmp(&values[a]).unwrap_or(std::cmp::Ordering::Equal));
+    order.sort_by(|&a, &b| {
+        values[b]
+            .partial_cmp(&values[a])
+            .unwrap_or(std::cmp::Ordering::Equal)
+    });
     order
 }
 
@@ -242,22 +295,39 @@ impl Points {
         let size = set.len();
         let compatible = Bits::where_true(&changes, size, |change| change < threshold);
         let local: Vec<u32> = (0..size).map(|other| compatible.common(0, other)).collect();
-        descending(&local).into_iter().take(second).map(|place| set[place]).collect()
+        descending(&local)
+            .into_iter()
+            .take(second)
+            .map(|place| set[place])
+            .collect()
     }
 
     /// The fit with most inliers, and their number; the first of equal ones.
-    fn best_fit(&self, sets: &[Vec<usize>], config: &Sc2PcrConfig) -> Option<(Isometry3<f64>, usize)> {
+    fn best_fit(
+        &self,
+        sets: &[Vec<usize>],
+        config: &Sc2PcrConfig,
+    ) -> Option<(Isometry3<f64>, usize)> {
         let size = sets.first()?.len();
-        let matrices: Vec<f32> = sets.iter().flat_map(|set| self.soft_compatibility(set, config)).collect();
+        let matrices: Vec<f32> = sets
+            .iter()
+            .flat_map(|set| self.soft_compatibility(set, config))
+            .collect();
         let weights = leading_eigenvectors(&matrices, size, config.power_iterations);
         let mut best: Option<(Isometry3<f64>, usize)> = None;
         for (set, weights) in sets.iter().zip(weights.chunks(size)) {
             let total = weights.iter().sum::<f32>() + WEIGHT_EPSILON as f32;
             let mut moments = PairMoments::default();
             for (&index, weight) in set.iter().zip(weights) {
-                moments.add(&vector(&self.source[index]), &vector(&self.target[index]), f64::from(weight / total));
+                moments.add(
+                    &vector(&self.source[index]),
+                    &vector(&self.target[index]),
+                    f64::from(weight / total),
+                );
             }
-            let Ok(fit) = moments.fit_biased(WEIGHT_EPSILON) else { continue };
+            let Ok(fit) = moments.fit_biased(WEIGHT_EPSILON) else {
+                continue;
+            };
             let inliers = self.inliers(&fit, config.inlier_threshold_m);
             if best.is_none_or(|(_, most)| inliers > most) {
                 best = Some((fit, inliers));
@@ -271,14 +341,22 @@ impl Points {
     /// The paper weights by the second order here; the published implementation computes that and then leaves it out.
     fn soft_compatibility(&self, set: &[usize], config: &Sc2PcrConfig) -> Vec<f32> {
         let threshold = config.distance_threshold_m as f32;
-        let mut compatibility: Vec<f32> =
-            self.changes_within(set).into_iter().map(|change| soft(change, threshold)).collect();
-        compatibility.iter_mut().step_by(set.len() + 1).for_each(|own| *own = 0.0);
+        let mut compatibility: Vec<f32> = self
+            .changes_within(set)
+            .into_iter()
+            .map(|change| soft(change, threshold))
+            .collect();
+        compatibility
+            .iter_mut()
+            .step_by(set.len() + 1)
+            .for_each(|own| *own = 0.0);
         compatibility
     }
 
     fn changes_within(&self, set: &[usize]) -> Vec<f32> {
-        let of = |points: &[[f32; 3]]| distances(&set.iter().map(|&index| points[index]).collect::<Vec<_>>());
+        let of = |points: &[[f32; 3]]| {
+            distances(&set.iter().map(|&index| points[index]).collect::<Vec<_>>())
+        };
         changes(&of(&self.source), &of(&self.target))
     }
 
@@ -287,7 +365,11 @@ impl Points {
         let residual = |source: &[f32; 3], target: &[f32; 3]| {
             (rotation * vector(source) + motion.translation.vector - vector(target)).norm()
         };
-        self.source.iter().zip(&self.target).filter(|(source, target)| residual(source, target) < threshold_m).count()
+        self.source
+            .iter()
+            .zip(&self.target)
+            .filter(|(source, target)| residual(source, target) < threshold_m)
+            .count()
     }
 }
 
@@ -299,31 +381,69 @@ mod tests {
     #[test]
     fn motions_are_found_among_outliers() {
         for seed in 0..8 {
-            let problem = Problem { count: 500, outliers: 0.7, noise_m: 0.1, ..Problem::default() }.drawn(seed);
+            let problem = Problem {
+                count: 500,
+                outliers: 0.7,
+                noise_m: 0.1,
+                ..Problem::default()
+            }
+            .drawn(seed);
             let found = solve(&problem.pairs, &Sc2PcrConfig::default()).unwrap();
             let (metres, degrees) = problem.error(&found.target_from_source);
-            assert!(metres < 0.15 && degrees < 0.15, "seed {seed}: {metres} m {degrees} degrees");
+            assert!(
+                metres < 0.15 && degrees < 0.15,
+                "seed {seed}: {metres} m {degrees} degrees"
+            );
         }
     }
 
     #[test]
     fn few_correspondences_use_small_sets() {
-        let problem = Problem { count: 20, outliers: 0.2, noise_m: 0.02, ..Problem::default() }.drawn(3);
-        let config = Sc2PcrConfig { seed_ratio: 0.3, min_inliers: 6, ..Sc2PcrConfig::default() };
-        let (metres, _) = problem.error(&solve(&problem.pairs, &config).unwrap().target_from_source);
+        let problem = Problem {
+            count: 20,
+            outliers: 0.2,
+            noise_m: 0.02,
+            ..Problem::default()
+        }
+        .drawn(3);
+        let config = Sc2PcrConfig {
+            seed_ratio: 0.3,
+            min_inliers: 6,
+            ..Sc2PcrConfig::default()
+        };
+        let (metres, _) =
+            problem.error(&solve(&problem.pairs, &config).unwrap().target_from_source);
         assert!(metres < 0.2, "{metres} m");
     }
 
     #[test]
     fn thin_evidence_is_no_pose() {
         let config = Sc2PcrConfig::default();
-        assert!(matches!(solve(&[], &config), Err(NoRegistration::TooFewCorrespondences { given: 0, .. })));
-        let nonsense = Problem { count: 60, outliers: 1.0, ..Problem::default() }.drawn(6);
-        assert!(matches!(solve(&nonsense.pairs, &config), Err(NoRegistration::TooFewInliers { .. })));
+        assert!(matches!(
+            solve(&[], &config),
+            Err(NoRegistration::TooFewCorrespondences { given: 0, .. })
+        ));
+        let nonsense = Problem {
+            count: 60,
+            outliers: 1.0,
+            ..Problem::default()
+        }
+        .drawn(6);
+        assert!(matches!(
+            solve(&nonsense.pairs, &config),
+            Err(NoRegistration::TooFewInliers { .. })
+        ));
         let mut unusable = nonsense.pairs;
         unusable.iter_mut().for_each(|pair| pair.weight = f32::NAN);
-        assert!(matches!(solve(&unusable, &config), Err(NoRegistration::TooFewCorrespondences { usable: 0, .. })));
-        let pair = Correspondence { source_m: [1.0; 3], target_m: [2.0; 3], weight: 1.0 };
+        assert!(matches!(
+            solve(&unusable, &config),
+            Err(NoRegistration::TooFewCorrespondences { usable: 0, .. })
+        ));
+        let pair = Correspondence {
+            source_m: [1.0; 3],
+            target_m: [2.0; 3],
+            weight: 1.0,
+        };
         assert!(solve(&[pair; 30], &config).is_err());
     }
 

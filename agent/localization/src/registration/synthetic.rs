@@ -43,7 +43,11 @@ impl Problem {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let tilt = self.tilt_rad.max(1e-12);
         self.truth = Isometry3::from_parts(
-            Translation3::new(random.random_range(-200.0..200.0), random.random_range(-200.0..200.0), 2.0),
+            Translation3::new(
+                random.random_range(-200.0..200.0),
+                random.random_range(-200.0..200.0),
+                2.0,
+            ),
             UnitQuaternion::from_euler_angles(
                 random.random_range(-tilt..tilt),
                 random.random_range(-tilt..tilt),
@@ -63,10 +67,17 @@ impl Problem {
                 Point3::new(place(260.0), place(260.0), place(5.0))
             } else {
                 let mut shaken = self.truth * source;
-                shaken.coords.iter_mut().for_each(|coordinate| *coordinate += noise.sample(&mut random));
+                shaken
+                    .coords
+                    .iter_mut()
+                    .for_each(|coordinate| *coordinate += noise.sample(&mut random));
                 shaken
             };
-            let weight = if is_outlier { random.random_range(0.1..0.6) } else { random.random_range(0.3..1.0) };
+            let weight = if is_outlier {
+                random.random_range(0.1..0.6)
+            } else {
+                random.random_range(0.3..1.0)
+            };
             self.pairs.push(Correspondence {
                 source_m: source.coords.map(|x| x as f32).into(),
                 target_m: target.coords.map(|x| x as f32).into(),
@@ -79,6 +90,9 @@ impl Problem {
     /// Distance in metres and angle in degrees to the solution.
     pub(crate) fn error(&self, found: &Isometry3<f64>) -> (f64, f64) {
         let distance_m = (found.translation.vector - self.truth.translation.vector).norm();
-        (distance_m, found.rotation.angle_to(&self.truth.rotation).to_degrees())
+        (
+            distance_m,
+            found.rotation.angle_to(&self.truth.rotation).to_degrees(),
+        )
     }
 }

@@ -37,7 +37,8 @@ impl PoseMeasurement {
         Self {
             capture_nanos,
             world_from_lidar: found.world_from_sensor,
-            position_std_m: (POSITION_FACTOR * error_m / std::f64::consts::SQRT_2).max(LEAST_POSITION_STD_M),
+            position_std_m: (POSITION_FACTOR * error_m / std::f64::consts::SQRT_2)
+                .max(LEAST_POSITION_STD_M),
             yaw_std_rad: (ROTATION_FACTOR * found.evidence.rotation_std_rad).clamp(least, most),
         }
     }

@@ -74,7 +74,13 @@ impl PoseTracker {
     /// Tracker of a vehicle whose place is not known.
     #[must_use]
     pub fn new(limits: TrackerLimits) -> Self {
-        Self { limits, filter: None, accepted: None, rejected: Vec::new(), contradiction_m: 0.0 }
+        Self {
+            limits,
+            filter: None,
+            accepted: None,
+            rejected: Vec::new(),
+            contradiction_m: 0.0,
+        }
     }
 
     /// Moves the state to the capture time of a sweep. `None`: the vehicle is lost, or the clock went back.
@@ -95,9 +101,13 @@ impl PoseTracker {
     }
 
     fn can_predict(&self, capture_nanos: u64) -> bool {
-        let is_recent =
-            |accepted: &PoseMeasurement| seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s;
-        let is_ahead = self.filter.as_ref().is_some_and(|filter| filter.capture_nanos <= capture_nanos);
+        let is_recent = |accepted: &PoseMeasurement| {
+            seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s
+        };
+        let is_ahead = self
+            .filter
+            .as_ref()
+            .is_some_and(|filter| filter.capture_nanos <= capture_nanos);
         is_ahead && self.accepted.as_ref().is_some_and(is_recent)
     }
 
@@ -112,7 +122,10 @@ impl PoseTracker {
             covariance.xx_m2 += variance;
             covariance.yy_m2 += variance;
         }
-        Some(TrackedState { world_from_lidar: filter.world_from_lidar(), covariance })
+        Some(TrackedState {
+            world_from_lidar: filter.world_from_lidar(),
+            covariance,
+        })
     }
 
     /// True if the last measurement was rejected.
@@ -127,19 +140,26 @@ impl PoseTracker {
             self.start(measurement);
             return Correction::Started;
         };
-        if filter.capture_nanos == measurement.capture_nanos && filter.distance_squared(measurement) <= GATE {
+        if filter.capture_nanos == measurement.capture_nanos
+            && filter.distance_squared(measurement) <= GATE
+        {
             filter.correct(measurement);
             self.accepted = Some(*measurement);
             self.rejected.clear();
             return Correction::Accepted;
         }
-        let off = filter.world_from_lidar().translation.vector - measurement.world_from_lidar.translation.vector;
+        let off = filter.world_from_lidar().translation.vector
+            - measurement.world_from_lidar.translation.vector;
         self.contradiction_m = off.norm();
         self.reject(measurement)
     }
 
     fn reject(&mut self, measurement: &PoseMeasurement) -> Correction {
-        if self.rejected.last().is_some_and(|before| !can_follow(before, measurement)) {
+        if self
+            .rejected
+            .last()
+            .is_some_and(|before| !can_follow(before, measurement))
+        {
             self.rejected.clear();
         }
         self.rejected.push(*measurement);
@@ -165,7 +185,11 @@ impl PoseTracker {
     /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
     #[must_use]
     pub fn needs_measurement(&self) -> bool {
-        self.is_contradicted() || self.filter.as_ref().is_none_or(|filter| filter.speed_std_mps() > SPEED_STD_MPS)
+        self.is_contradicted()
+            || self
+                .filter
+                .as_ref()
+                .is_none_or(|filter| filter.speed_std_mps() > SPEED_STD_MPS)
     }
 }
 
@@ -183,7 +207,11 @@ fn can_follow(from: &PoseMeasurement, to: &PoseMeasurement) -> bool {
 
 /// Speed along the heading from one pose to the next, metres per second.
 fn speed_mps(from: &PoseMeasurement, to: &PoseMeasurement) -> f64 {
-    let moved = from.world_from_lidar.inv_mul(&to.world_from_lidar).translation.x;
+    let moved = from
+        .world_from_lidar
+        .inv_mul(&to.world_from_lidar)
+        .translation
+        .x;
     moved / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
 }
 

@@ -6,7 +6,10 @@
 use std::f64::consts::{PI, TAU};
 
 use nalgebra::Vector3;
-use nalgebra::{Isometry3, Matrix2, RowSVector, RowVector2, SMatrix, SVector, Translation3, UnitQuaternion, Vector2};
+use nalgebra::{
+    Isometry3, Matrix2, RowSVector, RowVector2, SMatrix, SVector, Translation3, UnitQuaternion,
+    Vector2,
+};
 use protocol::PlanarCovariance;
 
 use super::measurement::PoseMeasurement;
@@ -73,7 +76,15 @@ impl MotionFilter {
         let [x, y, z] = measurement.world_from_lidar.translation.vector.data.0[0];
         let (roll_rad, pitch_rad, yaw) = measurement.world_from_lidar.rotation.euler_angles();
         let (position, [speed, yaw_rate]) = (measurement.position_std_m, FIRST_STD);
-        let std = State::from([position, position, measurement.yaw_std_rad, speed, yaw_rate, BIAS_STD, LEVER_STD_M]);
+        let std = State::from([
+            position,
+            position,
+            measurement.yaw_std_rad,
+            speed,
+            yaw_rate,
+            BIAS_STD,
+            LEVER_STD_M,
+        ]);
         Self {
             capture_nanos: measurement.capture_nanos,
             state: State::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0]),
@@ -95,7 +106,14 @@ impl MotionFilter {
             self.set_yaw_rate(rate);
         }
         let is_measured = measured.is_some();
-        self.advance_plane(time_s, if is_measured { RESIDUAL_YAW_ACCELERATION_STD } else { YAW_ACCELERATION_STD });
+        self.advance_plane(
+            time_s,
+            if is_measured {
+                RESIDUAL_YAW_ACCELERATION_STD
+            } else {
+                YAW_ACCELERATION_STD
+            },
+        );
         self.advance_height(time_s);
     }
 
@@ -120,9 +138,19 @@ impl MotionFilter {
         step[(Y, LEVER)] = cos * yaw_rate * time_s;
         step[(YAW, YAW_RATE)] = time_s;
         let half_square = time_s * time_s / 2.0;
-        let pushed = State::from([half_square * cos, half_square * sin, 0.0, time_s, 0.0, 0.0, 0.0]) * ACCELERATION_STD;
-        let turned = State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0]) * yaw_acceleration_std;
-        let slipped = State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
+        let pushed = State::from([
+            half_square * cos,
+            half_square * sin,
+            0.0,
+            time_s,
+            0.0,
+            0.0,
+            0.0,
+        ]) * ACCELERATION_STD;
+        let turned =
+            State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0]) * yaw_acceleration_std;
+        let slipped =
+            State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
         self.covariance = step * self.covariance * step.transpose()
             + pushed * pushed.transpose()
             + turned * turned.transpose()
@@ -136,7 +164,8 @@ impl MotionFilter {
         // Nose down is a positive pitch.
         let climbed_m = -self.state[SPEED] * self.pitch_rad.sin() * time_s;
         self.height = step * self.height + Vector2::new(climbed_m, 0.0);
-        self.height_covariance = step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
+        self.height_covariance =
+            step * self.height_covariance * step.transpose() + lifted * lifted.transpose();
     }
 
     /// Replaces the yaw rate by a measured one less the bias: their errors are the same, beside the noise.
@@ -164,13 +193,17 @@ impl MotionFilter {
     /// Squared Mahalanobis distance between a pose of the same time and the state: x, y and yaw.
     pub(super) fn distance_squared(&self, measurement: &PoseMeasurement) -> f64 {
         let (off, spread) = self.innovation(measurement);
-        spread.cholesky().map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
+        spread
+            .cholesky()
+            .map_or(f64::INFINITY, |factor| off.dot(&factor.solve(&off)))
     }
 
     /// Uses a pose of the same time.
     pub(super) fn correct(&mut self, measurement: &PoseMeasurement) {
         let (off, spread) = self.innovation(measurement);
-        let Some(inverse) = spread.try_inverse() else { return };
+        let Some(inverse) = spread.try_inverse() else {
+            return;
+        };
         let gain = self.covariance.fixed_columns::<3>(0) * inverse;
         let mut selects = SMatrix::<f64, 3, STATES>::zeros();
         selects.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
@@ -180,14 +213,18 @@ impl MotionFilter {
         let variance = self.height_covariance[(0, 0)] + measurement.position_std_m.powi(2);
         let gain = self.height_covariance.column(0) / variance;
         self.height += gain * off_m;
-        self.height_covariance = (Matrix2::identity() - gain * RowVector2::new(1.0, 0.0)) * self.height_covariance;
+        self.height_covariance =
+            (Matrix2::identity() - gain * RowVector2::new(1.0, 0.0)) * self.height_covariance;
         self.correct_tilt(measurement);
     }
 
     /// Roll and pitch move towards the measured ones, the further the longer ago the last measurement was.
     fn correct_tilt(&mut self, measurement: &PoseMeasurement) {
         let (roll_rad, pitch_rad, _) = measurement.world_from_lidar.rotation.euler_angles();
-        let time_s = measurement.capture_nanos.saturating_sub(self.measured_nanos) as f64 * 1e-9;
+        let time_s = measurement
+            .capture_nanos
+            .saturating_sub(self.measured_nanos) as f64
+            * 1e-9;
         let weight = 1.0 - (-time_s / TILT_TIME_S).exp();
         self.roll_rad += weight * wrapped_rad(roll_rad - self.roll_rad);
         self.pitch_rad += weight * wrapped_rad(pitch_rad - self.pitch_rad);
@@ -203,14 +240,20 @@ impl MotionFilter {
     /// Pose of the state.
     pub(super) fn world_from_lidar(&self) -> Isometry3<f64> {
         let position = Translation3::new(self.state[X], self.state[Y], self.height[0]);
-        let rotation = UnitQuaternion::from_euler_angles(self.roll_rad, self.pitch_rad, self.state[YAW]);
+        let rotation =
+            UnitQuaternion::from_euler_angles(self.roll_rad, self.pitch_rad, self.state[YAW]);
         Isometry3::from_parts(position, rotation)
     }
 
     /// Covariance of position and yaw.
     pub(super) fn planar_covariance(&self) -> PlanarCovariance {
         let entry = |row, column| self.covariance[(row, column)] as f32;
-        PlanarCovariance { xx_m2: entry(X, X), xy_m2: entry(X, Y), yy_m2: entry(Y, Y), yaw_rad2: entry(YAW, YAW) }
+        PlanarCovariance {
+            xx_m2: entry(X, X),
+            xy_m2: entry(X, Y),
+            yy_m2: entry(Y, Y),
+            yaw_rad2: entry(YAW, YAW),
+        }
     }
 
     /// Standard deviation of the speed, metres per second.
@@ -226,7 +269,8 @@ impl MotionFilter {
             pose.translation.y - self.state[Y],
             wrapped_rad(pose.rotation.euler_angles().2 - self.state[YAW]),
         );
-        let [position, yaw] = [measurement.position_std_m, measurement.yaw_std_rad].map(|std| std * std);
+        let [position, yaw] =
+            [measurement.position_std_m, measurement.yaw_std_rad].map(|std| std * std);
         let noise = SMatrix::from_diagonal(&Vector3::new(position, position, yaw));
         (off, self.covariance.fixed_view::<3, 3>(0, 0) + noise)
     }

@@ -8,7 +8,10 @@ use rand_distr::{Distribution, Normal};
 use super::*;
 
 const TENTH_NANOS: u64 = 100_000_000;
-const LIMITS: TrackerLimits = TrackerLimits { max_coast_s: 3.0, max_position_std_m: 2.0 };
+const LIMITS: TrackerLimits = TrackerLimits {
+    max_coast_s: 3.0,
+    max_position_std_m: 2.0,
+};
 
 /// Pose of the rear axle on a drive at 10 m/s through bends, 500 km from the origin.
 fn truth(sweep: u64) -> Isometry3<f64> {
@@ -19,21 +22,32 @@ fn truth(sweep: u64) -> Isometry3<f64> {
         y += 0.01 * 10.0 * yaw.sin();
     }
     let height = 2.0 + 0.02 * sweep as f64;
-    Isometry3::from_parts(Translation3::new(x, y, height), UnitQuaternion::from_euler_angles(0.0, 0.0, yaw))
+    Isometry3::from_parts(
+        Translation3::new(x, y, height),
+        UnitQuaternion::from_euler_angles(0.0, 0.0, yaw),
+    )
 }
 
 fn measured(sweep: u64, off_m: [f64; 2], position_std_m: f64) -> PoseMeasurement {
     let mut world_from_lidar = truth(sweep);
     world_from_lidar.translation.x += off_m[0];
     world_from_lidar.translation.y += off_m[1];
-    PoseMeasurement { capture_nanos: sweep * TENTH_NANOS, world_from_lidar, position_std_m, yaw_std_rad: 0.002 }
+    PoseMeasurement {
+        capture_nanos: sweep * TENTH_NANOS,
+        world_from_lidar,
+        position_std_m,
+        yaw_std_rad: 0.002,
+    }
 }
 
 /// Motion as a vehicle on the drive measures it, with a biased gyroscope.
 fn motion(sweep: u64, bias_rad_s: f64) -> EgoMotion {
     let yaw = |sweep: u64| truth(sweep).rotation.euler_angles().2;
     let yaw_rate_rad_s = Some((yaw(sweep) - yaw(sweep.saturating_sub(1))) / 0.1 + bias_rad_s);
-    EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s }
+    EgoMotion {
+        speed_mps: Some(10.0),
+        yaw_rate_rad_s,
+    }
 }
 
 /// Largest position error (metres) and yaw error (radians) of the predictions of sweeps 60 to 200, a fourth of which are
@@ -46,11 +60,17 @@ fn worst(motion: impl Fn(u64) -> EgoMotion, lever_m: f64) -> [f64; 2] {
         let state = tracker.predict(sweep * TENTH_NANOS, &motion(sweep));
         if let Some(state) = state.filter(|_| sweep >= 60) {
             let off = lidar(sweep).inv_mul(&state.world_from_lidar);
-            worst = [worst[0].max(off.translation.vector.xy().norm()), worst[1].max(off.rotation.angle())];
+            worst = [
+                worst[0].max(off.translation.vector.xy().norm()),
+                worst[1].max(off.rotation.angle()),
+            ];
         }
         if sweep % 4 == 0 || tracker.needs_measurement() {
             let world_from_lidar = lidar(sweep);
-            tracker.correct(&PoseMeasurement { world_from_lidar, ..measured(sweep, [0.0; 2], 0.02) });
+            tracker.correct(&PoseMeasurement {
+                world_from_lidar,
+                ..measured(sweep, [0.0; 2], 0.02)
+            });
         }
     }
     worst
@@ -58,7 +78,9 @@ fn worst(motion: impl Fn(u64) -> EgoMotion, lever_m: f64) -> [f64; 2] {
 
 /// Planar error of the state, metres.
 fn error_m(state: &TrackedState, sweep: u64) -> f64 {
-    (state.world_from_lidar.translation.vector - truth(sweep).translation.vector).xy().norm()
+    (state.world_from_lidar.translation.vector - truth(sweep).translation.vector)
+        .xy()
+        .norm()
 }
 
 /// Follows the drive with a measurement in every second sweep; error and bound of every prediction.
@@ -92,21 +114,37 @@ fn predictions_are_about_as_good_as_measurements_and_stay_within_their_bounds() 
         assert_eq!(results.len(), 98);
         let settled = &results[20..];
         errors.extend(settled.iter().map(|(error_m, _)| *error_m));
-        exceeded += settled.iter().filter(|(error_m, bound_m)| error_m > bound_m).count();
+        exceeded += settled
+            .iter()
+            .filter(|(error_m, bound_m)| error_m > bound_m)
+            .count();
     }
     // A measurement is off by 0.1 m in each of two axes: 0.125 m in the mean.
-    assert!(mean(errors.iter().copied()) < 0.15, "{}", mean(errors.iter().copied()));
-    assert!((exceeded as f64) < 0.05 * errors.len() as f64, "{exceeded} of {}", errors.len());
+    assert!(
+        mean(errors.iter().copied()) < 0.15,
+        "{}",
+        mean(errors.iter().copied())
+    );
+    assert!(
+        (exceeded as f64) < 0.05 * errors.len() as f64,
+        "{exceeded} of {}",
+        errors.len()
+    );
 }
 
 #[test]
 fn the_speed_that_the_vehicle_measures_is_used() {
-    let speed = EgoMotion { speed_mps: Some(10.0), yaw_rate_rad_s: None };
+    let speed = EgoMotion {
+        speed_mps: Some(10.0),
+        yaw_rate_rad_s: None,
+    };
     let off = |motion: &EgoMotion| {
         let mut tracker = PoseTracker::new(LIMITS);
         tracker.predict(0, motion);
         tracker.correct(&measured(0, [0.0; 2], 0.05));
-        tracker.predict(TENTH_NANOS, motion).map(|state| error_m(&state, 1))
+        tracker
+            .predict(TENTH_NANOS, motion)
+            .map(|state| error_m(&state, 1))
     };
     // The first pose says nothing of the speed.
     assert!(off(&speed).unwrap() < 0.1);
@@ -115,11 +153,23 @@ fn the_speed_that_the_vehicle_measures_is_used() {
 
 #[test]
 fn a_yaw_rate_keeps_the_prediction_from_lagging_in_bends() {
-    let without = worst(|sweep| EgoMotion { yaw_rate_rad_s: None, ..motion(sweep, 0.0) }, 0.0);
+    let without = worst(
+        |sweep| EgoMotion {
+            yaw_rate_rad_s: None,
+            ..motion(sweep, 0.0)
+        },
+        0.0,
+    );
     // A bias of 0.6 degrees/s is estimated.
     let with = worst(|sweep| motion(sweep, 0.01), 0.0);
-    assert!(without[1] > 0.01 && with[1] < 0.002 && with[0] < 0.02, "{without:?} {with:?}");
-    let broken = |sweep| EgoMotion { yaw_rate_rad_s: Some(f64::NAN), ..motion(sweep, 0.0) };
+    assert!(
+        without[1] > 0.01 && with[1] < 0.002 && with[0] < 0.02,
+        "{without:?} {with:?}"
+    );
+    let broken = |sweep| EgoMotion {
+        yaw_rate_rad_s: Some(f64::NAN),
+        ..motion(sweep, 0.0)
+    };
     assert_eq!(worst(broken, 0.0), without, "no yaw rate");
 }
 
@@ -133,7 +183,10 @@ fn a_lidar_ahead_of_the_rear_axle_is_swung_aside_in_bends() {
 #[test]
 fn a_gyroscope_that_fails_does_not_lose_the_vehicle() {
     for rate in [0.0, -0.3] {
-        let stuck = |sweep| EgoMotion { yaw_rate_rad_s: Some(rate), ..motion(sweep, 0.0) };
+        let stuck = |sweep| EgoMotion {
+            yaw_rate_rad_s: Some(rate),
+            ..motion(sweep, 0.0)
+        };
         let [off_m, _] = worst(stuck, 0.0);
         assert!(off_m < 1.0, "{rate} rad/s: {off_m} m");
     }
@@ -143,13 +196,26 @@ fn a_gyroscope_that_fails_does_not_lose_the_vehicle() {
 fn a_wrong_pose_does_not_pull_the_state_off() {
     let mut tracker = PoseTracker::new(LIMITS);
     followed(&mut tracker, 0..40, 1);
-    let predicted = tracker.predict(40 * TENTH_NANOS, &EgoMotion::default()).unwrap();
-    assert_eq!(tracker.correct(&measured(40, [30.0, 0.0], 0.1)), Correction::Rejected);
+    let predicted = tracker
+        .predict(40 * TENTH_NANOS, &EgoMotion::default())
+        .unwrap();
+    assert_eq!(
+        tracker.correct(&measured(40, [30.0, 0.0], 0.1)),
+        Correction::Rejected
+    );
     let doubted = tracker.state().unwrap();
     assert_eq!(doubted.world_from_lidar, predicted.world_from_lidar);
-    assert!(tracker.is_contradicted() && doubted.covariance.bound_95_m() > 30.0, "one of both is right");
-    tracker.predict(41 * TENTH_NANOS, &EgoMotion::default()).unwrap();
-    assert_eq!(tracker.correct(&measured(41, [0.1, 0.0], 0.1)), Correction::Accepted);
+    assert!(
+        tracker.is_contradicted() && doubted.covariance.bound_95_m() > 30.0,
+        "one of both is right"
+    );
+    tracker
+        .predict(41 * TENTH_NANOS, &EgoMotion::default())
+        .unwrap();
+    assert_eq!(
+        tracker.correct(&measured(41, [0.1, 0.0], 0.1)),
+        Correction::Accepted
+    );
     assert!(tracker.state().unwrap().covariance.bound_95_m() < 1.0);
 }
 
@@ -163,14 +229,29 @@ fn a_vehicle_that_was_carried_away_is_found_again() {
             tracker.correct(&measured(sweep, [200.0, 0.0], 0.1))
         })
         .collect();
-    assert_eq!(corrections, [Correction::Rejected, Correction::Rejected, Correction::Relocated]);
-    let state = tracker.predict(43 * TENTH_NANOS, &EgoMotion::default()).unwrap();
+    assert_eq!(
+        corrections,
+        [
+            Correction::Rejected,
+            Correction::Rejected,
+            Correction::Relocated
+        ]
+    );
+    let state = tracker
+        .predict(43 * TENTH_NANOS, &EgoMotion::default())
+        .unwrap();
     assert!((error_m(&state, 43) - 200.0).abs() < 2.0);
     // Poses of random places agree on none of them.
     for sweep in 43..47 {
         tracker.predict(sweep * TENTH_NANOS, &EgoMotion::default());
-        let off_m = [1000.0 * (sweep as f64).sin(), 900.0 * (3.0 * sweep as f64).cos()];
-        assert_eq!(tracker.correct(&measured(sweep, off_m, 0.1)), Correction::Rejected);
+        let off_m = [
+            1000.0 * (sweep as f64).sin(),
+            900.0 * (3.0 * sweep as f64).cos(),
+        ];
+        assert_eq!(
+            tracker.correct(&measured(sweep, off_m, 0.1)),
+            Correction::Rejected
+        );
     }
 }
 
@@ -190,15 +271,33 @@ fn without_measurements_the_bound_grows_until_the_vehicle_is_lost() {
     }
     assert!(bounds.windows(2).all(|pair| pair[1] > pair[0]));
     assert!((5..32).contains(&bounds.len()), "{}", bounds.len());
-    assert_eq!(tracker.correct(&measured(80, [0.0; 2], 0.1)), Correction::Started);
+    assert_eq!(
+        tracker.correct(&measured(80, [0.0; 2], 0.1)),
+        Correction::Started
+    );
 }
 
 #[test]
 fn a_tunnel_and_a_restarted_scene_end_the_track() {
     let mut tracker = PoseTracker::new(LIMITS);
     followed(&mut tracker, 0..40, 1);
-    assert_eq!(tracker.predict(140 * TENTH_NANOS, &EgoMotion::default()), None, "ten seconds without a sweep");
-    assert_eq!(tracker.correct(&measured(140, [0.0; 2], 0.1)), Correction::Started);
-    assert!(tracker.predict(141 * TENTH_NANOS, &EgoMotion::default()).is_some());
-    assert_eq!(tracker.predict(0, &EgoMotion::default()), None, "the clock went back");
+    assert_eq!(
+        tracker.predict(140 * TENTH_NANOS, &EgoMotion::default()),
+        None,
+        "ten seconds without a sweep"
+    );
+    assert_eq!(
+        tracker.correct(&measured(140, [0.0; 2], 0.1)),
+        Correction::Started
+    );
+    assert!(
+        tracker
+            .predict(141 * TENTH_NANOS, &EgoMotion::default())
+            .is_some()
+    );
+    assert_eq!(
+        tracker.predict(0, &EgoMotion::default()),
+        None,
+        "the clock went back"
+    );
 }

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, IntegritySummary, LocalizationSummary, evaluate,
-    evaluate_source, reliability_charts, write_csv, write_error_table,
+    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, IntegritySummary,
+    LocalizationSummary, evaluate, evaluate_source, reliability_charts, write_csv,
+    write_error_table,
 };
 use agent_offline::head_files::{ENCODER_FILE, encoder_of};
 use agent_offline::icp_map::{IcpMapPose, read_map};
@@ -14,7 +15,9 @@ use anyhow::Context;
 use clap::ValueEnum;
 use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, Retrieval, load_baseline};
-use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
+use localization::pgc::confidence::{
+    CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss,
+};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer};
@@ -78,7 +81,12 @@ pub(crate) struct Args {
     )]
     icp_map: Vec<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
-    #[arg(long, value_name = "METRES", default_value_t = 5.0, requires = "icp_map")]
+    #[arg(
+        long,
+        value_name = "METRES",
+        default_value_t = 5.0,
+        requires = "icp_map"
+    )]
     map_spacing: f64,
     /// Follow each vehicle from sweep to sweep (pose source tracked), and localize every sweep by itself beside it;
     /// files are written of the tracked poses.
@@ -107,7 +115,12 @@ pub(crate) struct Args {
     #[arg(long)]
     fit_confidence: bool,
     /// Largest share of poses less than 3 m off that --fit-confidence may reject.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.01, requires = "fit_confidence")]
+    #[arg(
+        long,
+        value_name = "SHARE",
+        default_value_t = 0.01,
+        requires = "fit_confidence"
+    )]
     good_loss: f64,
     /// Write a row per sweep.
     #[arg(long, value_name = "FILE")]
@@ -151,11 +164,14 @@ enum Subject {
 /// Localizes, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
-    check_good_loss(args.good_loss).map_err(|error| BadInput::new(format!("--good-loss: {error}")))?;
+    check_good_loss(args.good_loss)
+        .map_err(|error| BadInput::new(format!("--good-loss: {error}")))?;
     let groups = by_head(&args.head, &args.scene)?;
     if args.fit_confidence && groups.len() > 1 {
         let count = groups.len();
-        return Err(BadInput::new(format!("--fit-confidence fits one head, {count} are given")).into());
+        return Err(
+            BadInput::new(format!("--fit-confidence fits one head, {count} are given")).into(),
+        );
     }
     let (mut sweeps, mut tracked, mut left_out) = (Vec::new(), Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
@@ -172,17 +188,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     args.write(if args.tracked { &tracked } else { &sweeps })?;
     let summary = LocalizationSummary::of(&sweeps);
-    if let ([(head, scenes)], true) = (&groups[..], summary.no_pose == summary.sweeps && args.uses_head()) {
-        output::note(wrong_place_hint(summary.sweeps as u64, head, map_text(scenes).as_deref()));
+    if let ([(head, scenes)], true) = (
+        &groups[..],
+        summary.no_pose == summary.sweeps && args.uses_head(),
+    ) {
+        output::note(wrong_place_hint(
+            summary.sweeps as u64,
+            head,
+            map_text(scenes).as_deref(),
+        ));
     }
     let tracked = args.tracked.then(|| LocalizationSummary::of(&tracked));
     match (&tracked, args.json) {
-        (Some(tracked), true) => {
-            output::line(serde_json::to_string_pretty(&json!({ "pgc": summary, "tracked": tracked }))?)?
-        }
+        (Some(tracked), true) => output::line(serde_json::to_string_pretty(
+            &json!({ "pgc": summary, "tracked": tracked }),
+        )?)?,
         (None, true) => output::line(serde_json::to_string_pretty(&summary)?)?,
         (Some(tracked), false) => {
-            output::text(format!("every sweep by itself\n{}\ntracked\n{}", table(&summary), table(tracked)))?;
+            output::text(format!(
+                "every sweep by itself\n{}\ntracked\n{}",
+                table(&summary),
+                table(tracked)
+            ))?;
         }
         (None, false) => output::text(table(&summary))?,
     }
@@ -192,14 +219,24 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn subject(&self, head: &Path, left_out: &mut LeftOut) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            return Ok(Subject::Localizer(self.localizer(head, self.inference()?, left_out)?));
+            return Ok(Subject::Localizer(self.localizer(
+                head,
+                self.inference()?,
+                left_out,
+            )?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
-            return Err(BadInput::new(format!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
+            return Err(BadInput::new(format!(
+                "--map-spacing is {}, must be 0 or more",
+                self.map_spacing
+            )));
         }
         let config = IcpConfig::default();
         let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(BadInput::of)?;
-        Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
+        Ok(Subject::Source(Box::new(IcpMapPose::new(
+            Arc::new(map),
+            config,
+        ))))
     }
 
     /// True unless another method takes the place of the head.
@@ -208,14 +245,23 @@ impl Args {
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
-        let device = self.device.open().map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        let device = self
+            .device
+            .open()
+            .map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(Inference::new(device, self.precision))
     }
 
     fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {
-        let config = TrackedPoseConfig { encoder: self.encoder(head), head: head.to_owned(), ..self.tracker.0.clone() };
+        let config = TrackedPoseConfig {
+            encoder: self.encoder(head),
+            head: head.to_owned(),
+            ..self.tracker.0.clone()
+        };
         config.validate().map_err(BadInput::of)?;
-        Ok(Subject::Source(Box::new(TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?)))
+        Ok(Subject::Source(Box::new(
+            TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?,
+        )))
     }
 
     fn localizer(
@@ -225,14 +271,24 @@ impl Args {
         left_out: &mut LeftOut,
     ) -> Result<Box<dyn Localize>, BadInput> {
         let solver = match self.solver {
-            Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
+            Search::Ransac => Solver::Ransac(RansacConfig {
+                seed: self.seed,
+                ..RansacConfig::default()
+            }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
         };
-        let plain = PoseSolver { solver: solver.clone(), ..PoseSolver::default() };
+        let plain = PoseSolver {
+            solver: solver.clone(),
+            ..PoseSolver::default()
+        };
         if let Some(weights) = &self.baseline {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
-        let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
+        let load = if self.fit_confidence {
+            Localizer::load_without_confidence
+        } else {
+            Localizer::load
+        };
         let mut localizer = load(&self.encoder(head), head, inference).map_err(BadInput::of)?;
         if self.lightloc {
             return Ok(Box::new(LightLoc::new(localizer, plain)));
@@ -245,7 +301,11 @@ impl Args {
         Ok(Box::new(localizer))
     }
 
-    fn retrieval(&self, localizer: Localizer, left_out: &mut LeftOut) -> Result<Box<dyn Localize>, BadInput> {
+    fn retrieval(
+        &self,
+        localizer: Localizer,
+        left_out: &mut LeftOut,
+    ) -> Result<Box<dyn Localize>, BadInput> {
         let bar = progress::bar(0, "sweeps described");
         let mut on_sweep = |done, all| {
             bar.set_length(all as u64);
@@ -253,12 +313,18 @@ impl Args {
         };
         let database = read_database(&self.retrieval, &localizer, left_out, &mut on_sweep);
         bar.finish_and_clear();
-        Ok(Box::new(Retrieval::new(localizer, database.map_err(BadInput::of)?)))
+        Ok(Box::new(Retrieval::new(
+            localizer,
+            database.map_err(BadInput::of)?,
+        )))
     }
 
     fn encoder(&self, head: &Path) -> PathBuf {
         let beside = || head.with_file_name(ENCODER_FILE);
-        self.encoder.clone().or_else(|| encoder_of(head).ok()).unwrap_or_else(beside)
+        self.encoder
+            .clone()
+            .or_else(|| encoder_of(head).ok())
+            .unwrap_or_else(beside)
     }
 
     fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {
@@ -275,8 +341,12 @@ impl Args {
             bar.set_position(done as u64);
         };
         let evaluated = match subject {
-            Subject::Localizer(mut localizer) => evaluate(localizer.as_mut(), &options, &mut on_sweep),
-            Subject::Source(mut source) => evaluate_source(source.as_mut(), &options, &mut on_sweep),
+            Subject::Localizer(mut localizer) => {
+                evaluate(localizer.as_mut(), &options, &mut on_sweep)
+            }
+            Subject::Source(mut source) => {
+                evaluate_source(source.as_mut(), &options, &mut on_sweep)
+            }
         };
         bar.finish_and_clear();
         match evaluated {
@@ -288,11 +358,17 @@ impl Args {
 
     fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
         let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
-        let (model, report) = ConfidenceModel::fit(&labelled, self.good_loss).map_err(BadInput::of)?;
+        let (model, report) =
+            ConfidenceModel::fit(&labelled, self.good_loss).map_err(BadInput::of)?;
         let sha256 = annotate(head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
-        output::note(format_args!("{}: confidence written, SHA-256 is now {sha256}", head.display()));
+        output::note(format_args!(
+            "{}: confidence written, SHA-256 is now {sha256}",
+            head.display()
+        ));
         let confidence = Confidence::Calibrated(model);
-        sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
+        sweeps
+            .iter_mut()
+            .for_each(|sweep| sweep.judge_again(&confidence));
         Ok(report)
     }
 
@@ -318,23 +394,48 @@ fn map_text(scenes: &[PathBuf]) -> Option<String> {
 }
 
 fn report_line(report: &FitReport) -> String {
-    let FitReport { sweeps, bad, bad_rejected, good_rejected } = report;
+    let FitReport {
+        sweeps,
+        bad,
+        bad_rejected,
+        good_rejected,
+    } = report;
     let good = sweeps - bad;
-    format!("fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones")
+    format!(
+        "fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones"
+    )
 }
 
 /// Report as text.
 fn table(summary: &LocalizationSummary) -> String {
-    let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
+    let number = |value: Option<f64>, digits: usize| {
+        value.map_or("-".into(), |value| format!("{value:.digits$}"))
+    };
     let percent = |share: f64| format!("{:.1} %", 100.0 * share);
     let share = |value: Option<f64>| value.map_or("-".into(), percent);
-    let LocalizationSummary { sweeps, no_pose, rejected, ms, .. } = summary;
+    let LocalizationSummary {
+        sweeps,
+        no_pose,
+        rejected,
+        ms,
+        ..
+    } = summary;
     let total = ms.get("total").copied();
-    let stages: Vec<String> =
-        ms.iter().filter(|(stage, _)| *stage != "total").map(|(s, ms)| format!("{s} {ms:.1}")).collect();
+    let stages: Vec<String> = ms
+        .iter()
+        .filter(|(stage, _)| *stage != "total")
+        .map(|(s, ms)| format!("{s} {ms:.1}"))
+        .collect();
     let lines = [
-        format!("sweeps     {sweeps}, {no_pose} without a pose {:?}", summary.outcomes),
-        format!("success    {} under 3 m, {} under 1 m", percent(summary.success_3m), percent(summary.success_1m)),
+        format!(
+            "sweeps     {sweeps}, {no_pose} without a pose {:?}",
+            summary.outcomes
+        ),
+        format!(
+            "success    {} under 3 m, {} under 1 m",
+            percent(summary.success_3m),
+            percent(summary.success_1m)
+        ),
         format!(
             "position   mean {} m, median {}, 95 % {}, 99 % {}, largest {}",
             number(summary.mean_m, 2),
@@ -363,7 +464,12 @@ fn table(summary: &LocalizationSummary) -> String {
             rejected.bad,
             share(rejected.good_share)
         ),
-        format!("time       {} ms median, {:.1} mean: {}", number(total, 1), summary.mean_ms, stages.join(", ")),
+        format!(
+            "time       {} ms median, {:.1} mean: {}",
+            number(total, 1),
+            summary.mean_ms,
+            stages.join(", ")
+        ),
     ];
     let integrity = summary.integrity.map(|IntegritySummary { exceeded_share, p50_bound_m, .. }| {
         format!(
@@ -371,5 +477,10 @@ fn table(summary: &LocalizationSummary) -> String {
             percent(exceeded_share)
         )
     });
-    lines.into_iter().chain(integrity).collect::<Vec<_>>().join("\n") + "\n"
+    lines
+        .into_iter()
+        .chain(integrity)
+        .collect::<Vec<_>>()
+        .join("\n")
+        + "\n"
 }

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use indicatif::ProgressBar;
 use localization::pgc::wrong_place::wrong_place_hint;
-use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
+use localization::pose_source::{
+    LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable,
+};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use protocol::PoseEstimate;
@@ -43,18 +45,29 @@ pub(crate) struct Args {
 /// Localizes the scenarios that are not in the table yet.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
-    let done = if args.out.exists() { PoseTable::read(&args.out).map_err(bad)? } else { PoseTable::default() };
+    let done = if args.out.exists() {
+        PoseTable::read(&args.out).map_err(bad)?
+    } else {
+        PoseTable::default()
+    };
     let mut scenarios = Vec::new();
     for folder in &args.scene {
         scenarios.extend(dataset::open(folder).map_err(bad)?.scenarios);
     }
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // All heads are found before any is computed with.
-    let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
+    let heads: Vec<&Path> = scenarios
+        .iter()
+        .map(|scenario| head_of(&args.head, scenario))
+        .collect::<Result<_, _>>()?;
     let first_head = heads.first().copied();
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
-        let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
+        let scenes: Vec<String> = args
+            .scene
+            .iter()
+            .map(|scene| scene.display().to_string())
+            .collect();
         return Err(bad(anyhow::anyhow!("no sweep in {}", scenes.join(", "))));
     }
     let bar = progress::bar(sweeps, "sweeps");
@@ -85,9 +98,16 @@ impl Args {
         left_out: &mut LeftOut,
         bar: &ProgressBar,
     ) -> anyhow::Result<usize> {
-        let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), ..PgcConfig::default() };
+        let config = PgcConfig {
+            encoder: self.encoder.clone(),
+            head: head.to_owned(),
+            ..PgcConfig::default()
+        };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
-        let inference = Inference { precision: self.precision, ..Inference::default() };
+        let inference = Inference {
+            precision: self.precision,
+            ..Inference::default()
+        };
         for (agent, cav) in scenario.agents.iter().enumerate() {
             let mut source = LocalizedPose::pgc(&config, inference).map_err(bad)?;
             for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
@@ -108,12 +128,19 @@ impl Args {
                     measured: None,
                     motion: frame.motion(),
                 };
-                rows.push(PoseRow { cav, capture_nanos, estimate: source.estimate(&input) });
+                rows.push(PoseRow {
+                    cav,
+                    capture_nanos,
+                    estimate: source.estimate(&input),
+                });
                 source.observe(&input);
             }
         }
         PoseTable::append(&self.out, &scenario.name, &rows)?;
-        Ok(rows.iter().filter(|row| matches!(row.estimate, PoseEstimate::Pose { .. })).count())
+        Ok(rows
+            .iter()
+            .filter(|row| matches!(row.estimate, PoseEstimate::Pose { .. }))
+            .count())
     }
 }
 

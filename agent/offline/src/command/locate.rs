@@ -106,8 +106,15 @@ struct LocatedPose {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     let head = head_file(&args.head).map_err(BadInput::of)?;
-    let encoder = args.encoder.clone().map_or_else(|| encoder_of(&head), Ok).map_err(BadInput::of)?;
-    let inference = Inference { precision: args.precision, ..Inference::default() };
+    let encoder = args
+        .encoder
+        .clone()
+        .map_or_else(|| encoder_of(&head), Ok)
+        .map_err(BadInput::of)?;
+    let inference = Inference {
+        precision: args.precision,
+        ..Inference::default()
+    };
     let localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
     let mut points = Vec::new();
@@ -128,7 +135,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     }
     if found + lost + bad > 1 {
-        output::note(format_args!("{found} clouds found, {lost} without a pose, {bad} cannot be read"));
+        output::note(format_args!(
+            "{found} clouds found, {lost} without a pose, {bad} cannot be read"
+        ));
     }
     if found == 0 && lost > 0 {
         let (head, map) = (head.display(), &localizer.head_config().scene_name);
@@ -140,23 +149,53 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &points) {
         output::note(hint);
     }
-    Ok(if bad > 0 { Outcome::BadInput } else { Outcome::of(lost > 0) })
+    Ok(if bad > 0 {
+        Outcome::BadInput
+    } else {
+        Outcome::of(lost > 0)
+    })
 }
 
 impl Args {
-    fn locate(&self, localizer: &Localizer, file: Result<CloudFile, dataset::ReadError>) -> anyhow::Result<Located> {
+    fn locate(
+        &self,
+        localizer: &Localizer,
+        file: Result<CloudFile, dataset::ReadError>,
+    ) -> anyhow::Result<Located> {
         let map = localizer.head_config().scene_name.clone();
         let name = |file: &CloudFile| file.path().display().to_string();
         let (cloud, read) = match file {
             Ok(file) => (name(&file), file.read()),
-            Err(error) => (error.path().map(|path| path.display().to_string()).unwrap_or_default(), Err(error)),
+            Err(error) => (
+                error
+                    .path()
+                    .map(|path| path.display().to_string())
+                    .unwrap_or_default(),
+                Err(error),
+            ),
         };
-        let Cloud { mut points, left_out, is_of_data_set } = match read {
+        let Cloud {
+            mut points,
+            left_out,
+            is_of_data_set,
+        } = match read {
             Ok(read) => read,
             Err(error) => return Ok(Located::unreadable(cloud, map, &error)),
         };
-        let (count, y_axis) = (points.len(), if is_of_data_set { YAxis::Left } else { self.y_axis });
-        let mirror = |points: &mut protocol::PointCloud| points.xyzi.iter_mut().for_each(|point| point[1] = -point[1]);
+        let (count, y_axis) = (
+            points.len(),
+            if is_of_data_set {
+                YAxis::Left
+            } else {
+                self.y_axis
+            },
+        );
+        let mirror = |points: &mut protocol::PointCloud| {
+            points
+                .xyzi
+                .iter_mut()
+                .for_each(|point| point[1] = -point[1])
+        };
         if y_axis == YAxis::Right {
             mirror(&mut points);
         }
@@ -203,7 +242,10 @@ fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
 
 impl LocatedPose {
     fn of(found: FoundPose) -> Self {
-        let (translation, rotation) = (found.world_from_sensor.translation, found.world_from_sensor.rotation);
+        let (translation, rotation) = (
+            found.world_from_sensor.translation,
+            found.world_from_sensor.rotation,
+        );
         let (roll, pitch, yaw) = rotation.euler_angles();
         Self {
             position_m: translation.vector.into(),
@@ -233,11 +275,20 @@ impl Located {
 
     /// One line for a person.
     fn text(&self) -> String {
-        let Self { cloud, inliers, points, .. } = self;
+        let Self {
+            cloud,
+            inliers,
+            points,
+            ..
+        } = self;
         if let Some(error) = &self.error {
             return format!("error: {error}");
         }
-        let mirrored = if self.is_mirrored { ", y of the file negated" } else { "" };
+        let mirrored = if self.is_mirrored {
+            ", y of the file negated"
+        } else {
+            ""
+        };
         let Some(pose) = &self.pose else {
             let reason = self.no_pose.unwrap_or("failed");
             return format!("{cloud}: no pose, {reason} ({inliers} inliers, {points} points)");
@@ -286,7 +337,13 @@ mod tests {
             located(Some(pose), None).text(),
             "a.pcd: x 1.00 y -2.00 z 0.50 m (std 0.05), roll 0.00 pitch 0.10 yaw 90.00 degrees, confidence 0.988, 12 inliers"
         );
-        assert_eq!(located(None, None).text(), "a.pcd: no pose, too few inliers (12 inliers, 900 points)");
-        assert_eq!(located(None, Some("a.pcd: cut off")).text(), "error: a.pcd: cut off");
+        assert_eq!(
+            located(None, None).text(),
+            "a.pcd: no pose, too few inliers (12 inliers, 900 points)"
+        );
+        assert_eq!(
+            located(None, Some("a.pcd: cut off")).text(),
+            "error: a.pcd: cut off"
+        );
     }
 }

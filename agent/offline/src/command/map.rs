@@ -8,7 +8,9 @@ use agent_offline::mapping::{MapConfig, MapError, MapProgress, MapReport, make_m
 use anyhow::Context;
 use bus::malloc_settings;
 use perception::compute_device::ComputeDevice;
-use perception::train::{ComputePrecision, Interruption, Length, ModelCard, RunConfig, TrainingBar, check_out};
+use perception::train::{
+    ComputePrecision, Interruption, Length, ModelCard, RunConfig, TrainingBar, check_out,
+};
 use support::cli::{BadInput, Outcome};
 use support::output;
 
@@ -65,7 +67,8 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS).context("cannot execute this program again")?;
+    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS)
+        .context("cannot execute this program again")?;
     let config = args.config()?;
     let bar = TrainingBar::of(Length::Time(config.time));
     let total_s = config.time.as_secs_f64();
@@ -96,21 +99,34 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn config(&self) -> anyhow::Result<MapConfig> {
         check_folders(&self.drives)?;
-        let time = Duration::try_from_secs_f64(60.0 * self.minutes).ok().filter(|time| !time.is_zero());
-        let time = time.ok_or_else(|| BadInput::new(format!("--minutes is {}, must be above 0", self.minutes)))?;
+        let time = Duration::try_from_secs_f64(60.0 * self.minutes)
+            .ok()
+            .filter(|time| !time.is_zero());
+        let time = time.ok_or_else(|| {
+            BadInput::new(format!("--minutes is {}, must be above 0", self.minutes))
+        })?;
         check_out(&self.out, self.resume, self.force).map_err(BadInput::of)?;
         let missing = || BadInput::new("no released encoder is found: --encoder FILE");
-        let encoder = self.encoder.clone().or_else(released_encoder).ok_or_else(missing)?;
+        let encoder = self
+            .encoder
+            .clone()
+            .or_else(released_encoder)
+            .ok_or_else(missing)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = self.threads.map_or((cores / 2).clamp(1, 16), usize::from);
         tch::set_num_threads(i32::try_from(threads).unwrap_or(1));
-        let device = self.device.open().map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        let device = self
+            .device
+            .open()
+            .map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(MapConfig {
             drives: self.drives.clone(),
             place: self.name.clone().unwrap_or_else(|| name_of(&self.out)),
             encoder,
             time,
-            most_sweeps: self.sweeps.map(|count| usize::try_from(count).unwrap_or(usize::MAX)),
+            most_sweeps: self
+                .sweeps
+                .map(|count| usize::try_from(count).unwrap_or(usize::MAX)),
             run: RunConfig {
                 learning_rate: 2e-3,
                 seed: self.seed,
@@ -128,16 +144,28 @@ impl Args {
 
 fn name_of(folder: &Path) -> String {
     let absolute = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    absolute.file_name().map_or_else(|| "place".to_owned(), |name| name.to_string_lossy().into_owned())
+    absolute.file_name().map_or_else(
+        || "place".to_owned(),
+        |name| name.to_string_lossy().into_owned(),
+    )
 }
 
 /// Report as text.
 fn text(report: &MapReport) -> String {
-    let accuracy = report.held_out.map_or("not measured: too few sweeps".to_owned(), |accuracy| accuracy.text());
-    let confidence = report.confidence.map_or("not fitted: too few poses".to_owned(), |fit| {
-        let good = fit.sweeps - fit.bad;
-        format!("rejects {} of {} wrong poses, {} of {good} right ones", fit.bad_rejected, fit.bad, fit.good_rejected)
-    });
+    let accuracy = report
+        .held_out
+        .map_or("not measured: too few sweeps".to_owned(), |accuracy| {
+            accuracy.text()
+        });
+    let confidence = report
+        .confidence
+        .map_or("not fitted: too few poses".to_owned(), |fit| {
+            let good = fit.sweeps - fit.bad;
+            format!(
+                "rejects {} of {} wrong poses, {} of {good} right ones",
+                fit.bad_rejected, fit.bad, fit.good_rejected
+            )
+        });
     format!(
         "place      {}\ntraining   {}\naccuracy   {accuracy}\nconfidence {confidence}\ndriven     {}\n{}{}\n",
         report.place,
@@ -149,7 +177,9 @@ fn text(report: &MapReport) -> String {
 }
 
 fn indented(text: &str) -> String {
-    text.lines().map(|line| format!("           {line}\n")).collect()
+    text.lines()
+        .map(|line| format!("           {line}\n"))
+        .collect()
 }
 
 /// Writes the model card and the report.
@@ -158,14 +188,29 @@ fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
         &format!("Scene head of {}", report.place),
         "World coordinates of cells on the features of a frozen encoder, made by `agent map`.",
     );
-    let data = format!("{} sweeps of {} drives", report.training_sweeps, config.drives.len());
+    let data = format!(
+        "{} sweeps of {} drives",
+        report.training_sweeps,
+        config.drives.len()
+    );
     card.trained(&report.run, &report.trained, &data, "cells");
-    card.row("file with confidence and scales", format_args!("SHA-256 `{}`", report.sha256));
+    card.row(
+        "file with confidence and scales",
+        format_args!("SHA-256 `{}`", report.sha256),
+    );
     card.row("copies of each sweep", report.copies);
     card.row("encoder", format_args!("`{ENCODER_FILE}` beside the head"));
-    card.row("accuracy", report.held_out.map_or("not measured".to_owned(), |accuracy| accuracy.text()));
+    card.row(
+        "accuracy",
+        report
+            .held_out
+            .map_or("not measured".to_owned(), |accuracy| accuracy.text()),
+    );
     card.row("driven", report.coverage_text());
-    card.row("time of everything", format_args!("{:.0} s", report.seconds));
+    card.row(
+        "time of everything",
+        format_args!("{:.0} s", report.seconds),
+    );
     card.paragraph(&report.limits_text());
     card.paragraph(&format!(
         "Cells of {:.0} m with sweeps (#), north up:\n\n```\n{}```",

@@ -31,7 +31,8 @@ pub(crate) struct Args {
 /// Searches the scales and stores them.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(1);
-    let localizer = Localizer::load(&args.encoder, &args.head, Inference::FLOAT).map_err(BadInput::of)?;
+    let localizer =
+        Localizer::load(&args.encoder, &args.head, Inference::FLOAT).map_err(BadInput::of)?;
     let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
     for folder in &args.scene {
         for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {
@@ -49,10 +50,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     let scales = search.scales();
     if scales.is_empty() {
-        return Err(BadInput::new(format!("none of {observed} sweeps has cells: nothing to search scales on")).into());
+        return Err(BadInput::new(format!(
+            "none of {observed} sweeps has cells: nothing to search scales on"
+        ))
+        .into());
     }
-    let sha256 = annotate(&args.head, SCALES_KEY, &serde_json::to_string(&scales)?).map_err(BadInput::of)?;
+    let sha256 =
+        annotate(&args.head, SCALES_KEY, &serde_json::to_string(&scales)?).map_err(BadInput::of)?;
     let (head, activations) = (args.head.display(), scales.len());
-    output::line(format_args!("{head}: {activations} activations of {observed} sweeps, SHA-256 {sha256}"))?;
+    output::line(format_args!(
+        "{head}: {activations} activations of {observed} sweeps, SHA-256 {sha256}"
+    ))?;
     Ok(left_out.print())
 }

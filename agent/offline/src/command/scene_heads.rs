@@ -20,11 +20,22 @@ impl FromStr for SceneHeadFile {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let Some((map, weights)) = text.split_once('=') else {
-            return Ok(Self { map: None, weights: text.into() });
+            return Ok(Self {
+                map: None,
+                weights: text.into(),
+            });
         };
         let (name, seed) = map.split_once(':').unwrap_or((map, "0"));
-        let seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a map"))?;
-        Ok(Self { map: Some(GeneratedMap { name: name.to_owned(), seed }), weights: weights.into() })
+        let seed = seed
+            .parse()
+            .map_err(|_| format!("{seed:?} is no seed of a map"))?;
+        Ok(Self {
+            map: Some(GeneratedMap {
+                name: name.to_owned(),
+                seed,
+            }),
+            weights: weights.into(),
+        })
     }
 }
 
@@ -32,16 +43,23 @@ impl FromStr for SceneHeadFile {
 ///
 /// # Errors
 /// [`BadInput`] when its map cannot be read or has no head, and when one of several heads has no map.
-pub(crate) fn head_of<'a>(heads: &'a [SceneHeadFile], scenario: &Scenario) -> Result<&'a Path, BadInput> {
+pub(crate) fn head_of<'a>(
+    heads: &'a [SceneHeadFile],
+    scenario: &Scenario,
+) -> Result<&'a Path, BadInput> {
     if let [SceneHeadFile { map: None, weights }] = heads {
         return Ok(weights);
     }
     if let Some(SceneHeadFile { weights, .. }) = heads.iter().find(|head| head.map.is_none()) {
         let (weights, count) = (weights.display(), heads.len());
-        return Err(BadInput::new(format!("--head {weights}: of {count} heads each needs its map, MAP={weights}")));
+        return Err(BadInput::new(format!(
+            "--head {weights}: of {count} heads each needs its map, MAP={weights}"
+        )));
     }
     let map = scenario.generated_map();
-    let map = map.with_context(|| format!("the map of scenario {}", scenario.name)).map_err(BadInput::of)?;
+    let map = map
+        .with_context(|| format!("the map of scenario {}", scenario.name))
+        .map_err(BadInput::of)?;
     let head = heads.iter().find(|head| head.map.as_ref() == Some(&map));
     let missing = || BadInput::new(format!("{}: no --head for map {map}", scenario.name));
     Ok(&head.ok_or_else(missing)?.weights)
@@ -61,11 +79,17 @@ pub(crate) fn by_head<'a>(
     let mut groups: Vec<(&Path, Vec<PathBuf>)> = Vec::new();
     for folder in scenes {
         let scenarios = dataset::open(folder).map_err(BadInput::of)?.scenarios;
-        let needed = scenarios.iter().map(|scenario| head_of(heads, scenario)).collect::<Result<Vec<_>, _>>()?;
+        let needed = scenarios
+            .iter()
+            .map(|scenario| head_of(heads, scenario))
+            .collect::<Result<Vec<_>, _>>()?;
         let missing = || BadInput::new(format!("{}: there is no scenario in it", folder.display()));
         let &head = needed.first().ok_or_else(missing)?;
         if needed.iter().any(|other| *other != head) {
-            return Err(BadInput::new(format!("{}: scenarios of several maps", folder.display())));
+            return Err(BadInput::new(format!(
+                "{}: scenarios of several maps",
+                folder.display()
+            )));
         }
         match groups.iter_mut().find(|(of, _)| *of == head) {
             Some((_, folders)) => folders.push(folder.clone()),
@@ -83,12 +107,30 @@ mod tests {
 
     #[test]
     fn heads_are_of_one_town_or_of_all() {
-        let map = |name: &str, seed| Some(GeneratedMap { name: name.into(), seed });
-        for (text, expected) in [("h.st", None), ("town1=h.st", map("town1", 0)), ("town4:3=h.st", map("town4", 3))] {
+        let map = |name: &str, seed| {
+            Some(GeneratedMap {
+                name: name.into(),
+                seed,
+            })
+        };
+        for (text, expected) in [
+            ("h.st", None),
+            ("town1=h.st", map("town1", 0)),
+            ("town4:3=h.st", map("town4", 3)),
+        ] {
             let head: SceneHeadFile = text.parse().unwrap();
-            assert_eq!((head.map, head.weights), (expected, PathBuf::from("h.st")), "{text}");
+            assert_eq!(
+                (head.map, head.weights),
+                (expected, PathBuf::from("h.st")),
+                "{text}"
+            );
         }
-        assert!("town1:x=h".parse::<SceneHeadFile>().unwrap_err().contains('x'));
+        assert!(
+            "town1:x=h"
+                .parse::<SceneHeadFile>()
+                .unwrap_err()
+                .contains('x')
+        );
     }
 
     #[test]
@@ -96,22 +138,44 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let scene = |subset, name: &str| {
             let out = folder.path().join(name);
-            let options = SynthOptions { traversals: 1, frames: 1, ..SynthOptions::new(subset, 11, out.clone()) };
+            let options = SynthOptions {
+                traversals: 1,
+                frames: 1,
+                ..SynthOptions::new(subset, 11, out.clone())
+            };
             generate(&options, &|_| {}).unwrap();
             out
         };
-        let [a, b, c] = [(Subset::Town1loc, "a"), (Subset::Town4loc, "b"), (Subset::Town1loc, "c")]
-            .map(|(subset, name)| scene(subset, name));
+        let [a, b, c] = [
+            (Subset::Town1loc, "a"),
+            (Subset::Town4loc, "b"),
+            (Subset::Town1loc, "c"),
+        ]
+        .map(|(subset, name)| scene(subset, name));
         let scenes = [a.clone(), b.clone(), c.clone()];
-        let heads: Vec<SceneHeadFile> = ["town1=1.st", "town4=4.st"].map(|head| head.parse().unwrap()).into();
+        let heads: Vec<SceneHeadFile> = ["town1=1.st", "town4=4.st"]
+            .map(|head| head.parse().unwrap())
+            .into();
         let groups = by_head(&heads, &scenes).unwrap();
-        assert_eq!(groups, [(Path::new("1.st"), vec![a, c]), (Path::new("4.st"), vec![b])]);
+        assert_eq!(
+            groups,
+            [
+                (Path::new("1.st"), vec![a, c]),
+                (Path::new("4.st"), vec![b])
+            ]
+        );
         let error = by_head(&heads[..1], &scenes).unwrap_err().to_string();
         assert!(error.contains("no --head for map town4:0"), "{error}");
         let unclear = ["town1=1.st", "h.st"].map(|head| head.parse().unwrap());
         let error = by_head(&unclear, &scenes).unwrap_err().to_string();
-        assert!(error.contains("h.st: of 2 heads each needs its map"), "{error}");
+        assert!(
+            error.contains("h.st: of 2 heads each needs its map"),
+            "{error}"
+        );
         let any = ["h.st".parse().unwrap()];
-        assert_eq!(by_head(&any, &scenes).unwrap(), [(Path::new("h.st"), scenes.to_vec())]);
+        assert_eq!(
+            by_head(&any, &scenes).unwrap(),
+            [(Path::new("h.st"), scenes.to_vec())]
+        );
     }
 }

@@ -10,7 +10,9 @@ use dataset::frame::Frame;
 use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
-pub use summary::{CalibrationBin, IntegritySummary, LocalizationSummary, RejectionSummary, reliability_charts};
+pub use summary::{
+    CalibrationBin, IntegritySummary, LocalizationSummary, RejectionSummary, reliability_charts,
+};
 pub use table::{write_csv, write_error_table};
 
 use localization::pgc::LocalizerError;
@@ -41,7 +43,9 @@ pub enum EvaluationError {
     #[error("no sweep in {0:?}")]
     Empty(Vec<PathBuf>),
     /// A sweep has no pose to compare with.
-    #[error("{scenario}: {cav} at {stem}: there is no true pose to compare with (agent localize finds poses without)")]
+    #[error(
+        "{scenario}: {cav} at {stem}: there is no true pose to compare with (agent localize finds poses without)"
+    )]
     NoTruth {
         /// Name of the scenario.
         scenario: String,
@@ -74,25 +78,35 @@ impl EvaluatedSweep {
     /// Error of the estimated pose, rejected or not.
     #[must_use]
     pub fn error(&self) -> Option<PoseError> {
-        self.localization.found.map(|found| PoseError::between(&found.world_from_sensor.into(), &self.truth))
+        self.localization
+            .found
+            .map(|found| PoseError::between(&found.world_from_sensor.into(), &self.truth))
     }
 
     /// Error of the pose that is published, if there is one.
     #[must_use]
     pub(crate) fn told_error(&self) -> Option<PoseError> {
-        self.localization.estimate.world_from_cav().map(|pose| PoseError::between(pose, &self.truth))
+        self.localization
+            .estimate
+            .world_from_cav()
+            .map(|pose| PoseError::between(pose, &self.truth))
     }
 
     /// Sample for the fit of a confidence model.
     #[must_use]
     pub fn labelled(&self) -> Option<Labelled> {
         let found = self.localization.found?;
-        Some(Labelled { evidence: found.evidence, error_m: self.error()?.distance_m })
+        Some(Labelled {
+            evidence: found.evidence,
+            error_m: self.error()?.distance_m,
+        })
     }
 
     /// Applies another confidence model to the estimated pose.
     pub fn judge_again(&mut self, confidence: &Confidence) {
-        let Some(found) = &mut self.localization.found else { return };
+        let Some(found) = &mut self.localization.found else {
+            return;
+        };
         found.sigma = confidence.sigma(&found.evidence);
         found.is_rejected = confidence.rejects(found.sigma);
         self.localization.estimate = localization::pgc::pose_solver::estimate(&Ok(*found));
@@ -125,7 +139,11 @@ pub fn evaluate(
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, EvaluationError> {
-    evaluate_with(&mut |frame| localizer.localize(&frame.points), options, on_sweep)
+    evaluate_with(
+        &mut |frame| localizer.localize(&frame.points),
+        options,
+        on_sweep,
+    )
 }
 
 /// The same for a pose source, which gets the pose of the GNSS receiver.
@@ -139,13 +157,28 @@ pub fn evaluate_source(
 ) -> Result<Evaluated, EvaluationError> {
     let mut ask = |frame: &Frame| {
         let measured = frame.gnss_world_from_lidar();
-        let Frame { cav, capture_nanos, points, .. } = frame;
+        let Frame {
+            cav,
+            capture_nanos,
+            points,
+            ..
+        } = frame;
         let start = Instant::now();
         let (capture_nanos, motion) = (*capture_nanos, frame.motion());
-        let input = PoseInput { cav, capture_nanos, cloud: points, levels: None, measured: measured.as_ref(), motion };
+        let input = PoseInput {
+            cav,
+            capture_nanos,
+            cloud: points,
+            levels: None,
+            measured: measured.as_ref(),
+            motion,
+        };
         let estimate = source.estimate(&input);
         source.observe(&input);
-        let times = LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() };
+        let times = LocalizerTimes {
+            solve: start.elapsed(),
+            ..LocalizerTimes::default()
+        };
         Ok(Localization::from_estimate(estimate, times))
     };
     evaluate_with(&mut ask, options, on_sweep)
@@ -156,34 +189,64 @@ fn evaluate_with(
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, EvaluationError> {
-    let datasets = options.scenes.iter().map(|dir| dataset::open(dir)).collect::<Result<Vec<_>, _>>()?;
+    let datasets = options
+        .scenes
+        .iter()
+        .map(|dir| dataset::open(dir))
+        .collect::<Result<Vec<_>, _>>()?;
     let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
-    let all: Vec<Sweep<'_>> = scenarios.flat_map(|scenario| sweeps_of(scenario, options.every)).collect();
+    let all: Vec<Sweep<'_>> = scenarios
+        .flat_map(|scenario| sweeps_of(scenario, options.every))
+        .collect();
     let count = options.sweeps.map_or(all.len(), |most| most.min(all.len()));
     if count == 0 {
         return Err(EvaluationError::Empty(options.scenes.clone()));
     }
-    let load = LoadOptions { lidar_variant: options.variant.clone(), ..LoadOptions::default() };
-    let mut evaluated = Evaluated { sweeps: Vec::with_capacity(count), left_out: LeftOut::default() };
-    datasets.iter().for_each(|dataset| evaluated.left_out.add_files(&dataset.problems));
+    let load = LoadOptions {
+        lidar_variant: options.variant.clone(),
+        ..LoadOptions::default()
+    };
+    let mut evaluated = Evaluated {
+        sweeps: Vec::with_capacity(count),
+        left_out: LeftOut::default(),
+    };
+    datasets
+        .iter()
+        .for_each(|dataset| evaluated.left_out.add_files(&dataset.problems));
     for place in 0..count {
-        let Sweep { scenario, agent, tick } = all[place * all.len() / count];
+        let Sweep {
+            scenario,
+            agent,
+            tick,
+        } = all[place * all.len() / count];
         on_sweep(place + 1, count);
         let frame = match scenario.load(agent, tick, &load) {
             Ok(frame) => frame,
             Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
             Err(error) => {
-                evaluated.left_out.add_unreadable(agent, Problem::from(&error));
+                evaluated
+                    .left_out
+                    .add_unreadable(agent, Problem::from(&error));
                 continue;
             }
         };
         let stem = scenario.ticks[tick].stem.clone();
         let Some(truth) = frame.world_from_lidar else {
-            return Err(EvaluationError::NoTruth { scenario: scenario.name.clone(), cav: frame.cav, stem });
+            return Err(EvaluationError::NoTruth {
+                scenario: scenario.name.clone(),
+                cav: frame.cav,
+                stem,
+            });
         };
         let localization = localize(&frame)?;
         let scenario = scenario.name.clone();
-        evaluated.sweeps.push(EvaluatedSweep { scenario, cav: frame.cav, stem, truth, localization });
+        evaluated.sweeps.push(EvaluatedSweep {
+            scenario,
+            cav: frame.cav,
+            stem,
+            truth,
+            localization,
+        });
     }
     if evaluated.sweeps.is_empty() {
         return Err(EvaluationError::Empty(options.scenes.clone()));
@@ -194,9 +257,17 @@ fn evaluate_with(
 /// Sweeps vehicle by vehicle, in the order of time.
 fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_>> {
     let ticks = move |agent| {
-        (0..scenario.ticks.len()).step_by(every.max(1)).filter(move |&tick| scenario.is_present(agent, tick))
+        (0..scenario.ticks.len())
+            .step_by(every.max(1))
+            .filter(move |&tick| scenario.is_present(agent, tick))
     };
-    (0..scenario.agents.len()).flat_map(move |agent| ticks(agent).map(move |tick| Sweep { scenario, agent, tick }))
+    (0..scenario.agents.len()).flat_map(move |agent| {
+        ticks(agent).map(move |tick| Sweep {
+            scenario,
+            agent,
+            tick,
+        })
+    })
 }
 
 /// Name of a sweep's outcome.
@@ -228,7 +299,13 @@ pub(super) mod tests {
                 let outliers = 0.1 + 0.85 * hardness;
                 let twins = 0.6 * hardness;
                 let cells = if seed % 10 == 9 { 0 } else { 300 };
-                let mut scene = SyntheticScene { cells, outliers, twins, next_seed: seed, ..SyntheticScene::default() };
+                let mut scene = SyntheticScene {
+                    cells,
+                    outliers,
+                    twins,
+                    next_seed: seed,
+                    ..SyntheticScene::default()
+                };
                 EvaluatedSweep {
                     scenario: "town".into(),
                     cav: CavId::new("7").unwrap(),
@@ -257,9 +334,18 @@ pub(super) mod tests {
     #[test]
     fn folders_without_sweeps_are_named() {
         let empty = tempfile::tempdir().unwrap();
-        let options =
-            EvaluationOptions { scenes: vec![empty.path().to_owned()], variant: None, every: 1, sweeps: None };
-        let error = evaluate(&mut SyntheticScene::default(), &options, &mut |_, _| {}).unwrap_err().to_string();
-        assert!(error.contains(&empty.path().display().to_string()), "{error}");
+        let options = EvaluationOptions {
+            scenes: vec![empty.path().to_owned()],
+            variant: None,
+            every: 1,
+            sweeps: None,
+        };
+        let error = evaluate(&mut SyntheticScene::default(), &options, &mut |_, _| {})
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains(&empty.path().display().to_string()),
+            "{error}"
+        );
     }
 }

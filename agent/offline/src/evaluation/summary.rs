@@ -115,11 +115,25 @@ impl LocalizationSummary {
     /// Summary of sweeps.
     #[must_use]
     pub fn of(sweeps: &[EvaluatedSweep]) -> Self {
-        let published: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::told_error).collect();
-        let metres = sorted(&published.iter().map(|error| error.distance_m).collect::<Vec<_>>());
-        let degrees = sorted(&published.iter().map(|error| error.angle_deg).collect::<Vec<_>>());
+        let published: Vec<_> = sweeps
+            .iter()
+            .filter_map(EvaluatedSweep::told_error)
+            .collect();
+        let metres = sorted(
+            &published
+                .iter()
+                .map(|error| error.distance_m)
+                .collect::<Vec<_>>(),
+        );
+        let degrees = sorted(
+            &published
+                .iter()
+                .map(|error| error.angle_deg)
+                .collect::<Vec<_>>(),
+        );
         let success = |limit_m: f64| {
-            metres.iter().filter(|&&error_m| error_m < limit_m).count() as f64 / sweeps.len().max(1) as f64
+            metres.iter().filter(|&&error_m| error_m < limit_m).count() as f64
+                / sweeps.len().max(1) as f64
         };
         let judged = judged(sweeps);
         let sigmas: Vec<f64> = judged.iter().map(|pose| pose.sigma).collect();
@@ -130,11 +144,18 @@ impl LocalizationSummary {
         let calibration = calibration(&judged);
         let mut outcomes = BTreeMap::new();
         for sweep in sweeps {
-            *outcomes.entry(outcome(&sweep.localization.estimate)).or_default() += 1;
+            *outcomes
+                .entry(outcome(&sweep.localization.estimate))
+                .or_default() += 1;
         }
-        let total_ms: Vec<f64> =
-            sweeps.iter().map(|sweep| sweep.localization.times.total().as_secs_f64() * 1e3).collect();
-        let gaps: Vec<f64> = calibration.iter().map(|bin| (bin.sigma - bin.observed).abs()).collect();
+        let total_ms: Vec<f64> = sweeps
+            .iter()
+            .map(|sweep| sweep.localization.times.total().as_secs_f64() * 1e3)
+            .collect();
+        let gaps: Vec<f64> = calibration
+            .iter()
+            .map(|bin| (bin.sigma - bin.observed).abs())
+            .collect();
         Self {
             sweeps: sweeps.len(),
             success_3m: success(3.0),
@@ -165,7 +186,11 @@ impl LocalizationSummary {
 fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
     let judged = |sweep: &EvaluatedSweep| {
         let (found, error) = (sweep.localization.found?, sweep.error()?);
-        Some(Judged { sigma: found.sigma, error_m: error.distance_m, is_rejected: found.is_rejected })
+        Some(Judged {
+            sigma: found.sigma,
+            error_m: error.distance_m,
+            is_rejected: found.is_rejected,
+        })
     };
     sweeps.iter().filter_map(judged).collect()
 }
@@ -184,13 +209,19 @@ fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
         }
     };
     let cut = |bin: usize| bin * by_sigma.len() / BINS;
-    (0..BINS).map(|place| &by_sigma[cut(place)..cut(place + 1)]).filter(|poses| !poses.is_empty()).map(bin).collect()
+    (0..BINS)
+        .map(|place| &by_sigma[cut(place)..cut(place + 1)])
+        .filter(|poses| !poses.is_empty())
+        .map(bin)
+        .collect()
 }
 
 fn rejected(judged: &[Judged]) -> RejectionSummary {
-    let (good, bad): (Vec<&Judged>, Vec<&Judged>) = judged.iter().partition(|pose| pose.error_m <= BAD_M);
+    let (good, bad): (Vec<&Judged>, Vec<&Judged>) =
+        judged.iter().partition(|pose| pose.error_m <= BAD_M);
     let count = |poses: &[&Judged]| poses.iter().filter(|pose| pose.is_rejected).count();
-    let share = |poses: &[&Judged]| (!poses.is_empty()).then(|| count(poses) as f64 / poses.len() as f64);
+    let share =
+        |poses: &[&Judged]| (!poses.is_empty()).then(|| count(poses) as f64 / poses.len() as f64);
     RejectionSummary {
         poses: count(&good) + count(&bad),
         bad: bad.len(),
@@ -201,15 +232,23 @@ fn rejected(judged: &[Judged]) -> RejectionSummary {
 
 fn integrity(sweeps: &[EvaluatedSweep]) -> Option<IntegritySummary> {
     let judged = |sweep: &EvaluatedSweep| {
-        let PoseEstimate::Pose { world_from_cav, covariance: Some(covariance), .. } = &sweep.localization.estimate
+        let PoseEstimate::Pose {
+            world_from_cav,
+            covariance: Some(covariance),
+            ..
+        } = &sweep.localization.estimate
         else {
             return None;
         };
-        let off = |axis: usize| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis];
+        let off =
+            |axis: usize| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis];
         Some((off(0).hypot(off(1)), covariance.bound_95_m()))
     };
     let judged: Vec<(f64, f64)> = sweeps.iter().filter_map(judged).collect();
-    let exceeded = judged.iter().filter(|(error_m, bound_m)| error_m > bound_m).count();
+    let exceeded = judged
+        .iter()
+        .filter(|(error_m, bound_m)| error_m > bound_m)
+        .count();
     let bounds: Vec<f64> = judged.iter().map(|(_, bound_m)| *bound_m).collect();
     Some(IntegritySummary {
         poses: judged.len(),
@@ -224,11 +263,17 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
         let stages = sweep.localization.times;
         let mut add = |stage: &str, ms: f64| times.entry(stage.to_owned()).or_default().push(ms);
         for timing in stages.stages() {
-            add(timing.stage.trim_start_matches("pose "), timing.nanos as f64 * 1e-6);
+            add(
+                timing.stage.trim_start_matches("pose "),
+                timing.nanos as f64 * 1e-6,
+            );
         }
         add("total", stages.total().as_secs_f64() * 1e3);
     }
-    times.into_iter().map(|(stage, ms)| (stage, median(&ms).unwrap_or(0.0))).collect()
+    times
+        .into_iter()
+        .map(|(stage, ms)| (stage, median(&ms).unwrap_or(0.0)))
+        .collect()
 }
 
 /// The reliability curve, and every pose by sigma and error.
@@ -236,8 +281,10 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
 pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let judged = judged(sweeps);
     let bins = calibration(&judged);
-    let published =
-        sweeps.iter().filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. })).count();
+    let published = sweeps
+        .iter()
+        .filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. }))
+        .count();
     let cloud = |name: &str, is_rejected: bool| Series {
         name: name.into(),
         points: (judged.iter().filter(|pose| pose.is_rejected == is_rejected))
@@ -246,7 +293,10 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         mark: Mark::Dots,
     };
     let reliability = Chart {
-        title: format!("Reliability, {} sweeps, {published} poses published", sweeps.len()),
+        title: format!(
+            "Reliability, {} sweeps, {published} poses published",
+            sweeps.len()
+        ),
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::linear("mean of 1 / (1 + e^2), e in m", [0.0, 1.0]),
         series: vec![
@@ -255,7 +305,11 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
                 points: bins.iter().map(|bin| (bin.sigma, bin.observed)).collect(),
                 mark: Mark::LineAndDots,
             },
-            Series { name: "perfectly calibrated".into(), points: vec![(0.0, 0.0), (1.0, 1.0)], mark: Mark::Line },
+            Series {
+                name: "perfectly calibrated".into(),
+                points: vec![(0.0, 0.0), (1.0, 1.0)],
+                mark: Mark::Line,
+            },
         ],
     };
     let errors = Chart {
@@ -264,7 +318,11 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         y: Axis::logarithmic("distance to the true position, m", [0.01, 1000.0]),
         series: vec![
             cloud("published", false),
-            Series { name: "3 m".into(), points: vec![(0.0, BAD_M), (1.0, BAD_M)], mark: Mark::Line },
+            Series {
+                name: "3 m".into(),
+                points: vec![(0.0, BAD_M), (1.0, BAD_M)],
+                mark: Mark::Line,
+            },
             cloud("rejected", true),
         ],
     };
@@ -285,15 +343,31 @@ mod tests {
         assert_eq!(summary.outcomes.values().sum::<usize>(), 40);
         assert!(summary.success_1m <= summary.success_3m && summary.success_3m < 1.0);
         assert!(summary.p50_m < summary.p95_m && summary.p95_m <= summary.max_m);
-        assert_eq!(summary.calibration.iter().map(|bin| bin.poses).sum::<usize>(), 40 - summary.no_pose);
+        assert_eq!(
+            summary
+                .calibration
+                .iter()
+                .map(|bin| bin.poses)
+                .sum::<usize>(),
+            40 - summary.no_pose
+        );
         assert!(summary.sigma_spearman.unwrap() < -0.5);
-        assert_eq!((summary.rejected.poses, summary.rejected.good_share), (0, Some(0.0)));
+        assert_eq!(
+            (summary.rejected.poses, summary.rejected.good_share),
+            (0, Some(0.0))
+        );
         assert_eq!(summary.ms.len(), 6);
         // Rejecting everything leaves every sweep without a pose, and the errors of unpublished poses do not count.
-        let all = Confidence::Calibrated(ConfidenceModel { reject_below: 1.1, ..ConfidenceModel::example() });
+        let all = Confidence::Calibrated(ConfidenceModel {
+            reject_below: 1.1,
+            ..ConfidenceModel::example()
+        });
         sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&all));
         let silent = LocalizationSummary::of(&sweeps);
-        assert_eq!((silent.no_pose, silent.success_3m, silent.mean_m), (40, 0.0, None));
+        assert_eq!(
+            (silent.no_pose, silent.success_3m, silent.mean_m),
+            (40, 0.0, None)
+        );
         assert_eq!(silent.rejected.bad_share, Some(1.0));
         assert!(silent.sigma_spearman.is_some());
     }
@@ -301,9 +375,17 @@ mod tests {
     #[test]
     fn the_serialised_names_are_there() {
         let json = serde_json::to_value(LocalizationSummary::of(&evaluated(12))).unwrap();
-        for name in
-            ["sweeps", "success_3m", "success_1m", "mean_m", "p50_m", "p95_m", "mean_deg", "p50_deg", "sigma_spearman"]
-        {
+        for name in [
+            "sweeps",
+            "success_3m",
+            "success_1m",
+            "mean_m",
+            "p50_m",
+            "p95_m",
+            "mean_deg",
+            "p50_deg",
+            "sigma_spearman",
+        ] {
             assert!(json[name].is_number(), "{name}: {}", json[name]);
         }
         assert!(json["no_pose"].is_u64() && json["ms"]["total"].is_number());
@@ -314,8 +396,14 @@ mod tests {
     fn the_charts_show_every_pose() {
         let sweeps = evaluated(30);
         let charts = reliability_charts(&sweeps);
-        let found = sweeps.iter().filter(|sweep| sweep.localization.found.is_some()).count();
-        assert_eq!(charts[1].series[0].points.len() + charts[1].series[2].points.len(), found);
+        let found = sweeps
+            .iter()
+            .filter(|sweep| sweep.localization.found.is_some())
+            .count();
+        assert_eq!(
+            charts[1].series[0].points.len() + charts[1].series[2].points.len(),
+            found
+        );
         assert_eq!(charts[0].series[0].points.len(), BINS);
     }
 }

@@ -37,7 +37,13 @@ fn csv(sweeps: &[EvaluatedSweep]) -> String {
 }
 
 fn row(sweep: &EvaluatedSweep) -> Vec<String> {
-    let EvaluatedSweep { scenario, cav, stem, truth, localization } = sweep;
+    let EvaluatedSweep {
+        scenario,
+        cav,
+        stem,
+        truth,
+        localization,
+    } = sweep;
     let mut fields = vec![scenario.clone(), cav.to_string(), stem.clone()];
     fields.extend(pose(truth));
     let outcome = outcome(&localization.estimate).to_owned();
@@ -51,7 +57,10 @@ fn row(sweep: &EvaluatedSweep) -> Vec<String> {
         fields.push(outcome);
         fields.resize(fields.len() + 15, String::new());
     }
-    fields.push(format!("{:.3}", localization.times.total().as_secs_f64() * 1e3));
+    fields.push(format!(
+        "{:.3}",
+        localization.times.total().as_secs_f64() * 1e3
+    ));
     fields
 }
 
@@ -78,7 +87,15 @@ fn evidence_fields(evidence: &PoseEvidence) -> Vec<String> {
             second.worst_axis_std_m,
         ]
         .map(four);
-        [ratio, rms, epsilon, moved, quartile, format!("{:.3}", second.information_per_m2), worst]
+        [
+            ratio,
+            rms,
+            epsilon,
+            moved,
+            quartile,
+            format!("{:.3}", second.information_per_m2),
+            worst,
+        ]
     });
     fields.extend(second.unwrap_or_default());
     fields
@@ -97,8 +114,16 @@ fn error_table(sweeps: &[EvaluatedSweep]) -> String {
     let mut text = CsvText::new("x_m,y_m,z_m,yaw_deg,confidence");
     for sweep in sweeps {
         match &sweep.localization.estimate {
-            PoseEstimate::Pose { world_from_cav, confidence, .. } => {
-                let error: Pose = sweep.truth.isometry().inv_mul(&world_from_cav.isometry()).into();
+            PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            } => {
+                let error: Pose = sweep
+                    .truth
+                    .isometry()
+                    .inv_mul(&world_from_cav.isometry())
+                    .into();
                 let [x, y, z, yaw] = pose(&error);
                 text.row([x, y, z, yaw, format!("{confidence:.4}")]);
             }
@@ -117,10 +142,17 @@ mod tests {
     #[test]
     fn every_row_has_every_column() {
         let sweeps = evaluated(40);
-        assert!(sweeps.iter().any(|sweep| sweep.localization.found.is_none()));
+        assert!(
+            sweeps
+                .iter()
+                .any(|sweep| sweep.localization.found.is_none())
+        );
         let text = csv(&sweeps);
         let columns: Vec<usize> = text.lines().map(|line| line.split(',').count()).collect();
-        assert!(columns.len() == 41 && columns.iter().all(|&count| count == columns[0]), "{columns:?}");
+        assert!(
+            columns.len() == 41 && columns.iter().all(|&count| count == columns[0]),
+            "{columns:?}"
+        );
     }
 
     #[test]

@@ -51,18 +51,35 @@ pub(super) fn check(
             break;
         }
         progress(number, copies * list.len());
-        let Some((frame, scenario, stem)) = list.frame(index) else { continue };
-        let Some(truth) = frame.world_from_lidar else { continue };
+        let Some((frame, scenario, stem)) = list.frame(index) else {
+            continue;
+        };
+        let Some(truth) = frame.world_from_lidar else {
+            continue;
+        };
         let (cloud, truth) = match copy {
             0 => (frame.points, truth),
             _ => turned(&frame.points, &truth, &mut rng),
         };
         let localization = localizer.localize(&cloud)?;
-        let sweep = EvaluatedSweep { scenario, cav: frame.cav, stem, truth, localization };
+        let sweep = EvaluatedSweep {
+            scenario,
+            cav: frame.cav,
+            stem,
+            truth,
+            localization,
+        };
         check.labelled.extend(sweep.labelled());
-        let mirrored = EvaluatedSweep { localization: localizer.localize(&mirrored(&cloud))?, ..sweep.clone() };
+        let mirrored = EvaluatedSweep {
+            localization: localizer.localize(&mirrored(&cloud))?,
+            ..sweep.clone()
+        };
         // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.
-        check.labelled.extend(mirrored.labelled().filter(|labelled| labelled.error_m > BAD_M));
+        check.labelled.extend(
+            mirrored
+                .labelled()
+                .filter(|labelled| labelled.error_m > BAD_M),
+        );
         if copy == 0 {
             check.sweeps.push(sweep);
         }
@@ -75,15 +92,30 @@ fn turned(cloud: &PointCloud, world_from_sensor: &Pose, rng: &mut impl Rng) -> (
     let turned_from_sensor = yaw(rng.random_range(-TURN_RAD..TURN_RAD));
     let keep = rng.random_range(KEEP..1.0);
     let turn: Isometry3<f32> = turned_from_sensor.cast();
-    let kept = cloud.xyzi.iter().filter(|_| rng.random_bool(keep)).map(|&[x, y, z, intensity]| {
-        let point = turn * nalgebra::Point3::new(x, y, z);
-        [point.x, point.y, point.z, intensity]
-    });
-    (PointCloud { xyzi: kept.collect() }, (world_from_sensor.isometry() * turned_from_sensor.inverse()).into())
+    let kept = cloud
+        .xyzi
+        .iter()
+        .filter(|_| rng.random_bool(keep))
+        .map(|&[x, y, z, intensity]| {
+            let point = turn * nalgebra::Point3::new(x, y, z);
+            [point.x, point.y, point.z, intensity]
+        });
+    (
+        PointCloud {
+            xyzi: kept.collect(),
+        },
+        (world_from_sensor.isometry() * turned_from_sensor.inverse()).into(),
+    )
 }
 
 fn mirrored(cloud: &PointCloud) -> PointCloud {
-    PointCloud { xyzi: cloud.xyzi.iter().map(|&[x, y, z, intensity]| [x, -y, z, intensity]).collect() }
+    PointCloud {
+        xyzi: cloud
+            .xyzi
+            .iter()
+            .map(|&[x, y, z, intensity]| [x, -y, z, intensity])
+            .collect(),
+    }
 }
 
 #[cfg(test)]
@@ -92,12 +124,15 @@ mod tests {
 
     #[test]
     fn a_point_keeps_its_place_in_the_world_when_the_sensor_is_turned() {
-        let cloud = PointCloud { xyzi: vec![[10.0, -3.0, 1.0, 0.5]; 200] };
+        let cloud = PointCloud {
+            xyzi: vec![[10.0, -3.0, 1.0, 0.5]; 200],
+        };
         let pose = Pose::from_xyz_yaw([5.0, 6.0, 2.0], 0.7);
         let (copy, turned_pose) = turned(&cloud, &pose, &mut ChaCha8Rng::seed_from_u64(3));
         assert!((100..200).contains(&copy.len()));
-        let place =
-            |pose: &Pose, [x, y, z, _]: [f32; 4]| pose.isometry() * nalgebra::Point3::new(x, y, z).cast::<f64>();
+        let place = |pose: &Pose, [x, y, z, _]: [f32; 4]| {
+            pose.isometry() * nalgebra::Point3::new(x, y, z).cast::<f64>()
+        };
         let moved = place(&pose, cloud.xyzi[0]) - place(&turned_pose, copy.xyzi[0]);
         assert!(moved.norm() < 1e-5, "{moved}");
         assert_eq!(mirrored(&cloud).xyzi[0], [10.0, 3.0, 1.0, 0.5]);

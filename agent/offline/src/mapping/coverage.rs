@@ -54,18 +54,34 @@ impl Coverage {
         let cell_m = CELL_M.max((edge_m / MOST_CELLS / CELL_M).ceil() * CELL_M);
         let mut counts: BTreeMap<[i64; 2], usize> = BTreeMap::new();
         for position in all() {
-            *counts.entry([0, 1].map(|axis| (position[axis] / cell_m).floor() as i64)).or_default() += 1;
+            *counts
+                .entry([0, 1].map(|axis| (position[axis] / cell_m).floor() as i64))
+                .or_default() += 1;
         }
-        let cells =
-            counts.into_iter().map(|(cell, sweeps)| CoveredCell { corner_m: cell.map(|k| k as f64 * cell_m), sweeps });
-        let length_m = drives.iter().flat_map(|drive| drive.windows(2)).map(|pair| (pair[1] - pair[0]).norm()).sum();
-        Some(Self { sweeps: all().count(), length_m, low_m, high_m, cell_m, cells: cells.collect() })
+        let cells = counts.into_iter().map(|(cell, sweeps)| CoveredCell {
+            corner_m: cell.map(|k| k as f64 * cell_m),
+            sweeps,
+        });
+        let length_m = drives
+            .iter()
+            .flat_map(|drive| drive.windows(2))
+            .map(|pair| (pair[1] - pair[0]).norm())
+            .sum();
+        Some(Self {
+            sweeps: all().count(),
+            length_m,
+            low_m,
+            high_m,
+            cell_m,
+            cells: cells.collect(),
+        })
     }
 
     /// The grid as text, north up: `#` where there are sweeps, `.` where there are none.
     #[must_use]
     pub fn picture(&self) -> String {
-        let place = |corner_m: [f64; 2]| corner_m.map(|metres| (metres / self.cell_m).round() as i64);
+        let place =
+            |corner_m: [f64; 2]| corner_m.map(|metres| (metres / self.cell_m).round() as i64);
         let places: Vec<[i64; 2]> = self.cells.iter().map(|cell| place(cell.corner_m)).collect();
         let bounds = |axis: usize| {
             let values = || places.iter().map(move |place| place[axis]);
@@ -88,13 +104,27 @@ mod tests {
 
     #[test]
     fn a_drive_is_measured_and_drawn() {
-        let east: Vec<_> = (0..=10).map(|k| Vector3::new(f64::from(k) * 10.0, 30.0, 0.0)).collect();
-        let south = vec![Vector3::new(90.0, 30.0, 0.0), Vector3::new(90.0, -10.0, 0.0)];
+        let east: Vec<_> = (0..=10)
+            .map(|k| Vector3::new(f64::from(k) * 10.0, 30.0, 0.0))
+            .collect();
+        let south = vec![
+            Vector3::new(90.0, 30.0, 0.0),
+            Vector3::new(90.0, -10.0, 0.0),
+        ];
         let coverage = Coverage::of(&[east, south]).unwrap();
-        assert_eq!((coverage.sweeps, coverage.length_m, coverage.cell_m), (13, 140.0, 25.0));
-        assert_eq!((coverage.low_m, coverage.high_m), ([0.0, -10.0], [100.0, 30.0]));
+        assert_eq!(
+            (coverage.sweeps, coverage.length_m, coverage.cell_m),
+            (13, 140.0, 25.0)
+        );
+        assert_eq!(
+            (coverage.low_m, coverage.high_m),
+            ([0.0, -10.0], [100.0, 30.0])
+        );
         assert_eq!(coverage.picture(), "#####\n.....\n...#.\n");
-        assert_eq!(coverage.cells.iter().map(|cell| cell.sweeps).sum::<usize>(), 13);
+        assert_eq!(
+            coverage.cells.iter().map(|cell| cell.sweeps).sum::<usize>(),
+            13
+        );
         assert_eq!(Coverage::of(&[Vec::new()]), None);
     }
 

@@ -36,8 +36,13 @@ pub(super) fn held_out(positions_m: &[Vector3<f64>]) -> Vec<bool> {
 
 /// Sweeps of a piece, from the median distance of neighbours.
 fn piece_sweeps(positions_m: &[Vector3<f64>]) -> usize {
-    let steps: Vec<f64> = positions_m.windows(2).map(|pair| (pair[1] - pair[0]).norm()).collect();
-    let step_m = support::statistics::median(&steps).unwrap_or(PIECE_M).max(1e-3);
+    let steps: Vec<f64> = positions_m
+        .windows(2)
+        .map(|pair| (pair[1] - pair[0]).norm())
+        .collect();
+    let step_m = support::statistics::median(&steps)
+        .unwrap_or(PIECE_M)
+        .max(1e-3);
     ((PIECE_M / step_m) as usize + 1).min(PIECE_SWEEPS)
 }
 
@@ -46,7 +51,9 @@ mod tests {
     use super::*;
 
     fn drive(count: usize, step_m: f64) -> Vec<Vector3<f64>> {
-        (0..count).map(|k| Vector3::new(k as f64 * step_m, 0.0, 0.0)).collect()
+        (0..count)
+            .map(|k| Vector3::new(k as f64 * step_m, 0.0, 0.0))
+            .collect()
     }
 
     /// Lengths of the held-out pieces.
@@ -61,7 +68,10 @@ mod tests {
             let pieces = pieces(&held_out(&drive(count, step_m)));
             let all: usize = pieces.iter().sum();
             assert!(pieces.iter().all(|&piece| piece <= most), "{pieces:?}");
-            assert!((0.08..0.2).contains(&(all as f64 / count as f64)), "{count} at {step_m} m: {pieces:?}");
+            assert!(
+                (0.08..0.2).contains(&(all as f64 / count as f64)),
+                "{count} at {step_m} m: {pieces:?}"
+            );
         }
     }
 

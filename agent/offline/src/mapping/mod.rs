@@ -20,8 +20,8 @@ use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
 use crate::evaluation::LocalizationSummary;
 use crate::head_files::ENCODER_FILE;
 use crate::training::{
-    CELLS, FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps, SceneTrainConfig,
-    SweepAugmentation, SweepList, train_scene_on,
+    CELLS, FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps,
+    SceneTrainConfig, SweepAugmentation, SweepList, train_scene_on,
 };
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
 use localization::pgc::{CellEncoder, Localizer, LocalizerError};
@@ -123,7 +123,10 @@ impl MapError {
     pub fn is_bad_input(&self) -> bool {
         match self {
             Self::NoPoses { .. } | Self::Memory { .. } | Self::Resume { .. } => true,
-            Self::Training(error) => matches!(error, LocalizerTrainError::Read(_) | LocalizerTrainError::NoSweeps(_)),
+            Self::Training(error) => matches!(
+                error,
+                LocalizerTrainError::Read(_) | LocalizerTrainError::NoSweeps(_)
+            ),
             Self::Localizer(_) | Self::Weights(_) | Self::Io { .. } => false,
         }
     }
@@ -133,11 +136,22 @@ impl MapError {
 ///
 /// # Errors
 /// [`MapError`]; a checkpoint may stay.
-pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Result<MapReport, MapError> {
-    let mut map = Map { config, started: Instant::now(), observe };
+pub fn make_map(
+    config: &MapConfig,
+    observe: &mut dyn FnMut(MapProgress),
+) -> Result<MapReport, MapError> {
+    let mut map = Map {
+        config,
+        started: Instant::now(),
+        observe,
+    };
     let sweeps = map.survey()?;
     let plan = map.plan(&sweeps)?;
-    let training = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, plan.training)));
+    let training = Arc::new(
+        sweeps
+            .list
+            .subset(&thinned(&sweeps.training, plan.training)),
+    );
     let held_out = sweeps.list.subset(&thinned(&sweeps.held_out, plan.checked));
     let coverage = sweeps.coverage(&thinned(&sweeps.training, plan.training));
     let (summary, run) = map.train(&training, &plan)?;
@@ -147,9 +161,16 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
     let mut checked = map.check(&weights, &held_out)?;
     let (confidence, sha256) = map.fit(&weights, &mut checked)?;
     let mut data = training.data();
-    data.problems.extend(held_out.data().problems.into_iter().skip(data.problems.len()));
+    data.problems.extend(
+        held_out
+            .data()
+            .problems
+            .into_iter()
+            .skip(data.problems.len()),
+    );
     data.without_pose += sweeps.without_pose;
-    let accuracy = (!checked.sweeps.is_empty()).then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
+    let accuracy = (!checked.sweeps.is_empty())
+        .then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
     Ok(MapReport {
         place: config.place.clone(),
         sha256: sha256.unwrap_or_else(|| summary.trained.sha256.clone()),
@@ -170,7 +191,9 @@ pub fn make_map(config: &MapConfig, observe: &mut dyn FnMut(MapProgress)) -> Res
 /// `count` of some indices, evenly spread.
 fn thinned(indices: &[usize], count: usize) -> Vec<usize> {
     let count = count.min(indices.len());
-    (0..count).map(|place| indices[place * indices.len() / count]).collect()
+    (0..count)
+        .map(|place| indices[place * indices.len() / count])
+        .collect()
 }
 
 /// Sweeps with poses.
@@ -189,7 +212,9 @@ impl Sweeps {
         let mut drives: Vec<Vec<Vector3<f64>>> = Vec::new();
         let mut last = None;
         for &index in indices {
-            let (drive, Some(position)) = self.positions[index] else { continue };
+            let (drive, Some(position)) = self.positions[index] else {
+                continue;
+            };
             if last != Some(drive) {
                 drives.push(Vec::new());
                 last = Some(drive);
@@ -222,31 +247,56 @@ impl Map<'_> {
 
     fn no_poses(&self, list: &SweepList) -> MapError {
         let first = list.data().problems.into_iter().next();
-        MapError::NoPoses { folders: self.config.drives.clone(), sweeps: list.len(), first }
+        MapError::NoPoses {
+            folders: self.config.drives.clone(),
+            sweeps: list.len(),
+            first,
+        }
     }
 
     /// Reads the poses and holds sweeps out.
     fn survey(&mut self) -> Result<Sweeps, MapError> {
         let list = SweepList::open(&self.config.drives)?;
         self.at(format!("reading the poses of {} sweeps", list.len()));
-        let positions: Vec<(usize, Option<Vector3<f64>>)> =
-            list.poses().into_iter().map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector))).collect();
+        let positions: Vec<(usize, Option<Vector3<f64>>)> = list
+            .poses()
+            .into_iter()
+            .map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector)))
+            .collect();
         let (mut training, mut held) = (Vec::new(), Vec::new());
-        let drives = positions.iter().map(|(drive, _)| *drive).max().map_or(0, |last| last + 1);
+        let drives = positions
+            .iter()
+            .map(|(drive, _)| *drive)
+            .max()
+            .map_or(0, |last| last + 1);
         for drive in 0..drives {
-            let of_drive = positions.iter().enumerate().filter(|(_, (of, _))| *of == drive);
-            let known: Vec<(usize, Vector3<f64>)> =
-                of_drive.filter_map(|(index, (_, position))| Some((index, (*position)?))).collect();
+            let of_drive = positions
+                .iter()
+                .enumerate()
+                .filter(|(_, (of, _))| *of == drive);
+            let known: Vec<(usize, Vector3<f64>)> = of_drive
+                .filter_map(|(index, (_, position))| Some((index, (*position)?)))
+                .collect();
             let path: Vec<Vector3<f64>> = known.iter().map(|(_, position)| *position).collect();
             for ((index, _), is_held_out) in known.into_iter().zip(held_out::held_out(&path)) {
-                if is_held_out { held.push(index) } else { training.push(index) }
+                if is_held_out {
+                    held.push(index)
+                } else {
+                    training.push(index)
+                }
             }
         }
         if training.is_empty() {
             return Err(self.no_poses(&list));
         }
         let without_pose = list.len() - training.len() - held.len();
-        Ok(Sweeps { list, positions, training, held_out: held, without_pose })
+        Ok(Sweeps {
+            list,
+            positions,
+            training,
+            held_out: held,
+            without_pose,
+        })
     }
 
     /// Measures the time of a sweep, plans and announces; or takes the plan of the map that is resumed.
@@ -255,7 +305,12 @@ impl Map<'_> {
         let with_pose = sweeps.training.len() + sweeps.held_out.len();
         if run.resume {
             let plan = StoredPlan::read(&run.out, with_pose)?;
-            let Plan { training, copies, encoding_s, .. } = plan;
+            let Plan {
+                training,
+                copies,
+                encoding_s,
+                ..
+            } = plan;
             let encoded = training * copies;
             self.note(format!(
                 "resuming: {encoded} sweeps are encoded again, in {encoding_s:.0} s, before the training"
@@ -263,9 +318,17 @@ impl Map<'_> {
             return Ok(plan);
         }
         let (encoder, _) = CellEncoder::load(&self.config.encoder, run.device)?;
-        let wanted = self.config.most_sweeps.unwrap_or(usize::MAX).min(sweeps.training.len());
+        let wanted = self
+            .config
+            .most_sweeps
+            .unwrap_or(usize::MAX)
+            .min(sweeps.training.len());
         let probes = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, PROBES)));
-        let unchanged = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };
+        let unchanged = SweepAugmentation {
+            copies: 1,
+            turn_rad: 0.0,
+            keep: 1.0,
+        };
         let began = Instant::now();
         // The first sweeps are slower: they are not counted, unless there are no others.
         let mut first_s = 0.0;
@@ -275,9 +338,11 @@ impl Map<'_> {
                 first_s = began.elapsed().as_secs_f64();
             }
         };
-        FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress).map_err(|error| match error {
-            LocalizerTrainError::NoSweeps(_) => self.no_poses(&probes),
-            error => error.into(),
+        FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress).map_err(|error| {
+            match error {
+                LocalizerTrainError::NoSweeps(_) => self.no_poses(&probes),
+                error => error.into(),
+            }
         })?;
         let all_s = began.elapsed().as_secs_f64();
         let sweep_s = match probes.len() - first {
@@ -289,15 +354,31 @@ impl Map<'_> {
         let encoded = plan.training * plan.copies;
         let needed = feature_bytes(encoded, encoder.format().cell_channels());
         if let Some(free) = too_little_memory(needed) {
-            return Err(MapError::Memory { sweeps: encoded, needed, free });
+            return Err(MapError::Memory {
+                sweeps: encoded,
+                needed,
+                free,
+            });
         }
         self.announce(sweeps, &plan, wanted);
-        StoredPlan { sweeps: with_pose, plan }.write(&run.out)?;
+        StoredPlan {
+            sweeps: with_pose,
+            plan,
+        }
+        .write(&run.out)?;
         Ok(plan)
     }
 
     fn announce(&mut self, sweeps: &Sweeps, plan: &Plan, wanted: usize) {
-        let Plan { training, copies, checked, encoding_s, scales_s, check_s, .. } = *plan;
+        let Plan {
+            training,
+            copies,
+            checked,
+            encoding_s,
+            scales_s,
+            check_s,
+            ..
+        } = *plan;
         let total_s = self.config.time.as_secs_f64();
         if training < wanted {
             let minutes = (total_s * wanted as f64 / training as f64 / 60.0).ceil();
@@ -307,7 +388,11 @@ impl Map<'_> {
             ));
         }
         let training_s = (total_s - self.seconds() - encoding_s - plan.after_training_s()).max(0.0);
-        let copies = if copies > 1 { format!(" in {copies} copies, rotated and thinned") } else { String::new() };
+        let copies = if copies > 1 {
+            format!(" in {copies} copies, rotated and thinned")
+        } else {
+            String::new()
+        };
         self.note(format!(
             "{training} training sweeps{copies}, {checked} of {} held-out sweeps; encoding {encoding_s:.0} s, training \
              {training_s:.0} s, scales for 8-bit inference {scales_s:.0} s, check {check_s:.0} s: {:.1} min in all",
@@ -316,8 +401,13 @@ impl Map<'_> {
         ));
     }
 
-    fn train(&mut self, training: &Arc<SweepList>, plan: &Plan) -> Result<(SceneSummary, RunConfig), MapError> {
-        let left_s = (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
+    fn train(
+        &mut self,
+        training: &Arc<SweepList>,
+        plan: &Plan,
+    ) -> Result<(SceneSummary, RunConfig), MapError> {
+        let left_s =
+            (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
         let run = RunConfig {
             length: Length::Time(Duration::from_secs_f64(left_s)),
             batch: (plan.training * plan.copies * CELLS / BATCHES).clamp(LEAST_BATCH, MOST_BATCH),
@@ -336,12 +426,19 @@ impl Map<'_> {
             width: 448,
             blocks: 3,
             refiner: true,
-            augmentation: SweepAugmentation { copies: plan.copies, turn_rad: 10.0_f64.to_radians(), keep: 0.7 },
+            augmentation: SweepAugmentation {
+                copies: plan.copies,
+                turn_rad: 10.0_f64.to_radians(),
+                keep: 0.7,
+            },
             redundancy: None,
             run: run.clone(),
             validate_every: CHECKPOINT_EVERY,
         };
-        let sweeps = SceneSweeps { training: Arc::clone(training), validation: None };
+        let sweeps = SceneSweeps {
+            training: Arc::clone(training),
+            validation: None,
+        };
         let started = self.started;
         let observe = &mut *self.observe;
         let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
@@ -351,13 +448,24 @@ impl Map<'_> {
             let text = match report {
                 SceneReport::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
                 SceneReport::Classified(share) => {
-                    format!("{:.0} % of the sweeps are assigned to their part of the place", 100.0 * share)
+                    format!(
+                        "{:.0} % of the sweeps are assigned to their part of the place",
+                        100.0 * share
+                    )
                 }
-                SceneReport::Stepped { step, share_done, error_m, refined_m, .. } => {
+                SceneReport::Stepped {
+                    step,
+                    share_done,
+                    error_m,
+                    refined_m,
+                    ..
+                } => {
                     // A resumed training has a part behind it.
                     let began_s: f64 = *steps_began_s.get_or_insert(seconds);
                     seconds = began_s + share_done * (training_end_s - began_s).max(0.0);
-                    format!("training, step {step}, error of cells {error_m:.2} m, refined {refined_m:.2} m")
+                    format!(
+                        "training, step {step}, error of cells {error_m:.2} m, refined {refined_m:.2} m"
+                    )
                 }
                 SceneReport::Encoded(_) | SceneReport::Validated(..) => return,
             };
@@ -370,14 +478,26 @@ impl Map<'_> {
     fn copy_encoder(&self) -> Result<(), MapError> {
         let path = self.config.run.out.join(ENCODER_FILE);
         let is_there = path.canonicalize().ok() == self.config.encoder.canonicalize().ok();
-        let copied = if is_there { Ok(0) } else { std::fs::copy(&self.config.encoder, &path) };
-        copied.map(|_| ()).map_err(|source| MapError::Io { path, source })
+        let copied = if is_there {
+            Ok(0)
+        } else {
+            std::fs::copy(&self.config.encoder, &path)
+        };
+        copied
+            .map(|_| ())
+            .map_err(|source| MapError::Io { path, source })
     }
 
     /// Searches the scales of activations; their number.
-    fn quantise(&mut self, weights: &Path, training: &SweepList, sweeps: usize) -> Result<usize, MapError> {
+    fn quantise(
+        &mut self,
+        weights: &Path,
+        training: &SweepList,
+        sweeps: usize,
+    ) -> Result<usize, MapError> {
         self.at("scales for 8-bit inference".to_owned());
-        let localizer = Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
+        let localizer =
+            Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
         let mut search = ScaleSearch::default();
         let all: Vec<usize> = (0..training.len()).collect();
         for index in thinned(&all, sweeps) {
@@ -394,7 +514,11 @@ impl Map<'_> {
     }
 
     fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, MapError> {
-        let localizer = Localizer::load_without_confidence(&self.config.encoder, weights, Inference::default())?;
+        let localizer = Localizer::load_without_confidence(
+            &self.config.encoder,
+            weights,
+            Inference::default(),
+        )?;
         let started = self.started;
         let observe = &mut *self.observe;
         let mut progress = |done, all| {
@@ -402,17 +526,30 @@ impl Map<'_> {
             observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
         };
         let deadline = started + self.config.time;
-        Ok(check::check(&localizer, held_out, self.config.run.seed, deadline, &mut progress)?)
+        Ok(check::check(
+            &localizer,
+            held_out,
+            self.config.run.seed,
+            deadline,
+            &mut progress,
+        )?)
     }
 
     /// Fits the confidence, writes it into the head and applies it; the report and the new digest.
-    fn fit(&mut self, weights: &Path, checked: &mut Check) -> Result<(Option<FitReport>, Option<String>), MapError> {
+    fn fit(
+        &mut self,
+        weights: &Path,
+        checked: &mut Check,
+    ) -> Result<(Option<FitReport>, Option<String>), MapError> {
         match ConfidenceModel::fit(&checked.labelled, GOOD_LOSS) {
             Ok((model, report)) => {
                 let text = serde_json::to_string(&model).expect("a model is numbers");
                 let sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
                 let confidence = Confidence::Calibrated(model);
-                checked.sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
+                checked
+                    .sweeps
+                    .iter_mut()
+                    .for_each(|sweep| sweep.judge_again(&confidence));
                 Ok((Some(report), Some(sha256)))
             }
             Err(error) => {

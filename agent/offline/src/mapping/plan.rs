@@ -60,17 +60,33 @@ impl Plan {
         let checked_s = |count: usize| 4.0 * sweep_s * count as f64;
         let most_checked = (0.2 * total_s / checked_s(1)) as usize;
         let checked = held_out.min(MOST_CHECKED).min(most_checked.max(10));
-        let check_s = checked_s(if held_out > 0 { checked.max(LEAST_CHECKED) } else { 0 }).min(CHECK_SHARE * total_s);
+        let check_s = checked_s(if held_out > 0 {
+            checked.max(LEAST_CHECKED)
+        } else {
+            0
+        })
+        .min(CHECK_SHARE * total_s);
         // The localization costs as much as the encoding here too.
         let affordable_scales = (SCALES_SHARE * total_s / (2.0 * sweep_s)) as usize;
-        let scale_sweeps = affordable_scales.clamp(LEAST_SCALE_SWEEPS, MOST_SCALE_SWEEPS).min(training);
+        let scale_sweeps = affordable_scales
+            .clamp(LEAST_SCALE_SWEEPS, MOST_SCALE_SWEEPS)
+            .min(training);
         let scales_s = 2.0 * sweep_s * scale_sweeps as f64;
-        let affordable = ((total_s - check_s - scales_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
+        let affordable =
+            ((total_s - check_s - scales_s).max(0.0) * ENCODING_SHARE / sweep_s) as usize;
         let copies = (ENOUGH_SWEEPS / training.max(1)).clamp(1, MOST_COPIES);
         let copies = copies.min((affordable / training.max(1)).max(1));
         let training = training.min(affordable.max(1));
         let encoding_s = (training * copies) as f64 * sweep_s;
-        Self { training, copies, checked, scale_sweeps, encoding_s, scales_s, check_s }
+        Self {
+            training,
+            copies,
+            checked,
+            scale_sweeps,
+            encoding_s,
+            scales_s,
+            check_s,
+        }
     }
 }
 
@@ -92,18 +108,25 @@ impl StoredPlan {
     pub(super) fn write(&self, out: &Path) -> Result<(), MapError> {
         let path = out.join(Self::FILE);
         let text = serde_json::to_string(self).expect("a plan is numbers");
-        let written = fs::create_dir_all(out).and_then(|()| atomic_file::write(&path, text.as_bytes()));
+        let written =
+            fs::create_dir_all(out).and_then(|()| atomic_file::write(&path, text.as_bytes()));
         written.map_err(|source| MapError::Io { path, source })
     }
 
     /// The plan of a stopped map of `sweeps` sweeps.
     pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, MapError> {
         let path = out.join(Self::FILE);
-        let wrong = |reason: String| MapError::Resume { path: path.clone(), reason };
+        let wrong = |reason: String| MapError::Resume {
+            path: path.clone(),
+            reason,
+        };
         let text = fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
         let stored: Self = serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
         if stored.sweeps != sweeps {
-            return Err(wrong(format!("the stopped map was of {} sweeps, the drives have {sweeps}", stored.sweeps)));
+            return Err(wrong(format!(
+                "the stopped map was of {} sweeps, the drives have {sweeps}",
+                stored.sweeps
+            )));
         }
         Ok(stored.plan)
     }
@@ -122,7 +145,9 @@ pub(super) fn too_little_memory(needed: u64) -> Option<u64> {
 
 /// Available memory by Linux's own estimate, bytes.
 fn available_memory(meminfo: &str) -> Option<u64> {
-    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let line = meminfo
+        .lines()
+        .find_map(|line| line.strip_prefix("MemAvailable:"))?;
     Some(line.split_ascii_whitespace().next()?.parse::<u64>().ok()? * 1024)
 }
 
@@ -138,7 +163,10 @@ mod tests {
         assert_eq!(plan.scale_sweeps, 30);
         assert!((plan.after_training_s() - 38.0).abs() < 1e-9);
         let short = Plan::new(16_000, 2_000, 0.1, 600.0);
-        assert!(short.training < 3_000 && short.encoding_s <= 300.0 && short.check_s <= 120.0, "{short:?}");
+        assert!(
+            short.training < 3_000 && short.encoding_s <= 300.0 && short.check_s <= 120.0,
+            "{short:?}"
+        );
     }
 
     #[test]
@@ -146,23 +174,40 @@ mod tests {
         let plan = Plan::new(3, 1, 0.1, 600.0);
         assert_eq!((plan.training, plan.copies, plan.checked), (3, 40, 1));
         assert!(Plan::new(3, 1, 10.0, 60.0).copies <= 2);
-        assert_eq!([Plan::new(3, 1, 10.0, 60.0), Plan::new(90, 1, 0.5, 60.0)].map(|plan| plan.scale_sweeps), [3, 5]);
+        assert_eq!(
+            [Plan::new(3, 1, 10.0, 60.0), Plan::new(90, 1, 0.5, 60.0)]
+                .map(|plan| plan.scale_sweeps),
+            [3, 5]
+        );
     }
 
     #[test]
     fn a_plan_is_read_back_for_the_same_sweeps_only() {
         let folder = tempfile::tempdir().unwrap();
-        let reason = |sweeps| StoredPlan::read(folder.path(), sweeps).unwrap_err().to_string();
+        let reason = |sweeps| {
+            StoredPlan::read(folder.path(), sweeps)
+                .unwrap_err()
+                .to_string()
+        };
         assert!(reason(680).contains("plan.json"));
         let plan = Plan::new(600, 80, 0.1, 600.0);
-        StoredPlan { sweeps: 680, plan }.write(folder.path()).unwrap();
+        StoredPlan { sweeps: 680, plan }
+            .write(folder.path())
+            .unwrap();
         assert_eq!(StoredPlan::read(folder.path(), 680).unwrap(), plan);
-        assert!(reason(681).contains("of 680 sweeps, the drives have 681"), "{}", reason(681));
+        assert!(
+            reason(681).contains("of 680 sweeps, the drives have 681"),
+            "{}",
+            reason(681)
+        );
     }
 
     #[test]
     fn memory_is_compared_with_what_is_free() {
-        assert_eq!(available_memory("MemTotal: 9 kB\nMemAvailable:    2048 kB\n"), Some(2 << 20));
+        assert_eq!(
+            available_memory("MemTotal: 9 kB\nMemAvailable:    2048 kB\n"),
+            Some(2 << 20)
+        );
         assert_eq!(feature_bytes(10, 448), 10 * 400 * 936);
         assert_eq!(too_little_memory(1), None);
         assert!(too_little_memory(u64::MAX).is_some());

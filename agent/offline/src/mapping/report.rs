@@ -65,14 +65,31 @@ pub struct HeldOutAccuracy {
 
 impl HeldOutAccuracy {
     pub(super) fn of(summary: &LocalizationSummary) -> Self {
-        let &LocalizationSummary { sweeps, success_3m, success_1m, p50_m, p50_deg, no_pose, .. } = summary;
-        Self { sweeps, under_3m: success_3m, under_1m: success_1m, median_m: p50_m, median_deg: p50_deg, no_pose }
+        let &LocalizationSummary {
+            sweeps,
+            success_3m,
+            success_1m,
+            p50_m,
+            p50_deg,
+            no_pose,
+            ..
+        } = summary;
+        Self {
+            sweeps,
+            under_3m: success_3m,
+            under_1m: success_1m,
+            median_m: p50_m,
+            median_deg: p50_deg,
+            no_pose,
+        }
     }
 
     /// One line.
     #[must_use]
     pub fn text(&self) -> String {
-        let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
+        let number = |value: Option<f64>, digits: usize| {
+            value.map_or("-".into(), |value| format!("{value:.digits$}"))
+        };
         format!(
             "{:.1} % of {} held-out sweeps under 3 m, {:.1} % under 1 m, median {} m and {} degrees, {} without a pose",
             100.0 * self.under_3m,
@@ -89,7 +106,15 @@ impl MapReport {
     /// The driven area, in one line.
     #[must_use]
     pub fn coverage_text(&self) -> String {
-        let Coverage { sweeps, length_m, low_m, high_m, cells, cell_m, .. } = &self.coverage;
+        let Coverage {
+            sweeps,
+            length_m,
+            low_m,
+            high_m,
+            cells,
+            cell_m,
+            ..
+        } = &self.coverage;
         format!(
             "{sweeps} sweeps along {length_m:.0} m, x {:.0} to {:.0} m, y {:.0} to {:.0} m, {} cells of {cell_m:.0} m (#; x to the right, y up)",
             low_m[0],
@@ -103,10 +128,25 @@ impl MapReport {
     /// The training, in one line.
     #[must_use]
     pub fn training_text(&self) -> String {
-        let Self { training_sweeps, copies, cell_error_m, trained, .. } = self;
-        let copies = if *copies > 1 { format!(" in {copies} copies") } else { String::new() };
-        let error = cell_error_m.map(|error_m| format!(", error of cells {error_m:.1} m")).unwrap_or_default();
-        format!("{training_sweeps} sweeps{copies}, {} steps{error}", trained.steps)
+        let Self {
+            training_sweeps,
+            copies,
+            cell_error_m,
+            trained,
+            ..
+        } = self;
+        let copies = if *copies > 1 {
+            format!(" in {copies} copies")
+        } else {
+            String::new()
+        };
+        let error = cell_error_m
+            .map(|error_m| format!(", error of cells {error_m:.1} m"))
+            .unwrap_or_default();
+        format!(
+            "{training_sweeps} sweeps{copies}, {} steps{error}",
+            trained.steps
+        )
     }
 
     /// The limits of the head, in sentences.
@@ -114,17 +154,29 @@ impl MapReport {
     pub fn limits_text(&self) -> String {
         let roads = "Roads that were not driven give no pose: drive every road, and both directions of wide ones.";
         let limits = [self.training_limit(), self.confidence_limit()];
-        limits.into_iter().flatten().fold(roads.to_owned(), |text, limit| text + " " + &limit)
+        limits
+            .into_iter()
+            .flatten()
+            .fold(roads.to_owned(), |text, limit| text + " " + &limit)
     }
 
     fn training_limit(&self) -> Option<String> {
-        let error_m = self.cell_error_m.filter(|error_m| *error_m > SHORT_TRAINING_M)?;
-        Some(format!("The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes."))
+        let error_m = self
+            .cell_error_m
+            .filter(|error_m| *error_m > SHORT_TRAINING_M)?;
+        Some(format!(
+            "The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes."
+        ))
     }
 
     fn confidence_limit(&self) -> Option<String> {
         match (&self.held_out, &self.confidence) {
-            (Some(_), Some(FitReport { bad, bad_rejected, .. })) => {
+            (
+                Some(_),
+                Some(FitReport {
+                    bad, bad_rejected, ..
+                }),
+            ) => {
                 let is_enough = *bad_rejected as f64 >= ENOUGH_REJECTED * *bad as f64;
                 (!is_enough).then(|| {
                     format!(
@@ -132,10 +184,12 @@ impl MapReport {
                     )
                 })
             }
-            (Some(_), None) => {
-                Some("Its confidence is not fitted: too few poses; wrong poses may be given out.".into())
-            }
-            (None, _) => Some("Its accuracy is not measured: there were too few sweeps to hold any out.".into()),
+            (Some(_), None) => Some(
+                "Its confidence is not fitted: too few poses; wrong poses may be given out.".into(),
+            ),
+            (None, _) => Some(
+                "Its accuracy is not measured: there were too few sweeps to hold any out.".into(),
+            ),
         }
     }
 }

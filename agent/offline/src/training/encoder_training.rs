@@ -91,9 +91,15 @@ pub fn train_encoder(
     let mut training = Training::prepare(config, observe)?;
     let maker = training.maker.clone();
     let batch = config.run.batch as u64;
-    let mut loader = Prefetch::start(config.run.loader_threads, training.trainer.steps(), move |number| {
-        (number * batch..(number + 1) * batch).map(|pair| maker.pair(pair)).collect::<Result<Vec<_>, _>>()
-    });
+    let mut loader = Prefetch::start(
+        config.run.loader_threads,
+        training.trainer.steps(),
+        move |number| {
+            (number * batch..(number + 1) * batch)
+                .map(|pair| maker.pair(pair))
+                .collect::<Result<Vec<_>, _>>()
+        },
+    );
     let mut window = Window::default();
     while training.share_done() < 1.0 {
         training.step(&loader.next_batch()??, &mut window)?;
@@ -134,11 +140,17 @@ impl<'a> Training<'a> {
         run.start()?;
         let variables = VarStore::new(run.device);
         let encoder = SceneEncoder::new(&(variables.root() / "encoder"), &config.encoder)?;
-        let contrast = Contrast::new(&(variables.root() / "contrast"), config.encoder.local_channels());
+        let contrast = Contrast::new(
+            &(variables.root() / "contrast"),
+            config.encoder.local_channels(),
+        );
         let mut maker = |folders: &[PathBuf], seed| {
             let store = Arc::new(SweepStore::read(folders, config.encoder.range_m)?);
             observe(&EncoderReport::Read(store.data.clone()));
-            Ok::<_, LocalizerTrainError>((PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?, store))
+            Ok::<_, LocalizerTrainError>((
+                PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?,
+                store,
+            ))
         };
         let (training, store) = maker(&config.scenes, run.seed)?;
         let validation = match config.validation.as_slice() {
@@ -162,12 +174,16 @@ impl<'a> Training<'a> {
 
     fn share_done(&self) -> f64 {
         let pairs = self.trainer.steps() * self.config.run.batch as u64;
-        self.trainer.share_done(pairs as f64 / self.maker.anchors() as f64)
+        self.trainer
+            .share_done(pairs as f64 / self.maker.anchors() as f64)
     }
 
     fn loss(&self, pairs: &[Pair]) -> Result<ContrastLoss, tch::TchError> {
-        let RunConfig { precision, device, .. } = self.config.run;
-        self.contrast.loss(&self.encoder, pairs, precision.kind(), device)
+        let RunConfig {
+            precision, device, ..
+        } = self.config.run;
+        self.contrast
+            .loss(&self.encoder, pairs, precision.kind(), device)
     }
 
     fn step(&mut self, pairs: &[Pair], window: &mut Window) -> Result<(), LocalizerTrainError> {
@@ -182,13 +198,22 @@ impl<'a> Training<'a> {
     fn report(&mut self, window: Window) -> Result<EncoderReport, LocalizerTrainError> {
         let (loss, accuracy) = window.means();
         let (step, seconds) = (self.trainer.steps(), self.trainer.seconds());
-        self.curve.numbers(&[step as f64, seconds, loss, accuracy.top1, accuracy.offset_m])?;
+        self.curve
+            .numbers(&[step as f64, seconds, loss, accuracy.top1, accuracy.offset_m])?;
         let share_done = self.share_done().min(1.0);
-        Ok(EncoderReport::Stepped { step, share_done, seconds, loss, accuracy })
+        Ok(EncoderReport::Stepped {
+            step,
+            share_done,
+            seconds,
+            loss,
+            accuracy,
+        })
     }
 
     fn validate(&mut self) -> Result<Option<EncoderAccuracy>, LocalizerTrainError> {
-        let Some(maker) = &self.validation else { return Ok(None) };
+        let Some(maker) = &self.validation else {
+            return Ok(None);
+        };
         let mut window = Window::default();
         for number in 0..VALIDATION_PAIRS {
             let pairs = [maker.pair(2 * number)?, maker.pair(2 * number + 1)?];
@@ -208,10 +233,14 @@ impl<'a> Training<'a> {
             no_grad(|| variable.f_copy_(&trained[&format!("encoder.{name}")]))?;
         }
         let config = serde_json::to_string(&self.config.encoder).expect("a configuration is JSON");
-        let about =
-            BTreeMap::from([(CONFIG_KEY.to_owned(), config), (KIND_KEY.to_owned(), SceneEncoder::KIND.to_owned())]);
+        let about = BTreeMap::from([
+            (CONFIG_KEY.to_owned(), config),
+            (KIND_KEY.to_owned(), SceneEncoder::KIND.to_owned()),
+        ]);
         Ok(EncoderSummary {
-            trained: self.trainer.save_weights(&encoder, about, self.store.data.clone())?,
+            trained: self
+                .trainer
+                .save_weights(&encoder, about, self.store.data.clone())?,
             sweeps: self.store.sweeps.len(),
             accuracy: self.accuracy,
         })
@@ -239,6 +268,12 @@ impl Window {
     /// Mean loss and accuracy.
     fn means(&self) -> (f64, EncoderAccuracy) {
         let mean = |sum: f64| sum / self.steps.max(1) as f64;
-        (mean(self.loss), EncoderAccuracy { top1: mean(self.top1), offset_m: mean(self.offset_m) })
+        (
+            mean(self.loss),
+            EncoderAccuracy {
+                top1: mean(self.top1),
+                offset_m: mean(self.offset_m),
+            },
+        )
     }
 }

@@ -20,7 +20,9 @@ pub enum LocalizerTrainError {
     #[error("no two sweeps of one world within {0} m of each other")]
     NoPairs(f64),
     /// Sweeps overlap in range, but none has a cell in common with another one.
-    #[error("{0} pairs of sweeps side by side have no cell at the same spot: are the sweeps empty?")]
+    #[error(
+        "{0} pairs of sweeps side by side have no cell at the same spot: are the sweeps empty?"
+    )]
     NoMatches(usize),
     /// A head to start from finds its way in none of the sweeps.
     #[error("the head of {0:?} recognises none of the sweeps: are they of another scene?")]

@@ -62,14 +62,24 @@ impl FeatureCache {
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, LocalizerTrainError> {
-        let RunConfig { seed, loader_threads, precision, device, .. } = *run;
+        let RunConfig {
+            seed,
+            loader_threads,
+            precision,
+            device,
+            ..
+        } = *run;
         let total = list.len() * augmentation.copies.max(1);
         let format = encoder.format().clone();
         let source = Arc::clone(list);
         let prepare = move |batch: u64| -> Vec<TurnedSweep> {
-            let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
+            let numbers =
+                (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
             let prepared = numbers.map(|number| {
-                let (index, copy) = (number as usize % source.len(), number as usize / source.len());
+                let (index, copy) = (
+                    number as usize % source.len(),
+                    number as usize / source.len(),
+                );
                 let sweep = source.posed_sweep(index, format.range_m())?;
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 rng.set_stream(number);
@@ -77,7 +87,10 @@ impl FeatureCache {
                     0 => (Isometry3::identity(), 1.0),
                     _ => {
                         let angle = augmentation.turn_rad.clamp(1e-6, PI);
-                        (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
+                        (
+                            yaw(rng.random_range(-angle..angle)),
+                            rng.random_range(augmentation.keep..=1.0),
+                        )
                     }
                 };
                 Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
@@ -110,7 +123,8 @@ impl FeatureCache {
     /// # Errors
     /// Those of the tensor library.
     pub(crate) fn move_origin(&mut self, origin_m: [f64; 3]) -> Result<(), TchError> {
-        let moved: [f32; 3] = std::array::from_fn(|axis| (self.origin_m[axis] - origin_m[axis]) as f32);
+        let moved: [f32; 3] =
+            std::array::from_fn(|axis| (self.origin_m[axis] - origin_m[axis]) as f32);
         let moved = Tensor::f_from_slice(&moved)?.f_to_device(self.targets_m.device())?;
         self.targets_m = self.targets_m.f_add(&moved)?;
         self.origin_m = origin_m;
@@ -160,8 +174,10 @@ impl Builder {
         let filled = self.places.len() as i64;
         for (turned, of_sweep) in batch.iter().zip(&encoded.rows) {
             rows.extend(turned.rows.iter().map(|&row| of_sweep.start + row as i64));
-            self.sweep_of_cell.extend(turned.rows.iter().map(|_| (self.poses.len()) as i64));
-            self.places.extend(turned.rows.iter().map(|&row| turned.sweep.cells()[row]));
+            self.sweep_of_cell
+                .extend(turned.rows.iter().map(|_| (self.poses.len()) as i64));
+            self.places
+                .extend(turned.rows.iter().map(|&row| turned.sweep.cells()[row]));
             self.points.push(turned.points);
             self.poses.push(turned.world_from_sensor);
         }
@@ -181,7 +197,11 @@ impl Builder {
         }
         let count = self.poses.len() as f64;
         let origin_m: [f64; 3] = std::array::from_fn(|axis| {
-            self.poses.iter().map(|pose| pose.translation.vector[axis]).sum::<f64>() / count
+            self.poses
+                .iter()
+                .map(|pose| pose.translation.vector[axis])
+                .sum::<f64>()
+                / count
         });
         let mut targets = Vec::with_capacity(3 * self.places.len());
         for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
@@ -189,8 +209,16 @@ impl Builder {
             let place = self.poses[sweep as usize] * Point3::new(x, y, z);
             targets.extend((0..3).map(|axis| (place[axis] - origin_m[axis]) as f32));
         }
-        let sensor: Vec<f32> = self.places.iter().flat_map(|cell| cell.centroid_m).collect();
-        let columns = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([-1, 3])?.f_to_device(device);
+        let sensor: Vec<f32> = self
+            .places
+            .iter()
+            .flat_map(|cell| cell.centroid_m)
+            .collect();
+        let columns = |values: &[f32]| {
+            Tensor::f_from_slice(values)?
+                .f_view([-1, 3])?
+                .f_to_device(device)
+        };
         Ok(FeatureCache {
             cells: self.cells.f_narrow(0, 0, self.places.len() as i64)?,
             sweep_of_cell: Tensor::f_from_slice(&self.sweep_of_cell)?.f_to_device(device)?,

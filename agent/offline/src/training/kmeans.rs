@@ -11,18 +11,31 @@ const ROUNDS: usize = 25;
 ///
 /// Starts with points far from each other (k-means++, Arthur and Vassilvitskii 2007); same seed, same result.
 #[must_use]
-pub(crate) fn kmeans<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> (Vec<[f64; N]>, Vec<usize>) {
+pub(crate) fn kmeans<const N: usize>(
+    points: &[[f64; N]],
+    count: usize,
+    seed: u64,
+) -> (Vec<[f64; N]>, Vec<usize>) {
     let mut centres = spread(points, count.min(points.len()), seed);
     let mut labels = vec![0; points.len()];
     for _ in 0..ROUNDS {
-        labels.iter_mut().zip(points).for_each(|(label, point)| *label = nearest(&centres, point).0);
+        labels
+            .iter_mut()
+            .zip(points)
+            .for_each(|(label, point)| *label = nearest(&centres, point).0);
         let mut sums = vec![([0.0; N], 0.0); centres.len()];
         for (&label, point) in labels.iter().zip(points) {
             let (sum, count) = &mut sums[label];
-            sum.iter_mut().zip(point).for_each(|(sum, value)| *sum += value);
+            sum.iter_mut()
+                .zip(point)
+                .for_each(|(sum, value)| *sum += value);
             *count += 1.0;
         }
-        for (centre, (sum, count)) in centres.iter_mut().zip(&sums).filter(|(_, (_, count))| *count > 0.0) {
+        for (centre, (sum, count)) in centres
+            .iter_mut()
+            .zip(&sums)
+            .filter(|(_, (_, count))| *count > 0.0)
+        {
             *centre = sum.map(|sum| sum / count);
         }
     }
@@ -35,19 +48,36 @@ fn spread<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> Vec<[
     let mut centres: Vec<[f64; N]> = Vec::with_capacity(count);
     while centres.len() < count {
         let indices: Vec<usize> = (0..points.len()).collect();
-        let weight = |&index: &usize| if centres.is_empty() { 1.0 } else { squares[index] };
+        let weight = |&index: &usize| {
+            if centres.is_empty() {
+                1.0
+            } else {
+                squares[index]
+            }
+        };
         // All weights are zero when points repeat: any point is a valid choice then.
-        let chosen = indices.choose_weighted(&mut rng, weight).copied().unwrap_or(0);
+        let chosen = indices
+            .choose_weighted(&mut rng, weight)
+            .copied()
+            .unwrap_or(0);
         let centre = points[chosen];
-        squares.iter_mut().zip(points).for_each(|(least, point)| *least = least.min(square(&centre, point)));
+        squares
+            .iter_mut()
+            .zip(points)
+            .for_each(|(least, point)| *least = least.min(square(&centre, point)));
         centres.push(centre);
     }
     centres
 }
 
 fn nearest<const N: usize>(centres: &[[f64; N]], point: &[f64; N]) -> (usize, f64) {
-    let distances = centres.iter().map(|centre| square(centre, point)).enumerate();
-    distances.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0, f64::MAX))
+    let distances = centres
+        .iter()
+        .map(|centre| square(centre, point))
+        .enumerate();
+    distances
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .unwrap_or((0, f64::MAX))
 }
 
 fn square<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {
@@ -60,11 +90,17 @@ mod tests {
 
     #[test]
     fn heaps_become_clusters() {
-        let heap = |x: f64| (0..20).map(move |k| [x + 0.1 * f64::from(k % 5), 0.1 * f64::from(k / 5), 0.0]);
+        let heap = |x: f64| {
+            (0..20).map(move |k| [x + 0.1 * f64::from(k % 5), 0.1 * f64::from(k / 5), 0.0])
+        };
         let points: Vec<[f64; 3]> = heap(0.0).chain(heap(50.0)).chain(heap(100.0)).collect();
         let (centres, labels) = kmeans(&points, 3, 1);
         assert_eq!(centres.len(), 3);
-        assert!(labels.chunks(20).all(|heap| heap.iter().all(|label| *label == heap[0])));
+        assert!(
+            labels
+                .chunks(20)
+                .all(|heap| heap.iter().all(|label| *label == heap[0]))
+        );
         assert_eq!(kmeans(&points, 3, 1), (centres, labels));
     }
 

@@ -17,8 +17,12 @@ mod sgloc_training;
 mod sweep_store;
 mod turned_sweep;
 
-pub use diffloc_training::{DiffLocAccuracy, DiffLocReport, DiffLocSummary, DiffLocTrainConfig, train_diffloc};
-pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
+pub use diffloc_training::{
+    DiffLocAccuracy, DiffLocReport, DiffLocSummary, DiffLocTrainConfig, train_diffloc,
+};
+pub use encoder_training::{
+    EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder,
+};
 pub use error::LocalizerTrainError;
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;

@@ -84,7 +84,13 @@ impl PairMaker {
         if anchors.is_empty() {
             return Err(LocalizerTrainError::NoPairs(PAIR_RANGE_M));
         }
-        Ok(Self { store, config, seed, partners: Arc::new(partners), anchors: Arc::new(anchors) })
+        Ok(Self {
+            store,
+            config,
+            seed,
+            partners: Arc::new(partners),
+            anchors: Arc::new(anchors),
+        })
     }
 
     /// Number of sweeps that have a partner.
@@ -106,7 +112,9 @@ impl PairMaker {
             let [own, other] = &self.partners[anchor];
             let takes_other = own.is_empty() || (!other.is_empty() && rng.random_bool(OTHER_DRIVE));
             let among = if takes_other { other } else { own };
-            let Some(&partner) = among.choose(&mut rng) else { continue };
+            let Some(&partner) = among.choose(&mut rng) else {
+                continue;
+            };
             let pair = self.build(anchor, partner as usize, &mut rng);
             if !pair.matches.is_empty() {
                 return Ok(pair);
@@ -124,7 +132,10 @@ impl PairMaker {
             let turned_from_sensor = lean.isometry() * yaw(rng.random_range(-PI..PI));
             let keep = rng.random_range(MIN_KEPT..1.0);
             let sweep = stored.turned_voxels(&turned_from_sensor, keep, rng, &self.config);
-            (sweep, origin.inverse() * stored.world_from_sensor * turned_from_sensor.inverse())
+            (
+                sweep,
+                origin.inverse() * stored.world_from_sensor * turned_from_sensor.inverse(),
+            )
         };
         let (anchor_sweep, world_from_anchor) = turned(anchor);
         let (partner_sweep, world_from_partner) = turned(partner);
@@ -132,8 +143,10 @@ impl PairMaker {
         let partner_places = places(partner_sweep.cells(), &world_from_partner);
         let grid = Grid::new(&partner_places);
         let candidates = choose(anchor_sweep.cells(), CELLS, rng);
-        let matched: Vec<(usize, usize)> =
-            candidates.into_iter().filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?))).collect();
+        let matched: Vec<(usize, usize)> = candidates
+            .into_iter()
+            .filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?)))
+            .collect();
         // The partners of the anchor's cells, and others as negatives.
         let mut rows: Vec<usize> = matched.iter().map(|&(_, partner)| partner).collect();
         rows.extend(choose(partner_sweep.cells(), CELLS, rng));
@@ -149,8 +162,18 @@ impl PairMaker {
         let anchor_rows: Vec<usize> = matched.iter().map(|&(cell, _)| cell).collect();
         let relative_yaw_rad = heading_rad(&world_from_partner) - heading_rad(&world_from_anchor);
         Pair {
-            anchor: chosen(anchor_sweep, anchor_rows, &anchor_places, &world_from_anchor),
-            partner: chosen(partner_sweep, distinct, &partner_places, &world_from_partner),
+            anchor: chosen(
+                anchor_sweep,
+                anchor_rows,
+                &anchor_places,
+                &world_from_anchor,
+            ),
+            partner: chosen(
+                partner_sweep,
+                distinct,
+                &partner_places,
+                &world_from_partner,
+            ),
             matches,
             relative_yaw_rad,
         }
@@ -164,10 +187,20 @@ fn chosen(
     world_from_sensor: &Isometry3<f64>,
 ) -> ChosenCells {
     let places_m = rows.iter().map(|&row| places_m[row]).collect();
-    let rotation = world_from_sensor.rotation.inverse().to_rotation_matrix().into_inner().transpose();
+    let rotation = world_from_sensor
+        .rotation
+        .inverse()
+        .to_rotation_matrix()
+        .into_inner()
+        .transpose();
     // Column-major storage of the transpose is row-major storage of the matrix.
     let sensor_from_world = std::array::from_fn(|place| rotation.as_slice()[place] as f32);
-    ChosenCells { sweep, rows, places_m, sensor_from_world }
+    ChosenCells {
+        sweep,
+        rows,
+        places_m,
+        sensor_from_world,
+    }
 }
 
 /// A small roll and pitch.
@@ -178,7 +211,9 @@ impl UnitLean {
     const MAX_RAD: f64 = 0.03;
 
     fn random(rng: &mut impl Rng) -> Self {
-        Self(std::array::from_fn(|_| rng.random_range(-Self::MAX_RAD..Self::MAX_RAD)))
+        Self(std::array::from_fn(|_| {
+            rng.random_range(-Self::MAX_RAD..Self::MAX_RAD)
+        }))
     }
 
     fn isometry(&self) -> Isometry3<f64> {
@@ -188,7 +223,8 @@ impl UnitLean {
 
 /// Up to `count` cells at random, flat ground no more than its share.
 pub(super) fn choose(cells: &[Cell], count: usize, rng: &mut impl Rng) -> Vec<usize> {
-    let (mut flat, mut high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
+    let (mut flat, mut high): (Vec<usize>, Vec<usize>) =
+        (0..cells.len()).partition(|&cell| cells[cell].is_flat());
     high.shuffle(rng);
     flat.shuffle(rng);
     high.truncate(count - (count as f64 * FLAT_SHARE) as usize);
@@ -228,9 +264,15 @@ impl<'a> Grid<'a> {
         for dx in -1..=1 {
             for dy in -1..=1 {
                 for dz in -1..=1 {
-                    for &index in self.cubes.get(&[x + dx, y + dy, z + dz]).into_iter().flatten() {
+                    for &index in self
+                        .cubes
+                        .get(&[x + dx, y + dy, z + dz])
+                        .into_iter()
+                        .flatten()
+                    {
                         let place = self.places_m[index as usize];
-                        let square: f32 = (0..3).map(|axis| (place[axis] - point[axis]).powi(2)).sum();
+                        let square: f32 =
+                            (0..3).map(|axis| (place[axis] - point[axis]).powi(2)).sum();
                         if square < best.0 {
                             best = (square, Some(index as usize));
                         }
@@ -251,20 +293,36 @@ fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
     let bucket = |index: usize, dx: i32, dy: i32| {
         let sweep = &store.sweeps[index];
         let place = sweep.world_from_sensor.translation.vector / PAIR_RANGE_M;
-        (sweep.world, place.x.floor() as i32 + dx, place.y.floor() as i32 + dy)
+        (
+            sweep.world,
+            place.x.floor() as i32 + dx,
+            place.y.floor() as i32 + dy,
+        )
     };
     let mut buckets: HashMap<(usize, i32, i32), Vec<u32>> = HashMap::new();
-    (0..store.sweeps.len()).for_each(|index| buckets.entry(bucket(index, 0, 0)).or_default().push(index as u32));
+    (0..store.sweeps.len()).for_each(|index| {
+        buckets
+            .entry(bucket(index, 0, 0))
+            .or_default()
+            .push(index as u32)
+    });
     let near = |index: usize| {
         let own = &store.sweeps[index];
         let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy)));
-        let candidates = around.filter_map(|(dx, dy)| buckets.get(&bucket(index, dx, dy))).flatten().copied();
+        let candidates = around
+            .filter_map(|(dx, dy)| buckets.get(&bucket(index, dx, dy)))
+            .flatten()
+            .copied();
         let in_range = candidates.filter(|&other| {
-            let offset = store.sweeps[other as usize].world_from_sensor.translation.vector
+            let offset = store.sweeps[other as usize]
+                .world_from_sensor
+                .translation
+                .vector
                 - own.world_from_sensor.translation.vector;
             other as usize != index && offset.xy().norm() <= PAIR_RANGE_M && offset.z.abs() <= 2.0
         });
-        let (same, other) = in_range.partition(|&other| store.sweeps[other as usize].drive == own.drive);
+        let (same, other) =
+            in_range.partition(|&other| store.sweeps[other as usize].drive == own.drive);
         [same, other]
     };
     (0..store.sweeps.len()).map(near).collect()

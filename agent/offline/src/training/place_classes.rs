@@ -37,32 +37,59 @@ impl<const BRANCHES: usize> PlaceClasses<BRANCHES> {
         scale_m: [f64; 3],
         seed: u64,
     ) -> Result<Self, TchError> {
-        let units_m = scale_m.into_iter().chain([HEADING_M; 2]).map(|unit| unit as f32).collect::<Vec<f32>>();
+        let units_m = scale_m
+            .into_iter()
+            .chain([HEADING_M; 2])
+            .map(|unit| unit as f32)
+            .collect::<Vec<f32>>();
         let units_m = Tensor::f_from_slice(&units_m)?.f_to_device(poses.device())?;
-        let rows: Vec<f64> = Vec::try_from(&poses.f_mul(&units_m)?.f_to_kind(Kind::Double)?.f_reshape([-1])?)?;
+        let rows: Vec<f64> = Vec::try_from(
+            &poses
+                .f_mul(&units_m)?
+                .f_to_kind(Kind::Double)?
+                .f_reshape([-1])?,
+        )?;
         let (rows, _) = rows.as_chunks::<5>();
         let (centres, _) = kmeans(rows, CLASSES, seed);
-        let centres_m = Tensor::f_from_slice(centres.as_flattened())?.f_to_kind(Kind::Float)?.f_view([-1, 5])?;
-        let layers = paths.map(|path| nn::linear(path, width, centres.len() as i64, LinearConfig::default()));
-        Ok(Self { layers, units_m, centres_m: centres_m.f_to_device(poses.device())? })
+        let centres_m = Tensor::f_from_slice(centres.as_flattened())?
+            .f_to_kind(Kind::Float)?
+            .f_view([-1, 5])?;
+        let layers = paths
+            .map(|path| nn::linear(path, width, centres.len() as i64, LinearConfig::default()));
+        Ok(Self {
+            layers,
+            units_m,
+            centres_m: centres_m.f_to_device(poses.device())?,
+        })
     }
 
     /// `[BRANCHES]`: cross entropy of each branch's features `[N, width]` of sweeps with `poses` `[N, 5]`.
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(super) fn losses(&self, features: [&Tensor; BRANCHES], poses: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn losses(
+        &self,
+        features: [&Tensor; BRANCHES],
+        poses: &Tensor,
+    ) -> Result<Tensor, TchError> {
         let classes = self.classes(poses)?;
         let losses = self.layers.iter().zip(features).map(|(layer, features)| {
             let logits = layer.forward(features);
-            logits.f_cross_entropy_loss(&classes, None::<Tensor>, Reduction::Mean, -100, LABEL_SMOOTHING)
+            logits.f_cross_entropy_loss(
+                &classes,
+                None::<Tensor>,
+                Reduction::Mean,
+                -100,
+                LABEL_SMOOTHING,
+            )
         });
         Tensor::f_stack(&losses.collect::<Result<Vec<_>, _>>()?, 0)
     }
 
     /// `[N]`: the nearest centre of each of `poses` `[N, 5]`.
     fn classes(&self, poses: &Tensor) -> Result<Tensor, TchError> {
-        Tensor::f_cdist(&poses.f_mul(&self.units_m)?, &self.centres_m, 2.0, None)?.f_argmin(1, false)
+        Tensor::f_cdist(&poses.f_mul(&self.units_m)?, &self.centres_m, 2.0, None)?
+            .f_argmin(1, false)
     }
 }
 
@@ -87,7 +114,8 @@ mod tests {
     #[test]
     fn places_and_directions_are_classes_of_their_own() {
         let variables = VarStore::new(Device::Cpu);
-        let classes = PlaceClasses::new([variables.root()], 8, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
+        let classes =
+            PlaceClasses::new([variables.root()], 8, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
         let found: Vec<i64> = Vec::try_from(classes.classes(&poses()).unwrap()).unwrap();
         let mut sorted = found.clone();
         sorted.sort_unstable();
@@ -95,20 +123,40 @@ mod tests {
         // 3 m and 10 degrees away.
         let (sine, cosine) = 10f32.to_radians().sin_cos();
         let near = Tensor::from_slice(&[0.03f32, 0.0, 0.0, cosine, sine]).view([1, 5]);
-        assert_eq!(Vec::<i64>::try_from(classes.classes(&near).unwrap()).unwrap(), found[..1]);
+        assert_eq!(
+            Vec::<i64>::try_from(classes.classes(&near).unwrap()).unwrap(),
+            found[..1]
+        );
     }
 
     #[test]
     fn features_that_tell_the_class_have_a_small_loss() {
         let variables = VarStore::new(Device::Cpu);
-        let classes = PlaceClasses::new([variables.root()], 4, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
-        let own = classes.classes(&poses()).unwrap().one_hot(4).to_kind(Kind::Float);
+        let classes =
+            PlaceClasses::new([variables.root()], 4, &poses(), [100.0, 100.0, 1.0], 0).unwrap();
+        let own = classes
+            .classes(&poses())
+            .unwrap()
+            .one_hot(4)
+            .to_kind(Kind::Float);
         tch::no_grad(|| {
             let named = variables.variables();
-            named["weight"].shallow_clone().copy_(&(Tensor::eye(4, (Kind::Float, Device::Cpu)) * 20.0));
+            named["weight"]
+                .shallow_clone()
+                .copy_(&(Tensor::eye(4, (Kind::Float, Device::Cpu)) * 20.0));
             let _ = named["bias"].shallow_clone().zero_();
         });
-        let loss = |features: &Tensor| classes.losses([features], &poses()).unwrap().double_value(&[0]);
-        assert!(loss(&own) + 3.0 < loss(&own.roll([1], [0])), "{} {}", loss(&own), loss(&own.roll([1], [0])));
+        let loss = |features: &Tensor| {
+            classes
+                .losses([features], &poses())
+                .unwrap()
+                .double_value(&[0])
+        };
+        assert!(
+            loss(&own) + 3.0 < loss(&own.roll([1], [0])),
+            "{} {}",
+            loss(&own),
+            loss(&own.roll([1], [0]))
+        );
     }
 }

@@ -31,7 +31,13 @@ pub struct RedundancyConfig {
 impl Default for RedundancyConfig {
     /// A quarter after each of two windows; the last sixth of the training uses all.
     fn default() -> Self {
-        Self { leave_out: LeaveOut::EvenLoss, seed: 0, drop: 0.25, windows: [[0.1, 0.25], [0.35, 0.5]], all_from: 0.84 }
+        Self {
+            leave_out: LeaveOut::EvenLoss,
+            seed: 0,
+            drop: 0.25,
+            windows: [[0.1, 0.25], [0.35, 0.5]],
+            all_from: 0.84,
+        }
     }
 }
 
@@ -77,14 +83,24 @@ impl Redundancy {
     /// True if losses are recorded when this share of the training is done.
     #[must_use]
     pub(crate) fn watches(&self, share_done: f64) -> bool {
-        self.config.windows.get(self.windows_done).is_some_and(|[from, to]| (*from..*to).contains(&share_done))
+        self.config
+            .windows
+            .get(self.windows_done)
+            .is_some_and(|[from, to]| (*from..*to).contains(&share_done))
     }
 
     /// Records the losses of the cells of one pass: pairs of sweep and loss.
     pub(crate) fn record(&mut self, losses: &[(usize, f32)]) {
         let mut by_sweep = vec![Vec::new(); self.weights.len()];
-        losses.iter().for_each(|&(sweep, loss)| by_sweep[sweep].push(loss));
-        for (recorded, mut losses) in self.recorded.iter_mut().zip(by_sweep).filter(|(_, losses)| !losses.is_empty()) {
+        losses
+            .iter()
+            .for_each(|&(sweep, loss)| by_sweep[sweep].push(loss));
+        for (recorded, mut losses) in self
+            .recorded
+            .iter_mut()
+            .zip(by_sweep)
+            .filter(|(_, losses)| !losses.is_empty())
+        {
             let middle = losses.len() / 2;
             recorded.push(*losses.select_nth_unstable_by(middle, f32::total_cmp).1);
         }
@@ -99,7 +115,11 @@ impl Redundancy {
     /// Updates the selection at the end of a pass. True if it has changed.
     pub(crate) fn advance(&mut self, share_done: f64) -> bool {
         let is_over = |redundancy: &Self| {
-            redundancy.config.windows.get(redundancy.windows_done).is_some_and(|[_, to]| share_done >= *to)
+            redundancy
+                .config
+                .windows
+                .get(redundancy.windows_done)
+                .is_some_and(|[_, to]| share_done >= *to)
         };
         if share_done >= self.config.all_from {
             let changes = self.is_time_for_all(share_done);
@@ -108,7 +128,11 @@ impl Redundancy {
             return changes;
         }
         if is_over(self) {
-            if self.recorded.iter().all(|losses| losses.len() < ENOUGH_PASSES) {
+            if self
+                .recorded
+                .iter()
+                .all(|losses| losses.len() < ENOUGH_PASSES)
+            {
                 tracing::warn!(
                     "a window of RSD held fewer than {ENOUGH_PASSES} passes over the data: no sweep is left out after it"
                 );
@@ -124,26 +148,53 @@ impl Redundancy {
     /// Leaves out the sweeps with the lowest variance of their losses in each cluster, or random ones; the weights of the
     /// others grow. A sweep of unknown variance stays, however many that leaves.
     fn drop_redundant(&mut self) {
-        let variances: Vec<f32> = self.recorded.iter().map(|losses| variance(losses)).collect();
+        let variances: Vec<f32> = self
+            .recorded
+            .iter()
+            .map(|losses| variance(losses))
+            .collect();
         let order: Vec<f32> = match self.config.leave_out {
             LeaveOut::EvenLoss => variances,
             LeaveOut::Random => {
                 let rng = &mut self.rng;
                 // A random choice has the same chances: among sweeps of known variance.
-                variances.iter().map(|&known| if known < f32::MAX { rng.random() } else { f32::MAX }).collect()
+                variances
+                    .iter()
+                    .map(|&known| {
+                        if known < f32::MAX {
+                            rng.random()
+                        } else {
+                            f32::MAX
+                        }
+                    })
+                    .collect()
             }
         };
-        let classes = self.class_of_sweep.iter().max().map_or(0, |class| class + 1);
+        let classes = self
+            .class_of_sweep
+            .iter()
+            .max()
+            .map_or(0, |class| class + 1);
         for class in 0..classes {
-            let used = |&sweep: &usize| self.class_of_sweep[sweep] == class && self.weights[sweep] > 0.0;
-            let mut members: Vec<(f32, usize)> =
-                (0..self.weights.len()).filter(used).map(|sweep| (order[sweep], sweep)).collect();
+            let used =
+                |&sweep: &usize| self.class_of_sweep[sweep] == class && self.weights[sweep] > 0.0;
+            let mut members: Vec<(f32, usize)> = (0..self.weights.len())
+                .filter(used)
+                .map(|sweep| (order[sweep], sweep))
+                .collect();
             members.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            let known = members.iter().take_while(|(variance, _)| *variance < f32::MAX).count();
+            let known = members
+                .iter()
+                .take_while(|(variance, _)| *variance < f32::MAX)
+                .count();
             let dropped = ((members.len() as f64 * self.config.drop) as usize).min(known);
             let kept = (members.len() - dropped) as f32 / members.len().max(1) as f32;
             for (place, &(_, sweep)) in members.iter().enumerate() {
-                self.weights[sweep] = if place < dropped { 0.0 } else { self.weights[sweep] / kept };
+                self.weights[sweep] = if place < dropped {
+                    0.0
+                } else {
+                    self.weights[sweep] / kept
+                };
             }
         }
     }
@@ -155,7 +206,11 @@ fn variance(values: &[f32]) -> f32 {
         return f32::MAX;
     }
     let mean = values.iter().sum::<f32>() / values.len() as f32;
-    values.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / values.len() as f32
+    values
+        .iter()
+        .map(|value| (value - mean).powi(2))
+        .sum::<f32>()
+        / values.len() as f32
 }
 
 #[cfg(test)]
@@ -168,14 +223,23 @@ mod tests {
         assert!(redundancy.watches(0.2) && !redundancy.watches(0.3));
         for pass in 0..3 {
             let losses: Vec<(usize, f32)> = (0..8)
-                .flat_map(|sweep| [(sweep, (sweep * pass) as f32), (sweep, (sweep * pass) as f32 + 0.1)])
+                .flat_map(|sweep| {
+                    [
+                        (sweep, (sweep * pass) as f32),
+                        (sweep, (sweep * pass) as f32 + 0.1),
+                    ]
+                })
                 .collect();
             redundancy.record(&losses);
         }
         assert!(!redundancy.advance(0.2));
         assert!(redundancy.advance(0.25));
         assert_eq!(redundancy.weights()[..2], [0.0, 0.0]);
-        assert!(redundancy.weights()[2..].iter().all(|weight| (weight - 8.0 / 6.0).abs() < 1e-6));
+        assert!(
+            redundancy.weights()[2..]
+                .iter()
+                .all(|weight| (weight - 8.0 / 6.0).abs() < 1e-6)
+        );
         assert!(redundancy.watches(0.4) && !redundancy.watches(0.2));
         assert!(redundancy.advance(0.9));
         assert_eq!(redundancy.weights(), [1.0; 8]);
@@ -184,18 +248,30 @@ mod tests {
     #[test]
     fn a_random_choice_leaves_out_as_many() {
         let left_out = |seed| {
-            let config = RedundancyConfig { leave_out: LeaveOut::Random, seed, ..RedundancyConfig::default() };
+            let config = RedundancyConfig {
+                leave_out: LeaveOut::Random,
+                seed,
+                ..RedundancyConfig::default()
+            };
             let mut redundancy = Redundancy::new(config, vec![0; 8]);
             for _ in 0..2 {
-                redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| (sweep, sweep as f32)));
+                redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| {
+                    (sweep, sweep as f32)
+                }));
             }
             assert!(redundancy.advance(0.25));
             let unused = |&sweep: &usize| redundancy.weights()[sweep] == 0.0;
             (0..8).filter(unused).collect::<Vec<usize>>()
         };
         let choices: Vec<_> = (0..8).map(left_out).collect();
-        assert!(choices.iter().all(|choice| choice.len() == 2), "{choices:?}");
-        assert!(choices.iter().any(|choice| *choice != choices[0]), "{choices:?}");
+        assert!(
+            choices.iter().all(|choice| choice.len() == 2),
+            "{choices:?}"
+        );
+        assert!(
+            choices.iter().any(|choice| *choice != choices[0]),
+            "{choices:?}"
+        );
     }
 
     #[test]
@@ -211,10 +287,16 @@ mod tests {
     #[test]
     fn one_pass_gives_no_variance() {
         let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
-        redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| (sweep, sweep as f32)));
+        redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| {
+            (sweep, sweep as f32)
+        }));
         redundancy.advance(0.25);
         assert_eq!(redundancy.weights(), [1.0; 8]);
         redundancy.advance(0.5);
-        assert_eq!(redundancy.weights(), [1.0; 8], "nor does a window that a resumed training has not seen");
+        assert_eq!(
+            redundancy.weights(),
+            [1.0; 8],
+            "nor does a window that a resumed training has not seen"
+        );
     }
 }

@@ -38,26 +38,38 @@ pub(super) fn validate(
     kind: Kind,
 ) -> Result<SceneAccuracy, LocalizerTrainError> {
     let regression = no_grad(|| {
-        let logits = head.classify(&cache.sweeps, false)?.f_index_select(0, &cache.sweep_of_cell)?;
+        let logits = head
+            .classify(&cache.sweeps, false)?
+            .f_index_select(0, &cache.sweep_of_cell)?;
         head.regress(&head.normalise(&cache.cells)?, &logits, kind)
     })?;
     // Coordinates are relative to the origin of the head's scene.
     let origin = head.config().origin_m;
     let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
-    let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
-    let error = (&regression.coordinates_m - targets).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let targets =
+        &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
+    let error = (&regression.coordinates_m - targets)
+        .f_abs()?
+        .f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     let cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
     let world: Vec<f32> = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?)?;
     let sensor: Vec<f32> = Vec::try_from(&cache.sensor_m.f_reshape([-1])?)?;
     let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
     let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
     let solver = PoseSolver::default();
-    let search = PoseSearch { head, solver: &solver, kind };
+    let search = PoseSearch {
+        head,
+        solver: &solver,
+        kind,
+    };
     let mut translations = Vec::new();
     let mut rotations = Vec::new();
     let mut first = 0;
     for (sweep, truth) in cache.world_from_sensor.iter().enumerate() {
-        let count = sweeps[first..].iter().take_while(|&&of| of == sweep as i64).count();
+        let count = sweeps[first..]
+            .iter()
+            .take_while(|&&of| of == sweep as i64)
+            .count();
         let rows = first..first + count;
         let features = cache.cells.f_narrow(0, first as i64, count as i64)?;
         first += count;
@@ -67,8 +79,13 @@ pub(super) fn validate(
             epsilon_m: epsilon[rows].to_vec(),
             origin_m: head.config().origin_m,
         };
-        let refinement_cells = SweepCells { features, sensor_m: coordinates.sensor_m.clone() };
-        let found = search.run(&coordinates, &refinement_cells, &mut SearchTimes::default())?.into_solved();
+        let refinement_cells = SweepCells {
+            features,
+            sensor_m: coordinates.sensor_m.clone(),
+        };
+        let found = search
+            .run(&coordinates, &refinement_cells, &mut SearchTimes::default())?
+            .into_solved();
         let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
             let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
             (error.distance_m, error.angle_deg)
@@ -76,8 +93,10 @@ pub(super) fn validate(
         translations.push(metres);
         rotations.push(degrees);
     }
-    let share =
-        |limit: f64| translations.iter().filter(|&&error| error < limit).count() as f64 / translations.len() as f64;
+    let share = |limit: f64| {
+        translations.iter().filter(|&&error| error < limit).count() as f64
+            / translations.len() as f64
+    };
     let (success_3m, success_1m) = (share(3.0), share(1.0));
     Ok(SceneAccuracy {
         cell_p50_m: median(&cell_errors),

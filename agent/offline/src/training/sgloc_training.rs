@@ -70,20 +70,36 @@ pub fn train_sgloc(
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
-    let unchanged = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };
+    let unchanged = SweepAugmentation {
+        copies: 1,
+        turn_rad: 0.0,
+        keep: 1.0,
+    };
     let mut encoded = |done, total| observe(&SgLocReport::Encoding(done, total));
     let cache = FeatureCache::build(&list, &encoder, unchanged, run, &mut encoded)?;
-    let network_config =
-        SgLocConfig { scene_name: config.scene_name.clone(), origin_m: cache.origin_m, encoder: encoder_config };
+    let network_config = SgLocConfig {
+        scene_name: config.scene_name.clone(),
+        origin_m: cache.origin_m,
+        encoder: encoder_config,
+    };
     let variables = VarStore::new(run.device);
     let mut network = SgLoc::new(&variables.root(), &network_config)?;
-    let draw = Draw { seed: run.seed, cells: cache.cell_count(), device: run.device };
-    network.set_statistics(&cache.cells.f_index_select(0, &draw.rows(0, STATISTICS_CELLS)?)?)?;
+    let draw = Draw {
+        seed: run.seed,
+        cells: cache.cell_count(),
+        device: run.device,
+    };
+    network.set_statistics(
+        &cache
+            .cells
+            .f_index_select(0, &draw.rows(0, STATISTICS_CELLS)?)?,
+    )?;
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
     let mut trainer = Trainer::begin(run, &variables, None, started)?;
     let mut window = Vec::new();
-    let share_done =
-        |trainer: &Trainer| trainer.share_done((trainer.steps() * run.batch as u64) as f64 / list.len() as f64);
+    let share_done = |trainer: &Trainer| {
+        trainer.share_done((trainer.steps() * run.batch as u64) as f64 / list.len() as f64)
+    };
     while share_done(&trainer) < 1.0 {
         let rows = draw.rows(trainer.steps(), run.batch * CELLS)?;
         let loss = coordinate_loss(&network, &cache, &rows, run.precision.kind())?;
@@ -95,7 +111,12 @@ pub fn train_sgloc(
             let error_m = window.iter().sum::<f64>() / window.len() as f64;
             window.clear();
             let share_done = share_done(&trainer).min(1.0);
-            observe(&SgLocReport::Stepped { step, share_done, seconds: trainer.seconds(), error_m });
+            observe(&SgLocReport::Stepped {
+                step,
+                share_done,
+                seconds: trainer.seconds(),
+                error_m,
+            });
         }
         if step.is_multiple_of(CHECKPOINT_EVERY) {
             trainer.checkpoint(&variables)?;
@@ -103,7 +124,10 @@ pub fn train_sgloc(
     }
     trainer.checkpoint(&variables)?;
     let about = BTreeMap::from([
-        (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
+        (
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(&network_config).expect("a configuration is JSON"),
+        ),
         (KIND_KEY.to_owned(), SgLocLocalizer::KIND.to_owned()),
     ]);
     Ok(trainer.save_weights(&variables, about, list.data())?)
@@ -121,28 +145,46 @@ impl Draw {
     fn rows(&self, step: u64, wanted: usize) -> Result<Tensor, TchError> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(step);
-        let rows: Vec<i64> = (0..wanted).map(|_| rng.random_range(0..self.cells)).collect();
+        let rows: Vec<i64> = (0..wanted)
+            .map(|_| rng.random_range(0..self.cells))
+            .collect();
         Tensor::f_from_slice(&rows)?.f_to_device(self.device)
     }
 }
 
 /// Mean L1 error of the scene coordinates of some cells, metres, the sum of its axes as in SGLoc.
-fn coordinate_loss(network: &SgLoc, cache: &FeatureCache, rows: &Tensor, kind: Kind) -> Result<Tensor, TchError> {
+fn coordinate_loss(
+    network: &SgLoc,
+    cache: &FeatureCache,
+    rows: &Tensor,
+    kind: Kind,
+) -> Result<Tensor, TchError> {
     let cells = cache.cells.f_index_select(0, rows)?;
     let sensor_m = cache.sensor_m.f_index_select(0, rows)?;
     let found_m = network.coordinates(&cells, &sensor_m, kind, true)?;
     let error_m = (found_m - cache.targets_m.f_index_select(0, rows)?).f_abs()?;
-    error_m.f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_mean(Kind::Float)
+    error_m
+        .f_sum_dim_intlist(1_i64, false, Kind::Float)?
+        .f_mean(Kind::Float)
 }
 
 /// Gives the encoder below `variables` the weights of a file and freezes it.
-fn adopt_encoder(variables: &VarStore, path: &Path, config: &SceneEncoderConfig) -> Result<(), LocalizerTrainError> {
+fn adopt_encoder(
+    variables: &VarStore,
+    path: &Path,
+    config: &SceneEncoderConfig,
+) -> Result<(), LocalizerTrainError> {
     let stored = VarStore::new(variables.device());
     SceneEncoder::new(&stored.root(), config)?;
-    Weights::load(path).and_then(|weights| weights.copy_into(&stored)).map_err(LocalizerError::from)?;
+    Weights::load(path)
+        .and_then(|weights| weights.copy_into(&stored))
+        .map_err(LocalizerError::from)?;
     let stored = stored.variables();
     for (name, mut variable) in variables.variables() {
-        if let Some(source) = name.strip_prefix("encoder.").and_then(|name| stored.get(name)) {
+        if let Some(source) = name
+            .strip_prefix("encoder.")
+            .and_then(|name| stored.get(name))
+        {
             no_grad(|| variable.f_copy_(source))?;
             let _ = variable.f_set_requires_grad(false)?;
         }

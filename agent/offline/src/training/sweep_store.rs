@@ -32,14 +32,27 @@ pub(crate) struct StoredSweep {
 impl StoredSweep {
     /// A sweep from points in metres.
     #[must_use]
-    pub(crate) fn new(world: usize, drive: usize, world_from_sensor: Isometry3<f64>, points: &[[f32; 4]]) -> Self {
-        let stored = |point: &[f32; 4]| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16);
-        Self { world, drive, world_from_sensor, points: points.iter().map(stored).collect() }
+    pub(crate) fn new(
+        world: usize,
+        drive: usize,
+        world_from_sensor: Isometry3<f64>,
+        points: &[[f32; 4]],
+    ) -> Self {
+        let stored =
+            |point: &[f32; 4]| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16);
+        Self {
+            world,
+            drive,
+            world_from_sensor,
+            points: points.iter().map(stored).collect(),
+        }
     }
 
     /// x, y, z of every point, metres in the sensor frame.
     pub(crate) fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        self.points.iter().map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
+        self.points
+            .iter()
+            .map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
     }
 
     /// The voxels of the same sweep for a sensor in another orientation, `turned_from_sensor`; each point is kept with
@@ -53,8 +66,13 @@ impl StoredSweep {
     ) -> SweepVoxels {
         let turn: Isometry3<f32> = turned_from_sensor.cast();
         // 32 decisions from one draw of the generator would be faster still; this does not dominate the time.
-        let kept = self.points().filter(|_| keep >= 1.0 || rng.random_bool(keep));
-        SweepVoxels::new(kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into()), config)
+        let kept = self
+            .points()
+            .filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        SweepVoxels::new(
+            kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into()),
+            config,
+        )
     }
 }
 
@@ -68,7 +86,10 @@ pub(super) struct PosedSweep {
 /// A rotation about the vertical.
 #[must_use]
 pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
-    Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad))
+    Isometry3::from_parts(
+        Translation3::identity(),
+        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad),
+    )
 }
 
 /// Heading of a pose, radians.
@@ -112,8 +133,15 @@ impl SweepList {
             problems.extend(dataset.problems.iter().map(ToString::to_string));
             for scenario in dataset.scenarios.into_iter().map(Arc::new) {
                 for agent in 0..scenario.agents.len() {
-                    let place = |tick| Place { scenario: Arc::clone(&scenario), agent, tick, world, drive };
-                    let ticks = (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick));
+                    let place = |tick| Place {
+                        scenario: Arc::clone(&scenario),
+                        agent,
+                        tick,
+                        world,
+                        drive,
+                    };
+                    let ticks =
+                        (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick));
                     places.extend(ticks.map(place));
                     drive += 1;
                 }
@@ -124,32 +152,73 @@ impl SweepList {
             return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
         }
         let sha256 = dataset::content_sha256(scenarios.iter().map(AsRef::as_ref));
-        Ok(Self { places, sha256, problems, without_pose: Mutex::default(), unreadable: Mutex::default() })
+        Ok(Self {
+            places,
+            sha256,
+            problems,
+            without_pose: Mutex::default(),
+            unreadable: Mutex::default(),
+        })
     }
 
     /// Identity of the data, and the part of it that proved unusable so far.
     #[must_use]
     pub(crate) fn data(&self) -> DataListing {
-        let without_pose = self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).len();
-        let unreadable = self.unreadable.lock().unwrap_or_else(PoisonError::into_inner);
-        let problems = self.problems.iter().chain(unreadable.values()).cloned().collect();
-        DataListing { sha256: self.sha256.clone(), without_pose, problems }
+        let without_pose = self
+            .without_pose
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .len();
+        let unreadable = self
+            .unreadable
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        let problems = self
+            .problems
+            .iter()
+            .chain(unreadable.values())
+            .cloned()
+            .collect();
+        DataListing {
+            sha256: self.sha256.clone(),
+            without_pose,
+            problems,
+        }
     }
 
     /// The sweeps at some indices, as a list of their own, in the order given.
     #[must_use]
     pub(crate) fn subset(&self, indices: &[usize]) -> Self {
-        let places = indices.iter().filter_map(|&index| self.places.get(index).cloned()).collect();
+        let places = indices
+            .iter()
+            .filter_map(|&index| self.places.get(index).cloned())
+            .collect();
         let (sha256, problems) = (self.sha256.clone(), self.problems.clone());
-        Self { places, sha256, problems, without_pose: Mutex::default(), unreadable: Mutex::default() }
+        Self {
+            places,
+            sha256,
+            problems,
+            without_pose: Mutex::default(),
+            unreadable: Mutex::default(),
+        }
     }
 
     /// Drive of each sweep, and its pose without reading points; `None` for a sweep without one.
     pub(crate) fn poses(&self) -> Vec<(usize, Option<Isometry3<f64>>)> {
-        let options = LoadOptions { points: false, ..LoadOptions::default() };
-        let pose = |(index, Place { scenario, agent, tick, drive, .. }): (usize, &Place)| match scenario
-            .load(*agent, *tick, &options)
-        {
+        let options = LoadOptions {
+            points: false,
+            ..LoadOptions::default()
+        };
+        let pose = |(
+            index,
+            Place {
+                scenario,
+                agent,
+                tick,
+                drive,
+                ..
+            },
+        ): (usize, &Place)| match scenario.load(*agent, *tick, &options) {
             Ok(frame) => (*drive, frame.world_from_lidar.map(|pose| pose.isometry())),
             Err(error) => {
                 self.leave_out(index, &error);
@@ -161,7 +230,12 @@ impl SweepList {
 
     /// Reads the whole frame of a sweep, with the names of its scenario and its files; `None` if it cannot be read.
     pub(crate) fn frame(&self, index: usize) -> Option<(Frame, String, String)> {
-        let Place { scenario, agent, tick, .. } = self.places.get(index)?;
+        let Place {
+            scenario,
+            agent,
+            tick,
+            ..
+        } = self.places.get(index)?;
         let stem = scenario.ticks.get(*tick)?.stem.clone();
         match scenario.load(*agent, *tick, &LoadOptions::default()) {
             Ok(frame) => Some((frame, scenario.name.clone(), stem)),
@@ -173,7 +247,10 @@ impl SweepList {
     }
 
     fn leave_out(&self, index: usize, error: &ReadError) {
-        self.unreadable.lock().unwrap_or_else(PoisonError::into_inner).insert(index, error.to_string());
+        self.unreadable
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .insert(index, error.to_string());
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
@@ -199,7 +276,10 @@ impl SweepList {
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
         let Place { world, drive, .. } = self.places[index];
-        let PosedSweep { points, world_from_sensor } = self.posed_sweep(index, range_m)?;
+        let PosedSweep {
+            points,
+            world_from_sensor,
+        } = self.posed_sweep(index, range_m)?;
         Some(StoredSweep::new(world, drive, world_from_sensor, &points))
     }
 
@@ -208,7 +288,10 @@ impl SweepList {
         let (frame, world_from_sensor) = self.posed_frame(index)?;
         let (mut points, range) = (frame.points.xyzi, range_m as f32);
         points.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
-        Some(PosedSweep { points, world_from_sensor })
+        Some(PosedSweep {
+            points,
+            world_from_sensor,
+        })
     }
 
     /// Reads the whole frame of a sweep with the pose of its sensor; `None` if that is unknown or the frame cannot be
@@ -216,7 +299,10 @@ impl SweepList {
     pub(crate) fn posed_frame(&self, index: usize) -> Option<(Frame, Isometry3<f64>)> {
         let (frame, ..) = self.frame(index)?;
         let Some(pose) = frame.world_from_lidar else {
-            self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).insert(index);
+            self.without_pose
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .insert(index);
             return None;
         };
         Some((frame, pose.isometry()))
@@ -247,17 +333,21 @@ impl SweepStore {
         let count = list.len();
         let source = Arc::clone(&list);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let mut reader = Prefetch::start(threads, 0, move |number| match (number as usize) < count {
-            true => source.read(number as usize, range_m),
-            false => None,
-        });
+        let mut reader =
+            Prefetch::start(threads, 0, move |number| match (number as usize) < count {
+                true => source.read(number as usize, range_m),
+                false => None,
+            });
         let mut sweeps = Vec::with_capacity(count);
         for _ in 0..count {
             sweeps.extend(reader.next_batch()?);
         }
         match sweeps.is_empty() {
             true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),
-            false => Ok(Self { sweeps, data: list.data() }),
+            false => Ok(Self {
+                sweeps,
+                data: list.data(),
+            }),
         }
     }
 }
@@ -273,7 +363,10 @@ mod tests {
     fn sequence(folder: &Path, poses: &str) {
         fs::create_dir_all(folder.join("velodyne")).unwrap();
         for scan in ["000000", "000001"] {
-            let point: Vec<u8> = [7.0f32, 1.0, 0.5, 0.1].iter().flat_map(|axis| axis.to_le_bytes()).collect();
+            let point: Vec<u8> = [7.0f32, 1.0, 0.5, 0.1]
+                .iter()
+                .flat_map(|axis| axis.to_le_bytes())
+                .collect();
             fs::write(folder.join("velodyne").join(format!("{scan}.bin")), point).unwrap();
         }
         fs::write(folder.join("calib.txt"), "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
@@ -290,7 +383,10 @@ mod tests {
         sequence(&unknown, "");
         let store = SweepStore::read(&[known.clone(), unknown.clone()], 50.0).unwrap();
         assert_eq!((store.sweeps.len(), store.data.without_pose), (2, 2));
-        assert_eq!(store.data.left_out().unwrap(), "2 sweeps without a pose left out");
+        assert_eq!(
+            store.data.left_out().unwrap(),
+            "2 sweeps without a pose left out"
+        );
         let alone = SweepStore::read(&[known], 50.0).unwrap();
         assert_eq!((alone.sweeps.len(), alone.data.left_out()), (2, None));
         assert_ne!(alone.data.sha256, store.data.sha256);

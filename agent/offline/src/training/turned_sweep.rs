@@ -31,7 +31,10 @@ impl TurnedSweep {
         rng: &mut impl Rng,
         format: &SweepFormat,
     ) -> Self {
-        let PosedSweep { mut points, world_from_sensor } = sweep;
+        let PosedSweep {
+            mut points,
+            world_from_sensor,
+        } = sweep;
         let in_range = points.len();
         points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
         let turn: Isometry3<f32> = turned_from_sensor.cast();
@@ -44,6 +47,11 @@ impl TurnedSweep {
         let sweep = format.prepare(&points);
         let rows = choose(sweep.cells(), CELLS, rng);
         let world_from_sensor = world_from_sensor * turned_from_sensor.inverse();
-        Self { sweep, rows, points: in_range, world_from_sensor }
+        Self {
+            sweep,
+            rows,
+            points: in_range,
+            world_from_sensor,
+        }
     }
 }

@@ -24,7 +24,13 @@ impl Anchors {
     #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         let stride = usize::try_from(config.feature_stride()).unwrap_or(1).max(1);
-        Self::new(config.lidar_range_m, config.voxel_size_m, config.pillar_grid(), stride, &config.anchors)
+        Self::new(
+            config.lidar_range_m,
+            config.voxel_size_m,
+            config.pillar_grid(),
+            stride,
+            &config.anchors,
+        )
     }
 
     /// Anchors over an area with `grid` pillars (x, y, z) of which each cell of the head covers `stride` along an axis.
@@ -42,14 +48,22 @@ impl Anchors {
     ) -> Self {
         let along = |axis: usize| {
             let low = lidar_range_m[axis] + voxel_size_m[axis];
-            linspace(low, lidar_range_m[axis + 3] - voxel_size_m[axis], grid[axis] / stride)
+            linspace(
+                low,
+                lidar_range_m[axis + 3] - voxel_size_m[axis],
+                grid[axis] / stride,
+            )
         };
         Self {
             x_m: along(0),
             y_m: along(1),
             z_m: anchors.center_z_m,
             size_lwh_m: anchors.size_lwh_m,
-            yaws_rad: anchors.yaws_deg.iter().map(|yaw| yaw.to_radians()).collect(),
+            yaws_rad: anchors
+                .yaws_deg
+                .iter()
+                .map(|yaw| yaw.to_radians())
+                .collect(),
         }
     }
 
@@ -74,14 +88,30 @@ impl Anchors {
         let (cell, anchor) = (index / self.yaws_rad.len(), index % self.yaws_rad.len());
         let (row, column) = (cell / self.x_m.len(), cell % self.x_m.len());
         let [l, w, h] = self.size_lwh_m;
-        [self.x_m[column], self.y_m[row], self.z_m, h, w, l, self.yaws_rad[anchor]]
+        [
+            self.x_m[column],
+            self.y_m[row],
+            self.z_m,
+            h,
+            w,
+            l,
+            self.yaws_rad[anchor],
+        ]
     }
 }
 
 /// `count` numbers from `low` to `high`, both included.
 fn linspace(low: f64, high: f64, count: usize) -> Vec<f64> {
     let step = (high - low) / count.saturating_sub(1).max(1) as f64;
-    (0..count).map(|index| if index + 1 == count && index > 0 { high } else { low + step * index as f64 }).collect()
+    (0..count)
+        .map(|index| {
+            if index + 1 == count && index > 0 {
+                high
+            } else {
+                low + step * index as f64
+            }
+        })
+        .collect()
 }
 
 #[cfg(test)]
@@ -92,7 +122,10 @@ mod tests {
     fn anchors_of_stride_two_are_the_centres_of_the_cells() {
         let config = DetectorConfig::lean();
         let (anchors, grid) = (Anchors::for_detector(&config), config.feature_grid());
-        assert_eq!((anchors.x_m.len(), anchors.y_m.len()), (grid.width as usize, grid.height as usize));
+        assert_eq!(
+            (anchors.x_m.len(), anchors.y_m.len()),
+            (grid.width as usize, grid.height as usize)
+        );
         for (column, x) in anchors.x_m.iter().enumerate() {
             assert!((x - (grid.x_min_m + (column as f64 + 0.5) * grid.cell_m)).abs() < 1e-9);
         }

@@ -40,9 +40,23 @@ const MAX_LOG_SIZE: f32 = 8.0;
 ///
 /// # Errors
 /// [`DecodeError`] when the number of values does not fit the anchors.
-pub fn decode(scores: &[f32], offsets: &[f32], anchors: &Anchors, threshold: f32) -> Result<Vec<Decoded>, DecodeError> {
+pub fn decode(
+    scores: &[f32],
+    offsets: &[f32],
+    anchors: &Anchors,
+    threshold: f32,
+) -> Result<Vec<Decoded>, DecodeError> {
     let check = |field, found, expected| {
-        if found == expected { Ok(()) } else { Err(DecodeError { field, found, anchors: anchors.len(), expected }) }
+        if found == expected {
+            Ok(())
+        } else {
+            Err(DecodeError {
+                field,
+                found,
+                anchors: anchors.len(),
+                expected,
+            })
+        }
     };
     check("scores", scores.len(), anchors.len())?;
     check("offsets", offsets.len(), anchors.len() * 7)?;
@@ -57,10 +71,15 @@ pub fn decode(scores: &[f32], offsets: &[f32], anchors: &Anchors, threshold: f32
             if logit < lowest || sigmoid(logit) <= threshold || logit.is_nan() {
                 continue;
             }
-            let offsets: [f32; 7] = std::array::from_fn(|component| offsets[(7 * anchor + component) * cells + cell]);
+            let offsets: [f32; 7] =
+                std::array::from_fn(|component| offsets[(7 * anchor + component) * cells + cell]);
             let index = cell * per_cell + anchor;
             if let Some(box3d) = decode_box(offsets, anchors.get(index)) {
-                decoded.push(Decoded { anchor: index, score: sigmoid(logit), box3d });
+                decoded.push(Decoded {
+                    anchor: index,
+                    score: sigmoid(logit),
+                    box3d,
+                });
             }
         }
     }
@@ -76,7 +95,9 @@ pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
     let [x, y, z, h, w, l, yaw] = anchor;
     let diagonal = (l * l + w * w).sqrt();
     let [dx, dy, dz, _, _, _, dyaw] = offsets.map(f64::from);
-    let size = |component: usize, prior: f64| f64::from(offsets[component].min(MAX_LOG_SIZE)).exp() * prior;
+    let size = |component: usize, prior: f64| {
+        f64::from(offsets[component].min(MAX_LOG_SIZE)).exp() * prior
+    };
     Some(Box3d {
         center_m: [dx * diagonal + x, dy * diagonal + y, dz * h + z],
         size_m: [size(5, l), size(4, w), size(3, h)],
@@ -100,7 +121,10 @@ mod tests {
     use crate::model_config::DetectorConfig;
 
     fn anchors() -> Anchors {
-        let config = DetectorConfig { lidar_range_m: [0.0, 0.0, -3.0, 3.2, 3.2, 1.0], ..DetectorConfig::lean() };
+        let config = DetectorConfig {
+            lidar_range_m: [0.0, 0.0, -3.0, 3.2, 3.2, 1.0],
+            ..DetectorConfig::lean()
+        };
         Anchors::for_detector(&config)
     }
 
@@ -126,12 +150,22 @@ mod tests {
         assert_eq!(box3d.center_m, [6.0, -3.0, 2.0]);
         assert!((box3d.size_m[0] - 8.0).abs() < 1e-6 && box3d.heading_rad == 0.75);
         assert!(decode_box([0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0], anchor).is_none());
-        assert!(decode_box([0.0, 0.0, 0.0, f32::MAX, 0.0, 0.0, 0.0], anchor).unwrap().size_m[2].is_finite());
+        assert!(
+            decode_box([0.0, 0.0, 0.0, f32::MAX, 0.0, 0.0, 0.0], anchor)
+                .unwrap()
+                .size_m[2]
+                .is_finite()
+        );
     }
 
     #[test]
     fn a_map_of_another_size_is_rejected() {
-        let message = decode(&[0.0; 3], &[], &anchors(), 0.5).unwrap_err().to_string();
-        assert!(message.contains("scores has 3") && message.contains("32"), "{message}");
+        let message = decode(&[0.0; 3], &[], &anchors(), 0.5)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("scores has 3") && message.contains("32"),
+            "{message}"
+        );
     }
 }

@@ -10,7 +10,12 @@ use protocol::rotated_iou::Polygon;
 /// # Panics
 /// When the numbers of scores and boxes differ: an error of the caller, not of the data.
 #[must_use]
-pub fn rotated_nms(boxes: &[Polygon], scores: &[f32], threshold: f64, max_candidates: usize) -> Vec<usize> {
+pub fn rotated_nms(
+    boxes: &[Polygon],
+    scores: &[f32],
+    threshold: f64,
+    max_candidates: usize,
+) -> Vec<usize> {
     assert_eq!(boxes.len(), scores.len(), "one score per box");
     let mut order: Vec<usize> = (0..boxes.len()).collect();
     order.sort_by(|&a, &b| scores[b].total_cmp(&scores[a]));
@@ -18,7 +23,9 @@ pub fn rotated_nms(boxes: &[Polygon], scores: &[f32], threshold: f64, max_candid
     // A box is removed when a kept one suppresses it: the same result as striking out, without a table of pairs.
     let mut kept: Vec<usize> = Vec::new();
     for candidate in order {
-        let suppressed = kept.iter().any(|&better| boxes[better].overlaps_more_than(&boxes[candidate], threshold));
+        let suppressed = kept
+            .iter()
+            .any(|&better| boxes[better].overlaps_more_than(&boxes[candidate], threshold));
         if !suppressed {
             kept.push(candidate);
         }

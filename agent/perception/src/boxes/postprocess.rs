@@ -50,13 +50,20 @@ impl PostprocessConfig {
     #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
-        Self { z_range_m: [z_low, z_high], keep_range_m: [x_low, y_low, x_high, y_high], ..Self::default() }
+        Self {
+            z_range_m: [z_low, z_high],
+            keep_range_m: [x_low, y_low, x_high, y_high],
+            ..Self::default()
+        }
     }
 
     /// For boxes that another vehicle will merge: the receiver applies its own range.
     #[must_use]
     pub fn for_late_fusion(config: &DetectorConfig) -> Self {
-        Self { keep_range_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX], ..Self::for_detector(config) }
+        Self {
+            keep_range_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX],
+            ..Self::for_detector(config)
+        }
     }
 }
 
@@ -85,8 +92,11 @@ pub struct AgentBoxes<'a> {
 /// Returns the detections by descending score.
 #[must_use]
 pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec<Candidate> {
-    let mut candidates: Vec<Candidate> =
-        agents.iter().enumerate().flat_map(|(agent, boxes)| project(agent, boxes)).collect();
+    let mut candidates: Vec<Candidate> = agents
+        .iter()
+        .enumerate()
+        .flat_map(|(agent, boxes)| project(agent, boxes))
+        .collect();
     candidates.retain(|candidate| is_vehicle_sized(&candidate.corners, config));
     let mut kept = suppress(&candidates, config);
     kept.retain(|candidate| corners_within(&candidate.corners, config.keep_range_m));
@@ -94,9 +104,13 @@ pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec
 }
 
 /// The candidates of one agent in the output frame.
-fn project<'a>(agent: usize, boxes: &'a AgentBoxes<'_>) -> impl Iterator<Item = Candidate> + use<'a> {
+fn project<'a>(
+    agent: usize,
+    boxes: &'a AgentBoxes<'_>,
+) -> impl Iterator<Item = Candidate> + use<'a> {
     boxes.boxes.iter().map(move |decoded| Candidate {
-        corners: (decoded.box3d.corners()).map(|corner| (boxes.output_from_agent * Point3::from(corner)).into()),
+        corners: (decoded.box3d.corners())
+            .map(|corner| (boxes.output_from_agent * Point3::from(corner)).into()),
         score: decoded.score,
         agent,
     })
@@ -108,17 +122,28 @@ fn project<'a>(agent: usize, boxes: &'a AgentBoxes<'_>) -> impl Iterator<Item = 
 pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> bool {
     let [x, y, z] = bounds(corners);
     let extent = |[low, high]: [f64; 2]| high - low;
-    let sized = extent(x) <= config.max_extent_m && extent(y) <= config.max_extent_m && extent(z) > 0.0;
+    let sized =
+        extent(x) <= config.max_extent_m && extent(y) <= config.max_extent_m && extent(z) > 0.0;
     sized && z[0] >= config.z_range_m[0] && z[1] <= config.z_range_m[1]
 }
 
 /// Rotated non-maximum suppression on the footprints, by descending score.
 #[must_use]
 pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Candidate> {
-    let polygons: Vec<Polygon> = candidates.iter().map(|candidate| Polygon::footprint(&candidate.corners)).collect();
+    let polygons: Vec<Polygon> = candidates
+        .iter()
+        .map(|candidate| Polygon::footprint(&candidate.corners))
+        .collect();
     let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
-    let kept = rotated_nms(&polygons, &scores, config.nms_iou, config.nms_max_candidates);
-    kept.into_iter().map(|index| candidates[index].clone()).collect()
+    let kept = rotated_nms(
+        &polygons,
+        &scores,
+        config.nms_iou,
+        config.nms_max_candidates,
+    );
+    kept.into_iter()
+        .map(|index| candidates[index].clone())
+        .collect()
 }
 
 /// The upright box of eight corners.
@@ -127,21 +152,39 @@ pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Can
 /// four edges along the length: unlike a mean of four angles it is continuous at half a turn.
 #[must_use]
 pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
-    let center_m = std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
-    let edge = |from: usize, to: usize| [corners[to][0] - corners[from][0], corners[to][1] - corners[from][1]];
-    let mean_length = |edges: [[f64; 2]; 4]| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0;
+    let center_m =
+        std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
+    let edge = |from: usize, to: usize| {
+        [
+            corners[to][0] - corners[from][0],
+            corners[to][1] - corners[from][1],
+        ]
+    };
+    let mean_length =
+        |edges: [[f64; 2]; 4]| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0;
     let along = [edge(3, 0), edge(2, 1), edge(7, 4), edge(6, 5)];
     let across = [edge(0, 1), edge(3, 2), edge(4, 5), edge(7, 6)];
-    let height = (0..4).map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs()).sum::<f64>() / 4.0;
+    let height = (0..4)
+        .map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs())
+        .sum::<f64>()
+        / 4.0;
     let sum = |axis: usize| along.iter().map(|edge| edge[axis]).sum::<f64>();
-    Box3d { center_m, size_m: [mean_length(along), mean_length(across), height], heading_rad: sum(1).atan2(sum(0)) }
+    Box3d {
+        center_m,
+        size_m: [mean_length(along), mean_length(across), height],
+        heading_rad: sum(1).atan2(sum(0)),
+    }
 }
 
 impl Candidate {
     /// The published detection. `source` is the CAV if one alone detected it.
     #[must_use]
     pub fn detection(&self, source: Option<CavId>) -> Detection {
-        Detection { box3d: corners_to_box(&self.corners), score: self.score, source }
+        Detection {
+            box3d: corners_to_box(&self.corners),
+            score: self.score,
+            source,
+        }
     }
 }
 
@@ -149,7 +192,10 @@ impl Candidate {
 fn bounds(corners: &[[f64; 3]; 8]) -> [[f64; 2]; 3] {
     std::array::from_fn(|axis| {
         let values = || corners.iter().map(|corner| corner[axis]);
-        [values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max)]
+        [
+            values().fold(f64::INFINITY, f64::min),
+            values().fold(f64::NEG_INFINITY, f64::max),
+        ]
     })
 }
 
@@ -161,14 +207,25 @@ mod tests {
 
     use super::*;
 
-    const CAR: Box3d = Box3d { center_m: [10.0, 2.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.3 };
+    const CAR: Box3d = Box3d {
+        center_m: [10.0, 2.0, -1.0],
+        size_m: [4.0, 2.0, 1.5],
+        heading_rad: 0.3,
+    };
 
     fn decoded(box3d: Box3d, score: f32) -> Decoded {
-        Decoded { anchor: 0, score, box3d }
+        Decoded {
+            anchor: 0,
+            score,
+            box3d,
+        }
     }
 
     fn run(boxes: &[Decoded]) -> Vec<Candidate> {
-        let agent = AgentBoxes { boxes, output_from_agent: Isometry3::identity() };
+        let agent = AgentBoxes {
+            boxes,
+            output_from_agent: Isometry3::identity(),
+        };
         postprocess(&[agent], &PostprocessConfig::default())
     }
 
@@ -177,7 +234,11 @@ mod tests {
         for heading_rad in [0.3, -2.0, PI, -PI + 1e-7, PI - 1e-7] {
             let back = corners_to_box(&Box3d { heading_rad, ..CAR }.corners());
             let turn = (back.heading_rad - heading_rad).rem_euclid(2.0 * PI);
-            assert!(turn.min(2.0 * PI - turn) < 1e-9, "{heading_rad}: {}", back.heading_rad);
+            assert!(
+                turn.min(2.0 * PI - turn) < 1e-9,
+                "{heading_rad}: {}",
+                back.heading_rad
+            );
             assert!((0..3).all(|axis| (back.size_m[axis] - CAR.size_m[axis]).abs() < 1e-9));
             assert!((0..3).all(|axis| (back.center_m[axis] - CAR.center_m[axis]).abs() < 1e-9));
         }
@@ -185,10 +246,23 @@ mod tests {
 
     #[test]
     fn implausible_boxes_are_removed() {
-        let long = Box3d { size_m: [7.0, 2.0, 1.5], heading_rad: 0.0, ..CAR };
-        let high = Box3d { center_m: [10.0, 2.0, 0.5], ..CAR };
-        let flat = Box3d { size_m: [4.0, 2.0, 0.0], ..CAR };
-        let far = Box3d { center_m: [10.0, 39.5, -1.0], ..CAR };
+        let long = Box3d {
+            size_m: [7.0, 2.0, 1.5],
+            heading_rad: 0.0,
+            ..CAR
+        };
+        let high = Box3d {
+            center_m: [10.0, 2.0, 0.5],
+            ..CAR
+        };
+        let flat = Box3d {
+            size_m: [4.0, 2.0, 0.0],
+            ..CAR
+        };
+        let far = Box3d {
+            center_m: [10.0, 39.5, -1.0],
+            ..CAR
+        };
         for odd in [long, high, flat, far] {
             assert_eq!(run(&[decoded(odd, 0.9)]), [], "{odd:?}");
         }
@@ -201,8 +275,14 @@ mod tests {
         let seen_by_other = CAR.transformed(&ego_from_other.inverse());
         let (ego, other) = ([decoded(CAR, 0.6)], [decoded(seen_by_other, 0.8)]);
         let agents = [
-            AgentBoxes { boxes: &ego, output_from_agent: Isometry3::identity() },
-            AgentBoxes { boxes: &other, output_from_agent: ego_from_other },
+            AgentBoxes {
+                boxes: &ego,
+                output_from_agent: Isometry3::identity(),
+            },
+            AgentBoxes {
+                boxes: &other,
+                output_from_agent: ego_from_other,
+            },
         ];
         let found = postprocess(&agents, &PostprocessConfig::default());
         assert_eq!((found.len(), found[0].agent, found[0].score), (1, 1, 0.8));

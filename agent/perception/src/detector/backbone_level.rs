@@ -15,12 +15,20 @@ pub struct BackboneLevel {
 impl BackboneLevel {
     /// Levels in single precision.
     pub(super) fn in_float(maps: Vec<Tensor>) -> Vec<Self> {
-        maps.into_iter().map(|values| Self { values, quantisation: None }).collect()
+        maps.into_iter()
+            .map(|values| Self {
+                values,
+                quantisation: None,
+            })
+            .collect()
     }
 
     /// A level of quantised values.
     pub(super) fn in_integers(values: Tensor, quantisation: Quantisation) -> Self {
-        Self { values, quantisation: Some(quantisation) }
+        Self {
+            values,
+            quantisation: Some(quantisation),
+        }
     }
 
     /// Its values as the next layer takes them.
@@ -60,13 +68,19 @@ impl BackboneLevel {
     /// `[H * W, C]`: a view if channels are innermost in memory.
     fn by_cell(&self) -> Result<Tensor, TchError> {
         let channels = self.values.size()[1];
-        self.values.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])
+        self.values
+            .f_permute([0, 2, 3, 1])?
+            .f_reshape([-1, channels])
     }
 
     fn in_single_precision(&self, values: &Tensor) -> Result<Tensor, TchError> {
         let values = values.f_to_kind(Kind::Float)?;
-        let Some(Quantisation { scale, zero_point }) = self.quantisation else { return Ok(values) };
-        values.f_sub_scalar(i64::from(zero_point))?.f_mul_scalar(scale.step())
+        let Some(Quantisation { scale, zero_point }) = self.quantisation else {
+            return Ok(values);
+        };
+        values
+            .f_sub_scalar(i64::from(zero_point))?
+            .f_mul_scalar(scale.step())
     }
 }
 
@@ -80,13 +94,23 @@ mod tests {
     #[test]
     fn cells_have_the_features_of_their_place_in_both_formats() {
         let map = Tensor::arange(2 * 3 * 4, (Kind::Float, Device::Cpu)).view([1, 2, 3, 4]);
-        let quantisation = Quantisation { scale: Scale::of_exponent(-1), zero_point: 4 };
-        let quantised = BackboneLevel::in_integers(quantisation.quantise(&map).unwrap(), quantisation);
+        let quantisation = Quantisation {
+            scale: Scale::of_exponent(-1),
+            zero_point: 4,
+        };
+        let quantised =
+            BackboneLevel::in_integers(quantisation.quantise(&map).unwrap(), quantisation);
         let cells = Tensor::from_slice(&[5_i64, 0]);
-        for level in [&BackboneLevel::in_float(vec![map.shallow_clone()])[0], &quantised] {
+        for level in [
+            &BackboneLevel::in_float(vec![map.shallow_clone()])[0],
+            &quantised,
+        ] {
             let expected = Tensor::from_slice2(&[[5.0_f32, 17.0], [0.0, 12.0]]);
             assert_eq!(level.of_cells(&cells).unwrap(), expected);
-            assert_eq!((level.map().unwrap(), level.shape()), (map.shallow_clone(), [2, 3, 4]));
+            assert_eq!(
+                (level.map().unwrap(), level.shape()),
+                (map.shallow_clone(), [2, 3, 4])
+            );
         }
     }
 }

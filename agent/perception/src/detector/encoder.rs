@@ -23,8 +23,16 @@ pub(super) struct BevEncoder {
 
 #[derive(Debug)]
 enum Layers {
-    Float { canvas: Vec<f32>, backbone: BevBackbone, shrink: Option<Shrink> },
-    Int8 { canvas: Vec<u8>, quantisation: Quantisation, backbone: Int8Backbone },
+    Float {
+        canvas: Vec<f32>,
+        backbone: BevBackbone,
+        shrink: Option<Shrink>,
+    },
+    Int8 {
+        canvas: Vec<u8>,
+        quantisation: Quantisation,
+        backbone: Int8Backbone,
+    },
 }
 
 /// Canvas with the features of pillars: `[1, C_pillar, H, W]`, channels innermost in memory.
@@ -41,15 +49,35 @@ impl BevEncoder {
         device: Device,
     ) -> Self {
         let canvas = vec![0.0; canvas_len(&pillar_grid, &projection)];
-        Self { pillar_grid, projection, device, layers: Layers::Float { canvas, backbone, shrink } }
+        Self {
+            pillar_grid,
+            projection,
+            device,
+            layers: Layers::Float {
+                canvas,
+                backbone,
+                shrink,
+            },
+        }
     }
 
     /// The same in integers, if its layers can be quantised.
     pub(super) fn quantised(self, scales: &ActivationScales) -> Result<Self, QuantiseError> {
-        let Layers::Float { backbone, shrink, .. } = &self.layers else { return Ok(self) };
-        let Some(backbone) = Int8Backbone::new(backbone, shrink.as_ref(), scales)? else { return Ok(self) };
+        let Layers::Float {
+            backbone, shrink, ..
+        } = &self.layers
+        else {
+            return Ok(self);
+        };
+        let Some(backbone) = Int8Backbone::new(backbone, shrink.as_ref(), scales)? else {
+            return Ok(self);
+        };
         let canvas = vec![0; canvas_len(&self.pillar_grid, &self.projection)];
-        let layers = Layers::Int8 { canvas, quantisation: scales.get(CANVAS)?, backbone };
+        let layers = Layers::Int8 {
+            canvas,
+            quantisation: scales.get(CANVAS)?,
+            backbone,
+        };
         Ok(Self { layers, ..self })
     }
 
@@ -60,14 +88,23 @@ impl BevEncoder {
 
     /// Writes pillars to the canvas.
     pub(super) fn scatter(&mut self, pillars: &Pillars) -> Result<Canvas, TchError> {
-        let Self { pillar_grid, projection, device, layers } = self;
+        let Self {
+            pillar_grid,
+            projection,
+            device,
+            layers,
+        } = self;
         let flat = match layers {
             Layers::Float { canvas, .. } => {
                 canvas.fill(0.0);
                 projection.scatter(pillars, pillar_grid, canvas);
                 Tensor::f_from_slice(canvas)
             }
-            Layers::Int8 { canvas, quantisation, .. } => {
+            Layers::Int8 {
+                canvas,
+                quantisation,
+                ..
+            } => {
                 canvas.fill(0);
                 projection.scatter_quantised(pillars, pillar_grid, *quantisation, canvas);
                 Tensor::f_from_slice(canvas)
@@ -81,16 +118,23 @@ impl BevEncoder {
     /// Levels of the backbone for a canvas.
     pub(super) fn levels(&self, canvas: &Canvas) -> Result<Vec<BackboneLevel>, TchError> {
         match &self.layers {
-            Layers::Float { backbone, .. } => Ok(BackboneLevel::in_float(backbone.levels_of(&canvas.0, false))),
+            Layers::Float { backbone, .. } => Ok(BackboneLevel::in_float(
+                backbone.levels_of(&canvas.0, false),
+            )),
             Layers::Int8 { backbone, .. } => backbone.levels(&canvas.0),
         }
     }
 
     /// Feature map `[1, C, H', W']` of the levels of a canvas, contiguous.
     pub(super) fn features(&self, levels: &[BackboneLevel]) -> Result<Tensor, TchError> {
-        let maps: Vec<Tensor> = levels.iter().map(|level| level.values().shallow_clone()).collect();
+        let maps: Vec<Tensor> = levels
+            .iter()
+            .map(|level| level.values().shallow_clone())
+            .collect();
         match &self.layers {
-            Layers::Float { backbone, shrink, .. } => {
+            Layers::Float {
+                backbone, shrink, ..
+            } => {
                 let wide = backbone.upsampled(&maps, false);
                 match shrink {
                     Some(shrink) => shrink.forward_contiguous(&wide),
@@ -102,9 +146,15 @@ impl BevEncoder {
     }
 
     /// Adds the activations of a canvas to a search for their scales; nothing if the layers are in integers already.
-    pub(super) fn observe(&self, canvas: &Canvas, search: &mut ScaleSearch) -> Result<(), TchError> {
+    pub(super) fn observe(
+        &self,
+        canvas: &Canvas,
+        search: &mut ScaleSearch,
+    ) -> Result<(), TchError> {
         match &self.layers {
-            Layers::Float { backbone, shrink, .. } => observe_backbone(backbone, shrink.as_ref(), &canvas.0, search),
+            Layers::Float {
+                backbone, shrink, ..
+            } => observe_backbone(backbone, shrink.as_ref(), &canvas.0, search),
             Layers::Int8 { .. } => Ok(()),
         }
     }

@@ -35,7 +35,9 @@ impl Int8Backbone {
         shrink: Option<&Shrink>,
         scales: &ActivationScales,
     ) -> Result<Option<Self>, QuantiseError> {
-        let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else { return Ok(None) };
+        let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else {
+            return Ok(None);
+        };
         let mut input = scales.get(CANVAS)?;
         let (mut blocks, mut quantisations, mut deblocks) = (Vec::new(), Vec::new(), Vec::new());
         let upsampled = scales.get(UPSAMPLED)?;
@@ -55,11 +57,20 @@ impl Int8Backbone {
         let count = shrink.layers().len();
         for (position, layer) in shrink.layers().iter().enumerate() {
             let is_last = position + 1 == count;
-            let output = if is_last { None } else { Some(scales.get(&shrink_activation(position))?) };
+            let output = if is_last {
+                None
+            } else {
+                Some(scales.get(&shrink_activation(position))?)
+            };
             shrunk.push(layer.int8(input, output.map(|output| output.scale))?);
             input = output.unwrap_or(input);
         }
-        Ok(Some(Self { blocks, quantisations, deblocks, shrink: shrunk }))
+        Ok(Some(Self {
+            blocks,
+            quantisations,
+            deblocks,
+            shrink: shrunk,
+        }))
     }
 
     /// Levels of the quantised canvas `[1, C_pillar, H, W]`.
@@ -81,7 +92,11 @@ impl Int8Backbone {
     /// # Errors
     /// Those of the tensor library.
     pub(super) fn features(&self, levels: &[Tensor]) -> Result<Tensor, TchError> {
-        let upsampled = self.deblocks.iter().zip(levels).map(|(deblock, level)| deblock.forward(level));
+        let upsampled = self
+            .deblocks
+            .iter()
+            .zip(levels)
+            .map(|(deblock, level)| deblock.forward(level));
         let upsampled: Vec<Tensor> = upsampled.collect::<Result<_, _>>()?;
         contiguous_map(&through(&self.shrink, Tensor::f_cat(&upsampled, 1)?)?)
     }
@@ -110,14 +125,19 @@ pub(super) fn observe_backbone(
     canvas: &Tensor,
     search: &mut ScaleSearch,
 ) -> Result<(), TchError> {
-    let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else { return Ok(()) };
+    let (Some((levels, up)), Some(shrink)) = (backbone.plain_layers(), shrink) else {
+        return Ok(());
+    };
     search.observe(CANVAS, canvas)?;
     let mut observed = |layers: &[ConvLayer], x: &Tensor, name: &dyn Fn(usize) -> String| {
-        layers.iter().enumerate().try_fold(x.shallow_clone(), |x, (position, layer)| {
-            let y = layer.forward(&x, false);
-            search.observe(&name(position), &y)?;
-            Ok::<_, TchError>(y)
-        })
+        layers
+            .iter()
+            .enumerate()
+            .try_fold(x.shallow_clone(), |x, (position, layer)| {
+                let y = layer.forward(&x, false);
+                search.observe(&name(position), &y)?;
+                Ok::<_, TchError>(y)
+            })
     };
     let mut x = canvas.shallow_clone();
     let mut upsampled = Vec::new();
@@ -126,7 +146,10 @@ pub(super) fn observe_backbone(
         upsampled.push(deblock.forward(&x, false));
     }
     let wide = Tensor::f_cat(&upsampled, 1)?;
-    let hidden = shrink.layers().split_last().map_or(&[][..], |(_, hidden)| hidden);
+    let hidden = shrink
+        .layers()
+        .split_last()
+        .map_or(&[][..], |(_, hidden)| hidden);
     let _ = observed(hidden, &wide, &shrink_activation)?;
     search.observe(UPSAMPLED, &wide)
 }

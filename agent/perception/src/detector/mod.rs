@@ -71,16 +71,24 @@ impl Detector {
     ///
     /// # Errors
     /// See [`Self::load`].
-    pub fn from_weights(weights: &Weights, config: &DetectorConfig, device: Device) -> Result<Self, DetectorError> {
+    pub fn from_weights(
+        weights: &Weights,
+        config: &DetectorConfig,
+        device: Device,
+    ) -> Result<Self, DetectorError> {
         let network = VarStore::new(device);
         let pillars = PointPillars::new(&network.root(), config)?;
         weights.copy_into(&network)?;
         let (sha256, encoder_sha256) = (weights.sha256().to_owned(), encoder_sha256(weights));
-        let detector = Self { sha256, encoder_sha256, ..Self::from_network(pillars) };
+        let detector = Self {
+            sha256,
+            encoder_sha256,
+            ..Self::from_network(pillars)
+        };
         match weights.activation_scales()? {
-            Some(scales) if device == Device::Cpu => {
-                Ok(detector.quantised(&scales).map_err(|error| weights.quantise_error(error))?)
-            }
+            Some(scales) if device == Device::Cpu => Ok(detector
+                .quantised(&scales)
+                .map_err(|error| weights.quantise_error(error))?),
             _ => Ok(detector),
         }
     }
@@ -90,7 +98,10 @@ impl Detector {
     /// # Errors
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub fn quantised(self, scales: &ActivationScales) -> Result<Self, QuantiseError> {
-        Ok(Self { encoder: self.encoder.quantised(scales)?, ..self })
+        Ok(Self {
+            encoder: self.encoder.quantised(scales)?,
+            ..self
+        })
     }
 
     /// Uses a network, trained or not, on its device; its norms are folded into the convolutions.
@@ -164,7 +175,11 @@ impl Detector {
     #[must_use]
     pub fn map_shape(&self) -> [i64; 3] {
         let grid = self.grid();
-        [self.config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]
+        [
+            self.config.feature_channels(),
+            i64::from(grid.height),
+            i64::from(grid.width),
+        ]
     }
 
     /// Channels, height and width as transmitted: with a compressor, of the code.
@@ -178,7 +193,9 @@ impl Detector {
     /// messages.
     #[must_use]
     pub fn code_of(&self) -> Option<u32> {
-        self.compressor.as_ref().and_then(|_| u32::try_from(self.config.feature_channels()).ok())
+        self.compressor
+            .as_ref()
+            .and_then(|_| u32::try_from(self.config.feature_channels()).ok())
     }
 
     /// Encodes one sweep.
@@ -215,7 +232,11 @@ impl Detector {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn observe(&mut self, cloud: &PointCloud, search: &mut ScaleSearch) -> Result<(), DetectorError> {
+    pub fn observe(
+        &mut self,
+        cloud: &PointCloud,
+        search: &mut ScaleSearch,
+    ) -> Result<(), DetectorError> {
         let crop = self.crop;
         let pillars = self.pillars(&crop, cloud);
         let canvas = self.encoder.scatter(&pillars)?;
@@ -227,7 +248,9 @@ impl Detector {
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
         if self.config.y_axis == YAxis::Right {
-            self.cropped.iter_mut().for_each(|point| point[1] = -point[1]);
+            self.cropped
+                .iter_mut()
+                .for_each(|point| point[1] = -point[1]);
         }
         self.voxeliser.voxelise(&self.cropped)
     }
@@ -258,9 +281,13 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if there is a compressor and the feature map is not of this detector.
     pub fn compressed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
-        let Some(compressor) = &self.compressor else { return Ok(features.shallow_clone()) };
+        let Some(compressor) = &self.compressor else {
+            return Ok(features.shallow_clone());
+        };
         let map = one_map(features, self.map_shape())?;
-        Ok(tch::no_grad(|| compressor.encode(&map, false).f_contiguous())?)
+        Ok(tch::no_grad(|| {
+            compressor.encode(&map, false).f_contiguous()
+        })?)
     }
 
     /// Input of head and fusion, `[1, C, H, W]`, from a transmitted tensor.
@@ -268,9 +295,13 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if there is a compressor and the tensor is not a code of this detector.
     pub fn decompressed(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
-        let Some(compressor) = &self.compressor else { return Ok(sent.shallow_clone()) };
+        let Some(compressor) = &self.compressor else {
+            return Ok(sent.shallow_clone());
+        };
         let code = one_map(sent, self.sent_shape())?;
-        Ok(tch::no_grad(|| compressor.decode(&code, false).f_contiguous())?)
+        Ok(tch::no_grad(|| {
+            compressor.decode(&code, false).f_contiguous()
+        })?)
     }
 
     /// An encoded feature map `[1, C, H, W]` after the compressor: compressed and expanded again.
@@ -289,7 +320,16 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if it is not of this detector; the caller checks its BEV grid.
     pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor, DetectorError> {
-        let DecodedFeatures { features: BevFeatures { grid, channels, values, .. }, sent } = message;
+        let DecodedFeatures {
+            features:
+                BevFeatures {
+                    grid,
+                    channels,
+                    values,
+                    ..
+                },
+            sent,
+        } = message;
         let [expected, height, width] = self.sent_shape();
         let found = [*channels, grid.height, grid.width].map(i64::from);
         if found != self.sent_shape() || values.len() as i64 != expected * height * width {
@@ -304,7 +344,9 @@ impl Detector {
         match (sent, &self.compressor) {
             // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
-                let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
+                let sent = Tensor::f_from_slice(sent)?
+                    .f_to_kind(Kind::Float)?
+                    .f_view([1, 1, height, width])?;
                 Ok(decompressed.f_mul(&sent.f_to_device(self.device)?)?)
             }
             _ => Ok(decompressed),
@@ -324,8 +366,17 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Decode`] if the heads are of another detector.
-    pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>, DetectorError> {
-        let mut boxes = decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?;
+    pub fn boxes(
+        &self,
+        heads: &Heads,
+        score_threshold: f32,
+    ) -> Result<Vec<Decoded>, DetectorError> {
+        let mut boxes = decode(
+            &heads.scores,
+            &heads.offsets,
+            &self.anchors,
+            score_threshold,
+        )?;
         if self.config.y_axis == YAxis::Right {
             for found in &mut boxes {
                 found.box3d = found.box3d.mirrored_y();
@@ -341,7 +392,12 @@ impl Detector {
     pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures, DetectorError> {
         let sent = one_map(sent, self.sent_shape())?;
         let channels = self.config.sent_channels() as u32;
-        Ok(BevFeatures { grid: self.grid(), channels, code_of: self.code_of(), values: flat(&sent)? })
+        Ok(BevFeatures {
+            grid: self.grid(),
+            channels,
+            code_of: self.code_of(),
+            values: flat(&sent)?,
+        })
     }
 
     /// An encoded feature map `[1, C, H, W]` in its stored form, before the compressor.
@@ -351,7 +407,12 @@ impl Detector {
     pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
         let map = one_map(features, self.map_shape())?;
         let channels = self.config.feature_channels() as u32;
-        Ok(BevFeatures { grid: self.grid(), channels, code_of: None, values: flat(&map)? })
+        Ok(BevFeatures {
+            grid: self.grid(),
+            channels,
+            code_of: None,
+            values: flat(&map)?,
+        })
     }
 }
 
@@ -374,7 +435,11 @@ fn checked(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorErro
         return Ok(features.f_unsqueeze(0)?);
     }
     if found.split_first() != Some((&1, expected.as_slice())) {
-        return Err(DetectorError::Shape { what: "feature map", found, expected });
+        return Err(DetectorError::Shape {
+            what: "feature map",
+            found,
+            expected,
+        });
     }
     Ok(features.shallow_clone())
 }
@@ -389,7 +454,10 @@ mod tests {
     use crate::weights::{self, CONFIG_KEY, Precision};
 
     fn config() -> DetectorConfig {
-        DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() }
+        DetectorConfig {
+            lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
+            ..DetectorConfig::lean()
+        }
     }
 
     /// A network with running statistics that are not those of a new one, so that folding has something to do.
@@ -413,8 +481,17 @@ mod tests {
     }
 
     fn cloud() -> PointCloud {
-        let points = (0..4000).map(|k| [(k % 89) as f32 * 0.3 - 13.0, (k % 53) as f32 * 0.25 - 6.5, -1.0, 0.4]);
-        PointCloud { xyzi: points.collect() }
+        let points = (0..4000).map(|k| {
+            [
+                (k % 89) as f32 * 0.3 - 13.0,
+                (k % 53) as f32 * 0.25 - 6.5,
+                -1.0,
+                0.4,
+            ]
+        });
+        PointCloud {
+            xyzi: points.collect(),
+        }
     }
 
     #[test]
@@ -428,15 +505,30 @@ mod tests {
         let path = folder.path().join("w.safetensors");
         let scales = serde_json::to_string(&search.scales()).unwrap();
         let config = serde_json::to_string(&config()).unwrap();
-        let metadata: BTreeMap<_, _> =
-            [(CONFIG_KEY, config), (SCALES_KEY, scales)].map(|(key, value)| (key.to_owned(), value)).into();
+        let metadata: BTreeMap<_, _> = [(CONFIG_KEY, config), (SCALES_KEY, scales)]
+            .map(|(key, value)| (key.to_owned(), value))
+            .into();
         weights::save(&path, &store, &metadata, Precision::Single).unwrap();
-        let found = Detector::load(&path, Device::Cpu).unwrap().encode(&cloud).unwrap().features;
-        let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
+        let found = Detector::load(&path, Device::Cpu)
+            .unwrap()
+            .encode(&cloud)
+            .unwrap()
+            .features;
+        let error = (&found - &expected)
+            .square()
+            .mean(Kind::Float)
+            .sqrt()
+            .double_value(&[]);
         assert!(found.is_contiguous() && error > 0.0, "{error}");
-        assert!(error < 0.06 * expected.std(true).double_value(&[]), "{error}");
-        let weights = Weights::load(&path).unwrap().with_precision(InferencePrecision::Float);
-        let mut again = Detector::from_weights(&weights, &weights.config().unwrap(), Device::Cpu).unwrap();
+        assert!(
+            error < 0.06 * expected.std(true).double_value(&[]),
+            "{error}"
+        );
+        let weights = Weights::load(&path)
+            .unwrap()
+            .with_precision(InferencePrecision::Float);
+        let mut again =
+            Detector::from_weights(&weights, &weights.config().unwrap(), Device::Cpu).unwrap();
         assert!(again.encode(&cloud).unwrap().features.equal(&expected));
     }
 
@@ -446,11 +538,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("w.safetensors");
         let config = serde_json::to_string(&config()).unwrap();
-        let metadata: BTreeMap<_, _> =
-            [(CONFIG_KEY, config), (SCALES_KEY, "{}".to_owned())].map(|(key, value)| (key.to_owned(), value)).into();
+        let metadata: BTreeMap<_, _> = [(CONFIG_KEY, config), (SCALES_KEY, "{}".to_owned())]
+            .map(|(key, value)| (key.to_owned(), value))
+            .into();
         weights::save(&path, &store, &metadata, Precision::Single).unwrap();
         let message = Detector::load(&path, Device::Cpu).unwrap_err().to_string();
-        assert!(message.contains("w.safetensors") && message.contains("pillar_vfe.canvas"), "{message}");
+        assert!(
+            message.contains("w.safetensors") && message.contains("pillar_vfe.canvas"),
+            "{message}"
+        );
     }
 
     #[test]
@@ -468,50 +564,104 @@ mod tests {
         });
         let mut detector = Detector::from_network(pillars);
         let encoded = detector.encode(&cloud).unwrap();
-        assert_eq!((encoded.points, encoded.pillars), (cropped.len(), sweep.len()));
+        assert_eq!(
+            (encoded.points, encoded.pillars),
+            (cropped.len(), sweep.len())
+        );
         assert!(encoded.features.allclose(&expected, 1e-4, 1e-4, false));
         let heads = detector.heads(&encoded.features).unwrap();
-        let close = Tensor::from_slice(&heads.scores).allclose(&scores.reshape([-1]), 1e-4, 1e-4, false);
-        assert!(close && heads.confidence.iter().all(|value| (0.0..=1.0).contains(value)));
+        let close =
+            Tensor::from_slice(&heads.scores).allclose(&scores.reshape([-1]), 1e-4, 1e-4, false);
+        assert!(
+            close
+                && heads
+                    .confidence
+                    .iter()
+                    .all(|value| (0.0..=1.0).contains(value))
+        );
     }
 
     #[test]
     fn the_compressor_gives_the_same_as_in_training() {
-        let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(4), ..config() });
+        let (_store, pillars) = network_of(&DetectorConfig {
+            compress_ratio: Some(4),
+            ..config()
+        });
         let mut cropped = Vec::new();
         Crop::for_detector(&config()).keep(&cloud().xyzi, &mut cropped);
         let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
         let batch = PillarBatch::new(&[&sweep], pillars.pillar_grid());
-        let expected = tch::no_grad(|| pillars.through_compressor(&pillars.features(&batch, false), false));
+        let expected =
+            tch::no_grad(|| pillars.through_compressor(&pillars.features(&batch, false), false));
         let mut detector = Detector::from_network(pillars);
         let encoded = detector.encode(&cloud()).unwrap().features;
         let left = detector.through_compressor(&encoded).unwrap();
-        assert!(left.allclose(&expected, 1e-4, 1e-4, false) && !left.allclose(&encoded, 1e-2, 1e-2, false));
+        assert!(
+            left.allclose(&expected, 1e-4, 1e-4, false)
+                && !left.allclose(&encoded, 1e-2, 1e-2, false)
+        );
         let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
-        assert!(matches!(detector.through_compressor(&other), Err(DetectorError::Shape { .. })));
+        assert!(matches!(
+            detector.through_compressor(&other),
+            Err(DetectorError::Shape { .. })
+        ));
         let plain = Detector::from_network(network().1);
-        assert!(plain.through_compressor(&encoded).unwrap().equal(&encoded), "there is no compressor");
-        assert_eq!((plain.sent_shape(), plain.code_of()), (plain.map_shape(), None));
+        assert!(
+            plain.through_compressor(&encoded).unwrap().equal(&encoded),
+            "there is no compressor"
+        );
+        assert_eq!(
+            (plain.sent_shape(), plain.code_of()),
+            (plain.map_shape(), None)
+        );
     }
 
     #[test]
     fn the_transmitted_code_expands_to_the_same_bits() {
-        let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(16), ..config() });
+        let (_store, pillars) = network_of(&DetectorConfig {
+            compress_ratio: Some(16),
+            ..config()
+        });
         let mut detector = Detector::from_network(pillars);
         let encoded = detector.encode(&cloud()).unwrap().features;
-        let features = detector.to_message(&detector.compressed(&encoded).unwrap()).unwrap();
+        let features = detector
+            .to_message(&detector.compressed(&encoded).unwrap())
+            .unwrap();
         let cells = detector.grid().cells();
-        assert_eq!((features.channels, features.code_of, features.values.len()), (4, Some(64), 4 * cells));
+        assert_eq!(
+            (features.channels, features.code_of, features.values.len()),
+            (4, Some(64), 4 * cells)
+        );
         let whole = detector.through_compressor(&encoded).unwrap();
-        let received = |sent| detector.received(&DecodedFeatures { features: features.clone(), sent }).unwrap();
+        let received = |sent| {
+            detector
+                .received(&DecodedFeatures {
+                    features: features.clone(),
+                    sent,
+                })
+                .unwrap()
+        };
         assert!(received(None).equal(&whole));
         let half = received(Some((0..cells).map(|cell| cell < cells / 2).collect()));
         let values: Vec<f32> = Vec::try_from(half.view([-1])).unwrap();
-        assert!(values.chunks(cells).all(|channel| channel[cells / 2..].iter().all(|value| *value == 0.0)));
-        assert_eq!(&values[..10], &Vec::<f32>::try_from(whole.view([-1])).unwrap()[..10]);
-        let map = DecodedFeatures { features: detector.to_kept(&encoded).unwrap(), sent: None };
+        assert!(
+            values
+                .chunks(cells)
+                .all(|channel| channel[cells / 2..].iter().all(|value| *value == 0.0))
+        );
+        assert_eq!(
+            &values[..10],
+            &Vec::<f32>::try_from(whole.view([-1])).unwrap()[..10]
+        );
+        let map = DecodedFeatures {
+            features: detector.to_kept(&encoded).unwrap(),
+            sent: None,
+        };
         let message = detector.received(&map).unwrap_err().to_string();
-        assert!(message.contains("[64, 16, 32]") && message.contains("[4, 16, 32]"), "{message}");
+        assert!(
+            message.contains("[64, 16, 32]") && message.contains("[4, 16, 32]"),
+            "{message}"
+        );
         assert!(detector.to_message(&encoded).is_err());
     }
 
@@ -522,19 +672,34 @@ mod tests {
         let first = detector.encode(&cloud()).unwrap().features;
         let nothing = detector.encode(&PointCloud::default()).unwrap();
         assert_eq!((nothing.points, nothing.pillars), (0, 0));
-        let odd = PointCloud { xyzi: vec![[f32::NAN; 4], [5.0, f32::INFINITY, 0.0, 0.0]] };
-        assert!(detector.encode(&odd).unwrap().features.equal(&nothing.features));
+        let odd = PointCloud {
+            xyzi: vec![[f32::NAN; 4], [5.0, f32::INFINITY, 0.0, 0.0]],
+        };
+        assert!(
+            detector
+                .encode(&odd)
+                .unwrap()
+                .features
+                .equal(&nothing.features)
+        );
         assert!(detector.encode(&cloud()).unwrap().features.equal(&first));
         let message = detector.to_message(&first).unwrap();
         let [channels, height, width] = detector.map_shape();
         let back = Tensor::from_slice(&message.values).view([channels, height, width]);
-        assert_eq!(detector.heads(&back).unwrap(), detector.heads(&first).unwrap());
+        assert_eq!(
+            detector.heads(&back).unwrap(),
+            detector.heads(&first).unwrap()
+        );
     }
 
     #[test]
     fn a_network_of_a_mirrored_frame_gets_the_mirrored_cloud() {
         let (store, pillars) = network();
-        let _ = tch::no_grad(|| store.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
+        let _ = tch::no_grad(|| {
+            store.variables()["cls_head.bias"]
+                .shallow_clone()
+                .fill_(0.5)
+        });
         let mut plain = Detector::from_network(pillars);
         let (mirrored_store, mut pillars) = network();
         for (name, mut variable) in mirrored_store.variables() {
@@ -542,12 +707,27 @@ mod tests {
         }
         pillars.config.y_axis = YAxis::Right;
         let mut mirrored = Detector::from_network(pillars);
-        let flip =
-            |cloud: PointCloud| PointCloud { xyzi: cloud.xyzi.iter().map(|&[x, y, z, i]| [x, -y, z, i]).collect() };
-        let (there, here) = (plain.encode(&cloud()).unwrap(), mirrored.encode(&flip(cloud())).unwrap());
+        let flip = |cloud: PointCloud| PointCloud {
+            xyzi: cloud
+                .xyzi
+                .iter()
+                .map(|&[x, y, z, i]| [x, -y, z, i])
+                .collect(),
+        };
+        let (there, here) = (
+            plain.encode(&cloud()).unwrap(),
+            mirrored.encode(&flip(cloud())).unwrap(),
+        );
         assert!(there.features.equal(&here.features));
-        let boxes = |detector: &Detector, features| detector.boxes(&detector.heads(features).unwrap(), 0.3).unwrap();
-        let (theirs, ours) = (boxes(&plain, &there.features), boxes(&mirrored, &here.features));
+        let boxes = |detector: &Detector, features| {
+            detector
+                .boxes(&detector.heads(features).unwrap(), 0.3)
+                .unwrap()
+        };
+        let (theirs, ours) = (
+            boxes(&plain, &there.features),
+            boxes(&mirrored, &here.features),
+        );
         assert!(!theirs.is_empty() && theirs.len() == ours.len());
         for (theirs, ours) in theirs.iter().zip(&ours) {
             assert_eq!(theirs.box3d.center_m[1], -ours.box3d.center_m[1]);
@@ -561,12 +741,25 @@ mod tests {
         let (store, pillars) = network();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lean.safetensors");
-        let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config()).unwrap())].into();
+        let metadata: BTreeMap<_, _> = [(
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(&config()).unwrap(),
+        )]
+        .into();
         let sha256 = weights::save(&path, &store, &metadata, Precision::Single).unwrap();
         let mut loaded = Detector::load(&path, Device::Cpu).unwrap();
-        assert_eq!((loaded.sha256(), loaded.config()), (sha256.as_str(), &config()));
+        assert_eq!(
+            (loaded.sha256(), loaded.config()),
+            (sha256.as_str(), &config())
+        );
         let mut original = Detector::from_network(pillars);
-        assert!(loaded.encode(&cloud()).unwrap().features.equal(&original.encode(&cloud()).unwrap().features));
+        assert!(
+            loaded
+                .encode(&cloud())
+                .unwrap()
+                .features
+                .equal(&original.encode(&cloud()).unwrap().features)
+        );
     }
 
     #[test]
@@ -575,7 +768,10 @@ mod tests {
         let detector = Detector::from_network(pillars);
         let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
         let message = detector.heads(&other).unwrap_err().to_string();
-        assert!(message.contains("[1, 64, 8, 8]") && message.contains("[64, 16, 32]"), "{message}");
+        assert!(
+            message.contains("[1, 64, 8, 8]") && message.contains("[64, 16, 32]"),
+            "{message}"
+        );
         assert!(detector.to_message(&other).is_err());
     }
 }

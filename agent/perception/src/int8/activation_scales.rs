@@ -36,7 +36,10 @@ impl ActivationScales {
     /// # Errors
     /// [`MissingScale`] if it was not observed.
     pub fn get(&self, name: &str) -> Result<Quantisation, MissingScale> {
-        let missing = || MissingScale { name: name.to_owned(), known: self.0.keys().cloned().collect() };
+        let missing = || MissingScale {
+            name: name.to_owned(),
+            known: self.0.keys().cloned().collect(),
+        };
         self.0.get(name).copied().ok_or_else(missing)
     }
 
@@ -44,7 +47,9 @@ impl ActivationScales {
     #[must_use]
     pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
         let mut hash = Sha256::new();
-        for (name, Quantisation { scale, zero_point }) in self.0.iter().filter(|(name, _)| wanted(name)) {
+        for (name, Quantisation { scale, zero_point }) in
+            self.0.iter().filter(|(name, _)| wanted(name))
+        {
             hash.update(format!("{name} {} {zero_point}\n", scale.exponent));
         }
         hex(&hash.finalize())

@@ -23,7 +23,11 @@ impl ConvGeometry {
     /// Keeps the size of a map, for an odd kernel.
     #[must_use]
     pub const fn size_preserving(kernel: i64) -> Self {
-        Self { stride: 1, padding: kernel / 2, upsampling: 1 }
+        Self {
+            stride: 1,
+            padding: kernel / 2,
+            upsampling: 1,
+        }
     }
 }
 
@@ -59,7 +63,10 @@ impl Int8Convolution {
             ];
             operators.call("pack_convolution", &arguments)
         });
-        Ok(Self { layer: layer?, geometry })
+        Ok(Self {
+            layer: layer?,
+            geometry,
+        })
     }
 
     /// `[1, C_in, H, W]`, `u8`, to `[1, C_out, H', W']`; channels innermost in memory.
@@ -67,9 +74,19 @@ impl Int8Convolution {
     /// # Errors
     /// Those of the tensor library, when `x` has other channels or is not `u8`.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let ConvGeometry { stride, padding, upsampling } = self.geometry;
-        let y = self.layer.call("convolve", x, vec![both(stride), both(padding)])?;
-        if upsampling == 1 { Ok(y) } else { cells_to_squares(&y, upsampling) }
+        let ConvGeometry {
+            stride,
+            padding,
+            upsampling,
+        } = self.geometry;
+        let y = self
+            .layer
+            .call("convolve", x, vec![both(stride), both(padding)])?;
+        if upsampling == 1 {
+            Ok(y)
+        } else {
+            cells_to_squares(&y, upsampling)
+        }
     }
 }
 
@@ -81,9 +98,12 @@ fn both(size: i64) -> IValue {
 /// `[1, C, edge * H, edge * W]`.
 fn cells_to_squares(y: &Tensor, edge: i64) -> Result<Tensor, TchError> {
     let (_, _, height, width) = y.size4()?;
-    let cells = y.f_permute([0, 2, 3, 1])?.f_reshape([height, width, edge, edge, -1])?;
+    let cells = y
+        .f_permute([0, 2, 3, 1])?
+        .f_reshape([height, width, edge, edge, -1])?;
     let rows = cells.f_permute([0, 2, 1, 3, 4])?.f_contiguous()?;
-    rows.f_view([1, height * edge, width * edge, -1])?.f_permute([0, 3, 1, 2])
+    rows.f_view([1, height * edge, width * edge, -1])?
+        .f_permute([0, 3, 1, 2])
 }
 
 #[cfg(test)]
@@ -95,7 +115,10 @@ mod tests {
     use super::*;
     use crate::int8::{Quantisation, Scale};
 
-    const INPUT: Quantisation = Quantisation { scale: Scale::of_exponent(-4), zero_point: 100 };
+    const INPUT: Quantisation = Quantisation {
+        scale: Scale::of_exponent(-4),
+        zero_point: 100,
+    };
 
     fn channels_last(x: &Tensor) -> Tensor {
         x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
@@ -109,25 +132,44 @@ mod tests {
         let weight = Tensor::randn([20, 12, 3, 3], (Kind::Float, Device::Cpu)) * 0.1;
         let bias = Tensor::randn([20], (Kind::Float, Device::Cpu));
         for (stride, relu) in [(1, true), (2, false)] {
-            let geometry = ConvGeometry { stride, padding: 1, upsampling: 1 };
-            let format = LayerFormat { input: INPUT, output: None, relu };
+            let geometry = ConvGeometry {
+                stride,
+                padding: 1,
+                upsampling: 1,
+            };
+            let format = LayerFormat {
+                input: INPUT,
+                output: None,
+                relu,
+            };
             let convolution = Int8Convolution::new(&weight, Some(&bias), geometry, format).unwrap();
             let expected = x.conv2d(&weight, Some(&bias), [stride; 2], [1; 2], [1; 2], 1);
             let expected = if relu { expected.relu() } else { expected };
             let found = convolution.forward(&INPUT.quantise(&x).unwrap()).unwrap();
-            let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
-            assert!(error < 0.03 * expected.std(true).double_value(&[]), "stride {stride}: {error}");
+            let error = (&found - &expected)
+                .square()
+                .mean(Kind::Float)
+                .sqrt()
+                .double_value(&[]);
+            assert!(
+                error < 0.03 * expected.std(true).double_value(&[]),
+                "stride {stride}: {error}"
+            );
         }
     }
 
     #[test]
     fn each_cell_becomes_a_square() {
-        let y = channels_last(&Tensor::arange(2 * 8, (Kind::Float, Device::Cpu)).view([1, 8, 1, 2]));
+        let y =
+            channels_last(&Tensor::arange(2 * 8, (Kind::Float, Device::Cpu)).view([1, 8, 1, 2]));
         let squares = cells_to_squares(&y, 2).unwrap();
         assert_eq!(squares.size(), [1, 2, 2, 4]);
         // Channel (row, column, c) of cell x is channel c at that row and column of its square.
         let expected = [0.0, 4.0, 1.0, 5.0, 8.0, 12.0, 9.0, 13.0_f32];
-        assert_eq!(Vec::<f32>::try_from(squares.get(0).get(0).contiguous().view([-1])).unwrap(), expected);
+        assert_eq!(
+            Vec::<f32>::try_from(squares.get(0).get(0).contiguous().view([-1])).unwrap(),
+            expected
+        );
     }
 
     /// Numbers that are the same everywhere, -1 to 1.
@@ -136,7 +178,9 @@ mod tests {
         let mut state = seed;
         let values: Vec<f32> = (0..count)
             .map(|_| {
-                state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1_442_695_040_888_963_407);
                 (state >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
             })
             .collect();
@@ -149,12 +193,28 @@ mod tests {
         tch::set_num_threads(1);
         let x = channels_last(&(numbers(1, &[1, 64, 40, 56]) * 6.0));
         let (weight, bias) = (numbers(2, &[96, 64, 3, 3]) * 0.3, numbers(3, &[96]));
-        let format = LayerFormat { input: INPUT, output: Some(Scale::of_exponent(-3)), relu: true };
-        let convolution = Int8Convolution::new(&weight, Some(&bias), ConvGeometry::size_preserving(3), format).unwrap();
+        let format = LayerFormat {
+            input: INPUT,
+            output: Some(Scale::of_exponent(-3)),
+            relu: true,
+        };
+        let convolution = Int8Convolution::new(
+            &weight,
+            Some(&bias),
+            ConvGeometry::size_preserving(3),
+            format,
+        )
+        .unwrap();
         let y = convolution.forward(&INPUT.quantise(&x).unwrap()).unwrap();
         let bytes = Vec::<u8>::try_from(y.contiguous().view([-1])).unwrap();
-        let levels = bytes.iter().collect::<std::collections::BTreeSet<_>>().len();
+        let levels = bytes
+            .iter()
+            .collect::<std::collections::BTreeSet<_>>()
+            .len();
         assert!(levels > 200, "{levels} levels");
-        assert_eq!(hex(&Sha256::digest(&bytes)), "af7a5b847f2772172a998e20696873a84b22d9de7cd375bd8641674871fab22e");
+        assert_eq!(
+            hex(&Sha256::digest(&bytes)),
+            "af7a5b847f2772172a998e20696873a84b22d9de7cd375bd8641674871fab22e"
+        );
     }
 }

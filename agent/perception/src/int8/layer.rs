@@ -43,12 +43,26 @@ impl Layer {
         let quantised = QuantisedWeight::new(weight)?;
         let packed = pack(Operators::get()?, &quantised)?;
         let bias = bias.map(|bias| bias.f_to_kind(Kind::Float)).transpose()?;
-        Ok(Self { packed, quantised, bias, format })
+        Ok(Self {
+            packed,
+            quantised,
+            bias,
+            format,
+        })
     }
 
     /// Calls an operator with this layer's parameters, followed by others of the operator.
-    pub(super) fn call(&self, operator: &str, x: &Tensor, others: Vec<IValue>) -> Result<Tensor, TchError> {
-        let LayerFormat { input, output, relu } = self.format;
+    pub(super) fn call(
+        &self,
+        operator: &str,
+        x: &Tensor,
+        others: Vec<IValue>,
+    ) -> Result<Tensor, TchError> {
+        let LayerFormat {
+            input,
+            output,
+            relu,
+        } = self.format;
         let tensor = |tensor: &Tensor| IValue::Tensor(tensor.shallow_clone());
         let mut arguments = vec![
             tensor(x),

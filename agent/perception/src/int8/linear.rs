@@ -16,11 +16,18 @@ impl Int8Linear {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn new(weight: &Tensor, bias: Option<&Tensor>, format: LayerFormat) -> Result<Self, TchError> {
+    pub fn new(
+        weight: &Tensor,
+        bias: Option<&Tensor>,
+        format: LayerFormat,
+    ) -> Result<Self, TchError> {
         let inputs = weight.size2()?.1;
         let layer = Layer::new(weight, bias, format, |operators, quantised| {
             let shape = IValue::IntList(vec![USUAL_ROWS, inputs]);
-            operators.call("pack_linear", &[IValue::Tensor(quantised.steps.shallow_clone()), shape])
+            operators.call(
+                "pack_linear",
+                &[IValue::Tensor(quantised.steps.shallow_clone()), shape],
+            )
         });
         Ok(Self(layer?))
     }
@@ -45,15 +52,32 @@ mod tests {
     fn products_are_those_of_the_quantised_values() {
         tch::set_num_threads(1);
         tch::manual_seed(3);
-        let input = Quantisation { scale: Scale::of_exponent(-5), zero_point: 128 };
+        let input = Quantisation {
+            scale: Scale::of_exponent(-5),
+            zero_point: 128,
+        };
         let weight = Tensor::randn([7, 24], (Kind::Float, Device::Cpu)) * 0.2;
         let bias = Tensor::randn([7], (Kind::Float, Device::Cpu));
-        let linear = Int8Linear::new(&weight, Some(&bias), LayerFormat { input, output: None, relu: false }).unwrap();
-        let x = input.quantise(&Tensor::randn([40, 24], (Kind::Float, Device::Cpu))).unwrap();
+        let linear = Int8Linear::new(
+            &weight,
+            Some(&bias),
+            LayerFormat {
+                input,
+                output: None,
+                relu: false,
+            },
+        )
+        .unwrap();
+        let x = input
+            .quantise(&Tensor::randn([40, 24], (Kind::Float, Device::Cpu)))
+            .unwrap();
         let exact = input.dequantise(&x).unwrap().matmul(&weight.tr()) + &bias;
         let found = linear.forward(&x).unwrap();
         // A weight errs by half a step of at most 2^-6, an input is at most 4.
         let off = (&found - &exact).abs().max().double_value(&[]);
-        assert!(found.kind() == Kind::Float && off > 0.0 && off < 0.1, "{off}");
+        assert!(
+            found.kind() == Kind::Float && off > 0.0 && off < 0.1,
+            "{off}"
+        );
     }
 }

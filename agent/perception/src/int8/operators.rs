@@ -13,7 +13,8 @@ use zip::{CompressionMethod, ZipWriter};
 /// Source of the module.
 const SOURCE: &str = include_str!("operators.py");
 /// The module object: an instance of `Operators` whose only attribute is `training = False` (pickle, protocol 2).
-const INSTANCE: &[u8] = b"\x80\x02c__torch__\nOperators\nq\x00)\x81}(X\x08\x00\x00\x00trainingq\x01\x89ubq\x02.";
+const INSTANCE: &[u8] =
+    b"\x80\x02c__torch__\nOperators\nq\x00)\x81}(X\x08\x00\x00\x00trainingq\x01\x89ubq\x02.";
 /// Constants of the source: an empty tuple (pickle, protocol 2).
 const CONSTANTS: &[u8] = b"\x80\x02).";
 /// Version of the archive's format.
@@ -43,7 +44,9 @@ impl Operators {
     pub(super) fn call(&self, method: &str, arguments: &[IValue]) -> Result<Tensor, TchError> {
         match self.0.method_is(method, arguments)? {
             IValue::Tensor(tensor) => Ok(tensor),
-            other => Err(TchError::Kind(format!("{method} gave {other:?} instead of a tensor"))),
+            other => Err(TchError::Kind(format!(
+                "{method} gave {other:?} instead of a tensor"
+            ))),
         }
     }
 }
@@ -60,7 +63,8 @@ fn archive() -> Result<Vec<u8>, TchError> {
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
     for (name, content) in files {
         let options = FileOptions::default().compression_method(CompressionMethod::Stored);
-        zip.start_file(format!("operators/{name}"), options).map_err(failed)?;
+        zip.start_file(format!("operators/{name}"), options)
+            .map_err(failed)?;
         zip.write_all(content)?;
     }
     Ok(zip.finish().map_err(failed)?.into_inner())

@@ -25,7 +25,9 @@ impl Scale {
     #[must_use]
     pub(super) fn reaching(magnitude: f64, levels: f64) -> Self {
         let exponent = (magnitude / levels).log2().ceil();
-        Self { exponent: exponent.clamp(f64::from(i8::MIN), f64::from(i8::MAX)) as i8 }
+        Self {
+            exponent: exponent.clamp(f64::from(i8::MIN), f64::from(i8::MAX)) as i8,
+        }
     }
 
     /// Value of one step.
@@ -37,7 +39,9 @@ impl Scale {
     /// The next smaller scale.
     #[must_use]
     pub(super) fn finer(self) -> Self {
-        Self { exponent: self.exponent.saturating_sub(1) }
+        Self {
+            exponent: self.exponent.saturating_sub(1),
+        }
     }
 }
 
@@ -59,7 +63,10 @@ impl Quantisation {
     /// Quantisation of values that are never negative.
     #[must_use]
     pub const fn unsigned(scale: Scale) -> Self {
-        Self { scale, zero_point: 0 }
+        Self {
+            scale,
+            zero_point: 0,
+        }
     }
 
     /// Nearest quantised values, `u8`, in the memory order of `x`; values out of range become the nearest in range.
@@ -71,13 +78,16 @@ impl Quantisation {
         if self.zero_point != 0 {
             steps = steps.f_add_scalar_(i64::from(self.zero_point))?;
         }
-        steps.f_clamp_(0, i64::from(u8::MAX))?.f_to_kind(Kind::Uint8)
+        steps
+            .f_clamp_(0, i64::from(u8::MAX))?
+            .f_to_kind(Kind::Uint8)
     }
 
     /// The same of one value.
     #[must_use]
     pub fn quantise_value(&self, value: f32) -> u8 {
-        let steps = (value * self.scale.step().recip() as f32).round_ties_even() + f32::from(self.zero_point);
+        let steps = (value * self.scale.step().recip() as f32).round_ties_even()
+            + f32::from(self.zero_point);
         steps.clamp(0.0, MAX_ACTIVATION) as u8
     }
 
@@ -86,7 +96,9 @@ impl Quantisation {
     /// # Errors
     /// Those of the tensor library.
     pub fn dequantise(&self, steps: &Tensor) -> Result<Tensor, TchError> {
-        let mut centred = steps.f_to_kind(Kind::Float)?.f_sub_scalar_(i64::from(self.zero_point))?;
+        let mut centred = steps
+            .f_to_kind(Kind::Float)?
+            .f_sub_scalar_(i64::from(self.zero_point))?;
         centred.f_mul_scalar_(self.scale.step())
     }
 }
@@ -97,12 +109,18 @@ mod tests {
 
     #[test]
     fn values_are_rounded_to_the_nearest_step_and_clamped() {
-        let quantisation = Quantisation { scale: Scale::of_exponent(-2), zero_point: 10 };
+        let quantisation = Quantisation {
+            scale: Scale::of_exponent(-2),
+            zero_point: 10,
+        };
         let values = [-9.0_f32, -2.5, 0.0, 0.125, 0.126, 1.0, 61.25, 99.0];
         let expected = [0_u8, 0, 10, 10, 11, 14, 255, 255];
         let found = quantisation.quantise(&Tensor::from_slice(&values)).unwrap();
         assert_eq!(Vec::<u8>::try_from(&found).unwrap(), expected);
-        assert_eq!(values.map(|value| quantisation.quantise_value(value)), expected);
+        assert_eq!(
+            values.map(|value| quantisation.quantise_value(value)),
+            expected
+        );
         let back = Vec::<f32>::try_from(quantisation.dequantise(&found).unwrap()).unwrap();
         assert_eq!(back, [-2.5, -2.5, 0.0, 0.0, 0.25, 1.0, 61.25, 61.25]);
     }
@@ -110,7 +128,11 @@ mod tests {
     #[test]
     fn the_smallest_scale_that_reaches_a_magnitude() {
         for (magnitude, exponent) in [(63.0, 0), (63.1, 1), (31.5, -1), (0.5, -6)] {
-            assert_eq!(Scale::reaching(magnitude, 63.0), Scale::of_exponent(exponent), "{magnitude}");
+            assert_eq!(
+                Scale::reaching(magnitude, 63.0),
+                Scale::of_exponent(exponent),
+                "{magnitude}"
+            );
         }
     }
 }

@@ -38,7 +38,10 @@ impl ScaleSearch {
         let observed = self.activations.entry(name.to_owned()).or_default();
         observed.is_negative |= values.f_min()?.f_double_value(&[])? < 0.0;
         let largest = values.f_abs()?.f_max()?.f_double_value(&[])?;
-        let power = values.f_square()?.f_sum(Kind::Double)?.f_double_value(&[])?;
+        let power = values
+            .f_square()?
+            .f_sum(Kind::Double)?
+            .f_double_value(&[])?;
         let count = values.numel() as f64;
         for exponent in EXPONENTS {
             let scale = Scale::of_exponent(exponent);
@@ -69,7 +72,10 @@ impl ScaleSearch {
         };
         let chosen = self.activations.iter().map(|(name, observed)| {
             let quantisation = match observed.is_negative {
-                true => Quantisation { scale: best(&observed.centred), zero_point: MIDDLE },
+                true => Quantisation {
+                    scale: best(&observed.centred),
+                    zero_point: MIDDLE,
+                },
                 false => Quantisation::unsigned(best(&observed.unsigned)),
             };
             (name.clone(), quantisation)
@@ -80,7 +86,10 @@ impl ScaleSearch {
 
 fn squared_error(values: &Tensor, quantisation: Quantisation) -> Result<f64, TchError> {
     let back = quantisation.dequantise(&quantisation.quantise(values)?)?;
-    back.f_sub(values)?.f_square()?.f_sum(Kind::Double)?.f_double_value(&[])
+    back.f_sub(values)?
+        .f_square()?
+        .f_sum(Kind::Double)?
+        .f_double_value(&[])
 }
 
 #[cfg(test)]
@@ -96,13 +105,29 @@ mod tests {
         let even = Tensor::rand([100_000], (Kind::Float, Device::Cpu));
         let outlier = even.copy();
         let _ = outlier.get(0).fill_(3.0);
-        for (name, values) in [("even", &even), ("outlier", &outlier), ("signed", &(&even - 0.5))] {
+        for (name, values) in [
+            ("even", &even),
+            ("outlier", &outlier),
+            ("signed", &(&even - 0.5)),
+        ] {
             search.observe(name, values).unwrap();
         }
         let scales = search.scales();
         let found = |name: &str| scales.get(name).unwrap();
-        assert_eq!(found("even"), Quantisation::unsigned(Scale::of_exponent(-8)));
-        assert_eq!(found("outlier"), Quantisation::unsigned(Scale::of_exponent(-7)));
-        assert_eq!(found("signed"), Quantisation { scale: Scale::of_exponent(-8), zero_point: MIDDLE });
+        assert_eq!(
+            found("even"),
+            Quantisation::unsigned(Scale::of_exponent(-8))
+        );
+        assert_eq!(
+            found("outlier"),
+            Quantisation::unsigned(Scale::of_exponent(-7))
+        );
+        assert_eq!(
+            found("signed"),
+            Quantisation {
+                scale: Scale::of_exponent(-8),
+                zero_point: MIDDLE
+            }
+        );
     }
 }

@@ -27,11 +27,19 @@ impl QuantisedWeight {
     pub(super) fn new(weight: &Tensor) -> Result<Self, TchError> {
         let outputs = weight.size().first().copied().unwrap_or(0);
         let rows = weight.f_to_kind(Kind::Float)?.f_reshape([outputs, -1])?;
-        let largest = Vec::<f64>::try_from(rows.f_abs()?.f_amax([1_i64], false)?.f_to_kind(Kind::Double)?)?;
+        let largest = Vec::<f64>::try_from(
+            rows.f_abs()?
+                .f_amax([1_i64], false)?
+                .f_to_kind(Kind::Double)?,
+        )?;
         let (mut steps, mut scales) = (Vec::new(), Vec::new());
         for (row, largest) in (0..outputs).zip(largest) {
             let row = rows.f_get(row)?;
-            let wide = if largest > 0.0 { Scale::reaching(largest, MAX_WEIGHT as f64) } else { Scale::of_exponent(0) };
+            let wide = if largest > 0.0 {
+                Scale::reaching(largest, MAX_WEIGHT as f64)
+            } else {
+                Scale::of_exponent(0)
+            };
             let (of_wide, wide_error) = quantised(&row, wide)?;
             let (of_finer, finer_error) = quantised(&row, wide.finer())?;
             let is_finer_better = finer_error < wide_error;
@@ -40,7 +48,9 @@ impl QuantisedWeight {
         }
         let shape = weight.size();
         Ok(Self {
-            steps: Tensor::f_stack(&steps, 0)?.f_to_kind(Kind::Int8)?.f_reshape(shape.as_slice())?,
+            steps: Tensor::f_stack(&steps, 0)?
+                .f_to_kind(Kind::Int8)?
+                .f_reshape(shape.as_slice())?,
             zero_points: Tensor::f_zeros([outputs], (Kind::Int, weight.device()))?,
             scales: Tensor::f_from_slice(&scales)?,
         })
@@ -49,8 +59,15 @@ impl QuantisedWeight {
 
 /// Steps of a row, and its squared error.
 fn quantised(row: &Tensor, scale: Scale) -> Result<(Tensor, f64), TchError> {
-    let steps = row.f_mul_scalar(scale.step().recip())?.f_round()?.f_clamp(-MAX_WEIGHT, MAX_WEIGHT)?;
-    let error = steps.f_mul_scalar(scale.step())?.f_sub(row)?.f_square()?.f_sum(Kind::Double)?;
+    let steps = row
+        .f_mul_scalar(scale.step().recip())?
+        .f_round()?
+        .f_clamp(-MAX_WEIGHT, MAX_WEIGHT)?;
+    let error = steps
+        .f_mul_scalar(scale.step())?
+        .f_sub(row)?
+        .f_square()?
+        .f_sum(Kind::Double)?;
     Ok((steps, error.f_double_value(&[])?))
 }
 
@@ -79,7 +96,11 @@ mod tests {
         assert!(quantised.steps.abs().max().int64_value(&[]) <= MAX_WEIGHT);
         let scales = quantised.scales.view([16, 1, 1, 1]);
         let off = (quantised.steps.to_kind(Kind::Float) * &scales - &weight).abs() / &scales;
-        let within = off.le(0.5).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+        let within = off
+            .le(0.5)
+            .to_kind(Kind::Float)
+            .mean(Kind::Float)
+            .double_value(&[]);
         assert!(within > 0.99, "{within}");
     }
 }

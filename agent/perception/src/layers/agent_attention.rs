@@ -17,7 +17,8 @@ use tch::{Kind, TchError, Tensor};
 pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchError> {
     let (_, channels, _, _) = maps.size4()?;
     let query = maps.f_narrow(0, 0, 1)?;
-    let scores = (maps * query).f_sum_dim_intlist([1_i64].as_slice(), false, Kind::Float)? / (channels as f64).sqrt();
+    let scores = (maps * query).f_sum_dim_intlist([1_i64].as_slice(), false, Kind::Float)?
+        / (channels as f64).sqrt();
     let scores = match valid {
         Some(valid) => scores.f_masked_fill(&valid.f_logical_not()?, f64::NEG_INFINITY)?,
         None => scores,
@@ -36,7 +37,10 @@ pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchEr
 /// Those of the tensor library, when `record_len` does not add up to the number of maps.
 pub(crate) fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
     let samples = maps.f_split_with_sizes(record_len, 0)?;
-    let fused: Result<Vec<_>, _> = samples.iter().map(|sample| attend_ego(sample, None)).collect();
+    let fused: Result<Vec<_>, _> = samples
+        .iter()
+        .map(|sample| attend_ego(sample, None))
+        .collect();
     Tensor::f_stack(&fused?, 0)
 }
 
@@ -50,11 +54,23 @@ mod tests {
     fn ego_only_is_the_identity_and_a_masked_agent_does_not_count() {
         let maps = Tensor::randn([2, 4, 3, 5], (Kind::Float, Device::Cpu));
         let ego = maps.get(0);
-        assert!(attend_ego(&maps.narrow(0, 0, 1), None).unwrap().allclose(&ego, 1e-6, 1e-6, false));
+        assert!(
+            attend_ego(&maps.narrow(0, 0, 1), None)
+                .unwrap()
+                .allclose(&ego, 1e-6, 1e-6, false)
+        );
         let valid = Tensor::ones([2, 3, 5], (Kind::Bool, Device::Cpu));
         let _ = valid.get(1).fill_(0);
-        assert!(attend_ego(&maps, Some(&valid)).unwrap().allclose(&ego, 1e-6, 1e-6, false));
-        assert!(!attend_ego(&maps, None).unwrap().allclose(&ego, 1e-3, 1e-3, false));
+        assert!(
+            attend_ego(&maps, Some(&valid))
+                .unwrap()
+                .allclose(&ego, 1e-6, 1e-6, false)
+        );
+        assert!(
+            !attend_ego(&maps, None)
+                .unwrap()
+                .allclose(&ego, 1e-3, 1e-3, false)
+        );
     }
 
     #[test]

@@ -27,19 +27,37 @@ impl BevBackbone {
     #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Self {
         let mut input = config.pillar_channels;
-        let mut backbone = Self { blocks: Vec::new(), deblocks: Vec::new() };
+        let mut backbone = Self {
+            blocks: Vec::new(),
+            deblocks: Vec::new(),
+        };
         for (level, &filters) in config.num_filters.iter().enumerate() {
             let (layers, stride) = (config.layer_nums[level], config.layer_strides[level]);
             backbone.blocks.push(match config.blocks {
-                BlockKind::Plain => Block::Plain(block(&(path / "blocks" / level), [input, filters], layers, stride)),
+                BlockKind::Plain => Block::Plain(block(
+                    &(path / "blocks" / level),
+                    [input, filters],
+                    layers,
+                    stride,
+                )),
                 BlockKind::Residual => {
                     let path = path / "resnet" / format!("layer{level}");
-                    Block::Residual(ResidualBlock::chain(&path, [input, filters], layers, stride))
+                    Block::Residual(ResidualBlock::chain(
+                        &path,
+                        [input, filters],
+                        layers,
+                        stride,
+                    ))
                 }
             });
             let deblock = path / "deblocks" / level;
             let io = [filters, config.num_upsample_filters[level]];
-            let layer = ConvLayer::upsampling(&(&deblock / 0), &(&deblock / 1), io, config.upsample_strides[level]);
+            let layer = ConvLayer::upsampling(
+                &(&deblock / 0),
+                &(&deblock / 1),
+                io,
+                config.upsample_strides[level],
+            );
             backbone.deblocks.push(layer);
             input = filters;
         }
@@ -60,7 +78,12 @@ impl BevBackbone {
     ///
     /// # Errors
     /// Those of the tensor library, when `record_len` does not add up to the number of maps.
-    pub fn forward_fused(&self, x: &Tensor, record_len: &[i64], train: bool) -> Result<Tensor, TchError> {
+    pub fn forward_fused(
+        &self,
+        x: &Tensor,
+        record_len: &[i64],
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let levels = self.levels_of(x, train);
         let fused = levels.iter().map(|level| attend_samples(level, record_len));
         Ok(self.upsampled(&fused.collect::<Result<Vec<_>, _>>()?, train))
@@ -88,23 +111,37 @@ impl BevBackbone {
     /// When there is no such level.
     pub fn level(&self, level: usize, x: &Tensor, train: bool) -> Tensor {
         match &self.blocks[level] {
-            Block::Plain(layers) => layers.iter().fold(x.shallow_clone(), |x, layer| layer.forward(&x, train)),
-            Block::Residual(blocks) => blocks.iter().fold(x.shallow_clone(), |x, block| block.forward(&x, train)),
+            Block::Plain(layers) => layers
+                .iter()
+                .fold(x.shallow_clone(), |x, layer| layer.forward(&x, train)),
+            Block::Residual(blocks) => blocks
+                .iter()
+                .fold(x.shallow_clone(), |x, block| block.forward(&x, train)),
         }
     }
 
     /// Up-samples the outputs of all levels, own or fused, to one BEV grid: `[N, sum of C_up, H', W']`.
     pub fn upsampled(&self, levels: &[Tensor], train: bool) -> Tensor {
-        let mut levels: Vec<Tensor> =
-            self.deblocks.iter().zip(levels).map(|(deblock, level)| deblock.forward(level, train)).collect();
-        if levels.len() == 1 { levels.remove(0) } else { Tensor::cat(&levels, 1) }
+        let mut levels: Vec<Tensor> = self
+            .deblocks
+            .iter()
+            .zip(levels)
+            .map(|(deblock, level)| deblock.forward(level, train))
+            .collect();
+        if levels.len() == 1 {
+            levels.remove(0)
+        } else {
+            Tensor::cat(&levels, 1)
+        }
     }
 
     /// Layers of every level and up-sampling layers; `None` with residual blocks.
     pub(crate) fn plain_layers(&self) -> Option<(Vec<&[ConvLayer]>, &[ConvLayer])> {
         let mut levels = Vec::with_capacity(self.blocks.len());
         for block in &self.blocks {
-            let Block::Plain(layers) = block else { return None };
+            let Block::Plain(layers) = block else {
+                return None;
+            };
             levels.push(layers.as_slice());
         }
         Some((levels, &self.deblocks))
@@ -115,7 +152,9 @@ impl BevBackbone {
     pub fn folded(&self) -> Self {
         let fold = |block: &Block| match block {
             Block::Plain(layers) => Block::Plain(layers.iter().map(ConvLayer::folded).collect()),
-            Block::Residual(blocks) => Block::Residual(blocks.iter().map(ResidualBlock::folded).collect()),
+            Block::Residual(blocks) => {
+                Block::Residual(blocks.iter().map(ResidualBlock::folded).collect())
+            }
         };
         Self {
             blocks: self.blocks.iter().map(fold).collect(),
@@ -128,7 +167,12 @@ impl BevBackbone {
 ///
 /// The reference numbers zero padding, convolution, norm and ReLU in one list, so the first convolution is 1, its norm
 /// 2, and each later pair is three further.
-fn block(path: &nn::Path<'_>, [input, filters]: [i64; 2], layers: usize, stride: i64) -> Vec<ConvLayer> {
+fn block(
+    path: &nn::Path<'_>,
+    [input, filters]: [i64; 2],
+    layers: usize,
+    stride: i64,
+) -> Vec<ConvLayer> {
     (0..=layers)
         .map(|layer| {
             let (position, io, stride) = match layer {

@@ -63,7 +63,16 @@ impl Norm {
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let (weight, bias) = (Some(&self.weight), Some(&self.bias));
         let (mean, var) = (Some(&self.running_mean), Some(&self.running_var));
-        x.batch_norm(weight, bias, mean, var, train, self.momentum, self.eps, true)
+        x.batch_norm(
+            weight,
+            bias,
+            mean,
+            var,
+            train,
+            self.momentum,
+            self.eps,
+            true,
+        )
     }
 
     /// Learnt shift `[C]`.
@@ -103,54 +112,129 @@ pub struct ConvLayer {
 impl ConvLayer {
     /// `kernel x kernel` convolution with zero padding that keeps the size at stride 1. No bias: a norm must follow.
     #[must_use]
-    pub fn normed(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        let config = nn::ConvConfig { stride, padding: kernel / 2, bias: false, ..Default::default() };
-        Self::down(conv, io, kernel, config).with_norm(norm, io[1]).with_relu()
+    pub fn normed(
+        conv: &nn::Path<'_>,
+        norm: &nn::Path<'_>,
+        io: [i64; 2],
+        kernel: i64,
+        stride: i64,
+    ) -> Self {
+        let config = nn::ConvConfig {
+            stride,
+            padding: kernel / 2,
+            bias: false,
+            ..Default::default()
+        };
+        Self::down(conv, io, kernel, config)
+            .with_norm(norm, io[1])
+            .with_relu()
     }
 
     /// `kernel x kernel` convolution with bias and nothing after it.
     #[must_use]
     pub fn biased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, ..Default::default() })
+        Self::down(
+            conv,
+            io,
+            kernel,
+            nn::ConvConfig {
+                stride,
+                padding: kernel / 2,
+                ..Default::default()
+            },
+        )
     }
 
     /// `kernel x kernel` convolution without bias and with nothing after it.
     #[must_use]
     pub(crate) fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, bias: false, ..Default::default() })
+        Self::down(
+            conv,
+            io,
+            kernel,
+            nn::ConvConfig {
+                stride,
+                padding: kernel / 2,
+                bias: false,
+                ..Default::default()
+            },
+        )
     }
 
     /// Convolution whose kernel is its stride, so that every input counts once; batch norm, ReLU.
     #[must_use]
     pub fn patches(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], patch: i64) -> Self {
-        let config = nn::ConvConfig { stride: patch, padding: 0, bias: false, ..Default::default() };
-        Self::down(conv, io, patch, config).with_norm(norm, io[1]).with_relu()
+        let config = nn::ConvConfig {
+            stride: patch,
+            padding: 0,
+            bias: false,
+            ..Default::default()
+        };
+        Self::down(conv, io, patch, config)
+            .with_norm(norm, io[1])
+            .with_relu()
     }
 
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
     #[must_use]
     pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {
-        let weight = conv.var("weight", &[io[0], io[1], stride, stride], nn::init::DEFAULT_KAIMING_UNIFORM);
-        let layer = Self { weight, bias: None, stride, padding: 0, direction: Direction::Up, norm: None, relu: false };
+        let weight = conv.var(
+            "weight",
+            &[io[0], io[1], stride, stride],
+            nn::init::DEFAULT_KAIMING_UNIFORM,
+        );
+        let layer = Self {
+            weight,
+            bias: None,
+            stride,
+            padding: 0,
+            direction: Direction::Up,
+            norm: None,
+            relu: false,
+        };
         layer.with_norm(norm, io[1]).with_relu()
     }
 
-    fn down(path: &nn::Path<'_>, [input, output]: [i64; 2], kernel: i64, config: nn::ConvConfig) -> Self {
+    fn down(
+        path: &nn::Path<'_>,
+        [input, output]: [i64; 2],
+        kernel: i64,
+        config: nn::ConvConfig,
+    ) -> Self {
         let (stride, padding) = (config.stride, config.padding);
         let conv = nn::conv2d(path, input, output, kernel, config);
-        Self { weight: conv.ws, bias: conv.bs, stride, padding, direction: Direction::Down, norm: None, relu: false }
+        Self {
+            weight: conv.ws,
+            bias: conv.bs,
+            stride,
+            padding,
+            direction: Direction::Down,
+            norm: None,
+            relu: false,
+        }
     }
 
     /// The same with a batch norm after the convolution.
     #[must_use]
     pub(crate) fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
-        Self { norm: Some(Norm::new(norm, channels)), ..self }
+        Self {
+            norm: Some(Norm::new(norm, channels)),
+            ..self
+        }
     }
 
     /// The same with a batch norm of another epsilon and momentum.
     #[must_use]
-    pub(crate) fn with_norm_of(self, norm: &nn::Path<'_>, channels: i64, (eps, momentum): (f64, f64)) -> Self {
-        Self { norm: Some(Norm::with_eps(norm, channels, eps, momentum)), ..self }
+    pub(crate) fn with_norm_of(
+        self,
+        norm: &nn::Path<'_>,
+        channels: i64,
+        (eps, momentum): (f64, f64),
+    ) -> Self {
+        Self {
+            norm: Some(Norm::with_eps(norm, channels, eps, momentum)),
+            ..self
+        }
     }
 
     /// The same with a ReLU at the end.
@@ -189,11 +273,16 @@ impl ConvLayer {
     pub(crate) fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let (batch, input, height, width) = x.size4()?;
         let kernel = self.weight.size();
-        let pointwise = batch == 1 && kernel[2..] == [1, 1] && self.stride == 1 && self.direction == Direction::Down;
+        let pointwise = batch == 1
+            && kernel[2..] == [1, 1]
+            && self.stride == 1
+            && self.direction == Direction::Down;
         let (true, Some(bias), None) = (pointwise, &self.bias, &self.norm) else {
             return self.forward(x, false).f_contiguous();
         };
-        let cells = x.f_permute([0, 2, 3, 1])?.f_reshape([height * width, input])?;
+        let cells = x
+            .f_permute([0, 2, 3, 1])?
+            .f_reshape([height * width, input])?;
         let weight = self.weight.f_reshape([kernel[0], input])?;
         let mut rows = bias.f_unsqueeze(1)?.f_addmm(&weight, &cells.f_tr()?)?;
         let rows = if self.relu { rows.f_relu_()? } else { rows };
@@ -204,19 +293,58 @@ impl ConvLayer {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(crate) fn int8(&self, input: Quantisation, output: Option<Scale>) -> Result<Int8Convolution, TchError> {
-        let Self { weight, bias, stride, padding, relu, .. } = self;
-        let format = LayerFormat { input, output, relu: *relu };
+    pub(crate) fn int8(
+        &self,
+        input: Quantisation,
+        output: Option<Scale>,
+    ) -> Result<Int8Convolution, TchError> {
+        let Self {
+            weight,
+            bias,
+            stride,
+            padding,
+            relu,
+            ..
+        } = self;
+        let format = LayerFormat {
+            input,
+            output,
+            relu: *relu,
+        };
         let (weight, bias, geometry) = match self.direction {
             Direction::Down => {
-                let geometry = ConvGeometry { stride: *stride, padding: *padding, upsampling: 1 };
-                (weight.f_contiguous()?, bias.as_ref().map(Tensor::shallow_clone), geometry)
+                let geometry = ConvGeometry {
+                    stride: *stride,
+                    padding: *padding,
+                    upsampling: 1,
+                };
+                (
+                    weight.f_contiguous()?,
+                    bias.as_ref().map(Tensor::shallow_clone),
+                    geometry,
+                )
             }
             Direction::Up => {
                 let (input, output, edge, _) = weight.size4()?;
-                let rows = weight.f_permute([2, 3, 1, 0])?.f_reshape([edge * edge * output, input, 1, 1])?;
-                let bias = bias.as_ref().map(|bias| bias.f_repeat([edge * edge])).transpose()?;
-                (rows, bias, ConvGeometry { stride: 1, padding: 0, upsampling: edge })
+                let rows = weight.f_permute([2, 3, 1, 0])?.f_reshape([
+                    edge * edge * output,
+                    input,
+                    1,
+                    1,
+                ])?;
+                let bias = bias
+                    .as_ref()
+                    .map(|bias| bias.f_repeat([edge * edge]))
+                    .transpose()?;
+                (
+                    rows,
+                    bias,
+                    ConvGeometry {
+                        stride: 1,
+                        padding: 0,
+                        upsampling: edge,
+                    },
+                )
             }
         };
         Int8Convolution::new(&weight, bias.as_ref(), geometry, format)
@@ -226,7 +354,11 @@ impl ConvLayer {
     /// pass over the map; weights are channels-last, as the maps are.
     #[must_use]
     pub fn folded(&self) -> Self {
-        let output_dim = if self.direction == Direction::Down { 0 } else { 1 };
+        let output_dim = if self.direction == Direction::Down {
+            0
+        } else {
+            1
+        };
         let bias = self.bias.as_ref().map(Tensor::detach);
         let (weight, bias) = match &self.norm {
             None => (self.weight.detach(), bias),
@@ -234,11 +366,17 @@ impl ConvLayer {
                 let (scale, shift) = norm.scale_shift();
                 let mut shape = [1_i64; 4];
                 shape[output_dim] = -1;
-                let shift = bias.map_or_else(|| shift.shallow_clone(), |bias| bias * &scale + &shift);
+                let shift =
+                    bias.map_or_else(|| shift.shallow_clone(), |bias| bias * &scale + &shift);
                 (&self.weight * scale.view(shape), Some(shift))
             }
         };
-        Self { weight: channels_last(&weight.detach()), bias: bias.map(|bias| bias.detach()), norm: None, ..*self }
+        Self {
+            weight: channels_last(&weight.detach()),
+            bias: bias.map(|bias| bias.detach()),
+            norm: None,
+            ..*self
+        }
     }
 }
 
@@ -252,8 +390,13 @@ pub(crate) fn contiguous_map(map: &Tensor) -> Result<Tensor, TchError> {
     if batch != 1 {
         return map.f_contiguous();
     }
-    let cells = map.f_permute([0, 2, 3, 1])?.f_reshape([height * width, channels])?;
-    cells.f_tr()?.f_contiguous()?.f_view([1, channels, height, width])
+    let cells = map
+        .f_permute([0, 2, 3, 1])?
+        .f_reshape([height * width, channels])?;
+    cells
+        .f_tr()?
+        .f_contiguous()?
+        .f_view([1, channels, height, width])
 }
 
 /// The same values with the channels innermost in memory.
@@ -289,8 +432,16 @@ mod tests {
             let expected = tch::no_grad(|| layer.forward(&x, false));
             let folded = tch::no_grad(|| layer.folded());
             let contiguous = folded.forward_contiguous(&x).unwrap();
-            assert!(folded.forward(&x, false).allclose(&expected, 1e-5, 1e-5, false), "{index}");
-            assert!(contiguous.is_contiguous() && contiguous.allclose(&expected, 1e-5, 1e-5, false), "{index}");
+            assert!(
+                folded
+                    .forward(&x, false)
+                    .allclose(&expected, 1e-5, 1e-5, false),
+                "{index}"
+            );
+            assert!(
+                contiguous.is_contiguous() && contiguous.allclose(&expected, 1e-5, 1e-5, false),
+                "{index}"
+            );
         }
     }
 }

@@ -30,14 +30,23 @@ impl DetectionHead {
     #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64, anchors: i64) -> Self {
         let init = |mean| nn::ConvConfig {
-            ws_init: Init::Randn { mean: 0.0, stdev: 0.01 },
+            ws_init: Init::Randn {
+                mean: 0.0,
+                stdev: 0.01,
+            },
             bs_init: Init::Const(mean),
             ..Default::default()
         };
         let prior = -((1.0 - PRIOR) / PRIOR).ln();
         Self {
             scores: nn::conv2d(path / "cls_head", channels, anchors, 1, init(prior)),
-            offsets: nn::conv2d(path / "reg_head", channels, anchors * BOX_CODE, 1, init(0.0)),
+            offsets: nn::conv2d(
+                path / "reg_head",
+                channels,
+                anchors * BOX_CODE,
+                1,
+                init(0.0),
+            ),
         }
     }
 
@@ -46,8 +55,13 @@ impl DetectionHead {
     /// # Errors
     /// Those of the tensor library, when the features have another number of channels than the head.
     pub fn forward(&self, features: &Tensor) -> Result<HeadOutput, TchError> {
-        let apply = |conv: &nn::Conv2D| features.f_conv2d(&conv.ws, conv.bs.as_ref(), [1, 1], [0, 0], [1, 1], 1);
-        Ok(HeadOutput { scores: apply(&self.scores)?, offsets: apply(&self.offsets)? })
+        let apply = |conv: &nn::Conv2D| {
+            features.f_conv2d(&conv.ws, conv.bs.as_ref(), [1, 1], [0, 0], [1, 1], 1)
+        };
+        Ok(HeadOutput {
+            scores: apply(&self.scores)?,
+            offsets: apply(&self.offsets)?,
+        })
     }
 
     /// The same of one map `[1, C, H, W]` for inference: one matrix product, in whatever order the map is in memory.
@@ -60,14 +74,21 @@ impl DetectionHead {
         let weight = Tensor::f_cat(&both.map(|conv| &conv.ws), 0)?.f_flatten(1, 3)?;
         let cells = map.f_squeeze_dim(0)?.f_flatten(1, 2)?;
         let output = match both.map(|conv| conv.bs.as_ref()) {
-            [Some(scores), Some(offsets)] => {
-                Tensor::f_cat(&[scores, offsets], 0)?.f_unsqueeze(1)?.f_addmm(&weight, &cells)?
-            }
+            [Some(scores), Some(offsets)] => Tensor::f_cat(&[scores, offsets], 0)?
+                .f_unsqueeze(1)?
+                .f_addmm(&weight, &cells)?,
             _ => weight.f_mm(&cells)?,
         };
         let anchors = self.scores.ws.size4()?.0;
-        let of = |first: i64, count: i64| output.f_narrow(0, first, count)?.f_view([1, count, height, width]);
-        Ok(HeadOutput { scores: of(0, anchors)?, offsets: of(anchors, BOX_CODE * anchors)? })
+        let of = |first: i64, count: i64| {
+            output
+                .f_narrow(0, first, count)?
+                .f_view([1, count, height, width])
+        };
+        Ok(HeadOutput {
+            scores: of(0, anchors)?,
+            offsets: of(anchors, BOX_CODE * anchors)?,
+        })
     }
 }
 
@@ -91,13 +112,19 @@ mod tests {
         let head = DetectionHead::new(&variables.root(), 5, 2);
         let planes = Tensor::rand([1, 5, 6, 8], (Kind::Float, Device::Cpu));
         let expected = head.forward(&planes).unwrap();
-        let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
+        let cells = planes
+            .permute([0, 2, 3, 1])
+            .contiguous()
+            .permute([0, 3, 1, 2]);
         for map in [planes, cells] {
             let found = head.forward_one(&map).unwrap();
             assert_eq!(found.offsets.size(), [1, 14, 6, 8]);
             assert!(found.scores.allclose(&expected.scores, 1e-5, 1e-6, false));
             assert!(found.offsets.allclose(&expected.offsets, 1e-5, 1e-6, false));
         }
-        assert!(head.forward_one(&Tensor::zeros([1, 4, 6, 8], (Kind::Float, Device::Cpu))).is_err());
+        assert!(
+            head.forward_one(&Tensor::zeros([1, 4, 6, 8], (Kind::Float, Device::Cpu)))
+                .is_err()
+        );
     }
 }

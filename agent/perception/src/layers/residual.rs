@@ -19,7 +19,12 @@ impl ResidualBlock {
     /// Chain of `blocks`, the first with `stride`; parameters `<position>.{conv1,bn1,conv2,bn2}.*` and
     /// `0.downsample.{0,1}.*` under `path`.
     #[must_use]
-    pub fn chain(path: &nn::Path<'_>, [input, filters]: [i64; 2], blocks: usize, stride: i64) -> Vec<Self> {
+    pub fn chain(
+        path: &nn::Path<'_>,
+        [input, filters]: [i64; 2],
+        blocks: usize,
+        stride: i64,
+    ) -> Vec<Self> {
         (0..blocks)
             .map(|position| match position {
                 0 => Self::new(&(path / position), [input, filters], stride),
@@ -37,7 +42,8 @@ impl ResidualBlock {
         Self {
             first: layer(path / "conv1", path / "bn1", [input, filters], 3, stride).with_relu(),
             second: layer(path / "conv2", path / "bn2", [filters, filters], 3, 1),
-            shortcut: is_changed.then(|| layer(&shortcut / 0, &shortcut / 1, [input, filters], 1, stride)),
+            shortcut: is_changed
+                .then(|| layer(&shortcut / 0, &shortcut / 1, [input, filters], 1, stride)),
         }
     }
 
@@ -80,7 +86,11 @@ mod tests {
         }
         let x = Tensor::randn([2, 6, 8, 12], (Kind::Float, Device::Cpu));
         let through = |blocks: &[ResidualBlock]| {
-            tch::no_grad(|| blocks.iter().fold(x.shallow_clone(), |x, block| block.forward(&x, false)))
+            tch::no_grad(|| {
+                blocks
+                    .iter()
+                    .fold(x.shallow_clone(), |x, block| block.forward(&x, false))
+            })
         };
         let expected = through(&blocks);
         assert_eq!(expected.size(), [2, 10, 4, 6]);

@@ -19,11 +19,21 @@ impl Shrink {
         let layers = match *config {
             ShrinkConfig::DoubleConv { channels, stride } => {
                 let double = layer / "double_conv";
-                let first = ConvLayer::biased(&(&double / 0), [input, channels], 3, stride).with_relu();
-                vec![first, ConvLayer::biased(&(&double / 2), [channels, channels], 3, 1).with_relu()]
+                let first =
+                    ConvLayer::biased(&(&double / 0), [input, channels], 3, stride).with_relu();
+                vec![
+                    first,
+                    ConvLayer::biased(&(&double / 2), [channels, channels], 3, 1).with_relu(),
+                ]
             }
             ShrinkConfig::Pointwise { channels } => {
-                vec![ConvLayer::normed(&(&layer / 0), &(&layer / 1), [input, channels], 1, 1)]
+                vec![ConvLayer::normed(
+                    &(&layer / 0),
+                    &(&layer / 1),
+                    [input, channels],
+                    1,
+                    1,
+                )]
             }
         };
         Self { layers }
@@ -53,7 +63,9 @@ impl Shrink {
     /// The same for inference, norms folded in.
     #[must_use]
     pub fn folded(&self) -> Self {
-        Self { layers: self.layers.iter().map(ConvLayer::folded).collect() }
+        Self {
+            layers: self.layers.iter().map(ConvLayer::folded).collect(),
+        }
     }
 }
 
@@ -77,7 +89,10 @@ impl Compressor {
         let decoder = path / "decoder";
         Self {
             encoder: layer(&(path / "encoder"), 0, [channels, code]),
-            decoder: vec![layer(&decoder, 0, [code, channels]), layer(&decoder, 3, [channels, channels])],
+            decoder: vec![
+                layer(&decoder, 0, [code, channels]),
+                layer(&decoder, 3, [channels, channels]),
+            ],
         }
     }
 
@@ -94,10 +109,15 @@ impl Compressor {
     /// The same for inference, norms folded in.
     #[must_use]
     pub fn folded(&self) -> Self {
-        Self { encoder: self.encoder.folded(), decoder: self.decoder.iter().map(ConvLayer::folded).collect() }
+        Self {
+            encoder: self.encoder.folded(),
+            decoder: self.decoder.iter().map(ConvLayer::folded).collect(),
+        }
     }
 }
 
 fn chain(layers: &[ConvLayer], x: &Tensor, train: bool) -> Tensor {
-    layers.iter().fold(x.shallow_clone(), |x, layer| layer.forward(&x, train))
+    layers
+        .iter()
+        .fold(x.shallow_clone(), |x, layer| layer.forward(&x, train))
 }

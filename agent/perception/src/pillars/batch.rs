@@ -41,7 +41,9 @@ impl PillarGrid {
     /// Centre x, y, z of the pillar at the cell indices z, y, x, metres.
     #[must_use]
     pub fn center_m(&self, zyx: [i32; 3]) -> [f32; 3] {
-        std::array::from_fn(|axis| zyx[2 - axis] as f32 * self.size_m[axis] + self.first_center_m[axis])
+        std::array::from_fn(|axis| {
+            zyx[2 - axis] as f32 * self.size_m[axis] + self.first_center_m[axis]
+        })
     }
 
     /// Row-major index of a pillar's cell in `[H, W]`.
@@ -126,9 +128,14 @@ impl PillarBatch {
     pub fn scatter(&self, rows: &Tensor, pillar_grid: &PillarGrid) -> Tensor {
         let (height, width) = (pillar_grid.height as i64, pillar_grid.width as i64);
         let channels = rows.size()[1];
-        let canvas = Tensor::zeros([self.sweeps * height * width, channels], (Kind::Float, rows.device()));
+        let canvas = Tensor::zeros(
+            [self.sweeps * height * width, channels],
+            (Kind::Float, rows.device()),
+        );
         let canvas = canvas.index_copy(0, &self.cells, rows);
-        canvas.view([self.sweeps, height, width, channels]).permute([0, 3, 1, 2])
+        canvas
+            .view([self.sweeps, height, width, channels])
+            .permute([0, 3, 1, 2])
     }
 }
 

@@ -24,13 +24,19 @@ impl PillarEncoder {
         let layer = path / "pfn_layers" / "0";
         let shape = [channels, POINT_FEATURES as i64];
         let linear = (&layer / "linear").var("weight", &shape, nn::init::DEFAULT_KAIMING_UNIFORM);
-        Self { linear, norm: Norm::new(&(&layer / "norm"), channels) }
+        Self {
+            linear,
+            norm: Norm::new(&(&layer / "norm"), channels),
+        }
     }
 
     /// Features of every pillar: `[M, C]`.
     pub fn forward(&self, batch: &PillarBatch, train: bool) -> Tensor {
         let points = batch.points();
-        let zero_row = batch.features.new_zeros([1, POINT_FEATURES as i64], (batch.features.kind(), batch.device()));
+        let zero_row = batch.features.new_zeros(
+            [1, POINT_FEATURES as i64],
+            (batch.features.kind(), batch.device()),
+        );
         let rows = Tensor::cat(&[&batch.features, &zero_row], 0).matmul(&self.linear.tr());
         let rows = self.norm.forward(&rows, train).relu();
         let best = segment_max(&rows.narrow(0, 0, points), &batch.counts);
@@ -54,7 +60,16 @@ impl PillarEncoder {
 /// Maximum over runs of rows: `[P, C]` and `[M]` run lengths, each at least 1, to `[M, C]`.
 fn segment_max(rows: &Tensor, lengths: &Tensor) -> Tensor {
     let absent = None::<&Tensor>;
-    Tensor::segment_reduce(&rows.contiguous(), "max", Some(lengths), absent, absent, 0, false, f64::NEG_INFINITY)
+    Tensor::segment_reduce(
+        &rows.contiguous(),
+        "max",
+        Some(lengths),
+        absent,
+        absent,
+        0,
+        false,
+        f64::NEG_INFINITY,
+    )
 }
 
 #[cfg(test)]
@@ -72,7 +87,14 @@ mod tests {
         let points: Vec<[f32; 4]> = (0..40)
             .flat_map(|cell| {
                 let [x, y] = [(cell % 8) as f32 * 0.8 - 3.0, (cell / 8) as f32 * 0.8 - 1.8];
-                (0..=cell % 5).map(move |k| [x + 0.03 * k as f32, y - 0.02 * k as f32, -0.3 * k as f32, 0.1 * k as f32])
+                (0..=cell % 5).map(move |k| {
+                    [
+                        x + 0.03 * k as f32,
+                        y - 0.02 * k as f32,
+                        -0.3 * k as f32,
+                        0.1 * k as f32,
+                    ]
+                })
             })
             .collect();
         Voxeliser::for_detector(config).voxelise(&points)
@@ -88,14 +110,19 @@ mod tests {
             first += count;
         }
         let rows = Tensor::stack(&rows, 0);
-        let flat = rows.view([-1, POINT_FEATURES as i64]).matmul(&encoder.linear.tr());
+        let flat = rows
+            .view([-1, POINT_FEATURES as i64])
+            .matmul(&encoder.linear.tr());
         let normed = encoder.norm.forward(&flat, false).relu();
         normed.view([-1, slots, normed.size()[1]]).amax([1], false)
     }
 
     #[test]
     fn packed_points_give_the_values_and_gradients_of_padded_ones() {
-        let config = DetectorConfig { max_points_per_pillar: 5, ..DetectorConfig::lean() };
+        let config = DetectorConfig {
+            max_points_per_pillar: 5,
+            ..DetectorConfig::lean()
+        };
         tch::set_num_threads(1);
         tch::manual_seed(1);
         let network = VarStore::new(Device::Cpu);
@@ -113,7 +140,10 @@ mod tests {
         }
         assert!(results[0].0.allclose(&results[1].0, 1e-5, 1e-5, false));
         for (packed, padded) in results[0].1.iter().zip(&results[1].1) {
-            assert!(packed.allclose(padded, 1e-4, 1e-4, false), "{packed} {padded}");
+            assert!(
+                packed.allclose(padded, 1e-4, 1e-4, false),
+                "{packed} {padded}"
+            );
         }
     }
 }

@@ -43,8 +43,9 @@ impl PointPillars {
             compute: Kind::Float,
             encoder: PillarEncoder::new(&(path / "pillar_vfe"), config.pillar_channels),
             backbone: BevBackbone::new(&(path / "backbone"), config),
-            shrink: (config.shrink.as_ref())
-                .map(|shrink| Shrink::new(&(path / "shrink_conv"), config.backbone_channels(), shrink)),
+            shrink: (config.shrink.as_ref()).map(|shrink| {
+                Shrink::new(&(path / "shrink_conv"), config.backbone_channels(), shrink)
+            }),
             compressor: (config.compress_ratio)
                 .map(|ratio| Compressor::new(&(path / "naive_compressor"), channels, ratio)),
             head: DetectionHead::new(path, channels, config.anchors.yaws_deg.len() as i64),
@@ -106,12 +107,23 @@ mod tests {
     use crate::pillars::voxels::Voxeliser;
 
     fn small() -> DetectorConfig {
-        DetectorConfig { lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0], ..DetectorConfig::lean() }
+        DetectorConfig {
+            lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0],
+            ..DetectorConfig::lean()
+        }
     }
 
     fn batch(config: &DetectorConfig) -> PillarBatch {
-        let points: Vec<[f32; 4]> =
-            (0..500).map(|k| [k as f32 * 0.02 - 5.0, (k % 50) as f32 * 0.2 - 5.0, -1.0, 0.5]).collect();
+        let points: Vec<[f32; 4]> = (0..500)
+            .map(|k| {
+                [
+                    k as f32 * 0.02 - 5.0,
+                    (k % 50) as f32 * 0.2 - 5.0,
+                    -1.0,
+                    0.5,
+                ]
+            })
+            .collect();
         let pillars = Voxeliser::for_detector(config).voxelise(&points);
         PillarBatch::new(&[&pillars, &pillars], &PillarGrid::new(config))
     }
@@ -128,12 +140,18 @@ mod tests {
         let mut losses = Vec::new();
         for _ in 0..20 {
             let heads = pillars.heads(&pillars.features(&batch, true)).unwrap();
-            let loss = (heads.scores - 1.0).square().mean(Kind::Float) + heads.offsets.square().mean(Kind::Float);
+            let loss = (heads.scores - 1.0).square().mean(Kind::Float)
+                + heads.offsets.square().mean(Kind::Float);
             optimizer.backward_step(&loss);
             losses.push(loss.double_value(&[]));
         }
-        let running = network.variables()["backbone.blocks.0.2.running_mean"].abs().sum(Kind::Float);
-        assert!(running.double_value(&[]) > 0.0, "training moves the running statistics");
+        let running = network.variables()["backbone.blocks.0.2.running_mean"]
+            .abs()
+            .sum(Kind::Float);
+        assert!(
+            running.double_value(&[]) > 0.0,
+            "training moves the running statistics"
+        );
         (losses[0], losses[losses.len() - 1])
     }
 
@@ -156,10 +174,21 @@ mod tests {
         let pillars = PointPillars::new(&network.root(), &config).unwrap();
         let features = tch::no_grad(|| pillars.features(&batch(&config), false));
         let grid = config.feature_grid();
-        assert_eq!(features.size(), [2, config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]);
+        assert_eq!(
+            features.size(),
+            [
+                2,
+                config.feature_channels(),
+                i64::from(grid.height),
+                i64::from(grid.width)
+            ]
+        );
         let heads = pillars.heads(&features).unwrap();
         assert_eq!(heads.offsets.size()[1], 14);
-        assert_eq!(heads.confidence().size(), [2, i64::from(grid.height), i64::from(grid.width)]);
+        assert_eq!(
+            heads.confidence().size(),
+            [2, i64::from(grid.height), i64::from(grid.width)]
+        );
         assert!(pillars.heads(&features.narrow(1, 0, 8)).is_err());
     }
 }

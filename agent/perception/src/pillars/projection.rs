@@ -37,7 +37,11 @@ impl PillarProjection {
         let (weight, bias) = encoder.folded();
         let channels = weight.size()[0] as usize;
         let flat = |tensor: Tensor| {
-            let tensor = tensor.to_device(tch::Device::Cpu).to_kind(Kind::Float).contiguous().view([-1]);
+            let tensor = tensor
+                .to_device(tch::Device::Cpu)
+                .to_kind(Kind::Float)
+                .contiguous()
+                .view([-1]);
             Vec::<f32>::try_from(&tensor).expect("contiguous f32 values on the CPU")
         };
         let (weight, bias) = (flat(weight), flat(bias));
@@ -50,7 +54,9 @@ impl PillarProjection {
             })
         };
         let axes = |value: fn(&[f32], usize) -> f32| -> Vec<[[f32; LANES]; 3]> {
-            (0..blocks).map(|block| std::array::from_fn(|axis| lanes(block, &|row| value(row, axis)))).collect()
+            (0..blocks)
+                .map(|block| std::array::from_fn(|axis| lanes(block, &|row| value(row, axis))))
+                .collect()
         };
         let position = axes(|row, axis| row[axis] + row[4 + axis] + row[7 + axis]);
         Self {
@@ -61,7 +67,11 @@ impl PillarProjection {
             mean: axes(|row, axis| -row[4 + axis]),
             center: axes(|row, axis| row[axis]),
             bias: (0..blocks)
-                .map(|block| std::array::from_fn(|lane| bias.get(block * LANES + lane).copied().unwrap_or(0.0)))
+                .map(|block| {
+                    std::array::from_fn(|lane| {
+                        bias.get(block * LANES + lane).copied().unwrap_or(0.0)
+                    })
+                })
                 .collect(),
         }
     }
@@ -81,7 +91,12 @@ impl PillarProjection {
             let cell = pillar_grid.cell(coord) * self.channels;
             let center = pillar_grid.center_m(coord);
             let has_free_slot = points.len() < pillar_grid.max_points;
-            self.pillar(points, center, has_free_slot, &mut canvas[cell..cell + self.channels]);
+            self.pillar(
+                points,
+                center,
+                has_free_slot,
+                &mut canvas[cell..cell + self.channels],
+            );
         }
     }
 
@@ -100,26 +115,46 @@ impl PillarProjection {
         for (points, coord) in pillars.iter() {
             let cell = pillar_grid.cell(coord) * self.channels;
             let has_free_slot = points.len() < pillar_grid.max_points;
-            self.pillar(points, pillar_grid.center_m(coord), has_free_slot, &mut features);
+            self.pillar(
+                points,
+                pillar_grid.center_m(coord),
+                has_free_slot,
+                &mut features,
+            );
             for (steps, &value) in canvas[cell..cell + self.channels].iter_mut().zip(&features) {
                 *steps = quantisation.quantise_value(value);
             }
         }
     }
 
-    fn pillar(&self, points: &[[f32; 4]], center: [f32; 3], has_free_slot: bool, output: &mut [f32]) {
+    fn pillar(
+        &self,
+        points: &[[f32; 4]],
+        center: [f32; 3],
+        has_free_slot: bool,
+        output: &mut [f32],
+    ) {
         let mean = mean_xyz(points);
         for (block, output) in output.chunks_mut(LANES).enumerate() {
             let mut best = [f32::NEG_INFINITY; LANES];
             let weight = &self.point[block];
             for point in points {
-                let local = [point[0] - center[0], point[1] - center[1], point[2] - center[2], point[3]];
+                let local = [
+                    point[0] - center[0],
+                    point[1] - center[1],
+                    point[2] - center[2],
+                    point[3],
+                ];
                 for lane in 0..LANES {
                     let value = local[0] * weight[0][lane]
                         + local[1] * weight[1][lane]
                         + local[2] * weight[2][lane]
                         + local[3] * weight[3][lane];
-                    best[lane] = if value > best[lane] { value } else { best[lane] };
+                    best[lane] = if value > best[lane] {
+                        value
+                    } else {
+                        best[lane]
+                    };
                 }
             }
             for (lane, output) in output.iter_mut().enumerate() {
@@ -132,7 +167,12 @@ impl PillarProjection {
                 let bias = self.bias[block][lane];
                 let value = best[lane] + offset + bias;
                 // An empty slot of the reference is a zero row: it contributes the bias alone.
-                *output = if has_free_slot { value.max(bias) } else { value }.max(0.0);
+                *output = if has_free_slot {
+                    value.max(bias)
+                } else {
+                    value
+                }
+                .max(0.0);
             }
         }
     }
@@ -152,7 +192,11 @@ mod tests {
     fn it_computes_the_same_as_the_encoder() {
         tch::set_num_threads(1);
         tch::manual_seed(3);
-        let config = DetectorConfig { max_points_per_pillar: 3, pillar_channels: 24, ..DetectorConfig::lean() };
+        let config = DetectorConfig {
+            max_points_per_pillar: 3,
+            pillar_channels: 24,
+            ..DetectorConfig::lean()
+        };
         let network = VarStore::new(Device::Cpu);
         let encoder = PillarEncoder::new(&network.root(), 24);
         for (name, mut variable) in network.variables() {
@@ -161,17 +205,25 @@ mod tests {
         }
         let points: Vec<[f32; 4]> = (0..3000)
             .map(|k| {
-                [(k % 97) as f32 - 48.0, (k % 71) as f32 - 35.0, (k % 13) as f32 * 0.3 - 3.0, (k % 7) as f32 / 7.0]
+                [
+                    (k % 97) as f32 - 48.0,
+                    (k % 71) as f32 - 35.0,
+                    (k % 13) as f32 * 0.3 - 3.0,
+                    (k % 7) as f32 / 7.0,
+                ]
             })
             .collect();
         let pillars = Voxeliser::for_detector(&config).voxelise(&points);
         let pillar_grid = PillarGrid::new(&config);
         let batch = PillarBatch::new(&[&pillars], &pillar_grid);
-        let expected = tch::no_grad(|| batch.scatter(&encoder.forward(&batch, false), &pillar_grid));
+        let expected =
+            tch::no_grad(|| batch.scatter(&encoder.forward(&batch, false), &pillar_grid));
         let mut canvas = vec![0.0; pillar_grid.width * pillar_grid.height * 24];
         PillarProjection::new(&encoder).scatter(&pillars, &pillar_grid, &mut canvas);
         let shape = [1, pillar_grid.height as i64, pillar_grid.width as i64, 24];
-        let actual = Tensor::from_slice(&canvas).view(shape).permute([0, 3, 1, 2]);
+        let actual = Tensor::from_slice(&canvas)
+            .view(shape)
+            .permute([0, 3, 1, 2]);
         assert!(actual.allclose(&expected, 1e-5, 2e-5, false));
     }
 }

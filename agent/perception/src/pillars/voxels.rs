@@ -35,11 +35,14 @@ impl Pillars {
     /// The points of each pillar, in the order of the pillars.
     pub fn iter(&self) -> impl Iterator<Item = (&[[f32; 4]], [i32; 3])> {
         let mut rest = self.points.as_slice();
-        self.counts.iter().zip(&self.coords).map(move |(&count, &coord)| {
-            let (points, tail) = rest.split_at(count as usize);
-            rest = tail;
-            (points, coord)
-        })
+        self.counts
+            .iter()
+            .zip(&self.coords)
+            .map(move |(&count, &coord)| {
+                let (points, tail) = rest.split_at(count as usize);
+                rest = tail;
+                (points, coord)
+            })
     }
 
     /// The reference's layout: `[M, slots, 4]` row-major, unused slots zero.
@@ -197,22 +200,40 @@ mod tests {
     use super::*;
 
     fn voxeliser(max_points: usize, max_pillars: usize) -> Voxeliser {
-        Voxeliser::new([0.0, 0.0, -3.0, 4.0, 2.0, 1.0], [1.0, 1.0, 4.0], [4, 2, 1], max_points, max_pillars)
+        Voxeliser::new(
+            [0.0, 0.0, -3.0, 4.0, 2.0, 1.0],
+            [1.0, 1.0, 4.0],
+            [4, 2, 1],
+            max_points,
+            max_pillars,
+        )
     }
 
     #[test]
     fn points_of_a_pillar_lie_together_in_order_of_appearance() {
-        let points = [[3.5, 1.5, 0.0, 0.1], [0.5, 0.5, 0.0, 0.2], [3.2, 1.1, 0.0, 0.3]];
+        let points = [
+            [3.5, 1.5, 0.0, 0.1],
+            [0.5, 0.5, 0.0, 0.2],
+            [3.2, 1.1, 0.0, 0.3],
+        ];
         let pillars = voxeliser(8, 8).voxelise(&points);
         assert_eq!(pillars.coords, [[0, 1, 3], [0, 0, 0]]);
         assert_eq!(pillars.counts, [2, 1]);
         assert_eq!(pillars.points, [points[0], points[2], points[1]]);
-        assert_eq!(pillars.padded(2)[8..], [0.5, 0.5, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(
+            pillars.padded(2)[8..],
+            [0.5, 0.5, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0]
+        );
     }
 
     #[test]
     fn the_lower_border_is_in_and_the_upper_is_out() {
-        let points = [[0.0, 0.0, -3.0, 0.0], [4.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [-1e-6, 0.0, 0.0, 0.0]];
+        let points = [
+            [0.0, 0.0, -3.0, 0.0],
+            [4.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0],
+            [-1e-6, 0.0, 0.0, 0.0],
+        ];
         assert_eq!(voxeliser(8, 8).voxelise(&points).counts, [1]);
     }
 
@@ -221,14 +242,21 @@ mod tests {
         let a = [0.5, 0.5, 0.0, 0.0];
         let b = [1.5, 0.5, 0.0, 0.0];
         let pillars = voxeliser(2, 1).voxelise(&[a, b, a, a]);
-        assert_eq!((pillars.counts.as_slice(), pillars.points.len()), ([2].as_slice(), 2));
+        assert_eq!(
+            (pillars.counts.as_slice(), pillars.points.len()),
+            ([2].as_slice(), 2)
+        );
     }
 
     #[test]
     fn points_that_are_not_finite_are_dropped_and_tables_are_clean_afterwards() {
         let mut voxeliser = voxeliser(2, 8);
         let good = [0.5, 0.5, 0.0, 0.0];
-        let bad = [[f32::NAN, 0.5, 0.0, 0.0], [0.5, f32::INFINITY, 0.0, 0.0], [0.5, 0.5, f32::NEG_INFINITY, 0.0]];
+        let bad = [
+            [f32::NAN, 0.5, 0.0, 0.0],
+            [0.5, f32::INFINITY, 0.0, 0.0],
+            [0.5, 0.5, f32::NEG_INFINITY, 0.0],
+        ];
         for _ in 0..2 {
             assert!(voxeliser.voxelise(&bad).is_empty());
             assert_eq!(voxeliser.voxelise(&[good]).points, [good]);

@@ -21,8 +21,15 @@ impl SparseConv {
     #[must_use]
     pub fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
         let stdev = (2.0 / (10.0 * inputs as f64)).sqrt();
-        let weight = path.var("weight", &[KERNEL_VOLUME as i64 * inputs, outputs], Init::Randn { mean: 0.0, stdev });
-        Self { weight, bias: path.var("bias", &[outputs], Init::Const(0.0)) }
+        let weight = path.var(
+            "weight",
+            &[KERNEL_VOLUME as i64 * inputs, outputs],
+            Init::Randn { mean: 0.0, stdev },
+        );
+        Self {
+            weight,
+            bias: path.var("bias", &[outputs], Init::Const(0.0)),
+        }
     }
 
     /// `[N_in, C_in]` to `[N_out, C_out]`, in the precision of `x`.
@@ -30,8 +37,12 @@ impl SparseConv {
     /// # Errors
     /// Those of the tensor library, for example when the rows are not those of the rulebook.
     pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
-        let columns = index.gather(x)?.f_view([-1, KERNEL_VOLUME as i64 * x.size2()?.1])?;
-        self.bias.to_kind(x.kind()).f_addmm(&columns, &self.weight.to_kind(x.kind()))
+        let columns = index
+            .gather(x)?
+            .f_view([-1, KERNEL_VOLUME as i64 * x.size2()?.1])?;
+        self.bias
+            .to_kind(x.kind())
+            .f_addmm(&columns, &self.weight.to_kind(x.kind()))
     }
 }
 
@@ -59,7 +70,10 @@ mod tests {
 
     /// Rows into a dense `[1, C, SIZE, SIZE, SIZE]` block.
     fn dense(rows: &Tensor, sites: &Sites, size: i64) -> Tensor {
-        let block = Tensor::zeros([rows.size()[1], size, size, size], (Kind::Float, Device::Cpu));
+        let block = Tensor::zeros(
+            [rows.size()[1], size, size, size],
+            (Kind::Float, Device::Cpu),
+        );
         for (row, coord) in sites.coords().iter().enumerate() {
             let [x, y, z] = coord.map(i64::from);
             block.i((.., x, y, z)).copy_(&rows.get(row as i64));
@@ -80,8 +94,16 @@ mod tests {
         tch::set_num_threads(1);
         tch::manual_seed(seed);
         let (sites, _) = Sites::collect(occupied);
-        let outputs = if stride == 1 { sites.clone() } else { sites.halved().0 };
-        let book = if stride == 1 { Rulebook::submanifold(&sites) } else { Rulebook::strided(&sites, &outputs) };
+        let outputs = if stride == 1 {
+            sites.clone()
+        } else {
+            sites.halved().0
+        };
+        let book = if stride == 1 {
+            Rulebook::submanifold(&sites)
+        } else {
+            Rulebook::strided(&sites, &outputs)
+        };
         let index = Rulebook::stacked([&book], Device::Cpu).unwrap();
         let network = VarStore::new(Device::Cpu);
         let conv = SparseConv::new(&network.root(), 3, 5);
@@ -94,13 +116,29 @@ mod tests {
         let weight_gradient = conv.weight.grad();
 
         let dense_x = x.detach().set_requires_grad(true);
-        let kernel = conv.weight.detach().view([3, 3, 3, 3, 5]).permute([4, 3, 0, 1, 2]).contiguous();
+        let kernel = conv
+            .weight
+            .detach()
+            .view([3, 3, 3, 3, 5])
+            .permute([4, 3, 0, 1, 2])
+            .contiguous();
         let kernel = kernel.set_requires_grad(true);
         let block = dense(&dense_x, &sites, SIZE);
-        let full = block.conv3d(&kernel, Some(&conv.bias.detach()), [stride; 3], [1; 3], [1; 3], 1);
+        let full = block.conv3d(
+            &kernel,
+            Some(&conv.bias.detach()),
+            [stride; 3],
+            [1; 3],
+            [1; 3],
+            1,
+        );
         let expected = rows(&full, &outputs);
         (&expected * &pull).sum(Kind::Float).backward();
-        let expected_gradient = kernel.grad().permute([2, 3, 4, 1, 0]).contiguous().view([81, 5]);
+        let expected_gradient = kernel
+            .grad()
+            .permute([2, 3, 4, 1, 0])
+            .contiguous()
+            .view([81, 5]);
 
         sparse.allclose(&expected, 1e-4, 1e-5, false)
             && sparse_x.grad().allclose(&dense_x.grad(), 1e-4, 1e-5, false)
@@ -136,12 +174,33 @@ mod tests {
         let input = Quantisation::unsigned(Scale::of_exponent(-6));
         let x = Tensor::rand([sites.len() as i64, 8], (Kind::Float, Device::Cpu)) * 3.0;
         let expected = tch::no_grad(|| conv.forward(&x, &index).unwrap());
-        let int8 = tch::no_grad(|| conv.int8(LayerFormat { input, output: None, relu: false })).unwrap();
+        let int8 = tch::no_grad(|| {
+            conv.int8(LayerFormat {
+                input,
+                output: None,
+                relu: false,
+            })
+        })
+        .unwrap();
         let found = int8.forward(&input.quantise(&x).unwrap(), &index).unwrap();
-        let error = (&found - &expected).square().mean(Kind::Float).sqrt().double_value(&[]);
-        assert!(error > 0.0 && error < 0.02 * expected.std(true).double_value(&[]), "{error}");
+        let error = (&found - &expected)
+            .square()
+            .mean(Kind::Float)
+            .sqrt()
+            .double_value(&[]);
+        assert!(
+            error > 0.0 && error < 0.02 * expected.std(true).double_value(&[]),
+            "{error}"
+        );
         let odd = SparseConv::new(&(network.root() / "odd"), 3, 4);
-        let message = odd.int8(LayerFormat { input, output: None, relu: false }).unwrap_err().to_string();
+        let message = odd
+            .int8(LayerFormat {
+                input,
+                output: None,
+                relu: false,
+            })
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("3 input channels"), "{message}");
     }
 
@@ -151,7 +210,9 @@ mod tests {
         let conv = SparseConv::new(&network.root(), 2, 2);
         let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0]]).0);
         let index = Rulebook::stacked([&book], Device::Cpu).unwrap();
-        let message = conv.forward(&Tensor::zeros([2, 2], (Kind::Float, Device::Cpu)), &index).unwrap_err();
+        let message = conv
+            .forward(&Tensor::zeros([2, 2], (Kind::Float, Device::Cpu)), &index)
+            .unwrap_err();
         assert!(message.to_string().contains("2 rows") && message.to_string().contains("of 1"));
     }
 
@@ -161,8 +222,12 @@ mod tests {
         let network = VarStore::new(Device::Cpu);
         let conv = SparseConv::new(&network.root(), 2, 3);
         let x = Tensor::randn([4, 2], (Kind::Float, Device::Cpu));
-        let both = conv.forward(&x, &Rulebook::stacked([&book, &book], Device::Cpu).unwrap()).unwrap();
-        let one = conv.forward(&x.i(2..), &Rulebook::stacked([&book], Device::Cpu).unwrap()).unwrap();
+        let both = conv
+            .forward(&x, &Rulebook::stacked([&book, &book], Device::Cpu).unwrap())
+            .unwrap();
+        let one = conv
+            .forward(&x.i(2..), &Rulebook::stacked([&book], Device::Cpu).unwrap())
+            .unwrap();
         assert!(both.i(2..).allclose(&one, 1e-6, 1e-6, false));
     }
 }

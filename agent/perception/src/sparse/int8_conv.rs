@@ -19,12 +19,20 @@ impl Int8SparseConv {
     ///
     /// # Errors
     /// Those of the tensor library; [`TchError::Shape`] unless `C_in` is a multiple of four.
-    pub(super) fn new(weight: &Tensor, bias: &Tensor, format: LayerFormat) -> Result<Self, TchError> {
+    pub(super) fn new(
+        weight: &Tensor,
+        bias: &Tensor,
+        format: LayerFormat,
+    ) -> Result<Self, TchError> {
         let inputs = weight.size2()?.0 / KERNEL_VOLUME as i64;
         if inputs % WORD_BYTES != 0 {
-            return Err(TchError::Shape(format!("{inputs} input channels, must be a multiple of {WORD_BYTES}")));
+            return Err(TchError::Shape(format!(
+                "{inputs} input channels, must be a multiple of {WORD_BYTES}"
+            )));
         }
-        Ok(Self { linear: Int8Linear::new(&weight.f_tr()?.f_contiguous()?, Some(bias), format)? })
+        Ok(Self {
+            linear: Int8Linear::new(&weight.f_tr()?.f_contiguous()?, Some(bias), format)?,
+        })
     }
 
     /// `[N_in, C_in]`, `u8`, to `[N_out, C_out]`.
@@ -35,6 +43,10 @@ impl Int8SparseConv {
         let channels = x.size2()?.1;
         // The library gathers rows of floats many times faster than rows of bytes; nothing is computed with them here.
         let words = index.gather(&x.f_view_dtype(Kind::Float)?)?;
-        self.linear.forward(&words.f_view_dtype(Kind::Uint8)?.f_view([-1, KERNEL_VOLUME as i64 * channels])?)
+        self.linear.forward(
+            &words
+                .f_view_dtype(Kind::Uint8)?
+                .f_view([-1, KERNEL_VOLUME as i64 * channels])?,
+        )
     }
 }

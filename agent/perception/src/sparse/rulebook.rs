@@ -36,7 +36,10 @@ impl Rulebook {
                 }
             }
         }
-        Self { inputs: sites.len(), rows }
+        Self {
+            inputs: sites.len(),
+            rows,
+        }
     }
 
     /// Stride 2, from the sites of a level to those of the next: output `o` has the inputs `2 o + [-1, 1]^3`.
@@ -53,13 +56,17 @@ impl Rulebook {
                 for (y, dy) in choices[1].into_iter().flatten() {
                     for (z, dz) in choices[2].into_iter().flatten() {
                         if let Some(output) = halved.row([x, y, z]) {
-                            rows[output as usize * KERNEL_VOLUME + index([dx, dy, dz])] = row as u32;
+                            rows[output as usize * KERNEL_VOLUME + index([dx, dy, dz])] =
+                                row as u32;
                         }
                     }
                 }
             }
         }
-        Self { inputs: sites.len(), rows }
+        Self {
+            inputs: sites.len(),
+            rows,
+        }
     }
 
     /// Number of input rows.
@@ -84,16 +91,28 @@ impl Rulebook {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn stacked<'a>(rulebooks: impl IntoIterator<Item = &'a Self>, device: Device) -> Result<GatherIndex, TchError> {
+    pub fn stacked<'a>(
+        rulebooks: impl IntoIterator<Item = &'a Self>,
+        device: Device,
+    ) -> Result<GatherIndex, TchError> {
         let rulebooks: Vec<&Self> = rulebooks.into_iter().collect();
         let inputs: usize = rulebooks.iter().map(|book| book.inputs).sum();
         let mut index = Vec::with_capacity(rulebooks.iter().map(|book| book.rows.len()).sum());
         let mut first = 0;
         for book in rulebooks {
-            index.extend(book.rows.iter().map(|&row| if row == NONE { inputs as i64 } else { first + i64::from(row) }));
+            index.extend(book.rows.iter().map(|&row| {
+                if row == NONE {
+                    inputs as i64
+                } else {
+                    first + i64::from(row)
+                }
+            }));
             first += book.inputs as i64;
         }
-        Ok(GatherIndex { inputs: inputs as i64, rows: Tensor::f_from_slice(&index)?.f_to_device(device)? })
+        Ok(GatherIndex {
+            inputs: inputs as i64,
+            rows: Tensor::f_from_slice(&index)?.f_to_device(device)?,
+        })
     }
 }
 
@@ -114,17 +133,31 @@ impl GatherIndex {
     pub(super) fn gather(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let (rows, channels) = x.size2()?;
         if rows != self.inputs {
-            return Err(TchError::Shape(format!("{rows} rows of features, the rulebook is of {}", self.inputs)));
+            return Err(TchError::Shape(format!(
+                "{rows} rows of features, the rulebook is of {}",
+                self.inputs
+            )));
         }
         // A row of zeros stands for all missing neighbours.
-        let padded = Tensor::f_cat(&[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?], 0)?;
+        let padded = Tensor::f_cat(
+            &[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?],
+            0,
+        )?;
         // With an index that is expanded and not materialised, gather and its gradient copy whole rows.
-        padded.f_gather(0, &self.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?, false)
+        padded.f_gather(
+            0,
+            &self.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?,
+            false,
+        )
     }
 }
 
 fn offset(k: usize) -> [i32; 3] {
-    [(k / 9) as i32 - 1, (k / 3 % 3) as i32 - 1, (k % 3) as i32 - 1]
+    [
+        (k / 9) as i32 - 1,
+        (k / 3 % 3) as i32 - 1,
+        (k % 3) as i32 - 1,
+    ]
 }
 
 fn index([dx, dy, dz]: [i32; 3]) -> usize {

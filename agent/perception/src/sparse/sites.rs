@@ -40,7 +40,9 @@ impl Sites {
     /// True if a coordinate is near enough to zero to be a site.
     #[must_use]
     pub fn holds(coord: [i32; 3]) -> bool {
-        coord.iter().all(|axis| (-HALF_RANGE..HALF_RANGE).contains(axis))
+        coord
+            .iter()
+            .all(|axis| (-HALF_RANGE..HALF_RANGE).contains(axis))
     }
 
     /// Number of sites.
@@ -64,7 +66,10 @@ impl Sites {
     /// The row of a site.
     #[must_use]
     pub fn row(&self, coord: [i32; 3]) -> Option<u32> {
-        self.rows.get(&key(coord)).copied().filter(|_| Self::holds(coord))
+        self.rows
+            .get(&key(coord))
+            .copied()
+            .filter(|_| Self::holds(coord))
     }
 
     /// The sites of the next level, one for every 2x2x2 voxels with a site in them, and the row in it of each site.
@@ -75,8 +80,11 @@ impl Sites {
 }
 
 fn key(coord: [i32; 3]) -> u64 {
-    let axis_bits = |axis: i32| u64::from(axis.wrapping_add(HALF_RANGE) as u32 & ((1 << AXIS_BITS) - 1));
-    coord.iter().fold(0, |key, &axis| key << AXIS_BITS | axis_bits(axis))
+    let axis_bits =
+        |axis: i32| u64::from(axis.wrapping_add(HALF_RANGE) as u32 & ((1 << AXIS_BITS) - 1));
+    coord
+        .iter()
+        .fold(0, |key, &axis| key << AXIS_BITS | axis_bits(axis))
 }
 
 /// Hash by one multiplication: the keys are coordinates, and the table is used for one sweep.
@@ -85,7 +93,9 @@ struct KeyHasher(u64);
 
 impl Hasher for KeyHasher {
     fn write(&mut self, bytes: &[u8]) {
-        bytes.iter().for_each(|&byte| self.write_u64(u64::from(byte)));
+        bytes
+            .iter()
+            .for_each(|&byte| self.write_u64(u64::from(byte)));
     }
 
     fn write_u64(&mut self, value: u64) {
@@ -107,18 +117,32 @@ mod tests {
         let (sites, rows) = Sites::collect([[3, -2, 1], [0, 0, 0], [3, -2, 1], [-1, 5, 7]]);
         assert_eq!(sites.coords(), [[3, -2, 1], [0, 0, 0], [-1, 5, 7]]);
         assert_eq!(rows, [0, 1, 0, 2]);
-        assert_eq!((sites.row([-1, 5, 7]), sites.row([3, -2, 2])), (Some(2), None));
+        assert_eq!(
+            (sites.row([-1, 5, 7]), sites.row([3, -2, 2])),
+            (Some(2), None)
+        );
         let (halved, parents) = sites.halved();
         assert_eq!(
             (halved.coords(), parents.as_slice()),
-            ([[1, -1, 0], [0, 0, 0], [-1, 2, 3]].as_slice(), [0, 1, 2].as_slice())
+            (
+                [[1, -1, 0], [0, 0, 0], [-1, 2, 3]].as_slice(),
+                [0, 1, 2].as_slice()
+            )
         );
     }
 
     #[test]
     fn coordinates_beyond_the_range_are_no_sites() {
         let (sites, _) = Sites::collect([[0, 0, 0], [-HALF_RANGE, HALF_RANGE - 1, 1]]);
-        assert!(!Sites::holds([HALF_RANGE, 0, 0]) && Sites::holds([-HALF_RANGE, HALF_RANGE - 1, 1]));
-        assert_eq!((sites.row([i32::MIN, 0, 0]), sites.row([0, 2 * HALF_RANGE, 0])), (None, None));
+        assert!(
+            !Sites::holds([HALF_RANGE, 0, 0]) && Sites::holds([-HALF_RANGE, HALF_RANGE - 1, 1])
+        );
+        assert_eq!(
+            (
+                sites.row([i32::MIN, 0, 0]),
+                sites.row([0, 2 * HALF_RANGE, 0])
+            ),
+            (None, None)
+        );
     }
 }

@@ -24,7 +24,13 @@ pub struct AdamWConfig {
 
 impl Default for AdamWConfig {
     fn default() -> Self {
-        Self { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 1e-2, max_gradient_norm: 10.0 }
+        Self {
+            beta1: 0.9,
+            beta2: 0.999,
+            eps: 1e-8,
+            weight_decay: 1e-2,
+            max_gradient_norm: 10.0,
+        }
     }
 }
 
@@ -59,7 +65,9 @@ impl AdamW {
     #[must_use]
     pub fn new(variables: &VarStore, config: AdamWConfig) -> Self {
         let named: BTreeMap<String, Tensor> = variables.variables().into_iter().collect();
-        let entries = named.into_iter().filter(|(_, variable)| variable.requires_grad());
+        let entries = named
+            .into_iter()
+            .filter(|(_, variable)| variable.requires_grad());
         let entries = entries.map(|(name, variable)| Entry {
             name,
             mean: no_grad(|| variable.zeros_like()),
@@ -67,12 +75,18 @@ impl AdamW {
             decays: variable.dim() > 1,
             variable,
         });
-        Self { config, entries: entries.collect(), steps: 0 }
+        Self {
+            config,
+            entries: entries.collect(),
+            steps: 0,
+        }
     }
 
     /// Clears the gradients of the last step.
     pub fn zero_grad(&mut self) {
-        self.entries.iter_mut().for_each(|entry| entry.variable.zero_grad());
+        self.entries
+            .iter_mut()
+            .for_each(|entry| entry.variable.zero_grad());
     }
 
     /// Updates every variable by its gradient.
@@ -81,14 +95,24 @@ impl AdamW {
     /// [`TchError`] from the tensor library.
     pub fn step(&mut self, learning_rate: f64) -> Result<Step, TchError> {
         no_grad(|| {
-            let gradients: Vec<Tensor> = self.entries.iter().map(|entry| entry.variable.grad()).collect();
+            let gradients: Vec<Tensor> = self
+                .entries
+                .iter()
+                .map(|entry| entry.variable.grad())
+                .collect();
             let norm = global_norm(&gradients)?;
             if !norm.is_finite() {
                 return Ok(Step::Skipped);
             }
             let scale = (self.config.max_gradient_norm / (norm + 1e-6)).min(1.0);
             self.steps += 1;
-            let AdamWConfig { beta1, beta2, eps, weight_decay, .. } = self.config;
+            let AdamWConfig {
+                beta1,
+                beta2,
+                eps,
+                weight_decay,
+                ..
+            } = self.config;
             let mean_correction = 1.0 - beta1.powf(self.steps as f64);
             let square_correction = 1.0 - beta2.powf(self.steps as f64);
             for (entry, gradient) in self.entries.iter_mut().zip(&gradients) {
@@ -96,14 +120,24 @@ impl AdamW {
                     continue;
                 }
                 let gradient = gradient * scale;
-                let _ =
-                    entry.square.f_mul_scalar_(beta2)?.f_add_(&(gradient.f_square()?.f_mul_scalar_(1.0 - beta2)?))?;
-                let _ = entry.mean.f_mul_scalar_(beta1)?.f_add_(&(gradient * (1.0 - beta1)))?;
-                let deviation = (&entry.square / square_correction).f_sqrt_()?.f_add_scalar_(eps)?;
+                let _ = entry
+                    .square
+                    .f_mul_scalar_(beta2)?
+                    .f_add_(&(gradient.f_square()?.f_mul_scalar_(1.0 - beta2)?))?;
+                let _ = entry
+                    .mean
+                    .f_mul_scalar_(beta1)?
+                    .f_add_(&(gradient * (1.0 - beta1)))?;
+                let deviation = (&entry.square / square_correction)
+                    .f_sqrt_()?
+                    .f_add_scalar_(eps)?;
                 if entry.decays {
-                    let _ = entry.variable.f_mul_scalar_(1.0 - learning_rate * weight_decay)?;
+                    let _ = entry
+                        .variable
+                        .f_mul_scalar_(1.0 - learning_rate * weight_decay)?;
                 }
-                let change = (&entry.mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
+                let change =
+                    (&entry.mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
             Ok(Step::Taken(norm))
@@ -115,7 +149,9 @@ impl AdamW {
     #[must_use]
     pub fn state(&self) -> (BTreeMap<String, Tensor>, i64) {
         let both = self.entries.iter().flat_map(|entry| {
-            let stored = |prefix: &str, moment: &Tensor| (format!("{prefix}.{}", entry.name), moment.shallow_clone());
+            let stored = |prefix: &str, moment: &Tensor| {
+                (format!("{prefix}.{}", entry.name), moment.shallow_clone())
+            };
             [stored("mean", &entry.mean), stored("square", &entry.square)]
         });
         (both.collect(), self.steps)
@@ -125,11 +161,18 @@ impl AdamW {
     ///
     /// # Errors
     /// The name of a moment that is missing or of another shape.
-    pub(crate) fn restore(&mut self, moments: &BTreeMap<String, Tensor>, steps: i64) -> Result<(), String> {
+    pub(crate) fn restore(
+        &mut self,
+        moments: &BTreeMap<String, Tensor>,
+        steps: i64,
+    ) -> Result<(), String> {
         for entry in &mut self.entries {
             for (prefix, moment) in [("mean", &mut entry.mean), ("square", &mut entry.square)] {
                 let name = format!("{prefix}.{}", entry.name);
-                let stored = moments.get(&name).filter(|stored| stored.size() == moment.size()).ok_or(name)?;
+                let stored = moments
+                    .get(&name)
+                    .filter(|stored| stored.size() == moment.size())
+                    .ok_or(name)?;
                 *moment = stored.to_device(moment.device());
             }
         }
@@ -140,14 +183,18 @@ impl AdamW {
 
 /// Norm of all gradients together; variables that are not part of the loss count as zero.
 fn global_norm(gradients: &[Tensor]) -> Result<f64, TchError> {
-    let squares: Result<Vec<Tensor>, TchError> = (gradients.iter().filter(|gradient| gradient.defined()))
-        .map(|gradient| gradient.f_square()?.f_sum(Kind::Double))
-        .collect();
+    let squares: Result<Vec<Tensor>, TchError> =
+        (gradients.iter().filter(|gradient| gradient.defined()))
+            .map(|gradient| gradient.f_square()?.f_sum(Kind::Double))
+            .collect();
     let squares = squares?;
     if squares.is_empty() {
         return Ok(0.0);
     }
-    Ok(Tensor::f_stack(&squares, 0)?.f_sum(Kind::Double)?.f_double_value(&[])?.sqrt())
+    Ok(Tensor::f_stack(&squares, 0)?
+        .f_sum(Kind::Double)?
+        .f_double_value(&[])?
+        .sqrt())
 }
 
 #[cfg(test)]
@@ -166,7 +213,10 @@ mod tests {
     fn descend(optimizer: &mut AdamW, point: &Tensor, steps: usize) {
         for _ in 0..steps {
             optimizer.zero_grad();
-            (point - Tensor::from_slice(&[1f32, -1.0])).square().sum(Kind::Float).backward();
+            (point - Tensor::from_slice(&[1f32, -1.0]))
+                .square()
+                .sum(Kind::Float)
+                .backward();
             assert!(matches!(optimizer.step(0.1).unwrap(), Step::Taken(_)));
         }
     }
@@ -177,7 +227,10 @@ mod tests {
         let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
         descend(&mut optimizer, &point, 300);
         let found: Vec<f32> = Vec::try_from(&point.detach()).unwrap();
-        assert!((found[0] - 1.0).abs() < 1e-2 && (found[1] + 1.0).abs() < 1e-2, "{found:?}");
+        assert!(
+            (found[0] - 1.0).abs() < 1e-2 && (found[1] + 1.0).abs() < 1e-2,
+            "{found:?}"
+        );
     }
 
     #[test]
@@ -189,12 +242,18 @@ mod tests {
         let mut other = AdamW::new(&other_variables, AdamWConfig::default());
         no_grad(|| other_point.shallow_clone().copy_(&point));
         let (moments, steps) = optimizer.state();
-        let moments = moments.into_iter().map(|(name, moment)| (name, moment.copy())).collect();
+        let moments = moments
+            .into_iter()
+            .map(|(name, moment)| (name, moment.copy()))
+            .collect();
         other.restore(&moments, steps).unwrap();
         descend(&mut optimizer, &point, 5);
         descend(&mut other, &other_point, 5);
         assert_eq!(point, other_point);
-        assert_eq!(other.restore(&BTreeMap::new(), 0).unwrap_err(), "mean.point");
+        assert_eq!(
+            other.restore(&BTreeMap::new(), 0).unwrap_err(),
+            "mean.point"
+        );
     }
 
     #[test]

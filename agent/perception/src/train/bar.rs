@@ -58,13 +58,19 @@ impl TrainingBar {
     /// Bar for a training of this length, which is part of the estimate if sweeps have to be encoded first.
     #[must_use]
     pub fn of(length: Length) -> Self {
-        Self { length: Some(length), ..Self::default() }
+        Self {
+            length: Some(length),
+            ..Self::default()
+        }
     }
 
     /// The same for a training whose time counts from the start of the encoding.
     #[must_use]
     pub fn including_encoding(length: Length) -> Self {
-        Self { includes_encoding: true, ..Self::of(length) }
+        Self {
+            includes_encoding: true,
+            ..Self::of(length)
+        }
     }
 
     /// Shows the progress: `share_done` 0..1 after `seconds`, and a text.
@@ -80,35 +86,64 @@ impl TrainingBar {
     /// Shows that `done` of `all` sweeps of a data set are encoded; a smaller number than before belongs to the next
     /// one.
     pub fn encoded(&self, done: usize, all: usize) {
-        let fresh = Encoding { began: Instant::now(), first: done, latest: done, is_estimated: false };
-        let mut encoding = self.encoding.get().filter(|known| known.latest <= done).unwrap_or(fresh);
+        let fresh = Encoding {
+            began: Instant::now(),
+            first: done,
+            latest: done,
+            is_estimated: false,
+        };
+        let mut encoding = self
+            .encoding
+            .get()
+            .filter(|known| known.latest <= done)
+            .unwrap_or(fresh);
         encoding.latest = done;
         let left = all.saturating_sub(done) as f64;
         let passed = encoding.began.elapsed();
         let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
-        if let Some(remaining_s) = remaining_s.filter(|_| !encoding.is_estimated && passed >= ESTIMATE_AFTER) {
+        if let Some(remaining_s) =
+            remaining_s.filter(|_| !encoding.is_estimated && passed >= ESTIMATE_AFTER)
+        {
             let seconds = passed.as_secs_f64() + remaining_s;
             self.print_line(&estimate(all, seconds, self.length, self.includes_encoding));
             encoding.is_estimated = true;
         }
         self.encoding.set(Some(encoding));
-        self.show(done as f64 / all.max(1) as f64, remaining_s, &format!("{done} of {all} sweeps encoded"));
+        self.show(
+            done as f64 / all.max(1) as f64,
+            remaining_s,
+            &format!("{done} of {all} sweeps encoded"),
+        );
     }
 
     fn show(&self, share_done: f64, remaining_s: Option<f64>, text: &str) {
         if self.is_watched {
-            self.bar.set_position((share_done * 1000.0 * PARTS as f64) as u64);
+            self.bar
+                .set_position((share_done * 1000.0 * PARTS as f64) as u64);
             self.bar.set_message(text.to_owned());
-        } else if self.last_line.get().is_none_or(|last| last.elapsed() >= LINE_EVERY) {
-            let to_go = remaining_s.map(|seconds| format!(", {seconds:.0} s remaining")).unwrap_or_default();
-            output::note(format_args!("{text}, {:.1} % done{to_go}", 100.0 * share_done));
+        } else if self
+            .last_line
+            .get()
+            .is_none_or(|last| last.elapsed() >= LINE_EVERY)
+        {
+            let to_go = remaining_s
+                .map(|seconds| format!(", {seconds:.0} s remaining"))
+                .unwrap_or_default();
+            output::note(format_args!(
+                "{text}, {:.1} % done{to_go}",
+                100.0 * share_done
+            ));
             self.last_line.set(Some(Instant::now()));
         }
     }
 
     /// Prints a line that stays.
     pub fn print_line(&self, text: &str) {
-        if self.is_watched { self.bar.println(text) } else { output::note(text) }
+        if self.is_watched {
+            self.bar.println(text)
+        } else {
+            output::note(text)
+        }
     }
 
     /// Removes the bar.
@@ -118,14 +153,26 @@ impl TrainingBar {
 }
 
 /// Estimate of the duration of the encoding of all sweeps, and the training after it.
-fn estimate(sweeps: usize, seconds: f64, length: Option<Length>, includes_encoding: bool) -> String {
+fn estimate(
+    sweeps: usize,
+    seconds: f64,
+    length: Option<Length>,
+    includes_encoding: bool,
+) -> String {
     let then = match length {
         Some(Length::Time(time)) if includes_encoding && time.as_secs_f64() <= seconds => {
-            format!(", all of the {} in all: the training needs more time", minutes(time.as_secs_f64()))
+            format!(
+                ", all of the {} in all: the training needs more time",
+                minutes(time.as_secs_f64())
+            )
         }
         Some(Length::Time(time)) if includes_encoding => {
             let left_s = time.as_secs_f64() - seconds;
-            format!(" of the {} in all, which leaves {} for the training", minutes(time.as_secs_f64()), minutes(left_s))
+            format!(
+                " of the {} in all, which leaves {} for the training",
+                minutes(time.as_secs_f64()),
+                minutes(left_s)
+            )
         }
         Some(Length::Time(time)) => format!(", then {} of training", minutes(time.as_secs_f64())),
         Some(Length::Steps(steps)) => format!(", then {steps} steps of training"),
@@ -137,7 +184,11 @@ fn estimate(sweeps: usize, seconds: f64, length: Option<Length>, includes_encodi
 
 /// A duration in readable units.
 fn minutes(seconds: f64) -> String {
-    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.0} min", seconds / 60.0) }
+    if seconds < 90.0 {
+        format!("{seconds:.0} s")
+    } else {
+        format!("{:.0} min", seconds / 60.0)
+    }
 }
 
 /// Estimated time for `left` when `done` took `seconds`; `None` before anything is done.
@@ -160,10 +211,26 @@ mod tests {
     fn the_durations_of_encoding_and_training_are_estimated() {
         let training = |length| estimate(600, 540.0, length, false);
         let time = Some(Length::Time(Duration::from_secs(1200)));
-        assert_eq!(training(time), "encoding 600 sweeps takes 9 min, then 20 min of training");
-        assert_eq!(training(Some(Length::Steps(50))), "encoding 600 sweeps takes 9 min, then 50 steps of training");
-        assert_eq!(estimate(20, 42.4, None, false), "encoding 20 sweeps takes 42 s");
-        let within = |time| estimate(600, 540.0, Some(Length::Time(Duration::from_secs(time))), true);
+        assert_eq!(
+            training(time),
+            "encoding 600 sweeps takes 9 min, then 20 min of training"
+        );
+        assert_eq!(
+            training(Some(Length::Steps(50))),
+            "encoding 600 sweeps takes 9 min, then 50 steps of training"
+        );
+        assert_eq!(
+            estimate(20, 42.4, None, false),
+            "encoding 20 sweeps takes 42 s"
+        );
+        let within = |time| {
+            estimate(
+                600,
+                540.0,
+                Some(Length::Time(Duration::from_secs(time))),
+                true,
+            )
+        };
         assert_eq!(
             within(1200),
             "encoding 600 sweeps takes 9 min of the 20 min in all, which leaves 11 min for the training"
@@ -182,6 +249,9 @@ mod tests {
             bar.encoding.get().map(|encoding| encoding.first)
         };
         // An earlier run stored sixty feature maps; then the next data set.
-        assert_eq!([first(60), first(150), first(200), first(50), first(100)], [60, 60, 60, 50, 50].map(Some));
+        assert_eq!(
+            [first(60), first(150), first(200), first(50), first(100)],
+            [60, 60, 60, 50, 50].map(Some)
+        );
     }
 }

@@ -19,7 +19,9 @@ impl ModelCard {
     /// A card with an empty table.
     #[must_use]
     pub fn new(title: &str, about: &str) -> Self {
-        Self { text: format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n") }
+        Self {
+            text: format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n"),
+        }
     }
 
     /// Appends a row to the table.
@@ -33,12 +35,18 @@ impl ModelCard {
         self.row("command", format_args!("`{}`", run.command));
         self.row("parameters", trained.parameters);
         self.row("weights", format_args!("SHA-256 `{}`", trained.sha256));
-        self.row("data", format_args!("{data}, contents SHA-256 `{}`", trained.data.sha256));
+        self.row(
+            "data",
+            format_args!("{data}, contents SHA-256 `{}`", trained.data.sha256),
+        );
         if let Some(left_out) = trained.data.left_out() {
             self.row("left out", left_out);
         }
         self.row("seed", run.seed);
-        self.row("steps", format_args!("{} of {} {unit}", trained.steps, run.batch));
+        self.row(
+            "steps",
+            format_args!("{} of {} {unit}", trained.steps, run.batch),
+        );
         self.row("numbers", format_args!("{:?}", run.precision));
         self.row("time", format_args!("{:.0} s", trained.seconds));
     }

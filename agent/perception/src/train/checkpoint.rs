@@ -71,24 +71,42 @@ pub fn save<P: Serialize>(
     progress: &P,
 ) -> Result<(), CheckpointError> {
     let (moments, optimizer_steps) = optimizer.state();
-    let parameters = variables.variables().into_iter().map(|(name, tensor)| (format!("parameter.{name}"), tensor));
+    let parameters = variables
+        .variables()
+        .into_iter()
+        .map(|(name, tensor)| (format!("parameter.{name}"), tensor));
     let mut stored = Vec::new();
     for (name, tensor) in parameters.chain(moments) {
-        let values = values(&tensor).map_err(|source| CheckpointError::Torch { path: path.to_owned(), source })?;
+        let values = values(&tensor).map_err(|source| CheckpointError::Torch {
+            path: path.to_owned(),
+            source,
+        })?;
         let shape: Vec<usize> = tensor.size().iter().map(|&size| size as usize).collect();
-        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let bytes: Vec<u8> = values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect();
         stored.push((name, shape, bytes));
     }
-    let format = |source| CheckpointError::Format { path: path.to_owned(), source };
+    let format = |source| CheckpointError::Format {
+        path: path.to_owned(),
+        source,
+    };
     let views: Result<Vec<_>, _> = (stored.iter())
         .map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
         .collect();
     let header = HashMap::from([
-        (PROGRESS_KEY.to_owned(), serde_json::to_string(progress).unwrap_or_default()),
+        (
+            PROGRESS_KEY.to_owned(),
+            serde_json::to_string(progress).unwrap_or_default(),
+        ),
         ("optimizer_steps".to_owned(), optimizer_steps.to_string()),
     ]);
     let bytes = safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?;
-    let io = |source| CheckpointError::Io { path: path.to_owned(), source };
+    let io = |source| CheckpointError::Io {
+        path: path.to_owned(),
+        source,
+    };
     atomic_file::write(path, bytes).map_err(io)
 }
 
@@ -102,25 +120,49 @@ pub(crate) fn restore<P: DeserializeOwned>(
     variables: &VarStore,
     optimizer: &mut AdamW,
 ) -> Result<P, CheckpointError> {
-    let bytes = fs::read(path).map_err(|source| CheckpointError::Io { path: path.to_owned(), source })?;
-    let format = |source| CheckpointError::Format { path: path.to_owned(), source };
-    let mismatch = |reason: String| CheckpointError::Mismatch { path: path.to_owned(), reason };
+    let bytes = fs::read(path).map_err(|source| CheckpointError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    let format = |source| CheckpointError::Format {
+        path: path.to_owned(),
+        source,
+    };
+    let mismatch = |reason: String| CheckpointError::Mismatch {
+        path: path.to_owned(),
+        reason,
+    };
     let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
     let header = header.metadata().clone().unwrap_or_default();
-    let text = |key: &str| header.get(key).ok_or_else(|| mismatch(format!("the header has no {key:?}")));
-    let progress = serde_json::from_str(text(PROGRESS_KEY)?).map_err(|error| mismatch(error.to_string()))?;
-    let steps = text("optimizer_steps")?.parse().map_err(|error| mismatch(format!("optimizer_steps: {error}")))?;
+    let text = |key: &str| {
+        header
+            .get(key)
+            .ok_or_else(|| mismatch(format!("the header has no {key:?}")))
+    };
+    let progress =
+        serde_json::from_str(text(PROGRESS_KEY)?).map_err(|error| mismatch(error.to_string()))?;
+    let steps = text("optimizer_steps")?
+        .parse()
+        .map_err(|error| mismatch(format!("optimizer_steps: {error}")))?;
     let tensors = read_tensors(&bytes).map_err(format)?;
     let mut targets = Vec::new();
     for (name, variable) in variables.variables() {
-        let stored = tensors.get(&format!("parameter.{name}")).filter(|stored| stored.size() == variable.size());
-        let stored = stored.ok_or_else(|| mismatch(format!("no {name:?} of shape {:?}", variable.size())))?;
+        let stored = tensors
+            .get(&format!("parameter.{name}"))
+            .filter(|stored| stored.size() == variable.size());
+        let stored = stored
+            .ok_or_else(|| mismatch(format!("no {name:?} of shape {:?}", variable.size())))?;
         targets.push((variable, stored));
     }
-    optimizer.restore(&tensors, steps).map_err(|name| mismatch(format!("no {name:?} of the right shape")))?;
+    optimizer
+        .restore(&tensors, steps)
+        .map_err(|name| mismatch(format!("no {name:?} of the right shape")))?;
     for (mut variable, stored) in targets {
         let copied = no_grad(|| variable.f_copy_(stored));
-        copied.map_err(|source| CheckpointError::Torch { path: path.to_owned(), source })?;
+        copied.map_err(|source| CheckpointError::Torch {
+            path: path.to_owned(),
+            source,
+        })?;
     }
     Ok(progress)
 }
@@ -132,7 +174,13 @@ fn values(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
 fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorError> {
     let file = SafeTensors::deserialize(bytes)?;
     let read = |(name, view): (&str, TensorView<'_>)| {
-        let values: Vec<f32> = view.data().as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect();
+        let values: Vec<f32> = view
+            .data()
+            .as_chunks()
+            .0
+            .iter()
+            .map(|&bytes| f32::from_le_bytes(bytes))
+            .collect();
         let shape: Vec<i64> = view.shape().iter().map(|&size| size as i64).collect();
         (name.to_owned(), Tensor::from_slice(&values).reshape(shape))
     };
@@ -149,14 +197,24 @@ mod tests {
 
     fn network(size: i64) -> (VarStore, AdamW) {
         let variables = VarStore::new(Device::Cpu);
-        let _ = variables.root().var("weight", &[size, 2], Init::Randn { mean: 0.0, stdev: 1.0 });
+        let _ = variables.root().var(
+            "weight",
+            &[size, 2],
+            Init::Randn {
+                mean: 0.0,
+                stdev: 1.0,
+            },
+        );
         let optimizer = AdamW::new(&variables, AdamWConfig::default());
         (variables, optimizer)
     }
 
     fn step(variables: &VarStore, optimizer: &mut AdamW) {
         optimizer.zero_grad();
-        variables.variables()["weight"].exp().sum(Kind::Float).backward();
+        variables.variables()["weight"]
+            .exp()
+            .sum(Kind::Float)
+            .backward();
         optimizer.step(0.01).unwrap();
     }
 
@@ -170,9 +228,15 @@ mod tests {
         save(&path, &variables, &optimizer, &progress).unwrap();
         step(&variables, &mut optimizer);
         let (resumed, mut resumed_optimizer) = network(3);
-        assert_eq!(restore::<(u64, String)>(&path, &resumed, &mut resumed_optimizer).unwrap(), progress);
+        assert_eq!(
+            restore::<(u64, String)>(&path, &resumed, &mut resumed_optimizer).unwrap(),
+            progress
+        );
         step(&resumed, &mut resumed_optimizer);
-        assert_eq!(resumed.variables()["weight"], variables.variables()["weight"]);
+        assert_eq!(
+            resumed.variables()["weight"],
+            variables.variables()["weight"]
+        );
     }
 
     #[test]
@@ -182,10 +246,18 @@ mod tests {
         let (variables, optimizer) = network(3);
         save(&path, &variables, &optimizer, &1).unwrap();
         let (other, mut other_optimizer) = network(4);
-        let message = restore::<u64>(&path, &other, &mut other_optimizer).unwrap_err().to_string();
-        assert!(message.contains("weight") && message.contains("[4, 2]"), "{message}");
+        let message = restore::<u64>(&path, &other, &mut other_optimizer)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("weight") && message.contains("[4, 2]"),
+            "{message}"
+        );
         let bytes = fs::read(&path).unwrap();
         fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        assert!(matches!(restore::<u64>(&path, &other, &mut other_optimizer), Err(CheckpointError::Format { .. })));
+        assert!(matches!(
+            restore::<u64>(&path, &other, &mut other_optimizer),
+            Err(CheckpointError::Format { .. })
+        ));
     }
 }

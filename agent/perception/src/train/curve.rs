@@ -22,14 +22,20 @@ impl Curve {
     /// # Errors
     /// [`TrainingError::Io`] when the file cannot be read or written.
     pub fn open(path: &Path, header: &str, checkpoint: Option<u64>) -> Result<Self, TrainingError> {
-        let io = |source| TrainingError::Io { path: path.to_owned(), source };
+        let io = |source| TrainingError::Io {
+            path: path.to_owned(),
+            source,
+        };
         let kept = match checkpoint {
             Some(step) if path.exists() => rows_until(&fs::read_to_string(path).map_err(io)?, step),
             _ => format!("{header}\n"),
         };
         atomic_file::write(path, kept).map_err(io)?;
         let file = OpenOptions::new().append(true).open(path).map_err(io)?;
-        Ok(Self { path: path.to_owned(), file })
+        Ok(Self {
+            path: path.to_owned(),
+            file,
+        })
     }
 
     /// Path of the file.
@@ -43,7 +49,10 @@ impl Curve {
     /// # Errors
     /// [`TrainingError::Io`] when the file cannot be written.
     pub fn row(&mut self, row: &str) -> Result<(), TrainingError> {
-        writeln!(self.file, "{row}").map_err(|source| TrainingError::Io { path: self.path.clone(), source })
+        writeln!(self.file, "{row}").map_err(|source| TrainingError::Io {
+            path: self.path.clone(),
+            source,
+        })
     }
 
     /// Appends a row of numbers.
@@ -59,11 +68,16 @@ impl Curve {
 /// The header and all rows up to `step`; a truncated last row is left out.
 fn rows_until(csv: &str, step: u64) -> String {
     let is_kept = |row: &str| {
-        let first = row.split(',').next().and_then(|cell| cell.parse::<f64>().ok());
+        let first = row
+            .split(',')
+            .next()
+            .and_then(|cell| cell.parse::<f64>().ok());
         row.ends_with('\n') && first.is_some_and(|found| found <= step as f64)
     };
     let rows = csv.split_inclusive('\n').enumerate();
-    rows.filter(|(place, row)| *place == 0 || is_kept(row)).map(|(_, row)| row).collect()
+    rows.filter(|(place, row)| *place == 0 || is_kept(row))
+        .map(|(_, row)| row)
+        .collect()
 }
 
 #[cfg(test)]
@@ -84,10 +98,17 @@ mod tests {
         let mut resumed = Curve::open(&path, "step,loss", Some(20)).unwrap();
         resumed.row("30,again").unwrap();
         let text = fs::read_to_string(&path).unwrap();
-        assert_eq!(text, "step,loss\n10.00000,0.50000\n20.00000,0.50000\n30,again\n");
+        assert_eq!(
+            text,
+            "step,loss\n10.00000,0.50000\n20.00000,0.50000\n30,again\n"
+        );
 
         drop(Curve::open(&path, "step,loss", None).unwrap());
-        assert_eq!(fs::read_to_string(&path).unwrap(), "step,loss\n", "a new training begins a new curve");
+        assert_eq!(
+            fs::read_to_string(&path).unwrap(),
+            "step,loss\n",
+            "a new training begins a new curve"
+        );
         let elsewhere = folder.path().join("other.csv");
         drop(Curve::open(&elsewhere, "step,loss", Some(7)).unwrap());
         assert_eq!(fs::read_to_string(&elsewhere).unwrap(), "step,loss\n");

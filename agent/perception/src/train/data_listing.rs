@@ -16,9 +16,12 @@ impl DataListing {
     /// Text of the data that are left out; `None` if all can be used.
     #[must_use]
     pub fn left_out(&self) -> Option<String> {
-        let sweeps = (self.without_pose > 0).then(|| format!("{} sweeps without a pose left out", self.without_pose));
-        let problems =
-            self.problems.first().map(|first| format!("{} problems, the first: {first}", self.problems.len()));
+        let sweeps = (self.without_pose > 0)
+            .then(|| format!("{} sweeps without a pose left out", self.without_pose));
+        let problems = self
+            .problems
+            .first()
+            .map(|first| format!("{} problems, the first: {first}", self.problems.len()));
         let all: Vec<String> = sweeps.into_iter().chain(problems).collect();
         (!all.is_empty()).then(|| all.join("; "))
     }
@@ -30,10 +33,17 @@ mod tests {
 
     #[test]
     fn data_that_are_left_out_are_counted() {
-        let whole = DataListing { sha256: "12ab".into(), ..DataListing::default() };
+        let whole = DataListing {
+            sha256: "12ab".into(),
+            ..DataListing::default()
+        };
         assert_eq!(whole.left_out(), None);
         let problems = vec!["a.pcd: cut off".into(), "b.yaml: empty".into()];
-        let lacking = DataListing { without_pose: 3, problems, ..whole };
+        let lacking = DataListing {
+            without_pose: 3,
+            problems,
+            ..whole
+        };
         assert_eq!(
             lacking.left_out().unwrap(),
             "3 sweeps without a pose left out; 2 problems, the first: a.pcd: cut off"

@@ -98,7 +98,8 @@ impl TrainingOptions {
             precision: self.precision_on(device, has_bfloat16()),
             loader_threads: self.loader_threads,
             resume: self.resume,
-            interruption: Interruption::by_signals().map_err(|error| OptionsError::Signals(error.to_string()))?,
+            interruption: Interruption::by_signals()
+                .map_err(|error| OptionsError::Signals(error.to_string()))?,
             command: std::env::args().collect::<Vec<_>>().join(" "),
             ..RunConfig::new(self.length()?, &self.out)
         })
@@ -109,23 +110,33 @@ impl TrainingOptions {
     /// # Errors
     /// As [`output::line`].
     pub fn print(&self, trained: &Trained, more: &serde_json::Value) -> io::Result<()> {
-        let Trained { steps, seconds, weights, sha256, .. } = trained;
+        let Trained {
+            steps,
+            seconds,
+            weights,
+            sha256,
+            ..
+        } = trained;
         if self.json {
-            let mut report =
-                serde_json::json!({"steps": steps, "seconds": seconds, "weights": weights, "sha256": sha256});
+            let mut report = serde_json::json!({"steps": steps, "seconds": seconds, "weights": weights, "sha256": sha256});
             if let (Some(report), Some(more)) = (report.as_object_mut(), more.as_object()) {
                 report.extend(more.clone());
             }
             output::line(report)
         } else {
-            output::line(format_args!("{steps} steps in {seconds:.0} s: {}", weights.display()))
+            output::line(format_args!(
+                "{steps} steps in {seconds:.0} s: {}",
+                weights.display()
+            ))
         }
     }
 
     /// The number format of a device: bfloat16 without support in the CPU would take many times longer.
     fn precision_on(&self, device: Device, has_bfloat16: bool) -> ComputePrecision {
         if self.precision == ComputePrecision::Bf16 && device == Device::Cpu && !has_bfloat16 {
-            output::note("--precision bf16: this CPU has no native bfloat16, so f32 is used, which is faster here");
+            output::note(
+                "--precision bf16: this CPU has no native bfloat16, so f32 is used, which is faster here",
+            );
             return ComputePrecision::F32;
         }
         self.precision
@@ -151,7 +162,11 @@ impl TrainingOptions {
 pub fn check_out(out: &Path, resume: bool, force: bool) -> Result<(), OptionsError> {
     let [weights, checkpoint] = ["weights.safetensors", CHECKPOINT_FILE].map(|name| out.join(name));
     if resume {
-        return if checkpoint.exists() { Ok(()) } else { Err(OptionsError::NoCheckpoint(checkpoint)) };
+        return if checkpoint.exists() {
+            Ok(())
+        } else {
+            Err(OptionsError::NoCheckpoint(checkpoint))
+        };
     }
     match [weights, checkpoint].into_iter().find(|file| file.exists()) {
         Some(file) if !force => Err(OptionsError::Trained(file)),
@@ -163,7 +178,11 @@ impl ComputePrecision {
     /// The fastest number format of a device.
     #[must_use]
     pub fn fastest_on(device: Device) -> Self {
-        if device != Device::Cpu || has_bfloat16() { Self::Bf16 } else { Self::F32 }
+        if device != Device::Cpu || has_bfloat16() {
+            Self::Bf16
+        } else {
+            Self::F32
+        }
     }
 }
 
@@ -198,42 +217,82 @@ mod tests {
     fn a_length_above_zero_is_needed() {
         let run = run_config("train --minutes 1.5 --out runs/x", 4).unwrap();
         assert_eq!(run.length, Length::Time(Duration::from_secs(90)));
-        assert_eq!((run.precision, run.batch, run.seed, run.resume), (ComputePrecision::F32, 4, 0, false));
-        for length in ["", "--steps 0", "--epochs=-1", "--minutes=-1", "--minutes 1e30", "--minutes nan"] {
+        assert_eq!(
+            (run.precision, run.batch, run.seed, run.resume),
+            (ComputePrecision::F32, 4, 0, false)
+        );
+        for length in [
+            "",
+            "--steps 0",
+            "--epochs=-1",
+            "--minutes=-1",
+            "--minutes 1e30",
+            "--minutes nan",
+        ] {
             let line = format!("train --out x {length}");
-            assert_eq!(run_config(&line, 4).unwrap_err(), OptionsError::Length, "{line}");
+            assert_eq!(
+                run_config(&line, 4).unwrap_err(),
+                OptionsError::Length,
+                "{line}"
+            );
         }
-        assert_eq!(run_config("train --out x --steps 3", 0).unwrap_err(), OptionsError::Batch);
-        assert!(Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--minutes", "3"]).is_err());
+        assert_eq!(
+            run_config("train --out x --steps 3", 0).unwrap_err(),
+            OptionsError::Batch
+        );
+        assert!(
+            Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--minutes", "3"])
+                .is_err()
+        );
     }
 
     #[test]
     fn a_training_is_overwritten_only_on_request() {
         let folder = tempfile::tempdir().unwrap();
-        let line = |rest: &str| run_config(&format!("train --steps 3 --out {} {rest}", folder.path().display()), 4);
+        let line = |rest: &str| {
+            run_config(
+                &format!("train --steps 3 --out {} {rest}", folder.path().display()),
+                4,
+            )
+        };
         assert!(line("").is_ok());
         let checkpoint = folder.path().join("checkpoint.safetensors");
-        assert_eq!(line("--resume").unwrap_err(), OptionsError::NoCheckpoint(checkpoint));
+        assert_eq!(
+            line("--resume").unwrap_err(),
+            OptionsError::NoCheckpoint(checkpoint)
+        );
         for name in ["checkpoint.safetensors", "weights.safetensors"] {
             let file = folder.path().join(name);
             std::fs::write(&file, b"").unwrap();
             assert_eq!(line("").unwrap_err(), OptionsError::Trained(file), "{name}");
         }
         let message = line("").unwrap_err().to_string();
-        assert!(message.contains("weights.safetensors") && message.contains("--resume") && message.contains("--force"));
+        assert!(
+            message.contains("weights.safetensors")
+                && message.contains("--resume")
+                && message.contains("--force")
+        );
         assert!(line("--resume").unwrap().resume && !line("--force").unwrap().resume);
-        assert!(Line::try_parse_from(["train", "--steps", "3", "--out", "x", "--resume", "--force"]).is_err());
+        assert!(
+            Line::try_parse_from(["train", "--steps", "3", "--out", "x", "--resume", "--force"])
+                .is_err()
+        );
     }
 
     #[test]
     fn bfloat16_is_used_where_the_device_has_it() {
         let precision = |name: &str, device, has_bfloat16| {
-            let line = Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--precision", name]).unwrap();
+            let line =
+                Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--precision", name])
+                    .unwrap();
             line.options.precision_on(device, has_bfloat16)
         };
         assert_eq!(precision("bf16", Device::Cpu, true), ComputePrecision::Bf16);
         assert_eq!(precision("bf16", Device::Cpu, false), ComputePrecision::F32);
-        assert_eq!(precision("bf16", Device::Cuda(0), false), ComputePrecision::Bf16);
+        assert_eq!(
+            precision("bf16", Device::Cuda(0), false),
+            ComputePrecision::Bf16
+        );
         assert_eq!(precision("f32", Device::Cpu, true), ComputePrecision::F32);
     }
 }

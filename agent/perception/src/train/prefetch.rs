@@ -23,16 +23,27 @@ pub struct Prefetch<T> {
 impl<T: Send + 'static> Prefetch<T> {
     /// Starts `threads` threads; `prepare` gets the numbers of batches from `first` on.
     #[must_use]
-    pub fn start(threads: usize, first: u64, prepare: impl FnMut(u64) -> T + Clone + Send + 'static) -> Self {
+    pub fn start(
+        threads: usize,
+        first: u64,
+        prepare: impl FnMut(u64) -> T + Clone + Send + 'static,
+    ) -> Self {
         let count = threads.max(1);
         let (queues, threads) = (0..count)
             .map(|thread| {
                 let (sender, receiver) = sync_channel(AHEAD);
                 let prepare = prepare.clone();
-                (receiver, thread::spawn(move || work(prepare, first + thread as u64, count, &sender)))
+                (
+                    receiver,
+                    thread::spawn(move || work(prepare, first + thread as u64, count, &sender)),
+                )
             })
             .unzip();
-        Self { queues, threads, next: 0 }
+        Self {
+            queues,
+            threads,
+            next: 0,
+        }
     }
 
     /// The next batch.
@@ -42,7 +53,9 @@ impl<T: Send + 'static> Prefetch<T> {
     pub fn next_batch(&mut self) -> Result<T, TrainingError> {
         let queue = self.next;
         self.next = (queue + 1) % self.queues.len();
-        self.queues[queue].recv().map_err(|_| TrainingError::LoaderGone)
+        self.queues[queue]
+            .recv()
+            .map_err(|_| TrainingError::LoaderGone)
     }
 }
 
@@ -75,7 +88,10 @@ mod tests {
         for threads in 1..4 {
             let mut batches = Prefetch::start(threads, 5, |number| number * number);
             let got: Vec<u64> = (0..10).map(|_| batches.next_batch().unwrap()).collect();
-            assert_eq!(got, (5..15).map(|number| number * number).collect::<Vec<u64>>());
+            assert_eq!(
+                got,
+                (5..15).map(|number| number * number).collect::<Vec<u64>>()
+            );
         }
     }
 }

@@ -66,14 +66,19 @@ impl RunConfig {
     /// [`TrainingError::Io`] when the folder cannot be created, or the checkpoint not removed.
     pub fn start(&self) -> Result<(), TrainingError> {
         tch::manual_seed(self.seed as i64);
-        std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io { path: self.out.clone(), source })?;
+        std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io {
+            path: self.out.clone(),
+            source,
+        })?;
         if self.resume {
             return Ok(());
         }
         // Of a training that is overwritten: --resume would go on with it if this one ended before its first checkpoint.
         let path = self.out.join(CHECKPOINT_FILE);
         match std::fs::remove_file(&path) {
-            Err(source) if source.kind() != std::io::ErrorKind::NotFound => Err(TrainingError::Io { path, source }),
+            Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+                Err(TrainingError::Io { path, source })
+            }
             _ => Ok(()),
         }
     }
@@ -131,11 +136,19 @@ mod tests {
     fn a_training_that_starts_anew_leaves_no_older_checkpoint_to_resume() {
         let folder = tempfile::tempdir().unwrap();
         let checkpoint = folder.path().join(CHECKPOINT_FILE);
-        let run = RunConfig { resume: true, ..RunConfig::new(Length::Steps(1), folder.path()) };
+        let run = RunConfig {
+            resume: true,
+            ..RunConfig::new(Length::Steps(1), folder.path())
+        };
         std::fs::write(&checkpoint, b"").unwrap();
         run.start().unwrap();
         assert!(checkpoint.exists());
-        RunConfig { resume: false, ..run }.start().unwrap();
+        RunConfig {
+            resume: false,
+            ..run
+        }
+        .start()
+        .unwrap();
         assert!(!checkpoint.exists());
     }
 }

@@ -21,7 +21,8 @@ impl OneCycle {
     #[must_use]
     pub fn at(&self, progress: f64) -> f64 {
         let progress = progress.clamp(0.0, 1.0);
-        let between = |from: f64, to: f64, share: f64| to + (from - to) * (1.0 + (PI * share).cos()) / 2.0;
+        let between =
+            |from: f64, to: f64, share: f64| to + (from - to) * (1.0 + (PI * share).cos()) / 2.0;
         self.peak
             * if progress < RISE {
                 between(START, 1.0, progress / RISE)
@@ -42,7 +43,9 @@ mod tests {
         assert!((cycle.at(RISE) - 2e-3).abs() < 1e-12);
         assert!((cycle.at(1.0) - 2e-6).abs() < 1e-12);
         assert!((cycle.at(7.0) - cycle.at(1.0)).abs() < 1e-12);
-        let falling: Vec<f64> = (2..=20).map(|step| cycle.at(f64::from(step) / 20.0)).collect();
+        let falling: Vec<f64> = (2..=20)
+            .map(|step| cycle.at(f64::from(step) / 20.0))
+            .collect();
         assert!(falling.is_sorted_by(|a, b| a > b));
     }
 }

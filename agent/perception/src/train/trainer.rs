@@ -46,8 +46,15 @@ impl Progress {
             ("batch", self.batch.to_string(), requested.batch.to_string()),
             ("method", text(&self.method), text(&requested.method)),
         ];
-        match fields.into_iter().find(|(_, found, requested)| found != requested) {
-            Some((field, found, requested)) => Err(TrainingError::OtherTraining { field, found, asked: requested }),
+        match fields
+            .into_iter()
+            .find(|(_, found, requested)| found != requested)
+        {
+            Some((field, found, requested)) => Err(TrainingError::OtherTraining {
+                field,
+                found,
+                asked: requested,
+            }),
             None => Ok(()),
         }
     }
@@ -104,14 +111,23 @@ impl Trainer {
             method: method.map(str::to_owned),
         };
         if run.resume {
-            let stored: Progress = checkpoint::restore(&checkpoint_path(run), variables, &mut optimizer)?;
+            let stored: Progress =
+                checkpoint::restore(&checkpoint_path(run), variables, &mut optimizer)?;
             stored.check(&progress)?;
             progress = stored;
         }
         let seconds_before = progress.seconds;
         progress.preparing_seconds += started.elapsed().as_secs_f64();
         let steps = run.interruption.steps();
-        Ok(Self { run: run.clone(), optimizer, progress, skipped: 0, started, seconds_before, steps })
+        Ok(Self {
+            run: run.clone(),
+            optimizer,
+            progress,
+            skipped: 0,
+            started,
+            seconds_before,
+            steps,
+        })
     }
 
     /// Training curve, in `curve.csv` of the folder of the results.
@@ -150,13 +166,18 @@ impl Trainer {
     /// Share of the training that is done after `epoch` passes over the data, 0 at the start, 1 or more at the end.
     #[must_use]
     pub fn share_done(&self, epoch: f64) -> f64 {
-        self.run.length.share_done(self.steps(), epoch, self.seconds())
+        self.run
+            .length
+            .share_done(self.steps(), epoch, self.seconds())
     }
 
     /// The learning rate when a share is done.
     #[must_use]
     pub fn learning_rate(&self, share_done: f64) -> f64 {
-        OneCycle { peak: self.run.learning_rate }.at(share_done)
+        OneCycle {
+            peak: self.run.learning_rate,
+        }
+        .at(share_done)
     }
 
     /// Descends along the gradient of `loss`, or skips the step if that is not finite. True if the step was taken.
@@ -181,7 +202,12 @@ impl Trainer {
     /// [`TrainingError::Checkpoint`] when the file cannot be written.
     pub fn checkpoint(&mut self, variables: &VarStore) -> Result<(), TrainingError> {
         self.progress.seconds = self.seconds();
-        Ok(checkpoint::save(&checkpoint_path(&self.run), variables, &self.optimizer, &self.progress)?)
+        Ok(checkpoint::save(
+            &checkpoint_path(&self.run),
+            variables,
+            &self.optimizer,
+            &self.progress,
+        )?)
     }
 
     /// Ends the training if that was requested; writes a checkpoint before. To be called after each step.
@@ -232,14 +258,42 @@ mod tests {
 
     #[test]
     fn progress_of_localizers_and_detectors_is_read_and_another_training_rejected() {
-        let localizer: Progress = serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4}"#).unwrap();
+        let localizer: Progress =
+            serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4}"#).unwrap();
         let detector: Progress =
-            serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4,"method":"max"}"#).unwrap();
-        assert!(localizer.check(&Progress { step: 0, seconds: 0.0, ..localizer.clone() }).is_ok());
+            serde_json::from_str(r#"{"step":7,"seconds":1.5,"seed":3,"batch":4,"method":"max"}"#)
+                .unwrap();
+        assert!(
+            localizer
+                .check(&Progress {
+                    step: 0,
+                    seconds: 0.0,
+                    ..localizer.clone()
+                })
+                .is_ok()
+        );
         for (requested, expected) in [
-            (Progress { seed: 4, ..detector.clone() }, "seed 3, not 4"),
-            (Progress { batch: 8, ..detector.clone() }, "batch 4, not 8"),
-            (Progress { method: Some("attention".into()), ..detector.clone() }, "method max, not attention"),
+            (
+                Progress {
+                    seed: 4,
+                    ..detector.clone()
+                },
+                "seed 3, not 4",
+            ),
+            (
+                Progress {
+                    batch: 8,
+                    ..detector.clone()
+                },
+                "batch 4, not 8",
+            ),
+            (
+                Progress {
+                    method: Some("attention".into()),
+                    ..detector.clone()
+                },
+                "method max, not attention",
+            ),
         ] {
             let message = detector.check(&requested).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");

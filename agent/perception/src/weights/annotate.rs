@@ -21,9 +21,16 @@ const METADATA: &str = "__metadata__";
 /// # Errors
 /// [`WeightsError`] when the file is missing, not a complete safetensors file or not writable.
 pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, WeightsError> {
-    let io = |source| WeightsError::Io { path: path.to_owned(), source };
+    let io = |source| WeightsError::Io {
+        path: path.to_owned(),
+        source,
+    };
     let old = fs::read(path).map_err(io)?;
-    let format = |source| WeightsError::Format { path: path.to_owned(), size: old.len(), source };
+    let format = |source| WeightsError::Format {
+        path: path.to_owned(),
+        size: old.len(),
+        source,
+    };
     SafeTensors::deserialize(&old).map_err(format)?;
     let new = annotated(&old, key, text).map_err(|source| WeightsError::Metadata {
         path: path.to_owned(),
@@ -40,7 +47,9 @@ fn annotated(file: &[u8], key: &str, text: &str) -> Result<Vec<u8>, serde_json::
     let length = u64::from_le_bytes(length) as usize;
     let (header, data) = file[8..].split_at(length);
     let mut entries: BTreeMap<String, Value> = serde_json::from_slice(header)?;
-    let metadata = entries.entry(METADATA.to_owned()).or_insert_with(|| Value::Object(serde_json::Map::new()));
+    let metadata = entries
+        .entry(METADATA.to_owned())
+        .or_insert_with(|| Value::Object(serde_json::Map::new()));
     if let Value::Object(texts) = metadata {
         texts.insert(key.to_owned(), Value::String(text.to_owned()));
     }
@@ -48,7 +57,12 @@ fn annotated(file: &[u8], key: &str, text: &str) -> Result<Vec<u8>, serde_json::
     let mut header = serde_json::to_vec(&entries)?;
     // Tensor data begin at a multiple of eight.
     header.resize(header.len().next_multiple_of(8), b' ');
-    Ok([&(header.len() as u64).to_le_bytes(), header.as_slice(), data].concat())
+    Ok([
+        &(header.len() as u64).to_le_bytes(),
+        header.as_slice(),
+        data,
+    ]
+    .concat())
 }
 
 #[cfg(test)]
@@ -72,11 +86,17 @@ mod tests {
         for text in ["first", "second \"text\""] {
             let sha256 = annotate(&path, "confidence", text).unwrap();
             let weights = Weights::load(&path).unwrap();
-            assert_eq!((weights.metadata("confidence"), weights.sha256()), (Some(text), sha256.as_str()));
+            assert_eq!(
+                (weights.metadata("confidence"), weights.sha256()),
+                (Some(text), sha256.as_str())
+            );
             assert_eq!(weights.metadata("config"), Some("{\"x\":1}"));
             let _ = tch::no_grad(|| network.variables()["b"].shallow_clone().zero_());
             weights.copy_into(&network).unwrap();
-            let off = (network.variables()["b"].shallow_clone() - &before).abs().max().to_kind(Kind::Double);
+            let off = (network.variables()["b"].shallow_clone() - &before)
+                .abs()
+                .max()
+                .to_kind(Kind::Double);
             assert_eq!(off.double_value(&[]), 0.0);
         }
     }

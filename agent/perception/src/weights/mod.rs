@@ -62,9 +62,16 @@ impl Weights {
     /// # Errors
     /// [`WeightsError`] when the file is missing, truncated, or holds values that are no parameters.
     pub fn load(path: &Path) -> Result<Self, WeightsError> {
-        let io = |source| WeightsError::Io { path: path.to_owned(), source };
+        let io = |source| WeightsError::Io {
+            path: path.to_owned(),
+            source,
+        };
         let bytes = bounded_file::read(path, MAX_BYTES).map_err(io)?;
-        let format = |source| WeightsError::Format { path: path.to_owned(), size: bytes.len(), source };
+        let format = |source| WeightsError::Format {
+            path: path.to_owned(),
+            size: bytes.len(),
+            source,
+        };
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
         let file = SafeTensors::deserialize(&bytes).map_err(format)?;
         let mut tensors = BTreeMap::new();
@@ -74,8 +81,18 @@ impl Weights {
                 tensors.insert(name.to_owned(), Values { shape, values });
             }
         }
-        let metadata = header.metadata().clone().unwrap_or_default().into_iter().collect();
-        Ok(Self { path: path.to_owned(), metadata, tensors, sha256: hex(&Sha256::digest(&bytes)) })
+        let metadata = header
+            .metadata()
+            .clone()
+            .unwrap_or_default()
+            .into_iter()
+            .collect();
+        Ok(Self {
+            path: path.to_owned(),
+            metadata,
+            tensors,
+            sha256: hex(&Sha256::digest(&bytes)),
+        })
     }
 
     /// SHA-256 of the file, 64 hexadecimal digits: identifies the model in run records and descriptors.
@@ -88,9 +105,12 @@ impl Weights {
     #[must_use]
     pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
         let mut hash = Sha256::new();
-        for (name, Values { shape, values }) in self.tensors.iter().filter(|(name, _)| wanted(name)) {
+        for (name, Values { shape, values }) in self.tensors.iter().filter(|(name, _)| wanted(name))
+        {
             hash.update(format!("{name} {shape:?}\n"));
-            values.iter().for_each(|value| hash.update(value.to_le_bytes()));
+            values
+                .iter()
+                .for_each(|value| hash.update(value.to_le_bytes()));
         }
         hex(&hash.finalize())
     }
@@ -115,7 +135,10 @@ impl Weights {
     /// Number of parameters.
     #[must_use]
     pub fn parameters(&self) -> usize {
-        self.tensors.values().map(|tensor| tensor.values.len()).sum()
+        self.tensors
+            .values()
+            .map(|tensor| tensor.values.len())
+            .sum()
     }
 
     /// The text under a metadata key.
@@ -131,9 +154,11 @@ impl Weights {
     pub fn check_kind(&self, expected: &'static str) -> Result<(), WeightsError> {
         let detector = || self.metadata(METHOD_KEY).map(|_| DETECTOR_KIND);
         match self.metadata(KIND_KEY).or_else(detector) {
-            Some(found) if found != expected => {
-                Err(WeightsError::Kind { path: self.path.clone(), found: found.to_owned(), expected })
-            }
+            Some(found) if found != expected => Err(WeightsError::Kind {
+                path: self.path.clone(),
+                found: found.to_owned(),
+                expected,
+            }),
             _ => Ok(()),
         }
     }
@@ -160,11 +185,14 @@ impl Weights {
     /// # Errors
     /// [`WeightsError::NoMetadata`] when the key is missing, [`WeightsError::Metadata`] when its JSON has another form.
     pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, WeightsError> {
-        let text = self.metadata.get(key).ok_or_else(|| WeightsError::NoMetadata {
-            path: self.path.clone(),
-            key: key.to_owned(),
-            found: self.metadata.keys().cloned().collect(),
-        })?;
+        let text = self
+            .metadata
+            .get(key)
+            .ok_or_else(|| WeightsError::NoMetadata {
+                path: self.path.clone(),
+                key: key.to_owned(),
+                found: self.metadata.keys().cloned().collect(),
+            })?;
         serde_json::from_str(text).map_err(|source| WeightsError::Metadata {
             path: self.path.clone(),
             key: key.to_owned(),
@@ -177,7 +205,10 @@ impl Weights {
     /// # Errors
     /// [`WeightsError::Metadata`] when the JSON has another form.
     pub fn activation_scales(&self) -> Result<Option<ActivationScales>, WeightsError> {
-        self.metadata.contains_key(SCALES_KEY).then(|| self.metadata_json(SCALES_KEY)).transpose()
+        self.metadata
+            .contains_key(SCALES_KEY)
+            .then(|| self.metadata_json(SCALES_KEY))
+            .transpose()
     }
 
     /// The same weights for a number format: in [`InferencePrecision::Float`] the scales of activations are ignored.
@@ -191,7 +222,10 @@ impl Weights {
 
     /// The error of quantising these weights.
     pub fn quantise_error(&self, source: impl Into<QuantiseError>) -> WeightsError {
-        WeightsError::Quantise { path: self.path.clone(), source: source.into() }
+        WeightsError::Quantise {
+            path: self.path.clone(),
+            source: source.into(),
+        }
     }
 
     /// Copies the parameters into a network; tensors that the network does not have are ignored.
@@ -207,19 +241,31 @@ impl Weights {
     ///
     /// # Errors
     /// As [`Self::copy_into`].
-    pub fn copy_some_into(&self, network: &VarStore, wanted: impl Fn(&str) -> bool) -> Result<(), WeightsError> {
-        let variables: BTreeMap<String, Tensor> =
-            network.variables().into_iter().filter(|(name, _)| wanted(name)).collect();
+    pub fn copy_some_into(
+        &self,
+        network: &VarStore,
+        wanted: impl Fn(&str) -> bool,
+    ) -> Result<(), WeightsError> {
+        let variables: BTreeMap<String, Tensor> = network
+            .variables()
+            .into_iter()
+            .filter(|(name, _)| wanted(name))
+            .collect();
         for (name, variable) in &variables {
             self.checked(name, variable.size())?;
         }
         for (name, mut variable) in variables {
             let source = self.checked(&name, variable.size())?;
             let copied = tch::no_grad(|| {
-                let values = Tensor::f_from_slice(&source.values)?.f_view(source.shape.as_slice())?;
+                let values =
+                    Tensor::f_from_slice(&source.values)?.f_view(source.shape.as_slice())?;
                 variable.f_copy_(&values)
             });
-            copied.map_err(|source| WeightsError::Tensor { path: self.path.clone(), name, source })?;
+            copied.map_err(|source| WeightsError::Tensor {
+                path: self.path.clone(),
+                name,
+                source,
+            })?;
         }
         Ok(())
     }
@@ -244,15 +290,45 @@ impl Weights {
 }
 
 /// The values of one tensor as `f32`; `None` for integers.
-fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<Vec<f32>>, WeightsError> {
+fn read_values(
+    path: &Path,
+    name: &str,
+    view: &TensorView<'_>,
+) -> Result<Option<Vec<f32>>, WeightsError> {
     let data = view.data();
     let values: Vec<f32> = match view.dtype() {
-        Dtype::F16 => data.as_chunks().0.iter().map(|&bytes| f16::from_le_bytes(bytes).to_f32()).collect(),
-        Dtype::BF16 => data.as_chunks().0.iter().map(|&bytes| bf16::from_le_bytes(bytes).to_f32()).collect(),
-        Dtype::F32 => data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
-        Dtype::F64 => data.as_chunks().0.iter().map(|&bytes| f64::from_le_bytes(bytes) as f32).collect(),
+        Dtype::F16 => data
+            .as_chunks()
+            .0
+            .iter()
+            .map(|&bytes| f16::from_le_bytes(bytes).to_f32())
+            .collect(),
+        Dtype::BF16 => data
+            .as_chunks()
+            .0
+            .iter()
+            .map(|&bytes| bf16::from_le_bytes(bytes).to_f32())
+            .collect(),
+        Dtype::F32 => data
+            .as_chunks()
+            .0
+            .iter()
+            .map(|&bytes| f32::from_le_bytes(bytes))
+            .collect(),
+        Dtype::F64 => data
+            .as_chunks()
+            .0
+            .iter()
+            .map(|&bytes| f64::from_le_bytes(bytes) as f32)
+            .collect(),
         Dtype::I64 | Dtype::I32 => return Ok(None),
-        dtype => return Err(WeightsError::Dtype { path: path.to_owned(), name: name.to_owned(), dtype }),
+        dtype => {
+            return Err(WeightsError::Dtype {
+                path: path.to_owned(),
+                name: name.to_owned(),
+                dtype,
+            });
+        }
     };
     check_finite(path, name, &values)?;
     Ok(Some(values))
@@ -263,7 +339,12 @@ fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsEr
         None => Ok(()),
         Some(index) => {
             let value = values[index];
-            Err(WeightsError::NotFinite { path: path.to_owned(), name: name.to_owned(), index, value })
+            Err(WeightsError::NotFinite {
+                path: path.to_owned(),
+                name: name.to_owned(),
+                index,
+                value,
+            })
         }
     }
 }
@@ -292,7 +373,11 @@ mod tests {
     }
 
     fn metadata(config: &DetectorConfig) -> BTreeMap<String, String> {
-        [(CONFIG_KEY.to_owned(), serde_json::to_string(config).unwrap())].into()
+        [(
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(config).unwrap(),
+        )]
+        .into()
     }
 
     #[test]
@@ -306,25 +391,49 @@ mod tests {
         assert_eq!(weights.sha256(), sha256);
         assert_eq!(weights.detector_config().unwrap(), config);
         let is_head = |name: &str| name.starts_with("cls_head");
-        assert_ne!(weights.sha256_of(is_head), weights.sha256_of(|name| !is_head(name)));
+        assert_ne!(
+            weights.sha256_of(is_head),
+            weights.sha256_of(|name| !is_head(name))
+        );
         let second = network(&config);
         weights.copy_into(&second).unwrap();
         let copies = second.variables();
-        assert!(first.variables().iter().all(|(name, tensor)| tensor.equal(&copies[name])));
+        assert!(
+            first
+                .variables()
+                .iter()
+                .all(|(name, tensor)| tensor.equal(&copies[name]))
+        );
     }
 
     #[test]
     fn another_kind_of_network_is_named_before_its_configuration_is_read() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("encoder.safetensors");
-        let about = [(CONFIG_KEY, r#"{"voxel_m": 0.5}"#), (KIND_KEY, "scene encoder")];
-        let about = about.map(|(key, value)| (key.to_owned(), value.to_owned())).into();
+        let about = [
+            (CONFIG_KEY, r#"{"voxel_m": 0.5}"#),
+            (KIND_KEY, "scene encoder"),
+        ];
+        let about = about
+            .map(|(key, value)| (key.to_owned(), value.to_owned()))
+            .into();
         save(&path, &network(&small()), &about, Precision::Single).unwrap();
-        let message = Weights::load(&path).unwrap().detector_config().unwrap_err().to_string();
-        assert!(message.contains("\"scene encoder\"") && message.contains("\"detector\""), "{message}");
+        let message = Weights::load(&path)
+            .unwrap()
+            .detector_config()
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("\"scene encoder\"") && message.contains("\"detector\""),
+            "{message}"
+        );
         let about = [(METHOD_KEY.to_owned(), "max".to_owned())].into();
         save(&path, &network(&small()), &about, Precision::Single).unwrap();
-        let message = Weights::load(&path).unwrap().check_kind("scene encoder").unwrap_err().to_string();
+        let message = Weights::load(&path)
+            .unwrap()
+            .check_kind("scene encoder")
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("\"detector\""), "{message}");
     }
 
@@ -339,7 +448,10 @@ mod tests {
         let copies = second.variables();
         for (name, tensor) in first.variables() {
             let tolerance = if tensor.dim() > 1 { 1e-3 } else { 0.0 };
-            assert!(tensor.allclose(&copies[&name], tolerance, 1e-6, false), "{name}");
+            assert!(
+                tensor.allclose(&copies[&name], tolerance, 1e-6, false),
+                "{name}"
+            );
         }
     }
 
@@ -347,18 +459,44 @@ mod tests {
     fn a_file_of_another_configuration_is_named_with_both_shapes() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("other.safetensors");
-        save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
+        save(
+            &path,
+            &network(&small()),
+            &metadata(&small()),
+            Precision::Single,
+        )
+        .unwrap();
         let weights = Weights::load(&path).unwrap();
-        let wide = DetectorConfig { pillar_channels: 16, ..small() };
+        let wide = DetectorConfig {
+            pillar_channels: 16,
+            ..small()
+        };
         let message = weights.copy_into(&network(&wide)).unwrap_err().to_string();
-        for part in ["other.safetensors", "backbone.blocks.0.1.weight", "[8, 8, 3, 3]", "[8, 16, 3, 3]"] {
+        for part in [
+            "other.safetensors",
+            "backbone.blocks.0.1.weight",
+            "[8, 8, 3, 3]",
+            "[8, 16, 3, 3]",
+        ] {
             assert!(message.contains(part), "{message}");
         }
-        let deep = DetectorConfig { layer_nums: vec![2, 3, 4], ..small() };
+        let deep = DetectorConfig {
+            layer_nums: vec![2, 3, 4],
+            ..small()
+        };
         let message = weights.copy_into(&network(&deep)).unwrap_err().to_string();
-        assert!(message.contains("backbone.blocks.2.13.weight") && message.contains("missing"), "{message}");
-        let message = weights.metadata_json::<DetectorConfig>("fusion").unwrap_err().to_string();
-        assert!(message.contains("fusion") && message.contains("config"), "{message}");
+        assert!(
+            message.contains("backbone.blocks.2.13.weight") && message.contains("missing"),
+            "{message}"
+        );
+        let message = weights
+            .metadata_json::<DetectorConfig>("fusion")
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("fusion") && message.contains("config"),
+            "{message}"
+        );
     }
 
     #[test]
@@ -366,12 +504,21 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cut.safetensors");
         assert!(matches!(Weights::load(&path), Err(WeightsError::Io { .. })));
-        save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
+        save(
+            &path,
+            &network(&small()),
+            &metadata(&small()),
+            Precision::Single,
+        )
+        .unwrap();
         let bytes = std::fs::read(&path).unwrap();
         for length in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..length]).unwrap();
             let message = Weights::load(&path).unwrap_err().to_string();
-            assert!(message.contains("cut.safetensors") && message.contains(&length.to_string()), "{message}");
+            assert!(
+                message.contains("cut.safetensors") && message.contains(&length.to_string()),
+                "{message}"
+            );
         }
     }
 
@@ -381,8 +528,13 @@ mod tests {
         let path = folder.path().join("nan.safetensors");
         let network = network(&small());
         let _ = tch::no_grad(|| network.variables()["cls_head.bias"].get(1).fill_(f64::NAN));
-        let message = save(&path, &network, &metadata(&small()), Precision::Half).unwrap_err().to_string();
-        assert!(message.contains("cls_head.bias") && message.contains("index 1"), "{message}");
+        let message = save(&path, &network, &metadata(&small()), Precision::Half)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("cls_head.bias") && message.contains("index 1"),
+            "{message}"
+        );
         assert!(!path.exists());
     }
 }

@@ -43,13 +43,27 @@ pub fn save(
         stored.push(store(path, name, &variable, precision)?);
     }
     let size = stored.iter().map(|tensor| tensor.bytes.len()).sum();
-    let format = |source| WeightsError::Format { path: path.to_owned(), size, source };
+    let format = |source| WeightsError::Format {
+        path: path.to_owned(),
+        size,
+        source,
+    };
     let views: Result<Vec<_>, _> = (stored.iter())
-        .map(|tensor| Ok((&tensor.name, TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?)))
+        .map(|tensor| {
+            Ok((
+                &tensor.name,
+                TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?,
+            ))
+        })
         .collect();
     let header: HashMap<_, _> = metadata.clone().into_iter().collect();
-    let bytes = with_sorted_header(safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?);
-    let io = |source| WeightsError::Io { path: path.to_owned(), source };
+    let bytes = with_sorted_header(
+        safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?,
+    );
+    let io = |source| WeightsError::Io {
+        path: path.to_owned(),
+        source,
+    };
     atomic_file::write(path, &bytes).map_err(io)?;
     Ok(hex(&Sha256::digest(&bytes)))
 }
@@ -57,14 +71,30 @@ pub fn save(
 /// The same file with its header in the order of names: the library writes metadata in the order of a hash map, and
 /// equal weights should give equal files.
 fn with_sorted_header(bytes: Vec<u8>) -> Vec<u8> {
-    let Some((length, rest)) = bytes.split_first_chunk::<8>() else { return bytes };
-    let Some((header, data)) = rest.split_at_checked(u64::from_le_bytes(*length) as usize) else { return bytes };
-    let Ok(mut entries) = serde_json::from_slice::<BTreeMap<String, serde_json::Value>>(header) else { return bytes };
-    entries.values_mut().for_each(serde_json::Value::sort_all_objects);
-    let Ok(mut header) = serde_json::to_vec(&entries) else { return bytes };
+    let Some((length, rest)) = bytes.split_first_chunk::<8>() else {
+        return bytes;
+    };
+    let Some((header, data)) = rest.split_at_checked(u64::from_le_bytes(*length) as usize) else {
+        return bytes;
+    };
+    let Ok(mut entries) = serde_json::from_slice::<BTreeMap<String, serde_json::Value>>(header)
+    else {
+        return bytes;
+    };
+    entries
+        .values_mut()
+        .for_each(serde_json::Value::sort_all_objects);
+    let Ok(mut header) = serde_json::to_vec(&entries) else {
+        return bytes;
+    };
     // Tensor data begin at a multiple of eight.
     header.resize(header.len().next_multiple_of(8), b' ');
-    [&(header.len() as u64).to_le_bytes(), header.as_slice(), data].concat()
+    [
+        &(header.len() as u64).to_le_bytes(),
+        header.as_slice(),
+        data,
+    ]
+    .concat()
 }
 
 struct Stored {
@@ -74,20 +104,52 @@ struct Stored {
     bytes: Vec<u8>,
 }
 
-fn store(path: &Path, name: String, variable: &Tensor, precision: Precision) -> Result<Stored, WeightsError> {
+fn store(
+    path: &Path,
+    name: String,
+    variable: &Tensor,
+    precision: Precision,
+) -> Result<Stored, WeightsError> {
     let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
-    let flat = tch::no_grad(|| variable.f_to_kind(Kind::Float).and_then(|values| values.f_reshape([-1])));
+    let flat = tch::no_grad(|| {
+        variable
+            .f_to_kind(Kind::Float)
+            .and_then(|values| values.f_reshape([-1]))
+    });
     let values = flat.and_then(|flat| Vec::<f32>::try_from(&flat));
     let values = match values {
         Ok(values) => values,
-        Err(source) => return Err(WeightsError::Tensor { path: path.to_owned(), name, source }),
+        Err(source) => {
+            return Err(WeightsError::Tensor {
+                path: path.to_owned(),
+                name,
+                source,
+            });
+        }
     };
     check_finite(path, &name, &values)?;
     let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
     let (dtype, bytes) = if precision == Precision::Half && shape.len() > 1 && fits {
-        (Dtype::F16, values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect())
+        (
+            Dtype::F16,
+            values
+                .iter()
+                .flat_map(|&value| f16::from_f32(value).to_le_bytes())
+                .collect(),
+        )
     } else {
-        (Dtype::F32, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+        (
+            Dtype::F32,
+            values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect(),
+        )
     };
-    Ok(Stored { name, dtype, shape, bytes })
+    Ok(Stored {
+        name,
+        dtype,
+        shape,
+        bytes,
+    })
 }

@@ -19,7 +19,8 @@ pub(crate) struct Arguments {}
 impl Arguments {
     /// Estimates and prints.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let scenario: Scenario = serde_json::from_reader(io::stdin().lock().take(MAX_BYTES)).context("scenario")?;
+        let scenario: Scenario =
+            serde_json::from_reader(io::stdin().lock().take(MAX_BYTES)).context("scenario")?;
         let capacity = estimate(&Fleet::plan(&scenario)?)?;
         output::line(serde_json::to_string(&capacity)?)?;
         Ok(Outcome::Done)

@@ -59,7 +59,12 @@ pub(crate) struct Arguments {
     #[arg(long)]
     view: bool,
     /// Address of the page (--view).
-    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088", requires = "view")]
+    #[arg(
+        long,
+        value_name = "HOST:PORT",
+        default_value = "127.0.0.1:8088",
+        requires = "view"
+    )]
     listen: SocketAddr,
     /// Print the metrics of the last method's run as JSON instead of a table of all.
     #[arg(long)]
@@ -82,8 +87,13 @@ impl Arguments {
                 scenario.record.get_or_insert_default();
             }
             scenario.check(&file)?;
-            let options = RunOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
-            let result = run_scenario(&scenario, &options).with_context(|| format!("method {method}"))?;
+            let options = RunOptions {
+                runs: self.runs.clone(),
+                programs: programs()?,
+                prefix: "demo",
+            };
+            let result =
+                run_scenario(&scenario, &options).with_context(|| format!("method {method}"))?;
             if !self.json {
                 output::line(report::run_report(&result))?;
             }
@@ -94,7 +104,9 @@ impl Arguments {
             }
         }
         self.print(&results)?;
-        results.iter().for_each(|result| report::print_loss(result, results.len() > 1));
+        results
+            .iter()
+            .for_each(|result| report::print_loss(result, results.len() > 1));
         if let Some(last) = results.last().filter(|last| self.view && !last.interrupted) {
             show_recorded(&last.folder.file("recording.mcap"), self.listen)?;
         }
@@ -103,7 +115,11 @@ impl Arguments {
 
     fn scenario(&self) -> Result<PathBuf, BadInput> {
         let shared = || shared_files::shared(SCENARIO).into_iter().next();
-        let none = || BadInput::new(format!("{SCENARIO} is not beside the programs: name a file by --scenario"));
+        let none = || {
+            BadInput::new(format!(
+                "{SCENARIO} is not beside the programs: name a file by --scenario"
+            ))
+        };
         self.scenario.clone().or_else(shared).ok_or_else(none)
     }
 
@@ -125,7 +141,10 @@ impl Arguments {
         ));
         let began = Instant::now();
         generate(&options)?;
-        output::note(format_args!("generated in {:.1} s", began.elapsed().as_secs_f64()));
+        output::note(format_args!(
+            "generated in {:.1} s",
+            began.elapsed().as_secs_f64()
+        ));
         Ok(folder)
     }
 
@@ -140,12 +159,17 @@ impl Arguments {
     }
 
     fn print(&self, results: &[RunResult]) -> anyhow::Result<()> {
-        let Some(last) = results.last() else { return Ok(()) };
+        let Some(last) = results.last() else {
+            return Ok(());
+        };
         if self.json {
             output::line(serde_json::to_string_pretty(&last.metrics)?)?;
             return Ok(());
         }
-        let metrics: Vec<_> = results.iter().map(|result| result.metrics.clone()).collect();
+        let metrics: Vec<_> = results
+            .iter()
+            .map(|result| result.metrics.clone())
+            .collect();
         output::text(report::table(&metrics))?;
         output::text(report::run_notes(last))?;
         Ok(())
@@ -159,7 +183,9 @@ fn generate(options: &SynthOptions) -> anyhow::Result<()> {
     bar.finish_and_clear();
     match generated {
         Ok(_) => Ok(()),
-        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => Err(error.into()),
+        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => {
+            Err(error.into())
+        }
         Err(error) => Err(BadInput::of(error).into()),
     }
 }

@@ -107,7 +107,12 @@ pub(crate) struct Arguments {
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
     /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` describes the rule].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Number of compute threads, 1 to 256 [default: 1].
     #[arg(long)]
@@ -145,7 +150,8 @@ impl Arguments {
             (true, several) => output::line(serde_json::to_string_pretty(several)?)?,
             (false, several) => {
                 output::text(report::table(several))?;
-                if let Some(protocol) = several.iter().find_map(|metrics| metrics.protocol.as_ref()) {
+                if let Some(protocol) = several.iter().find_map(|metrics| metrics.protocol.as_ref())
+                {
                     output::line(protocol)?;
                 }
             }
@@ -159,7 +165,9 @@ impl Arguments {
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
         self.pose.0.validate().map_err(bad)?;
         if self.rate.0.watch_queue && !self.emulates_link() {
-            return Err(BadInput::new("--watch-queue: without --link there is no queue to watch"));
+            return Err(BadInput::new(
+                "--watch-queue: without --link there is no queue to watch",
+            ));
         }
         let codec = self.codec.0;
         Ok(EvaluationOptions {
@@ -185,7 +193,11 @@ impl Arguments {
             }),
             frames: self.frames.map(at_most),
             stepped: self.emulates_link().then(|| self.stepped()).transpose()?,
-            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
+            part: Part {
+                scenarios: self.scenarios.map(at_most),
+                ticks: None,
+                intensity_scale: self.intensity_scale,
+            },
             protocol: self.protocol.clone(),
             out: self.out.clone(),
         })
@@ -199,17 +211,29 @@ impl Arguments {
         let (mut link, link_folder) =
             LinkConfig::open(self.link.as_deref().unwrap_or("ideal")).map_err(BadInput::of)?;
         if let Some(rate_mbps) = self.bandwidth {
-            link.capacity = CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 };
+            link.capacity = CapacityConfig::TokenBucket {
+                rate_mbps,
+                burst_bytes: 0,
+            };
         }
         if let Some(latency_ms) = self.latency {
             link.delay = DelayModel::ConstantMs(latency_ms);
         }
         link.validate().map_err(BadInput::of)?;
         let &[pose_ms, map_ms, fuse_ms] = &self.compute[..] else {
-            return Err(BadInput::new(format!("--compute takes 3 numbers, not {}", self.compute.len())));
+            return Err(BadInput::new(format!(
+                "--compute takes 3 numbers, not {}",
+                self.compute.len()
+            )));
         };
-        if let Some(ms) = self.compute.iter().find(|ms| !(0.0..=60_000.0).contains(*ms)) {
-            return Err(BadInput::new(format!("--compute: {ms} is not 0 to 60000 ms")));
+        if let Some(ms) = self
+            .compute
+            .iter()
+            .find(|ms| !(0.0..=60_000.0).contains(*ms))
+        {
+            return Err(BadInput::new(format!(
+                "--compute: {ms} is not 0 to 60000 ms"
+            )));
         }
         let defaults = EgoSettings::default();
         let ego = EgoSettings {
@@ -224,7 +248,11 @@ impl Arguments {
             seed: self.seed,
             deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
             pairing: ego.pairing(),
-            compute: ComputeTimes { pose_ms, map_ms, fuse_ms },
+            compute: ComputeTimes {
+                pose_ms,
+                map_ms,
+                fuse_ms,
+            },
             crew: AgentPool::First(usize::MAX),
             vehicles: BTreeMap::new(),
             ticks: 0..usize::MAX,
@@ -242,8 +270,13 @@ fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let mut progress = TableProgress(progress::spinner("frames"));
     let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
     progress.0.finish_and_clear();
-    filled.iter().try_for_each(|table| output::line(table::markdown(table)))?;
-    let cells = filled.iter().flat_map(|table| &table.rows).flat_map(|row| row.cells.iter().flatten());
+    filled
+        .iter()
+        .try_for_each(|table| output::line(table::markdown(table)))?;
+    let cells = filled
+        .iter()
+        .flat_map(|table| &table.rows)
+        .flat_map(|row| row.cells.iter().flatten());
     Ok(left_out(cells.map(|cell| &cell.metrics.left_out)))
 }
 
@@ -252,7 +285,10 @@ struct TableProgress(ProgressBar);
 
 impl TableObserver for TableProgress {
     fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
-        let text = format!("{table}: {row}, {column}{}", if known { ", known" } else { "" });
+        let text = format!(
+            "{table}: {row}, {column}{}",
+            if known { ", known" } else { "" }
+        );
         if self.0.is_hidden() {
             output::note(&text);
         }

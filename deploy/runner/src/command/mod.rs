@@ -44,7 +44,11 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let settings = [malloc_settings::KEPT_MEMORY.as_slice(), &[malloc_settings::ROUTER_THREADS]].concat();
+        let settings = [
+            malloc_settings::KEPT_MEMORY.as_slice(),
+            &[malloc_settings::ROUTER_THREADS],
+        ]
+        .concat();
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Capacity(arguments) => arguments.run(),
@@ -77,12 +81,19 @@ pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
         || cause.is::<EvaluationError>()
         || cause.is::<TableError>()
         || BusError::is_behind(cause)
-        || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
-        || cause.downcast_ref::<RunError>().is_some_and(RunError::is_bad_input)
+        || cause
+            .downcast_ref::<SweepError>()
+            .is_some_and(SweepError::is_bad_input)
+        || cause
+            .downcast_ref::<RunError>()
+            .is_some_and(RunError::is_bad_input)
 }
 
 /// Folder of the programs: they are built and installed together.
 pub(crate) fn programs() -> anyhow::Result<PathBuf> {
     let own = std::env::current_exe().context("folder of this program")?;
-    Ok(own.parent().context("this program is in no folder")?.to_path_buf())
+    Ok(own
+        .parent()
+        .context("this program is in no folder")?
+        .to_path_buf())
 }

@@ -44,12 +44,20 @@ impl Arguments {
             return Ok(Outcome::Done);
         }
         let jobs = usize::from(self.jobs);
-        let options = SweepOptions { out: out.clone(), jobs, dry_run: self.dry_run, keep_maps: self.keep_maps };
+        let options = SweepOptions {
+            out: out.clone(),
+            jobs,
+            dry_run: self.dry_run,
+            keep_maps: self.keep_maps,
+        };
         let swept = sweep.run(&options)?;
         output::text(&swept.table)?;
         if !self.dry_run {
             note_maps(&out.join("maps"));
-            output::note(format_args!("all columns and the report: {}", out.display()));
+            output::note(format_args!(
+                "all columns and the report: {}",
+                out.display()
+            ));
         }
         Ok(left_out(swept.left_out.iter()))
     }
@@ -58,9 +66,14 @@ impl Arguments {
 /// Names the size of the feature maps that are kept.
 fn note_maps(folder: &Path) {
     let files = fs::read_dir(folder).into_iter().flatten().flatten();
-    let bytes: u64 = files.filter_map(|file| Some(file.metadata().ok()?.len())).sum();
+    let bytes: u64 = files
+        .filter_map(|file| Some(file.metadata().ok()?.len()))
+        .sum();
     if bytes > 0 {
         let megabytes = bytes as f64 / 1e6;
-        output::note(format_args!("{megabytes:.1} MB of feature maps in {}", folder.display()));
+        output::note(format_args!(
+            "{megabytes:.1} MB of feature maps in {}",
+            folder.display()
+        ));
     }
 }

@@ -66,7 +66,14 @@ impl Arguments {
         }
         scenario.network.metrics = self.metrics.or(scenario.network.metrics);
         scenario.check(&self.scenario)?;
-        let result = run_scenario(&scenario, &RunOptions { runs: self.runs, programs: programs()?, prefix: "up" })?;
+        let result = run_scenario(
+            &scenario,
+            &RunOptions {
+                runs: self.runs,
+                programs: programs()?,
+                prefix: "up",
+            },
+        )?;
         if self.json {
             output::line(serde_json::to_string_pretty(&result.metrics)?)?;
         } else {

@@ -90,19 +90,39 @@ impl Part {
     ///
     /// # Errors
     /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
-    pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData, EvaluationError> {
-        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+    pub fn open(
+        &self,
+        path: &Path,
+        protocol: &ProtocolConfig,
+    ) -> Result<OpenedData, EvaluationError> {
+        let options = OpenOptions {
+            intensity_scale: self.intensity_scale,
+            ..OpenOptions::default()
+        };
         let dataset = dataset::open_with(path, &options)?;
-        let protocol = protocol.resolve(dataset.layout).map_err(EvaluationError::Protocol)?;
-        let mut scenarios: Vec<Scenario> =
-            dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
-        scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
-        Ok(OpenedData { scenarios, protocol, problems: dataset.problems })
+        let protocol = protocol
+            .resolve(dataset.layout)
+            .map_err(EvaluationError::Protocol)?;
+        let mut scenarios: Vec<Scenario> = dataset
+            .scenarios
+            .iter()
+            .filter_map(|scenario| protocol.arrange(scenario))
+            .collect();
+        scenarios
+            .iter_mut()
+            .for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
+        Ok(OpenedData {
+            scenarios,
+            protocol,
+            problems: dataset.problems,
+        })
     }
 
     /// The requested scenarios.
     pub fn chosen<'a>(&self, scenarios: &'a [Scenario]) -> impl Iterator<Item = &'a Scenario> {
-        let count = self.scenarios.map_or(scenarios.len(), |most| most.min(scenarios.len()));
+        let count = self
+            .scenarios
+            .map_or(scenarios.len(), |most| most.min(scenarios.len()));
         (0..count).map(move |index| &scenarios[index * scenarios.len() / count])
     }
 }
@@ -111,7 +131,9 @@ impl Part {
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
     /// No ground truth for the evaluation.
-    #[error("scenario {scenario} has no true poses of the ego {ego}: its results cannot be evaluated")]
+    #[error(
+        "scenario {scenario} has no true poses of the ego {ego}: its results cannot be evaluated"
+    )]
     NoPoses {
         /// Name of the scenario.
         scenario: String,
@@ -143,8 +165,15 @@ pub enum EvaluationError {
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
 pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let scenarios = options.part.open(&options.dataset, &options.protocol)?.scenarios;
-    let ticks = options.part.chosen(&scenarios).map(|scenario| scenario.ticks.len()).sum();
+    let scenarios = options
+        .part
+        .open(&options.dataset, &options.protocol)?
+        .scenarios;
+    let ticks = options
+        .part
+        .chosen(&scenarios)
+        .map(|scenario| scenario.ticks.len())
+        .sum();
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
@@ -172,7 +201,11 @@ pub(crate) fn judged(
     on_frame: &mut dyn FnMut(),
 ) -> Result<(FrameScores, Evaluator, Instant), EvaluationError> {
     let began = Instant::now();
-    let OpenedData { scenarios, protocol, problems } = options.part.open(&options.dataset, &options.protocol)?;
+    let OpenedData {
+        scenarios,
+        protocol,
+        problems,
+    } = options.part.open(&options.dataset, &options.protocol)?;
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
@@ -186,7 +219,11 @@ pub(crate) fn judged(
         attack: options.attack,
         trust: options.trust,
     })?;
-    if let Some(kept) = options.maps.as_ref().filter(|_| method.exchange() != Exchange::Points) {
+    if let Some(kept) = options
+        .maps
+        .as_ref()
+        .filter(|_| method.exchange() != Exchange::Points)
+    {
         evaluator = evaluator.with_maps(maps(kept, &weights, options.precision, &scenarios)?);
     }
     if let Some(stepped) = &options.stepped {
@@ -195,21 +232,37 @@ pub(crate) fn judged(
     evaluator.add_left_out_files(&problems);
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().sent_channels();
-    let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
+    let map_values =
+        u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
-    let is_timed = options.stepped.as_ref().is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
+    let is_timed = options
+        .stepped
+        .as_ref()
+        .is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
     let mut board: Option<FrameScores> = None;
-    let mut files = options.out.as_ref().map(|out| FrameFiles::create(out, method)).transpose()?;
+    let mut files = options
+        .out
+        .as_ref()
+        .map(|out| FrameFiles::create(out, method))
+        .transpose()?;
     for scenario in options.part.chosen(&scenarios) {
-        let Some(ego) = scenario.agents.first() else { continue };
+        let Some(ego) = scenario.agents.first() else {
+            continue;
+        };
         if !scenario.has_poses(0, 0) {
-            return Err(EvaluationError::NoPoses { scenario: scenario.name.clone(), ego: ego.clone() });
+            return Err(EvaluationError::NoPoses {
+                scenario: scenario.name.clone(),
+                ego: ego.clone(),
+            });
         }
-        let board = board.get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
+        let board = board
+            .get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
-            let is_written = files.as_mut().is_none_or(|files| files.add(&scenario.name, &frame));
+            let is_written = files
+                .as_mut()
+                .is_none_or(|files| files.add(&scenario.name, &frame));
             judge(board, frame, is_timed);
             on_frame();
             if board.records().len() >= left || !is_written {
@@ -222,8 +275,9 @@ pub(crate) fn judged(
             break;
         }
     }
-    let board =
-        board.filter(|board| !board.records().is_empty()).ok_or(EvaluationError::Empty(options.dataset.clone()))?;
+    let board = board
+        .filter(|board| !board.records().is_empty())
+        .ok_or(EvaluationError::Empty(options.dataset.clone()))?;
     files.map(|files| files.finish(&board)).transpose()?;
     Ok((board, evaluator, began))
 }
@@ -235,9 +289,16 @@ fn maps(
     precision: InferencePrecision,
     scenarios: &[Scenario],
 ) -> Result<MapSource, EvaluationError> {
-    let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?.with_precision(precision));
+    let weights = Arc::new(
+        Weights::load(weights)
+            .map_err(EvaluateError::from)?
+            .with_precision(precision),
+    );
     let store = FeatureStore::open(kept, &weights, scenarios, 1, &mut |_, _| {});
-    Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
+    Ok(MapSource::new(
+        Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?),
+        weights,
+    ))
 }
 
 pub(crate) fn metrics(
@@ -251,6 +312,17 @@ pub(crate) fn metrics(
         None => ("offline", began.elapsed().as_secs_f64()),
     };
     let names = [evaluator.ego().method().name(), options.pose_source.name()];
-    let metrics = Metrics::of(board, clock, names, seconds, evaluator.ledger(), Some(evaluator.sent_bytes()));
-    Metrics { left_out: evaluator.left_out().clone(), protocol: evaluator.protocol(), ..metrics }
+    let metrics = Metrics::of(
+        board,
+        clock,
+        names,
+        seconds,
+        evaluator.ledger(),
+        Some(evaluator.sent_bytes()),
+    );
+    Metrics {
+        left_out: evaluator.left_out().clone(),
+        protocol: evaluator.protocol(),
+        ..metrics
+    }
 }

@@ -36,10 +36,19 @@ impl FrameFiles {
     /// [`FrameFilesError`] when there are such files already, or they cannot be written.
     pub(crate) fn create(out: &Path, method: Method) -> Result<Self, FrameFilesError> {
         let folder = out.join(file_name(method));
-        let failed = |source| FrameFilesError { folder: folder.clone(), source };
-        fs::create_dir_all(out).and_then(|()| fs::create_dir(&folder)).map_err(failed)?;
+        let failed = |source| FrameFilesError {
+            folder: folder.clone(),
+            source,
+        };
+        fs::create_dir_all(out)
+            .and_then(|()| fs::create_dir(&folder))
+            .map_err(failed)?;
         let lines = FrameLines::create(&folder).map_err(failed)?;
-        Ok(Self { folder, lines, scenarios: Vec::new() })
+        Ok(Self {
+            folder,
+            lines,
+            scenarios: Vec::new(),
+        })
     }
 
     /// Adds a frame of a scenario; false after an error, which [`Self::finish`] returns.
@@ -53,18 +62,35 @@ impl FrameFiles {
     /// # Errors
     /// [`FrameFilesError`] with the first error of the operating system.
     pub(crate) fn finish(self, board: &FrameScores) -> Result<(), FrameFilesError> {
-        let Self { folder, lines, scenarios } = self;
+        let Self {
+            folder,
+            lines,
+            scenarios,
+        } = self;
         let write = || {
             lines.finish()?;
-            fs::write(folder.join("frames.csv"), frames_csv(board.records(), &BTreeMap::new(), Some(&scenarios)))?;
-            fs::write(folder.join("precision_recall.csv"), board.precision_recall_csv())
+            fs::write(
+                folder.join("frames.csv"),
+                frames_csv(board.records(), &BTreeMap::new(), Some(&scenarios)),
+            )?;
+            fs::write(
+                folder.join("precision_recall.csv"),
+                board.precision_recall_csv(),
+            )
         };
-        write().map_err(|source| FrameFilesError { folder: folder.clone(), source })
+        write().map_err(|source| FrameFilesError {
+            folder: folder.clone(),
+            source,
+        })
     }
 }
 
 /// Name of a method as a name of files.
 fn file_name(method: Method) -> String {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
-    method.name().chars().map(|letter| if is_plain(letter) { letter } else { '-' }).collect()
+    method
+        .name()
+        .chars()
+        .map(|letter| if is_plain(letter) { letter } else { '-' })
+        .collect()
 }

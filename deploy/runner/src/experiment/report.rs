@@ -24,13 +24,22 @@ pub fn run_table(result: &RunResult) -> String {
 /// Pace, stages, CPU, memory and bytes of a run, under its method.
 #[must_use]
 pub fn run_report(result: &RunResult) -> String {
-    format!("\n{} in {}\n{}", result.metrics.method, result.folder.path().display(), result.report)
+    format!(
+        "\n{} in {}\n{}",
+        result.metrics.method,
+        result.folder.path().display(),
+        result.report
+    )
 }
 
 /// Prints the reasons for exit code 3 to standard error, `with_method` under the method of the run.
 pub fn print_loss(result: &RunResult, with_method: bool) {
     if let Some(sentence) = loss::sentence(result) {
-        let method = if with_method { format!("{}: ", result.metrics.method) } else { String::new() };
+        let method = if with_method {
+            format!("{}: ", result.metrics.method)
+        } else {
+            String::new()
+        };
         output::note(format_args!("exit 3: {method}{sentence}"));
     }
 }
@@ -43,8 +52,13 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
         _ => return,
     };
     if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
-        let scenarios = dataset::open(scene).map(|dataset| dataset.scenarios).unwrap_or_default();
-        let map = scenarios.first().and_then(|scenario| scenario.generated_map().ok()).map(|map| map.to_string());
+        let scenarios = dataset::open(scene)
+            .map(|dataset| dataset.scenarios)
+            .unwrap_or_default();
+        let map = scenarios
+            .first()
+            .and_then(|scenario| scenario.generated_map().ok())
+            .map(|map| map.to_string());
         output::note(wrong_place_hint(metrics.pose.no_pose, head, map.as_deref()));
     }
 }
@@ -61,15 +75,32 @@ pub fn run_notes(result: &RunResult) -> String {
         messages.sent, messages.received, messages.in_flight
     );
     if messages.are_stuck() {
-        let _ =
-            writeln!(text, "stuck     most messages were still in flight at the end: the link carries next to nothing");
+        let _ = writeln!(
+            text,
+            "stuck     most messages were still in flight at the end: the link carries next to nothing"
+        );
     }
-    let dropped: Vec<String> = messages.dropped.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
-    let _ = writeln!(text, "dropped   {}", if dropped.is_empty() { "none".into() } else { dropped.join(", ") });
+    let dropped: Vec<String> = messages
+        .dropped
+        .iter()
+        .map(|(reason, count)| format!("{count} {reason}"))
+        .collect();
+    let _ = writeln!(
+        text,
+        "dropped   {}",
+        if dropped.is_empty() {
+            "none".into()
+        } else {
+            dropped.join(", ")
+        }
+    );
     let verdict = if result.balance.is_exact() {
         "every message is accounted for".into()
     } else {
-        format!("{} accounts do not add up, see ledger.json", result.balance.discrepancies.len())
+        format!(
+            "{} accounts do not add up, see ledger.json",
+            result.balance.discrepancies.len()
+        )
     };
     let _ = writeln!(text, "ledger    {verdict}");
     if result.missed > 0 {
@@ -99,9 +130,15 @@ pub fn table(all: &[Metrics]) -> String {
         Column::left("poses", all, |metrics| metrics.pose_source.clone()),
     ];
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
-    columns.push(Column::right(if is_live { "answered" } else { "frames" }, all, frames));
+    columns.push(Column::right(
+        if is_live { "answered" } else { "frames" },
+        all,
+        frames,
+    ));
     for (name, of) in BY_IOU {
-        columns.push(Column::right(&format!("AP@{name}"), all, |metrics| number(of(&metrics.ap_global), 3)));
+        columns.push(Column::right(&format!("AP@{name}"), all, |metrics| {
+            number(of(&metrics.ap_global), 3)
+        }));
     }
     if is_live {
         let all_ticks = |metrics: &Metrics| number(metrics.ap_unanswered_empty.at_50, 3);
@@ -109,13 +146,17 @@ pub fn table(all: &[Metrics]) -> String {
         columns.push(Column::right("AP@0.5 all", all, all_ticks));
         columns.push(Column::right("sAP@0.5", all, streaming));
     } else {
-        columns.push(Column::right("frame order 0.5", all, |metrics| number(metrics.ap_frame_order.at_50, 3)));
+        columns.push(Column::right("frame order 0.5", all, |metrics| {
+            number(metrics.ap_frame_order.at_50, 3)
+        }));
     }
     if all.iter().any(|metrics| metrics.contribution.sent > 0) {
         let fused = |metrics: &Metrics| number(metrics.contribution.fused_per_frame, 2);
         columns.push(Column::right("fused", all, fused));
     }
-    columns.push(Column::right("pose m", all, |metrics| number(metrics.pose.mean_m, 2)));
+    columns.push(Column::right("pose m", all, |metrics| {
+        number(metrics.pose.mean_m, 2)
+    }));
     columns.push(Column::right("latency ms", all, latency));
     columns.push(Column::right("bytes", all, wire_bytes));
     lines(&columns, all.len()) + &comparison(all)
@@ -123,22 +164,46 @@ pub fn table(all: &[Metrics]) -> String {
 
 /// Name of an IoU threshold, and its AP.
 type AtOverlap = (&'static str, fn(&ByIou) -> Option<f64>);
-const BY_IOU: [AtOverlap; 3] = [("0.3", |ap| ap.at_30), ("0.5", |ap| ap.at_50), ("0.7", |ap| ap.at_70)];
+const BY_IOU: [AtOverlap; 3] = [
+    ("0.3", |ap| ap.at_30),
+    ("0.5", |ap| ap.at_50),
+    ("0.7", |ap| ap.at_70),
+];
 
 /// Notes for a comparison: differences between runs, and messages that did not reach an ego.
 fn comparison(all: &[Metrics]) -> String {
     let mut text = String::new();
     if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
         let compare = match all.iter().any(|metrics| metrics.ap_streaming.is_some()) {
-            true => "compare \"AP@0.5 all\" and sAP@0.5, in which unanswered ticks count, and not AP over other frames",
+            true => {
+                "compare \"AP@0.5 all\" and sAP@0.5, in which unanswered ticks count, and not AP over other frames"
+            }
             false => "their AP cannot be compared",
         };
-        let _ = writeln!(text, "\nwarning: rows are evaluated over different frames: {compare}");
+        let _ = writeln!(
+            text,
+            "\nwarning: rows are evaluated over different frames: {compare}"
+        );
     }
-    for Metrics { method, contribution: Contribution { sent, used, sent_bytes_mean, .. }, .. } in all {
+    for Metrics {
+        method,
+        contribution:
+            Contribution {
+                sent,
+                used,
+                sent_bytes_mean,
+                ..
+            },
+        ..
+    } in all
+    {
         if let Some(what) = shared(method).filter(|_| used < sent) {
-            let size = sent_bytes_mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
-            let _ = writeln!(text, "{method}: of {sent} {what}{size} {used} arrived in time");
+            let size =
+                sent_bytes_mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
+            let _ = writeln!(
+                text,
+                "{method}: of {sent} {what}{size} {used} arrived in time"
+            );
         }
     }
     text
@@ -163,14 +228,21 @@ fn frames(metrics: &Metrics) -> String {
 
 fn latency(metrics: &Metrics) -> String {
     match &metrics.latency_ms.capture_to_detection {
-        Percentiles { p50: None, p95: None, .. } => "-".into(),
+        Percentiles {
+            p50: None,
+            p95: None,
+            ..
+        } => "-".into(),
         Percentiles { p50, p95, .. } => format!("{} / {}", number(*p50, 0), number(*p95, 0)),
     }
 }
 
 /// Wire bytes of the fused messages, or if there were none, of all messages sent.
 fn wire_bytes(metrics: &Metrics) -> String {
-    let mean = metrics.comm.wire_bytes_mean.or(metrics.contribution.sent_bytes_mean);
+    let mean = metrics
+        .comm
+        .wire_bytes_mean
+        .or(metrics.contribution.sent_bytes_mean);
     mean.map_or("-".into(), bytes)
 }
 
@@ -183,17 +255,28 @@ struct Column {
 
 impl Column {
     fn left(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
-        Self { name: name.to_owned(), side: Side::Left, cells: all.iter().map(cell).collect() }
+        Self {
+            name: name.to_owned(),
+            side: Side::Left,
+            cells: all.iter().map(cell).collect(),
+        }
     }
 
     fn right(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
-        Self { side: Side::Right, ..Self::left(name, all, cell) }
+        Self {
+            side: Side::Right,
+            ..Self::left(name, all, cell)
+        }
     }
 }
 
 /// Header and rows.
 fn lines(columns: &[Column], rows: usize) -> String {
-    let mut table = TextTable::new(columns.iter().map(|column| (column.name.as_str(), column.side)));
+    let mut table = TextTable::new(
+        columns
+            .iter()
+            .map(|column| (column.name.as_str(), column.side)),
+    );
     (0..rows).for_each(|row| table.row(columns.iter().map(|column| column.cells[row].clone())));
     table.to_string()
 }
@@ -205,8 +288,16 @@ mod tests {
 
     fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
         Metrics {
-            ap_global: ByIou { at_50, ..ByIou::default() },
-            latency_ms: Latencies { capture_to_detection: Percentiles { p50: Some(81.4), ..Percentiles::default() } },
+            ap_global: ByIou {
+                at_50,
+                ..ByIou::default()
+            },
+            latency_ms: Latencies {
+                capture_to_detection: Percentiles {
+                    p50: Some(81.4),
+                    ..Percentiles::default()
+                },
+            },
             frames: 60,
             ticks: 60,
             answered: 60,
@@ -217,7 +308,10 @@ mod tests {
     }
 
     fn answered(method: &str, answered: u64, ap: f64) -> Metrics {
-        let ap = |share: f64| ByIou { at_50: Some(ap * share), ..ByIou::default() };
+        let ap = |share: f64| ByIou {
+            at_50: Some(ap * share),
+            ..ByIou::default()
+        };
         Metrics {
             frames: answered,
             answered,
@@ -231,32 +325,73 @@ mod tests {
     fn columns_line_up_and_missing_numbers_are_dashes() {
         let text = table(&[metrics("none", None), metrics("attention", Some(0.5))]);
         let lines: Vec<&str> = text.lines().collect();
-        assert!(lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()), "{text}");
-        assert!(lines[1].contains("81 / -") && lines[2].contains("0.500"), "{text}");
-        assert!(lines[0].contains("frames") && !lines[0].contains("answered"), "{text}");
+        assert!(
+            lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()),
+            "{text}"
+        );
+        assert!(
+            lines[1].contains("81 / -") && lines[2].contains("0.500"),
+            "{text}"
+        );
+        assert!(
+            lines[0].contains("frames") && !lines[0].contains("answered"),
+            "{text}"
+        );
     }
 
     #[test]
     fn a_live_table_gives_the_answered_ticks_and_warns_where_they_differ() {
         let text = table(&[answered("max", 33, 0.8), answered("pastat", 29, 0.9)]);
         let lines: Vec<&str> = text.lines().collect();
-        assert!(lines[1].contains("33/60") && lines[2].contains("29/60"), "{text}");
-        assert!(lines[1].contains("0.400") && lines[1].contains("0.200"), "all ticks and streaming: {text}");
-        assert!(text.contains("warning: rows are evaluated over different frames"), "{text}");
+        assert!(
+            lines[1].contains("33/60") && lines[2].contains("29/60"),
+            "{text}"
+        );
+        assert!(
+            lines[1].contains("0.400") && lines[1].contains("0.200"),
+            "all ticks and streaming: {text}"
+        );
+        assert!(
+            text.contains("warning: rows are evaluated over different frames"),
+            "{text}"
+        );
         assert!(!table(&[answered("max", 60, 0.8), answered("none", 60, 0.7)]).contains("warning"));
     }
 
     #[test]
     fn undelivered_messages_are_reported() {
-        let contribution =
-            Contribution { fused_per_frame: Some(0.05), sent: 38, used: 2, sent_bytes_mean: Some(3_150_000.0) };
+        let contribution = Contribution {
+            fused_per_frame: Some(0.05),
+            sent: 38,
+            used: 2,
+            sent_bytes_mean: Some(3_150_000.0),
+        };
         let latency_ms = Latencies::default();
-        let ego_only = Metrics { contribution, ..metrics("none", Some(0.7)) };
-        assert!(!table(&[ego_only]).contains("arrived in time"), "it fuses nothing in any case");
-        let text = table(&[Metrics { contribution, latency_ms, ..metrics("max", Some(0.8)) }]);
-        assert!(text.contains("  fused  ") && text.contains("0.05"), "{text}");
-        assert!(text.contains("max: of 38 feature maps of 3.1 MB each 2 arrived in time"), "{text}");
+        let ego_only = Metrics {
+            contribution,
+            ..metrics("none", Some(0.7))
+        };
+        assert!(
+            !table(&[ego_only]).contains("arrived in time"),
+            "it fuses nothing in any case"
+        );
+        let text = table(&[Metrics {
+            contribution,
+            latency_ms,
+            ..metrics("max", Some(0.8))
+        }]);
+        assert!(
+            text.contains("  fused  ") && text.contains("0.05"),
+            "{text}"
+        );
+        assert!(
+            text.contains("max: of 38 feature maps of 3.1 MB each 2 arrived in time"),
+            "{text}"
+        );
         assert!(!text.contains(" / "), "no latency is known: {text}");
-        assert!(!table(&[metrics("max", None)]).contains("fused"), "nothing was transmitted");
+        assert!(
+            !table(&[metrics("max", None)]).contains("fused"),
+            "nothing was transmitted"
+        );
     }
 }

@@ -14,7 +14,9 @@ use ego_fuser::config::EgoConfig;
 use fusion::Exchange;
 use protocol::{CavId, CodecConfig, RunId, Stream};
 use serde::Serialize;
-use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig};
+use sim_replay::config::{
+    LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig,
+};
 
 use super::Fleet;
 use crate::scenario::Clock;
@@ -39,24 +41,48 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub fn processes(
+        &self,
+        context: &SessionContext<'_>,
+    ) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
-        planner.plan(format!("ego-{}", self.ego), "ego-fuser run", RestartPolicy::Service, |bus| {
-            self.ego_config(context, bus)
-        })?;
+        planner.plan(
+            format!("ego-{}", self.ego),
+            "ego-fuser run",
+            RestartPolicy::Service,
+            |bus| self.ego_config(context, bus),
+        )?;
         if self.is_over_link() {
-            planner.plan(format!("link-{}", self.ego), "sim-replay link", RestartPolicy::Service, |bus| {
-                self.link_config(context, bus)
-            })?;
+            planner.plan(
+                format!("link-{}", self.ego),
+                "sim-replay link",
+                RestartPolicy::Service,
+                |bus| self.link_config(context, bus),
+            )?;
         }
-        planner
-            .plan(REPLAY.into(), "sim-replay stream", RestartPolicy::Task, |bus| self.replay_config(context, bus))?;
+        planner.plan(
+            REPLAY.into(),
+            "sim-replay stream",
+            RestartPolicy::Task,
+            |bus| self.replay_config(context, bus),
+        )?;
         if let Some(record) = &self.scenario.record {
             let (run, out) = (context.run.clone(), context.folder.file(RECORDING));
-            let config = |bus| RecorderConfig { run, out, record: record.clone(), keep_running: false, bus };
+            let config = |bus| RecorderConfig {
+                run,
+                out,
+                record: record.clone(),
+                keep_running: false,
+                bus,
+            };
             // A recording cannot be resumed after an interruption.
-            planner.plan(RECORDER.into(), "sim-replay record --json", RestartPolicy::Optional, config)?;
+            planner.plan(
+                RECORDER.into(),
+                "sim-replay record --json",
+                RestartPolicy::Optional,
+                config,
+            )?;
         }
         Ok(planner.specs)
     }
@@ -65,7 +91,10 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub(crate) fn agent_processes(&self, context: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub(crate) fn agent_processes(
+        &self,
+        context: &SessionContext<'_>,
+    ) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
         Ok(planner.specs)
@@ -78,28 +107,56 @@ impl Fleet {
             supervised: true,
             ..BusConfig::default()
         };
-        Planner { context, bus, metrics: self.scenario.network.metrics, specs: Vec::new() }
+        Planner {
+            context,
+            bus,
+            metrics: self.scenario.network.metrics,
+            specs: Vec::new(),
+        }
     }
 
     fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
-        for cav in self.agents.iter().filter(|cav| !self.scenario.remote_agents.contains(cav)) {
+        for cav in self
+            .agents
+            .iter()
+            .filter(|cav| !self.scenario.remote_agents.contains(cav))
+        {
             let context = planner.context;
-            planner.plan(format!("agent-{cav}"), "agent run", RestartPolicy::Service, |bus| {
-                self.agent_config(cav, context, bus)
-            })?;
+            planner.plan(
+                format!("agent-{cav}"),
+                "agent run",
+                RestartPolicy::Service,
+                |bus| self.agent_config(cav, context, bus),
+            )?;
         }
         Ok(())
     }
 
-    fn agent_config(&self, cav: &CavId, context: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
+    fn agent_config(
+        &self,
+        cav: &CavId,
+        context: &SessionContext<'_>,
+        bus: BusConfig,
+    ) -> AgentConfig {
         let mut settings = self.scenario.settings_of(cav);
         let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
-        let turn = self.agents.iter().position(|agent| agent == cav).and_then(|turn| u32::try_from(turn).ok());
-        settings.pose = settings.pose.for_scenario(scene).with_turn(turn.unwrap_or_default());
+        let turn = self
+            .agents
+            .iter()
+            .position(|agent| agent == cav)
+            .and_then(|turn| u32::try_from(turn).ok());
+        settings.pose = settings
+            .pose
+            .for_scenario(scene)
+            .with_turn(turn.unwrap_or_default());
         let is_ego = *cav == self.ego;
         if is_ego {
             // It sends to its own ego, not over the link, and the ego needs its complete feature map.
-            settings.codec = CodecConfig { gate: None, budget_bytes: None, ..settings.codec };
+            settings.codec = CodecConfig {
+                gate: None,
+                budget_bytes: None,
+                ..settings.codec
+            };
             settings.rate = RateConfig::default();
         } else {
             settings.codec.gate = settings.codec.gate.or(self.scenario.method.gate());
@@ -184,20 +241,38 @@ impl Planner<'_> {
         life: RestartPolicy,
         config: impl FnOnce(BusConfig) -> C,
     ) -> Result<(), RunFolderError> {
-        let SessionContext { keys, programs, folder, .. } = self.context;
+        let SessionContext {
+            keys,
+            programs,
+            folder,
+            ..
+        } = self.context;
         self.metrics = self.metrics.and_then(port_behind);
         let keys = keys.map(|keys| keys.of_process(&name));
-        let bus = BusConfig { keys, metrics: self.metrics, ..self.bus.clone() };
+        let bus = BusConfig {
+            keys,
+            metrics: self.metrics,
+            ..self.bus.clone()
+        };
         let file = folder.write_config(&name, &config(bus))?;
         let mut parts = command.split(' ');
         let program = programs.join(parts.next().unwrap_or_default());
         let mut args: Vec<_> = parts.map(Into::into).collect();
         args.extend(["--config".into(), file.into()]);
-        self.specs.push(ProcessSpec { name, program, args, life, metrics: self.metrics });
+        self.specs.push(ProcessSpec {
+            name,
+            program,
+            args,
+            life,
+            metrics: self.metrics,
+        });
         Ok(())
     }
 }
 
 fn port_behind(address: SocketAddr) -> Option<SocketAddr> {
-    Some(SocketAddr::new(address.ip(), address.port().checked_add(1)?))
+    Some(SocketAddr::new(
+        address.ip(),
+        address.port().checked_add(1)?,
+    ))
 }

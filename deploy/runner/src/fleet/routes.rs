@@ -16,11 +16,17 @@ impl Fleet {
         let ego = process_id(Role::Ego, &self.ego);
         let scorer = process_id(Role::Scorer, &scorer_cav());
         let route = |cav: &CavId, stream, receiver: &ProcessId| Route {
-            topic: Topic::Stream { cav: cav.clone(), stream },
+            topic: Topic::Stream {
+                cav: cav.clone(),
+                stream,
+            },
             receiver: receiver.clone(),
         };
         let mut routes = vec![
-            Route { topic: Topic::Truth, receiver: scorer.clone() },
+            Route {
+                topic: Topic::Truth,
+                receiver: scorer.clone(),
+            },
             route(&self.ego, Stream::Detections, &scorer),
         ];
         for cav in &self.agents {
@@ -34,9 +40,16 @@ impl Fleet {
         }
         for cav in self.neighbours() {
             if self.is_over_link() {
-                let topic = Topic::Received { ego: self.ego.clone(), cav: cav.clone(), stream };
+                let topic = Topic::Received {
+                    ego: self.ego.clone(),
+                    cav: cav.clone(),
+                    stream,
+                };
                 routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));
-                routes.push(Route { topic, receiver: ego.clone() });
+                routes.push(Route {
+                    topic,
+                    receiver: ego.clone(),
+                });
             } else {
                 routes.push(route(cav, stream, &ego));
             }
@@ -50,10 +63,20 @@ impl Fleet {
         if self.scenario.record.is_some() {
             let receiver = process_id(Role::Recorder, &recorder_cav());
             let sensors = self.agents.iter().flat_map(|cav| {
-                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::Stream { cav: cav.clone(), stream })
+                [Stream::Lidar, Stream::Gnss, Stream::Imu].map(|stream| Topic::Stream {
+                    cav: cav.clone(),
+                    stream,
+                })
             });
-            let topics: BTreeSet<Topic> = routes.iter().map(|route| route.topic.clone()).chain(sensors).collect();
-            routes.extend(topics.into_iter().map(|topic| Route { topic, receiver: receiver.clone() }));
+            let topics: BTreeSet<Topic> = routes
+                .iter()
+                .map(|route| route.topic.clone())
+                .chain(sensors)
+                .collect();
+            routes.extend(topics.into_iter().map(|topic| Route {
+                topic,
+                receiver: receiver.clone(),
+            }));
         }
         routes
     }

@@ -47,7 +47,13 @@ impl CrewProcesses {
         let keys = fleet.keys(folder)?;
         let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
         let endpoint = &place.endpoint;
-        let specs = fleet.agent_processes(&SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder })?;
+        let specs = fleet.agent_processes(&SessionContext {
+            run,
+            endpoint,
+            keys: keys.as_ref(),
+            programs,
+            folder,
+        })?;
         check_free(&place, &fleet.scenario.network, run, &specs)?;
         let identity = Identity {
             run: run.clone(),
@@ -71,17 +77,41 @@ impl CrewProcesses {
             }
         });
         let stream = fleet.publish().stream();
-        let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), stream)).collect();
+        let vehicles: Vec<_> = fleet
+            .agents
+            .iter()
+            .map(|cav| (cav.clone(), stream))
+            .collect();
         let timeouts = &fleet.scenario.timeouts;
-        let remote = RemotePool::connect(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
-            .map_err(|error| EvaluateError::from(Box::new(error)))?;
+        let remote = RemotePool::connect(
+            &bus,
+            &vehicles,
+            Duration::from_secs_f64(timeouts.ready_s),
+            &stop,
+        )
+        .map_err(|error| EvaluateError::from(Box::new(error)))?;
         let grace = Duration::from_secs_f64(timeouts.stop_s);
-        Ok((Self { supervisor, bus, place, grace, _keys: keys }, remote))
+        Ok((
+            Self {
+                supervisor,
+                bus,
+                place,
+                grace,
+                _keys: keys,
+            },
+            remote,
+        ))
     }
 
     /// Ends all processes; returns the names of those that had to be killed.
     pub(crate) fn end(self) -> Vec<String> {
-        let Self { supervisor, bus, place, grace, _keys } = self;
+        let Self {
+            supervisor,
+            bus,
+            place,
+            grace,
+            _keys,
+        } = self;
         let killed = supervisor.stop(grace).killed;
         for closed in [bus.leave(LEAVE_LIMIT), place.close()] {
             if let Err(overdue) = closed {

@@ -35,16 +35,27 @@ pub fn estimate_apart(fleet: &Fleet, programs: &Path) -> io::Result<Option<Capac
         return Ok(None);
     }
     let mut command = Command::new(programs.join(RUNNER));
-    command.arg("capacity").stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+        .arg("capacity")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
     let mut child = command.spawn()?;
     // A process that ends before it has read the scenario says why itself.
-    drop(child.stdin.take().map(|stdin| serde_json::to_writer(stdin, &fleet.scenario)));
+    drop(
+        child
+            .stdin
+            .take()
+            .map(|stdin| serde_json::to_writer(stdin, &fleet.scenario)),
+    );
     let output = child.wait_with_output()?;
     if output.status.success() {
         return Ok(serde_json::from_slice(&output.stdout)?);
     }
     let reasons = String::from_utf8_lossy(&output.stderr);
-    Err(io::Error::other(reasons.lines().last().unwrap_or_default().to_owned()))
+    Err(io::Error::other(
+        reasons.lines().last().unwrap_or_default().to_owned(),
+    ))
 }
 
 /// Estimates the pace of a fleet. `None` for a run without a pace of its own: in lockstep, as fast as possible, or
@@ -55,8 +66,13 @@ pub fn estimate_apart(fleet: &Fleet, programs: &Path) -> io::Result<Option<Capac
 pub fn estimate(fleet: &Fleet) -> Result<Option<Capacity>, RunError> {
     let scene = &fleet.scenario.scene;
     let recorded = recorded(fleet)?;
-    let steps = recorded.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-    let Some(period_nanos) = steps.min().filter(|_| has_pace(fleet)) else { return Ok(None) };
+    let steps = recorded
+        .ticks
+        .windows(2)
+        .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+    let Some(period_nanos) = steps.min().filter(|_| has_pace(fleet)) else {
+        return Ok(None);
+    };
     let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
     fleet.scenario.models.threads.apply();
     let vehicles = fleet.agents.len();
@@ -65,14 +81,30 @@ pub fn estimate(fleet: &Fleet) -> Result<Option<Capacity>, RunError> {
     let elapsed = evaluator.estimate(&recorded, vehicles, BUDGET)?;
     // Share of a core that other programs leave.
     let left = ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
-    let [pose_ms, map_ms, fuse_ms] = [elapsed.pose_ms, elapsed.map_ms, elapsed.fuse_ms].map(|ms| ms * left);
-    let times = ComputeTimes { pose_ms, map_ms, fuse_ms };
+    let [pose_ms, map_ms, fuse_ms] =
+        [elapsed.pose_ms, elapsed.map_ms, elapsed.fuse_ms].map(|ms| ms * left);
+    let times = ComputeTimes {
+        pose_ms,
+        map_ms,
+        fuse_ms,
+    };
     let machine = this_machine();
     let threads = machine.cores.min(vehicles + 1);
-    let shared_speed = left * if threads > 1 { speed_of_many(threads) } else { 1.0 };
+    let shared_speed = left
+        * if threads > 1 {
+            speed_of_many(threads)
+        } else {
+            1.0
+        };
     let remote = fleet.scenario.remote_agents.len();
     let method = fleet.scenario.method.name();
-    Ok(Some(capacity_of(machine, (method, vehicles, vehicles - remote.min(vehicles)), &times, period_ms, shared_speed)))
+    Ok(Some(capacity_of(
+        machine,
+        (method, vehicles, vehicles - remote.min(vehicles)),
+        &times,
+        period_ms,
+        shared_speed,
+    )))
 }
 
 /// Capacity from measured times.
@@ -88,7 +120,9 @@ fn capacity_of(
     let available_ms = machine.cores as f64 * shared_speed * period_ms;
     // Neither an agent nor the ego computes two frames at once.
     let longest_ms = agent_ms.max(fuse_ms) / shared_speed;
-    let expected_share = (available_ms / needed_ms).min(period_ms / longest_ms).min(1.0);
+    let expected_share = (available_ms / needed_ms)
+        .min(period_ms / longest_ms)
+        .min(1.0);
     let method = method.to_owned();
     Capacity {
         machine,
@@ -106,7 +140,9 @@ fn capacity_of(
 }
 /// True if a run has a pace of its own, and one that can be estimated.
 fn has_pace(Fleet { scenario, .. }: &Fleet) -> bool {
-    !scenario.scene.lockstep && scenario.scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu
+    !scenario.scene.lockstep
+        && scenario.scene.rate > 0.0
+        && scenario.models.device == ComputeDevice::Cpu
 }
 
 /// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.
@@ -124,10 +160,21 @@ pub fn remedies(fleet: &Fleet, capacity: Option<&Capacity>) -> String {
         all.push("fewer vehicles (scene.agents)".to_owned());
     }
     let relative = capacity.map_or(0.5, Capacity::relative_rate);
-    all.push(format!("--rate {}", rounded(relative * scenario.scene.rate)));
+    all.push(format!(
+        "--rate {}",
+        rounded(relative * scenario.scene.rate)
+    ));
     // Simulation time refuses processes that are slower than the scene.
-    let fits = capacity.is_none_or(|capacity| capacity.agent_ms.max(capacity.fuse_ms) < 0.9 * capacity.period_ms);
-    all.push(if fits { "clock: stepped" } else { "scene.lockstep: true" }.to_owned());
+    let fits = capacity
+        .is_none_or(|capacity| capacity.agent_ms.max(capacity.fuse_ms) < 0.9 * capacity.period_ms);
+    all.push(
+        if fits {
+            "clock: stepped"
+        } else {
+            "scene.lockstep: true"
+        }
+        .to_owned(),
+    );
     listed(&all, "or")
 }
 
@@ -141,18 +188,34 @@ mod tests {
     use super::*;
 
     fn capacity(cores: usize, pose_ms: f64, fuse_ms: f64, shared_speed: f64) -> Capacity {
-        let machine = Machine { cores, instructions: "AVX2".into() };
-        let times = ComputeTimes { pose_ms, map_ms: 40.0, fuse_ms };
+        let machine = Machine {
+            cores,
+            instructions: "AVX2".into(),
+        };
+        let times = ComputeTimes {
+            pose_ms,
+            map_ms: 40.0,
+            fuse_ms,
+        };
         capacity_of(machine, ("pastat", 2, 2), &times, 100.0, shared_speed)
     }
 
     #[test]
     fn a_machine_with_time_to_spare_keeps_up() {
         let capacity = capacity(4, 20.0, 40.0, 1.0);
-        assert!(capacity.keeps_up() && (capacity.needed_ms, capacity.available_ms) == (192.0, 400.0), "{capacity:?}");
+        assert!(
+            capacity.keeps_up() && (capacity.needed_ms, capacity.available_ms) == (192.0, 400.0),
+            "{capacity:?}"
+        );
         let text = capacity.to_string();
-        assert!(text.contains("4 cores, AVX2; pastat with 2 vehicles needs about 192 ms"), "{text}");
-        assert!(text.ends_with("expect about 10 of 10 frames answered"), "{text}");
+        assert!(
+            text.contains("4 cores, AVX2; pastat with 2 vehicles needs about 192 ms"),
+            "{text}"
+        );
+        assert!(
+            text.ends_with("expect about 10 of 10 frames answered"),
+            "{text}"
+        );
     }
 
     #[test]

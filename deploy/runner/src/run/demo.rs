@@ -24,39 +24,78 @@ pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> 
     }
 }
 
-fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<dyn std::error::Error>> {
-    let pose_of = |cav: &CavId| frame.world_from_lidar.iter().find(|(known, _)| known == cav).map(|(_, pose)| *pose);
+fn try_draw(
+    fleet: &Fleet,
+    frame: &JudgedFrame,
+    path: &Path,
+) -> Result<(), Box<dyn std::error::Error>> {
+    let pose_of = |cav: &CavId| {
+        frame
+            .world_from_lidar
+            .iter()
+            .find(|(known, _)| known == cav)
+            .map(|(_, pose)| *pose)
+    };
     let world_from_ego: Pose = pose_of(&fleet.ego).ok_or("the truth names no pose of the ego")?;
     let dataset = dataset::open(&fleet.scenario.scene.dir)?;
     let name = fleet.scenario.scene.scenario.as_deref();
-    let scenario = dataset.scenarios.iter().find(|known| Some(known.name.as_str()) == name);
+    let scenario = dataset
+        .scenarios
+        .iter()
+        .find(|known| Some(known.name.as_str()) == name);
     let scenario = scenario.ok_or("the scene is gone")?;
-    let options = LoadOptions { lidar_variant: fleet.scenario.scene.variant.clone(), ..LoadOptions::default() };
-    let shown = std::iter::once(&fleet.ego).chain(frame.result.fused.iter().map(|neighbour| &neighbour.cav));
+    let options = LoadOptions {
+        lidar_variant: fleet.scenario.scene.variant.clone(),
+        ..LoadOptions::default()
+    };
+    let shown = std::iter::once(&fleet.ego)
+        .chain(frame.result.fused.iter().map(|neighbour| &neighbour.cav));
     let mut loaded = Vec::new();
     for cav in shown {
-        let (Some(index), Some(world_from_cav)) = (scenario.agents.iter().position(|agent| agent == cav), pose_of(cav))
-        else {
+        let (Some(index), Some(world_from_cav)) = (
+            scenario.agents.iter().position(|agent| agent == cav),
+            pose_of(cav),
+        ) else {
             continue;
         };
         let recorded = scenario.load(index, usize::try_from(frame.tick)?, &options)?;
-        loaded.push((cav.to_string(), world_from_ego.from_world(&world_from_cav), recorded.points.xyzi));
+        loaded.push((
+            cav.to_string(),
+            world_from_ego.from_world(&world_from_cav),
+            recorded.points.xyzi,
+        ));
     }
     let rule = fleet.ground_truth_rule();
-    let detections: Vec<_> =
-        frame.result.detections.iter().map(|detection| (detection.box3d, detection.score)).collect();
+    let detections: Vec<_> = frame
+        .result
+        .detections
+        .iter()
+        .map(|detection| (detection.box3d, detection.score))
+        .collect();
     let places = |axis: usize| {
-        let boxes = frame.truth.iter().chain(detections.iter().map(|(found, _)| found));
-        let vehicles = loaded.iter().map(move |(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
+        let boxes = frame
+            .truth
+            .iter()
+            .chain(detections.iter().map(|(found, _)| found));
+        let vehicles = loaded
+            .iter()
+            .map(move |(_, ego_from_cav, _)| ego_from_cav.translation_m[axis]);
         boxes.map(move |shape| shape.center_m[axis]).chain(vehicles)
     };
     Picture {
-        title: format!("{}  tick {} (most neighbours)  {}", fleet.scenario.method, frame.tick, scenario.name),
+        title: format!(
+            "{}  tick {} (most neighbours)  {}",
+            fleet.scenario.method, frame.tick, scenario.name
+        ),
         x_m: around(places(0), rule.x_m),
         y_m: around(places(1), rule.y_m),
         views: loaded
             .iter()
-            .map(|(name, ego_from_cav, xyzi)| View { name: name.clone(), ego_from_cav: *ego_from_cav, xyzi })
+            .map(|(name, ego_from_cav, xyzi)| View {
+                name: name.clone(),
+                ego_from_cav: *ego_from_cav,
+                xyzi,
+            })
             .collect(),
         truth: frame.truth.clone(),
         detections,
@@ -67,9 +106,10 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<d
 
 /// Range of the places and a margin around it, metres, within a limit: the rest of the limit is empty.
 fn around(places: impl Iterator<Item = f64>, [low, high]: [f64; 2]) -> [f64; 2] {
-    let (first, last) = places
-        .filter(|place| (low..=high).contains(place))
-        .fold((f64::INFINITY, f64::NEG_INFINITY), |(first, last), place| (first.min(place), last.max(place)));
+    let (first, last) = places.filter(|place| (low..=high).contains(place)).fold(
+        (f64::INFINITY, f64::NEG_INFINITY),
+        |(first, last), place| (first.min(place), last.max(place)),
+    );
     if first > last {
         return [low, high];
     }
@@ -82,8 +122,14 @@ mod tests {
 
     #[test]
     fn a_picture_shows_what_is_there_within_the_evaluated_area() {
-        assert_eq!(around([3.0, -20.0, 500.0, f64::NAN].into_iter(), [-140.0, 140.0]), [-32.0, 15.0]);
-        assert_eq!(around([-45.0, 30.0].into_iter(), [-40.0, 40.0]), [18.0, 40.0]);
+        assert_eq!(
+            around([3.0, -20.0, 500.0, f64::NAN].into_iter(), [-140.0, 140.0]),
+            [-32.0, 15.0]
+        );
+        assert_eq!(
+            around([-45.0, 30.0].into_iter(), [-40.0, 40.0]),
+            [18.0, 40.0]
+        );
         assert_eq!(around([].into_iter(), [-40.0, 40.0]), [-40.0, 40.0]);
     }
 }

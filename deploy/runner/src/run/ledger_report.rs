@@ -83,12 +83,24 @@ impl LedgerReport {
     /// Adds the requests that the router of the run refused.
     #[must_use]
     pub(crate) fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
-        let refused = refused.iter().map(|(Rejection { peer, message, reason }, count)| RefusedReport {
-            peer: peer.clone(),
-            message: message.clone(),
-            reason: reason.clone(),
-            count: *count,
-        });
-        Self { refused: refused.collect(), ..self }
+        let refused = refused.iter().map(
+            |(
+                Rejection {
+                    peer,
+                    message,
+                    reason,
+                },
+                count,
+            )| RefusedReport {
+                peer: peer.clone(),
+                message: message.clone(),
+                reason: reason.clone(),
+                count: *count,
+            },
+        );
+        Self {
+            refused: refused.collect(),
+            ..self
+        }
     }
 }

@@ -14,18 +14,31 @@ const OVERLOAD: [DropReason; 2] = [DropReason::Superseded, DropReason::Stale];
 pub(crate) fn sentence(result: &RunResult) -> Option<String> {
     let reasons = reasons(result);
     let help = help(result);
-    (!reasons.is_empty())
-        .then(|| format!("{}{}", listed(&reasons, "and"), help.map_or(String::new(), |help| format!("; {help}"))))
+    (!reasons.is_empty()).then(|| {
+        format!(
+            "{}{}",
+            listed(&reasons, "and"),
+            help.map_or(String::new(), |help| format!("; {help}"))
+        )
+    })
 }
 
 fn reasons(result: &RunResult) -> Vec<String> {
     let mut reasons = Vec::new();
     if result.missed > 0 {
-        reasons.push(format!("{} of {} ticks unanswered", result.missed, result.metrics.ticks));
+        reasons.push(format!(
+            "{} of {} ticks unanswered",
+            result.missed, result.metrics.ticks
+        ));
     }
     let messages = &result.metrics.messages;
-    let dropped = messages.dropped.iter().filter(|(reason, count)| reason.is_loss() && **count > 0);
-    let dropped: Vec<String> = dropped.map(|(reason, count)| format!("{count} {}", spoken(*reason))).collect();
+    let dropped = messages
+        .dropped
+        .iter()
+        .filter(|(reason, count)| reason.is_loss() && **count > 0);
+    let dropped: Vec<String> = dropped
+        .map(|(reason, count)| format!("{count} {}", spoken(*reason)))
+        .collect();
     if !dropped.is_empty() {
         reasons.push(format!("messages lost ({})", dropped.join(", ")));
     }
@@ -33,19 +46,38 @@ fn reasons(result: &RunResult) -> Vec<String> {
         reasons.push("most messages were still in flight at the end".into());
     }
     if !result.balance.is_exact() {
-        reasons.push(format!("{} accounts of ledger.json do not add up", result.balance.discrepancies.len()));
+        reasons.push(format!(
+            "{} accounts of ledger.json do not add up",
+            result.balance.discrepancies.len()
+        ));
     }
     reasons.extend(result.failures.iter().cloned());
-    reasons.extend(result.killed.iter().map(|process| format!("{process} did not end in time")));
+    reasons.extend(
+        result
+            .killed
+            .iter()
+            .map(|process| format!("{process} did not end in time")),
+    );
     if !result.unwritten.is_empty() {
-        reasons.push(format!("{} files of the run are incomplete", result.unwritten.len()));
+        reasons.push(format!(
+            "{} files of the run are incomplete",
+            result.unwritten.len()
+        ));
     }
     reasons
 }
 
 /// What would help, from the first cause that applies.
 fn help(result: &RunResult) -> Option<String> {
-    let count = |reason: &DropReason| result.metrics.messages.dropped.get(reason).copied().unwrap_or(0);
+    let count = |reason: &DropReason| {
+        result
+            .metrics
+            .messages
+            .dropped
+            .get(reason)
+            .copied()
+            .unwrap_or(0)
+    };
     let log = |folder: &Path| format!("see {}", folder.join("log").display());
     if !result.unwritten.is_empty() {
         Some("free disk space".into())
@@ -60,7 +92,10 @@ fn help(result: &RunResult) -> Option<String> {
     } else if count(&DropReason::NoPose) > 0 && result.metrics.pose.success_3m == Some(0.0) {
         Some("no vehicle found itself: is the head of agents.pose that of this scene?".into())
     } else if result.missed > 0 || OVERLOAD.iter().any(|reason| count(reason) > 0) {
-        result.remedies.as_ref().map(|remedies| format!("{remedies} would answer more"))
+        result
+            .remedies
+            .as_ref()
+            .map(|remedies| format!("{remedies} would answer more"))
     } else {
         Some(log(result.folder.path()))
     }

@@ -8,7 +8,11 @@ use deploy::report::Machine;
 use tch::{Device, Kind, Tensor};
 
 /// Variables that limit the instructions of libtorch and its libraries.
-const LIMITS: [&str; 3] = ["ONEDNN_MAX_CPU_ISA", "ATEN_CPU_CAPABILITY", "MKL_ENABLE_INSTRUCTIONS"];
+const LIMITS: [&str; 3] = [
+    "ONEDNN_MAX_CPU_ISA",
+    "ATEN_CPU_CAPABILITY",
+    "MKL_ENABLE_INSTRUCTIONS",
+];
 /// Feature map and kernel of the convolution that the cores are compared with: those of a detector's first block.
 const MAP: [i64; 4] = [1, 64, 96, 128];
 const KERNEL: [i64; 4] = [64, 64, 3, 3];
@@ -19,23 +23,46 @@ const REPETITIONS: usize = 6;
 #[must_use]
 pub(crate) fn this_machine() -> Machine {
     let cores = thread::available_parallelism().map_or(1, usize::from);
-    let limits = LIMITS.iter().filter_map(|name| Some(format!("{name}={}", std::env::var(name).ok()?)));
+    let limits = LIMITS
+        .iter()
+        .filter_map(|name| Some(format!("{name}={}", std::env::var(name).ok()?)));
     let limits: Vec<String> = limits.collect();
-    let limited = if limits.is_empty() { String::new() } else { format!(" (limited by {})", limits.join(" ")) };
-    Machine { cores, instructions: instructions() + &limited }
+    let limited = if limits.is_empty() {
+        String::new()
+    } else {
+        format!(" (limited by {})", limits.join(" "))
+    };
+    Machine {
+        cores,
+        instructions: instructions() + &limited,
+    }
 }
 
 /// Vector instructions of the processor.
 #[cfg(target_arch = "x86_64")]
 fn instructions() -> String {
     let has = [
-        ("AVX2", is_x86_feature_detected!("avx2") && !is_x86_feature_detected!("avx512f")),
+        (
+            "AVX2",
+            is_x86_feature_detected!("avx2") && !is_x86_feature_detected!("avx512f"),
+        ),
         ("AVX-512", is_x86_feature_detected!("avx512f")),
-        ("VNNI", is_x86_feature_detected!("avx512vnni") || is_x86_feature_detected!("avxvnni")),
+        (
+            "VNNI",
+            is_x86_feature_detected!("avx512vnni") || is_x86_feature_detected!("avxvnni"),
+        ),
         ("AMX", has_amx()),
     ];
-    let names: Vec<&str> = has.iter().filter(|(_, is_there)| *is_there).map(|(name, _)| *name).collect();
-    if names.is_empty() { "no AVX2".into() } else { names.join(", ") }
+    let names: Vec<&str> = has
+        .iter()
+        .filter(|(_, is_there)| *is_there)
+        .map(|(name, _)| *name)
+        .collect();
+    if names.is_empty() {
+        "no AVX2".into()
+    } else {
+        names.join(", ")
+    }
 }
 
 /// Vector instructions of the processor.
@@ -48,7 +75,9 @@ fn instructions() -> String {
 #[cfg(target_arch = "x86_64")]
 fn has_amx() -> bool {
     let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    info.lines().find(|line| line.starts_with("flags")).is_some_and(|line| line.contains(" amx_int8"))
+    info.lines()
+        .find(|line| line.starts_with("flags"))
+        .is_some_and(|line| line.contains(" amx_int8"))
 }
 
 /// Speed of a core while `threads` cores compute, relative to one that computes alone, at most 1. Two hyperthreads of
@@ -62,10 +91,18 @@ pub(crate) fn speed_of_many(threads: usize) -> f64 {
 
 /// Mean time of the convolutions on each of `threads` threads that begin together.
 fn convolve_together(threads: usize) -> Duration {
-    let (begin, count) = (Barrier::new(threads), u32::try_from(threads).unwrap_or(u32::MAX));
+    let (begin, count) = (
+        Barrier::new(threads),
+        u32::try_from(threads).unwrap_or(u32::MAX),
+    );
     let total: Duration = thread::scope(|scope| {
-        let workers: Vec<_> = (0..threads).map(|_| scope.spawn(|| convolve(&begin))).collect();
-        workers.into_iter().map(|worker| worker.join().unwrap_or_default()).sum()
+        let workers: Vec<_> = (0..threads)
+            .map(|_| scope.spawn(|| convolve(&begin)))
+            .collect();
+        workers
+            .into_iter()
+            .map(|worker| worker.join().unwrap_or_default())
+            .sum()
     });
     total / count.max(1)
 }
@@ -73,8 +110,10 @@ fn convolve_together(threads: usize) -> Duration {
 fn convolve(begin: &Barrier) -> Duration {
     // The number of threads is a property of the calling thread.
     tch::set_num_threads(1);
-    let (map, kernel) =
-        (Tensor::ones(MAP, (Kind::Float, Device::Cpu)), Tensor::ones(KERNEL, (Kind::Float, Device::Cpu)));
+    let (map, kernel) = (
+        Tensor::ones(MAP, (Kind::Float, Device::Cpu)),
+        Tensor::ones(KERNEL, (Kind::Float, Device::Cpu)),
+    );
     let step = || tch::no_grad(|| map.conv2d(&kernel, None::<&Tensor>, 1, 1, 1, 1));
     // The first one prepares the kernel.
     drop(step());
@@ -91,7 +130,10 @@ mod tests {
     #[test]
     fn this_machine_has_cores_and_instructions() {
         let machine = this_machine();
-        assert!(machine.cores > 0 && !machine.instructions.is_empty(), "{machine:?}");
+        assert!(
+            machine.cores > 0 && !machine.instructions.is_empty(),
+            "{machine:?}"
+        );
         let speed = speed_of_many(2);
         assert!(speed > 0.0 && speed <= 1.0, "{speed}");
     }

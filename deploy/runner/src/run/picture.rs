@@ -97,17 +97,23 @@ impl Picture<'_> {
     /// [`PictureError`] when the range makes no picture or the file cannot be written.
     pub(crate) fn save(&self, path: &Path) -> Result<(), PictureError> {
         let map = self.map_size()?;
-        Ok(figures::save_image(path, picture_size(map), |image| self.draw(map, image))?)
+        Ok(figures::save_image(path, picture_size(map), |image| {
+            self.draw(map, image)
+        })?)
     }
 
     /// Width and height of the plan view, pixels.
     fn map_size(&self) -> Result<(u32, u32), PictureError> {
-        let [width, height] = [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
+        let [width, height] =
+            [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
         let can_be_drawn = |side: f64| (1.0..=MAX_SIDE).contains(&side);
         if can_be_drawn(width) && can_be_drawn(height) {
             Ok((width as u32, height as u32))
         } else {
-            Err(PictureError::Range { x_m: self.x_m, y_m: self.y_m })
+            Err(PictureError::Range {
+                x_m: self.x_m,
+                y_m: self.y_m,
+            })
         }
     }
 
@@ -115,7 +121,8 @@ impl Picture<'_> {
         image.fill(&BACKGROUND)?;
         let (map, legend) = image.split_vertically(height);
         let (x, y) = (self.x_m[0]..self.x_m[1], self.y_m[0]..self.y_m[1]);
-        let plane = map.apply_coord_spec(Cartesian2d::new(x, y, (0..width as i32, height as i32..0)));
+        let plane =
+            map.apply_coord_spec(Cartesian2d::new(x, y, (0..width as i32, height as i32..0)));
         self.draw_grid(&plane)?;
         // The ego last, so that its points are on top.
         for (view, colour) in self.coloured_views().rev() {
@@ -137,12 +144,16 @@ impl Picture<'_> {
     }
 
     fn coloured_views(&self) -> impl DoubleEndedIterator<Item = (&View<'_>, RGBColor)> {
-        self.views.iter().enumerate().map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
+        self.views
+            .iter()
+            .enumerate()
+            .map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
     }
 
     /// True if a point is on the plan view or at most `margin_m` outside it.
     fn is_near(&self, x: f64, y: f64, margin_m: f64) -> bool {
-        let is_within = |[low, high]: [f64; 2], value| (low - margin_m..=high + margin_m).contains(&value);
+        let is_within =
+            |[low, high]: [f64; 2], value| (low - margin_m..=high + margin_m).contains(&value);
         is_within(self.x_m, x) && is_within(self.y_m, y)
     }
 
@@ -160,10 +171,16 @@ impl Picture<'_> {
         Ok(())
     }
 
-    fn draw_points(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<(), FigureError> {
+    fn draw_points(
+        &self,
+        view: &View<'_>,
+        colour: RGBColor,
+        plane: &Plane<'_>,
+    ) -> Result<(), FigureError> {
         let ego_from_cav = view.ego_from_cav.isometry();
         for &[x, y, z, _] in view.xyzi {
-            let point = ego_from_cav * nalgebra::Point3::new(f64::from(x), f64::from(y), f64::from(z));
+            let point =
+                ego_from_cav * nalgebra::Point3::new(f64::from(x), f64::from(y), f64::from(z));
             // The ground only indicates the road; objects on it are bright.
             let opacity = if point.z < GROUND_Z_M { 0.3 } else { 0.85 };
             if self.is_near(point.x, point.y, 0.0) {
@@ -174,21 +191,36 @@ impl Picture<'_> {
     }
 
     /// The outline, with a stroke from the centre to the front.
-    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Plane<'_>) -> Result<(), FigureError> {
+    fn draw_box(
+        &self,
+        shape: &Box3d,
+        colour: RGBColor,
+        plane: &Plane<'_>,
+    ) -> Result<(), FigureError> {
         let corners = shape.corners();
-        if !corners.iter().all(|corner| self.is_near(corner[0], corner[1], BOX_MARGIN_M)) {
+        if !corners
+            .iter()
+            .all(|corner| self.is_near(corner[0], corner[1], BOX_MARGIN_M))
+        {
             return Ok(());
         }
         let outline = [0, 1, 2, 3, 0].map(|index: usize| (corners[index][0], corners[index][1]));
         plane.draw(&PathElement::new(outline, stroke(colour)))?;
         let front = [0, 1].map(|axis| (corners[0][axis] + corners[1][axis]) / 2.0);
         let [x, y, _] = shape.center_m;
-        Ok(plane.draw(&PathElement::new([(x, y), (front[0], front[1])], stroke(colour)))?)
+        Ok(plane.draw(&PathElement::new(
+            [(x, y), (front[0], front[1])],
+            stroke(colour),
+        ))?)
     }
 
     /// Detections whose score is written: the highest ones first, and none over another.
     fn labelled(&self) -> Vec<(&Box3d, f32)> {
-        let mut by_score: Vec<_> = self.detections.iter().map(|(found, score)| (found, *score)).collect();
+        let mut by_score: Vec<_> = self
+            .detections
+            .iter()
+            .map(|(found, score)| (found, *score))
+            .collect();
         by_score.sort_by(|(_, a), (_, b)| b.total_cmp(a));
         let mut labelled: Vec<(&Box3d, f32)> = Vec::new();
         for (found, score) in by_score {
@@ -213,7 +245,12 @@ impl Picture<'_> {
         Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
     }
 
-    fn draw_position(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<(), FigureError> {
+    fn draw_position(
+        &self,
+        view: &View<'_>,
+        colour: RGBColor,
+        plane: &Plane<'_>,
+    ) -> Result<(), FigureError> {
         let [x, y, _] = view.ego_from_cav.translation_m;
         if !self.is_near(x, y, 0.0) {
             return Ok(());
@@ -228,7 +265,11 @@ impl Picture<'_> {
         area.draw(&Text::new(self.title.as_str(), (14, 8), text(18, INK)))?;
         let mut x = 14;
         for (label, colour, is_outline) in self.legend() {
-            let style = if is_outline { stroke(colour) } else { colour.filled() };
+            let style = if is_outline {
+                stroke(colour)
+            } else {
+                colour.filled()
+            };
             area.draw(&Rectangle::new([(x, 39), (x + 12, 51)], style))?;
             area.draw(&Text::new(label.as_str(), (x + 18, 38), text(15, INK)))?;
             x += 18 + area.estimate_text_size(&label, &text(15, INK))?.0 as i32 + 22;
@@ -237,12 +278,19 @@ impl Picture<'_> {
     }
 
     fn legend(&self) -> Vec<(String, RGBColor, bool)> {
-        let cavs = self.coloured_views().enumerate().map(|(index, (view, colour))| {
-            let role = if index == 0 { "ego" } else { "CAV" };
-            (format!("{role} {}", view.name), colour, false)
-        });
+        let cavs = self
+            .coloured_views()
+            .enumerate()
+            .map(|(index, (view, colour))| {
+                let role = if index == 0 { "ego" } else { "CAV" };
+                (format!("{role} {}", view.name), colour, false)
+            });
         let truth = (format!("truth ({})", self.truth.len()), TRUTH, true);
-        let detected = (format!("detected ({})", self.detections.len()), DETECTION, true);
+        let detected = (
+            format!("detected ({})", self.detections.len()),
+            DETECTION,
+            true,
+        );
         cavs.chain([truth, detected]).collect()
     }
 }
@@ -250,7 +298,11 @@ impl Picture<'_> {
 /// A bar of 10 m and the axes.
 fn draw_scale(area: &Image<'_>) -> Result<(), FigureError> {
     let (left, right, y) = (14, 14 + (10.0 * PIXELS_PER_M) as i32, 68);
-    for line in [[(left, y), (right, y)], [(left, y - 4), (left, y + 4)], [(right, y - 4), (right, y + 4)]] {
+    for line in [
+        [(left, y), (right, y)],
+        [(left, y - 4), (left, y + 4)],
+        [(right, y - 4), (right, y + 4)],
+    ] {
         area.draw(&PathElement::new(line, stroke(FAINT)))?;
     }
     let text_line = "10 m   x to the right, y up, ego LiDAR frame";
@@ -276,7 +328,11 @@ mod tests {
     use super::*;
 
     fn car(x: f64, y: f64) -> Box3d {
-        Box3d { center_m: [x, y, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 }
+        Box3d {
+            center_m: [x, y, -1.0],
+            size_m: [4.0, 2.0, 1.5],
+            heading_rad: 0.0,
+        }
     }
 
     fn picture<'a>(xyzi: &'a [[f32; 4]]) -> Picture<'a> {
@@ -284,7 +340,11 @@ mod tests {
             title: "tick 7".into(),
             x_m: [-40.0, 40.0],
             y_m: [-20.0, 20.0],
-            views: vec![View { name: "4279".into(), ego_from_cav: Pose::IDENTITY, xyzi }],
+            views: vec![View {
+                name: "4279".into(),
+                ego_from_cav: Pose::IDENTITY,
+                xyzi,
+            }],
             truth: vec![car(20.0, 10.0)],
             detections: vec![(car(-20.0, -10.0), 0.9)],
         }
@@ -297,12 +357,19 @@ mod tests {
 
     /// True if a pixel within one of the position has about this colour.
     fn shows(pixels: &[u8], [x, y]: [f64; 2], colour: RGBColor) -> bool {
-        let (column, row) = ((PIXELS_PER_M * (x + 40.0)) as usize, (PIXELS_PER_M * (20.0 - y)) as usize);
+        let (column, row) = (
+            (PIXELS_PER_M * (x + 40.0)) as usize,
+            (PIXELS_PER_M * (20.0 - y)) as usize,
+        );
         let wanted = [colour.0, colour.1, colour.2];
-        let is_like =
-            |at: usize| pixels[3 * at..].iter().zip(wanted).all(|(found, wanted)| found.abs_diff(wanted) < 40);
-        let around =
-            (row - 1..=row + 1).flat_map(|row| (column - 1..=column + 1).map(move |column| 960 * row + column));
+        let is_like = |at: usize| {
+            pixels[3 * at..]
+                .iter()
+                .zip(wanted)
+                .all(|(found, wanted)| found.abs_diff(wanted) < 40)
+        };
+        let around = (row - 1..=row + 1)
+            .flat_map(|row| (column - 1..=column + 1).map(move |column| 960 * row + column));
         around.into_iter().any(is_like)
     }
 
@@ -311,16 +378,36 @@ mod tests {
         let points = [[5.0, 5.0, 0.0, 0.5]; 4];
         let pixels = pixels(&picture(&points));
         assert!(shows(&pixels, [5.0, 5.0], CAV_COLOURS[0]));
-        assert!(shows(&pixels, [20.0, 11.0], TRUTH), "left side of the true box");
-        assert!(shows(&pixels, [-18.0, -10.5], DETECTION), "front of the detection");
+        assert!(
+            shows(&pixels, [20.0, 11.0], TRUTH),
+            "left side of the true box"
+        );
+        assert!(
+            shows(&pixels, [-18.0, -10.5], DETECTION),
+            "front of the detection"
+        );
         assert!(shows(&pixels, [33.0, -13.0], BACKGROUND));
     }
 
     #[test]
     fn of_detections_upon_each_other_the_highest_score_is_written() {
-        let detections = vec![(car(0.0, 0.0), 0.3), (car(1.0, 0.5), 0.9), (car(10.0, 0.0), 0.2)];
-        let picture = Picture { detections, ..picture(&[]) };
-        assert_eq!(picture.labelled().iter().map(|(_, score)| *score).collect::<Vec<_>>(), [0.9, 0.2]);
+        let detections = vec![
+            (car(0.0, 0.0), 0.3),
+            (car(1.0, 0.5), 0.9),
+            (car(10.0, 0.0), 0.2),
+        ];
+        let picture = Picture {
+            detections,
+            ..picture(&[])
+        };
+        assert_eq!(
+            picture
+                .labelled()
+                .iter()
+                .map(|(_, score)| *score)
+                .collect::<Vec<_>>(),
+            [0.9, 0.2]
+        );
     }
 
     #[test]
@@ -329,23 +416,42 @@ mod tests {
         let file = folder.path().join("frame.png");
         let picture = picture(&[]);
         picture.save(&file).unwrap();
-        let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(&file).unwrap())).read_info().unwrap();
+        let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(&file).unwrap()))
+            .read_info()
+            .unwrap();
         let mut read = vec![0; reader.output_buffer_size().unwrap()];
         reader.next_frame(&mut read).unwrap();
-        assert_eq!((reader.info().width, reader.info().height), (960, 480 + LEGEND_HEIGHT));
+        assert_eq!(
+            (reader.info().width, reader.info().height),
+            (960, 480 + LEGEND_HEIGHT)
+        );
         assert!(read == pixels(&picture));
     }
 
     #[test]
     fn points_and_boxes_that_are_nowhere_are_left_out() {
-        let points = [[f32::NAN, 0.0, 0.0, 0.0], [f32::INFINITY, 3e9, 0.0, 0.0], [1e30, -1e30, 0.0, 0.0]];
+        let points = [
+            [f32::NAN, 0.0, 0.0, 0.0],
+            [f32::INFINITY, 3e9, 0.0, 0.0],
+            [1e30, -1e30, 0.0, 0.0],
+        ];
         let mut far = picture(&points);
-        far.views.push(View { name: "far".into(), ..far.views[0].clone() });
+        far.views.push(View {
+            name: "far".into(),
+            ..far.views[0].clone()
+        });
         far.views[1].ego_from_cav.translation_m = [1e30, f64::NAN, 0.0];
         let mut near = picture(&[]);
-        near.views.push(View { xyzi: &[], ego_from_cav: Pose::IDENTITY, ..far.views[1].clone() });
+        near.views.push(View {
+            xyzi: &[],
+            ego_from_cav: Pose::IDENTITY,
+            ..far.views[1].clone()
+        });
         near.views[1].ego_from_cav.translation_m = [500.0, 0.0, 0.0];
-        let endless = Box3d { size_m: [f64::INFINITY, 2.0, 1.5], ..car(0.0, 0.0) };
+        let endless = Box3d {
+            size_m: [f64::INFINITY, 2.0, 1.5],
+            ..car(0.0, 0.0)
+        };
         far.truth = vec![endless, car(1e30, 0.0)];
         near.truth = vec![car(500.0, 0.0), car(0.0, 500.0)];
         assert!(pixels(&far) == pixels(&near));
@@ -354,7 +460,12 @@ mod tests {
     #[test]
     fn a_range_that_makes_no_picture_is_refused() {
         for x_m in [[0.0, 0.0], [0.0, 1e9], [0.0, f64::NAN]] {
-            let error = Picture { x_m, ..picture(&[]) }.map_size().unwrap_err();
+            let error = Picture {
+                x_m,
+                ..picture(&[])
+            }
+            .map_size()
+            .unwrap_err();
             assert!(error.to_string().starts_with("cannot draw x"), "{error}");
         }
     }

@@ -71,7 +71,10 @@ impl RunError {
         match self {
             Self::Network(error) => error.is_bad_input(),
             Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) | Self::Live { .. } => true,
-            Self::Evaluate(error) => matches!(**error, EvaluateError::TooSlow { .. } | EvaluateError::Link(_)),
+            Self::Evaluate(error) => matches!(
+                **error,
+                EvaluateError::TooSlow { .. } | EvaluateError::Link(_)
+            ),
             _ => false,
         }
     }

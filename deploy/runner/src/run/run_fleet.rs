@@ -101,7 +101,11 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
         return crate::run::stepped::run_scenario(scenario, options);
     }
     let fleet = Fleet::plan(scenario)?;
-    let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
+    let run = fleet
+        .scenario
+        .run
+        .clone()
+        .unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, options, &run, &folder);
     if result.as_ref().is_err_and(RunError::is_refusal) {
@@ -118,13 +122,21 @@ fn announce_capacity(fleet: &Fleet, programs: &Path) -> Option<Capacity> {
     })?;
     output::note(format_args!("this machine: {capacity}"));
     if !capacity.keeps_up() {
-        output::note(format_args!("it will not keep up; {} would help", remedies(fleet, Some(&capacity))));
+        output::note(format_args!(
+            "it will not keep up; {} would help",
+            remedies(fleet, Some(&capacity))
+        ));
     }
     Some(capacity)
 }
 
 /// Runs a fleet under the given run name in the given folder.
-fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, RunError> {
+fn go(
+    fleet: &Fleet,
+    options: &RunOptions,
+    run: &RunId,
+    folder: &RunFolder,
+) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
     // Before anything else of the run takes the cores.
@@ -134,15 +146,37 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     let keys = fleet.keys(folder)?;
     let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
     let (endpoint, programs) = (&place.endpoint, options.programs.as_path());
-    let context = SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder };
+    let context = SessionContext {
+        run,
+        endpoint,
+        keys: keys.as_ref(),
+        programs,
+        folder,
+    };
     let specs = fleet.processes(&context)?;
     check_free(&place, &fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
-    let board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let board = FrameScores::new(
+        fleet.ego.clone(),
+        fleet.ground_truth_rule(),
+        fleet.map_values(),
+    );
     let files = LINES.map(|name| folder.file(name));
-    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, files)?;
+    let mut scorer = ScorerNode::start(
+        place.session.clone(),
+        run,
+        &fleet.agents,
+        &fleet.ego,
+        board,
+        files,
+    )?;
     if let Some(address) = fleet.scenario.network.metrics {
-        let peer = |spec: &ProcessSpec| Some(MetricsPeer { process: spec.name.clone(), address: spec.metrics? });
+        let peer = |spec: &ProcessSpec| {
+            Some(MetricsPeer {
+                process: spec.name.clone(),
+                address: spec.metrics?,
+            })
+        };
         scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
     }
     let watched = watch(fleet, &context, specs, &place.endpoint, &scorer, &stop);
@@ -154,7 +188,14 @@ fn go(fleet: &Fleet, options: &RunOptions, run: &RunId, folder: &RunFolder) -> R
     }
     let watched = watched?;
 
-    let result = write(fleet, (run, folder.clone()), (scored, &refused), &watched, fingerprint, capacity);
+    let result = write(
+        fleet,
+        (run, folder.clone()),
+        (scored, &refused),
+        &watched,
+        fingerprint,
+        capacity,
+    );
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
@@ -178,7 +219,11 @@ pub(super) fn check_free(
     if processes.is_empty() {
         return Ok(());
     }
-    Err(RunError::Live { run: run.clone(), router: place.endpoint.to_string(), processes })
+    Err(RunError::Live {
+        run: run.clone(),
+        router: place.endpoint.to_string(),
+        processes,
+    })
 }
 
 /// Observations of the supervisor during a run.
@@ -198,7 +243,10 @@ struct Watched {
 fn swept(log: &Path) -> BTreeMap<u64, u64> {
     support::sweep_log::read(log).unwrap_or_else(|error| {
         if error.kind() != std::io::ErrorKind::NotFound {
-            tracing::warn!("{}: {error}; frames.csv lacks the arrival times of the sweeps", log.display());
+            tracing::warn!(
+                "{}: {error}; frames.csv lacks the arrival times of the sweeps",
+                log.display()
+            );
         }
         BTreeMap::new()
     })
@@ -217,7 +265,9 @@ fn watch(
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
     if let Some(address) = fleet.scenario.network.metrics {
-        display.print_line(&format!("metrics of all processes at http://{address}/metrics"));
+        display.print_line(&format!(
+            "metrics of all processes at http://{address}/metrics"
+        ));
     }
     let restarts = fleet.scenario.timeouts.restarts;
     display.print_line(&format!(
@@ -235,7 +285,11 @@ fn watch(
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
     drain(&supervisor, scorer, limits.drain, &mut display);
-    killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all).killed);
+    killed.extend(
+        supervisor
+            .end(|name| name.starts_with("agent"), limits.all)
+            .killed,
+    );
     // The recorder captures the last messages of all others.
     killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
     killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
@@ -246,7 +300,13 @@ fn watch(
     watch.tell(Phase::Over, &scorer.progress());
     offline.extend(killed.iter().cloned());
     let failures = watch.failures();
-    Ok(Watched { ending, killed, offline, failures, crashed })
+    Ok(Watched {
+        ending,
+        killed,
+        offline,
+        failures,
+        crashed,
+    })
 }
 
 /// Deadlines of the steps of the end.
@@ -263,15 +323,21 @@ impl Limits {
         let now = Instant::now();
         let after = |seconds: f64| now + Duration::from_secs_f64(seconds);
         match ending {
-            Ending::Over => {
-                Self { replay: now, drain: after(timeouts.drain_s), all: after(timeouts.drain_s + timeouts.stop_s) }
-            }
+            Ending::Over => Self {
+                replay: now,
+                drain: after(timeouts.drain_s),
+                all: after(timeouts.drain_s + timeouts.stop_s),
+            },
             Ending::Asked => Self {
                 replay: after(timeouts.stop_s * REPLAY_SHARE),
                 drain: after(timeouts.stop_s * DRAIN_SHARE),
                 all: after(timeouts.stop_s),
             },
-            Ending::Failed { .. } => Self { replay: after(timeouts.stop_s), drain: now, all: after(timeouts.stop_s) },
+            Ending::Failed { .. } => Self {
+                replay: after(timeouts.stop_s),
+                drain: now,
+                all: after(timeouts.stop_s),
+            },
         }
     }
 }
@@ -291,7 +357,10 @@ fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: 
 
 /// Hashes programs, weights and scene during the run.
 fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
-    let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
+    let (programs, weights) = (
+        Fleet::programs(programs),
+        fleet.scenario.models.weights.clone(),
+    );
     let scene = fleet.scene_dir.clone();
     let poses = fleet.scenario.poses();
     std::thread::spawn(move || Provenance::collect(&programs, &weights, &poses, &scene))
@@ -306,10 +375,18 @@ fn write(
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
     capacity: Option<Capacity>,
 ) -> RunResult {
-    let Scored { board, stats, progress, unwritten: lines } = scored;
+    let Scored {
+        board,
+        stats,
+        progress,
+        unwritten: lines,
+    } = scored;
     let mut unwritten = Vec::new();
     for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
-        unwritten.push(format!("{lines} lines are missing in {}", folder.file(name).display()));
+        unwritten.push(format!(
+            "{lines} lines are missing in {}",
+            folder.file(name).display()
+        ));
     }
     let mut note = |written: Result<(), RunFolderError>| {
         if let Err(error) = written {
@@ -324,13 +401,17 @@ fn write(
     let balance = sum.balance();
     let missed = missed(fleet, &board, &watched.ending);
     let metrics = metrics(fleet, &board, &progress, &sum);
-    let metrics = Metrics { ticks: metrics.answered + missed, ..metrics };
+    let metrics = Metrics {
+        ticks: metrics.answered + missed,
+        ..metrics
+    };
     note(folder.write_json(deploy::score::metrics::FILE, &metrics));
     let remedies = remedies(fleet, capacity.as_ref());
     let run_report = RunReport::new(run, &metrics, board.records(), &stats, capacity);
     note(folder.write_json(report::FILE, &run_report));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
-    let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted)).with_refused(refused);
+    let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
+        .with_refused(refused);
     note(folder.write_json("ledger.json", &report));
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),
@@ -340,7 +421,11 @@ fn write(
         }
         Err(_) => None,
     };
-    let resolved = Scenario { run: Some(run.clone()), provenance, ..fleet.scenario.clone() };
+    let resolved = Scenario {
+        run: Some(run.clone()),
+        provenance,
+        ..fleet.scenario.clone()
+    };
     note(folder.write("scenario.yaml", &resolved.to_yaml()));
     let picture = crate::run::demo::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
@@ -364,12 +449,17 @@ fn write(
 /// their number only, once the scene is over.
 fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
     let (reported, _) = board.ticks();
-    let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over)).unwrap_or(0) as u64;
+    let played = fleet
+        .ticks
+        .filter(|_| matches!(ending, Ending::Over))
+        .unwrap_or(0) as u64;
     board.missed() + played.saturating_sub(reported)
 }
 
 fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
-    let seconds = progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64());
+    let seconds = progress.span.map_or(0.0, |(first, last)| {
+        last.duration_since(first).as_secs_f64()
+    });
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     Metrics::of(board, "wall", names, seconds, sum, None)
 }

@@ -13,7 +13,9 @@ use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
-use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig, VehicleConfig};
+use ego_fuser_offline::evaluation::stepped::{
+    AgentPool, ComputeTimes, SteppedConfig, VehicleConfig,
+};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
@@ -39,14 +41,29 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     fleet.scenario.models.threads.apply();
     let recorded = recorded(&fleet)?;
     let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
-    let compute = match fleet.scenario.stepped.as_ref().and_then(|stepped| stepped.compute) {
+    let compute = match fleet
+        .scenario
+        .stepped
+        .as_ref()
+        .and_then(|stepped| stepped.compute)
+    {
         Some(compute) => compute,
         None => evaluator.measure(&recorded)?,
     };
     // Written into the run's scenario, from which another run can take it.
-    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
-    fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
-    let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
+    let processes = fleet
+        .scenario
+        .stepped
+        .is_some_and(|stepped| stepped.processes);
+    fleet.scenario.stepped = Some(Stepped {
+        compute: Some(compute),
+        processes,
+    });
+    let run = fleet
+        .scenario
+        .run
+        .clone()
+        .unwrap_or_else(|| name_of_now(options.prefix));
     let mut evaluator = evaluator.with_link(stepped_config(&fleet, compute)?);
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
@@ -64,8 +81,13 @@ fn go(
     (run, folder): (&RunId, &RunFolder),
     options: &RunOptions,
 ) -> Result<RunResult, RunError> {
-    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
-    let crew = processes.then(|| CrewProcesses::start(fleet, run, folder, &options.programs)).transpose()?;
+    let processes = fleet
+        .scenario
+        .stepped
+        .is_some_and(|stepped| stepped.processes);
+    let crew = processes
+        .then(|| CrewProcesses::start(fleet, run, folder, &options.programs))
+        .transpose()?;
     let processes = crew.map(|(processes, remote)| {
         evaluator.set_processes(Some(remote));
         processes
@@ -81,7 +103,9 @@ fn go(
 pub(super) fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
     let scene = &fleet.scenario.scene;
     let scenarios = dataset::open_with(&scene.dir, &open_options(scene))?.scenarios;
-    let found = scenarios.into_iter().find(|known| Some(&known.name) == scene.scenario.as_ref());
+    let found = scenarios
+        .into_iter()
+        .find(|known| Some(&known.name) == scene.scenario.as_ref());
     found.ok_or_else(|| FleetError::Empty(scene.dir.clone()))
 }
 
@@ -102,7 +126,9 @@ pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
 }
 
 fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig, FleetError> {
-    let Scenario { scene, ego, link, .. } = &fleet.scenario;
+    let Scenario {
+        scene, ego, link, ..
+    } = &fleet.scenario;
     let (config, link_folder, seed) = match link {
         Some(link) => {
             let (config, folder) = LinkConfig::open(&link.model)?;
@@ -111,7 +137,10 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
         None => (LinkConfig::default(), PathBuf::from("."), 0),
     };
     let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
-    let vehicles = fleet.agents.iter().map(|cav| (cav.clone(), vehicle(&fleet.scenario, cav)));
+    let vehicles = fleet
+        .agents
+        .iter()
+        .map(|cav| (cav.clone(), vehicle(&fleet.scenario, cav)));
     let last = fleet.ticks.map_or(usize::MAX, |ticks| scene.seek + ticks);
     Ok(SteppedConfig {
         link: config,
@@ -128,8 +157,18 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
 }
 
 fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
-    let AgentSettings { pose, codec, rate, falsification } = scenario.settings_of(cav);
-    VehicleConfig { pose_source: for_scene(&pose, scenario), codec, rate, falsification }
+    let AgentSettings {
+        pose,
+        codec,
+        rate,
+        falsification,
+    } = scenario.settings_of(cav);
+    VehicleConfig {
+        pose_source: for_scene(&pose, scenario),
+        codec,
+        rate,
+        falsification,
+    }
 }
 
 /// The source as in the configuration of an agent's process.
@@ -144,15 +183,26 @@ fn play(
     evaluator: &mut Evaluator,
     folder: &RunFolder,
 ) -> Result<FrameScores, RunError> {
-    let mut board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
-    let unwritable = |source| RunFolderError::Write { path: folder.path().to_owned(), source };
+    let mut board = FrameScores::new(
+        fleet.ego.clone(),
+        fleet.ground_truth_rule(),
+        fleet.map_values(),
+    );
+    let unwritable = |source| RunFolderError::Write {
+        path: folder.path().to_owned(),
+        source,
+    };
     let mut lines = FrameLines::create(folder.path()).map_err(unwritable)?;
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
         let is_written = lines.add(None, &frame);
         judge(&mut board, frame, true);
-        if is_written { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        if is_written {
+            ControlFlow::Continue(())
+        } else {
+            ControlFlow::Break(())
+        }
     })?;
     bar.finish_and_clear();
     lines.finish().map_err(unwritable)?;
@@ -169,17 +219,37 @@ fn write(
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
-    let metrics = Metrics::of(board, "stepped", names, board.seconds(), ledger, Some(evaluator.sent_bytes()));
+    let metrics = Metrics::of(
+        board,
+        "stepped",
+        names,
+        board.seconds(),
+        ledger,
+        Some(evaluator.sent_bytes()),
+    );
     folder.write_json(deploy::score::metrics::FILE, &metrics)?;
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
-    folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
+    folder.write_json(
+        "ledger.json",
+        &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)),
+    )?;
     let models = &fleet.scenario.models;
     let programs = Fleet::programs(&options.programs);
-    let provenance = Provenance::collect(&programs, &models.weights, &fleet.scenario.poses(), &fleet.scene_dir);
-    let provenance = provenance.inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}")).ok();
-    let resolved = Scenario { provenance, ..fleet.scenario.clone() };
+    let provenance = Provenance::collect(
+        &programs,
+        &models.weights,
+        &fleet.scenario.poses(),
+        &fleet.scene_dir,
+    );
+    let provenance = provenance
+        .inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}"))
+        .ok();
+    let resolved = Scenario {
+        provenance,
+        ..fleet.scenario.clone()
+    };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
     let picture = crate::run::demo::draw(fleet, board, &folder.file("frame.png"));
     Ok(RunResult {

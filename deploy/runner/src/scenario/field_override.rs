@@ -16,14 +16,15 @@ impl FromStr for FieldOverride {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let (path, value) = text
-            .split_once('=')
-            .ok_or_else(|| format!("{text:?} is not FIELD=VALUE, for example scene.lockstep=true"))?;
+        let (path, value) = text.split_once('=').ok_or_else(|| {
+            format!("{text:?} is not FIELD=VALUE, for example scene.lockstep=true")
+        })?;
         let path: Vec<String> = path.split('.').map(str::to_owned).collect();
         if path.iter().any(String::is_empty) {
             return Err(format!("{text:?}: a part of the field's name is empty"));
         }
-        let value = serde_saphyr::from_str(value).map_err(|error| format!("{value:?} is no YAML: {error}"))?;
+        let value = serde_saphyr::from_str(value)
+            .map_err(|error| format!("{value:?} is no YAML: {error}"))?;
         Ok(Self { path, value })
     }
 }
@@ -37,10 +38,14 @@ impl fmt::Display for FieldOverride {
 impl FieldOverride {
     /// Sets the field in a document; sections on the way that are missing or have no fields are made.
     pub(super) fn apply(&self, document: &mut Value) {
-        let Some((field, sections)) = self.path.split_last() else { return };
+        let Some((field, sections)) = self.path.split_last() else {
+            return;
+        };
         let mut place = document;
         for section in sections {
-            place = fields_of(place).entry(section.as_str()).or_insert(Value::Null);
+            place = fields_of(place)
+                .entry(section.as_str())
+                .or_insert(Value::Null);
         }
         fields_of(place).insert(field.clone(), self.value.clone());
     }
@@ -62,7 +67,11 @@ mod tests {
     #[test]
     fn fields_are_set_by_their_path() {
         let mut document = json!({"scene": {"dir": "a", "rate": 1.0}});
-        for text in ["scene.rate=0.5", "agents.codec.dtype=i8", "vehicles.4279.pose={noisy: {position_std_m: 1}}"] {
+        for text in [
+            "scene.rate=0.5",
+            "agents.codec.dtype=i8",
+            "vehicles.4279.pose={noisy: {position_std_m: 1}}",
+        ] {
             text.parse::<FieldOverride>().unwrap().apply(&mut document);
         }
         let expected = json!({

@@ -37,7 +37,12 @@ impl Provenance {
     ///
     /// # Errors
     /// The first file that cannot be read, by name.
-    pub fn collect(programs: &[PathBuf], weights: &Path, poses: &[PoseSourceConfig], scene: &Path) -> io::Result<Self> {
+    pub fn collect(
+        programs: &[PathBuf],
+        weights: &Path,
+        poses: &[PoseSourceConfig],
+        scene: &Path,
+    ) -> io::Result<Self> {
         let scene_files = scene_files(scene)?;
         let (mut localizer_sha256, mut baseline_sha256) = (None, None);
         for pose in poses {
@@ -46,13 +51,23 @@ impl Provenance {
                 | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
                     localizer_sha256 = Some([hash_file(encoder)?.1, hash_file(head)?.1]);
                 }
-                PoseSourceConfig::Baseline(network) => baseline_sha256 = Some(hash_file(&network.weights)?.1),
-                PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => {}
+                PoseSourceConfig::Baseline(network) => {
+                    baseline_sha256 = Some(hash_file(&network.weights)?.1)
+                }
+                PoseSourceConfig::Recorded
+                | PoseSourceConfig::Noisy(_)
+                | PoseSourceConfig::Cached(_) => {}
             }
         }
         Ok(Self {
             version: env!("CARGO_PKG_VERSION").into(),
-            program_sha256: hash_all(programs.first().and_then(|path| path.parent()).unwrap_or(scene), programs)?,
+            program_sha256: hash_all(
+                programs
+                    .first()
+                    .and_then(|path| path.parent())
+                    .unwrap_or(scene),
+                programs,
+            )?,
             weights_sha256: hash_file(weights)?.1,
             localizer_sha256,
             baseline_sha256,
@@ -72,7 +87,9 @@ fn scene_files(scene: &Path) -> io::Result<Vec<PathBuf>> {
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(&folder).map_err(|error| named(error, &folder))? {
             let path = entry?.path();
-            let is_image = path.extension().is_some_and(|kind| kind == "png" || kind == "jpg");
+            let is_image = path
+                .extension()
+                .is_some_and(|kind| kind == "png" || kind == "jpg");
             if path.is_dir() {
                 folders.push(path);
             } else if !is_image {
@@ -89,7 +106,10 @@ fn hash_all(root: &Path, files: &[PathBuf]) -> io::Result<String> {
     let mut all = Sha256::new();
     for path in files {
         let (length, hash) = hash_file(path)?;
-        all.update(format!("{} {length} {hash}\n", path.strip_prefix(root).unwrap_or(path).display()));
+        all.update(format!(
+            "{} {length} {hash}\n",
+            path.strip_prefix(root).unwrap_or(path).display()
+        ));
     }
     Ok(hex(&all.finalize()))
 }
@@ -137,24 +157,43 @@ mod tests {
         std::fs::write(&weights, b"weights").unwrap();
         let file = || weights.clone();
         let poses = [
-            PoseSourceConfig::Pgc(PgcConfig { encoder: file(), head: file(), ..Default::default() }),
-            PoseSourceConfig::Baseline(BaselinePoseConfig { weights: file(), ..Default::default() }),
+            PoseSourceConfig::Pgc(PgcConfig {
+                encoder: file(),
+                head: file(),
+                ..Default::default()
+            }),
+            PoseSourceConfig::Baseline(BaselinePoseConfig {
+                weights: file(),
+                ..Default::default()
+            }),
         ];
-        let collect =
-            |scene: &Path| Provenance::collect(std::slice::from_ref(&weights), &weights, &poses, scene).unwrap();
+        let collect = |scene: &Path| {
+            Provenance::collect(std::slice::from_ref(&weights), &weights, &poses, scene).unwrap()
+        };
         let first = collect(&scene(one.path(), "0 0 0"));
         assert_eq!(first.scene_files, 2, "images do not count");
         // From `printf weights | sha256sum`.
-        assert!(first.weights_sha256.starts_with("9a129038d9a00aed"), "{}", first.weights_sha256);
-        assert_eq!(first.localizer_sha256.as_ref().unwrap()[1], first.weights_sha256);
+        assert!(
+            first.weights_sha256.starts_with("9a129038d9a00aed"),
+            "{}",
+            first.weights_sha256
+        );
+        assert_eq!(
+            first.localizer_sha256.as_ref().unwrap()[1],
+            first.weights_sha256
+        );
         assert_eq!(first.baseline_sha256.as_ref(), Some(&first.weights_sha256));
         assert_eq!(first, collect(&scene(two.path(), "0 0 0")));
-        assert_ne!(first.scene_sha256, collect(&scene(three.path(), "0 0 1")).scene_sha256);
+        assert_ne!(
+            first.scene_sha256,
+            collect(&scene(three.path(), "0 0 1")).scene_sha256
+        );
     }
 
     #[test]
     fn a_missing_file_is_named() {
-        let error = Provenance::collect(&[], Path::new("/nowhere/w"), &[], Path::new("/nowhere")).unwrap_err();
+        let error = Provenance::collect(&[], Path::new("/nowhere/w"), &[], Path::new("/nowhere"))
+            .unwrap_err();
         assert!(error.to_string().starts_with("/nowhere"), "{error}");
     }
 }

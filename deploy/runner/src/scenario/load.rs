@@ -44,18 +44,36 @@ impl Scenario {
         if !overrides.is_empty() {
             scenario = overridden(path, overrides)?;
         }
-        let file = std::path::absolute(path).map_err(|source| ConfigError::Io { path: path.into(), source })?;
+        let file = std::path::absolute(path).map_err(|source| ConfigError::Io {
+            path: path.into(),
+            source,
+        })?;
         let folder = file.parent().unwrap_or(Path::new("/"));
         let absolute = |place: &Path| without_dots(&folder.join(place));
-        let Scenario { scene, models, agents, vehicles, link, security, .. } = &mut scenario;
+        let Scenario {
+            scene,
+            models,
+            agents,
+            vehicles,
+            link,
+            security,
+            ..
+        } = &mut scenario;
         let keys = security.iter_mut().flat_map(|security| &mut security.keys);
-        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(keys) {
+        for place in [&mut scene.dir, &mut models.weights]
+            .into_iter()
+            .chain(keys)
+        {
             *place = absolute(place);
         }
         agents.pose = std::mem::take(&mut agents.pose).map_files(absolute);
-        vehicles.values_mut().for_each(|own| own.map_pose(|pose| pose.map_files(absolute)));
+        vehicles
+            .values_mut()
+            .for_each(|own| own.map_pose(|pose| pose.map_files(absolute)));
         if let Some(link) = link.as_mut().filter(|link| !link.is_preset()) {
-            link.model = absolute(Path::new(&link.model)).to_string_lossy().into_owned();
+            link.model = absolute(Path::new(&link.model))
+                .to_string_lossy()
+                .into_owned();
         }
         Ok(scenario)
     }
@@ -67,14 +85,22 @@ fn overridden(path: &Path, overrides: &[FieldOverride]) -> Result<Scenario, Scen
     for field in overrides {
         field.apply(&mut document);
         // One by one, so that an error names the field.
-        serde_json::from_value::<Scenario>(document.clone()).map_err(|error| ConfigError::Syntax {
-            path: path.into(),
-            line: None,
-            reason: format!("--set {field}: {error}"),
+        serde_json::from_value::<Scenario>(document.clone()).map_err(|error| {
+            ConfigError::Syntax {
+                path: path.into(),
+                line: None,
+                reason: format!("--set {field}: {error}"),
+            }
         })?;
     }
-    serde_json::from_value(document)
-        .map_err(|error| ConfigError::Syntax { path: path.into(), line: None, reason: error.to_string() }.into())
+    serde_json::from_value(document).map_err(|error| {
+        ConfigError::Syntax {
+            path: path.into(),
+            line: None,
+            reason: error.to_string(),
+        }
+        .into()
+    })
 }
 
 /// The path without `.` and `a/..`, for readable messages and resolved copies.
@@ -120,20 +146,40 @@ mod tests {
     fn fields_are_set_from_the_command_line_and_wrong_ones_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("s.yaml");
-        std::fs::write(&file, format!("{SMALL}vehicles: {{4288: {{codec: {{dtype: i8}}}}}}\n")).unwrap();
+        std::fs::write(
+            &file,
+            format!("{SMALL}vehicles: {{4288: {{codec: {{dtype: i8}}}}}}\n"),
+        )
+        .unwrap();
         let read = |texts: &[&str]| {
-            let overrides: Vec<FieldOverride> = texts.iter().map(|text| text.parse().unwrap()).collect();
+            let overrides: Vec<FieldOverride> =
+                texts.iter().map(|text| text.parse().unwrap()).collect();
             Scenario::read_with(&file, &overrides)
         };
-        let scenario =
-            read(&["scene.lockstep=true", "agents.codec.dtype=f32", "vehicles.4288.codec.zstd_level=3"]).unwrap();
+        let scenario = read(&[
+            "scene.lockstep=true",
+            "agents.codec.dtype=f32",
+            "vehicles.4288.codec.zstd_level=3",
+        ])
+        .unwrap();
         assert!(scenario.scene.lockstep && scenario.agents.codec.dtype == Dtype::F32);
         let own = scenario.settings_of(&CavId::new("4288").unwrap()).codec;
         assert_eq!((own.dtype, own.zstd_level), (Dtype::I8, Some(3)));
-        assert_eq!(scenario.scene.dir, without_dots(&folder.path().join("../scene")));
+        assert_eq!(
+            scenario.scene.dir,
+            without_dots(&folder.path().join("../scene"))
+        );
         let message = read(&["scene.lockstep=maybe"]).unwrap_err().to_string();
-        assert!(message.contains("s.yaml") && message.contains("--set scene.lockstep=\"maybe\""), "{message}");
-        assert!(read(&["scene.lock=true"]).unwrap_err().to_string().contains("unknown field `lock`"));
+        assert!(
+            message.contains("s.yaml") && message.contains("--set scene.lockstep=\"maybe\""),
+            "{message}"
+        );
+        assert!(
+            read(&["scene.lock=true"])
+                .unwrap_err()
+                .to_string()
+                .contains("unknown field `lock`")
+        );
     }
 
     #[test]
@@ -143,10 +189,21 @@ mod tests {
         );
         let scenario = parse(&text).unwrap();
         let own = scenario.settings_of(&CavId::new("4288").unwrap());
-        assert_eq!((own.codec.dtype, own.codec.zstd_level), (Dtype::I8, Some(3)));
-        let PoseSourceConfig::Noisy(noise) = own.pose else { panic!("{:?}", own.pose) };
-        assert_eq!((noise.mode, noise.position_std_m, noise.heading_std_deg), (NoiseMode::Fixed, 1.5, 0.2));
-        assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()), scenario.agents);
+        assert_eq!(
+            (own.codec.dtype, own.codec.zstd_level),
+            (Dtype::I8, Some(3))
+        );
+        let PoseSourceConfig::Noisy(noise) = own.pose else {
+            panic!("{:?}", own.pose)
+        };
+        assert_eq!(
+            (noise.mode, noise.position_std_m, noise.heading_std_deg),
+            (NoiseMode::Fixed, 1.5, 0.2)
+        );
+        assert_eq!(
+            scenario.settings_of(&CavId::new("4279").unwrap()),
+            scenario.agents
+        );
     }
 
     #[test]
@@ -157,11 +214,19 @@ mod tests {
         let scenario = parse(&text).unwrap();
         let rate_of = |cav| scenario.settings_of(&CavId::new(cav).unwrap()).rate;
         let rate = rate_of("4279");
-        assert_eq!((rate.message_bytes, rate.bytes_per_second, rate.watch_queue), (None, Some(750_000), true));
+        assert_eq!(
+            (rate.message_bytes, rate.bytes_per_second, rate.watch_queue),
+            (None, Some(750_000), true)
+        );
         let rate = rate_of("4288");
-        assert_eq!((rate.message_bytes, rate.bytes_per_second, rate.watch_queue), (Some(75_000), None, false));
+        assert_eq!(
+            (rate.message_bytes, rate.bytes_per_second, rate.watch_queue),
+            (Some(75_000), None, false)
+        );
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
-        let message = parse(&format!("{SMALL}agents: {{rate: {{bytes: 3}}}}\n")).unwrap_err().to_string();
+        let message = parse(&format!("{SMALL}agents: {{rate: {{bytes: 3}}}}\n"))
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("bytes_per_second"), "{message}");
     }
 
@@ -170,19 +235,30 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("s.yaml");
         let text = |pose: &str| {
-            format!("scene: {{dir: .}}\nmodels: {{weights: s.yaml}}\nvehicles:\n  4288: {{pose: {{{pose}}}}}\n")
+            format!(
+                "scene: {{dir: .}}\nmodels: {{weights: s.yaml}}\nvehicles:\n  4288: {{pose: {{{pose}}}}}\n"
+            )
         };
         std::fs::write(&file, text("pgc: {encoder: e.safetensors}")).unwrap();
         let message = Scenario::load(&file).unwrap_err().to_string();
         assert!(message.contains("head"), "{message}");
         std::fs::write(&file, text("pgc: {encoder: e.safetensors, head: s.yaml}")).unwrap();
         let message = Scenario::load(&file).unwrap_err().to_string();
-        assert!(message.contains("agents.pose: ") && message.contains("e.safetensors"), "{message}");
+        assert!(
+            message.contains("agents.pose: ") && message.contains("e.safetensors"),
+            "{message}"
+        );
         std::fs::write(folder.path().join("e.safetensors"), b"").unwrap();
         let scenario = Scenario::load(&file).unwrap();
-        let PoseSourceConfig::Pgc(pgc) = scenario.settings_of(&CavId::new("4288").unwrap()).pose else { panic!() };
+        let PoseSourceConfig::Pgc(pgc) = scenario.settings_of(&CavId::new("4288").unwrap()).pose
+        else {
+            panic!()
+        };
         assert!(pgc.encoder.is_absolute() && pgc.head.exists());
-        assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()).pose, PoseSourceConfig::Recorded);
+        assert_eq!(
+            scenario.settings_of(&CavId::new("4279").unwrap()).pose,
+            PoseSourceConfig::Recorded
+        );
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
         std::fs::write(&file, text("baseline: {weights: e.safetensors}")).unwrap();
         assert_eq!(Scenario::load(&file).unwrap().poses()[1].name(), "baseline");
@@ -190,17 +266,32 @@ mod tests {
 
     #[test]
     fn an_unknown_field_is_refused_with_file_line_and_field() {
-        let message = parse(&format!("{SMALL}ego:\n  dedline_ms: 5\n")).unwrap_err().to_string();
-        assert!(message.starts_with("s.yaml:4:") && message.contains("dedline_ms"), "{message}");
-        assert!(message.contains("deadline_ms"), "the message should name what is known: {message}");
+        let message = parse(&format!("{SMALL}ego:\n  dedline_ms: 5\n"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.starts_with("s.yaml:4:") && message.contains("dedline_ms"),
+            "{message}"
+        );
+        assert!(
+            message.contains("deadline_ms"),
+            "the message should name what is known: {message}"
+        );
     }
 
     #[test]
     fn a_field_of_the_wrong_kind_is_refused_with_its_line() {
-        let message = parse("scene:\n  dir: a\n  rate: fast\nmodels: {weights: w}\n").unwrap_err().to_string();
+        let message = parse("scene:\n  dir: a\n  rate: fast\nmodels: {weights: w}\n")
+            .unwrap_err()
+            .to_string();
         assert!(message.starts_with("s.yaml:3:"), "{message}");
-        let message = parse(&format!("{SMALL}method: magic\n")).unwrap_err().to_string();
-        assert!(message.starts_with("s.yaml:3:") && message.contains("magic"), "{message}");
+        let message = parse(&format!("{SMALL}method: magic\n"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.starts_with("s.yaml:3:") && message.contains("magic"),
+            "{message}"
+        );
     }
 
     #[test]
@@ -210,36 +301,73 @@ mod tests {
         for (line, field) in [
             ("scene: {dir: ., rate: 0}", "scene.rate is 0"),
             ("scene: {dir: ., frames: 0}", "scene.frames is 0"),
-            ("scene: {dir: .}\nagents: {pose: {noisy: {step_s: 0}}}", "noisy.step_s is 0"),
+            (
+                "scene: {dir: .}\nagents: {pose: {noisy: {step_s: 0}}}",
+                "noisy.step_s is 0",
+            ),
             ("scene: {dir: nowhere}", "nowhere does not exist"),
-            ("scene: {dir: .}\nnetwork: {listen: localhost}", "network.listen is localhost"),
-            ("scene: {dir: .}\nnetwork: {connect: quic/10.0.0.1:7447}", "network.connect is quic/10.0.0.1:7447"),
-            ("scene: {dir: .}\nnetwork: {metrics: \"127.0.0.1:0\"}", "network.metrics is 127.0.0.1:0"),
-            ("scene: {dir: .}\ntimeouts: {ready_s: 1e30}", "timeouts.ready_s is 1000000"),
-            ("scene: {dir: .}\nclock: stepped\nrecord: {}", "record is given"),
+            (
+                "scene: {dir: .}\nnetwork: {listen: localhost}",
+                "network.listen is localhost",
+            ),
+            (
+                "scene: {dir: .}\nnetwork: {connect: quic/10.0.0.1:7447}",
+                "network.connect is quic/10.0.0.1:7447",
+            ),
+            (
+                "scene: {dir: .}\nnetwork: {metrics: \"127.0.0.1:0\"}",
+                "network.metrics is 127.0.0.1:0",
+            ),
+            (
+                "scene: {dir: .}\ntimeouts: {ready_s: 1e30}",
+                "timeouts.ready_s is 1000000",
+            ),
+            (
+                "scene: {dir: .}\nclock: stepped\nrecord: {}",
+                "record is given",
+            ),
             (
                 "scene: {dir: .}\nclock: stepped\nnetwork: {metrics: \"127.0.0.1:9464\"}",
                 "network.metrics is 127.0.0.1:9464",
             ),
             ("scene: {dir: ., agents: [a]}\nego: {id: b}", "ego.id is b"),
-            ("scene: {dir: ., rate: 2}\nclock: stepped", "scene.rate is 2"),
-            ("scene: {dir: ., lockstep: true}\nclock: stepped", "scene.lockstep is true"),
+            (
+                "scene: {dir: ., rate: 2}\nclock: stepped",
+                "scene.rate is 2",
+            ),
+            (
+                "scene: {dir: ., lockstep: true}\nclock: stepped",
+                "scene.lockstep is true",
+            ),
             ("scene: {dir: .}\nstepped: {}", "stepped is given"),
             (
                 "scene: {dir: .}\nclock: stepped\nstepped: {compute: {pose_ms: -1, map_ms: 0, fuse_ms: 0}}",
                 "pose_ms is -1",
             ),
-            ("scene: {dir: .}\nmodels: {weights: s.yaml, threads: 0}", "models.threads is 0: must be 1 to 256"),
+            (
+                "scene: {dir: .}\nmodels: {weights: s.yaml, threads: 0}",
+                "models.threads is 0: must be 1 to 256",
+            ),
             (
                 "scene: {dir: .}\nclock: stepped\nmodels: {weights: s.yaml, device: cuda}",
                 "models.device is cuda: must be cpu with clock stepped",
             ),
-            ("scene: {dir: .}\nmodels: {weights: none.safetensors}", "none.safetensors does not exist"),
+            (
+                "scene: {dir: .}\nmodels: {weights: none.safetensors}",
+                "none.safetensors does not exist",
+            ),
         ] {
-            let models = if line.contains("models") { "" } else { "models: {weights: s.yaml}\n" };
+            let models = if line.contains("models") {
+                ""
+            } else {
+                "models: {weights: s.yaml}\n"
+            };
             std::fs::write(&file, format!("{line}\n{models}")).unwrap();
             let message = Scenario::load(&file).unwrap_err().to_string();
-            assert!(message.contains(field) && message.contains("s.yaml"), "{line}: {message}");
+            assert!(
+                message.contains(field) && message.contains("s.yaml"),
+                "{line}: {message}"
+            );
         }
     }
 
@@ -266,15 +394,20 @@ mod tests {
     #[test]
     fn the_samples_are_scenarios_and_state_the_defaults() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scenarios");
-        let entries = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path());
-        let samples: Vec<_> = entries.filter(|path| path.extension().is_some_and(|kind| kind == "yaml")).collect();
+        let entries = std::fs::read_dir(&folder)
+            .unwrap()
+            .map(|entry| entry.unwrap().path());
+        let samples: Vec<_> = entries
+            .filter(|path| path.extension().is_some_and(|kind| kind == "yaml"))
+            .collect();
         assert!(samples.len() >= 2, "{samples:?}");
         for sample in samples {
             Scenario::read(&sample).unwrap();
         }
         let demo = Scenario::read(&folder.join("demo.yaml")).unwrap();
         let mut plain = parse(SMALL).unwrap();
-        (plain.scene.dir, plain.models.weights) = (demo.scene.dir.clone(), demo.models.weights.clone());
+        (plain.scene.dir, plain.models.weights) =
+            (demo.scene.dir.clone(), demo.models.weights.clone());
         plain.agents.codec.dtype = Dtype::F16;
         assert!(matches!(demo.agents.pose, PoseSourceConfig::Tracked(_)));
         plain.agents.pose = demo.agents.pose.clone();

@@ -144,6 +144,8 @@ impl Scenario {
     /// Settings of vehicle `cav`: `agents`, with its own entry of `vehicles` on top.
     #[must_use]
     pub(crate) fn settings_of(&self, cav: &CavId) -> AgentSettings {
-        self.vehicles.get(cav).map_or_else(|| self.agents.clone(), |own| own.over(&self.agents))
+        self.vehicles
+            .get(cav)
+            .map_or_else(|| self.agents.clone(), |own| own.over(&self.agents))
     }
 }

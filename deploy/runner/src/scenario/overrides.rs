@@ -15,7 +15,8 @@ pub struct AgentOverrides(Map<String, Value>);
 impl<'de> Deserialize<'de> for AgentOverrides {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let fields = Map::deserialize(deserializer)?;
-        serde_json::from_value::<AgentSettings>(Value::Object(fields.clone())).map_err(D::Error::custom)?;
+        serde_json::from_value::<AgentSettings>(Value::Object(fields.clone()))
+            .map_err(D::Error::custom)?;
         Ok(Self(fields))
     }
 }
@@ -39,7 +40,9 @@ impl AgentOverrides {
     /// `settings` with the fields of this vehicle.
     #[must_use]
     pub fn over(&self, settings: &AgentSettings) -> AgentSettings {
-        let Ok(Value::Object(mut all)) = serde_json::to_value(settings) else { return settings.clone() };
+        let Ok(Value::Object(mut all)) = serde_json::to_value(settings) else {
+            return settings.clone();
+        };
         all.extend(self.0.clone());
         // Both were valid settings before.
         serde_json::from_value(Value::Object(all)).unwrap_or_else(|_| settings.clone())

@@ -81,23 +81,40 @@ pub(crate) fn weights_of(path: &Path, method: Method) -> Result<PathBuf, Weights
     if found == 0 && trained.is_file() {
         return trained_for(trained, method, &candidates);
     }
-    Err(WeightsChoiceError::NotOne { folder: path.to_path_buf(), method, name, found })
+    Err(WeightsChoiceError::NotOne {
+        folder: path.to_path_buf(),
+        method,
+        name,
+        found,
+    })
 }
 
 /// The weights of a training of a method that `method` can run with.
-fn trained_for(file: PathBuf, method: Method, candidates: &[&'static str]) -> Result<PathBuf, WeightsChoiceError> {
+fn trained_for(
+    file: PathBuf,
+    method: Method,
+    candidates: &[&'static str],
+) -> Result<PathBuf, WeightsChoiceError> {
     let weights = Weights::load(&file)?;
     match weights.metadata(METHOD_KEY) {
         Some(trained) if !candidates.contains(&trained) => {
             let trained = trained.to_owned();
-            Err(WeightsChoiceError::OtherMethod { file, method, name: candidates[0], trained })
+            Err(WeightsChoiceError::OtherMethod {
+                file,
+                method,
+                name: candidates[0],
+                trained,
+            })
         }
         _ => Ok(file),
     }
 }
 
 fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>, WeightsChoiceError> {
-    let io = |source| WeightsChoiceError::Io { folder: folder.to_path_buf(), source };
+    let io = |source| WeightsChoiceError::Io {
+        folder: folder.to_path_buf(),
+        source,
+    };
     let ending = format!("-{name}.safetensors");
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(io)? {
@@ -124,18 +141,43 @@ mod tests {
     #[test]
     fn a_folder_holds_one_file_per_method() {
         let folder = tempfile::tempdir().unwrap();
-        for name in ["lean-none.safetensors", "lean-max.safetensors", "full-max.safetensors", "lean-none.md"] {
+        for name in [
+            "lean-none.safetensors",
+            "lean-max.safetensors",
+            "full-max.safetensors",
+            "lean-none.md",
+        ] {
             std::fs::write(folder.path().join(name), b"").unwrap();
         }
         let of = |method| weights_of(folder.path(), method);
         for method in [Method::NONE, Method::LATE, Method::EARLY] {
-            assert!(of(method).unwrap().ends_with("lean-none.safetensors"), "{method}");
+            assert!(
+                of(method).unwrap().ends_with("lean-none.safetensors"),
+                "{method}"
+            );
         }
         std::fs::write(folder.path().join("lean-early.safetensors"), b"").unwrap();
-        assert!(of(Method::EARLY).unwrap().ends_with("lean-early.safetensors"));
-        assert!(of(Method::MAX).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
-        assert!(of(Method::ATTENTION).unwrap_err().to_string().contains("0 files"));
-        assert_eq!(weights_of(Path::new("w.safetensors"), Method::LATE).unwrap(), Path::new("w.safetensors"));
+        assert!(
+            of(Method::EARLY)
+                .unwrap()
+                .ends_with("lean-early.safetensors")
+        );
+        assert!(
+            of(Method::MAX)
+                .unwrap_err()
+                .to_string()
+                .contains("2 files named *-max.safetensors")
+        );
+        assert!(
+            of(Method::ATTENTION)
+                .unwrap_err()
+                .to_string()
+                .contains("0 files")
+        );
+        assert_eq!(
+            weights_of(Path::new("w.safetensors"), Method::LATE).unwrap(),
+            Path::new("w.safetensors")
+        );
     }
 
     /// A training's folder with weights that name their method.
@@ -144,7 +186,13 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let _ = variables.root().var("weight", &[2], Init::Const(1.0));
         let about = BTreeMap::from([(METHOD_KEY.to_owned(), method.name().to_owned())]);
-        save(&folder.join(TRAINED_FILE), &variables, &about, Precision::Single).unwrap();
+        save(
+            &folder.join(TRAINED_FILE),
+            &variables,
+            &about,
+            Precision::Single,
+        )
+        .unwrap();
     }
 
     #[test]
@@ -157,7 +205,9 @@ mod tests {
         }
         let refused = of(Method::ATTENTION).unwrap_err().to_string();
         assert!(
-            refused.contains("trained for none, and method attention needs weights trained for attention"),
+            refused.contains(
+                "trained for none, and method attention needs weights trained for attention"
+            ),
             "{refused}"
         );
     }
@@ -169,10 +219,24 @@ mod tests {
             write_trained(&folder.path().join(method.name()), method);
         }
         let of = |method| weights_of(folder.path(), method);
-        assert_eq!(of(Method::MAX).unwrap(), folder.path().join("max").join(TRAINED_FILE));
-        assert_eq!(of(Method::LATE).unwrap(), folder.path().join("none").join(TRAINED_FILE));
-        assert!(of(Method::ATTENTION).unwrap_err().to_string().contains("attention/weights.safetensors"));
+        assert_eq!(
+            of(Method::MAX).unwrap(),
+            folder.path().join("max").join(TRAINED_FILE)
+        );
+        assert_eq!(
+            of(Method::LATE).unwrap(),
+            folder.path().join("none").join(TRAINED_FILE)
+        );
+        assert!(
+            of(Method::ATTENTION)
+                .unwrap_err()
+                .to_string()
+                .contains("attention/weights.safetensors")
+        );
         std::fs::write(folder.path().join("lean-max.safetensors"), b"").unwrap();
-        assert!(of(Method::MAX).unwrap_err().to_string().contains("2 files"), "two that could be meant");
+        assert!(
+            of(Method::MAX).unwrap_err().to_string().contains("2 files"),
+            "two that could be meant"
+        );
     }
 }

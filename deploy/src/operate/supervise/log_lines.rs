@@ -9,7 +9,11 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 const MAX_LINE: usize = 64 << 10;
 
 /// Copies all of `output` into `log` and passes its lines, without line ends, to `on_line`.
-pub(super) async fn follow(mut output: impl AsyncRead + Unpin, mut log: File, mut on_line: impl FnMut(String)) {
+pub(super) async fn follow(
+    mut output: impl AsyncRead + Unpin,
+    mut log: File,
+    mut on_line: impl FnMut(String),
+) {
     let (mut line, mut piece) = (Vec::new(), vec![0; 4096]);
     while let Ok(count @ 1..) = output.read(&mut piece).await {
         let bytes = &piece[..count];
@@ -19,7 +23,11 @@ pub(super) async fn follow(mut output: impl AsyncRead + Unpin, mut log: File, mu
             let room = MAX_LINE.saturating_sub(line.len());
             line.extend_from_slice(&part[..part.len().min(room)]);
             if part.ends_with(b"\n") {
-                on_line(String::from_utf8_lossy(&std::mem::take(&mut line)).trim_end().to_owned());
+                on_line(
+                    String::from_utf8_lossy(&std::mem::take(&mut line))
+                        .trim_end()
+                        .to_owned(),
+                );
             }
         }
     }
@@ -38,8 +46,14 @@ mod tests {
         let path = folder.path().join("log");
         let printed = format!("one\ntwo {}\nthree", "x".repeat(MAX_LINE));
         let mut lines = Vec::new();
-        follow(printed.as_bytes(), File::create(&path).unwrap(), |line| lines.push(line)).await;
-        assert_eq!((lines[0].as_str(), lines[1].len(), lines[2].as_str()), ("one", MAX_LINE, "three"));
+        follow(printed.as_bytes(), File::create(&path).unwrap(), |line| {
+            lines.push(line)
+        })
+        .await;
+        assert_eq!(
+            (lines[0].as_str(), lines[1].len(), lines[2].as_str()),
+            ("one", MAX_LINE, "three")
+        );
         assert_eq!(std::fs::read_to_string(path).unwrap(), printed);
     }
 }

@@ -180,7 +180,12 @@ impl Supervisor {
                     crashes: 0,
                     restarted: 0,
                 };
-                Watched { name, stop, replace, task: runtime.spawn(watcher.run()) }
+                Watched {
+                    name,
+                    stop,
+                    replace,
+                    task: runtime.spawn(watcher.run()),
+                }
             })
             .collect();
         Ok(Self { runtime, watched })
@@ -189,7 +194,9 @@ impl Supervisor {
     /// True if every process has ended for good.
     #[must_use]
     pub fn all_ended(&self) -> bool {
-        self.watched.iter().all(|watched| watched.task.is_finished())
+        self.watched
+            .iter()
+            .all(|watched| watched.task.is_finished())
     }
 
     /// Kills a hung process; then the rules of a crash apply. `why` describes the problem.
@@ -203,7 +210,10 @@ impl Supervisor {
     /// Ends the processes that `which` selects by name: SIGTERM, then SIGKILL at `deadline`. Returns when they have
     /// ended.
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
-        let (chosen, others) = self.watched.drain(..).partition(|watched| which(&watched.name));
+        let (chosen, others) = self
+            .watched
+            .drain(..)
+            .partition(|watched| which(&watched.name));
         self.watched = others;
         let chosen: Vec<Watched> = chosen;
         for watched in &chosen {

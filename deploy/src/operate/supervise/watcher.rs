@@ -13,7 +13,9 @@ use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 
-use super::{ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, log_lines};
+use super::{
+    ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, log_lines,
+};
 
 /// Exit code of our programs for bad usage or input: a restart cannot help.
 const BAD_INPUT: i32 = 2;
@@ -49,7 +51,11 @@ impl Log {
     fn last_line(&self) -> Option<String> {
         let bytes = std::fs::read(&self.path).ok()?;
         let tail = String::from_utf8_lossy(&bytes[bytes.len().saturating_sub(4096)..]).into_owned();
-        tail.lines().rev().map(str::trim).find(|line| !line.is_empty()).map(str::to_owned)
+        tail.lines()
+            .rev()
+            .map(str::trim)
+            .find(|line| !line.is_empty())
+            .map(str::to_owned)
     }
 }
 
@@ -79,7 +85,9 @@ impl Watcher {
                 Ok(mut child) => {
                     // Taken out, as waiting for a child closes the input that it still holds.
                     let _parent_death_pipe = child.stdin.take();
-                    self.report(ProcessEventKind::Started { pid: child.id().unwrap_or(0) });
+                    self.report(ProcessEventKind::Started {
+                        pid: child.id().unwrap_or(0),
+                    });
                     let report = self.follow(&mut child);
                     let stop = self.stop.clone();
                     // A request for the previous instance.
@@ -120,7 +128,11 @@ impl Watcher {
             }
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.crashes - 1).min(5)));
             self.restarted += 1;
-            self.report(ProcessEventKind::Crashed { how, again_after: pause, restart: self.restarted });
+            self.report(ProcessEventKind::Crashed {
+                how,
+                again_after: pause,
+                restart: self.restarted,
+            });
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}
                 _ = stop_requested(self.stop.clone()) => return false,
@@ -152,9 +164,13 @@ impl Watcher {
             None => return true,
             // Before it handles signals it has nothing to lose.
             Some(status) if is_done(status) || status.signal() == Some(Signal::TERM.as_raw()) => {
-                self.report(ProcessEventKind::Done { data_lost: status.code() == Some(DATA_LOST) });
+                self.report(ProcessEventKind::Done {
+                    data_lost: status.code() == Some(DATA_LOST),
+                });
             }
-            Some(status) => self.report(ProcessEventKind::Failed { how: describe(status) }),
+            Some(status) => self.report(ProcessEventKind::Failed {
+                how: describe(status),
+            }),
         }
         false
     }
@@ -164,20 +180,32 @@ impl Watcher {
         let (output, log) = (child.stdout.take()?, self.log.file.try_clone().ok()?);
         let (events, name) = (self.events.clone(), self.spec.name.clone());
         Some(tokio::spawn(log_lines::follow(output, log, move |line| {
-            let _ = events.send(ProcessEvent { name: name.clone(), what: ProcessEventKind::Logged { line } });
+            let _ = events.send(ProcessEvent {
+                name: name.clone(),
+                what: ProcessEventKind::Logged { line },
+            });
         })))
     }
 
     fn give_up(&self, how: &str) -> bool {
-        let last_line = self.log.last_line().map_or(String::new(), |line| format!(": {line}"));
+        let last_line = self
+            .log
+            .last_line()
+            .map_or(String::new(), |line| format!(": {line}"));
         let is_optional = self.spec.life == RestartPolicy::Optional;
-        self.report(ProcessEventKind::GaveUp { how: format!("{how}{last_line}"), is_optional });
+        self.report(ProcessEventKind::GaveUp {
+            how: format!("{how}{last_line}"),
+            is_optional,
+        });
         false
     }
 
     fn report(&self, what: ProcessEventKind) {
         // Without a receiver, the run is over.
-        let _ = self.events.send(ProcessEvent { name: self.spec.name.clone(), what });
+        let _ = self.events.send(ProcessEvent {
+            name: self.spec.name.clone(),
+            what,
+        });
     }
 }
 
@@ -192,7 +220,10 @@ async fn stop_requested(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
 
 /// Sends SIGTERM to a process, then SIGKILL at the deadline. Returns its exit status; `None`: it had to be killed.
 async fn end(child: &mut Child, deadline: Instant) -> Option<ExitStatus> {
-    if let Some(pid) = child.id().and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?)) {
+    if let Some(pid) = child
+        .id()
+        .and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?))
+    {
         // It may have ended at this moment, which is as good.
         let _ = kill_process(pid, Signal::TERM);
         // A stopped process does not handle SIGTERM.

@@ -1,6 +1,7 @@
 use dataset::class_set::ClassSet;
 use protocol::{
-    AgentTruth, Detection, FusedNeighbour, MisbehaviourReason, NeighbourState, SkippedNeighbour, TrueObject,
+    AgentTruth, Detection, FusedNeighbour, MisbehaviourReason, NeighbourState, SkippedNeighbour,
+    TrueObject,
 };
 
 use super::super::open_ticks::MOST_OPEN;
@@ -21,12 +22,24 @@ fn cav(text: &str) -> CavId {
 
 fn stamp(name: &str, tick: u64, publish_ms: u64) -> Stamp {
     let publish_nanos = publish_ms * 1_000_000;
-    Stamp { cav: cav(name), epoch: 1, sequence: tick, capture_nanos: tick * 100_000_000, publish_nanos }
+    Stamp {
+        cav: cav(name),
+        epoch: 1,
+        sequence: tick,
+        capture_nanos: tick * 100_000_000,
+        publish_nanos,
+    }
 }
 
 fn object(id: i64, class: &str, x: f64) -> TrueObject {
     let world_from_object = Pose::from_xyz_yaw([x, 0.0, -1.0], 0.0);
-    TrueObject { id, class: class.into(), world_from_object, size_m: [4.0, 2.0, 1.5], speed_mps: None }
+    TrueObject {
+        id,
+        class: class.into(),
+        world_from_object,
+        size_m: [4.0, 2.0, 1.5],
+        speed_mps: None,
+    }
 }
 
 /// The ego at the origin sees 1 and a pedestrian, its neighbour at x = 20 m sees 1 and 2.
@@ -48,7 +61,11 @@ fn truth(tick: u64) -> Truth {
 
 fn result(tick: u64, at_x: &[f64]) -> Detections {
     let found = |&x: &f64| Detection {
-        box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 },
+        box3d: Box3d {
+            center_m: [x, 0.0, -1.0],
+            size_m: [4.0, 2.0, 1.5],
+            heading_rad: 0.0,
+        },
         score: 0.9,
         source: None,
     };
@@ -87,11 +104,22 @@ fn a_frame_is_judged_against_everyones_truth() {
     board.result(&stamp("e", 0, 1_080), result(0, &[10.0, 30.0, -20.0]));
     board.close();
     let record = &board.records()[0];
-    assert_eq!((record.truth, record.detected, record.found), (2, 3, 2), "the pedestrian does not count");
-    assert_eq!((record.latency_ms, record.payload_bytes, record.wire_bytes), (Some(80.0), 1000, 1300));
+    assert_eq!(
+        (record.truth, record.detected, record.found),
+        (2, 3, 2),
+        "the pedestrian does not count"
+    );
+    assert_eq!(
+        (record.latency_ms, record.payload_bytes, record.wire_bytes),
+        (Some(80.0), 1000, 1300)
+    );
     assert_eq!(record.ego_error_m, Some(1.0));
     let (global, _) = board.average_precision();
-    assert_eq!(global.at_50, Some(1.0), "the false box has the same score and comes last");
+    assert_eq!(
+        global.at_50,
+        Some(1.0),
+        "the false box has the same score and comes last"
+    );
     assert_eq!(board.communication().payload_bytes_mean, Some(1000.0));
     assert_eq!(board.showpiece().unwrap().truth.len(), 2);
 }
@@ -105,7 +133,11 @@ fn order_of_arrival_changes_nothing() {
             ticks.reverse();
         }
         for tick in ticks {
-            let detected: &[f64] = if tick % 2 == 0 { &[10.0] } else { &[-7.0, 30.0] };
+            let detected: &[f64] = if tick % 2 == 0 {
+                &[10.0]
+            } else {
+                &[-7.0, 30.0]
+            };
             if backwards {
                 board.result(&stamp("e", tick, 50), result(tick, detected));
                 board.truth(&stamp("replay", tick, 0), truth(tick));
@@ -130,9 +162,16 @@ fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
     board.result(&stamp("e", 1, 90), result(1, &[]));
     board.close();
     assert_eq!((board.missed(), board.ticks()), (2, (3, 1)));
-    let answered: Vec<bool> = board.records().iter().map(FrameRecord::is_answered).collect();
+    let answered: Vec<bool> = board
+        .records()
+        .iter()
+        .map(FrameRecord::is_answered)
+        .collect();
     assert_eq!(answered, [false, true, false], "every tick has a record");
-    assert_eq!((board.records()[1].latency_ms, board.records()[1].detected), (Some(50.0), 1));
+    assert_eq!(
+        (board.records()[1].latency_ms, board.records()[1].detected),
+        (Some(50.0), 1)
+    );
 }
 
 /// Three precisions of hand-made ticks, 100 ms apart, with two cars that stand still in front of an ego that stands too:
@@ -144,8 +183,15 @@ fn the_three_precisions_differ_in_what_they_count() {
     for tick in 0..4 {
         board.truth(&stamp("replay", tick, began_ms(tick)), truth(tick));
     }
-    for (tick, latency_ms, at_x) in [(0, 50, &[10.0, 30.0][..]), (2, 250, &[10.0, 30.0]), (3, 20, &[10.0])] {
-        board.result(&stamp("e", tick, began_ms(tick) + latency_ms), result(tick, at_x));
+    for (tick, latency_ms, at_x) in [
+        (0, 50, &[10.0, 30.0][..]),
+        (2, 250, &[10.0, 30.0]),
+        (3, 20, &[10.0]),
+    ] {
+        board.result(
+            &stamp("e", tick, began_ms(tick) + latency_ms),
+            result(tick, at_x),
+        );
     }
     board.close();
     let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
@@ -154,23 +200,47 @@ fn the_three_precisions_differ_in_what_they_count() {
     assert!(is_near(board.unanswered_empty().at_50, 5.0 / 8.0));
     // Nothing is published by tick 0; its result is the newest at the three that follow: 6 of 8 boxes.
     assert!(is_near(board.streaming().unwrap().at_50, 6.0 / 8.0));
-    let streamed: Vec<Option<u64>> = board.records().iter().map(|record| Some(record.streamed?.tick)).collect();
+    let streamed: Vec<Option<u64>> = board
+        .records()
+        .iter()
+        .map(|record| Some(record.streamed?.tick))
+        .collect();
     assert_eq!(streamed, [None, Some(0), Some(0), Some(0)]);
-    assert_eq!(board.records()[2].streamed.map(|streamed| (streamed.age_ms, streamed.found)), Some((200.0, 2)));
+    assert_eq!(
+        board.records()[2]
+            .streamed
+            .map(|streamed| (streamed.age_ms, streamed.found)),
+        Some((200.0, 2))
+    );
     assert_eq!(board.ticks(), (4, 3));
 }
 
 #[test]
 fn poses_of_all_vehicles_are_judged() {
     let mut board = board();
-    board.pose(&stamp("n", 0, 0), PoseEstimate::new(Pose::from_xyz_yaw([20.0, 4.0, 0.0], 0.0), 0.5));
+    board.pose(
+        &stamp("n", 0, 0),
+        PoseEstimate::new(Pose::from_xyz_yaw([20.0, 4.0, 0.0], 0.0), 0.5),
+    );
     let reason = protocol::NoPoseReason::TooFewPoints;
-    board.pose(&stamp("e", 0, 0), PoseEstimate::NoPose { reason, inlier_count: 2 });
-    board.pose(&stamp("unknown", 0, 0), PoseEstimate::new(Pose::IDENTITY, 0.5));
+    board.pose(
+        &stamp("e", 0, 0),
+        PoseEstimate::NoPose {
+            reason,
+            inlier_count: 2,
+        },
+    );
+    board.pose(
+        &stamp("unknown", 0, 0),
+        PoseEstimate::new(Pose::IDENTITY, 0.5),
+    );
     board.truth(&stamp("replay", 0, 0), truth(0));
     board.close();
     let errors = board.pose_errors();
-    assert_eq!((errors.mean_m, errors.no_pose, errors.success_3m), (Some(4.0), 1, Some(0.0)));
+    assert_eq!(
+        (errors.mean_m, errors.no_pose, errors.success_3m),
+        (Some(4.0), 1, Some(0.0))
+    );
 }
 
 #[test]
@@ -183,7 +253,11 @@ fn a_long_run_keeps_few_ticks_open() {
     assert!(board.open.len() <= MOST_OPEN && board.records().len() >= 1_000 - MOST_OPEN);
     board.result(&stamp("e", 3, 50), result(3, &[]));
     board.close();
-    assert_eq!(board.records().len(), 1_000, "a late second result of a judged tick adds none");
+    assert_eq!(
+        board.records().len(),
+        1_000,
+        "a late second result of a judged tick adds none"
+    );
 }
 
 #[test]
@@ -191,7 +265,10 @@ fn neighbours_are_followed_over_the_run() {
     let mut board = FrameScores::new(cav("e"), RULE, 1);
     let misbehaving = Detections {
         fused: vec![],
-        skipped: vec![SkippedNeighbour { cav: cav("n"), reason: Some(DropReason::Misbehaviour) }],
+        skipped: vec![SkippedNeighbour {
+            cav: cav("n"),
+            reason: Some(DropReason::Misbehaviour),
+        }],
         neighbours: vec![NeighbourState {
             cav: cav("n"),
             trust: Some(0.25),
@@ -215,5 +292,8 @@ fn neighbours_are_followed_over_the_run() {
         (1, 1, 1)
     );
     assert_eq!((record.trust, record.least_trust), (Some(0.25), Some(0.25)));
-    assert_eq!((record.misbehaviour, record.clock_offset_s), (Some(MisbehaviourReason::GhostObjects), Some(0.125)));
+    assert_eq!(
+        (record.misbehaviour, record.clock_offset_s),
+        (Some(MisbehaviourReason::GhostObjects), Some(0.125))
+    );
 }

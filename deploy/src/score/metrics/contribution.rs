@@ -19,18 +19,41 @@ pub struct Contribution {
 impl Contribution {
     /// Summarises the ledger of a run of `ego`: in `frames` frames `fused` neighbours were fused. `sent_bytes` is the
     /// size of all messages that were sent, if known.
-    pub(crate) fn of(frames: u64, fused: usize, ego: &CavId, ledger: &Ledger, sent_bytes: Option<u64>) -> Self {
-        let of_neighbours = || ledger.iter().filter(|(account, _)| shares(&account.topic, ego));
+    pub(crate) fn of(
+        frames: u64,
+        fused: usize,
+        ego: &CavId,
+        ledger: &Ledger,
+        sent_bytes: Option<u64>,
+    ) -> Self {
+        let of_neighbours = || {
+            ledger
+                .iter()
+                .filter(|(account, _)| shares(&account.topic, ego))
+        };
         let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
-        let sent = of_neighbours().filter(|(account, _)| is_sent(account)).map(|(_, counts)| counts.sent).sum();
+        let sent = of_neighbours()
+            .filter(|(account, _)| is_sent(account))
+            .map(|(_, counts)| counts.sent)
+            .sum();
         let ego_process = format!("{}-", Role::Ego);
-        let is_used = |account: &Account| account.to.as_ref().is_some_and(|to| to.as_str().starts_with(&ego_process));
-        let used = of_neighbours().filter(|(account, _)| is_used(account)).map(|(_, counts)| counts.received).sum();
+        let is_used = |account: &Account| {
+            account
+                .to
+                .as_ref()
+                .is_some_and(|to| to.as_str().starts_with(&ego_process))
+        };
+        let used = of_neighbours()
+            .filter(|(account, _)| is_used(account))
+            .map(|(_, counts)| counts.received)
+            .sum();
         Self {
             fused_per_frame: (frames > 0).then(|| fused as f64 / frames as f64),
             sent,
             used,
-            sent_bytes_mean: sent_bytes.filter(|_| sent > 0).map(|bytes| bytes as f64 / sent as f64),
+            sent_bytes_mean: sent_bytes
+                .filter(|_| sent > 0)
+                .map(|bytes| bytes as f64 / sent as f64),
         }
     }
 }
@@ -53,7 +76,10 @@ mod tests {
 
     fn ledger() -> (Ledger, CavId) {
         let (ego, to) = (CavId::new("1").unwrap(), ProcessId::new("ego-1").unwrap());
-        let topic = |name: &str, stream| Topic::Stream { cav: CavId::new(name).unwrap(), stream };
+        let topic = |name: &str, stream| Topic::Stream {
+            cav: CavId::new(name).unwrap(),
+            stream,
+        };
         let mut ledger = Ledger::default();
         for name in ["1", "2", "3"] {
             for stream in [Stream::Pose, Stream::Bev] {
@@ -75,16 +101,28 @@ mod tests {
         let (ledger, ego) = ledger();
         let contribution = Contribution::of(4, 2, &ego, &ledger, Some(800));
         assert_eq!((contribution.sent, contribution.used), (8, 2));
-        assert_eq!((contribution.fused_per_frame, contribution.sent_bytes_mean), (Some(0.5), Some(100.0)));
+        assert_eq!(
+            (contribution.fused_per_frame, contribution.sent_bytes_mean),
+            (Some(0.5), Some(100.0))
+        );
     }
 
     #[test]
     fn what_a_live_link_passes_on_is_sent_once() {
         let (mut ledger, ego) = ledger();
         let cav = CavId::new("2").unwrap();
-        let passed = Topic::Received { ego: ego.clone(), cav: cav.clone(), stream: Stream::Bev };
-        ledger
-            .received(&Account::towards(Topic::Stream { cav, stream: Stream::Bev }, &ProcessId::new("link").unwrap()));
+        let passed = Topic::Received {
+            ego: ego.clone(),
+            cav: cav.clone(),
+            stream: Stream::Bev,
+        };
+        ledger.received(&Account::towards(
+            Topic::Stream {
+                cav,
+                stream: Stream::Bev,
+            },
+            &ProcessId::new("link").unwrap(),
+        ));
         ledger.sent(&Account::published(passed.clone()));
         ledger.received(&Account::towards(passed, &ProcessId::new("ego-1").unwrap()));
         let contribution = Contribution::of(4, 2, &ego, &ledger, None);
@@ -93,7 +131,8 @@ mod tests {
 
     #[test]
     fn without_frames_and_network_all_values_are_absent() {
-        let nothing = Contribution::of(0, 0, &CavId::new("1").unwrap(), &Ledger::default(), Some(0));
+        let nothing =
+            Contribution::of(0, 0, &CavId::new("1").unwrap(), &Ledger::default(), Some(0));
         assert_eq!(nothing, Contribution::default());
     }
 }

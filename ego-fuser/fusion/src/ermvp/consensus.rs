@@ -53,10 +53,18 @@ impl Consensus {
     /// The motion that moves a neighbour's feature map `[H, W, C]` onto the ego's; `None` where they share no cell.
     ///
     /// `weight` `[H, W]` is the weight of a cell for both, 0 where the neighbour has none.
-    pub(super) fn motion(&self, ego: &Tensor, other: &Tensor, weight: &Tensor) -> Result<Option<Motion>, TchError> {
+    pub(super) fn motion(
+        &self,
+        ego: &Tensor,
+        other: &Tensor,
+        weight: &Tensor,
+    ) -> Result<Option<Motion>, TchError> {
         let (height, width, channels) = ego.size3()?;
         let count = self.cells.min(height * width);
-        let (_, best) = weight.f_detach()?.f_view([-1])?.f_topk(count, 0, true, false)?;
+        let (_, best) = weight
+            .f_detach()?
+            .f_view([-1])?
+            .f_topk(count, 0, true, false)?;
         let weight = weight.f_view([-1])?.f_index_select(0, &best)?;
         if weight.f_sum(Kind::Float)?.f_double_value(&[])? < TOO_LITTLE {
             return Ok(None);
@@ -72,17 +80,24 @@ impl Consensus {
         let places = around(&rows, 1, height)? * width + around(&columns, 0, width)?;
         let keys = |cells: &Tensor| {
             let key = self.key.forward(cells)?;
-            let norm = key.f_square()?.f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)? + 1e-6;
+            let norm = key
+                .f_square()?
+                .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
+                + 1e-6;
             key.f_div(&norm.f_sqrt()?)
         };
-        let candidates = ego.f_reshape([-1, channels])?.f_index_select(0, &places.f_view([-1])?)?;
+        let candidates = ego
+            .f_reshape([-1, channels])?
+            .f_index_select(0, &places.f_view([-1])?)?;
         let candidates = keys(&candidates)?.f_view([count, -1, KEYS])?;
         let asked = keys(&other.f_reshape([-1, channels])?.f_index_select(0, &best)?)?;
         let similarity = candidates.f_bmm(&asked.f_unsqueeze(2)?)?.f_squeeze_dim(2)?;
-        let share = similarity.f_mul(&self.sharpness.f_exp()?)?.f_softmax(1, None::<Kind>)?;
+        let share = similarity
+            .f_mul(&self.sharpness.f_exp()?)?
+            .f_softmax(1, None::<Kind>)?;
         let moved = share.f_matmul(&offsets.f_to_kind(ego.kind())?)?;
-        let middle =
-            Tensor::from_slice(&[(width - 1) as f32 / 2.0, (height - 1) as f32 / 2.0]).f_to_device(ego.device())?;
+        let middle = Tensor::from_slice(&[(width - 1) as f32 / 2.0, (height - 1) as f32 / 2.0])
+            .f_to_device(ego.device())?;
         let from = Tensor::f_stack(&[columns, rows], 1)?.f_to_kind(ego.kind())? - middle;
         let certain = share.f_amax([1i64].as_slice(), false)?;
         Ok(Some(self.fit(&from, &moved, &(weight * certain))?))
@@ -91,15 +106,22 @@ impl Consensus {
     /// `[(2 * reach + 1)^2, 2]` columns and rows around a cell.
     fn offsets(&self, like: &Tensor) -> Result<Tensor, TchError> {
         let side = -self.reach..=self.reach;
-        let offsets: Vec<i64> =
-            side.clone().flat_map(|row| side.clone().flat_map(move |column| [column, row])).collect();
-        Tensor::f_from_slice(&offsets)?.f_view([-1, 2])?.f_to_device(like.device())
+        let offsets: Vec<i64> = side
+            .clone()
+            .flat_map(|row| side.clone().flat_map(move |column| [column, row]))
+            .collect();
+        Tensor::f_from_slice(&offsets)?
+            .f_view([-1, 2])?
+            .f_to_device(like.device())
     }
 
     /// The motion of points `from` `[K, 2]` by `moved`, scaled by the learnt share.
     fn fit(&self, from: &Tensor, moved: &Tensor, weight: &Tensor) -> Result<Motion, TchError> {
-        let weight = weight.f_div(&(weight.f_sum(Kind::Float)? + TOO_LITTLE))?.f_unsqueeze(1)?;
-        let mean = |x: &Tensor| (x * &weight).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>);
+        let weight = weight
+            .f_div(&(weight.f_sum(Kind::Float)? + TOO_LITTLE))?
+            .f_unsqueeze(1)?;
+        let mean =
+            |x: &Tensor| (x * &weight).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>);
         let (centre, step) = (mean(from)?, mean(moved)?);
         let (one, other) = (from - &centre, from + moved - &centre - &step);
         let [x, y] = [one.f_select(1, 0)?, one.f_select(1, 1)?];
@@ -134,12 +156,18 @@ impl Motion {
             from.f_get(1)? * (2.0 / height_m),
         ];
         let theta = Tensor::f_stack(&entries, 0)?.f_view([1, 2, 3])?;
-        let sampling_grid = Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
-        let maps =
-            map.f_permute([2, 0, 1])?.f_unsqueeze(0)?.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)?;
+        let sampling_grid =
+            Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
+        let maps = map.f_permute([2, 0, 1])?.f_unsqueeze(0)?.f_grid_sampler(
+            &sampling_grid,
+            BILINEAR,
+            PADDING_ZEROS,
+            false,
+        )?;
         let mask = mask.f_view([1, 1, height, width])?;
-        let mask =
-            mask.f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_view([height, width])?;
+        let mask = mask
+            .f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?
+            .f_view([height, width])?;
         let moved = maps.f_squeeze_dim(0)?.f_permute([1, 2, 0])? * mask.f_unsqueeze(2)?;
         Ok((moved.f_contiguous()?, mask))
     }
@@ -177,14 +205,36 @@ mod tests {
         let weight = Tensor::zeros([24, 32], (Kind::Float, Device::Cpu));
         let _ = weight.narrow(0, 6, 12).narrow(1, 6, 20).fill_(1.0);
         let motion = consensus.motion(&ego, &other, &weight).unwrap().unwrap();
-        assert!((motion.shift.double_value(&[0]) + 2.0).abs() < 0.1, "{:?}", motion.shift);
-        assert!((motion.shift.double_value(&[1]) - 1.0).abs() < 0.1, "{:?}", motion.shift);
+        assert!(
+            (motion.shift.double_value(&[0]) + 2.0).abs() < 0.1,
+            "{:?}",
+            motion.shift
+        );
+        assert!(
+            (motion.shift.double_value(&[1]) - 1.0).abs() < 0.1,
+            "{:?}",
+            motion.shift
+        );
         assert!(motion.angle.double_value(&[]).abs() < 0.01);
         let inner = |map: &Tensor| map.narrow(0, 6, 12).narrow(1, 6, 20);
         let (moved, mask) = motion.apply(&other, &weight.ones_like()).unwrap();
-        let error = |map: &Tensor| (inner(map) - inner(&ego)).abs().mean(Kind::Float).double_value(&[]);
-        assert!(error(&moved) < 0.2 * error(&other), "{} of {}", error(&moved), error(&other));
-        assert_eq!(mask.double_value(&[10, 31]), 0.0, "nothing comes from beyond the edge");
+        let error = |map: &Tensor| {
+            (inner(map) - inner(&ego))
+                .abs()
+                .mean(Kind::Float)
+                .double_value(&[])
+        };
+        assert!(
+            error(&moved) < 0.2 * error(&other),
+            "{} of {}",
+            error(&moved),
+            error(&other)
+        );
+        assert_eq!(
+            mask.double_value(&[10, 31]),
+            0.0,
+            "nothing comes from beyond the edge"
+        );
     }
 
     #[test]
@@ -193,18 +243,37 @@ mod tests {
         let (angle, shift) = (0.05f64, [1.5f64, -0.7]);
         let from = Tensor::rand([50, 2], (Kind::Float, Device::Cpu)) * 40.0 - 20.0;
         let (sine, cosine) = angle.sin_cos();
-        let turn = Tensor::from_slice(&[cosine as f32, sine as f32, -sine as f32, cosine as f32]).view([2, 2]);
+        let turn = Tensor::from_slice(&[cosine as f32, sine as f32, -sine as f32, cosine as f32])
+            .view([2, 2]);
         let to = from.matmul(&turn) + Tensor::from_slice(&shift.map(|value| value as f32));
-        let motion = consensus.fit(&from, &(to - &from), &Tensor::ones([50], (Kind::Float, Device::Cpu))).unwrap();
-        assert!((motion.angle.double_value(&[]) - angle).abs() < 2e-3, "{:?}", motion.angle);
+        let motion = consensus
+            .fit(
+                &from,
+                &(to - &from),
+                &Tensor::ones([50], (Kind::Float, Device::Cpu)),
+            )
+            .unwrap();
+        assert!(
+            (motion.angle.double_value(&[]) - angle).abs() < 2e-3,
+            "{:?}",
+            motion.angle
+        );
         // A feature map with one bright cell: it must land at the moved position.
         let map = Tensor::zeros([41, 41, 1], (Kind::Float, Device::Cpu));
         let _ = map.get(20 + 4).get(20 + 10).fill_(1.0);
-        let (moved, _) = motion.apply(&map, &Tensor::ones([41, 41], (Kind::Float, Device::Cpu))).unwrap();
-        let expected = [cosine * 10.0 - sine * 4.0 + shift[0], sine * 10.0 + cosine * 4.0 + shift[1]];
+        let (moved, _) = motion
+            .apply(&map, &Tensor::ones([41, 41], (Kind::Float, Device::Cpu)))
+            .unwrap();
+        let expected = [
+            cosine * 10.0 - sine * 4.0 + shift[0],
+            sine * 10.0 + cosine * 4.0 + shift[1],
+        ];
         let found = moved.argmax(None::<i64>, false).int64_value(&[]);
         let found = [(found % 41 - 20) as f64, (found / 41 - 20) as f64];
-        assert!((found[0] - expected[0]).abs() < 0.8 && (found[1] - expected[1]).abs() < 0.8, "{found:?} {expected:?}");
+        assert!(
+            (found[0] - expected[0]).abs() < 0.8 && (found[1] - expected[1]).abs() < 0.8,
+            "{found:?} {expected:?}"
+        );
     }
 
     #[test]

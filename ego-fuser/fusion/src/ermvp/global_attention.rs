@@ -27,7 +27,11 @@ impl Extract {
         let compressed = (channels / SQUEEZE).max(1);
         let path = path / "conv";
         Self {
-            depthwise: (&path / 0).var("weight", &[channels, 1, 3, 3], nn::init::DEFAULT_KAIMING_UNIFORM),
+            depthwise: (&path / 0).var(
+                "weight",
+                &[channels, 1, 3, 3],
+                nn::init::DEFAULT_KAIMING_UNIFORM,
+            ),
             squeeze: Linear::new(&(&path / 2 / "fc" / 0), channels, compressed, false),
             excite: Linear::new(&(&path / 2 / "fc" / 2), compressed, channels, false),
             mix: Linear::residual(&(&path / 3), channels, channels, false),
@@ -38,11 +42,19 @@ impl Extract {
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let channels = x.size4()?.1;
         let one = [1i64, 1];
-        let seen = x.f_conv2d(&self.depthwise, None::<Tensor>, one, one, one, channels)?.f_gelu("none")?;
+        let seen = x
+            .f_conv2d(&self.depthwise, None::<Tensor>, one, one, one, channels)?
+            .f_gelu("none")?;
         let mean = seen.f_mean_dim([2i64, 3].as_slice(), false, None::<Kind>)?;
-        let gate = self.excite.forward(&self.squeeze.forward(&mean)?.f_gelu("none")?)?.f_sigmoid()?;
+        let gate = self
+            .excite
+            .forward(&self.squeeze.forward(&mean)?.f_gelu("none")?)?
+            .f_sigmoid()?;
         let seen = seen * gate.f_unsqueeze(2)?.f_unsqueeze(3)?;
-        let seen = self.mix.forward(&seen.f_permute([0, 2, 3, 1])?)?.f_permute([0, 3, 1, 2])?;
+        let seen = self
+            .mix
+            .forward(&seen.f_permute([0, 2, 3, 1])?)?
+            .f_permute([0, 3, 1, 2])?;
         (x + seen).f_max_pool2d([3i64, 3], [2i64, 2], one, one, false)
     }
 }
@@ -70,12 +82,19 @@ impl GlobalHalf {
         let channels = config.channels;
         Self {
             norm: LayerNorm::new(&(&attention / "norm"), channels),
-            extract: std::array::from_fn(|index| Extract::new(&(&inner / "to_q_global" / index), channels)),
+            extract: std::array::from_fn(|index| {
+                Extract::new(&(&inner / "to_q_global" / index), channels)
+            }),
             key_value: Linear::new(&(&inner / "qkv"), channels, 2 * channels, true),
             offsets: OffsetTable::new(&inner, config),
             out: Linear::residual(&(&inner / "to_out" / 0), channels, channels, false),
             feed_norm: LayerNorm::new(&(&feed / "norm"), channels),
-            feed_forward: FeedForward::new(&(&feed / "fn"), channels, config.hidden, config.dropout),
+            feed_forward: FeedForward::new(
+                &(&feed / "fn"),
+                channels,
+                config.hidden,
+                config.dropout,
+            ),
             heads: channels / config.head_channels,
             window: config.window,
             dropout: config.dropout,
@@ -83,32 +102,53 @@ impl GlobalHalf {
     }
 
     /// A feature map `[S, H, W, C]` to the same. H and W are multiples of [`REDUCTION`] windows.
-    pub(super) fn forward(&self, map: &Tensor, slots: Slots<'_>, train: bool) -> Result<Tensor, TchError> {
-        let &[count, height, width, channels] = &map.size()[..] else { return Err(shape_error(map)) };
+    pub(super) fn forward(
+        &self,
+        map: &Tensor,
+        slots: Slots<'_>,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        let &[count, height, width, channels] = &map.size()[..] else {
+            return Err(shape_error(map));
+        };
         let x = self.norm.forward(map)?;
         let query = self.queries(&x, slots)?;
         let groups = Partition::Window.cut(&x, self.window)?;
         let windows = groups.size()[0];
         let heads = |x: &Tensor| x.f_unflatten(-1, [self.heads, channels / self.heads]);
         let query = heads(&query)?.f_expand([windows, -1, -1, -1], false)?;
-        let key_value = self.key_value.forward(&groups)?.f_view([windows, -1, 2 * channels])?.f_split(channels, 2)?;
+        let key_value = self
+            .key_value
+            .forward(&groups)?
+            .f_view([windows, -1, 2 * channels])?
+            .f_split(channels, 2)?;
         let bias = self.offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
         let bias = match slots.unseen(Partition::Window, self.window)? {
             Some(unseen) => bias + unseen,
             None => bias,
         };
-        let seen = attend(&query, &heads(&key_value[0])?, &heads(&key_value[1])?, Some(&bias))?;
+        let seen = attend(
+            &query,
+            &heads(&key_value[0])?,
+            &heads(&key_value[1])?,
+            Some(&bias),
+        )?;
         let seen = dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(&groups)?;
         let x = map + Partition::Window.map(&seen, [height, width], self.window)?;
-        Ok(&x + self.feed_forward.forward(&self.feed_norm.forward(&x)?, train)?)
+        Ok(&x
+            + self
+                .feed_forward
+                .forward(&self.feed_norm.forward(&x)?, train)?)
     }
 
     /// One query for each token of a window, `[1, S * P, C]`: the mean over all windows of a smaller feature map after
     /// self-attention among the tokens of each window.
     fn queries(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
         let small = x.f_permute([0, 3, 1, 2])?.f_contiguous()?;
-        let small =
-            self.extract[1].forward(&self.extract[0].forward(&small)?)?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let small = self.extract[1]
+            .forward(&self.extract[0].forward(&small)?)?
+            .f_permute([0, 2, 3, 1])?
+            .f_contiguous()?;
         let groups = Partition::Window.cut(&small, self.window)?;
         let channels = groups.size()[3];
         let tokens = groups.f_view([groups.size()[0], -1, 1, channels])?;
@@ -117,11 +157,22 @@ impl GlobalHalf {
             Some(reach) => {
                 // A cell of the small feature map is valid where any of its cells is.
                 let step = [REDUCTION, REDUCTION];
-                let reach = reach.f_unsqueeze(1)?.f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
+                let reach =
+                    reach
+                        .f_unsqueeze(1)?
+                        .f_max_pool2d(step, step, [0i64, 0], [1i64, 1], false)?;
                 let reach = reach.f_squeeze_dim(1)?;
-                Slots { reach: Some(&reach), ..slots }.unseen(Partition::Window, self.window)?
+                Slots {
+                    reach: Some(&reach),
+                    ..slots
+                }
+                .unseen(Partition::Window, self.window)?
             }
         };
-        attend(&tokens, &tokens, &tokens, unseen.as_ref())?.f_mean_dim([0i64].as_slice(), true, None::<Kind>)
+        attend(&tokens, &tokens, &tokens, unseen.as_ref())?.f_mean_dim(
+            [0i64].as_slice(),
+            true,
+            None::<Kind>,
+        )
     }
 }

@@ -67,13 +67,22 @@ impl ErmvpConfig {
     /// The published sizes, for feature maps of `channels` (256 there).
     #[must_use]
     pub fn full(channels: i64) -> Self {
-        Self { layers: SwapFusionConfig::full(channels), kept: 0.2, compared: 128, search: 2 }
+        Self {
+            layers: SwapFusionConfig::full(channels),
+            kept: 0.2,
+            compared: 128,
+            search: 2,
+        }
     }
 
     /// For live traffic on two cores; cells are half as large, so the search range is twice as many cells.
     #[must_use]
     pub fn lean(channels: i64) -> Self {
-        Self { layers: SwapFusionConfig::lean(channels), search: 3, ..Self::full(channels) }
+        Self {
+            layers: SwapFusionConfig::lean(channels),
+            search: 3,
+            ..Self::full(channels)
+        }
     }
 
     /// Checks that a network can be built.
@@ -86,11 +95,19 @@ impl ErmvpConfig {
         within("fusion.search", self.search, 1..=16)?;
         if self.layers.count_missing {
             let must = "false: only present agents are fused";
-            return Err(ConfigError::Value { field: "fusion.layers.count_missing", value: "true".into(), must });
+            return Err(ConfigError::Value {
+                field: "fusion.layers.count_missing",
+                value: "true".into(),
+                must,
+            });
         }
         if !(self.kept > 0.0 && self.kept <= 1.0) {
             let value = self.kept.to_string();
-            return Err(ConfigError::Value { field: "fusion.kept", value, must: "a share above 0 and up to 1" });
+            return Err(ConfigError::Value {
+                field: "fusion.kept",
+                value,
+                must: "a share above 0 and up to 1",
+            });
         }
         Ok(())
     }
@@ -137,11 +154,19 @@ impl Ermvp {
             let path = path / "layers" / index;
             let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
             let local = HalfBlock::new(Partition::Window, &attention, &feed, sizes);
-            Layer { local, global: GlobalHalf::new(&path, sizes) }
+            Layer {
+                local,
+                global: GlobalHalf::new(&path, sizes),
+            }
         };
         Ok(Self {
             sampler: Sampler::new(&(path / "sampler"), sizes.channels, config.kept),
-            consensus: Consensus::new(&(path / "consensus"), sizes.channels, config.compared, config.search),
+            consensus: Consensus::new(
+                &(path / "consensus"),
+                sizes.channels,
+                config.compared,
+                config.search,
+            ),
             layers: (0..sizes.depth).map(layer).collect(),
             head: MeanHead::new(&(path / "mlp_head"), sizes.channels),
             window: sizes.window,
@@ -173,14 +198,29 @@ impl Ermvp {
 }
 
 impl Fusion for Ermvp {
-    fn fuse(&self, AlignedMaps { warped, metadata, is_training, .. }: &AlignedMaps) -> Result<FusionOutput, TchError> {
+    fn fuse(
+        &self,
+        AlignedMaps {
+            warped,
+            metadata,
+            is_training,
+            ..
+        }: &AlignedMaps,
+    ) -> Result<FusionOutput, TchError> {
         let order = nearest_first(metadata).to_device(warped.features.device());
         let features = warped.features.f_index_select(0, &order)?;
         let mask = warped.mask.f_index_select(0, &order)?;
         let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
-        let maps = padding.maps(&features, 0)?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let maps = padding
+            .maps(&features, 0)?
+            .f_permute([0, 2, 3, 1])?
+            .f_contiguous()?;
         let (maps, reach) = self.received(&maps, &padding.mask(&mask, 0)?.f_squeeze_dim(1)?)?;
-        let slots = Slots { asked: reach.size()[0], reach: Some(&reach), count_missing: false };
+        let slots = Slots {
+            asked: reach.size()[0],
+            reach: Some(&reach),
+            count_missing: false,
+        };
         let mut x = maps;
         for layer in &self.layers {
             let groups = layer.local.whole(&x, slots, self.window, *is_training)?;
@@ -200,7 +240,19 @@ mod tests {
         assert!(ErmvpConfig::full(256).validate().is_ok());
         assert!(ErmvpConfig::lean(64).validate().is_ok());
         let message = |config: ErmvpConfig| config.validate().unwrap_err().to_string();
-        assert!(message(ErmvpConfig { kept: 0.0, ..ErmvpConfig::lean(64) }).contains("fusion.kept is 0"));
-        assert!(message(ErmvpConfig { search: 99, ..ErmvpConfig::lean(64) }).contains("fusion.search"));
+        assert!(
+            message(ErmvpConfig {
+                kept: 0.0,
+                ..ErmvpConfig::lean(64)
+            })
+            .contains("fusion.kept is 0")
+        );
+        assert!(
+            message(ErmvpConfig {
+                search: 99,
+                ..ErmvpConfig::lean(64)
+            })
+            .contains("fusion.search")
+        );
     }
 }

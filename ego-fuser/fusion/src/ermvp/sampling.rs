@@ -19,13 +19,23 @@ impl Sampler {
         let path = path / "score_pred_net";
         let score = Linear::residual(&(&path / 2), channels, 1, true);
         // Near one at the start, so that selected cells are passed on almost unchanged.
-        let _ = score.bias.as_ref().map(|bias| tch::no_grad(|| bias.shallow_clone().fill_(2.0)));
-        Self { hidden: Linear::new(&(&path / 0), channels, channels, true), score, share }
+        let _ = score
+            .bias
+            .as_ref()
+            .map(|bias| tch::no_grad(|| bias.shallow_clone().fill_(2.0)));
+        Self {
+            hidden: Linear::new(&(&path / 0), channels, channels, true),
+            score,
+            share,
+        }
     }
 
     /// Scores `[N, H, W]` of maps `[N, H, W, C]`, 0..1.
     pub(super) fn scores(&self, maps: &Tensor) -> Result<Tensor, TchError> {
-        self.score.forward(&self.hidden.forward(maps)?.f_relu()?)?.f_squeeze_dim(3)?.f_sigmoid()
+        self.score
+            .forward(&self.hidden.forward(maps)?.f_relu()?)?
+            .f_squeeze_dim(3)?
+            .f_sigmoid()
     }
 
     /// 1 at the cells that are kept: all of the ego, which sends nothing, and of each neighbour those with the best
@@ -44,8 +54,17 @@ impl Sampler {
         // Scores are above zero, so cells out of reach rank last.
         let ranked = (ranked * &reach_of_others).f_view([agents - 1, cells])?;
         let (_, best) = ranked.f_topk(count, 1, true, false)?;
-        let kept = ranked.f_zeros_like()?.f_scatter_value(1, &best, 1.0)?.f_view([agents - 1, height, width])?;
-        Tensor::f_cat(&[reach.f_narrow(0, 0, 1)?, kept.f_to_kind(Kind::Float)? * reach_of_others], 0)
+        let kept = ranked
+            .f_zeros_like()?
+            .f_scatter_value(1, &best, 1.0)?
+            .f_view([agents - 1, height, width])?;
+        Tensor::f_cat(
+            &[
+                reach.f_narrow(0, 0, 1)?,
+                kept.f_to_kind(Kind::Float)? * reach_of_others,
+            ],
+            0,
+        )
     }
 }
 
@@ -60,11 +79,20 @@ mod tests {
     fn the_best_cells_within_reach_are_kept_and_all_of_the_ego() {
         let variables = VarStore::new(Device::Cpu);
         let sampler = Sampler::new(&variables.root(), 4, 0.25);
-        let scores = Tensor::from_slice(&[0.1f32, 0.1, 0.1, 0.1, 0.9, 0.5, 0.2, 0.8]).view([2, 2, 2]);
+        let scores =
+            Tensor::from_slice(&[0.1f32, 0.1, 0.1, 0.1, 0.9, 0.5, 0.2, 0.8]).view([2, 2, 2]);
         let reach = Tensor::from_slice(&[1f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0]).view([2, 2, 2]);
         let kept = sampler.kept(&scores, &reach).unwrap();
-        assert_eq!(Vec::<f32>::try_from(kept.view(-1)).unwrap(), [1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
-        let scores = sampler.scores(&Tensor::rand([1, 2, 2, 4], (Kind::Float, Device::Cpu))).unwrap();
-        assert!(scores.min().double_value(&[]) > 0.7, "almost all passes at the start");
+        assert_eq!(
+            Vec::<f32>::try_from(kept.view(-1)).unwrap(),
+            [1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+        );
+        let scores = sampler
+            .scores(&Tensor::rand([1, 2, 2, 4], (Kind::Float, Device::Cpu)))
+            .unwrap();
+        assert!(
+            scores.min().double_value(&[]) > 0.7,
+            "almost all passes at the start"
+        );
     }
 }

@@ -16,10 +16,19 @@ const SHAPE: [i64; 3] = [16, 16, 24];
 fn all() -> impl Iterator<Item = (Method, Box<dyn Fusion>)> {
     tch::set_num_threads(1);
     let shrink = Some(ShrinkConfig::Pointwise { channels: SHAPE[0] });
-    let detector = DetectorConfig { shrink, ..DetectorConfig::lean() };
+    let detector = DetectorConfig {
+        shrink,
+        ..DetectorConfig::lean()
+    };
     Method::ALL.into_iter().map(move |method| {
         let variables = VarStore::new(Device::Cpu);
-        (method, method.default_fusion(&detector).build(&variables.root()).unwrap())
+        (
+            method,
+            method
+                .default_fusion(&detector)
+                .build(&variables.root())
+                .unwrap(),
+        )
     })
 }
 
@@ -34,12 +43,25 @@ fn fuse(fusion: &dyn Fusion, features: &Tensor, reach: &[f32]) -> Tensor {
 
 /// The same for maps of these agents, each at another position.
 fn fuse_of(fusion: &dyn Fusion, features: &Tensor, reach: &[f32], agents: &[usize]) -> Tensor {
-    let mask = Tensor::from_slice(reach).view([-1, 1, 1, 1]).expand([-1, 1, SHAPE[1], SHAPE[2]], false);
+    let mask = Tensor::from_slice(reach)
+        .view([-1, 1, 1, 1])
+        .expand([-1, 1, SHAPE[1], SHAPE[2]], false);
     let facts: Vec<_> = (agents.iter())
-        .map(|&agent| MapMetadata::fresh(agent, Pose::from_xyz_yaw([2.0 * agent as f64, 0.0, 0.0], 0.0)))
+        .map(|&agent| {
+            MapMetadata::fresh(
+                agent,
+                Pose::from_xyz_yaw([2.0 * agent as f64, 0.0, 0.0], 0.0),
+            )
+        })
         .collect();
     let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
-    let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
+    let grid = BevGrid {
+        x_min_m: -12.0,
+        y_min_m: -8.0,
+        cell_m: 1.0,
+        width,
+        height,
+    };
     let maps = AlignedMaps::newest(features, &mask, &facts, &grid);
     let fused = no_grad(|| fusion.fuse(&maps)).unwrap().map;
     assert_eq!(fused.size(), SHAPE);
@@ -55,7 +77,10 @@ fn masked_neighbours_change_nothing() {
     let features = random(3);
     for (method, fusion) in all() {
         let ego_only = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
-        assert!(ego_only.isfinite().all().double_value(&[]) == 1.0, "{method}");
+        assert!(
+            ego_only.isfinite().all().double_value(&[]) == 1.0,
+            "{method}"
+        );
         let masked = fuse(&*fusion, &features, &[1.0, 0.0, 0.0]);
         assert!(difference(&ego_only, &masked) < 1e-4, "{method}");
     }
@@ -68,7 +93,11 @@ fn neighbours_that_are_seen_change_something_unless_maps_are_not_exchanged() {
         let ego_only = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
         let together = fuse(&*fusion, &features, &[1.0, 1.0, 1.0]);
         let shares_maps = method.exchange() == Exchange::Features;
-        assert_eq!(difference(&ego_only, &together) > 1e-4, shares_maps, "{method}");
+        assert_eq!(
+            difference(&ego_only, &together) > 1e-4,
+            shares_maps,
+            "{method}"
+        );
     }
 }
 
@@ -87,17 +116,35 @@ fn the_order_of_neighbours_does_not_matter() {
 fn every_parameter_learns() {
     let features = random(3);
     let shrink = Some(ShrinkConfig::Pointwise { channels: SHAPE[0] });
-    let detector = DetectorConfig { shrink, ..DetectorConfig::lean() };
+    let detector = DetectorConfig {
+        shrink,
+        ..DetectorConfig::lean()
+    };
     for method in Method::ALL {
         let variables = VarStore::new(Device::Cpu);
-        let fusion = method.default_fusion(&detector).build(&variables.root()).unwrap();
+        let fusion = method
+            .default_fusion(&detector)
+            .build(&variables.root())
+            .unwrap();
         let mask = Tensor::ones([3, 1, SHAPE[1], SHAPE[2]], FLOAT);
         let facts: Vec<_> = (0..3)
-            .map(|agent| MapMetadata { age_secs: 0.07 * agent as f64, ..MapMetadata::fresh(agent, Pose::IDENTITY) })
+            .map(|agent| MapMetadata {
+                age_secs: 0.07 * agent as f64,
+                ..MapMetadata::fresh(agent, Pose::IDENTITY)
+            })
             .collect();
         let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
-        let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
-        let maps = AlignedMaps { is_training: true, ..AlignedMaps::newest(&features, &mask, &facts, &grid) };
+        let grid = BevGrid {
+            x_min_m: -12.0,
+            y_min_m: -8.0,
+            cell_m: 1.0,
+            width,
+            height,
+        };
+        let maps = AlignedMaps {
+            is_training: true,
+            ..AlignedMaps::newest(&features, &mask, &facts, &grid)
+        };
         let fused = fusion.fuse(&maps).unwrap().map;
         if variables.is_empty() {
             continue;
@@ -106,8 +153,11 @@ fn every_parameter_learns() {
         for (name, variable) in variables.variables() {
             // Parameters of another agent type get no gradient from vehicles, and the temporal feature memory none from
             // the newest maps.
-            let is_idle = name.contains("linears.1.") || name.starts_with("recall.") || !variable.requires_grad();
-            let learns = variable.grad().defined() && variable.grad().isfinite().all().double_value(&[]) == 1.0;
+            let is_idle = name.contains("linears.1.")
+                || name.starts_with("recall.")
+                || !variable.requires_grad();
+            let learns = variable.grad().defined()
+                && variable.grad().isfinite().all().double_value(&[]) == 1.0;
             assert!(learns || is_idle, "{method}: {name}");
         }
     }
@@ -118,15 +168,27 @@ fn names_round_trip_and_are_unique() {
     for method in Method::ALL {
         assert_eq!(method.to_string().parse(), Ok(method));
         assert_eq!(serde_json::to_value(method).unwrap(), method.name());
-        assert_eq!(serde_json::from_value::<Method>(method.name().into()).unwrap(), method);
-        assert_eq!(Method::ALL.iter().filter(|other| **other == method).count(), 1, "{method}");
+        assert_eq!(
+            serde_json::from_value::<Method>(method.name().into()).unwrap(),
+            method
+        );
+        assert_eq!(
+            Method::ALL.iter().filter(|other| **other == method).count(),
+            1,
+            "{method}"
+        );
     }
 }
 
 #[test]
 fn the_message_lists_every_method() {
     let message = "pastat2".parse::<Method>().unwrap_err().to_string();
-    assert!(Method::ALL.iter().all(|method| message.contains(method.name())), "{message}");
+    assert!(
+        Method::ALL
+            .iter()
+            .all(|method| message.contains(method.name())),
+        "{message}"
+    );
 }
 
 #[test]
@@ -134,11 +196,18 @@ fn settings_come_back_from_json_and_unknown_ones_are_named() {
     for method in Method::ALL {
         let config = method.default_fusion(&DetectorConfig::lean());
         let text = config.to_json();
-        assert!(text.starts_with(&format!("{{\"kind\":\"{}\"", config.kind())), "{text}");
+        assert!(
+            text.starts_with(&format!("{{\"kind\":\"{}\"", config.kind())),
+            "{text}"
+        );
         let read: FusionConfig = serde_json::from_str(&text).unwrap();
         assert!(read == config && method.has_fusion(&read), "{method}");
     }
-    let error = |text: &str| serde_json::from_str::<FusionConfig>(text).unwrap_err().to_string();
+    let error = |text: &str| {
+        serde_json::from_str::<FusionConfig>(text)
+            .unwrap_err()
+            .to_string()
+    };
     assert!(error("{\"kind\":\"mean\"}").contains("mean"));
     assert!(error("{\"kind\":\"max\",\"power\":2}").contains("power"));
     assert!(error("{}").contains("kind"));
@@ -150,7 +219,9 @@ mod mean {
     use serde::{Deserialize, Serialize};
     use tch::{TchError, nn};
 
-    use crate::{AlignedMaps, Exchange, Fusion, FusionOutput, FusionSettings, FusionSpec, MethodSpec};
+    use crate::{
+        AlignedMaps, Exchange, Fusion, FusionOutput, FusionSettings, FusionSpec, MethodSpec,
+    };
 
     pub(super) static METHOD: MethodSpec = MethodSpec {
         name: "mean",
@@ -183,7 +254,10 @@ mod mean {
 
     impl Fusion for Mean {
         fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
-            let mean = maps.warped.features.f_mean_dim([0_i64].as_slice(), false, None)?;
+            let mean = maps
+                .warped
+                .features
+                .f_mean_dim([0_i64].as_slice(), false, None)?;
             Ok((mean * self.0).into())
         }
     }
@@ -192,17 +266,39 @@ mod mean {
 #[test]
 fn a_method_from_outside_the_table_runs_through_the_pipeline() {
     let method = Method::of(&mean::METHOD);
-    assert!(!Method::ALL.contains(&method) && method.name() == "mean" && method.weights_names() == ["max"]);
+    assert!(
+        !Method::ALL.contains(&method)
+            && method.name() == "mean"
+            && method.weights_names() == ["max"]
+    );
     let detector = DetectorConfig::lean();
     let config = method.default_fusion(&detector);
-    assert_eq!(config.settings::<mean::MeanConfig>().map(|settings| settings.gain), Some(2.0));
+    assert_eq!(
+        config
+            .settings::<mean::MeanConfig>()
+            .map(|settings| settings.gain),
+        Some(2.0)
+    );
     let stage = FusionStage::untrained(method, &detector, Device::Cpu).unwrap();
     let grid = detector.feature_grid();
-    let size = [2, detector.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
+    let size = [
+        2,
+        detector.feature_channels(),
+        i64::from(grid.height),
+        i64::from(grid.width),
+    ];
     let maps = Tensor::rand(size, FLOAT);
-    let metadata: Vec<_> = (0..2).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
-    let aligned = stage.align(&ReceivedMaps::new(maps.shallow_clone(), None), &metadata).unwrap();
+    let metadata: Vec<_> = (0..2)
+        .map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY))
+        .collect();
+    let aligned = stage
+        .align(&ReceivedMaps::new(maps.shallow_clone(), None), &metadata)
+        .unwrap();
     let fused = stage.fuse(&aligned).unwrap();
-    assert!(fused.map.allclose(&(maps.get(0) + maps.get(1)), 1e-6, 1e-6, false));
+    assert!(
+        fused
+            .map
+            .allclose(&(maps.get(0) + maps.get(1)), 1e-6, 1e-6, false)
+    );
     assert!(fused.corrections.is_none());
 }

@@ -15,7 +15,9 @@ use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
 use crate::f64_tensor::{Order, are_numbers};
 use crate::full_resolution::FullResolutionMap;
-use crate::maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells, with_cells_of};
+use crate::maps::{
+    AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells, with_cells_of,
+};
 use crate::method::{Exchange, Method};
 use crate::settings::{FUSION_KEY, FusionConfig, Requirements};
 use crate::warp::{WarpError, WarpedMaps, check, warp_cells, warp_to_ego};
@@ -80,11 +82,26 @@ impl FusionStage {
         let shares_maps = method.exchange() == Exchange::Features;
         let mixing = shares_maps.then(|| ChannelMixing::new(path, detector.feature_channels()));
         let fusion = config.build(&(path / "fusion"))?;
-        let sizes = [detector.feature_channels(), detector.anchors.yaws_deg.len() as i64];
+        let sizes = [
+            detector.feature_channels(),
+            detector.anchors.yaws_deg.len() as i64,
+        ];
         let requirements = config.requirements();
-        let classes = requirements.history.full_resolution.then(|| Classes::under(path, sizes));
+        let classes = requirements
+            .history
+            .full_resolution
+            .then(|| Classes::under(path, sizes));
         let (grid, y_axis) = (detector.feature_grid(), detector.y_axis);
-        Ok(Self { config: config.clone(), requirements, fusion, mixing, classes, grid, y_axis, search: None })
+        Ok(Self {
+            config: config.clone(),
+            requirements,
+            fusion,
+            mixing,
+            classes,
+            grid,
+            y_axis,
+            search: None,
+        })
     }
 
     /// The fusion of a weights file, or the one of `method` where it differs and has no parameters; it takes maps on
@@ -102,12 +119,18 @@ impl FusionStage {
         let config = stored_config(weights, method, detector)?;
         let mut stage = Self::new(&variables.root(), &config, method, detector)?;
         let is_needed = |name: &str| name != channel_mixing::WEIGHT || weights.contains(name);
-        weights.copy_some_into(&variables, is_needed).map_err(|error| of_method(error, weights, method))?;
+        weights
+            .copy_some_into(&variables, is_needed)
+            .map_err(|error| of_method(error, weights, method))?;
         if !weights.contains(channel_mixing::WEIGHT) {
             stage.mixing = None;
         }
-        if let Some(scales) = weights.activation_scales()?.filter(|_| device == Device::Cpu) {
-            tch::no_grad(|| stage.fusion.quantise(&scales)).map_err(|error| weights.quantise_error(error))?;
+        if let Some(scales) = weights
+            .activation_scales()?
+            .filter(|_| device == Device::Cpu)
+        {
+            tch::no_grad(|| stage.fusion.quantise(&scales))
+                .map_err(|error| weights.quantise_error(error))?;
         }
         Ok(stage)
     }
@@ -117,10 +140,17 @@ impl FusionStage {
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no fusion can be built from.
-    pub fn untrained(method: Method, detector: &DetectorConfig, device: Device) -> Result<Self, ConfigError> {
+    pub fn untrained(
+        method: Method,
+        detector: &DetectorConfig,
+        device: Device,
+    ) -> Result<Self, ConfigError> {
         let variables = VarStore::new(device);
         let config = method.default_fusion(detector);
-        Ok(Self { mixing: None, ..Self::new(&variables.root(), &config, method, detector)? })
+        Ok(Self {
+            mixing: None,
+            ..Self::new(&variables.root(), &config, method, detector)?
+        })
     }
 
     /// Settings that the fusion was built from.
@@ -140,7 +170,11 @@ impl FusionStage {
     ///
     /// # Errors
     /// [`WarpError`] when the maps do not lie on the grid or metadata are missing.
-    pub fn align(&self, received: &ReceivedMaps, metadata: &[MapMetadata]) -> Result<AlignedMaps, WarpError> {
+    pub fn align(
+        &self,
+        received: &ReceivedMaps,
+        metadata: &[MapMetadata],
+    ) -> Result<AlignedMaps, WarpError> {
         let (count, newest) = (received.maps.size4()?.0, newest(metadata) as i64);
         if count == newest {
             return self.align_with(received, None, metadata);
@@ -152,30 +186,50 @@ impl FusionStage {
             earlier.sent.as_ref().map(Tensor::shallow_clone),
         );
         let earlier = self.kept(&earlier, &turned)?;
-        self.align_with(&received.only(0, newest.min(count))?, Some(earlier), metadata)
+        self.align_with(
+            &received.only(0, newest.min(count))?,
+            Some(earlier),
+            metadata,
+        )
     }
 
     /// The form in which maps are kept for later frames, given the same maps in the axes of the ego, `turned`.
     ///
     /// # Errors
     /// [`TchError`] when the maps have not four dimensions.
-    pub fn kept(&self, received: &ReceivedMaps, turned: &ReceivedMaps) -> Result<ReceivedMaps, TchError> {
+    pub fn kept(
+        &self,
+        received: &ReceivedMaps,
+        turned: &ReceivedMaps,
+    ) -> Result<ReceivedMaps, TchError> {
         let ReceivedMaps { maps, sent, .. } = received;
         let history = self.requirements.history;
         let kept = match history.earlier_cells {
             Some(cells) => ReceivedMaps::new(
                 cell_by_cell(&larger_cells(maps, cells)?)?,
                 // A pooled cell was sent where any of its cells was.
-                sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?,
+                sent.as_ref()
+                    .map(|sent| larger_cells(sent, cells)?.f_ceil())
+                    .transpose()?,
             ),
-            None => ReceivedMaps::new(maps.shallow_clone(), sent.as_ref().map(Tensor::shallow_clone)),
+            None => ReceivedMaps::new(
+                maps.shallow_clone(),
+                sent.as_ref().map(Tensor::shallow_clone),
+            ),
         };
         let full_resolution = match history.full_resolution {
             true if turned.full_resolution.is_empty() => full_resolution(turned)?,
-            true => turned.full_resolution.iter().map(FullResolutionMap::shallow_clone).collect(),
+            true => turned
+                .full_resolution
+                .iter()
+                .map(FullResolutionMap::shallow_clone)
+                .collect(),
             false => Vec::new(),
         };
-        Ok(ReceivedMaps { full_resolution, ..kept })
+        Ok(ReceivedMaps {
+            full_resolution,
+            ..kept
+        })
     }
 
     /// Maps in the axes of the ego.
@@ -189,7 +243,11 @@ impl FusionStage {
     /// Memory order in which the fusion reads its maps: one with pooled earlier maps takes the maximum over the newest
     /// cell by cell.
     fn order(&self) -> Order {
-        if self.requirements.history.earlier_cells.is_some() { Order::Cells } else { Order::Planes }
+        if self.requirements.history.earlier_cells.is_some() {
+            Order::Cells
+        } else {
+            Order::Planes
+        }
     }
 
     /// [`Self::align`] with earlier maps in the form of [`Self::kept`].
@@ -204,20 +262,35 @@ impl FusionStage {
     ) -> Result<AlignedMaps, WarpError> {
         let mut metadata = self.of_network(metadata).into_owned();
         let count = newest.maps.size4()?.0;
-        let maps = count + earlier.as_ref().map_or(Ok(0), |earlier| earlier.maps.size4().map(|size| size.0))?;
+        let maps = count
+            + earlier
+                .as_ref()
+                .map_or(Ok(0), |earlier| earlier.maps.size4().map(|size| size.0))?;
         if maps != metadata.len() as i64 {
-            return Err(WarpError::PoseCount { maps, poses: metadata.len() });
+            return Err(WarpError::PoseCount {
+                maps,
+                poses: metadata.len(),
+            });
         }
         let earlier = match (self.requirements.history.earlier_cells, earlier) {
             (Some(cells), Some(earlier)) => {
                 let metadata = metadata.split_off(count as usize);
-                let (_, warped) = self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells))?;
+                let (_, warped) =
+                    self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells))?;
                 let classes = self.classes.as_ref().map(Classes::shallow_clone);
                 let full_resolution = classes.map(|classes| (earlier.full_resolution, classes));
-                Some(EarlierMaps { warped, metadata, full_resolution })
+                Some(EarlierMaps {
+                    warped,
+                    metadata,
+                    full_resolution,
+                })
             }
             (None, Some(earlier)) => {
-                return self.aligned(&ReceivedMaps::together(&[newest, &earlier])?, None, metadata);
+                return self.aligned(
+                    &ReceivedMaps::together(&[newest, &earlier])?,
+                    None,
+                    metadata,
+                );
             }
             (_, None) => None,
         };
@@ -231,7 +304,14 @@ impl FusionStage {
         metadata: Vec<MapMetadata>,
     ) -> Result<AlignedMaps, WarpError> {
         let (received, warped) = self.warped(received, &metadata, &self.grid)?;
-        Ok(AlignedMaps { warped, received, metadata, grid: self.grid, earlier, is_training: false })
+        Ok(AlignedMaps {
+            warped,
+            received,
+            metadata,
+            grid: self.grid,
+            earlier,
+            is_training: false,
+        })
     }
 
     /// Maps in the axes of the ego, and the same warped onto the ego's `grid`.
@@ -250,7 +330,11 @@ impl FusionStage {
             return Ok((turned, warped));
         }
         turned.full_resolution = full_resolution(&turned)?;
-        let cells: Vec<_> = turned.full_resolution.iter().filter_map(FullResolutionMap::numbers).collect();
+        let cells: Vec<_> = turned
+            .full_resolution
+            .iter()
+            .filter_map(FullResolutionMap::numbers)
+            .collect();
         let warped = warp_cells(&cells, &poses, grid)?;
         Ok((turned, warped))
     }
@@ -281,13 +365,18 @@ impl FusionStage {
         if self.y_axis == YAxis::Left {
             return Cow::Borrowed(metadata);
         }
-        let mirrored = metadata.iter().map(|map| MapMetadata { ego_from_cav: map.ego_from_cav.mirrored_y(), ..*map });
+        let mirrored = metadata.iter().map(|map| MapMetadata {
+            ego_from_cav: map.ego_from_cav.mirrored_y(),
+            ..*map
+        });
         Cow::Owned(mirrored.collect())
     }
 }
 
 /// Each of the maps at full resolution.
-fn full_resolution(ReceivedMaps { maps, sent, .. }: &ReceivedMaps) -> Result<Vec<FullResolutionMap>, TchError> {
+fn full_resolution(
+    ReceivedMaps { maps, sent, .. }: &ReceivedMaps,
+) -> Result<Vec<FullResolutionMap>, TchError> {
     let of_map = |map: i64| {
         let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
         FullResolutionMap::of(&of(maps)?, sent.as_ref().map(of).transpose()?.as_ref())
@@ -297,15 +386,26 @@ fn full_resolution(ReceivedMaps { maps, sent, .. }: &ReceivedMaps) -> Result<Vec
 
 /// Number of leading entries that are the newest of their agents.
 fn newest(facts: &[MapMetadata]) -> usize {
-    let is_first = |(entry, of): &(usize, &MapMetadata)| facts[..*entry].iter().all(|before| before.agent != of.agent);
+    let is_first = |(entry, of): &(usize, &MapMetadata)| {
+        facts[..*entry]
+            .iter()
+            .all(|before| before.agent != of.agent)
+    };
     facts.iter().enumerate().take_while(is_first).count()
 }
 
 /// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents. The
 /// ego's own entry of the same time step gives that frame; without one the ego counts as stationary.
 fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
-    let step = |entry: usize| facts[..entry].iter().filter(|before| before.agent == facts[entry].agent).count();
-    let ego_of = |wanted: usize| (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted);
+    let step = |entry: usize| {
+        facts[..entry]
+            .iter()
+            .filter(|before| before.agent == facts[entry].agent)
+            .count()
+    };
+    let ego_of = |wanted: usize| {
+        (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted)
+    };
     let of_entry = |entry: usize| {
         if facts[entry].agent == 0 {
             return Pose::IDENTITY;
@@ -319,7 +419,10 @@ fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
 /// Maps with the channels of a cell contiguous in memory, where no gradient flows.
 fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
     match are_numbers(maps) {
-        true => maps.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
+        true => maps
+            .f_permute([0, 2, 3, 1])?
+            .f_contiguous()?
+            .f_permute([0, 3, 1, 2]),
         false => Ok(maps.shallow_clone()),
     }
 }
@@ -327,9 +430,11 @@ fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
 /// Names the method of the weights beside an error, if it is another one.
 fn of_method(error: WeightsError, weights: &Weights, method: Method) -> StageError {
     match weights.metadata(METHOD_KEY) {
-        Some(trained) if trained != method.name() => {
-            StageError::OtherMethod { trained: trained.to_owned(), method: method.name(), source: Box::new(error) }
-        }
+        Some(trained) if trained != method.name() => StageError::OtherMethod {
+            trained: trained.to_owned(),
+            method: method.name(),
+            source: Box::new(error),
+        },
         _ => error.into(),
     }
 }
@@ -345,7 +450,11 @@ pub(crate) fn stored_config(
         return Ok(usual);
     }
     let stored: FusionConfig = weights.metadata_json(FUSION_KEY)?;
-    Ok(if method.has_fusion(&stored) { stored } else { usual })
+    Ok(if method.has_fusion(&stored) {
+        stored
+    } else {
+        usual
+    })
 }
 
 #[cfg(test)]
@@ -360,17 +469,33 @@ mod tests {
     fn a_mirrored_world_is_fused_like_this_one() {
         tch::set_num_threads(1);
         let plain = DetectorConfig::lean();
-        let mirrored = DetectorConfig { y_axis: YAxis::Right, ..DetectorConfig::lean() };
+        let mirrored = DetectorConfig {
+            y_axis: YAxis::Right,
+            ..DetectorConfig::lean()
+        };
         let grid = plain.feature_grid();
-        let size = [3, plain.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
+        let size = [
+            3,
+            plain.feature_channels(),
+            i64::from(grid.height),
+            i64::from(grid.width),
+        ];
         let maps = Tensor::rand(size, (Kind::Float, Device::Cpu));
-        let poses =
-            [Pose::IDENTITY, Pose::from_xyz_yaw([8.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-5.0, 9.0, 0.0], -2.0)];
-        let facts: Vec<MapMetadata> = (0..3).map(|agent| MapMetadata::fresh(agent, poses[agent])).collect();
+        let poses = [
+            Pose::IDENTITY,
+            Pose::from_xyz_yaw([8.0, 3.0, 0.0], 0.4),
+            Pose::from_xyz_yaw([-5.0, 9.0, 0.0], -2.0),
+        ];
+        let facts: Vec<MapMetadata> = (0..3)
+            .map(|agent| MapMetadata::fresh(agent, poses[agent]))
+            .collect();
         let fused = |detector: &DetectorConfig, maps: &Tensor| {
             let stage = FusionStage::untrained(Method::ATTENTION, detector, Device::Cpu).unwrap();
             let received = ReceivedMaps::new(maps.shallow_clone(), None);
-            stage.fuse(&stage.align(&received, &facts).unwrap()).unwrap().map
+            stage
+                .fuse(&stage.align(&received, &facts).unwrap())
+                .unwrap()
+                .map
         };
         let here = fused(&plain, &maps);
         let there = fused(&mirrored, &maps.flip([2])).flip([1]);
@@ -384,14 +509,27 @@ mod tests {
         let detector = DetectorConfig::lean();
         let variables = VarStore::new(Device::Cpu);
         let attention = Method::ATTENTION;
-        FusionStage::new(&variables.root(), &attention.default_fusion(&detector), attention, &detector).unwrap();
+        FusionStage::new(
+            &variables.root(),
+            &attention.default_fusion(&detector),
+            attention,
+            &detector,
+        )
+        .unwrap();
         let about = [(METHOD_KEY.to_owned(), attention.name().to_owned())].into();
         save(&path, &variables, &about, Precision::Single).unwrap();
         let weights = Weights::load(&path).unwrap();
-        let error = FusionStage::from_weights(&weights, Method::COBEVT, &detector, Device::Cpu).unwrap_err();
+        let error = FusionStage::from_weights(&weights, Method::COBEVT, &detector, Device::Cpu)
+            .unwrap_err();
         let message = error.to_string();
-        assert!(message.starts_with(&path.display().to_string()), "{message}");
-        assert!(message.ends_with("; the file was trained for method attention, not cobevt"), "{message}");
+        assert!(
+            message.starts_with(&path.display().to_string()),
+            "{message}"
+        );
+        assert!(
+            message.ends_with("; the file was trained for method attention, not cobevt"),
+            "{message}"
+        );
     }
 
     #[test]
@@ -399,9 +537,20 @@ mod tests {
         let turned = |yaw_rad: f64| Pose::from_xyz_yaw([1.0, 2.0, 0.0], yaw_rad);
         let fact = |agent: usize, yaw_rad: f64| MapMetadata::fresh(agent, turned(yaw_rad));
         // The ego has turned by 0.1 since; it has no map of a third time step.
-        let facts = [MapMetadata::fresh(0, Pose::IDENTITY), fact(1, 0.7), fact(0, -0.1), fact(1, 0.5), fact(1, 0.4)];
+        let facts = [
+            MapMetadata::fresh(0, Pose::IDENTITY),
+            fact(1, 0.7),
+            fact(0, -0.1),
+            fact(1, 0.5),
+            fact(1, 0.4),
+        ];
         let yaws: Vec<f64> = then_from_cav(&facts, 2).iter().map(Pose::yaw_rad).collect();
-        assert!(yaws.iter().zip([0.0, 0.6, 0.4]).all(|(found, expected)| (found - expected).abs() < 1e-9), "{yaws:?}");
+        assert!(
+            yaws.iter()
+                .zip([0.0, 0.6, 0.4])
+                .all(|(found, expected)| (found - expected).abs() < 1e-9),
+            "{yaws:?}"
+        );
         assert_eq!(then_from_cav(&facts, 2)[0], Pose::IDENTITY);
     }
 }

@@ -22,15 +22,25 @@ pub enum Part {
 ///
 /// # Errors
 /// [`ConfigError`] where there is nothing to leave out.
-pub fn ablated(fusion: &FusionConfig, without: &[Part], frames: Option<usize>) -> Result<FusionConfig, ConfigError> {
+pub fn ablated(
+    fusion: &FusionConfig,
+    without: &[Part],
+    frames: Option<usize>,
+) -> Result<FusionConfig, ConfigError> {
     let Some(config) = fusion.settings::<PastatConfig>() else {
         if without.is_empty() && frames.is_none() {
             return Ok(fusion.clone());
         }
         let value = format!("without {without:?}, {frames:?} frames");
-        return Err(ConfigError::Value { field: "fusion", value, must: "unchanged for methods other than pastat" });
+        return Err(ConfigError::Value {
+            field: "fusion",
+            value,
+            must: "unchanged for methods other than pastat",
+        });
     };
-    let mut config = without.iter().fold(config.clone(), |config, &part| without_part(config, part));
+    let mut config = without
+        .iter()
+        .fold(config.clone(), |config, &part| without_part(config, part));
     config.frames = frames.unwrap_or(config.frames);
     // With one time step there is nothing to remember.
     if config.frames == 1 {
@@ -41,9 +51,18 @@ pub fn ablated(fusion: &FusionConfig, without: &[Part], frames: Option<usize>) -
 
 fn without_part(config: PastatConfig, part: Part) -> PastatConfig {
     match part {
-        Part::Ce => PastatConfig { ce: false, ..config },
-        Part::Fsa => PastatConfig { fsa: None, ..config },
+        Part::Ce => PastatConfig {
+            ce: false,
+            ..config
+        },
+        Part::Fsa => PastatConfig {
+            fsa: None,
+            ..config
+        },
         Part::Te => PastatConfig { te: None, ..config },
-        Part::TemporalMemory => PastatConfig { temporal_memory: None, ..config },
+        Part::TemporalMemory => PastatConfig {
+            temporal_memory: None,
+            ..config
+        },
     }
 }

@@ -58,12 +58,21 @@ pub(super) struct Origins {
 impl CoarseAlignment {
     pub(super) fn new(config: &PastatConfig) -> Self {
         let padding_cells = config.padding_cells();
-        Self { padding_cells, earlier_padding_cells: padding_cells / config.earlier_cells }
+        Self {
+            padding_cells,
+            earlier_padding_cells: padding_cells / config.earlier_cells,
+        }
     }
 
     /// The entries of `maps` that reach any cell; the ego's newest is always one.
     pub(super) fn pick(&self, maps: &AlignedMaps) -> Result<CoarseMaps, TchError> {
-        let AlignedMaps { warped, received, metadata, earlier, .. } = maps;
+        let AlignedMaps {
+            warped,
+            received,
+            metadata,
+            earlier,
+            ..
+        } = maps;
         let newest = reaching(&warped.mask, true)?;
         let sent = match &received.sent {
             Some(sent) => sent.shallow_clone(),
@@ -74,26 +83,48 @@ impl CoarseAlignment {
             None => Vec::new(),
         };
         let first = metadata.len() as i64;
-        let metadata: Vec<MapMetadata> =
-            metadata.iter().chain(earlier.iter().flat_map(|earlier| &earlier.metadata)).copied().collect();
-        let places: Vec<i64> =
-            newest.iter().copied().chain(earlier_entries.iter().map(|entry| entry + first)).collect();
-        let picked: Vec<MapMetadata> = places.iter().map(|&place| metadata[place as usize]).collect();
+        let metadata: Vec<MapMetadata> = metadata
+            .iter()
+            .chain(earlier.iter().flat_map(|earlier| &earlier.metadata))
+            .copied()
+            .collect();
+        let places: Vec<i64> = newest
+            .iter()
+            .copied()
+            .chain(earlier_entries.iter().map(|entry| entry + first))
+            .collect();
+        let picked: Vec<MapMetadata> = places
+            .iter()
+            .map(|&place| metadata[place as usize])
+            .collect();
         Ok(CoarseMaps {
-            newest: padded(&rows_of(&warped.features, &warped.mask, &newest)?, self.padding_cells)?,
+            newest: padded(
+                &rows_of(&warped.features, &warped.mask, &newest)?,
+                self.padding_cells,
+            )?,
             received: rows_of(&received.maps, &sent, &newest)?,
             received_cells: {
                 let of_entry = |&entry: &i64| received.full_resolution.get(entry as usize);
-                newest.iter().filter_map(of_entry).map(FullResolutionMap::shallow_clone).collect()
+                newest
+                    .iter()
+                    .filter_map(of_entry)
+                    .map(FullResolutionMap::shallow_clone)
+                    .collect()
             },
             earlier: match earlier.as_ref().filter(|_| !earlier_entries.is_empty()) {
                 Some(earlier) => {
                     let WarpedMaps { features, mask } = &earlier.warped;
-                    Some(padded(&rows_of(features, mask, &earlier_entries)?, self.earlier_padding_cells)?)
+                    Some(padded(
+                        &rows_of(features, mask, &earlier_entries)?,
+                        self.earlier_padding_cells,
+                    )?)
                 }
                 None => None,
             },
-            earlier_entries: earlier_entries.iter().map(|&entry| entry as usize).collect(),
+            earlier_entries: earlier_entries
+                .iter()
+                .map(|&entry| entry as usize)
+                .collect(),
             origins: Origins::of(&picked),
             places,
             all: metadata.len() as i64,
@@ -108,9 +139,16 @@ impl CoarseMaps {
         if self.places.len() as i64 == self.all {
             return Ok(corrections.shallow_clone());
         }
-        let all = Tensor::f_zeros([self.all - 1, 3], (corrections.kind(), corrections.device()))?;
+        let all = Tensor::f_zeros(
+            [self.all - 1, 3],
+            (corrections.kind(), corrections.device()),
+        )?;
         let places: Vec<i64> = self.places[1..].iter().map(|place| place - 1).collect();
-        all.f_index_copy(0, &Tensor::f_from_slice(&places)?.f_to_device(corrections.device())?, corrections)
+        all.f_index_copy(
+            0,
+            &Tensor::f_from_slice(&places)?.f_to_device(corrections.device())?,
+            corrections,
+        )
     }
 }
 
@@ -135,9 +173,14 @@ impl Origins {
 
 /// Index of every entry among those of its agent, 0 for the newest; of two of one age the first is the newer.
 pub(super) fn steps_back(agent: &[usize], age_secs: &[f64]) -> Vec<usize> {
-    let is_newer = |a: usize, b: usize| age_secs[a] < age_secs[b] || (age_secs[a] == age_secs[b] && a < b);
+    let is_newer =
+        |a: usize, b: usize| age_secs[a] < age_secs[b] || (age_secs[a] == age_secs[b] && a < b);
     (0..agent.len())
-        .map(|entry| (0..agent.len()).filter(|&other| agent[other] == agent[entry] && is_newer(other, entry)).count())
+        .map(|entry| {
+            (0..agent.len())
+                .filter(|&other| agent[other] == agent[entry] && is_newer(other, entry))
+                .count()
+        })
         .collect()
 }
 
@@ -149,18 +192,31 @@ fn rows_of(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<WarpedMa
         true => tensor.f_to_kind(Kind::Float),
         false => tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float),
     };
-    Ok(WarpedMaps { features: pick(features)?, mask: pick(mask)? })
+    Ok(WarpedMaps {
+        features: pick(features)?,
+        mask: pick(mask)?,
+    })
 }
 
 /// With rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.
 fn padded(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
     let padded = |maps: &Tensor| Padding::to_multiples_of(cells, maps);
-    Ok(WarpedMaps { features: padded(&maps.features)?, mask: padded(&maps.mask)? })
+    Ok(WarpedMaps {
+        features: padded(&maps.features)?,
+        mask: padded(&maps.mask)?,
+    })
 }
 
 /// The entries of `mask` `[N, 1, H, W]` that reach any cell; `with_ego`: the first is always one.
 fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchError> {
-    let reach: Vec<f32> = Vec::try_from(mask.f_amax([1_i64, 2, 3].as_slice(), false)?.f_to_kind(Kind::Float)?)?;
+    let reach: Vec<f32> = Vec::try_from(
+        mask.f_amax([1_i64, 2, 3].as_slice(), false)?
+            .f_to_kind(Kind::Float)?,
+    )?;
     let counts = |(entry, reach): &(i64, f32)| (with_ego && *entry == 0) || *reach > 0.0;
-    Ok((0..).zip(reach).filter(counts).map(|(entry, _)| entry).collect())
+    Ok((0..)
+        .zip(reach)
+        .filter(counts)
+        .map(|(entry, _)| entry)
+        .collect())
 }

@@ -35,24 +35,49 @@ pub(super) struct Confidences {
 impl ConfidenceEmbedding {
     /// Its variable is `ce.weight` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let deviation = ((config.channels * config.patch * config.patch) as f64).sqrt().recip();
-        let random = Init::Uniform { lo: -deviation, up: deviation };
-        let weight = config.ce.then(|| (path / "ce").var("weight", &[config.dim], random));
-        Self { weight, device: path.device() }
+        let deviation = ((config.channels * config.patch * config.patch) as f64)
+            .sqrt()
+            .recip();
+        let random = Init::Uniform {
+            lo: -deviation,
+            up: deviation,
+        };
+        let weight = config
+            .ce
+            .then(|| (path / "ce").var("weight", &[config.dim], random));
+        Self {
+            weight,
+            device: path.device(),
+        }
     }
 
     /// Eq. 7 for every entry.
-    pub(super) fn embed(&self, Origins { confidence, steps_back, .. }: &Origins) -> Result<Confidences, TchError> {
+    pub(super) fn embed(
+        &self,
+        Origins {
+            confidence,
+            steps_back,
+            ..
+        }: &Origins,
+    ) -> Result<Confidences, TchError> {
         let shares = shares(confidence, steps_back);
         let of_entry = |(share, &own): (&f32, &f64)| [*share, own as f32, confidence[0] as f32];
         let of_maps: Vec<f32> = shares.iter().zip(confidence).flat_map(of_entry).collect();
-        let of_maps = Tensor::f_from_slice(&of_maps)?.f_view([-1, CONFIDENCES])?.f_to_device(self.device)?;
+        let of_maps = Tensor::f_from_slice(&of_maps)?
+            .f_view([-1, CONFIDENCES])?
+            .f_to_device(self.device)?;
         Ok(match &self.weight {
             Some(weight) => {
                 let shares = Tensor::f_from_slice(&shares)?.f_to_device(self.device)?;
-                Confidences { of_tokens: Some(shares.f_unsqueeze(1)? * weight), of_maps }
+                Confidences {
+                    of_tokens: Some(shares.f_unsqueeze(1)? * weight),
+                    of_maps,
+                }
             }
-            None => Confidences { of_tokens: None, of_maps: of_maps.f_zeros_like()? },
+            None => Confidences {
+                of_tokens: None,
+                of_maps: of_maps.f_zeros_like()?,
+            },
         })
     }
 }
@@ -69,9 +94,17 @@ pub(super) fn shares(confidence: &[f64], steps_back: &[usize]) -> Vec<f32> {
     }
     let share = |(&sigma, step): (&f64, &usize)| {
         let (sum, count) = sums[step];
-        if sum > 0.0 { sigma.max(0.0) / sum } else { 1.0 / count as f64 }
+        if sum > 0.0 {
+            sigma.max(0.0) / sum
+        } else {
+            1.0 / count as f64
+        }
     };
-    confidence.iter().zip(steps_back).map(|pair| share(pair) as f32).collect()
+    confidence
+        .iter()
+        .zip(steps_back)
+        .map(|pair| share(pair) as f32)
+        .collect()
 }
 
 #[cfg(test)]
@@ -93,7 +126,10 @@ mod tests {
     fn every_time_step_is_divided_for_itself() {
         let steps = steps_back(&[0, 1, 0, 1, 1], &[0.0, 0.2, 0.1, 0.3, 0.25]);
         assert_eq!(steps, [0, 0, 1, 2, 1]);
-        assert_eq!(shares(&[0.5, 0.5, 0.3, 0.4, 0.1], &steps), [0.5, 0.5, 0.75, 1.0, 0.25]);
+        assert_eq!(
+            shares(&[0.5, 0.5, 0.3, 0.4, 0.1], &steps),
+            [0.5, 0.5, 0.75, 1.0, 0.25]
+        );
     }
 
     proptest! {

@@ -65,7 +65,11 @@ impl Default for FsaConfig {
             hidden: 64,
             max_shift_m: 3.0,
             max_turn_rad: 5.0_f64.to_radians(),
-            alignment_search: Some(SearchConfig { cells: 4, radius: 9, margin: 0.1 }),
+            alignment_search: Some(SearchConfig {
+                cells: 4,
+                radius: 9,
+                margin: 0.1,
+            }),
         }
     }
 }
@@ -82,7 +86,10 @@ pub(crate) struct MemoryConfig {
 
 impl Default for MemoryConfig {
     fn default() -> Self {
-        Self { hidden: 24, share: 0.125 }
+        Self {
+            hidden: 24,
+            share: 0.125,
+        }
     }
 }
 
@@ -165,7 +172,10 @@ impl PastatConfig {
             map_refinement: Some(channels),
             temporal_memory: None,
             earlier_cells: 1,
-            fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
+            fsa: Some(FsaConfig {
+                matching: 16,
+                ..FsaConfig::default()
+            }),
             ..Self::lean(channels)
         }
     }
@@ -175,10 +185,15 @@ impl PastatConfig {
     #[must_use]
     pub(crate) fn padding_cells(&self) -> i64 {
         let larger = |fsa: &FsaConfig| {
-            fsa.alignment_search.map_or(self.earlier_cells, |search| lcm(search.cells, self.earlier_cells))
+            fsa.alignment_search.map_or(self.earlier_cells, |search| {
+                lcm(search.cells, self.earlier_cells)
+            })
         };
         let parts = self.fsa.as_ref().map_or(1, |fsa| PARTS * larger(fsa));
-        lcm(self.patch * self.windows.iter().copied().fold(1, lcm), parts)
+        lcm(
+            self.patch * self.windows.iter().copied().fold(1, lcm),
+            parts,
+        )
     }
 
     /// Checks that a module can be built.
@@ -193,41 +208,89 @@ impl PastatConfig {
             ("pastat dim", self.dim, 1024),
             ("pastat heads", self.heads, 64),
             ("pastat mlp_ratio", self.mlp_ratio, 16),
-            ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
+            (
+                "pastat depth",
+                i64::try_from(self.depth).unwrap_or(i64::MAX),
+                32,
+            ),
             ("pastat refine", self.map_refinement.unwrap_or(1), 4096),
-            ("pastat temporal memory hidden", self.temporal_memory.map_or(1, |memory| memory.hidden), 4096),
-            ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
+            (
+                "pastat temporal memory hidden",
+                self.temporal_memory.map_or(1, |memory| memory.hidden),
+                4096,
+            ),
+            (
+                "pastat frames",
+                i64::try_from(self.frames).unwrap_or(i64::MAX),
+                16,
+            ),
         ] {
             if !(1..=most).contains(&value) {
-                return error(field, value.to_string(), "above zero and of a sensible size");
+                return error(
+                    field,
+                    value.to_string(),
+                    "above zero and of a sensible size",
+                );
             }
         }
         if self.earlier_cells < 1 || self.patch % self.earlier_cells != 0 {
-            return error("pastat earlier_cells", self.earlier_cells.to_string(), "a divisor of the patch");
+            return error(
+                "pastat earlier_cells",
+                self.earlier_cells.to_string(),
+                "a divisor of the patch",
+            );
         }
         if self.dim % (2 * self.heads) != 0 {
-            return error("pastat dim", self.dim.to_string(), "a multiple of twice the heads");
+            return error(
+                "pastat dim",
+                self.dim.to_string(),
+                "a multiple of twice the heads",
+            );
         }
         let sizes = i64::try_from(self.windows.len()).unwrap_or(i64::MAX);
         let are_sizes = self.windows.iter().all(|size| (1..=32).contains(size));
         if sizes == 0 || self.heads % sizes != 0 || !are_sizes {
-            return error("pastat windows", format!("{:?}", self.windows), "1 to 32 tokens each, sharing the heads");
+            return error(
+                "pastat windows",
+                format!("{:?}", self.windows),
+                "1 to 32 tokens each, sharing the heads",
+            );
         }
         if !(1e-3..=10.0).contains(&self.frame_secs) {
-            return error("pastat frame_secs", self.frame_secs.to_string(), "0.001 to 10 s");
+            return error(
+                "pastat frame_secs",
+                self.frame_secs.to_string(),
+                "0.001 to 10 s",
+            );
         }
-        if let Some(cells) = self.fsa.as_ref().and_then(|fsa| fsa.alignment_search).map(|search| search.cells)
+        if let Some(cells) = self
+            .fsa
+            .as_ref()
+            .and_then(|fsa| fsa.alignment_search)
+            .map(|search| search.cells)
             && cells % self.earlier_cells != 0
         {
-            return error("pastat fsa search cells", cells.to_string(), "a multiple of earlier_cells");
+            return error(
+                "pastat fsa search cells",
+                cells.to_string(),
+                "a multiple of earlier_cells",
+            );
         }
         if let Some(MemoryConfig { share, .. }) = self.temporal_memory
             && !(share > 0.0 && share <= 1.0)
         {
-            return error("pastat temporal memory share", share.to_string(), "above 0, up to 1");
+            return error(
+                "pastat temporal memory share",
+                share.to_string(),
+                "above 0, up to 1",
+            );
         }
         if self.temporal_memory.is_some() && self.frames < 2 {
-            return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are blended in");
+            return error(
+                "pastat frames",
+                self.frames.to_string(),
+                "2 or more, as earlier maps are blended in",
+            );
         }
         self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
     }
@@ -250,11 +313,21 @@ impl FsaConfig {
             let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
             return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
         }
-        if let Some(SearchConfig { cells, radius, margin }) = self.alignment_search
-            && !((1..=16).contains(&cells) && (1..=32).contains(&radius) && (0.0..=2.0).contains(&margin))
+        if let Some(SearchConfig {
+            cells,
+            radius,
+            margin,
+        }) = self.alignment_search
+            && !((1..=16).contains(&cells)
+                && (1..=32).contains(&radius)
+                && (0.0..=2.0).contains(&margin))
         {
             let value = format!("{cells}, {radius}, {margin}");
-            return error("pastat fsa search", value, "1 to 16 cells, 1 to 32 of them away, a margin of 0 to 2");
+            return error(
+                "pastat fsa search",
+                value,
+                "1 to 16 cells, 1 to 32 of them away, a margin of 0 to 2",
+            );
         }
         Ok(())
     }
@@ -280,36 +353,105 @@ mod tests {
             assert_eq!(serde_json::from_str::<PastatConfig>(&text).unwrap(), config);
         }
         assert_eq!(PastatConfig::lean(64).padding_cells(), 16);
-        assert_eq!(PastatConfig { windows: vec![4, 6], ..PastatConfig::lean(64) }.padding_cells(), 48);
+        assert_eq!(
+            PastatConfig {
+                windows: vec![4, 6],
+                ..PastatConfig::lean(64)
+            }
+            .padding_cells(),
+            48
+        );
     }
 
     #[test]
     fn invalid_settings_are_named() {
-        let with_memory = |memory| PastatConfig { temporal_memory: Some(memory), ..PastatConfig::lean(64) };
+        let with_memory = |memory| PastatConfig {
+            temporal_memory: Some(memory),
+            ..PastatConfig::lean(64)
+        };
         for (config, part) in [
-            (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
-            (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
-            (PastatConfig { earlier_cells: 3, ..PastatConfig::lean(64) }, "earlier_cells is 3"),
+            (
+                PastatConfig {
+                    dim: 36,
+                    ..PastatConfig::lean(64)
+                },
+                "dim is 36",
+            ),
+            (
+                PastatConfig {
+                    windows: vec![4, 8, 16],
+                    ..PastatConfig::lean(64)
+                },
+                "windows is [4, 8, 16]",
+            ),
+            (
+                PastatConfig {
+                    earlier_cells: 3,
+                    ..PastatConfig::lean(64)
+                },
+                "earlier_cells is 3",
+            ),
             (
                 PastatConfig {
                     fsa: Some(FsaConfig {
-                        alignment_search: Some(SearchConfig { cells: 3, radius: 9, margin: 0.1 }),
+                        alignment_search: Some(SearchConfig {
+                            cells: 3,
+                            radius: 9,
+                            margin: 0.1,
+                        }),
                         ..FsaConfig::default()
                     }),
                     ..PastatConfig::lean(64)
                 },
                 "search cells is 3",
             ),
-            (PastatConfig { frames: 1, ..PastatConfig::lean(64) }, "frames is 1"),
-            (with_memory(MemoryConfig { hidden: 0, ..MemoryConfig::default() }), "temporal memory hidden is 0"),
-            (with_memory(MemoryConfig { share: f64::NAN, ..MemoryConfig::default() }), "temporal memory share is NaN"),
-            (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
-            (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
+            (
+                PastatConfig {
+                    frames: 1,
+                    ..PastatConfig::lean(64)
+                },
+                "frames is 1",
+            ),
+            (
+                with_memory(MemoryConfig {
+                    hidden: 0,
+                    ..MemoryConfig::default()
+                }),
+                "temporal memory hidden is 0",
+            ),
+            (
+                with_memory(MemoryConfig {
+                    share: f64::NAN,
+                    ..MemoryConfig::default()
+                }),
+                "temporal memory share is NaN",
+            ),
+            (
+                PastatConfig {
+                    frames: 0,
+                    ..PastatConfig::lean(64)
+                },
+                "frames is 0",
+            ),
+            (
+                PastatConfig {
+                    frame_secs: f64::NAN,
+                    ..PastatConfig::lean(64)
+                },
+                "frame_secs is NaN",
+            ),
         ] {
             let message = config.validate().unwrap_err().to_string();
             assert!(message.contains(part), "{message}");
         }
-        let text = serde_json::to_string(&PastatConfig::lean(64)).unwrap().replace("\"ce\"", "\"cf\"");
-        assert!(serde_json::from_str::<PastatConfig>(&text).unwrap_err().to_string().contains("cf"));
+        let text = serde_json::to_string(&PastatConfig::lean(64))
+            .unwrap()
+            .replace("\"ce\"", "\"cf\"");
+        assert!(
+            serde_json::from_str::<PastatConfig>(&text)
+                .unwrap_err()
+                .to_string()
+                .contains("cf")
+        );
     }
 }

@@ -64,7 +64,10 @@ impl FusionSettings for PastatConfig {
             earlier_cells: Some(self.earlier_cells),
             full_resolution: self.temporal_memory.is_some(),
         };
-        Requirements { history, ..Requirements::default() }
+        Requirements {
+            history,
+            ..Requirements::default()
+        }
     }
 }
 
@@ -98,8 +101,13 @@ impl Pastat {
             temporal_encoding: TemporalEncoding::new(path, config),
             transformer: Transformer::new(path, config),
             decoder: Decoder::new(path, config),
-            temporal_memory: config.temporal_memory.as_ref().map(|memory| TemporalMemory::new(path, config, memory)),
-            map_refinement: config.map_refinement.map(|hidden| MapRefinement::new(path, config.channels, hidden)),
+            temporal_memory: config
+                .temporal_memory
+                .as_ref()
+                .map(|memory| TemporalMemory::new(path, config, memory)),
+            map_refinement: config
+                .map_refinement
+                .map(|hidden| MapRefinement::new(path, config.channels, hidden)),
         })
     }
 }
@@ -110,16 +118,32 @@ impl Pastat {
         let coarse = self.coarse_alignment.pick(maps)?; // Eq. 2
         let confidences = self.confidence_embedding.embed(&coarse.origins)?; // Eq. 7
         let patches = self.patches.flatten(&coarse)?;
-        let (fine, aligned) =
-            self.spatial_alignment.align(&coarse, patches, &confidences, &maps.grid, maps.is_training)?; // FSA
-        let tokens = self.temporal_encoding.encode(aligned, &confidences, &coarse.origins.age_secs)?; // Eq. 10-12
+        let (fine, aligned) = self.spatial_alignment.align(
+            &coarse,
+            patches,
+            &confidences,
+            &maps.grid,
+            maps.is_training,
+        )?; // FSA
+        let tokens =
+            self.temporal_encoding
+                .encode(aligned, &confidences, &coarse.origins.age_secs)?; // Eq. 10-12
         let context = self.transformer.forward(&tokens)?; // Eq. 8, 9
         let mut fused = self.decoder.maximum(&fine, &tokens, &context)?;
         if let Some(memory) = &self.temporal_memory {
             fused = memory.blend(fused, maps, &coarse, &fine, &context)?;
         }
-        let corrections = fine.corrections.map(|corrections| coarse.among_all(&corrections)).transpose()?;
-        Ok((cropped(&self.decoder.changed(&fused, &context)?, &maps.warped.features)?, corrections))
+        let corrections = fine
+            .corrections
+            .map(|corrections| coarse.among_all(&corrections))
+            .transpose()?;
+        Ok((
+            cropped(
+                &self.decoder.changed(&fused, &context)?,
+                &maps.warped.features,
+            )?,
+            corrections,
+        ))
     }
 }
 
@@ -133,7 +157,12 @@ impl Fusion for Pastat {
             }
             None => fused,
         };
-        Ok(FusionOutput { map: refined.f_squeeze_dim(0)?.f_to_kind(maps.warped.features.kind())?, corrections })
+        Ok(FusionOutput {
+            map: refined
+                .f_squeeze_dim(0)?
+                .f_to_kind(maps.warped.features.kind())?,
+            corrections,
+        })
     }
 
     fn observe(&self, maps: &AlignedMaps, search: &mut ScaleSearch) -> Result<(), TchError> {
@@ -144,15 +173,22 @@ impl Fusion for Pastat {
     }
 
     fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
-        self.map_refinement.as_mut().map_or(Ok(()), |refinement| refinement.quantise(scales))
+        self.map_refinement
+            .as_mut()
+            .map_or(Ok(()), |refinement| refinement.quantise(scales))
     }
 }
 
 /// Likelihood of a vehicle by the detector's class head, `[1, 1, H, W]`; `None` without earlier maps, since the input
 /// contains the head together with these.
 fn likely(fused: &Tensor, maps: &AlignedMaps) -> Result<Option<Tensor>, TchError> {
-    let full_resolution = maps.earlier.as_ref().and_then(|earlier| earlier.full_resolution.as_ref());
-    full_resolution.map(|(_, classes)| classes.likely(fused)).transpose()
+    let full_resolution = maps
+        .earlier
+        .as_ref()
+        .and_then(|earlier| earlier.full_resolution.as_ref());
+    full_resolution
+        .map(|(_, classes)| classes.likely(fused))
+        .transpose()
 }
 
 /// `[1, C, H, W]` without the padding, given maps without padding.

@@ -27,14 +27,35 @@ pub(super) struct PatchTokens {
 impl Patches {
     /// Its variables are `patches.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let PastatConfig { channels, dim, patch, earlier_cells, .. } = *config;
-        let stride = nn::ConvConfig { stride: patch, ..Default::default() };
-        Self { convolution: nn::conv2d(path / "patches", channels, dim, patch, stride), patch, earlier_cells }
+        let PastatConfig {
+            channels,
+            dim,
+            patch,
+            earlier_cells,
+            ..
+        } = *config;
+        let stride = nn::ConvConfig {
+            stride: patch,
+            ..Default::default()
+        };
+        Self {
+            convolution: nn::conv2d(path / "patches", channels, dim, patch, stride),
+            patch,
+            earlier_cells,
+        }
     }
 
     /// Tokens of the newest maps, then of the earlier ones.
-    pub(super) fn flatten(&self, CoarseMaps { newest, earlier, .. }: &CoarseMaps) -> Result<PatchTokens, TchError> {
-        let (mut values, mut valid) = (self.values(&newest.features, 1)?, self.valid(&newest.mask, 1)?);
+    pub(super) fn flatten(
+        &self,
+        CoarseMaps {
+            newest, earlier, ..
+        }: &CoarseMaps,
+    ) -> Result<PatchTokens, TchError> {
+        let (mut values, mut valid) = (
+            self.values(&newest.features, 1)?,
+            self.valid(&newest.mask, 1)?,
+        );
         if let Some(WarpedMaps { features, mask }) = earlier {
             values = Tensor::f_cat(&[values, self.values(features, self.earlier_cells)?], 0)?;
             valid = Tensor::f_cat(&[valid, self.valid(mask, self.earlier_cells)?], 0)?;
@@ -49,7 +70,14 @@ impl Patches {
         // Equal to all pooled cells showing their mean.
         let weight = match cells {
             1 => ws.shallow_clone(),
-            _ => ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?,
+            _ => ws.f_avg_pool2d(
+                [cells, cells],
+                [cells, cells],
+                [0_i64, 0],
+                false,
+                true,
+                None::<i64>,
+            )?,
         };
         let weight = weight * (cells * cells) as f64;
         maps.f_conv2d(&weight, bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)
@@ -60,7 +88,8 @@ impl Patches {
     fn valid(&self, mask: &Tensor, cells: i64) -> Result<Tensor, TchError> {
         let edge = self.patch / cells;
         let none: [i64; 2] = [0, 0];
-        mask.f_max_pool2d([edge, edge], [edge, edge], none, [1, 1], false)?.f_squeeze_dim(1)
+        mask.f_max_pool2d([edge, edge], [edge, edge], none, [1, 1], false)?
+            .f_squeeze_dim(1)
     }
 }
 

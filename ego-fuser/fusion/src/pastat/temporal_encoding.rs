@@ -28,7 +28,10 @@ pub(super) struct Tokens {
 impl TemporalEncoding {
     /// It has no variables; `path` is that of the module.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        Self { config: config.clone(), device: path.device() }
+        Self {
+            config: config.clone(),
+            device: path.device(),
+        }
     }
 
     /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the terms of the confidence (Eq. 7) and of the match quality from FSA.
@@ -46,15 +49,25 @@ impl TemporalEncoding {
         if let Some(fit) = fit {
             of_map = of_map.f_add(&fit)?;
         }
-        Ok(Tokens { values: values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?, valid })
+        Ok(Tokens {
+            values: values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?,
+            valid,
+        })
     }
 
     /// `[N, D]`: `E_t` of each map; zeros without the encoding, for the ablation.
     fn of_ages(&self, age_secs: &[f64]) -> Result<Tensor, TchError> {
         let size = [age_secs.len() as i64, self.config.dim];
-        let Some(wavelengths) = self.config.te else { return Tensor::f_zeros(size, (Kind::Float, self.device)) };
-        let values: Vec<f32> = age_secs.iter().flat_map(|&age| encoding(age, &self.config, wavelengths)).collect();
-        Tensor::f_from_slice(&values)?.f_view(size)?.f_to_device(self.device)
+        let Some(wavelengths) = self.config.te else {
+            return Tensor::f_zeros(size, (Kind::Float, self.device));
+        };
+        let values: Vec<f32> = age_secs
+            .iter()
+            .flat_map(|&age| encoding(age, &self.config, wavelengths))
+            .collect();
+        Tensor::f_from_slice(&values)?
+            .f_view(size)?
+            .f_to_device(self.device)
     }
 }
 
@@ -83,7 +96,12 @@ mod tests {
     use super::*;
 
     fn config() -> PastatConfig {
-        PastatConfig { frames: 3, frame_secs: 0.1, dim: 8, ..PastatConfig::lean(64) }
+        PastatConfig {
+            frames: 3,
+            frame_secs: 0.1,
+            dim: 8,
+            ..PastatConfig::lean(64)
+        }
     }
 
     #[test]
@@ -91,8 +109,15 @@ mod tests {
         let found = encoding(0.0, &config(), Wavelengths::Printed);
         for (channel, value) in found.iter().enumerate() {
             let angle = 3.0 / 10_000_f64.powf(channel as f64 / 8.0);
-            let expected = if channel % 2 == 0 { angle.sin() } else { angle.cos() };
-            assert!((f64::from(*value) - expected).abs() < 1e-6, "channel {channel}");
+            let expected = if channel % 2 == 0 {
+                angle.sin()
+            } else {
+                angle.cos()
+            };
+            assert!(
+                (f64::from(*value) - expected).abs() < 1e-6,
+                "channel {channel}"
+            );
         }
         let usual = encoding(0.0, &config(), Wavelengths::Usual);
         assert_eq!(usual[0], found[0]);
@@ -104,7 +129,14 @@ mod tests {
         let at = |age| encoding(age, &config(), Wavelengths::Printed)[0];
         assert!((at(0.2) - 1.0_f32.sin()).abs() < 1e-6);
         assert!((at(0.05) - 2.5_f32.sin()).abs() < 1e-6);
-        assert_ne!(encoding(0.0, &config(), Wavelengths::Printed), encoding(0.5, &config(), Wavelengths::Printed));
-        assert!(encoding(f64::INFINITY, &config(), Wavelengths::Printed).iter().all(|value| value.is_finite()));
+        assert_ne!(
+            encoding(0.0, &config(), Wavelengths::Printed),
+            encoding(0.5, &config(), Wavelengths::Printed)
+        );
+        assert!(
+            encoding(f64::INFINITY, &config(), Wavelengths::Printed)
+                .iter()
+                .all(|value| value.is_finite())
+        );
     }
 }

@@ -12,7 +12,13 @@ use crate::test_data::{redraw, uniform};
 use crate::warp::WarpedMaps;
 
 const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
-const GRID: BevGrid = BevGrid { x_min_m: -10.0, y_min_m: -6.0, cell_m: 1.0, width: 20, height: 12 };
+const GRID: BevGrid = BevGrid {
+    x_min_m: -10.0,
+    y_min_m: -6.0,
+    cell_m: 1.0,
+    width: 20,
+    height: 12,
+};
 
 /// Synthetic entries.
 struct Scene {
@@ -49,11 +55,18 @@ impl Scene {
     }
 
     fn aligned_with_cells_of(&self, cells: i64) -> AlignedMaps {
-        let is_newest =
-            |entry: &usize| self.facts[..*entry].iter().all(|facts| facts.agent != self.facts[*entry].agent);
-        let (newest, earlier): (Vec<usize>, Vec<usize>) = (0..self.facts.len()).partition(is_newest);
+        let is_newest = |entry: &usize| {
+            self.facts[..*entry]
+                .iter()
+                .all(|facts| facts.agent != self.facts[*entry].agent)
+        };
+        let (newest, earlier): (Vec<usize>, Vec<usize>) =
+            (0..self.facts.len()).partition(is_newest);
         let (newest, earlier) = (self.only(&newest), self.only(&earlier));
-        let received = ReceivedMaps::new(newest.features.shallow_clone(), Some(newest.mask.shallow_clone()));
+        let received = ReceivedMaps::new(
+            newest.features.shallow_clone(),
+            Some(newest.mask.shallow_clone()),
+        );
         AlignedMaps {
             received,
             earlier: (!earlier.facts.is_empty()).then(|| earlier.pooled(cells)),
@@ -64,7 +77,9 @@ impl Scene {
 
     fn pooled(&self, cells: i64) -> EarlierMaps {
         let of = |tensor: &Tensor, entry: usize| tensor.narrow(0, entry as i64, 1);
-        let map = |entry| FullResolutionMap::of(&of(&self.features, entry), Some(&of(&self.mask, entry))).unwrap();
+        let map = |entry| {
+            FullResolutionMap::of(&of(&self.features, entry), Some(&of(&self.mask, entry))).unwrap()
+        };
         let head = VarStore::new(Device::Cpu);
         let classes = Classes::under(&head.root(), [4, 2]);
         redraw(&head, &["cls_head"], 1.0);
@@ -91,8 +106,16 @@ impl Scene {
 
 /// Without the search, in which random maps match anywhere.
 fn small() -> PastatConfig {
-    let fsa = FsaConfig { alignment_search: None, ..FsaConfig::default() };
-    PastatConfig { dim: 16, windows: vec![2, 4], fsa: Some(fsa), ..PastatConfig::lean(4) }
+    let fsa = FsaConfig {
+        alignment_search: None,
+        ..FsaConfig::default()
+    };
+    PastatConfig {
+        dim: 16,
+        windows: vec![2, 4],
+        fsa: Some(fsa),
+        ..PastatConfig::lean(4)
+    }
 }
 
 /// A module without neutral weights, as after a training.
@@ -110,12 +133,26 @@ fn distance(a: &Tensor, b: &Tensor) -> f64 {
 
 #[test]
 fn untrained_it_is_the_maximum_of_the_newest_maps() {
-    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, earlier_cells: 1, ..small() }] {
+    for config in [
+        small(),
+        PastatConfig {
+            rows: Rows::All,
+            patch: 1,
+            earlier_cells: 1,
+            ..small()
+        },
+    ] {
         let variables = VarStore::new(Device::Cpu);
         let pastat = Pastat::new(&variables.root(), &config).unwrap();
         let scene = Scene::new(&[0, 1, 2, 0, 1], &[0.0, 0.1, 0.0, 0.1, 0.2]);
-        let newest = scene.features.narrow(0, 0, 3).amax([0_i64].as_slice(), false);
-        let fused = pastat.fuse(&scene.aligned_with_cells_of(config.earlier_cells)).unwrap().map;
+        let newest = scene
+            .features
+            .narrow(0, 0, 3)
+            .amax([0_i64].as_slice(), false);
+        let fused = pastat
+            .fuse(&scene.aligned_with_cells_of(config.earlier_cells))
+            .unwrap()
+            .map;
         assert!(distance(&fused, &newest) < 1e-4);
         let ego_only = Scene::new(&[0], &[0.0]);
         assert!(distance(&ego_only.fused(&pastat), &ego_only.features.get(0)) < 1e-6);
@@ -125,7 +162,11 @@ fn untrained_it_is_the_maximum_of_the_newest_maps() {
 #[test]
 fn masked_entries_change_nothing_also_after_training() {
     for rows in [Rows::Ego, Rows::All] {
-        let (_store, pastat) = trained(&PastatConfig { rows, fsa: None, ..small() });
+        let (_store, pastat) = trained(&PastatConfig {
+            rows,
+            fsa: None,
+            ..small()
+        });
         let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
         for entry in [1, 3] {
             let _ = scene.mask.get(entry).fill_(0.0);
@@ -148,7 +189,12 @@ fn masked_entries_change_nothing_also_after_training() {
 fn the_order_of_neighbours_does_not_matter() {
     let (_store, pastat) = trained(&small());
     let scene = Scene::new(&[0, 1, 2, 0], &[0.0, 0.1, 0.0, 0.1]);
-    assert!(distance(&scene.only(&[0, 3, 2, 1]).fused(&pastat), &scene.fused(&pastat)) < 1e-4);
+    assert!(
+        distance(
+            &scene.only(&[0, 3, 2, 1]).fused(&pastat),
+            &scene.fused(&pastat)
+        ) < 1e-4
+    );
 }
 
 #[test]
@@ -157,16 +203,34 @@ fn each_switch_decides_whether_its_input_matters() {
     for (ce, te) in [(false, false), (true, false), (false, true)] {
         let te = te.then_some(Wavelengths::Printed);
         let is_timed = te.is_some();
-        let (_store, pastat) = trained(&PastatConfig { ce, te, fsa: None, ..small() });
+        let (_store, pastat) = trained(&PastatConfig {
+            ce,
+            te,
+            fsa: None,
+            ..small()
+        });
         let mut scene = base();
         let fused = scene.fused(&pastat);
         scene.facts[1].confidence = 0.1;
-        assert_eq!(distance(&scene.fused(&pastat), &fused) > 1e-5, ce, "confidence");
+        assert_eq!(
+            distance(&scene.fused(&pastat), &fused) > 1e-5,
+            ce,
+            "confidence"
+        );
         scene.facts[1].confidence = 0.8;
         scene.facts[1].age_secs = 0.4;
-        assert_eq!(distance(&scene.fused(&pastat), &fused) > 1e-5, is_timed, "age");
+        assert_eq!(
+            distance(&scene.fused(&pastat), &fused) > 1e-5,
+            is_timed,
+            "age"
+        );
     }
-    let count = |fsa| trained(&PastatConfig { fsa, ..small() }).0.variables().len();
+    let count = |fsa| {
+        trained(&PastatConfig { fsa, ..small() })
+            .0
+            .variables()
+            .len()
+    };
     assert!(count(None) < count(Some(FsaConfig::default())));
 }
 
@@ -175,12 +239,17 @@ fn every_parameter_gets_a_gradient() {
     for rows in [Rows::Ego, Rows::All] {
         let (store, pastat) = trained(&PastatConfig { rows, ..small() });
         let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
-        (scene.fused(&pastat) * (uniform(8, &[4, 12, 20]) - 0.5)).sum(Kind::Float).backward();
+        (scene.fused(&pastat) * (uniform(8, &[4, 12, 20]) - 0.5))
+            .sum(Kind::Float)
+            .backward();
         for (name, variable) in store.variables() {
             let gradient = variable.grad();
             assert!(gradient.defined(), "{name} has no gradient");
             let is_finite = gradient.isfinite().all().int64_value(&[]) == 1;
-            assert!(is_finite && gradient.abs().max().double_value(&[]) > 0.0, "{name}");
+            assert!(
+                is_finite && gradient.abs().max().double_value(&[]) > 0.0,
+                "{name}"
+            );
         }
     }
 }
@@ -190,16 +259,25 @@ fn fine(pastat: &Pastat, maps: &AlignedMaps) -> FineMaps {
     let coarse = pastat.coarse_alignment.pick(maps).unwrap();
     let confidences = pastat.confidence_embedding.embed(&coarse.origins).unwrap();
     let patches = pastat.patches.flatten(&coarse).unwrap();
-    pastat.spatial_alignment.align(&coarse, patches, &confidences, &maps.grid, true).unwrap().0
+    pastat
+        .spatial_alignment
+        .align(&coarse, patches, &confidences, &maps.grid, true)
+        .unwrap()
+        .0
 }
 
 #[test]
 fn fsa_learns_a_shift_from_the_maps_only() {
     tch::manual_seed(7);
     let variables = VarStore::new(Device::Cpu);
-    let config = PastatConfig { patch: 1, earlier_cells: 1, ..small() };
+    let config = PastatConfig {
+        patch: 1,
+        earlier_cells: 1,
+        ..small()
+    };
     let pastat = Pastat::new(&variables.root(), &config).unwrap();
-    let mut optimizer = perception::train::AdamW::new(&variables, perception::train::AdamWConfig::default());
+    let mut optimizer =
+        perception::train::AdamW::new(&variables, perception::train::AdamWConfig::default());
     // The neighbour's map is the ego's shifted by a cell; the target is one sharp map.
     let mut error = |step: u64, train: bool| {
         let mut scene = Scene::new(&[0, 1], &[0.0, 0.0]);
@@ -227,7 +305,10 @@ fn fsa_learns_a_shift_from_the_maps_only() {
 
 #[test]
 fn the_memory_takes_of_earlier_maps_where_they_show_something() {
-    let (_store, pastat) = trained(&PastatConfig { fsa: None, ..small() });
+    let (_store, pastat) = trained(&PastatConfig {
+        fsa: None,
+        ..small()
+    });
     let scene = Scene::new(&[0, 1, 0, 1, 0], &[0.0, 0.0, 0.1, 0.1, 0.2]);
     let fused = scene.fused(&pastat);
     let _ = scene.mask.get(4).fill_(0.0);
@@ -237,5 +318,14 @@ fn the_memory_takes_of_earlier_maps_where_they_show_something() {
     let _ = scene.features.get(4).fill_(9.0);
     assert!(distance(&scene.fused(&pastat), &without) < 1e-4);
     assert!(distance(&scene.only(&[0, 1, 2, 3]).fused(&pastat), &without) < 1e-4);
-    assert!(scene.only(&[0, 1]).fused(&pastat).isfinite().all().int64_value(&[]) == 1, "nothing to remember");
+    assert!(
+        scene
+            .only(&[0, 1])
+            .fused(&pastat)
+            .isfinite()
+            .all()
+            .int64_value(&[])
+            == 1,
+        "nothing to remember"
+    );
 }

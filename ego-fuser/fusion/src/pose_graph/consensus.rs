@@ -27,10 +27,21 @@ pub(super) fn consensus(
     prior: &Isometry3<f64>,
     config: &PoseGraphConfig,
 ) -> Option<Consensus> {
-    let search = Search { objects, boxes, prior, config, candidates: candidates(objects, boxes, prior, config) };
+    let search = Search {
+        objects,
+        boxes,
+        prior,
+        config,
+        candidates: candidates(objects, boxes, prior, config),
+    };
     let motions = search.motions();
-    let best = motions.iter().max_by(|one, other| one.score.total_cmp(&other.score))?;
-    let rival = motions.iter().filter(|other| search.differ(&best.motion, &other.motion)).map(|other| other.score);
+    let best = motions
+        .iter()
+        .max_by(|one, other| one.score.total_cmp(&other.score))?;
+    let rival = motions
+        .iter()
+        .filter(|other| search.differ(&best.motion, &other.motion))
+        .map(|other| other.score);
     if rival.fold(f64::NEG_INFINITY, f64::max) + MIN_LEAD > best.score {
         return None;
     }
@@ -53,7 +64,10 @@ fn candidates(
     let mut candidates = Vec::new();
     for (index, center) in boxes.iter().enumerate() {
         let place = moved(prior, center);
-        let near = objects.iter().enumerate().filter(|(_, object)| (*object - place).norm() < config.search_m);
+        let near = objects
+            .iter()
+            .enumerate()
+            .filter(|(_, object)| (*object - place).norm() < config.search_m);
         candidates.extend(near.map(|(object, _)| (object, index)));
     }
     candidates
@@ -78,10 +92,15 @@ impl Search<'_> {
         let mut motions = Vec::new();
         for (index, &first) in self.candidates.iter().enumerate() {
             for &second in &self.candidates[index + 1..] {
-                let Some(motion) = self.motion(first, second) else { continue };
+                let Some(motion) = self.motion(first, second) else {
+                    continue;
+                };
                 let matches = self.matches(&motion);
                 if matches.len() >= self.config.min_shared.max(2) {
-                    motions.push(Scored { score: self.score(&motion, &matches), motion });
+                    motions.push(Scored {
+                        score: self.score(&motion, &matches),
+                        motion,
+                    });
                 }
             }
         }
@@ -102,10 +121,14 @@ impl Search<'_> {
         if turn.abs() > self.config.max_turn_deg.to_radians() {
             return None;
         }
-        let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn) * self.prior.rotation;
+        let rotation =
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn) * self.prior.rotation;
         let middle = (self.objects[first.0] + self.objects[second.0]) / 2.0;
         let from = rotation * (self.boxes[first.1] + self.boxes[second.1]) / 2.0;
-        Some(Isometry3::from_parts(Translation3::from(middle - from), rotation))
+        Some(Isometry3::from_parts(
+            Translation3::from(middle - from),
+            rotation,
+        ))
     }
 
     /// Candidates that a motion aligns, each box and each object once, the nearest first.
@@ -117,7 +140,10 @@ impl Search<'_> {
         near.sort_by(|one, other| one.0.total_cmp(&other.0));
         let mut matches: Vec<(usize, usize)> = Vec::with_capacity(near.len());
         for (_, object, index) in near {
-            if matches.iter().all(|&(other, taken)| other != object && taken != index) {
+            if matches
+                .iter()
+                .all(|&(other, taken)| other != object && taken != index)
+            {
                 matches.push((object, index));
             }
         }
@@ -138,7 +164,11 @@ impl Search<'_> {
 
     /// Mean distance between the boxes under two motions.
     fn off(&self, one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
-        let sum: f64 = self.boxes.iter().map(|center| (moved(one, center) - moved(other, center)).norm()).sum();
+        let sum: f64 = self
+            .boxes
+            .iter()
+            .map(|center| (moved(one, center) - moved(other, center)).norm())
+            .sum();
         sum / self.boxes.len().max(1) as f64
     }
 
@@ -149,7 +179,9 @@ impl Search<'_> {
     /// The best fit to the inliers of a motion.
     fn refined(&self, motion: Isometry3<f64>) -> Isometry3<f64> {
         let matches = self.matches(&motion);
-        let pairs = matches.iter().map(|&(object, index)| (self.boxes[index], self.objects[object]));
+        let pairs = matches
+            .iter()
+            .map(|&(object, index)| (self.boxes[index], self.objects[object]));
         planar_fit::fit(&pairs).unwrap_or(motion)
     }
 }

@@ -56,10 +56,20 @@ impl ObservedBox {
         let [x, y, _] = found.box3d.center_m;
         let center = Vector3::new(x, y, 0.0);
         let heading_rad = found.box3d.heading_rad;
-        let is_sound = center.norm() < 1e4 && heading_rad.is_finite() && found.score >= config.min_score;
-        let scale = (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
-        let (std_m, std_rad) = (config.box_std_m * scale, config.box_std_deg.to_radians() * scale);
-        is_sound.then_some(Self { center, heading_rad, std_m, std_rad })
+        let is_sound =
+            center.norm() < 1e4 && heading_rad.is_finite() && found.score >= config.min_score;
+        let scale =
+            (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
+        let (std_m, std_rad) = (
+            config.box_std_m * scale,
+            config.box_std_deg.to_radians() * scale,
+        );
+        is_sound.then_some(Self {
+            center,
+            heading_rad,
+            std_m,
+            std_rad,
+        })
     }
 }
 
@@ -69,11 +79,31 @@ impl ObservedBox {
 /// the ego may still be aligned through a third.
 #[must_use]
 pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
-    let seen: Vec<Vec<ObservedBox>> = agents.iter().map(|agent| sound_boxes(agent.boxes, config)).collect();
-    let priors: Vec<Isometry3<f64>> = agents.iter().map(|agent| flattened(&agent.ego_from_agent)).collect();
-    let unmoved = || agents.iter().map(|agent| Corrected { ego_from_agent: agent.ego_from_agent, shared: 0 }).collect();
-    let Some(own) = seen.first() else { return Vec::new() };
-    let mut graph = Assembly { objects: Vec::new(), observations: Vec::new(), joined: Vec::new() };
+    let seen: Vec<Vec<ObservedBox>> = agents
+        .iter()
+        .map(|agent| sound_boxes(agent.boxes, config))
+        .collect();
+    let priors: Vec<Isometry3<f64>> = agents
+        .iter()
+        .map(|agent| flattened(&agent.ego_from_agent))
+        .collect();
+    let unmoved = || {
+        agents
+            .iter()
+            .map(|agent| Corrected {
+                ego_from_agent: agent.ego_from_agent,
+                shared: 0,
+            })
+            .collect()
+    };
+    let Some(own) = seen.first() else {
+        return Vec::new();
+    };
+    let mut graph = Assembly {
+        objects: Vec::new(),
+        observations: Vec::new(),
+        joined: Vec::new(),
+    };
     graph.join(0, &Isometry3::identity(), own, &[]);
     let mut waiting: Vec<usize> = (1..agents.len()).collect();
     while let Some((place, found)) = graph.next(&waiting, &seen, &priors, config) {
@@ -98,7 +128,8 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
 /// Mean distance between the boxes before and after.
 fn moved_by(seen: &[ObservedBox], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
     let moved = |seen: &ObservedBox| {
-        let [old, new] = [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
+        let [old, new] =
+            [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
         (new - old).norm()
     };
     seen.iter().map(moved).sum::<f64>() / seen.len().max(1) as f64
@@ -107,13 +138,21 @@ fn moved_by(seen: &[ObservedBox], before: &Isometry3<f64>, after: &Isometry3<f64
 fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<ObservedBox> {
     let mut sorted: Vec<&Detection> = boxes.iter().collect();
     sorted.sort_by(|a, b| b.score.total_cmp(&a.score));
-    sorted.into_iter().filter_map(|found| ObservedBox::new(found, config)).take(config.max_boxes).collect()
+    sorted
+        .into_iter()
+        .filter_map(|found| ObservedBox::new(found, config))
+        .take(config.max_boxes)
+        .collect()
 }
 
 /// Planar position and heading.
 fn flattened(pose: &Pose) -> Isometry3<f64> {
     let [x, y, _] = pose.translation_m;
-    planar(&Node { x_m: x, y_m: y, heading_rad: pose.yaw_rad() })
+    planar(&Node {
+        x_m: x,
+        y_m: y,
+        heading_rad: pose.yaw_rad(),
+    })
 }
 
 fn planar(node: &Node) -> Isometry3<f64> {
@@ -139,11 +178,17 @@ impl Assembly {
         priors: &[Isometry3<f64>],
         config: &PoseGraphConfig,
     ) -> Option<(usize, consensus::Consensus)> {
-        let objects: Vec<Vector3<f64>> =
-            self.objects.iter().map(|node| Vector3::new(node.x_m, node.y_m, 0.0)).collect();
+        let objects: Vec<Vector3<f64>> = self
+            .objects
+            .iter()
+            .map(|node| Vector3::new(node.x_m, node.y_m, 0.0))
+            .collect();
         let found = waiting.iter().enumerate().filter_map(|(place, &agent)| {
             let centers: Vec<Vector3<f64>> = seen[agent].iter().map(|seen| seen.center).collect();
-            Some((place, consensus(&objects, &centers, &priors[agent], config)?))
+            Some((
+                place,
+                consensus(&objects, &centers, &priors[agent], config)?,
+            ))
         });
         found.max_by(|(_, one), (_, other)| one.score.total_cmp(&other.score))
     }
@@ -159,17 +204,33 @@ impl Assembly {
         let node = self.joined.len();
         let heading = ego_from_agent.rotation.euler_angles().2;
         for (index, seen) in seen.iter().enumerate() {
-            let known = matches.iter().find(|(_, matched)| *matched == index).map(|(object, _)| *object);
+            let known = matches
+                .iter()
+                .find(|(_, matched)| *matched == index)
+                .map(|(object, _)| *object);
             let object = known.unwrap_or_else(|| {
-                let place = ego_from_agent.rotation * seen.center + ego_from_agent.translation.vector;
-                self.objects.push(Node { x_m: place.x, y_m: place.y, heading_rad: heading + seen.heading_rad });
+                let place =
+                    ego_from_agent.rotation * seen.center + ego_from_agent.translation.vector;
+                self.objects.push(Node {
+                    x_m: place.x,
+                    y_m: place.y,
+                    heading_rad: heading + seen.heading_rad,
+                });
                 self.objects.len() - 1
             });
             self.observations.push(Observation {
                 agent: node,
                 object,
-                seen: Node { x_m: seen.center.x, y_m: seen.center.y, heading_rad: seen.heading_rad },
-                information: [seen.std_m.powi(-2), seen.std_m.powi(-2), seen.std_rad.powi(-2)],
+                seen: Node {
+                    x_m: seen.center.x,
+                    y_m: seen.center.y,
+                    heading_rad: seen.heading_rad,
+                },
+                information: [
+                    seen.std_m.powi(-2),
+                    seen.std_m.powi(-2),
+                    seen.std_rad.powi(-2),
+                ],
             });
         }
         self.joined.push((agent, *ego_from_agent));
@@ -182,10 +243,15 @@ impl Assembly {
         config: &PoseGraphConfig,
     ) -> impl Iterator<Item = (usize, Isometry3<f64>, usize)> {
         let mut viewers = vec![0usize; self.objects.len()];
-        self.observations.iter().for_each(|observation| viewers[observation.object] += 1);
+        self.observations
+            .iter()
+            .for_each(|observation| viewers[observation.object] += 1);
         // An object seen by one agent only does not constrain poses.
-        let shared: Vec<Observation> =
-            self.observations.into_iter().filter(|observation| viewers[observation.object] > 1).collect();
+        let shared: Vec<Observation> = self
+            .observations
+            .into_iter()
+            .filter(|observation| viewers[observation.object] > 1)
+            .collect();
         let node = |motion: &Isometry3<f64>| Node {
             x_m: motion.translation.x,
             y_m: motion.translation.y,
@@ -194,17 +260,30 @@ impl Assembly {
         let (std_m, std_rad) = (config.pose_std_m, config.pose_std_deg.to_radians());
         let mut graph = Graph {
             agents: self.joined.iter().map(|(_, motion)| node(motion)).collect(),
-            priors: self.joined.iter().map(|(agent, _)| node(&priors[*agent])).collect(),
+            priors: self
+                .joined
+                .iter()
+                .map(|(agent, _)| node(&priors[*agent]))
+                .collect(),
             prior_information: [std_m.powi(-2), std_m.powi(-2), std_rad.powi(-2)],
             objects: self.objects,
             observations: shared,
         };
         graph.optimise();
-        let Graph { agents, observations, .. } = graph;
-        self.joined.into_iter().zip(agents).enumerate().skip(1).map(move |(place, ((agent, _), solved))| {
-            let shared = observations.iter().filter(|observation| observation.agent == place).count();
-            (agent, planar(&solved), shared)
-        })
+        let Graph {
+            agents,
+            observations,
+            ..
+        } = graph;
+        self.joined.into_iter().zip(agents).enumerate().skip(1).map(
+            move |(place, ((agent, _), solved))| {
+                let shared = observations
+                    .iter()
+                    .filter(|observation| observation.agent == place)
+                    .count();
+                (agent, planar(&solved), shared)
+            },
+        )
     }
 }
 

@@ -21,7 +21,11 @@ pub(super) struct Node {
 
 impl Node {
     fn moved(&self, step: &Vector3<f64>) -> Self {
-        Self { x_m: self.x_m + step.x, y_m: self.y_m + step.y, heading_rad: self.heading_rad + step.z }
+        Self {
+            x_m: self.x_m + step.x,
+            y_m: self.y_m + step.y,
+            heading_rad: self.heading_rad + step.z,
+        }
     }
 }
 
@@ -96,16 +100,24 @@ impl Graph {
     fn cost(&self) -> f64 {
         let seen = self.observations.iter().map(|observation| {
             let far = self.weighed(observation).1.sqrt();
-            if far <= HUBER { far * far } else { HUBER * (2.0 * far - HUBER) }
+            if far <= HUBER {
+                far * far
+            } else {
+                HUBER * (2.0 * far - HUBER)
+            }
         });
         let stayed = self.agents.iter().zip(&self.priors).skip(1);
-        let stayed = stayed.map(|(agent, prior)| squared(&difference(agent, prior), &self.prior_information));
+        let stayed = stayed
+            .map(|(agent, prior)| squared(&difference(agent, prior), &self.prior_information));
         seen.sum::<f64>() + stayed.sum::<f64>()
     }
 
     /// Residual of an observation and its square in standard deviations.
     fn weighed(&self, observation: &Observation) -> (Vector3<f64>, f64) {
-        let (agent, object) = (&self.agents[observation.agent], &self.objects[observation.object]);
+        let (agent, object) = (
+            &self.agents[observation.agent],
+            &self.objects[observation.object],
+        );
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
         let residual = Vector3::new(
@@ -136,22 +148,43 @@ impl Graph {
     }
 
     fn add(&self, observation: &Observation, equations: &mut Equations) {
-        let (agent, object) = (&self.agents[observation.agent], &self.objects[observation.object]);
+        let (agent, object) = (
+            &self.agents[observation.agent],
+            &self.objects[observation.object],
+        );
         let (sin, cos) = agent.heading_rad.sin_cos();
         let (dx, dy) = (object.x_m - agent.x_m, object.y_m - agent.y_m);
         let (residual, square) = self.weighed(observation);
-        let robust = if square.sqrt() <= HUBER { 1.0 } else { HUBER / square.sqrt() };
+        let robust = if square.sqrt() <= HUBER {
+            1.0
+        } else {
+            HUBER / square.sqrt()
+        };
         let information = Matrix3::from_diagonal(&Vector3::from(observation.information)) * robust;
         let by_object = Matrix3::new(cos, sin, 0.0, -sin, cos, 0.0, 0.0, 0.0, 1.0);
         let weighed = by_object.transpose() * information;
         let (block, gradient) = &mut equations.objects[observation.object];
         *block += weighed * by_object;
         *gradient += weighed * residual;
-        let Some(row) = observation.agent.checked_sub(1) else { return };
-        let by_agent = Matrix3::new(-cos, -sin, -sin * dx + cos * dy, sin, -cos, -cos * dx - sin * dy, 0.0, 0.0, -1.0);
+        let Some(row) = observation.agent.checked_sub(1) else {
+            return;
+        };
+        let by_agent = Matrix3::new(
+            -cos,
+            -sin,
+            -sin * dx + cos * dy,
+            sin,
+            -cos,
+            -cos * dx - sin * dy,
+            0.0,
+            0.0,
+            -1.0,
+        );
         let weighed = by_agent.transpose() * information;
         equations.add_agent(row, &(weighed * by_agent), &(weighed * residual));
-        equations.mixed.push((row, observation.object, weighed * by_object));
+        equations
+            .mixed
+            .push((row, observation.object, weighed * by_object));
     }
 }
 
@@ -172,7 +205,11 @@ impl Equations {
             .map(|(block, _)| {
                 let damped = block + Matrix3::from_diagonal(&block.diagonal()) * damping;
                 // An object without observations stays where it is.
-                if block.trace() == 0.0 { Some(Matrix3::zeros()) } else { damped.try_inverse() }
+                if block.trace() == 0.0 {
+                    Some(Matrix3::zeros())
+                } else {
+                    damped.try_inverse()
+                }
             })
             .collect();
         let inverses = inverses?;
@@ -186,22 +223,35 @@ impl Equations {
             }
         }
         let agents = -self.agents.cholesky()?.solve(&self.agent_gradient);
-        let mut pulled: Vec<Vector3<f64>> = self.objects.iter().map(|(_, gradient)| *gradient).collect();
+        let mut pulled: Vec<Vector3<f64>> =
+            self.objects.iter().map(|(_, gradient)| *gradient).collect();
         for (row, object, block) in &self.mixed {
             pulled[*object] += block.transpose() * agents.fixed_rows::<3>(3 * row);
         }
-        let objects = pulled.iter().zip(&inverses).map(|(pulled, inverse)| -(inverse * pulled)).collect();
+        let objects = pulled
+            .iter()
+            .zip(&inverses)
+            .map(|(pulled, inverse)| -(inverse * pulled))
+            .collect();
         Some((agents, objects))
     }
 }
 
 fn squared(residual: &Vector3<f64>, information: &[f64; 3]) -> f64 {
-    residual.iter().zip(information).map(|(residual, information)| residual * residual * information).sum()
+    residual
+        .iter()
+        .zip(information)
+        .map(|(residual, information)| residual * residual * information)
+        .sum()
 }
 
 fn difference(one: &Node, other: &Node) -> Vector3<f64> {
     let turn = one.heading_rad - other.heading_rad;
-    Vector3::new(one.x_m - other.x_m, one.y_m - other.y_m, turn.sin().atan2(turn.cos()))
+    Vector3::new(
+        one.x_m - other.x_m,
+        one.y_m - other.y_m,
+        turn.sin().atan2(turn.cos()),
+    )
 }
 
 /// An angle within a quarter turn of zero that differs by half turns.

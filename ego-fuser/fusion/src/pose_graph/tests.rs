@@ -18,18 +18,33 @@ impl Scene {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let mut cars: Vec<Box3d> = Vec::new();
         while cars.len() < count {
-            let center_m = [rng.random_range(-40.0..70.0), rng.random_range(-25.0..25.0), -1.0];
-            let near = |car: &Box3d| (car.center_m[0] - center_m[0]).hypot(car.center_m[1] - center_m[1]) < 7.0;
+            let center_m = [
+                rng.random_range(-40.0..70.0),
+                rng.random_range(-25.0..25.0),
+                -1.0,
+            ];
+            let near = |car: &Box3d| {
+                (car.center_m[0] - center_m[0]).hypot(car.center_m[1] - center_m[1]) < 7.0
+            };
             if !cars.iter().any(near) {
                 let heading_rad = rng.random_range(-PI..PI);
-                cars.push(Box3d { center_m, size_m: [4.4, 1.9, 1.6], heading_rad });
+                cars.push(Box3d {
+                    center_m,
+                    size_m: [4.4, 1.9, 1.6],
+                    heading_rad,
+                });
             }
         }
         Self { cars, rng }
     }
 
     /// Detections of an agent at `ego_from_agent` of `cars`, with the errors of a detector.
-    fn seen(&mut self, ego_from_agent: &Pose, cars: std::ops::Range<usize>, error_m: f64) -> Vec<Detection> {
+    fn seen(
+        &mut self,
+        ego_from_agent: &Pose,
+        cars: std::ops::Range<usize>,
+        error_m: f64,
+    ) -> Vec<Detection> {
         let agent_from_ego = ego_from_agent.isometry().inverse();
         let rng = &mut self.rng;
         self.cars[cars]
@@ -42,20 +57,35 @@ impl Scene {
                 if rng.random_bool(0.2) {
                     box3d.heading_rad += PI;
                 }
-                Detection { box3d, score: rng.random_range(0.4..1.0), source: None }
+                Detection {
+                    box3d,
+                    score: rng.random_range(0.4..1.0),
+                    source: None,
+                }
             })
             .collect()
     }
 
     fn disturbed(&mut self, pose: &Pose) -> Pose {
-        let (shift, direction) = (self.rng.random_range(0.5..2.0), self.rng.random_range(-PI..PI));
-        let turn = self.rng.random_range(1.0f64..2.0).to_radians() * if self.rng.random_bool(0.5) { 1.0 } else { -1.0 };
+        let (shift, direction) = (
+            self.rng.random_range(0.5..2.0),
+            self.rng.random_range(-PI..PI),
+        );
+        let turn = self.rng.random_range(1.0f64..2.0).to_radians()
+            * if self.rng.random_bool(0.5) { 1.0 } else { -1.0 };
         let [x, y, z] = pose.translation_m;
-        Pose::from_xyz_yaw([x + shift * direction.cos(), y + shift * direction.sin(), z], pose.yaw_rad() + turn)
+        Pose::from_xyz_yaw(
+            [x + shift * direction.cos(), y + shift * direction.sin(), z],
+            pose.yaw_rad() + turn,
+        )
     }
 
     fn pose(&mut self) -> Pose {
-        let place = [self.rng.random_range(-30.0..50.0), self.rng.random_range(-15.0..15.0), 0.1];
+        let place = [
+            self.rng.random_range(-30.0..50.0),
+            self.rng.random_range(-15.0..15.0),
+            0.1,
+        ];
         Pose::from_xyz_yaw(place, self.rng.random_range(-PI..PI))
     }
 }
@@ -77,20 +107,42 @@ fn injected_errors_shrink_by_what_is_shared() {
         let shared = scene.rng.random_range(3..=8);
         let truth = scene.pose();
         // The ego sees the first of the cars, the neighbour the last; `shared` of them are seen by both.
-        let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..8, 0.15), scene.seen(&truth, 8 - shared..12, 0.15));
+        let (ego, neighbour) = (
+            scene.seen(&Pose::IDENTITY, 0..8, 0.15),
+            scene.seen(&truth, 8 - shared..12, 0.15),
+        );
         let reported = scene.disturbed(&truth);
         let agents = [
-            Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-            Observer { ego_from_agent: reported, boxes: &neighbour },
+            Observer {
+                ego_from_agent: Pose::IDENTITY,
+                boxes: &ego,
+            },
+            Observer {
+                ego_from_agent: reported,
+                boxes: &neighbour,
+            },
         ];
         let corrected = correct(&agents, &PoseGraphConfig::default());
-        assert_eq!(corrected[0], Corrected { ego_from_agent: Pose::IDENTITY, shared: 0 });
-        let (was, is) = (off(&reported, &truth, &neighbour), off(&corrected[1].ego_from_agent, &truth, &neighbour));
+        assert_eq!(
+            corrected[0],
+            Corrected {
+                ego_from_agent: Pose::IDENTITY,
+                shared: 0
+            }
+        );
+        let (was, is) = (
+            off(&reported, &truth, &neighbour),
+            off(&corrected[1].ego_from_agent, &truth, &neighbour),
+        );
         before += was;
         after += is;
         worse += usize::from(is > was);
         if shared >= 5 {
-            assert!(is < 0.6, "seed {seed}: {was} to {is} with {:?}", corrected[1]);
+            assert!(
+                is < 0.6,
+                "seed {seed}: {was} to {is} with {:?}",
+                corrected[1]
+            );
         }
     }
     assert!(after < 0.25 * before, "{before} to {after} m in 100 scenes");
@@ -102,10 +154,19 @@ fn right_poses_and_exact_boxes_stay_as_they_are() {
     for seed in 0..20 {
         let mut scene = Scene::new(seed, 8);
         let truth = scene.pose();
-        let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..8, 0.0), scene.seen(&truth, 0..8, 0.0));
+        let (ego, neighbour) = (
+            scene.seen(&Pose::IDENTITY, 0..8, 0.0),
+            scene.seen(&truth, 0..8, 0.0),
+        );
         let agents = [
-            Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-            Observer { ego_from_agent: truth, boxes: &neighbour },
+            Observer {
+                ego_from_agent: Pose::IDENTITY,
+                boxes: &ego,
+            },
+            Observer {
+                ego_from_agent: truth,
+                boxes: &neighbour,
+            },
         ];
         let corrected = correct(&agents, &PoseGraphConfig::default());
         assert_eq!(corrected[1].ego_from_agent, truth, "seed {seed}");
@@ -117,12 +178,25 @@ fn a_good_pose_is_not_spoilt_by_boxes() {
     for seed in 0..20 {
         let mut scene = Scene::new(seed, 8);
         let truth = scene.pose();
-        let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..8, 0.25), scene.seen(&truth, 0..8, 0.25));
+        let (ego, neighbour) = (
+            scene.seen(&Pose::IDENTITY, 0..8, 0.25),
+            scene.seen(&truth, 0..8, 0.25),
+        );
         let agents = [
-            Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-            Observer { ego_from_agent: truth, boxes: &neighbour },
+            Observer {
+                ego_from_agent: Pose::IDENTITY,
+                boxes: &ego,
+            },
+            Observer {
+                ego_from_agent: truth,
+                boxes: &neighbour,
+            },
         ];
-        assert_eq!(correct(&agents, &PoseGraphConfig::default())[1].ego_from_agent, truth, "seed {seed}");
+        assert_eq!(
+            correct(&agents, &PoseGraphConfig::default())[1].ego_from_agent,
+            truth,
+            "seed {seed}"
+        );
     }
 }
 
@@ -132,13 +206,29 @@ fn with_too_little_in_common_poses_stay_bit_for_bit() {
     let truth = scene.pose();
     let reported = scene.disturbed(&truth);
     for shared in 0..3 {
-        let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..6, 0.1), scene.seen(&truth, 6 - shared..9, 0.1));
+        let (ego, neighbour) = (
+            scene.seen(&Pose::IDENTITY, 0..6, 0.1),
+            scene.seen(&truth, 6 - shared..9, 0.1),
+        );
         let agents = [
-            Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-            Observer { ego_from_agent: reported, boxes: &neighbour },
+            Observer {
+                ego_from_agent: Pose::IDENTITY,
+                boxes: &ego,
+            },
+            Observer {
+                ego_from_agent: reported,
+                boxes: &neighbour,
+            },
         ];
         let corrected = correct(&agents, &PoseGraphConfig::default());
-        assert_eq!(corrected[1], Corrected { ego_from_agent: reported, shared: 0 }, "{shared} shared");
+        assert_eq!(
+            corrected[1],
+            Corrected {
+                ego_from_agent: reported,
+                shared: 0
+            },
+            "{shared} shared"
+        );
     }
     assert!(correct(&[], &PoseGraphConfig::default()).is_empty());
 }
@@ -152,9 +242,18 @@ fn a_neighbour_beyond_the_egos_sight_is_placed_by_a_third() {
     let beyond = scene.seen(&truths[1], 6..15, 0.05);
     let reported = truths.map(|truth| scene.disturbed(&truth));
     let agents = [
-        Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-        Observer { ego_from_agent: reported[1], boxes: &beyond },
-        Observer { ego_from_agent: reported[0], boxes: &between },
+        Observer {
+            ego_from_agent: Pose::IDENTITY,
+            boxes: &ego,
+        },
+        Observer {
+            ego_from_agent: reported[1],
+            boxes: &beyond,
+        },
+        Observer {
+            ego_from_agent: reported[0],
+            boxes: &between,
+        },
     ];
     let corrected = correct(&agents, &PoseGraphConfig::default());
     assert!(off(&corrected[2].ego_from_agent, &truths[0], &between) < 0.3);
@@ -172,8 +271,14 @@ fn boxes_that_are_none_are_passed_over() {
     neighbour[1].box3d.heading_rad = f64::INFINITY;
     neighbour[2].score = f32::NAN;
     let agents = [
-        Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
-        Observer { ego_from_agent: scene.disturbed(&truth), boxes: &neighbour },
+        Observer {
+            ego_from_agent: Pose::IDENTITY,
+            boxes: &ego,
+        },
+        Observer {
+            ego_from_agent: scene.disturbed(&truth),
+            boxes: &neighbour,
+        },
     ];
     let corrected = correct(&agents, &PoseGraphConfig::default());
     assert_eq!(corrected[1].shared, 5);

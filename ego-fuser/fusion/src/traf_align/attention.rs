@@ -26,7 +26,10 @@ impl TrajectoryAttention {
             project: linear(&(path / "project"), [dim, 3 * dim]),
             out: linear(&(path / "out"), [dim, dim]),
             norm: LayerNorm::new(&(path / "norm"), dim),
-            mlp: [linear(&(path / "mlp" / 0), [dim, 2 * dim]), linear(&(path / "mlp" / 1), [2 * dim, dim])],
+            mlp: [
+                linear(&(path / "mlp" / 0), [dim, 2 * dim]),
+                linear(&(path / "mlp" / 1), [2 * dim, dim]),
+            ],
             mlp_norm: LayerNorm::new(&(path / "mlp_norm"), dim),
             heads: config.heads,
         }
@@ -36,9 +39,18 @@ impl TrajectoryAttention {
     pub(super) fn forward(&self, tokens: &Tensor, points: &Tensor) -> Result<Tensor, TchError> {
         let (agents, dim, height, width) = tokens.size4()?;
         let last = tokens.f_permute([0, 2, 3, 1])?.f_contiguous()?;
-        let projected = self.project.forward(&last)?.f_permute([0, 3, 1, 2])?.f_contiguous()?;
+        let projected = self
+            .project
+            .forward(&last)?
+            .f_permute([0, 3, 1, 2])?
+            .f_contiguous()?;
         let query = projected.f_narrow(1, 0, dim)?;
-        let read = projected.f_narrow(1, dim, 2 * dim)?.f_grid_sampler(points, BILINEAR, PADDING_ZEROS, false)?;
+        let read = projected.f_narrow(1, dim, 2 * dim)?.f_grid_sampler(
+            points,
+            BILINEAR,
+            PADDING_ZEROS,
+            false,
+        )?;
         let per_head = dim / self.heads;
         let count = points.size()[1] / height;
         let split = |first: i64| {
@@ -47,13 +59,19 @@ impl TrajectoryAttention {
         };
         let (keys, values) = (split(0)?, split(dim)?);
         let query = query.f_reshape([agents, self.heads, per_head, 1, height, width])?;
-        let scores = (query * keys).f_sum_dim_intlist([2i64].as_slice(), true, None)? / (per_head as f64).sqrt();
+        let scores = (query * keys).f_sum_dim_intlist([2i64].as_slice(), true, None)?
+            / (per_head as f64).sqrt();
         let weights = scores.f_softmax(3, None)?;
         let attended = (weights * values).f_sum_dim_intlist([3i64].as_slice(), false, None)?;
-        let attended = attended.f_reshape([agents, dim, height, width])?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let attended = attended
+            .f_reshape([agents, dim, height, width])?
+            .f_permute([0, 2, 3, 1])?
+            .f_contiguous()?;
         let tokens = self.norm.forward(&(last + self.out.forward(&attended)?))?;
         let [first, second] = &self.mlp;
-        let tokens = self.mlp_norm.forward(&(&tokens + second.forward(&first.forward(&tokens)?.f_relu()?)?))?;
+        let tokens = self
+            .mlp_norm
+            .forward(&(&tokens + second.forward(&first.forward(&tokens)?.f_relu()?)?))?;
         tokens.f_permute([0, 3, 1, 2])
     }
 }
@@ -62,7 +80,18 @@ impl TrajectoryAttention {
 fn linear(path: &nn::Path<'_>, [input, output]: [i64; 2]) -> Linear {
     let bound = 1.0 / (input as f64).sqrt();
     Linear {
-        weight: path.var("weight", &[output, input], nn::init::DEFAULT_KAIMING_UNIFORM),
-        bias: Some(path.var("bias", &[output], Init::Uniform { lo: -bound, up: bound })),
+        weight: path.var(
+            "weight",
+            &[output, input],
+            nn::init::DEFAULT_KAIMING_UNIFORM,
+        ),
+        bias: Some(path.var(
+            "bias",
+            &[output],
+            Init::Uniform {
+                lo: -bound,
+                up: bound,
+            },
+        )),
     }
 }

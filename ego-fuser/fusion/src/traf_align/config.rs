@@ -34,13 +34,30 @@ impl TrafAlignConfig {
     #[must_use]
     pub(crate) fn lean(channels: i64) -> Self {
         let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
-        Self { channels, patch, dim, heads, kernel, layers, field, frames: 3, frame_secs: 0.1 }
+        Self {
+            channels,
+            patch,
+            dim,
+            heads,
+            kernel,
+            layers,
+            field,
+            frames: 3,
+            frame_secs: 0.1,
+        }
     }
 
     /// About the published sizes.
     #[must_use]
     pub(crate) fn full(channels: i64) -> Self {
-        Self { patch: 1, dim: channels, heads: 4, layers: 2, frames: 4, ..Self::lean(channels) }
+        Self {
+            patch: 1,
+            dim: channels,
+            heads: 4,
+            layers: 2,
+            frames: 4,
+            ..Self::lean(channels)
+        }
     }
 
     /// Checks that a network can be built.
@@ -51,11 +68,23 @@ impl TrafAlignConfig {
         within("fusion channels", self.channels, 1..=4096)?;
         within("fusion patch", self.patch, 1..=8)?;
         within("fusion dim", self.dim, 2..=4096)?;
-        within("fusion heads", if self.dim % self.heads.max(1) == 0 { self.heads } else { 0 }, 1..=64)?;
+        within(
+            "fusion heads",
+            if self.dim % self.heads.max(1) == 0 {
+                self.heads
+            } else {
+                0
+            },
+            1..=64,
+        )?;
         within("fusion kernel", self.kernel, 1..=9)?;
         within("fusion layers", self.layers as i64, 1..=16)?;
         within("fusion field", self.field, 1..=64)?;
         within("fusion frames", self.frames as i64, 1..=16)?;
-        within("fusion frame_secs in ms", (self.frame_secs * 1e3) as i64, 1..=60_000)
+        within(
+            "fusion frame_secs in ms",
+            (self.frame_secs * 1e3) as i64,
+            1..=60_000,
+        )
     }
 }

@@ -29,7 +29,13 @@ impl Trajectories {
         let [full, half] = WIDTHS;
         let points = config.kernel * config.kernel;
         let layer = |name: &str, io: [i64; 2], stride: i64| {
-            ConvLayer::normed(&(path / name), &(path / format!("{name}_norm")), io, 3, stride)
+            ConvLayer::normed(
+                &(path / name),
+                &(path / format!("{name}_norm")),
+                io,
+                3,
+                stride,
+            )
         };
         let offsets = path / "offsets";
         Self {
@@ -54,10 +60,19 @@ impl Trajectories {
         let fine = self.inner.forward(tokens, train);
         let coarse = self.deep.forward(&self.down.forward(&fine, train), train);
         let joined = Tensor::f_cat(&[&fine, &self.up.forward(&coarse, train)], 1)?;
-        let field = self.field.forward(&self.joined.forward(&joined, train), train).f_sigmoid()?;
+        let field = self
+            .field
+            .forward(&self.joined.forward(&joined, train), train)
+            .f_sigmoid()?;
         let (weight, bias) = &self.offsets;
-        let offsets =
-            self.before_offsets.forward(&field, train).f_conv2d(weight, Some(bias), [1, 1], [1, 1], [1, 1], 1)?;
+        let offsets = self.before_offsets.forward(&field, train).f_conv2d(
+            weight,
+            Some(bias),
+            [1, 1],
+            [1, 1],
+            [1, 1],
+            1,
+        )?;
         self.sampling_grid(&offsets)
     }
 
@@ -67,15 +82,25 @@ impl Trajectories {
         let (points, options) = (channels / 2, (Kind::Float, offsets.device()));
         let middle = (self.kernel - 1) as f64 / 2.0;
         let square = Tensor::f_arange(self.kernel, options)? - middle;
-        let along =
-            |size: i64, view: [i64; 4]| -> Result<Tensor, TchError> { Tensor::f_arange(size, options)?.f_view(view) };
+        let along = |size: i64, view: [i64; 4]| -> Result<Tensor, TchError> {
+            Tensor::f_arange(size, options)?.f_view(view)
+        };
         let of_points = |repeat_inner: bool| -> Result<Tensor, TchError> {
-            let [rows, columns] = if repeat_inner { [self.kernel, 1] } else { [1, self.kernel] };
-            let grid = square.f_view([columns, rows])?.f_expand([self.kernel, self.kernel], false)?;
+            let [rows, columns] = if repeat_inner {
+                [self.kernel, 1]
+            } else {
+                [1, self.kernel]
+            };
+            let grid = square
+                .f_view([columns, rows])?
+                .f_expand([self.kernel, self.kernel], false)?;
             grid.f_reshape([1, points, 1, 1])
         };
-        let x = offsets.f_narrow(1, 0, points)? + of_points(true)? + along(width, [1, 1, 1, width])?;
-        let y = offsets.f_narrow(1, points, points)? + of_points(false)? + along(height, [1, 1, height, 1])?;
+        let x =
+            offsets.f_narrow(1, 0, points)? + of_points(true)? + along(width, [1, 1, 1, width])?;
+        let y = offsets.f_narrow(1, points, points)?
+            + of_points(false)?
+            + along(height, [1, 1, height, 1])?;
         let scaled = |place: Tensor, size: i64| (place + 0.5) * (2.0 / size as f64) - 1.0;
         let sampling_grid = Tensor::f_stack(&[scaled(x, width), scaled(y, height)], -1)?;
         sampling_grid.f_view([agents, points * height, width, 2])
@@ -96,7 +121,9 @@ mod tests {
         let config = TrafAlignConfig::lean(8);
         let trajectories = Trajectories::new(&variables.root(), &config);
         let tokens = Tensor::randn([1, config.dim, 6, 4], (Kind::Float, Device::Cpu));
-        let points = tch::no_grad(|| trajectories.points(&tokens, false)).unwrap().view([3, 3, 6, 4, 2]);
+        let points = tch::no_grad(|| trajectories.points(&tokens, false))
+            .unwrap()
+            .view([3, 3, 6, 4, 2]);
         // Of the token in row 2, column 1, the point one row below and one column to the left.
         let at = |axis: i64| points.double_value(&[2, 0, 2, 1, axis]);
         assert!((at(0) - (0.5 / 4.0 * 2.0 - 1.0)).abs() < 1e-6, "{}", at(0));

@@ -58,8 +58,14 @@ impl FusionSettings for TrafAlignConfig {
     }
 
     fn requirements(&self) -> Requirements {
-        let history = HistorySpec { frames: self.frames, ..HistorySpec::default() };
-        Requirements { history, ..Requirements::default() }
+        let history = HistorySpec {
+            frames: self.frames,
+            ..HistorySpec::default()
+        };
+        Requirements {
+            history,
+            ..Requirements::default()
+        }
     }
 }
 
@@ -86,11 +92,28 @@ impl TrafAlign {
     /// [`ConfigError`] names the field that no network can be built from.
     pub(crate) fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let TrafAlignConfig { channels, patch, dim, .. } = *config;
+        let TrafAlignConfig {
+            channels,
+            patch,
+            dim,
+            ..
+        } = *config;
         let layer = |index: usize| TrajectoryAttention::new(&(path / "layers" / index), config);
         Ok(Self {
-            tokeniser: ConvLayer::patches(&(path / "tokens"), &(path / "tokens_norm"), [channels, dim], patch),
-            age: path.var("age", &[2 * WAVES, dim], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            tokeniser: ConvLayer::patches(
+                &(path / "tokens"),
+                &(path / "tokens_norm"),
+                [channels, dim],
+                patch,
+            ),
+            age: path.var(
+                "age",
+                &[2 * WAVES, dim],
+                Init::Randn {
+                    mean: 0.0,
+                    stdev: 0.02,
+                },
+            ),
             trajectories: Trajectories::new(&(path / "trajectories"), config),
             layers: (0..config.layers).map(layer).collect(),
             decoder: path.var("decoder", &[dim, channels, patch, patch], Init::Const(0.0)),
@@ -112,10 +135,19 @@ impl TrafAlign {
     }
 
     /// One map of tokens per agent: the sum over its frames, `[A, D, h, w]`.
-    fn over_time(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
+    fn over_time(
+        &self,
+        maps: &Tensor,
+        mask: &Tensor,
+        agents: &Agents,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let patch = [self.config.patch; 2];
         let seen = mask.f_max_pool2d(patch, patch, [0, 0], [1, 1], false)?;
-        let ages = self.ages(&agents.age_secs)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
+        let ages = self
+            .ages(&agents.age_secs)?
+            .f_unsqueeze(-1)?
+            .f_unsqueeze(-1)?;
         let tokens = (self.tokeniser.forward(maps, train) + ages) * seen;
         let mut size = tokens.size();
         size[0] = agents.newest.len() as i64;
@@ -123,7 +155,13 @@ impl TrafAlign {
         Tensor::f_zeros(size, (tokens.kind(), tokens.device()))?.f_index_add(0, &owner, &tokens)
     }
 
-    fn fuse_present(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
+    fn fuse_present(
+        &self,
+        maps: &Tensor,
+        mask: &Tensor,
+        agents: &Agents,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let (_, _, height, width) = maps.size4()?;
         // The U-Net halves the resolution of the tokens once.
         let padded = |maps: &Tensor| Padding::to_multiples_of(2 * self.config.patch, maps);
@@ -134,11 +172,23 @@ impl TrafAlign {
             tokens = layer.forward(&tokens, &points)?;
         }
         let patch = [self.config.patch; 2];
-        let gathered = tokens.f_conv_transpose2d(&self.decoder, None::<Tensor>, patch, [0, 0], [0, 0], 1, [1, 1])?;
+        let gathered = tokens.f_conv_transpose2d(
+            &self.decoder,
+            None::<Tensor>,
+            patch,
+            [0, 0],
+            [0, 0],
+            1,
+            [1, 1],
+        )?;
         let newest = Tensor::f_from_slice(&agents.newest)?.f_to_device(maps.device())?;
         let out_of_reach = mask.f_index_select(0, &newest)?.f_eq(0.0)?;
-        let fused = (maps.f_index_select(0, &newest)? + gathered).f_masked_fill(&out_of_reach, f64::NEG_INFINITY)?;
-        fused.f_amax([0i64].as_slice(), false)?.f_narrow(1, 0, height)?.f_narrow(2, 0, width)
+        let fused = (maps.f_index_select(0, &newest)? + gathered)
+            .f_masked_fill(&out_of_reach, f64::NEG_INFINITY)?;
+        fused
+            .f_amax([0i64].as_slice(), false)?
+            .f_narrow(1, 0, height)?
+            .f_narrow(2, 0, width)
     }
 }
 
@@ -153,7 +203,10 @@ struct Agents {
 
 impl Agents {
     fn new(metadata: &[MapMetadata], entries: &[i64]) -> Self {
-        let facts: Vec<_> = entries.iter().map(|&entry| metadata[entry as usize]).collect();
+        let facts: Vec<_> = entries
+            .iter()
+            .map(|&entry| metadata[entry as usize])
+            .collect();
         let mut names: Vec<usize> = Vec::new();
         let owner: Vec<i64> = (facts.iter())
             .map(|facts| {
@@ -167,19 +220,38 @@ impl Agents {
         let age_secs: Vec<f64> = facts.iter().map(|facts| facts.age_secs).collect();
         let newest = (0..names.len() as i64).map(|agent| {
             let of_agent = (0..owner.len()).filter(|&entry| owner[entry] == agent);
-            of_agent.min_by(|&one, &other| age_secs[one].total_cmp(&age_secs[other])).unwrap_or(0) as i64
+            of_agent
+                .min_by(|&one, &other| age_secs[one].total_cmp(&age_secs[other]))
+                .unwrap_or(0) as i64
         });
-        Self { newest: newest.collect(), owner, age_secs }
+        Self {
+            newest: newest.collect(),
+            owner,
+            age_secs,
+        }
     }
 }
 
 impl Fusion for TrafAlign {
-    fn fuse(&self, AlignedMaps { warped, metadata, is_training, .. }: &AlignedMaps) -> Result<FusionOutput, TchError> {
+    fn fuse(
+        &self,
+        AlignedMaps {
+            warped,
+            metadata,
+            is_training,
+            ..
+        }: &AlignedMaps,
+    ) -> Result<FusionOutput, TchError> {
         let entries = present(&warped.mask)?;
         let agents = Agents::new(metadata, &entries);
         let index = Tensor::f_from_slice(&entries)?.f_to_device(warped.features.device())?;
         let pick = |tensor: &Tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float);
-        let fused = self.fuse_present(&pick(&warped.features)?, &pick(&warped.mask)?, &agents, *is_training)?;
+        let fused = self.fuse_present(
+            &pick(&warped.features)?,
+            &pick(&warped.mask)?,
+            &agents,
+            *is_training,
+        )?;
         Ok(fused.f_to_kind(warped.features.kind())?.into())
     }
 }

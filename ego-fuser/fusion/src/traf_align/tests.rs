@@ -6,7 +6,13 @@ use super::*;
 use crate::{MapMetadata, MaxFusion};
 
 const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
-const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.8, width: 22, height: 18 };
+const GRID: BevGrid = BevGrid {
+    x_min_m: 0.0,
+    y_min_m: 0.0,
+    cell_m: 0.8,
+    width: 22,
+    height: 18,
+};
 
 fn network() -> (VarStore, TrafAlign) {
     tch::set_num_threads(1);
@@ -18,13 +24,18 @@ fn network() -> (VarStore, TrafAlign) {
 
 fn fuse(fusion: &dyn Fusion, features: &Tensor, facts: &[MapMetadata], train: bool) -> Tensor {
     let mask = Tensor::ones([features.size()[0], 1, 18, 22], FLOAT);
-    let maps = AlignedMaps { is_training: train, ..AlignedMaps::newest(features, &mask, facts, &GRID) };
+    let maps = AlignedMaps {
+        is_training: train,
+        ..AlignedMaps::newest(features, &mask, facts, &GRID)
+    };
     fusion.fuse(&maps).unwrap().map
 }
 
 fn facts(agents_and_ages: &[(usize, f64)]) -> Vec<MapMetadata> {
-    let facts =
-        |&(agent, age_secs): &(usize, f64)| MapMetadata { age_secs, ..MapMetadata::fresh(agent, Pose::IDENTITY) };
+    let facts = |&(agent, age_secs): &(usize, f64)| MapMetadata {
+        age_secs,
+        ..MapMetadata::fresh(agent, Pose::IDENTITY)
+    };
     agents_and_ages.iter().map(facts).collect()
 }
 
@@ -35,17 +46,33 @@ fn untrained_it_is_the_maximum_of_the_newest_maps() {
     let facts = facts(&[(0, 0.0), (0, 0.1), (1, 0.2), (1, 0.1)]);
     let fused = no_grad(|| fuse(&network, &features, &facts, false));
     let newest = features.index_select(0, &Tensor::from_slice(&[0i64, 3]));
-    assert!(fused.allclose(&fuse(&MaxFusion, &newest, &facts[..2], false), 1e-6, 1e-6, false));
+    assert!(fused.allclose(
+        &fuse(&MaxFusion, &newest, &facts[..2], false),
+        1e-6,
+        1e-6,
+        false
+    ));
 }
 
 #[test]
 fn history_changes_what_is_gathered_and_so_does_its_age() {
     let (variables, network) = network();
-    let _ = no_grad(|| variables.variables()["decoder"].shallow_clone().normal_(0.0, 0.3));
+    let _ = no_grad(|| {
+        variables.variables()["decoder"]
+            .shallow_clone()
+            .normal_(0.0, 0.3)
+    });
     let features = Tensor::rand([2, 6, 18, 22], FLOAT);
     let fused = |count: i64, age: f64| {
         let facts = facts(&[(0, 0.0), (0, age)]);
-        no_grad(|| fuse(&network, &features.narrow(0, 0, count), &facts[..count as usize], false))
+        no_grad(|| {
+            fuse(
+                &network,
+                &features.narrow(0, 0, count),
+                &facts[..count as usize],
+                false,
+            )
+        })
     };
     let difference = |one: &Tensor, other: &Tensor| (one - other).abs().max().double_value(&[]);
     let (ego_only, with_history) = (fused(1, 0.0), fused(2, 0.1));
@@ -66,7 +93,11 @@ fn it_learns_to_attend_along_a_motion() {
         let row = 2 + (step * 5) % 14;
         let features = Tensor::zeros([3, 6, 18, 22], FLOAT);
         for age in 1..3 {
-            let _ = features.get(age).narrow(1, row, 2).narrow(2, column - 2 * age, 2).fill_(1.0);
+            let _ = features
+                .get(age)
+                .narrow(1, row, 2)
+                .narrow(2, column - 2 * age, 2)
+                .fill_(1.0);
         }
         let target = Tensor::zeros([18, 22], FLOAT);
         let _ = target.narrow(0, row, 2).narrow(1, column, 2).fill_(1.0);
@@ -86,6 +117,9 @@ fn it_learns_to_attend_along_a_motion() {
             assert!(norm.is_finite(), "{name}");
         }
     }
-    let moved = variables.variables()["trajectories.offsets.weight"].abs().max().double_value(&[]);
+    let moved = variables.variables()["trajectories.offsets.weight"]
+        .abs()
+        .max()
+        .double_value(&[]);
     assert!(moved > 0.0, "offsets learn from the detection loss only");
 }

@@ -38,13 +38,33 @@ struct Asked {
 impl AgentAttention {
     /// Variables `q_linears`, `k_linears`, `v_linears`, `a_linears`, `relation_att` and `relation_msg` below `path`.
     #[must_use]
-    pub fn new(path: &nn::Path<'_>, channels: i64, heads: i64, head_channels: i64, dropout: f64) -> Self {
+    pub fn new(
+        path: &nn::Path<'_>,
+        channels: i64,
+        heads: i64,
+        head_channels: i64,
+        dropout: f64,
+    ) -> Self {
         let inner = heads * head_channels;
-        let into = |name: &str| std::array::from_fn(|kind| Linear::new(&(path / name / kind), channels, inner, true));
+        let into = |name: &str| {
+            std::array::from_fn(|kind| Linear::new(&(path / name / kind), channels, inner, true))
+        };
         let relation = |name: &str| {
-            let shape = [(AGENT_TYPES * AGENT_TYPES) as i64, heads, head_channels, head_channels];
+            let shape = [
+                (AGENT_TYPES * AGENT_TYPES) as i64,
+                heads,
+                head_channels,
+                head_channels,
+            ];
             // Near the identity: typed attention starts as ordinary attention.
-            let relation = path.var(name, &shape, Init::Randn { mean: 0.0, stdev: 0.02 });
+            let relation = path.var(
+                name,
+                &shape,
+                Init::Randn {
+                    mean: 0.0,
+                    stdev: 0.02,
+                },
+            );
             let identity = Tensor::eye(head_channels, (relation.kind(), relation.device()));
             let _ = tch::no_grad(|| relation.shallow_clone().g_add_(&identity));
             relation
@@ -54,7 +74,9 @@ impl AgentAttention {
             query: into("q_linears"),
             key: into("k_linears"),
             value: into("v_linears"),
-            out: std::array::from_fn(|kind| Linear::residual(&(path / "a_linears" / kind), inner, channels, true)),
+            out: std::array::from_fn(|kind| {
+                Linear::residual(&(path / "a_linears" / kind), inner, channels, true)
+            }),
             relation_att: relation("relation_att"),
             relation_msg: relation("relation_msg"),
             dropout,
@@ -80,20 +102,29 @@ impl AgentAttention {
         train: bool,
     ) -> Result<Tensor, TchError> {
         let (agents, cells, _) = x.size3()?;
-        if types.len() as i64 != agents || queries > types.len() || types.iter().any(|&kind| kind >= AGENT_TYPES) {
-            return Err(TchError::Shape(format!("{queries} of {agents} agents of the types {types:?}")));
+        if types.len() as i64 != agents
+            || queries > types.len()
+            || types.iter().any(|&kind| kind >= AGENT_TYPES)
+        {
+            return Err(TchError::Shape(format!(
+                "{queries} of {agents} agents of the types {types:?}"
+            )));
         }
         let chunk = if train { cells } else { CHUNK };
         let mut kinds = types[..queries].to_vec();
         kinds.sort_unstable();
         kinds.dedup();
-        let asked =
-            kinds.into_iter().map(|kind| Ok((kind, self.asked(kind)?))).collect::<Result<Vec<_>, TchError>>()?;
+        let asked = kinds
+            .into_iter()
+            .map(|kind| Ok((kind, self.asked(kind)?)))
+            .collect::<Result<Vec<_>, TchError>>()?;
         let mut seen = Vec::new();
         for first in (0..cells).step_by(chunk.max(1) as usize) {
             let length = chunk.min(cells - first);
             let x = x.f_narrow(1, first, length)?;
-            let unseen = unseen.map(|unseen| unseen.f_narrow(1, first, length)).transpose()?;
+            let unseen = unseen
+                .map(|unseen| unseen.f_narrow(1, first, length))
+                .transpose()?;
             seen.push(self.chunk(&x, unseen.as_ref(), types, queries, &asked)?);
         }
         dropout(Tensor::f_cat(&seen, 1)?, self.dropout, train)
@@ -108,12 +139,18 @@ impl AgentAttention {
         asked: &[(usize, Asked)],
     ) -> Result<Tensor, TchError> {
         // [N, t] to [t, 1, 1, N]: added to the scores of all heads and all queries.
-        let bias =
-            unseen.map(|unseen| unseen.f_transpose(0, 1)?.f_contiguous()?.f_view([-1, 1, 1, types.len() as i64]));
+        let bias = unseen.map(|unseen| {
+            unseen
+                .f_transpose(0, 1)?
+                .f_contiguous()?
+                .f_view([-1, 1, 1, types.len() as i64])
+        });
         let bias = bias.transpose()?;
         let mut answers: Vec<Option<Tensor>> = (0..queries).map(|_| None).collect();
         for (kind, asked) in asked {
-            let askers: Vec<usize> = (0..queries).filter(|&agent| types[agent] == *kind).collect();
+            let askers: Vec<usize> = (0..queries)
+                .filter(|&agent| types[agent] == *kind)
+                .collect();
             let query = if askers.len() == types.len() {
                 x.shallow_clone()
             } else {
@@ -147,7 +184,10 @@ impl AgentAttention {
         if types.len() == 1 {
             // With a single agent all weights are 1.
             let (weight, offset) = &asked.key_value[first];
-            let (weight, offset) = (weight.f_narrow(0, inner, inner)?, offset.f_narrow(0, inner, inner)?);
+            let (weight, offset) = (
+                weight.f_narrow(0, inner, inner)?,
+                offset.f_narrow(0, inner, inner)?,
+            );
             return x.f_linear(&weight, Some(&offset))?.f_transpose(0, 1);
         }
         let query = query.f_linear(&asked.query.0, Some(&asked.query.1))?;
@@ -162,22 +202,40 @@ impl AgentAttention {
             Tensor::f_stack(&each.collect::<Result<Vec<_>, TchError>>()?, 0)?
         };
         // Cells are the groups, agents the tokens.
-        let cut = |x: &Tensor| x.f_unflatten(2, [self.heads, inner / self.heads])?.f_transpose(0, 1);
+        let cut = |x: &Tensor| {
+            x.f_unflatten(2, [self.heads, inner / self.heads])?
+                .f_transpose(0, 1)
+        };
         let parts = key_value.f_split(inner, 2)?;
         attend(&cut(&query)?, &cut(&parts[0])?, &cut(&parts[1])?, bias)
     }
 
     fn asked(&self, kind: usize) -> Result<Asked, TchError> {
-        let bias = |linear: &Linear| linear.bias.as_ref().expect("all projections have a bias").shallow_clone();
-        let query = (self.query[kind].weight.shallow_clone(), bias(&self.query[kind]));
+        let bias = |linear: &Linear| {
+            linear
+                .bias
+                .as_ref()
+                .expect("all projections have a bias")
+                .shallow_clone()
+        };
+        let query = (
+            self.query[kind].weight.shallow_clone(),
+            bias(&self.query[kind]),
+        );
         let mut key_value = Vec::with_capacity(AGENT_TYPES);
         for sender in 0..AGENT_TYPES {
             let relation = (kind * AGENT_TYPES + sender) as i64;
-            let (att, msg) = (self.relation_att.f_get(relation)?, self.relation_msg.f_get(relation)?);
+            let (att, msg) = (
+                self.relation_att.f_get(relation)?,
+                self.relation_msg.f_get(relation)?,
+            );
             // q W k = q (W k), and (v as a row) W = W^T v.
             let key = folded(&att, &self.key[sender])?;
             let value = folded(&msg.f_transpose(1, 2)?, &self.value[sender])?;
-            key_value.push((Tensor::f_cat(&[key.0, value.0], 0)?, Tensor::f_cat(&[key.1, value.1], 0)?));
+            key_value.push((
+                Tensor::f_cat(&[key.0, value.0], 0)?,
+                Tensor::f_cat(&[key.1, value.1], 0)?,
+            ));
         }
         let key_value = key_value.try_into().expect("one for each type");
         Ok(Asked { query, key_value })
@@ -187,8 +245,12 @@ impl AgentAttention {
 /// A projection with a matrix per head, `[M, D, D]`, multiplied into it from the left.
 fn folded(matrix: &Tensor, linear: &Linear) -> Result<(Tensor, Tensor), TchError> {
     let (heads, channels, _) = matrix.size3()?;
-    let weight = matrix.f_bmm(&linear.weight.f_view([heads, channels, -1])?)?.f_reshape_as(&linear.weight)?;
+    let weight = matrix
+        .f_bmm(&linear.weight.f_view([heads, channels, -1])?)?
+        .f_reshape_as(&linear.weight)?;
     let bias = linear.bias.as_ref().expect("all projections have a bias");
-    let bias = matrix.f_bmm(&bias.f_view([heads, channels, 1])?)?.f_reshape([-1])?;
+    let bias = matrix
+        .f_bmm(&bias.f_view([heads, channels, 1])?)?
+        .f_reshape([-1])?;
     Ok((weight, bias))
 }

@@ -57,7 +57,11 @@ impl V2xVitConfig {
     /// The published sizes, for feature maps of `channels` (256 there).
     #[must_use]
     pub fn full(channels: i64) -> Self {
-        let window = |edge, heads| WindowConfig { edge, heads, head_channels: (channels / heads).max(1) };
+        let window = |edge, heads| WindowConfig {
+            edge,
+            heads,
+            head_channels: (channels / heads).max(1),
+        };
         Self {
             channels,
             depth: 3,
@@ -76,7 +80,11 @@ impl V2xVitConfig {
     /// costs as much as a layer norm and a projection).
     #[must_use]
     pub fn lean(channels: i64) -> Self {
-        let window = |edge, heads| WindowConfig { edge, heads, head_channels: (channels / heads).max(1) };
+        let window = |edge, heads| WindowConfig {
+            edge,
+            heads,
+            head_channels: (channels / heads).max(1),
+        };
         Self {
             depth: 2,
             agent_heads: 2,
@@ -117,16 +125,31 @@ impl V2xVitConfig {
             sizes.push(("fusion.windows.heads", window.heads));
             sizes.push(("fusion.windows.head_channels", window.head_channels));
         }
-        if let Some((field, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
-            return Err(ConfigError::Value { field, value: size.to_string(), must: "1 to 4096" });
+        if let Some((field, size)) = sizes
+            .into_iter()
+            .find(|(_, size)| !(1..=4096).contains(size))
+        {
+            return Err(ConfigError::Value {
+                field,
+                value: size.to_string(),
+                must: "1 to 4096",
+            });
         }
         if self.order()?.largest() > 64 {
             let value = self.order()?.largest().to_string();
-            return Err(ConfigError::Value { field: "fusion.windows.edge", value, must: "at most 64" });
+            return Err(ConfigError::Value {
+                field: "fusion.windows.edge",
+                value,
+                must: "at most 64",
+            });
         }
         if !(0.0..1.0).contains(&self.dropout) {
             let value = self.dropout.to_string();
-            return Err(ConfigError::Value { field: "fusion.dropout", value, must: "a share below 1" });
+            return Err(ConfigError::Value {
+                field: "fusion.dropout",
+                value,
+                must: "a share below 1",
+            });
         }
         Ok(())
     }

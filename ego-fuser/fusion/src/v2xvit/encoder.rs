@@ -56,7 +56,9 @@ impl Block {
         queries: usize,
         train: bool,
     ) -> Result<Tensor, TchError> {
-        let seen = self.agents.forward(&self.agent_norm.forward(x)?, unseen, types, queries, train)?;
+        let seen =
+            self.agents
+                .forward(&self.agent_norm.forward(x)?, unseen, types, queries, train)?;
         (x.f_narrow(0, 0, queries as i64)? + seen).f_contiguous()
     }
 
@@ -110,11 +112,21 @@ impl Encoder {
             Layer {
                 blocks: (0..config.blocks).map(block).collect(),
                 norm: LayerNorm::new(&(&path / 1 / "norm"), config.channels),
-                feed_forward: FeedForward::new(&(&path / 1 / "fn"), config.channels, config.hidden, config.dropout),
+                feed_forward: FeedForward::new(
+                    &(&path / 1 / "fn"),
+                    config.channels,
+                    config.hidden,
+                    config.dropout,
+                ),
             }
         };
-        let temporal = config.temporal_encoding.then(|| TemporalEncoding::new(&(path / "rte"), config.channels));
-        Self { layers: (0..config.depth).map(layer).collect(), temporal }
+        let temporal = config
+            .temporal_encoding
+            .then(|| TemporalEncoding::new(&(path / "rte"), config.channels));
+        Self {
+            layers: (0..config.depth).map(layer).collect(),
+            temporal,
+        }
     }
 
     /// The layers, first to last.
@@ -159,7 +171,11 @@ impl Encoder {
                 let is_last = index + 1 == layer.blocks.len();
                 x = each_agent(&x, |x| {
                     let x = block.across_cells(x, train)?;
-                    if is_last { layer.feed_forward(&x, train) } else { Ok(x) }
+                    if is_last {
+                        layer.feed_forward(&x, train)
+                    } else {
+                        Ok(x)
+                    }
                 })?;
             }
         }
@@ -168,7 +184,16 @@ impl Encoder {
 }
 
 /// Applies `step` to each of `[N, T, C]`.
-fn each_agent(x: &Tensor, step: impl Fn(&Tensor) -> Result<Tensor, TchError>) -> Result<Tensor, TchError> {
-    let agents = (0..x.size3()?.0).map(|agent| step(&x.f_get(agent)?)).collect::<Result<Vec<_>, _>>()?;
-    if let [only] = &agents[..] { only.f_unsqueeze(0) } else { Tensor::f_stack(&agents, 0) }
+fn each_agent(
+    x: &Tensor,
+    step: impl Fn(&Tensor) -> Result<Tensor, TchError>,
+) -> Result<Tensor, TchError> {
+    let agents = (0..x.size3()?.0)
+        .map(|agent| step(&x.f_get(agent)?))
+        .collect::<Result<Vec<_>, _>>()?;
+    if let [only] = &agents[..] {
+        only.f_unsqueeze(0)
+    } else {
+        Tensor::f_stack(&agents, 0)
+    }
 }

@@ -69,12 +69,22 @@ impl V2xVit {
     pub fn new(path: &nn::Path<'_>, config: &V2xVitConfig) -> Result<Self, ConfigError> {
         config.validate()?;
         let order = config.order()?;
-        Ok(Self { encoder: Encoder::new(&(path / "encoder"), config, &order), order })
+        Ok(Self {
+            encoder: Encoder::new(&(path / "encoder"), config, &order),
+            order,
+        })
     }
 
     /// The features with the code of each map's age where the map reaches.
-    fn with_age(&self, AlignedMaps { warped, metadata, .. }: &AlignedMaps) -> Result<Tensor, TchError> {
-        let Some(temporal) = self.encoder.temporal() else { return Ok(warped.features.shallow_clone()) };
+    fn with_age(
+        &self,
+        AlignedMaps {
+            warped, metadata, ..
+        }: &AlignedMaps,
+    ) -> Result<Tensor, TchError> {
+        let Some(temporal) = self.encoder.temporal() else {
+            return Ok(warped.features.shallow_clone());
+        };
         let rows: Vec<f64> = metadata.iter().map(|map| map.age_secs / ROW_SECS).collect();
         let code = temporal.encode(&rows)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
         // The reference adds it before the warp, which leaves zeros where a map does not reach.
@@ -86,16 +96,31 @@ impl Fusion for V2xVit {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
         let mask = &maps.warped.mask;
         let padding = Padding::to_multiples(&maps.warped.features, self.order.largest())?;
-        let tokens = self.order.tokens(&padding.maps(&self.with_age(maps)?, 0)?)?;
+        let tokens = self
+            .order
+            .tokens(&padding.maps(&self.with_age(maps)?, 0)?)?;
         let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let unseen = if sees_all && padding.is_empty() {
             None
         } else {
-            Some(self.order.tokens(&unseen(&padding.mask(mask, 0)?)?)?.f_squeeze_dim(2)?)
+            Some(
+                self.order
+                    .tokens(&unseen(&padding.mask(mask, 0)?)?)?
+                    .f_squeeze_dim(2)?,
+            )
         };
         let types = vec![VEHICLE; maps.metadata.len()];
-        let fused = self.encoder.forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
+        let fused = self
+            .encoder
+            .forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
         let [height, width] = padding.size();
-        Ok(padding.crop(&self.order.maps(&fused.f_unsqueeze(0)?, height, width)?.f_get(0)?)?.into())
+        Ok(padding
+            .crop(
+                &self
+                    .order
+                    .maps(&fused.f_unsqueeze(0)?, height, width)?
+                    .f_get(0)?,
+            )?
+            .into())
     }
 }

@@ -25,7 +25,10 @@ impl TemporalEncoding {
         let path = path / "emb";
         let mut table = (&path / "emb").var("weight", &[ROWS, channels], Init::Const(0.0));
         tch::no_grad(|| table.copy_(&waves(channels)));
-        Self { table, linear: Linear::new(&(&path / "lin"), channels, channels, true) }
+        Self {
+            table,
+            linear: Linear::new(&(&path / "lin"), channels, channels, true),
+        }
     }
 
     /// The code of each delay, given in rows of the table: `N` of them to `[N, C]`.
@@ -37,15 +40,31 @@ impl TemporalEncoding {
     /// [`TchError`] of the tensor library.
     pub fn encode(&self, rows: &[f64]) -> Result<Tensor, TchError> {
         let last = (ROWS - 1) as f64;
-        let rows: Vec<f64> = rows.iter().map(|row| if row.is_nan() { 0.0 } else { row.clamp(0.0, last) }).collect();
+        let rows: Vec<f64> = rows
+            .iter()
+            .map(|row| {
+                if row.is_nan() {
+                    0.0
+                } else {
+                    row.clamp(0.0, last)
+                }
+            })
+            .collect();
         let lower: Vec<i64> = rows.iter().map(|row| row.floor() as i64).collect();
         let upper: Vec<i64> = rows.iter().map(|row| row.ceil() as i64).collect();
         let share: Vec<f32> = rows.iter().map(|row| row.fract() as f32).collect();
         let row = |index: &[i64]| {
-            self.table.f_index_select(0, &Tensor::f_from_slice(index)?.f_to_device(self.table.device())?)
+            self.table.f_index_select(
+                0,
+                &Tensor::f_from_slice(index)?.f_to_device(self.table.device())?,
+            )
         };
-        let share = Tensor::f_from_slice(&share)?.f_view([-1, 1])?.f_to_device(self.table.device())?;
-        self.linear.forward(&row(&lower)?.f_lerp_tensor(&row(&upper)?, &share.f_expand_as(&row(&lower)?)?)?)
+        let share = Tensor::f_from_slice(&share)?
+            .f_view([-1, 1])?
+            .f_to_device(self.table.device())?;
+        self.linear.forward(
+            &row(&lower)?.f_lerp_tensor(&row(&upper)?, &share.f_expand_as(&row(&lower)?)?)?,
+        )
     }
 }
 
@@ -56,11 +75,17 @@ fn waves(channels: i64) -> Tensor {
             let (row, channel) = ((index / channels) as f64, index % channels);
             let rate = 10_000f64.powf(-((channel - channel % 2) as f64) / channels as f64);
             let phase = row * rate;
-            let wave = if channel % 2 == 0 { phase.sin() } else { phase.cos() };
+            let wave = if channel % 2 == 0 {
+                phase.sin()
+            } else {
+                phase.cos()
+            };
             (wave / (channels as f64).sqrt()) as f32
         })
         .collect();
-    Tensor::from_slice(&values).view([ROWS, channels]).to_kind(Kind::Float)
+    Tensor::from_slice(&values)
+        .view([ROWS, channels])
+        .to_kind(Kind::Float)
 }
 
 #[cfg(test)]
@@ -74,7 +99,9 @@ mod tests {
     fn delays_between_rows_lie_between_their_codes() {
         let variables = VarStore::new(Device::Cpu);
         let encoding = TemporalEncoding::new(&variables.root(), 8);
-        let codes = encoding.encode(&[2.0, 2.25, 3.0, 1e9, 99.0, -4.0, 0.0]).unwrap();
+        let codes = encoding
+            .encode(&[2.0, 2.25, 3.0, 1e9, 99.0, -4.0, 0.0])
+            .unwrap();
         let expected = codes.get(0) * 0.75 + codes.get(2) * 0.25;
         assert!((codes.get(1) - expected).abs().max().double_value(&[]) < 1e-6);
         assert_eq!(codes.get(3), codes.get(4));

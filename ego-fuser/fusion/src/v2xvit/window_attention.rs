@@ -28,15 +28,25 @@ impl WindowBranch {
         let (edge, inner) = (config.edge, config.heads * config.head_channels);
         let places = order.places(edge);
         let span = 2 * edge - 1;
-        let offset =
-            |[row, column]: [i64; 2], to: [i64; 2]| (to[0] - row + edge - 1) * span + to[1] - column + edge - 1;
-        let offsets: Vec<i64> =
-            places.iter().flat_map(|&from| places.iter().map(move |&to| offset(from, to))).collect();
+        let offset = |[row, column]: [i64; 2], to: [i64; 2]| {
+            (to[0] - row + edge - 1) * span + to[1] - column + edge - 1
+        };
+        let offsets: Vec<i64> = places
+            .iter()
+            .flat_map(|&from| places.iter().map(move |&to| offset(from, to)))
+            .collect();
         Self {
             tokens: edge * edge,
             heads: config.heads,
             to_qkv: Linear::new(&(path / "to_qkv"), channels, 3 * inner, false),
-            pos_embedding: path.var("pos_embedding", &[span, span], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            pos_embedding: path.var(
+                "pos_embedding",
+                &[span, span],
+                Init::Randn {
+                    mean: 0.0,
+                    stdev: 0.02,
+                },
+            ),
             offsets: Tensor::from_slice(&offsets).to_device(path.device()),
             out: Linear::residual(&(path / "to_out" / 0), inner, channels, true),
         }
@@ -44,7 +54,10 @@ impl WindowBranch {
 
     /// `[tokens, tokens]` added to the scores.
     fn bias(&self) -> Result<Tensor, TchError> {
-        self.pos_embedding.f_view([-1])?.f_index_select(0, &self.offsets)?.f_view([self.tokens, self.tokens])
+        self.pos_embedding
+            .f_view([-1])?
+            .f_index_select(0, &self.offsets)?
+            .f_view([self.tokens, self.tokens])
     }
 
     /// Tokens of whole windows `[t, C]` to `[t, inner]`, before the last projection.
@@ -53,7 +66,8 @@ impl WindowBranch {
         let head_channels = qkv.size()[1] / (3 * self.heads);
         let qkv = qkv.f_view([-1, self.tokens, 3, self.heads, head_channels])?;
         let parts = qkv.f_unbind(2)?;
-        attend(&parts[0], &parts[1], &parts[2], Some(bias))?.f_view([-1, self.heads * head_channels])
+        attend(&parts[0], &parts[1], &parts[2], Some(bias))?
+            .f_view([-1, self.heads * head_channels])
     }
 
     /// Output of this branch: the tokens of one agent, `[T, C]` to the same.
@@ -77,7 +91,10 @@ impl Gate {
     /// From the branches' summed mean over the map `[C]` to shares `[branches, C]`.
     fn shares(&self, mean: &Tensor) -> Result<Tensor, TchError> {
         let hidden = self.bn1.forward(&self.fc1.forward(mean)?)?.f_relu()?;
-        self.fc2.forward(&hidden)?.f_view([-1, mean.size()[0]])?.f_softmax(0, None::<Kind>)
+        self.fc2
+            .forward(&hidden)?
+            .f_view([-1, mean.size()[0]])?
+            .f_softmax(0, None::<Kind>)
     }
 }
 
@@ -101,15 +118,26 @@ impl WindowAttention {
         order: &BlockOrder,
         dropout: f64,
     ) -> Self {
-        let branch = |(index, config)| WindowBranch::new(&(path / "pwmsa" / index), channels, config, order);
+        let branch =
+            |(index, config)| WindowBranch::new(&(path / "pwmsa" / index), channels, config, order);
         let gate = path / "split_attn";
         let gate = (merge == Merge::SplitAttention).then(|| Gate {
             fc1: Linear::new(&(&gate / "fc1"), channels, channels, false),
             bn1: LayerNorm::new(&(&gate / "bn1"), channels),
-            fc2: Linear::new(&(&gate / "fc2"), channels, windows.len() as i64 * channels, false),
+            fc2: Linear::new(
+                &(&gate / "fc2"),
+                channels,
+                windows.len() as i64 * channels,
+                false,
+            ),
         });
         let largest = order.largest() * order.largest();
-        Self { branches: windows.iter().enumerate().map(branch).collect(), gate, largest, dropout }
+        Self {
+            branches: windows.iter().enumerate().map(branch).collect(),
+            gate,
+            largest,
+            dropout,
+        }
     }
 
     /// The branches, in the order of the configuration.
@@ -124,16 +152,35 @@ impl WindowAttention {
     /// [`TchError`] when the tokens do not fill complete windows.
     pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let tokens = x.size2()?.0;
-        let chunk = if train { tokens } else { (CHUNK / self.largest).max(1) * self.largest };
-        let biases = self.branches.iter().map(WindowBranch::bias).collect::<Result<Vec<_>, _>>()?;
+        let chunk = if train {
+            tokens
+        } else {
+            (CHUNK / self.largest).max(1) * self.largest
+        };
+        let biases = self
+            .branches
+            .iter()
+            .map(WindowBranch::bias)
+            .collect::<Result<Vec<_>, _>>()?;
         let attend = |x: &Tensor| -> Result<Vec<Tensor>, TchError> {
-            self.branches.iter().zip(&biases).map(|(branch, bias)| branch.attend(x, bias)).collect()
+            self.branches
+                .iter()
+                .zip(&biases)
+                .map(|(branch, bias)| branch.attend(x, bias))
+                .collect()
         };
         let chunks = x.f_split(chunk.max(1), 0)?;
         let seen: Vec<Vec<Tensor>> = chunks.iter().map(attend).collect::<Result<_, _>>()?;
         let (weights, bias) = self.merged(&seen, tokens)?;
-        let outputs: Vec<Tensor> = seen.iter().map(|seen| project(seen, &weights, &bias)).collect::<Result<_, _>>()?;
-        let output = if let [only] = &outputs[..] { only.shallow_clone() } else { Tensor::f_cat(&outputs, 0)? };
+        let outputs: Vec<Tensor> = seen
+            .iter()
+            .map(|seen| project(seen, &weights, &bias))
+            .collect::<Result<_, _>>()?;
+        let output = if let [only] = &outputs[..] {
+            only.shallow_clone()
+        } else {
+            Tensor::f_cat(&outputs, 0)?
+        };
         dropout(output, self.dropout, train)
     }
 
@@ -142,28 +189,54 @@ impl WindowAttention {
     /// Both merges weight the branches' outputs channel by channel. Those outputs are linear in the attention outputs,
     /// so the weights go into the projection, and so does the mean over the map that the gate needs.
     fn merged(&self, seen: &[Vec<Tensor>], tokens: i64) -> Result<(Vec<Tensor>, Tensor), TchError> {
-        let bias = |branch: &WindowBranch| branch.out.bias.as_ref().expect("the projection has a bias").shallow_clone();
+        let bias = |branch: &WindowBranch| {
+            branch
+                .out
+                .bias
+                .as_ref()
+                .expect("the projection has a bias")
+                .shallow_clone()
+        };
         let biases = Tensor::f_stack(&self.branches.iter().map(bias).collect::<Vec<_>>(), 0)?;
         let shares = match &self.gate {
             None => biases.f_ones_like()? / self.branches.len() as f64,
             Some(gate) => {
-                let mut parts = vec![biases.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?];
+                let mut parts =
+                    vec![biases.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?];
                 for (index, branch) in self.branches.iter().enumerate() {
-                    let sums =
-                        seen.iter().map(|seen| seen[index].f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>));
+                    let sums = seen.iter().map(|seen| {
+                        seen[index].f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)
+                    });
                     let sums = Tensor::f_stack(&sums.collect::<Result<Vec<_>, _>>()?, 0)?;
-                    let sum = sums.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / tokens as f64;
+                    let sum = sums.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?
+                        / tokens as f64;
                     parts.push(branch.out.weight.f_mv(&sum)?);
                 }
-                let mean = Tensor::f_stack(&parts, 0)?.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
+                let mean = Tensor::f_stack(&parts, 0)?.f_sum_dim_intlist(
+                    [0i64].as_slice(),
+                    false,
+                    None::<Kind>,
+                )?;
                 gate.shares(&mean)?
             }
         };
         let weight = |(index, branch): (usize, &WindowBranch)| {
-            branch.out.weight.f_transpose(0, 1)?.f_mul(&shares.f_get(index as i64)?)
+            branch
+                .out
+                .weight
+                .f_transpose(0, 1)?
+                .f_mul(&shares.f_get(index as i64)?)
         };
-        let weights = self.branches.iter().enumerate().map(weight).collect::<Result<Vec<_>, _>>()?;
-        Ok((weights, (&biases * &shares).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?))
+        let weights = self
+            .branches
+            .iter()
+            .enumerate()
+            .map(weight)
+            .collect::<Result<Vec<_>, _>>()?;
+        Ok((
+            weights,
+            (&biases * &shares).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?,
+        ))
     }
 }
 

@@ -13,11 +13,25 @@ use super::{BILINEAR, PADDING_ZEROS};
 ///
 /// # Errors
 /// [`TchError`] when the last two sizes are not 4.
-pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> Result<Tensor, TchError> {
+pub fn normalized(
+    pairwise: &Tensor,
+    height: i64,
+    width: i64,
+    pixel_m: f64,
+) -> Result<Tensor, TchError> {
     let (height, width) = (height as f64, width as f64);
-    let scale = [1.0, height / width, 2.0 / (pixel_m * width), width / height, 1.0, 2.0 / (pixel_m * height)];
-    let scale =
-        Tensor::from_slice(&scale).f_view([2, 3])?.f_to_kind(pairwise.kind())?.f_to_device(pairwise.device())?;
+    let scale = [
+        1.0,
+        height / width,
+        2.0 / (pixel_m * width),
+        width / height,
+        1.0,
+        2.0 / (pixel_m * height),
+    ];
+    let scale = Tensor::from_slice(&scale)
+        .f_view([2, 3])?
+        .f_to_kind(pairwise.kind())?
+        .f_to_device(pairwise.device())?;
     let rows = pairwise.f_narrow(-2, 0, 2)?;
     let planar = Tensor::f_cat(&[rows.f_narrow(-1, 0, 2)?, rows.f_narrow(-1, 3, 1)?], -1)?;
     planar.f_mul(&scale)
@@ -28,8 +42,14 @@ pub fn normalized(pairwise: &Tensor, height: i64, width: i64, pixel_m: f64) -> R
 /// # Errors
 /// [`TchError`] when shapes do not fit.
 pub fn warp_affine(source: &Tensor, matrix: &Tensor) -> Result<Tensor, TchError> {
-    let sampling_grid = Tensor::f_affine_grid_generator(&matrix.f_to_kind(Kind::Float)?, source.size(), false)?;
-    source.f_grid_sampler(&sampling_grid.f_to_kind(source.kind())?, BILINEAR, PADDING_ZEROS, false)
+    let sampling_grid =
+        Tensor::f_affine_grid_generator(&matrix.f_to_kind(Kind::Float)?, source.size(), false)?;
+    source.f_grid_sampler(
+        &sampling_grid.f_to_kind(source.kind())?,
+        BILINEAR,
+        PADDING_ZEROS,
+        false,
+    )
 }
 
 #[cfg(test)]
@@ -42,13 +62,26 @@ mod tests {
 
     #[test]
     fn on_a_centred_grid_it_equals_the_warp_of_this_module() {
-        let grid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+        let grid = BevGrid {
+            x_min_m: -8.0,
+            y_min_m: -4.0,
+            cell_m: 0.5,
+            width: 32,
+            height: 16,
+        };
         let ego_from_cav = Pose::from_xyz_yaw([1.3, -0.6, 0.0], 0.4);
         let cav_from_ego = ego_from_cav.isometry().inverse().to_homogeneous();
         let cav_from_ego = Tensor::from_slice(cav_from_ego.transpose().as_slice()).view([1, 4, 4]);
         let features = Tensor::randn([1, 3, 16, 32], (Kind::Float, Device::Cpu));
-        let theirs = warp_affine(&features, &normalized(&cav_from_ego, 16, 32, 0.5).unwrap()).unwrap();
+        let theirs =
+            warp_affine(&features, &normalized(&cav_from_ego, 16, 32, 0.5).unwrap()).unwrap();
         let ours = warp_to_ego(&features, None, &[ego_from_cav], &grid).unwrap();
-        assert!((ours.features - theirs * ours.mask).abs().max().double_value(&[]) < 1e-5);
+        assert!(
+            (ours.features - theirs * ours.mask)
+                .abs()
+                .max()
+                .double_value(&[])
+                < 1e-5
+        );
     }
 }

@@ -67,7 +67,10 @@ impl WarpedMaps {
     /// The entries from `first` up to `end`.
     pub(crate) fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
         let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
-        Ok(Self { features: of(&self.features)?, mask: of(&self.mask)? })
+        Ok(Self {
+            features: of(&self.features)?,
+            mask: of(&self.mask)?,
+        })
     }
 }
 
@@ -100,9 +103,15 @@ pub fn warp_to_ego(
         None => Tensor::f_ones([1, 1, height, width], (Kind::Float, features.device()))?
             .f_expand([maps, 1, height, width], false)?,
     };
-    let affine: Vec<_> = ego_from_cav.iter().map(|pose| cav_from_ego_normalized(pose, grid)).collect();
+    let affine: Vec<_> = ego_from_cav
+        .iter()
+        .map(|pose| cav_from_ego_normalized(pose, grid))
+        .collect();
     if affine.iter().all(|&affine| affine == UNMOVED) {
-        return Ok(WarpedMaps { features: features.shallow_clone(), mask: sent.f_to_kind(features.kind())? });
+        return Ok(WarpedMaps {
+            features: features.shallow_clone(),
+            mask: sent.f_to_kind(features.kind())?,
+        });
     }
     let mut moved = Vec::with_capacity(ego_from_cav.len());
     let mut masks = Vec::with_capacity(ego_from_cav.len());
@@ -119,7 +128,10 @@ pub fn warp_to_ego(
         moved.push(map);
         masks.push(mask);
     }
-    Ok(WarpedMaps { features: Tensor::f_cat(&moved, 0)?, mask: Tensor::f_cat(&masks, 0)? })
+    Ok(WarpedMaps {
+        features: Tensor::f_cat(&moved, 0)?,
+        mask: Tensor::f_cat(&masks, 0)?,
+    })
 }
 
 /// [`warp_to_ego`] of maps in plain floats, each with its sent cells `[H * W]`: the channels of each cell are contiguous
@@ -143,8 +155,13 @@ pub(crate) fn warp_cells(
         }
     }
     let [height, width] = [grid.height, grid.width].map(i64::from);
-    let features = Tensor::f_from_slice(&features)?.f_view([count, height, width, -1])?.f_permute([0, 3, 1, 2])?;
-    Ok(WarpedMaps { features, mask: Tensor::f_from_slice(&mask)?.f_view([count, 1, height, width])? })
+    let features = Tensor::f_from_slice(&features)?
+        .f_view([count, height, width, -1])?
+        .f_permute([0, 3, 1, 2])?;
+    Ok(WarpedMaps {
+        features,
+        mask: Tensor::f_from_slice(&mask)?.f_view([count, 1, height, width])?,
+    })
 }
 
 /// Checks that maps `[N, C, H, W]` lie on `grid`, one for each pose.
@@ -153,19 +170,29 @@ pub(crate) fn warp_cells(
 /// [`WarpError`] states both sizes or counts.
 pub(crate) fn check(maps: &Tensor, ego_from_cav: &[Pose], grid: &BevGrid) -> Result<(), WarpError> {
     let size = maps.size();
-    let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
+    let &[maps, _, height, width] = size.as_slice() else {
+        return Err(shape_error(size, grid));
+    };
     if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
         return Err(shape_error(size, grid));
     }
     if maps != ego_from_cav.len() as i64 {
-        return Err(WarpError::PoseCount { maps, poses: ego_from_cav.len() });
+        return Err(WarpError::PoseCount {
+            maps,
+            poses: ego_from_cav.len(),
+        });
     }
     Ok(())
 }
 
 /// Positions of a grid's cells under an affine map of normalised coordinates, `[1, h, w, 2]` for `grid_sampler`.
 fn sampling_grid(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
-    Tensor::f_from_slice(&places(affine, grid))?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
+    Tensor::f_from_slice(&places(affine, grid))?.f_view([
+        1,
+        i64::from(grid.height),
+        i64::from(grid.width),
+        2,
+    ])
 }
 
 /// The same in plain floats, two for each cell.
@@ -173,13 +200,18 @@ fn places(affine: [f32; 6], grid: &BevGrid) -> Vec<f32> {
     let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
     let mut places = Vec::with_capacity(2 * rows * columns);
     for row in 0..rows {
-        (0..columns).for_each(|column| places.extend_from_slice(&place_of([row, column], affine, grid)));
+        (0..columns)
+            .for_each(|column| places.extend_from_slice(&place_of([row, column], affine, grid)));
     }
     places
 }
 
 /// The same of one cell, by row and column.
-fn place_of([row, column]: [usize; 2], [xx, xy, x0, yx, yy, y0]: [f32; 6], grid: &BevGrid) -> [f32; 2] {
+fn place_of(
+    [row, column]: [usize; 2],
+    [xx, xy, x0, yx, yy, y0]: [f32; 6],
+    grid: &BevGrid,
+) -> [f32; 2] {
     let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
     let (x, y) = (middle(column, grid.width), middle(row, grid.height));
     [xx * x + xy * y + x0, yx * x + yy * y + y0]
@@ -189,7 +221,10 @@ fn place_of([row, column]: [usize; 2], [xx, xy, x0, yx, yy, y0]: [f32; 6], grid:
 /// coordinates, two for each.
 pub(crate) fn places_of(cells: &[[usize; 2]], ego_from_cav: &Pose, grid: &BevGrid) -> Vec<f32> {
     let affine = cav_from_ego_normalized(ego_from_cav, grid);
-    cells.iter().flat_map(|&cell| place_of(cell, affine, grid)).collect()
+    cells
+        .iter()
+        .flat_map(|&cell| place_of(cell, affine, grid))
+        .collect()
 }
 
 /// A map `[1, C, H, W]` and the mask of its sent cells `[1, 1, H, W]`, sampled at `sampling_grid` `[1, h, w, 2]`.
@@ -198,19 +233,33 @@ fn read(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, 
         return read_by_tensors(map, sent, sampling_grid);
     }
     let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
-    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(sampling_grid)?)?;
+    let (map, mask) =
+        Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(sampling_grid)?)?;
     Ok((as_batch(&map)?, mask.f_unsqueeze(0)?))
 }
 
 /// [`read`] on any device, in any precision, with gradients.
-fn read_by_tensors(map: &Tensor, sent: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
-    let mask = sent.f_grid_sampler(sampling_grid, NEAREST, PADDING_ZEROS, false)?.f_to_kind(map.kind())?;
+fn read_by_tensors(
+    map: &Tensor,
+    sent: &Tensor,
+    sampling_grid: &Tensor,
+) -> Result<(Tensor, Tensor), TchError> {
+    let mask = sent
+        .f_grid_sampler(sampling_grid, NEAREST, PADDING_ZEROS, false)?
+        .f_to_kind(map.kind())?;
     let sampling_grid = sampling_grid.f_to_kind(map.kind())?;
-    Ok((map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask, mask))
+    Ok((
+        map.f_grid_sampler(&sampling_grid, BILINEAR, PADDING_ZEROS, false)? * &mask,
+        mask,
+    ))
 }
 
 fn shape_error(found: Vec<i64>, grid: &BevGrid) -> WarpError {
-    WarpError::Shape { found, height: grid.height, width: grid.width }
+    WarpError::Shape {
+        found,
+        height: grid.height,
+        width: grid.width,
+    }
 }
 
 /// The identity.
@@ -228,7 +277,15 @@ pub fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f32; 6] 
     let (from_x, from_y) = (middle_x - ego_x, middle_y - ego_y);
     let x0 = (cos * from_x + sin * from_y - middle_x) / half_x;
     let y0 = (-sin * from_x + cos * from_y - middle_y) / half_y;
-    [cos, sin * half_y / half_x, x0, -sin * half_x / half_y, cos, y0].map(|value| value as f32)
+    [
+        cos,
+        sin * half_y / half_x,
+        x0,
+        -sin * half_x / half_y,
+        cos,
+        y0,
+    ]
+    .map(|value| value as f32)
 }
 
 #[cfg(test)]
@@ -241,7 +298,13 @@ mod tests {
     use super::*;
     use crate::test_data::uniform;
 
-    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -8.0,
+        y_min_m: -4.0,
+        cell_m: 0.5,
+        width: 32,
+        height: 16,
+    };
 
     fn one_hot(row: i64, column: i64) -> Tensor {
         let map = Tensor::zeros([1, 1, 16, 32], (Kind::Float, Device::Cpu));
@@ -293,7 +356,8 @@ mod tests {
         let planes = warp_to_ego(&maps, None, &poses, &GRID).unwrap();
         let cells = [0, 1].map(|map| Cells::of(&maps.get(map)).unwrap());
         let sent = [1.0; 16 * 32];
-        let cells = warp_cells(&cells.each_ref().map(|map| (map, &sent[..])), &poses, &GRID).unwrap();
+        let cells =
+            warp_cells(&cells.each_ref().map(|map| (map, &sent[..])), &poses, &GRID).unwrap();
         assert_eq!(planes.features, cells.features);
         assert_eq!(planes.mask, cells.mask);
     }
@@ -323,7 +387,13 @@ mod tests {
 
     #[test]
     fn half_a_cell_shares_between_two() {
-        let warped = warp_to_ego(&one_hot(8, 16), None, &[Pose::from_xyz_yaw([0.25, 0.0, 0.0], 0.0)], &GRID).unwrap();
+        let warped = warp_to_ego(
+            &one_hot(8, 16),
+            None,
+            &[Pose::from_xyz_yaw([0.25, 0.0, 0.0], 0.0)],
+            &GRID,
+        )
+        .unwrap();
         assert!((at(&warped.features, 8, 16) - 0.5).abs() < 1e-4);
         assert!((at(&warped.features, 8, 17) - 0.5).abs() < 1e-4);
     }
@@ -340,7 +410,13 @@ mod tests {
     #[test]
     fn a_neighbour_out_of_reach_leaves_nothing() {
         let features = Tensor::ones([1, 2, 16, 32], (Kind::Float, Device::Cpu));
-        let warped = warp_to_ego(&features, None, &[Pose::from_xyz_yaw([500.0, 0.0, 0.0], 1.0)], &GRID).unwrap();
+        let warped = warp_to_ego(
+            &features,
+            None,
+            &[Pose::from_xyz_yaw([500.0, 0.0, 0.0], 1.0)],
+            &GRID,
+        )
+        .unwrap();
         assert_eq!(warped.features.abs().max().double_value(&[]), 0.0);
         assert_eq!(warped.mask.max().double_value(&[]), 0.0);
     }
@@ -348,9 +424,17 @@ mod tests {
     #[test]
     fn maps_of_another_grid_are_rejected() {
         let features = Tensor::zeros([1, 2, 16, 31], (Kind::Float, Device::Cpu));
-        let error = warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID).unwrap_err().to_string();
-        assert!(error.contains("[1, 2, 16, 31]") && error.contains("16 rows and 32 columns"), "{error}");
+        let error = warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("[1, 2, 16, 31]") && error.contains("16 rows and 32 columns"),
+            "{error}"
+        );
         let features = Tensor::zeros([2, 2, 16, 32], (Kind::Float, Device::Cpu));
-        assert!(matches!(warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID), Err(WarpError::PoseCount { .. })));
+        assert!(matches!(
+            warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID),
+            Err(WarpError::PoseCount { .. })
+        ));
     }
 }

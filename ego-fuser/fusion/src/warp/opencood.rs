@@ -35,7 +35,9 @@ pub fn discretized(matrix: &Tensor, pixel_m: f64) -> Result<Tensor, TchError> {
 /// [`TchError`] when the shape is another.
 pub fn about_centre(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, TchError> {
     let centre = Tensor::from_slice(&[width as f64 / 2.0, height as f64 / 2.0]).f_view([2, 1])?;
-    let centre = centre.f_to_kind(matrix.kind())?.f_to_device(matrix.device())?;
+    let centre = centre
+        .f_to_kind(matrix.kind())?
+        .f_to_device(matrix.device())?;
     let rotation = matrix.f_narrow(-1, 0, 2)?;
     let translation = matrix.f_narrow(-1, 2, 1)? + &centre - rotation.f_matmul(&centre)?;
     Tensor::f_cat(&[rotation, translation], -1)
@@ -45,15 +47,25 @@ pub fn about_centre(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, 
 ///
 /// # Errors
 /// [`TchError`] when shapes do not fit or a transform cannot be inverted.
-pub fn warp_affine(source: &Tensor, matrix: &Tensor, interpolation: Interpolation) -> Result<Tensor, TchError> {
+pub fn warp_affine(
+    source: &Tensor,
+    matrix: &Tensor,
+    interpolation: Interpolation,
+) -> Result<Tensor, TchError> {
     let (batch, channels, height, width) = source.size4()?;
     let theta = normalized(matrix, height, width)?;
-    let sampling_grid = Tensor::f_affine_grid_generator(&theta, [batch, channels, height, width], true)?;
+    let sampling_grid =
+        Tensor::f_affine_grid_generator(&theta, [batch, channels, height, width], true)?;
     let mode = match interpolation {
         Interpolation::Bilinear => BILINEAR,
         Interpolation::Nearest => NEAREST,
     };
-    source.f_grid_sampler(&sampling_grid.f_to_kind(source.kind())?, mode, PADDING_ZEROS, true)
+    source.f_grid_sampler(
+        &sampling_grid.f_to_kind(source.kind())?,
+        mode,
+        PADDING_ZEROS,
+        true,
+    )
 }
 
 /// Destination-to-source matrices `[N, 2, 3]` on coordinates -1..1 with aligned corners, from source-to-destination
@@ -83,10 +95,16 @@ pub fn roi_mask(
     width: i64,
     pixel_m: f64,
 ) -> Result<Tensor, TchError> {
-    let matrix = about_centre(&discretized(correction, pixel_m)?.f_view([-1, 2, 3])?, height, width)?;
+    let matrix = about_centre(
+        &discretized(correction, pixel_m)?.f_view([-1, 2, 3])?,
+        height,
+        width,
+    )?;
     let extent = rotated_extent(&matrix, height, width)?;
     let (batch, agents) = present.size2()?;
-    extent.f_view([batch, agents, height, width])?.f_mul(&present.f_view([batch, agents, 1, 1])?)
+    extent
+        .f_view([batch, agents, height, width])?
+        .f_mul(&present.f_view([batch, agents, 1, 1])?)
 }
 
 /// The warped extent of a full map, by pixel transforms `[N, 2, 3]`: `[N, 1, H, W]` of 0 and 1.
@@ -94,7 +112,10 @@ pub fn roi_mask(
 /// # Errors
 /// [`TchError`] when shapes do not fit.
 pub fn rotated_extent(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, TchError> {
-    let ones = Tensor::f_ones([matrix.size3()?.0, 1, height, width], (matrix.kind(), matrix.device()))?;
+    let ones = Tensor::f_ones(
+        [matrix.size3()?.0, 1, height, width],
+        (matrix.kind(), matrix.device()),
+    )?;
     warp_affine(&ones, matrix, Interpolation::Nearest)
 }
 
@@ -102,21 +123,35 @@ pub fn rotated_extent(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor
 ///
 /// # Errors
 /// [`TchError`] when shapes do not fit.
-pub fn spatial_correction(features: &Tensor, correction: &Tensor, pixel_m: f64) -> Result<Tensor, TchError> {
+pub fn spatial_correction(
+    features: &Tensor,
+    correction: &Tensor,
+    pixel_m: f64,
+) -> Result<Tensor, TchError> {
     let channels_first = features.f_permute([0, 1, 4, 2, 3])?;
     let (_, agents, channels, height, width) = channels_first.size5()?;
     let others = channels_first.f_narrow(1, 1, agents - 1)?;
-    let matrix = discretized(correction, pixel_m)?.f_narrow(1, 1, agents - 1)?.f_reshape([-1, 2, 3])?;
+    let matrix = discretized(correction, pixel_m)?
+        .f_narrow(1, 1, agents - 1)?
+        .f_reshape([-1, 2, 3])?;
     let matrix = about_centre(&matrix, height, width)?;
-    let moved = warp_affine(&others.f_reshape([-1, channels, height, width])?, &matrix, Interpolation::Bilinear)?;
+    let moved = warp_affine(
+        &others.f_reshape([-1, channels, height, width])?,
+        &matrix,
+        Interpolation::Bilinear,
+    )?;
     let ego = channels_first.f_narrow(1, 0, 1)?;
     Tensor::f_cat(&[ego, moved.f_view_as(&others)?], 1)?.f_permute([0, 1, 3, 4, 2])
 }
 
 /// `[N, 2, 3]` with the row `0 0 1` appended.
 fn homogeneous(matrix: &Tensor) -> Result<Tensor, TchError> {
-    let last = Tensor::from_slice(&[0f32, 0.0, 1.0]).f_to_kind(matrix.kind())?.f_to_device(matrix.device())?;
-    let last = last.f_view([1, 1, 3])?.f_expand([matrix.size3()?.0, 1, 3], false)?;
+    let last = Tensor::from_slice(&[0f32, 0.0, 1.0])
+        .f_to_kind(matrix.kind())?
+        .f_to_device(matrix.device())?;
+    let last = last
+        .f_view([1, 1, 3])?
+        .f_expand([matrix.size3()?.0, 1, 3], false)?;
     Tensor::f_cat(&[matrix, &last], 1)
 }
 
@@ -124,8 +159,21 @@ fn homogeneous(matrix: &Tensor) -> Result<Tensor, TchError> {
 fn pixel_to_normal(height: i64, width: i64, like: &Tensor) -> Result<Tensor, TchError> {
     // The reference divides by a tiny number for maps of one pixel.
     let scale = |size: i64| 2.0 / if size == 1 { 1e-14 } else { (size - 1) as f64 };
-    let entries = [scale(width), 0.0, -1.0, 0.0, scale(height), -1.0, 0.0, 0.0, 1.0];
-    Tensor::from_slice(&entries).f_view([3, 3])?.f_to_kind(like.kind())?.f_to_device(like.device())
+    let entries = [
+        scale(width),
+        0.0,
+        -1.0,
+        0.0,
+        scale(height),
+        -1.0,
+        0.0,
+        0.0,
+        1.0,
+    ];
+    Tensor::from_slice(&entries)
+        .f_view([3, 3])?
+        .f_to_kind(like.kind())?
+        .f_to_device(like.device())
 }
 
 #[cfg(test)]
@@ -141,16 +189,27 @@ mod tests {
         let _ = matrix.get(0).get(0).get(3).fill_(1.6);
         let pixels = discretized(&matrix, 0.8).unwrap();
         let centred = about_centre(&pixels, 6, 10).unwrap();
-        assert!((&centred - &pixels).abs().max().double_value(&[]) < 1e-6, "a shift has no centre");
+        assert!(
+            (&centred - &pixels).abs().max().double_value(&[]) < 1e-6,
+            "a shift has no centre"
+        );
         let moved = warp_affine(&source, &centred, Interpolation::Bilinear).unwrap();
         let expected = source.narrow(3, 0, 8);
-        assert!((moved.narrow(3, 2, 8) - expected).abs().max().double_value(&[]) < 1e-3);
+        assert!(
+            (moved.narrow(3, 2, 8) - expected)
+                .abs()
+                .max()
+                .double_value(&[])
+                < 1e-3
+        );
         assert!(moved.narrow(3, 0, 2).abs().max().double_value(&[]) < 1e-4);
     }
 
     #[test]
     fn absent_agents_see_nothing() {
-        let identity = Tensor::eye(4, (Kind::Float, Device::Cpu)).view([1, 1, 4, 4]).repeat([1, 2, 1, 1]);
+        let identity = Tensor::eye(4, (Kind::Float, Device::Cpu))
+            .view([1, 1, 4, 4])
+            .repeat([1, 2, 1, 1]);
         let present = Tensor::from_slice(&[1f32, 0.0]).view([1, 2]);
         let mask = roi_mask(&identity, &present, 5, 7, 0.8).unwrap();
         assert_eq!(mask.get(0).get(0).min().double_value(&[]), 1.0);

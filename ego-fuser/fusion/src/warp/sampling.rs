@@ -31,33 +31,59 @@ impl Cells {
     pub(crate) fn of(map: &Tensor) -> Result<Self, TchError> {
         let (channels, height, width) = map.size3()?;
         let [channels, height, width] = [channels, height, width].map(|size| size as usize);
-        Ok(Self { values: f64_tensor::cells(map)?, channels, height, width })
+        Ok(Self {
+            values: f64_tensor::cells(map)?,
+            channels,
+            height,
+            width,
+        })
     }
 
     /// The map `[C, h, w]` sampled bilinearly at `sampling_grid` `[h, w, 2]` (`grid_sampler`'s coordinates), and its validity
     /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where cells are invalid.
-    pub(super) fn read(&self, valid: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    pub(super) fn read(
+        &self,
+        valid: &Tensor,
+        sampling_grid: &Tensor,
+    ) -> Result<(Tensor, Tensor), TchError> {
         let (rows, columns, _) = sampling_grid.size3()?;
         let (valid, sampling_grid) = (numbers(valid)?, numbers(sampling_grid)?);
         let cells = (rows * columns) as usize;
         let (mut read, mut reached) = (vec![0.0; self.channels * cells], vec![0.0; cells]);
         let mut block = vec![0.0; BLOCK * self.channels];
-        for (index, (sampling_grid, reached)) in
-            sampling_grid.chunks(2 * BLOCK).zip(reached.chunks_mut(BLOCK)).enumerate()
+        for (index, (sampling_grid, reached)) in sampling_grid
+            .chunks(2 * BLOCK)
+            .zip(reached.chunks_mut(BLOCK))
+            .enumerate()
         {
-            let places = sampling_grid.chunks_exact(2).zip(reached.iter_mut()).zip(block.chunks_mut(self.channels));
-            places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
+            let places = sampling_grid
+                .chunks_exact(2)
+                .zip(reached.iter_mut())
+                .zip(block.chunks_mut(self.channels));
+            places.for_each(|((at, reached), values)| {
+                *reached = self.read_at([at[0], at[1]], &valid, values)
+            });
             for (channel, plane) in read.chunks_mut(cells).enumerate() {
                 let plane = plane[index * BLOCK..].iter_mut().take(reached.len());
-                plane.zip(block[channel..].iter().step_by(self.channels)).for_each(|(cell, value)| *cell = *value);
+                plane
+                    .zip(block[channel..].iter().step_by(self.channels))
+                    .for_each(|(cell, value)| *cell = *value);
             }
         }
         let read = Tensor::f_from_slice(&read)?.f_view([-1, rows, columns])?;
-        Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
+        Ok((
+            read,
+            Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?,
+        ))
     }
 
     /// Appends the same cell after cell: the values to `read`, the validity to `reached`.
-    pub(super) fn append(&self, valid: &[f32], sampling_grid: &[f32], [read, reached]: [&mut Vec<f32>; 2]) {
+    pub(super) fn append(
+        &self,
+        valid: &[f32],
+        sampling_grid: &[f32],
+        [read, reached]: [&mut Vec<f32>; 2],
+    ) {
         let mut values = vec![0.0; self.channels];
         for at in sampling_grid.chunks_exact(2) {
             reached.push(self.read_at([at[0], at[1]], valid, &mut values));
@@ -76,7 +102,10 @@ impl Cells {
         self.for_each_valid(valid, sampling_grid, |cell, shown| {
             let strongest = &mut strongest[cell * self.channels..][..self.channels];
             let share = shares[cell];
-            strongest.iter_mut().zip(shown).for_each(|(most, shown)| *most = larger(*most, share * shown));
+            strongest
+                .iter_mut()
+                .zip(shown)
+                .for_each(|(most, shown)| *most = larger(*most, share * shown));
         });
     }
 
@@ -88,7 +117,12 @@ impl Cells {
     /// Calls `see` with the features at each position of `sampling_grid` (`grid_sampler`'s coordinates, two per
     /// position) where the nearest cell of `valid` `[H, W]` is valid.
     #[inline]
-    pub(crate) fn for_each_valid(&self, valid: &[f32], sampling_grid: &[f32], mut see: impl FnMut(usize, &[f32])) {
+    pub(crate) fn for_each_valid(
+        &self,
+        valid: &[f32],
+        sampling_grid: &[f32],
+        mut see: impl FnMut(usize, &[f32]),
+    ) {
         let mut shown = vec![0.0; self.channels];
         for (cell, at) in sampling_grid.chunks_exact(2).enumerate() {
             if self.read_at([at[0], at[1]], valid, &mut shown) != 0.0 {
@@ -111,7 +145,9 @@ impl Cells {
 
     #[inline]
     fn read_cell(&self, place: &Place, valid: f32, values: &mut [f32]) {
-        let [a, b, c, d] = place.cells.map(|cell| &self.values[cell * self.channels..][..self.channels]);
+        let [a, b, c, d] = place
+            .cells
+            .map(|cell| &self.values[cell * self.channels..][..self.channels]);
         let [of_a, of_b, of_c, of_d] = place.weights.map(|weight| weight * valid);
         for ((((value, a), b), c), d) in values.iter_mut().zip(a).zip(b).zip(c).zip(d) {
             *value = of_a * a + of_b * b + of_c * c + of_d * d;
@@ -121,16 +157,26 @@ impl Cells {
     /// From -1..1 over the whole extent of the map, edges of the outer cells included.
     #[inline]
     fn place(&self, [x, y]: [f32; 2]) -> Place {
-        let ([columns, rows], [width, height]) =
-            ([along(x, self.width), along(y, self.height)], [self.width, self.height]);
+        let ([columns, rows], [width, height]) = (
+            [along(x, self.width), along(y, self.height)],
+            [self.width, self.height],
+        );
         let (columns, rows) = (Pair::around(columns, width), Pair::around(rows, height));
         let cell = |row: usize, column: usize| row * self.width + column;
         let ([top, bottom], [left, right]) = (rows.places, columns.places);
         let ([up, down], [before, behind]) = (rows.weights, columns.weights);
         Place {
-            cells: [cell(top, left), cell(top, right), cell(bottom, left), cell(bottom, right)],
+            cells: [
+                cell(top, left),
+                cell(top, right),
+                cell(bottom, left),
+                cell(bottom, right),
+            ],
             weights: [up * before, up * behind, down * before, down * behind],
-            nearest: rows.nearest.zip(columns.nearest).map(|(row, column)| cell(row, column)),
+            nearest: rows
+                .nearest
+                .zip(columns.nearest)
+                .map(|(row, column)| cell(row, column)),
         }
     }
 }
@@ -168,7 +214,11 @@ impl Pair {
         let last = size as i32 - 1;
         let on_map = |cell: i32| 0 <= cell && cell <= last;
         let weight = |cell: i32, weight: f32| if on_map(cell) { weight } else { 0.0 };
-        let nearest = if share > 0.5 || (share == 0.5 && first & 1 != 0) { second } else { first };
+        let nearest = if share > 0.5 || (share == 0.5 && first & 1 != 0) {
+            second
+        } else {
+            first
+        };
         Self {
             places: [first, second].map(|cell| cell.clamp(0, last) as usize),
             weights: [weight(first, 1.0 - share), weight(second, share)],
@@ -202,10 +252,16 @@ mod tests {
     #[test]
     fn half_way_the_even_cell_is_the_nearest_and_what_is_no_place_has_none() {
         let nearest = |at: f32| Pair::around(at, 4).nearest;
-        assert_eq!([0.5, 1.5, 2.5, -0.5, 3.5].map(nearest), [Some(0), Some(2), Some(2), Some(0), None]);
+        assert_eq!(
+            [0.5, 1.5, 2.5, -0.5, 3.5].map(nearest),
+            [Some(0), Some(2), Some(2), Some(0), None]
+        );
         for at in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 3e9, -3e9] {
             assert_eq!(nearest(at), None);
-            assert_eq!(Pair::around(at, 4).weights.map(|weight| weight == 0.0), [true; 2]);
+            assert_eq!(
+                Pair::around(at, 4).weights.map(|weight| weight == 0.0),
+                [true; 2]
+            );
         }
     }
 }

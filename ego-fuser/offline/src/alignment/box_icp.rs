@@ -18,23 +18,38 @@ const CONVERGED_M: f64 = 1e-4;
 ///
 /// # Errors
 /// [`NoAlignment::TooFewBoxes`].
-pub fn align(ego: &[Box3d], neighbour: &[Box3d], start: &Isometry3<f64>) -> Result<Isometry3<f64>, NoAlignment> {
+pub fn align(
+    ego: &[Box3d],
+    neighbour: &[Box3d],
+    start: &Isometry3<f64>,
+) -> Result<Isometry3<f64>, NoAlignment> {
     let centres = |boxes: &[Box3d]| -> Vec<Vector3<f64>> {
         let centres = boxes.iter().map(|node| Vector3::from(node.center_m));
-        centres.filter(|centre| centre.iter().all(|c| c.abs() < 1e6)).collect()
+        centres
+            .filter(|centre| centre.iter().all(|c| c.abs() < 1e6))
+            .collect()
     };
     let (ego, neighbour) = (centres(ego), centres(neighbour));
     if ego.len() < MIN_BOXES || neighbour.len() < MIN_BOXES {
-        return Err(NoAlignment::TooFewBoxes { ego: ego.len(), neighbour: neighbour.len(), required: MIN_BOXES });
+        return Err(NoAlignment::TooFewBoxes {
+            ego: ego.len(),
+            neighbour: neighbour.len(),
+            required: MIN_BOXES,
+        });
     }
     let mut motion = *start;
     for _ in 0..MAX_ROUNDS {
         let pairs = neighbour.iter().filter_map(|centre| {
             let moved = motion.rotation * centre + motion.translation.vector;
             let apart = |other: &&Vector3<f64>| (*other - moved).xy().norm_squared();
-            Some((*centre, *ego.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?))
+            Some((
+                *centre,
+                *ego.iter().min_by(|a, b| apart(a).total_cmp(&apart(b)))?,
+            ))
         });
-        let Some(next) = planar_fit::fit(&pairs) else { break };
+        let Some(next) = planar_fit::fit(&pairs) else {
+            break;
+        };
         let off = motion.inv_mul(&next);
         motion = next;
         if off.translation.vector.norm() + 100.0 * off.rotation.angle() < CONVERGED_M {
@@ -49,11 +64,22 @@ mod tests {
     use super::*;
 
     fn cars(from: &Isometry3<f64>) -> Vec<Box3d> {
-        let at = [[0.0, 8.0], [14.0, -6.0], [-22.0, 3.0], [35.0, 12.0], [-9.0, -17.0], [25.0, -20.0]];
+        let at = [
+            [0.0, 8.0],
+            [14.0, -6.0],
+            [-22.0, 3.0],
+            [35.0, 12.0],
+            [-9.0, -17.0],
+            [25.0, -20.0],
+        ];
         let inverse = from.inverse();
         let car = |[x, y]: [f64; 2]| {
             let center = inverse.rotation * Vector3::new(x, y, 0.0) + inverse.translation.vector;
-            Box3d { center_m: center.into(), size_m: [4.5, 1.9, 1.6], heading_rad: 0.0 }
+            Box3d {
+                center_m: center.into(),
+                size_m: [4.5, 1.9, 1.6],
+                heading_rad: 0.0,
+            }
         };
         at.map(car).into()
     }
@@ -67,6 +93,9 @@ mod tests {
         let far = Isometry3::new(Vector3::new(40.0, 10.0, 0.0), Vector3::z() * 2.0);
         let found = align(&cars(&here), &cars(&far), &here).unwrap();
         assert!(far.inv_mul(&found).translation.vector.norm() > 3.0);
-        assert!(matches!(align(&[], &cars(&here), &here), Err(NoAlignment::TooFewBoxes { ego: 0, .. })));
+        assert!(matches!(
+            align(&[], &cars(&here), &here),
+            Err(NoAlignment::TooFewBoxes { ego: 0, .. })
+        ));
     }
 }

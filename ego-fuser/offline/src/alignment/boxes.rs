@@ -9,7 +9,10 @@ use super::free_align::{self, FreeAlignConfig};
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
 /// No pose is known: these methods do not need one.
-const NO_POSE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+const NO_POSE: PoseEstimate = PoseEstimate::NoPose {
+    reason: NoPoseReason::NoSource,
+    inlier_count: 0,
+};
 
 /// Matches the graphs of both vehicles' boxes.
 #[derive(Debug, Clone, Default)]
@@ -22,16 +25,25 @@ impl FreeAlign {
     /// The method with some settings.
     #[must_use]
     pub fn spec(config: FreeAlignConfig) -> AlignmentSpec {
-        AlignmentSpec::new("free-align", true, move || Self { config: config.clone() })
+        AlignmentSpec::new("free-align", true, move || Self {
+            config: config.clone(),
+        })
     }
 }
 
 impl AlignmentMethod for FreeAlign {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
-        Ok(message(&vehicle.boxes[..vehicle.boxes.len().min(self.config.max_boxes)]))
+        Ok(message(
+            &vehicle.boxes[..vehicle.boxes.len().min(self.config.max_boxes)],
+        ))
     }
 
-    fn align(&self, _: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {
+    fn align(
+        &self,
+        _: &Vehicle<'_>,
+        own: &Message,
+        received: &Message,
+    ) -> Result<Isometry3<f64>, NotAligned> {
         let (ego, neighbour) = (boxes(own)?, boxes(received)?);
         Ok(free_align::align(&ego, &neighbour, &self.config)?.ego_from_neighbour)
     }
@@ -54,19 +66,42 @@ impl AlignmentMethod for BoxIcp {
         Ok(message(vehicle.boxes))
     }
 
-    fn align(&self, _: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {
-        Ok(box_icp::align(&boxes(own)?, &boxes(received)?, &Isometry3::identity())?)
+    fn align(
+        &self,
+        _: &Vehicle<'_>,
+        own: &Message,
+        received: &Message,
+    ) -> Result<Isometry3<f64>, NotAligned> {
+        Ok(box_icp::align(
+            &boxes(own)?,
+            &boxes(received)?,
+            &Isometry3::identity(),
+        )?)
     }
 }
 
 fn message(boxes: &[Box3d]) -> Message {
-    let detections = boxes.iter().map(|box3d| Detection { box3d: *box3d, score: 1.0, source: None }).collect();
-    Message::Boxes(Boxes { pose: NO_POSE, detections })
+    let detections = boxes
+        .iter()
+        .map(|box3d| Detection {
+            box3d: *box3d,
+            score: 1.0,
+            source: None,
+        })
+        .collect();
+    Message::Boxes(Boxes {
+        pose: NO_POSE,
+        detections,
+    })
 }
 
 fn boxes(message: &Message) -> Result<Vec<Box3d>, NotAligned> {
     match message {
-        Message::Boxes(boxes) => Ok(boxes.detections.iter().map(|detection| detection.box3d).collect()),
+        Message::Boxes(boxes) => Ok(boxes
+            .detections
+            .iter()
+            .map(|detection| detection.box3d)
+            .collect()),
         _ => Err(NotAligned::Message),
     }
 }

@@ -19,29 +19,56 @@ impl CloudIcp {
     #[must_use]
     pub fn spec(config: IcpConfig, starts_at_gnss: bool) -> AlignmentSpec {
         let name = if starts_at_gnss { "icp-gnss" } else { "icp" };
-        AlignmentSpec::new(name, false, move || Self { config: config.clone(), starts_at_gnss })
+        AlignmentSpec::new(name, false, move || Self {
+            config: config.clone(),
+            starts_at_gnss,
+        })
     }
 
-    fn start(&self, own: &PoseEstimate, received: &PoseEstimate) -> Result<Isometry3<f64>, NotAligned> {
+    fn start(
+        &self,
+        own: &PoseEstimate,
+        received: &PoseEstimate,
+    ) -> Result<Isometry3<f64>, NotAligned> {
         if !self.starts_at_gnss {
             return Ok(Isometry3::identity());
         }
         let own = own.world_from_cav().ok_or(NotAligned::NoPose)?;
-        Ok(own.from_world(received.world_from_cav().ok_or(NotAligned::NoPose)?).isometry())
+        Ok(own
+            .from_world(received.world_from_cav().ok_or(NotAligned::NoPose)?)
+            .isometry())
     }
 }
 
 impl AlignmentMethod for CloudIcp {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
         let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
-        let xyzi = decimate.points_m().iter().map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]).collect();
-        let measured = vehicle.frame.gnss_world_from_lidar().filter(|_| self.starts_at_gnss);
-        let no_pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+        let xyzi = decimate
+            .points_m()
+            .iter()
+            .map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0])
+            .collect();
+        let measured = vehicle
+            .frame
+            .gnss_world_from_lidar()
+            .filter(|_| self.starts_at_gnss);
+        let no_pose = PoseEstimate::NoPose {
+            reason: NoPoseReason::NoSource,
+            inlier_count: 0,
+        };
         let pose = measured.map_or(no_pose, |pose| PoseEstimate::new(pose, 1.0));
-        Ok(Message::Points(Points { pose, points: PointCloud { xyzi } }))
+        Ok(Message::Points(Points {
+            pose,
+            points: PointCloud { xyzi },
+        }))
     }
 
-    fn align(&self, ego: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {
+    fn align(
+        &self,
+        ego: &Vehicle<'_>,
+        own: &Message,
+        received: &Message,
+    ) -> Result<Isometry3<f64>, NotAligned> {
         let (Message::Points(own), Message::Points(received)) = (own, received) else {
             return Err(NotAligned::Message);
         };

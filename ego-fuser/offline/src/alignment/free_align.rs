@@ -101,27 +101,65 @@ pub enum NoAlignment {
 ///
 /// # Errors
 /// [`NoAlignment`] where the evidence is thin.
-pub fn align(ego: &[Box3d], neighbour: &[Box3d], config: &FreeAlignConfig) -> Result<BoxAlignment, NoAlignment> {
+pub fn align(
+    ego: &[Box3d],
+    neighbour: &[Box3d],
+    config: &FreeAlignConfig,
+) -> Result<BoxAlignment, NoAlignment> {
     let (ego, neighbour) = (Graph::new(ego, config), Graph::new(neighbour, config));
     let required = config.min_matches.max(2);
     if ego.len() < required || neighbour.len() < required {
-        return Err(NoAlignment::TooFewBoxes { ego: ego.len(), neighbour: neighbour.len(), required });
+        return Err(NoAlignment::TooFewBoxes {
+            ego: ego.len(),
+            neighbour: neighbour.len(),
+            required,
+        });
     }
-    let mut search = Search { ego: &ego, neighbour: &neighbour, config, largest: 0, motions: Vec::new() };
-    search.run();
-    let too_few = NoAlignment::TooFewMatches { found: search.largest, required };
-    let mut finalists = search.finalists();
-    finalists.sort_by(|a, b| b.matches.len().cmp(&a.matches.len()).then(a.rms_m.total_cmp(&b.rms_m)));
-    let best = finalists.first().filter(|best| best.matches.len() >= required).ok_or(too_few)?;
-    let is_other = |other: &&BoxAlignment| {
-        !same_motion(&other.ego_from_neighbour, &best.ego_from_neighbour, config.fit_tolerance_m)
+    let mut search = Search {
+        ego: &ego,
+        neighbour: &neighbour,
+        config,
+        largest: 0,
+        motions: Vec::new(),
     };
-    let rival = finalists.iter().find(is_other).map_or(0, |rival| rival.matches.len());
+    search.run();
+    let too_few = NoAlignment::TooFewMatches {
+        found: search.largest,
+        required,
+    };
+    let mut finalists = search.finalists();
+    finalists.sort_by(|a, b| {
+        b.matches
+            .len()
+            .cmp(&a.matches.len())
+            .then(a.rms_m.total_cmp(&b.rms_m))
+    });
+    let best = finalists
+        .first()
+        .filter(|best| best.matches.len() >= required)
+        .ok_or(too_few)?;
+    let is_other = |other: &&BoxAlignment| {
+        !same_motion(
+            &other.ego_from_neighbour,
+            &best.ego_from_neighbour,
+            config.fit_tolerance_m,
+        )
+    };
+    let rival = finalists
+        .iter()
+        .find(is_other)
+        .map_or(0, |rival| rival.matches.len());
     if rival + config.min_lead > best.matches.len() {
-        return Err(NoAlignment::Ambiguous { matches: best.matches.len(), rival });
+        return Err(NoAlignment::Ambiguous {
+            matches: best.matches.len(),
+            rival,
+        });
     }
     let given = |&(a, b): &(usize, usize)| (ego.given[a], neighbour.given[b]);
-    Ok(BoxAlignment { matches: best.matches.iter().map(given).collect(), ..best.clone() })
+    Ok(BoxAlignment {
+        matches: best.matches.iter().map(given).collect(),
+        ..best.clone()
+    })
 }
 
 fn same_motion(a: &Isometry3<f64>, b: &Isometry3<f64>, tolerance_m: f64) -> bool {
@@ -140,11 +178,23 @@ struct Graph {
 
 impl Graph {
     fn new(boxes: &[Box3d], config: &FreeAlignConfig) -> Self {
-        let nodes = boxes.iter().enumerate().filter(|(_, node)| node.center_m.iter().all(|c| c.abs() < 1e6));
-        let (given, centres): (Vec<_>, Vec<_>) =
-            nodes.take(config.max_boxes).map(|(index, node)| (index, Vector3::from(node.center_m))).unzip();
-        let edges = centres.iter().flat_map(|a| centres.iter().map(move |b| (a - b).xy().norm())).collect();
-        Self { given, centres, edges }
+        let nodes = boxes
+            .iter()
+            .enumerate()
+            .filter(|(_, node)| node.center_m.iter().all(|c| c.abs() < 1e6));
+        let (given, centres): (Vec<_>, Vec<_>) = nodes
+            .take(config.max_boxes)
+            .map(|(index, node)| (index, Vector3::from(node.center_m)))
+            .unzip();
+        let edges = centres
+            .iter()
+            .flat_map(|a| centres.iter().map(move |b| (a - b).xy().norm()))
+            .collect();
+        Self {
+            given,
+            centres,
+            edges,
+        }
     }
 
     fn len(&self) -> usize {
@@ -217,10 +267,13 @@ impl Search<'_> {
         let mut matches = vec![first, second];
         for &(_, (k, l)) in candidates {
             let agrees = |&(a, b): &Match| {
-                a != k && b != l && (self.ego.edge(a, k) - self.neighbour.edge(b, l)).abs() < tolerance
+                a != k
+                    && b != l
+                    && (self.ego.edge(a, k) - self.neighbour.edge(b, l)).abs() < tolerance
             };
             // A mirror image has the same distances and the other sign.
-            let sides = self.ego.left_of((first.0, second.0), k) - self.neighbour.left_of((first.1, second.1), l);
+            let sides = self.ego.left_of((first.0, second.0), k)
+                - self.neighbour.left_of((first.1, second.1), l);
             if matches.iter().all(agrees) && sides.abs() < 2.0 * tolerance {
                 matches.push((k, l));
             }
@@ -229,8 +282,12 @@ impl Search<'_> {
     }
 
     fn note(&mut self, matches: &[Match]) {
-        let Some(motion) = self.fit(matches) else { return };
-        let same = |(_, known): &&mut (usize, Isometry3<f64>)| same_motion(known, &motion, self.config.fit_tolerance_m);
+        let Some(motion) = self.fit(matches) else {
+            return;
+        };
+        let same = |(_, known): &&mut (usize, Isometry3<f64>)| {
+            same_motion(known, &motion, self.config.fit_tolerance_m)
+        };
         match self.motions.iter_mut().find(same) {
             Some(known) if known.0 < matches.len() => *known = (matches.len(), motion),
             Some(_) => {}
@@ -239,14 +296,22 @@ impl Search<'_> {
     }
 
     fn fit(&self, matches: &[Match]) -> Option<Isometry3<f64>> {
-        planar_fit::fit(&matches.iter().map(|&(a, b)| (self.neighbour.centres[b], self.ego.centres[a])))
+        planar_fit::fit(
+            &matches
+                .iter()
+                .map(|&(a, b)| (self.neighbour.centres[b], self.ego.centres[a])),
+        )
     }
 
     /// The best motions, each with its inliers and fitted to these.
     fn finalists(mut self) -> Vec<BoxAlignment> {
-        self.motions.sort_by_key(|(size, _)| std::cmp::Reverse(*size));
+        self.motions
+            .sort_by_key(|(size, _)| std::cmp::Reverse(*size));
         self.motions.truncate(FINALISTS);
-        self.motions.iter().filter_map(|(_, motion)| self.settled(motion)).collect()
+        self.motions
+            .iter()
+            .filter_map(|(_, motion)| self.settled(motion))
+            .collect()
     }
 
     fn settled(&self, start: &Isometry3<f64>) -> Option<BoxAlignment> {
@@ -255,9 +320,16 @@ impl Search<'_> {
             motion = self.fit(&self.together(&motion))?;
         }
         let matches = self.together(&motion);
-        let squares: f64 = matches.iter().map(|&pair| self.apart(pair, &motion).powi(2)).sum();
+        let squares: f64 = matches
+            .iter()
+            .map(|&pair| self.apart(pair, &motion).powi(2))
+            .sum();
         let rms_m = (squares / matches.len().max(1) as f64).sqrt();
-        Some(BoxAlignment { ego_from_neighbour: motion, matches, rms_m })
+        Some(BoxAlignment {
+            ego_from_neighbour: motion,
+            matches,
+            rms_m,
+        })
     }
 
     /// Inliers of a motion, one to one, nearest first.
@@ -270,7 +342,10 @@ impl Search<'_> {
         near.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut matches: Vec<Match> = Vec::new();
         for (_, pair) in near {
-            if matches.iter().all(|known| known.0 != pair.0 && known.1 != pair.1) {
+            if matches
+                .iter()
+                .all(|known| known.0 != pair.0 && known.1 != pair.1)
+            {
                 matches.push(pair);
             }
         }
@@ -292,21 +367,39 @@ mod tests {
     use super::*;
 
     fn boxes(centres: impl IntoIterator<Item = Vector3<f64>>) -> Vec<Box3d> {
-        let car = |centre: Vector3<f64>| Box3d { center_m: centre.into(), size_m: [4.5, 1.9, 1.6], heading_rad: 0.0 };
+        let car = |centre: Vector3<f64>| Box3d {
+            center_m: centre.into(),
+            size_m: [4.5, 1.9, 1.6],
+            heading_rad: 0.0,
+        };
         centres.into_iter().map(car).collect()
     }
 
     fn scattered(count: usize, random: &mut ChaCha8Rng) -> Vec<Vector3<f64>> {
-        let mut place = || Vector3::new(random.random_range(-50.0..50.0), random.random_range(-38.0..38.0), -1.0);
+        let mut place = || {
+            Vector3::new(
+                random.random_range(-50.0..50.0),
+                random.random_range(-38.0..38.0),
+                -1.0,
+            )
+        };
         (0..count).map(|_| place()).collect()
     }
 
     /// Boxes that two vehicles detect of `shared` vehicles and of `others` each, in their own frames, with noise up to
     /// `noise_m`.
-    fn views(seed: u64, shared: usize, others: usize, noise_m: f64) -> (Isometry3<f64>, Vec<Box3d>, Vec<Box3d>) {
+    fn views(
+        seed: u64,
+        shared: usize,
+        others: usize,
+        noise_m: f64,
+    ) -> (Isometry3<f64>, Vec<Box3d>, Vec<Box3d>) {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let heading = random.random_range(-3.1..3.1);
-        let truth = Isometry3::new(Vector3::new(random.random_range(-40.0..40.0), 15.0, 0.3), Vector3::z() * heading);
+        let truth = Isometry3::new(
+            Vector3::new(random.random_range(-40.0..40.0), 15.0, 0.3),
+            Vector3::z() * heading,
+        );
         let common = scattered(shared, &mut random);
         let mut shaken = |point: &Vector3<f64>| {
             let mut off = || random.random_range(-noise_m..=noise_m);
@@ -314,8 +407,10 @@ mod tests {
         };
         let mut ego: Vec<_> = common.iter().map(&mut shaken).collect();
         let inverse = truth.inverse();
-        let mut neighbour: Vec<_> =
-            common.iter().map(|point| shaken(&(inverse.rotation * point + inverse.translation.vector))).collect();
+        let mut neighbour: Vec<_> = common
+            .iter()
+            .map(|point| shaken(&(inverse.rotation * point + inverse.translation.vector)))
+            .collect();
         ego.extend(scattered(others, &mut random));
         neighbour.splice(0..0, scattered(others, &mut random));
         (truth, boxes(ego), boxes(neighbour))
@@ -327,15 +422,25 @@ mod tests {
             let (truth, ego, neighbour) = views(seed, 7, 8, 0.1);
             let found = align(&ego, &neighbour, &FreeAlignConfig::default()).unwrap();
             let off = truth.inv_mul(&found.ego_from_neighbour);
-            assert!(off.translation.vector.norm() < 0.4 && off.rotation.angle() < 0.02, "seed {seed}: {off}");
-            let right = found.matches.iter().filter(|(a, b)| *b == a + 8 && *a < 7).count();
+            assert!(
+                off.translation.vector.norm() < 0.4 && off.rotation.angle() < 0.02,
+                "seed {seed}: {off}"
+            );
+            let right = found
+                .matches
+                .iter()
+                .filter(|(a, b)| *b == a + 8 && *a < 7)
+                .count();
             assert!(right >= 7 && found.rms_m < 0.3, "seed {seed}: {found:?}");
         }
     }
 
     #[test]
     fn views_without_common_boxes_are_rarely_aligned() {
-        let config = FreeAlignConfig { min_matches: 5, ..FreeAlignConfig::default() };
+        let config = FreeAlignConfig {
+            min_matches: 5,
+            ..FreeAlignConfig::default()
+        };
         let aligned = (0..60).filter(|seed| {
             let (_, ego, neighbour) = views(*seed, 0, 12, 0.0);
             align(&ego, &neighbour, &config).is_ok()
@@ -347,12 +452,26 @@ mod tests {
     #[test]
     fn too_few_boxes_are_reported() {
         let (_, ego, neighbour) = views(1, 3, 0, 0.0);
-        let refused = NoAlignment::TooFewBoxes { ego: 3, neighbour: 3, required: 4 };
-        assert_eq!(align(&ego, &neighbour, &FreeAlignConfig::default()), Err(refused));
+        let refused = NoAlignment::TooFewBoxes {
+            ego: 3,
+            neighbour: 3,
+            required: 4,
+        };
+        assert_eq!(
+            align(&ego, &neighbour, &FreeAlignConfig::default()),
+            Err(refused)
+        );
         assert!(align(&[], &[], &FreeAlignConfig::default()).is_err());
         let nowhere = boxes([Vector3::repeat(f64::NAN); 9]);
-        let refused = NoAlignment::TooFewBoxes { ego: 0, neighbour: 3, required: 4 };
-        assert_eq!(align(&nowhere, &neighbour, &FreeAlignConfig::default()), Err(refused));
+        let refused = NoAlignment::TooFewBoxes {
+            ego: 0,
+            neighbour: 3,
+            required: 4,
+        };
+        assert_eq!(
+            align(&nowhere, &neighbour, &FreeAlignConfig::default()),
+            Err(refused)
+        );
     }
 
     #[test]
@@ -361,33 +480,83 @@ mod tests {
             let (_, ego, _) = views(seed, 9, 0, 0.0);
             let mirrored: Vec<_> = ego
                 .iter()
-                .map(|node| Box3d { center_m: [node.center_m[0], -node.center_m[1], node.center_m[2]], ..*node })
+                .map(|node| Box3d {
+                    center_m: [node.center_m[0], -node.center_m[1], node.center_m[2]],
+                    ..*node
+                })
                 .collect();
-            let found = align(&ego, &mirrored, &FreeAlignConfig { min_matches: 6, ..FreeAlignConfig::default() });
-            assert!(matches!(found, Err(NoAlignment::TooFewMatches { required: 6, .. })), "{found:?}");
+            let found = align(
+                &ego,
+                &mirrored,
+                &FreeAlignConfig {
+                    min_matches: 6,
+                    ..FreeAlignConfig::default()
+                },
+            );
+            assert!(
+                matches!(found, Err(NoAlignment::TooFewMatches { required: 6, .. })),
+                "{found:?}"
+            );
         }
     }
 
     #[test]
     fn a_row_of_parked_cars_could_be_anywhere_along_itself() {
-        let row = |from: i32| boxes((from..from + 8).map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0)));
+        let row = |from: i32| {
+            boxes((from..from + 8).map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0)))
+        };
         let found = align(&row(0), &row(-3), &FreeAlignConfig::default());
-        assert!(matches!(found, Err(NoAlignment::Ambiguous { .. })), "{found:?}");
+        assert!(
+            matches!(found, Err(NoAlignment::Ambiguous { .. })),
+            "{found:?}"
+        );
         // And an arrangement that is symmetric under a half turn.
-        let cross = [[20.0, 4.0], [-20.0, -4.0], [12.0, -9.0], [-12.0, 9.0], [30.0, -17.0], [-30.0, 17.0]];
+        let cross = [
+            [20.0, 4.0],
+            [-20.0, -4.0],
+            [12.0, -9.0],
+            [-12.0, 9.0],
+            [30.0, -17.0],
+            [-30.0, 17.0],
+        ];
         let cross = boxes(cross.map(|[x, y]| Vector3::new(x, y, -1.0)));
         let found = align(&cross, &cross, &FreeAlignConfig::default());
-        assert_eq!(found, Err(NoAlignment::Ambiguous { matches: 6, rival: 6 }));
+        assert_eq!(
+            found,
+            Err(NoAlignment::Ambiguous {
+                matches: 6,
+                rival: 6
+            })
+        );
     }
 
     #[test]
     fn one_car_more_settles_where_along_the_row() {
-        let mut row: Vec<_> = (0..6).map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0)).collect();
-        row.extend([Vector3::new(11.0, -14.0, -1.0), Vector3::new(-20.0, 1.0, -1.0)]);
+        let mut row: Vec<_> = (0..6)
+            .map(|k| Vector3::new(f64::from(k) * 6.0, 5.0, -1.0))
+            .collect();
+        row.extend([
+            Vector3::new(11.0, -14.0, -1.0),
+            Vector3::new(-20.0, 1.0, -1.0),
+        ]);
         let truth = Isometry3::new(Vector3::new(7.0, 3.0, 0.0), Vector3::z() * 1.3);
-        let moved = row.iter().map(|point| truth.inverse().rotation * point + truth.inverse().translation.vector);
-        let found = align(&boxes(row.clone()), &boxes(moved), &FreeAlignConfig::default()).unwrap();
-        assert!(truth.inv_mul(&found.ego_from_neighbour).translation.vector.norm() < 1e-6);
+        let moved = row
+            .iter()
+            .map(|point| truth.inverse().rotation * point + truth.inverse().translation.vector);
+        let found = align(
+            &boxes(row.clone()),
+            &boxes(moved),
+            &FreeAlignConfig::default(),
+        )
+        .unwrap();
+        assert!(
+            truth
+                .inv_mul(&found.ego_from_neighbour)
+                .translation
+                .vector
+                .norm()
+                < 1e-6
+        );
         assert_eq!(found.matches.len(), 8);
     }
 }

@@ -29,7 +29,12 @@ pub trait AlignmentMethod {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError>;
 
     /// `ego_from_neighbour`, both in the frames of their LiDARs, or the reason why there is none.
-    fn align(&self, ego: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned>;
+    fn align(
+        &self,
+        ego: &Vehicle<'_>,
+        own: &Message,
+        received: &Message,
+    ) -> Result<Isometry3<f64>, NotAligned>;
 }
 
 type Construct = Box<dyn Fn() -> Box<dyn AlignmentMethod>>;
@@ -50,7 +55,11 @@ impl AlignmentSpec {
         needs_boxes: bool,
         construct: impl Fn() -> M + 'static,
     ) -> Self {
-        Self { name: name.into(), needs_boxes, construct: Box::new(move || Box::new(construct())) }
+        Self {
+            name: name.into(),
+            needs_boxes,
+            construct: Box::new(move || Box::new(construct())),
+        }
     }
 
     /// The method at the beginning of a scene.
@@ -62,7 +71,9 @@ impl AlignmentSpec {
 
 impl fmt::Debug for AlignmentSpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("AlignmentSpec").field("name", &self.name).finish_non_exhaustive()
+        f.debug_struct("AlignmentSpec")
+            .field("name", &self.name)
+            .finish_non_exhaustive()
     }
 }
 

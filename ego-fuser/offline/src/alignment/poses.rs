@@ -38,13 +38,19 @@ impl Poses {
         build: impl Fn() -> Result<Box<dyn PoseSource>, PoseSourceError> + 'static,
     ) -> AlignmentSpec {
         let build: Rc<Build> = Rc::new(build);
-        AlignmentSpec::new(name, false, move || Self { build: Rc::clone(&build), measured, sources: BTreeMap::new() })
+        AlignmentSpec::new(name, false, move || Self {
+            build: Rc::clone(&build),
+            measured,
+            sources: BTreeMap::new(),
+        })
     }
 }
 
 impl fmt::Debug for Poses {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Poses").field("measured", &self.measured).finish_non_exhaustive()
+        f.debug_struct("Poses")
+            .field("measured", &self.measured)
+            .finish_non_exhaustive()
     }
 }
 
@@ -72,7 +78,12 @@ impl AlignmentMethod for Poses {
         Ok(Message::Pose(estimate))
     }
 
-    fn align(&self, _: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {
+    fn align(
+        &self,
+        _: &Vehicle<'_>,
+        own: &Message,
+        received: &Message,
+    ) -> Result<Isometry3<f64>, NotAligned> {
         let (Message::Pose(own), Message::Pose(received)) = (own, received) else {
             return Err(NotAligned::Message);
         };

@@ -35,7 +35,12 @@ pub(crate) struct Arguments {
     #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Methods; none named: all but icp-map.
     #[arg(long, num_args = 1.., value_enum)]
@@ -116,9 +121,10 @@ impl FromStr for NamedSource {
 
     fn from_str(text: &str) -> Result<Self, String> {
         match text.split_once('=') {
-            Some((name, file)) if !name.is_empty() && !file.is_empty() => {
-                Ok(Self { name: name.to_owned(), file: file.into() })
-            }
+            Some((name, file)) if !name.is_empty() && !file.is_empty() => Ok(Self {
+                name: name.to_owned(),
+                file: file.into(),
+            }),
             _ => Err(format!("{text:?} is not NAME=FILE.yaml")),
         }
     }
@@ -138,7 +144,10 @@ impl Arguments {
             let found = self.compare(&methods, &mut source, &scenarios)?;
             rows.extend(found.into_iter().zip(&methods).map(|(row, method)| {
                 match self.boxes.len() > 1 && method.needs_boxes {
-                    true => Row { method: format!("{}, {}", row.method, boxes.adjective()), ..row },
+                    true => Row {
+                        method: format!("{}, {}", row.method, boxes.adjective()),
+                        ..row
+                    },
                     false => row,
                 }
             }));
@@ -154,9 +163,15 @@ impl Arguments {
     fn methods(&self) -> Result<Vec<AlignmentSpec>> {
         use Method::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
         let all = [Gnss, Icp, IcpGnss, BoxIcpMethod, FreeAlignMethod];
-        let named = if self.method.is_empty() { &all[..] } else { &self.method };
+        let named = if self.method.is_empty() {
+            &all[..]
+        } else {
+            &self.method
+        };
         let built_in = named.iter().map(|method| self.built_in(*method));
-        built_in.chain(self.pose_source.iter().map(from_source)).collect()
+        built_in
+            .chain(self.pose_source.iter().map(from_source))
+            .collect()
     }
 
     fn built_in(&self, method: Method) -> Result<AlignmentSpec> {
@@ -172,7 +187,10 @@ impl Arguments {
 
     fn icp_map(&self) -> Result<AlignmentSpec> {
         if self.map.is_empty() || self.map_spacing.is_nan() || self.map_spacing < 0.0 {
-            return Err(BadInput::new("icp-map needs --map DIR, and a spacing that is not negative").into());
+            return Err(BadInput::new(
+                "icp-map needs --map DIR, and a spacing that is not negative",
+            )
+            .into());
         }
         let config = IcpConfig::default();
         let map = read_map(&self.map, self.map_spacing, &config).map_err(BadInput::of)?;
@@ -187,23 +205,43 @@ impl Arguments {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {
-            return Err(BadInput::new("detected boxes need --weights FILE; or use --boxes annotated").into());
+            return Err(BadInput::new(
+                "detected boxes need --weights FILE; or use --boxes annotated",
+            )
+            .into());
         };
         let detector = Detector::load(weights, Device::Cpu).map_err(BadInput::of)?;
         let cav = CavId::new("detector").context("a name")?;
-        Ok(BoxSource::Detected(Box::new(Agent::new(cav, Box::new(RecordedPose), detector))))
+        Ok(BoxSource::Detected(Box::new(Agent::new(
+            cav,
+            Box::new(RecordedPose),
+            detector,
+        ))))
     }
 
-    fn compare(&self, methods: &[AlignmentSpec], boxes: &mut BoxSource, scenarios: &[Scenario]) -> Result<Vec<Row>> {
+    fn compare(
+        &self,
+        methods: &[AlignmentSpec],
+        boxes: &mut BoxSource,
+        scenarios: &[Scenario],
+    ) -> Result<Vec<Row>> {
         let bar = progress::bar(scenarios.len(), "scenes");
         let mut tallies = vec![Tally::default(); methods.len()];
         for scenario in scenarios {
-            let ticks = (0..scenario.ticks.len()).step_by(self.every as usize).take(self.frames.unwrap_or(usize::MAX));
-            alignment::run(methods, boxes, scenario, ticks, &mut |outcome| tallies[outcome.method].add(&outcome))?;
+            let ticks = (0..scenario.ticks.len())
+                .step_by(self.every as usize)
+                .take(self.frames.unwrap_or(usize::MAX));
+            alignment::run(methods, boxes, scenario, ticks, &mut |outcome| {
+                tallies[outcome.method].add(&outcome)
+            })?;
             bar.inc(1);
         }
         bar.finish_and_clear();
-        Ok(tallies.iter().zip(methods).map(|(tally, method)| tally.row(&method.name)).collect())
+        Ok(tallies
+            .iter()
+            .zip(methods)
+            .map(|(tally, method)| tally.row(&method.name))
+            .collect())
     }
 }
 
@@ -213,6 +251,10 @@ fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
     // Built once without use, so that a missing file is found before the first scene.
-    config.build(Inference::default()).map_err(|error| bad(&error))?;
-    Ok(Poses::spec(name.clone(), Measured::True, move || config.build(Inference::default())))
+    config
+        .build(Inference::default())
+        .map_err(|error| bad(&error))?;
+    Ok(Poses::spec(name.clone(), Measured::True, move || {
+        config.build(Inference::default())
+    }))
 }

@@ -19,7 +19,12 @@ pub(crate) struct Arguments {
     #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Weights of a method that aligns maps itself, such as pastat.
     #[arg(long, value_name = "FILE")]
@@ -49,12 +54,23 @@ impl Arguments {
         if !self.shifts.iter().chain(&self.turns).all(is_sensible) {
             return Err(BadInput::new("--shifts and --turns are 0 to 100").into());
         }
-        let shifts = self.shifts.iter().map(|&shift_m| Offset { shift_m, turn_deg: 0.0 });
-        let turns = self.turns.iter().map(|&turn_deg| Offset { shift_m: 0.0, turn_deg });
+        let shifts = self.shifts.iter().map(|&shift_m| Offset {
+            shift_m,
+            turn_deg: 0.0,
+        });
+        let turns = self.turns.iter().map(|&turn_deg| Offset {
+            shift_m: 0.0,
+            turn_deg,
+        });
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
         let mut meter = AlignmentMeter::load(&weights).map_err(BadInput::of)?;
-        let found = meter.measure(&scenarios(&self.data, self.intensity_scale)?, self.every, &offsets, self.seed)?;
+        let found = meter.measure(
+            &scenarios(&self.data, self.intensity_scale)?,
+            self.every,
+            &offsets,
+            self.seed,
+        )?;
         if self.json {
             output::line(serde_json::to_string_pretty(&found)?)?;
             return Ok(());
@@ -65,13 +81,28 @@ impl Arguments {
 }
 
 fn table(found: &[AlignmentError]) -> TextTable {
-    let right = ["pairs", "mean m before/after", "median m before/after", "mean degrees before/after"];
-    let mut table = TextTable::new([("offset", Side::Left)].into_iter().chain(right.map(|name| (name, Side::Right))));
+    let right = [
+        "pairs",
+        "mean m before/after",
+        "median m before/after",
+        "mean degrees before/after",
+    ];
+    let mut table = TextTable::new(
+        [("offset", Side::Left)]
+            .into_iter()
+            .chain(right.map(|name| (name, Side::Right))),
+    );
     for summary in found {
         let Offset { shift_m, turn_deg } = summary.offset;
         let [mean, median, angle] = [summary.mean_m, summary.p50_m, summary.mean_deg]
             .map(|[before, after]| format!("{before:.3} / {after:.3}"));
-        table.row([format!("{shift_m} m {turn_deg} deg"), summary.pairs.to_string(), mean, median, angle]);
+        table.row([
+            format!("{shift_m} m {turn_deg} deg"),
+            summary.pairs.to_string(),
+            mean,
+            median,
+            angle,
+        ]);
     }
     table
 }

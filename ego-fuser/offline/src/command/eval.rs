@@ -33,7 +33,12 @@ pub(crate) struct Arguments {
     #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Weights of encoder and head.
     #[arg(long, value_name = "FILE")]
@@ -67,8 +72,11 @@ impl Arguments {
             self.run_multi_scale(&data, &mut left_out)?;
             return Ok(print_left_out(&left_out));
         }
-        let methods =
-            if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
+        let methods = if self.method.is_empty() {
+            vec![None]
+        } else {
+            self.method.iter().map(|method| Some(*method)).collect()
+        };
         let mut rows = Vec::new();
         for method in methods {
             let config = |data: &Data| EvaluateConfig {
@@ -78,7 +86,8 @@ impl Arguments {
                 method,
                 ..EvaluateConfig::default()
             };
-            let (row, lost) = evaluate(&config, &data, self.frames.unwrap_or(usize::MAX), self.json)?;
+            let (row, lost) =
+                evaluate(&config, &data, self.frames.unwrap_or(usize::MAX), self.json)?;
             left_out.merge(&lost);
             rows.push(row);
         }
@@ -101,13 +110,26 @@ fn print_left_out(left_out: &LeftOut) -> Outcome {
 impl Arguments {
     /// The data sets, each with the agents of its protocol.
     fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
-        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let options = OpenOptions {
+            intensity_scale: self.intensity_scale,
+            ..OpenOptions::default()
+        };
         let open = |folder: &PathBuf| {
-            let Dataset { layout, scenarios, problems } = dataset::open_with(folder, &options).map_err(BadInput::of)?;
+            let Dataset {
+                layout,
+                scenarios,
+                problems,
+            } = dataset::open_with(folder, &options).map_err(BadInput::of)?;
             left_out.add_files(&problems);
             let protocol = self.protocol.resolve(layout).map_err(BadInput::new)?;
-            let scenarios = scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
-            Ok(Data { protocol, scenarios })
+            let scenarios = scenarios
+                .iter()
+                .filter_map(|scenario| protocol.arrange(scenario))
+                .collect();
+            Ok(Data {
+                protocol,
+                scenarios,
+            })
         };
         self.data.iter().map(open).collect()
     }
@@ -115,7 +137,9 @@ impl Arguments {
     /// A network that fuses at every level is one method of its own.
     fn run_multi_scale(&self, data: &[Data], left_out: &mut LeftOut) -> Result<()> {
         if !self.method.is_empty() {
-            return Err(BadInput::new("a multi-scale network has one method: leave --method out").into());
+            return Err(
+                BadInput::new("a multi-scale network has one method: leave --method out").into(),
+            );
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let rule = detector.rule();
@@ -123,12 +147,14 @@ impl Arguments {
         let mut tally = Tally::default();
         for scenario in data.iter().flat_map(|data| &data.scenarios) {
             for tick in 0..scenario.ticks.len().min(frames) {
-                let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+                let loaded =
+                    scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
                 left_out.add_tick(&loaded);
                 if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
                     continue;
                 }
-                let frames: Vec<Frame> = loaded.frames.into_iter().map(|(_, frame)| frame).collect();
+                let frames: Vec<Frame> =
+                    loaded.frames.into_iter().map(|(_, frame)| frame).collect();
                 let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
                 let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
                 tally.frames += 1;
@@ -164,7 +190,11 @@ fn evaluate(
     for data in data {
         let mut evaluator = Evaluator::new(config(data)).map_err(BadInput::of)?;
         name = evaluator.ego().method().name();
-        let frame_count = data.scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
+        let frame_count = data
+            .scenarios
+            .iter()
+            .map(|scenario| scenario.ticks.len().min(frames))
+            .sum();
         let bar = progress::bar(frame_count, "frames").with_message(name);
         for scenario in &data.scenarios {
             let mut done = 0;
@@ -172,7 +202,11 @@ fn evaluate(
                 tally.add(&frame);
                 bar.inc(1);
                 done += 1;
-                if done < frames { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+                if done < frames {
+                    ControlFlow::Continue(())
+                } else {
+                    ControlFlow::Break(())
+                }
             })?;
         }
         bar.finish_and_clear();
@@ -186,7 +220,9 @@ fn evaluate(
 }
 
 fn print_row(row: &serde_json::Value) -> std::io::Result<()> {
-    let ap = |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
+    let ap = |name: &str| {
+        THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)))
+    };
     let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
     output::line(format_args!(
         "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
@@ -208,7 +244,13 @@ impl Tally {
     fn add(&mut self, frame: &EvaluatedFrame) {
         self.frames += 1;
         self.scorer.add(&frame.result.detections, &frame.objects);
-        self.payload_bytes.extend(frame.result.fused.iter().map(|neighbour| neighbour.payload_bytes));
+        self.payload_bytes.extend(
+            frame
+                .result
+                .fused
+                .iter()
+                .map(|neighbour| neighbour.payload_bytes),
+        );
     }
 
     fn row(&self, method: &str) -> serde_json::Value {
@@ -220,7 +262,8 @@ impl Tally {
                 .map(|(iou, ap)| (iou.to_string(), json!(ap)))
                 .collect::<serde_json::Map<_, _>>()
         };
-        let bytes = self.payload_bytes.iter().sum::<u64>() as f64 / self.payload_bytes.len().max(1) as f64;
+        let bytes =
+            self.payload_bytes.iter().sum::<u64>() as f64 / self.payload_bytes.len().max(1) as f64;
         json!({
             "method": method,
             "frames": self.frames,

@@ -31,7 +31,8 @@ pub(crate) enum Command {
 impl Command {
     /// Carries out the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("restarting with malloc settings")?;
+        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
+            .context("restarting with malloc settings")?;
         match self {
             Self::Align(arguments) => arguments.run()?,
             Self::Eval(arguments) => return arguments.run(),
@@ -44,11 +45,21 @@ impl Command {
 }
 
 /// All scenarios of some datasets.
-fn scenarios(folders: &[PathBuf], intensity_scale: IntensityScale) -> anyhow::Result<Vec<Scenario>> {
-    let options = OpenOptions { intensity_scale, ..OpenOptions::default() };
+fn scenarios(
+    folders: &[PathBuf],
+    intensity_scale: IntensityScale,
+) -> anyhow::Result<Vec<Scenario>> {
+    let options = OpenOptions {
+        intensity_scale,
+        ..OpenOptions::default()
+    };
     let mut scenarios = Vec::new();
     for folder in folders {
-        scenarios.extend(dataset::open_with(folder, &options).map_err(BadInput::of)?.scenarios);
+        scenarios.extend(
+            dataset::open_with(folder, &options)
+                .map_err(BadInput::of)?
+                .scenarios,
+        );
     }
     Ok(scenarios)
 }

@@ -23,7 +23,12 @@ pub(crate) struct Arguments {
     #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Number of frames of every scenario.
     #[arg(long, default_value_t = 5)]
@@ -36,19 +41,30 @@ impl Arguments {
         tch::set_num_threads(1);
         let scenarios = scenarios(&self.data, self.intensity_scale)?;
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) || self.frames == 0 {
-            return Err(BadInput::new("--dataset and --frames: no frame to search scales on").into());
+            return Err(
+                BadInput::new("--dataset and --frames: no frame to search scales on").into(),
+            );
         }
         let mut left_out = LeftOut::default();
         for path in &self.weights {
             // The same sweeps for every file.
             left_out = LeftOut::default();
-            let scales = search_scales(path, &scenarios, self.frames, &mut left_out).map_err(BadInput::of)?;
+            let scales = search_scales(path, &scenarios, self.frames, &mut left_out)
+                .map_err(BadInput::of)?;
             if scales.is_empty() {
-                output::line(format_args!("{}: no layer can be quantised, unchanged", path.display()))?;
+                output::line(format_args!(
+                    "{}: no layer can be quantised, unchanged",
+                    path.display()
+                ))?;
                 continue;
             }
-            let sha256 = annotate(path, SCALES_KEY, &serde_json::to_string(&scales)?).map_err(BadInput::of)?;
-            output::line(format_args!("{}: {} activations, SHA-256 {sha256}", path.display(), scales.len()))?;
+            let sha256 = annotate(path, SCALES_KEY, &serde_json::to_string(&scales)?)
+                .map_err(BadInput::of)?;
+            output::line(format_args!(
+                "{}: {} activations, SHA-256 {sha256}",
+                path.display(),
+                scales.len()
+            ))?;
         }
         Ok(left_out.print())
     }

@@ -33,7 +33,12 @@ pub(crate) struct Arguments {
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
     /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
     intensity_scale: IntensityScale,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value_t = Method::NONE)]
@@ -140,7 +145,10 @@ impl Arguments {
         }
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
-        self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
+        self.options.print(
+            &summary.trained,
+            &serde_json::json!({"accuracy": summary.accuracy}),
+        )?;
         Ok(())
     }
 
@@ -163,25 +171,46 @@ impl Arguments {
                 .map_err(|error| BadInput::new(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
         }
-        let rule = self.protocol.resolve(Layout::OPV2V).map_err(BadInput::new)?.ground_truth;
+        let rule = self
+            .protocol
+            .resolve(Layout::OPV2V)
+            .map_err(BadInput::new)?
+            .ground_truth;
         let samples = SampleConfig {
-            augmentation: Augmentation { turn_rad: self.turn.to_radians(), ..Augmentation::default() },
+            augmentation: Augmentation {
+                turn_rad: self.turn.to_radians(),
+                ..Augmentation::default()
+            },
             drop_neighbour: self.drop_neighbour,
             poses: self.poses()?,
-            moments: Moments { frames: 1, gap: self.gap, max_delay_nanos: self.max_delay * 1_000_000 },
+            moments: Moments {
+                frames: 1,
+                gap: self.gap,
+                max_delay_nanos: self.max_delay * 1_000_000,
+            },
             max_agents: self.protocol.max_agents.unwrap_or(5),
             comm_range_m: rule.comm_range_m,
             classes: rule.classes,
             merged_truth: self.ego_only,
             ..SampleConfig::training(SampleKind::Single)
         };
-        let unassigned = if self.ignore_unassigned { Unassigned::Ignored } else { Unassigned::Background };
-        let run = self.options.run_config(self.batch, self.lr).map_err(BadInput::of)?;
+        let unassigned = if self.ignore_unassigned {
+            Unassigned::Ignored
+        } else {
+            Unassigned::Background
+        };
+        let run = self
+            .options
+            .run_config(self.batch, self.lr)
+            .map_err(BadInput::of)?;
         Ok(TrainConfig {
             data: self.data.clone(),
             validation: self.validation.clone(),
             protocol: self.protocol.clone(),
-            open: OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() },
+            open: OpenOptions {
+                intensity_scale: self.intensity_scale,
+                ..OpenOptions::default()
+            },
             method: self.method,
             detector: self.config.clone(),
             init: self.init.clone(),
@@ -195,11 +224,21 @@ impl Arguments {
                 limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64,
                 intensity_scale: self.intensity_scale,
             }),
-            run: RunConfig { optimizer: AdamWConfig { weight_decay: self.weight_decay, ..run.optimizer }, ..run },
+            run: RunConfig {
+                optimizer: AdamWConfig {
+                    weight_decay: self.weight_decay,
+                    ..run.optimizer
+                },
+                ..run
+            },
             validate_every: self.validate_every,
             validation_frames: self.validation_frames,
             samples,
-            loss: LossConfig { unassigned, alignment_weight: self.alignment_weight, ..LossConfig::default() },
+            loss: LossConfig {
+                unassigned,
+                alignment_weight: self.alignment_weight,
+                ..LossConfig::default()
+            },
         })
     }
 
@@ -214,7 +253,12 @@ impl Arguments {
             ..NoisyPoseConfig::default()
         });
         let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
-        let poses = SamplePoses { tables, noise, noise_share: self.noise_share, lost_share: self.lost_share };
+        let poses = SamplePoses {
+            tables,
+            noise,
+            noise_share: self.noise_share,
+            lost_share: self.lost_share,
+        };
         poses.validate().map_err(BadInput::of)?;
         Ok(poses)
     }
@@ -231,7 +275,11 @@ impl Arguments {
             }
             None => self.config.clone(),
         };
-        let fusion = ablated(&self.method.default_fusion(&detector), &self.without, self.frames);
+        let fusion = ablated(
+            &self.method.default_fusion(&detector),
+            &self.without,
+            self.frames,
+        );
         Ok(Some(fusion.map_err(BadInput::of)?))
     }
 }
@@ -239,7 +287,9 @@ impl Arguments {
 /// Cause of an early end of a training: the input, if the initial model could not be built.
 fn blamed(error: TrainError) -> anyhow::Error {
     match error {
-        TrainError::Model(ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_))
+        TrainError::Model(
+            ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_),
+        )
         | TrainError::NotTrained(_)
         | TrainError::NothingToFreeze
         | TrainError::NothingToKeep(_) => BadInput::of(error).into(),
@@ -261,7 +311,9 @@ struct Progress(TrainingBar);
 
 impl Observer for Progress {
     fn opened(&mut self, data: &DataListing) {
-        data.left_out().iter().for_each(|text| self.0.print_line(text));
+        data.left_out()
+            .iter()
+            .for_each(|text| self.0.print_line(text));
     }
 
     fn encoded(&mut self, done: usize, all: usize) {
@@ -306,7 +358,10 @@ mod tests {
     fn weights_that_are_not_there_are_bad_input_and_a_training_that_diverges_is_not() {
         let missing = Weights::load(Path::new("no/such.safetensors")).unwrap_err();
         let blame = blamed(TrainError::Model(missing.into()));
-        assert!(blame.is::<BadInput>() && blame.to_string().contains("no/such.safetensors"), "{blame}");
+        assert!(
+            blame.is::<BadInput>() && blame.to_string().contains("no/such.safetensors"),
+            "{blame}"
+        );
         assert!(!blamed(TrainError::Training(TrainingError::Diverged(9))).is::<BadInput>());
     }
 }

@@ -52,7 +52,10 @@ pub struct AlignmentError {
 impl AlignmentError {
     fn between(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> Self {
         let off = truth.inv_mul(found);
-        Self { metres: off.translation.vector.norm(), degrees: off.rotation.angle().to_degrees() }
+        Self {
+            metres: off.translation.vector.norm(),
+            degrees: off.rotation.angle().to_degrees(),
+        }
     }
 }
 
@@ -73,19 +76,27 @@ pub fn run(
         let frames = (scenario.present_agents(tick))
             .map(|agent| Ok(scenario.load(agent, tick, &LoadOptions::default())?))
             .collect::<Result<Vec<Frame>, AlignError>>()?;
-        let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick))).collect::<Result<Vec<_>, _>>()?;
+        let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick)))
+            .collect::<Result<Vec<_>, _>>()?;
         let boxes = needs_boxes.then_some(&mut *box_source);
         moment(&mut methods, boxes, &frames, &truth, on_outcome)?;
     }
     Ok(())
 }
 
-fn true_pose(frame: &Frame, scenario: &Scenario, tick: usize) -> Result<Isometry3<f64>, AlignError> {
-    frame.world_from_lidar.map(|pose| pose.isometry()).ok_or_else(|| AlignError::NoTruth {
-        scenario: scenario.name.clone(),
-        stem: scenario.ticks[tick].stem.clone(),
-        cav: frame.cav.clone(),
-    })
+fn true_pose(
+    frame: &Frame,
+    scenario: &Scenario,
+    tick: usize,
+) -> Result<Isometry3<f64>, AlignError> {
+    frame
+        .world_from_lidar
+        .map(|pose| pose.isometry())
+        .ok_or_else(|| AlignError::NoTruth {
+            scenario: scenario.name.clone(),
+            stem: scenario.ticks[tick].stem.clone(),
+            cav: frame.cav.clone(),
+        })
 }
 
 /// All pairs of one tick; the ego comes first.
@@ -97,8 +108,9 @@ fn moment(
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<(), AlignError> {
     let ego_from = |index: usize| truth[0].inv_mul(&truth[index]);
-    let near: Vec<usize> =
-        (0..frames.len()).filter(|&index| ego_from(index).translation.vector.norm() <= Ego::COMM_RANGE_M).collect();
+    let near: Vec<usize> = (0..frames.len())
+        .filter(|&index| ego_from(index).translation.vector.norm() <= Ego::COMM_RANGE_M)
+        .collect();
     let boxes = near
         .iter()
         .map(|&index| match &mut box_source {
@@ -106,12 +118,22 @@ fn moment(
             None => Ok(Vec::new()),
         })
         .collect::<Result<Vec<_>, _>>()?;
-    let vehicles: Vec<Vehicle<'_>> =
-        near.iter().zip(&boxes).map(|(&index, boxes)| Vehicle { frame: &frames[index], boxes }).collect();
+    let vehicles: Vec<Vehicle<'_>> = near
+        .iter()
+        .zip(&boxes)
+        .map(|(&index, boxes)| Vehicle {
+            frame: &frames[index],
+            boxes,
+        })
+        .collect();
     for (number, method) in methods.iter_mut().enumerate() {
-        let prepared =
-            vehicles.iter().map(|vehicle| prepare(method.as_mut(), vehicle)).collect::<Result<Vec<_>, _>>()?;
-        let Some((own, neighbours)) = prepared.split_first() else { continue };
+        let prepared = vehicles
+            .iter()
+            .map(|vehicle| prepare(method.as_mut(), vehicle))
+            .collect::<Result<Vec<_>, _>>()?;
+        let Some((own, neighbours)) = prepared.split_first() else {
+            continue;
+        };
         for (received, &index) in neighbours.iter().zip(&near[1..]) {
             let start = Instant::now();
             let found = method.align(&vehicles[0], &own.message, &received.message);
@@ -133,19 +155,37 @@ struct Prepared {
     time: Duration,
 }
 
-fn prepare(method: &mut dyn AlignmentMethod, vehicle: &Vehicle<'_>) -> Result<Prepared, AlignError> {
+fn prepare(
+    method: &mut dyn AlignmentMethod,
+    vehicle: &Vehicle<'_>,
+) -> Result<Prepared, AlignError> {
     let start = Instant::now();
     let message = method.prepare(vehicle)?;
     let time = start.elapsed();
-    let Frame { cav, capture_nanos, .. } = vehicle.frame;
-    let stamp =
-        Stamp { cav: cav.clone(), epoch: 0, sequence: 0, capture_nanos: *capture_nanos, publish_nanos: *capture_nanos };
+    let Frame {
+        cav, capture_nanos, ..
+    } = vehicle.frame;
+    let stamp = Stamp {
+        cav: cav.clone(),
+        epoch: 0,
+        sequence: 0,
+        capture_nanos: *capture_nanos,
+        publish_nanos: *capture_nanos,
+    };
     let bytes = wire::encode_any(&stamp, message.clone())?.wire_bytes() - HEADER_LEN;
-    Ok(Prepared { message, bytes: bytes as u64, time })
+    Ok(Prepared {
+        message,
+        bytes: bytes as u64,
+        time,
+    })
 }
 
 /// A vehicle's boxes in the frame of its LiDAR, the most confident first.
-fn boxes(source: &mut BoxSource, frame: &Frame, world_from_lidar: &Isometry3<f64>) -> Result<Vec<Box3d>, AlignError> {
+fn boxes(
+    source: &mut BoxSource,
+    frame: &Frame,
+    world_from_lidar: &Isometry3<f64>,
+) -> Result<Vec<Box3d>, AlignError> {
     match source {
         BoxSource::Detected(agent) => {
             let mut found = agent.perceive(&frame.points)?.detections;
@@ -154,9 +194,13 @@ fn boxes(source: &mut BoxSource, frame: &Frame, world_from_lidar: &Isometry3<f64
         }
         BoxSource::Annotated => {
             let lidar_from_world = world_from_lidar.inverse();
-            let targets = frame.objects.iter().filter(|object| ClassSet::VEHICLES.contains(object.class));
-            let mut found: Vec<Box3d> =
-                targets.map(|object| ground_truth::upright_box(object, &lidar_from_world)).collect();
+            let targets = frame
+                .objects
+                .iter()
+                .filter(|object| ClassSet::VEHICLES.contains(object.class));
+            let mut found: Vec<Box3d> = targets
+                .map(|object| ground_truth::upright_box(object, &lidar_from_world))
+                .collect();
             // Nearest first, as an estimate of the best detected ones.
             let range = |found: &Box3d| found.center_m[0].hypot(found.center_m[1]);
             found.sort_by(|a, b| range(a).total_cmp(&range(b)));

@@ -30,7 +30,11 @@ pub(super) struct PoseTimes {
 
 impl Participant {
     pub(super) fn new(agent: Agent, attack: Option<Attack>) -> Self {
-        Self { agent, attack, times: PoseTimes::default() }
+        Self {
+            agent,
+            attack,
+            times: PoseTimes::default(),
+        }
     }
 
     pub(super) fn cav(&self) -> &CavId {
@@ -49,7 +53,9 @@ impl Participant {
         let began = Instant::now();
         let pose = self.agent.estimate_pose(input);
         self.times.estimate = began.elapsed();
-        self.attack.as_ref().map_or(pose, |attack| attack.pose(pose))
+        self.attack
+            .as_ref()
+            .map_or(pose, |attack| attack.pose(pose))
     }
 
     /// Last step of a sweep.
@@ -65,7 +71,11 @@ impl Participant {
     }
 
     /// The published map, confidence and detections, from a map `[1, C, H, W]` of the encoder where there is one.
-    pub(super) fn perceive(&mut self, frame: &Frame, map: Option<&Tensor>) -> Result<Perception, DetectorError> {
+    pub(super) fn perceive(
+        &mut self,
+        frame: &Frame,
+        map: Option<&Tensor>,
+    ) -> Result<Perception, DetectorError> {
         let perception = match map {
             Some(map) => self.agent.perceive_map(map),
             None => self.agent.perceive(&frame.points),
@@ -92,6 +102,11 @@ impl Participant {
         codec: &CodecConfig,
         capture_nanos: u64,
     ) -> Result<EncodedFeatures, WireError> {
-        self.agent.write_map(perception.features, &perception.confidence, codec, capture_nanos)
+        self.agent.write_map(
+            perception.features,
+            &perception.confidence,
+            codec,
+            capture_nanos,
+        )
     }
 }

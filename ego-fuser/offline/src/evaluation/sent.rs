@@ -4,7 +4,10 @@ use agent::agent::AgentInput;
 use agent::attack::CapturedMessages;
 use dataset::frame::Frame;
 use protocol::message::{Bev, Boxes, Payload, Points};
-use protocol::{CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire};
+use protocol::{
+    CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError,
+    wire,
+};
 use tch::Tensor;
 
 use super::EvaluateError;
@@ -30,14 +33,36 @@ pub(super) struct Sent {
 impl Sent {
     /// As received by the ego; absent where nothing was sent.
     pub(super) fn view(&self) -> Option<View> {
-        let Self { cav, capture_nanos, pose, content, .. } = self;
-        Some(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content: content.clone()? })
+        let Self {
+            cav,
+            capture_nanos,
+            pose,
+            content,
+            ..
+        } = self;
+        Some(View {
+            cav: cav.clone(),
+            pose: *pose,
+            capture_nanos: *capture_nanos,
+            content: content.clone()?,
+        })
     }
 
     /// As received by the ego; absent where nothing was sent.
     pub(super) fn into_view(self) -> Option<ego_fuser::ego::View> {
-        let Self { cav, capture_nanos, pose, content, .. } = self;
-        Some(ego_fuser::ego::View { cav, pose, capture_nanos, content: content? })
+        let Self {
+            cav,
+            capture_nanos,
+            pose,
+            content,
+            ..
+        } = self;
+        Some(ego_fuser::ego::View {
+            cav,
+            pose,
+            capture_nanos,
+            content: content?,
+        })
     }
 
     /// As captured by a vehicle that replays it.
@@ -112,18 +137,32 @@ pub(super) fn view(
             return Ok(Sent { rate, ..sent });
         }
     };
-    Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
+    Ok(sent(
+        Some(content),
+        bytes - HEADER_LEN as u64,
+        bytes + pose_bytes,
+    ))
 }
 
 /// Encodes and decodes a message; returns its size on the wire too.
 fn through_the_wire<M: Payload>(stamp: &Stamp, message: M) -> Result<(M, u64), WireError> {
     let encoded = wire::encode(stamp, message)?;
-    let bytes = encoded.pieces().iter().map(|piece| piece.len() as u64).sum();
+    let bytes = encoded
+        .pieces()
+        .iter()
+        .map(|piece| piece.len() as u64)
+        .sum();
     let (_, message): (Header, M) = wire::decode(encoded.pieces(), &Limits::default())?;
     Ok((message, bytes))
 }
 
 /// Sender and capture time of a sweep's messages, stamped at the capture time.
 pub(super) fn stamp(cav: &CavId, capture_nanos: u64) -> Stamp {
-    Stamp { cav: cav.clone(), epoch: 0, sequence: 0, capture_nanos, publish_nanos: capture_nanos }
+    Stamp {
+        cav: cav.clone(),
+        epoch: 0,
+        sequence: 0,
+        capture_nanos,
+        publish_nanos: capture_nanos,
+    }
 }

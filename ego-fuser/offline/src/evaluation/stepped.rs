@@ -19,7 +19,9 @@ use dataset::ground_truth;
 use dataset::{LoadOptions, Scenario};
 use link::{LinkConfig, LinkEmulator};
 use localization::pose_source::PoseSourceConfig;
-use protocol::{CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
+use protocol::{
+    CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
+};
 use support::random::derive_seed;
 
 pub use compute::ComputeTimes;
@@ -92,7 +94,9 @@ pub(super) fn run(
     let mut run = Run::open(evaluator, config, scenario)?;
     let mut flow = ControlFlow::Continue(());
     for tick in run.next..run.end {
-        let Some(frame) = run.decide(tick)? else { continue };
+        let Some(frame) = run.decide(tick)? else {
+            continue;
+        };
         flow = on_frame(frame);
         if flow.is_break() {
             break;
@@ -160,23 +164,46 @@ impl<'a> Run<'a> {
         for &place in &places {
             let cav = &scenario.agents[place];
             if evaluator.remote.is_some() {
-                crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Elsewhere });
+                crew.push(Member {
+                    place,
+                    cav: cav.clone(),
+                    pipeline: Pipeline::Elsewhere,
+                });
                 continue;
             }
             let own = config.vehicles.get(cav);
             let codec = own.map_or(evaluator.config.codec, |own| own.codec);
             let gate = codec.gate.or(evaluator.ego.method().gate());
-            let codec = if crew.is_empty() { of_the_ego(codec) } else { CodecConfig { gate, ..codec } };
+            let codec = if crew.is_empty() {
+                of_the_ego(codec)
+            } else {
+                CodecConfig { gate, ..codec }
+            };
             let participant = evaluator.participant(scenario, cav, crew.is_empty(), own)?;
-            crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(participant), codec) });
+            crew.push(Member {
+                place,
+                cav: cav.clone(),
+                pipeline: Pipeline::Here(Box::new(participant), codec),
+            });
         }
-        let is_witness = |place: &usize| matches!(config.crew, AgentPool::First(_)) && !places.contains(place);
+        let is_witness =
+            |place: &usize| matches!(config.crew, AgentPool::First(_)) && !places.contains(place);
         let observers = (0..scenario.agents.len()).filter(is_witness).collect();
-        let ticks = config.ticks.start.min(scenario.ticks.len())..config.ticks.end.min(scenario.ticks.len());
-        let began_nanos = scenario.ticks.get(ticks.start).map_or(0, |tick| tick.capture_nanos);
+        let ticks = config.ticks.start.min(scenario.ticks.len())
+            ..config.ticks.end.min(scenario.ticks.len());
+        let began_nanos = scenario
+            .ticks
+            .get(ticks.start)
+            .map_or(0, |tick| tick.capture_nanos);
         let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
-        let link = LinkEmulator::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &seed_words))?;
-        let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
+        let link = LinkEmulator::new(
+            config.link.clone(),
+            &config.link_folder,
+            derive_seed(config.seed, &seed_words),
+        )?;
+        let ego = crew
+            .first()
+            .map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
         Ok(Self {
             delivery: DelayedDelivery::new(link, &ego, began_nanos),
             evaluator,
@@ -202,12 +229,20 @@ impl<'a> Run<'a> {
         let places: Vec<usize> = self.crew.iter().map(|member| member.place).collect();
         let ego_place = places.first().copied();
         // Without an exchange, neighbours have nothing to encode; their poses are still needed.
-        let is_needed = |place: usize| Some(place) == ego_place || method.exchange() != Exchange::Nothing;
+        let is_needed =
+            |place: usize| Some(place) == ego_place || method.exchange() != Exchange::Nothing;
         let is_here = self.evaluator.remote.is_none();
         let with_maps = |place| is_here && is_needed(place);
-        let sweeps = self.evaluator.sweeps(self.scenario, tick, &places, &load, with_maps)?;
+        let sweeps = self
+            .evaluator
+            .sweeps(self.scenario, tick, &places, &load, with_maps)?;
         if sweeps.first().map(|ego| ego.place) != ego_place {
-            self.computed.push_back(Computed { own: None, senders: vec![], frames: vec![], poses: vec![] });
+            self.computed.push_back(Computed {
+                own: None,
+                senders: vec![],
+                frames: vec![],
+                poses: vec![],
+            });
             return Ok(());
         }
         let all = self.perceive(&sweeps)?;
@@ -220,14 +255,30 @@ impl<'a> Run<'a> {
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 senders.push(sent.cav.clone());
                 let distance_m = distance_m(&frames[0], &frames[place]);
-                enqueue(&mut self.delivery, &self.config.compute, tick, sent, distance_m);
+                enqueue(
+                    &mut self.delivery,
+                    &self.config.compute,
+                    tick,
+                    sent,
+                    distance_m,
+                );
             }
         }
-        let blind = LoadOptions { points: false, ..load };
-        let observers = self.scenario.load_tick(tick, self.observers.iter().copied(), &blind);
+        let blind = LoadOptions {
+            points: false,
+            ..load
+        };
+        let observers = self
+            .scenario
+            .load_tick(tick, self.observers.iter().copied(), &blind);
         self.evaluator.left_out.add_tick(&observers);
         frames.extend(observers.frames.into_iter().map(|(_, frame)| frame));
-        self.computed.push_back(Computed { own, senders, frames, poses });
+        self.computed.push_back(Computed {
+            own,
+            senders,
+            frames,
+            poses,
+        });
         Ok(())
     }
 
@@ -242,7 +293,9 @@ impl<'a> Run<'a> {
         for Sweep { place, frame, map } in sweeps {
             let is_needed = all.is_empty() || method.exchange() != Exchange::Nothing;
             let exchange = is_needed.then(|| method.own_content());
-            let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else { continue };
+            let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else {
+                continue;
+            };
             if let Pipeline::Here(participant, codec) = &mut member.pipeline {
                 participant.capture(all.last());
                 all.push(view(participant, frame, map.as_ref(), exchange, codec)?);
@@ -252,9 +305,17 @@ impl<'a> Run<'a> {
     }
 
     fn load_options(&self) -> LoadOptions {
-        let own = self.config.vehicles.values().any(|own| own.pose_source.looks_at_sweeps());
+        let own = self
+            .config
+            .vehicles
+            .values()
+            .any(|own| own.pose_source.looks_at_sweeps());
         let points = own || self.evaluator.remote.is_some() || self.evaluator.needs_points();
-        LoadOptions { points, lidar_variant: self.config.lidar_variant.clone(), ..LoadOptions::default() }
+        LoadOptions {
+            points,
+            lidar_variant: self.config.lidar_variant.clone(),
+            ..LoadOptions::default()
+        }
     }
 
     /// Fuses a tick; `None` where the ego's sweep cannot be read.
@@ -262,31 +323,63 @@ impl<'a> Run<'a> {
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
         let compute = self.config.compute;
         let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
-        let closes_nanos = capture_nanos.saturating_add(self.config.deadline_nanos).max(ready_nanos);
+        let closes_nanos = capture_nanos
+            .saturating_add(self.config.deadline_nanos)
+            .max(ready_nanos);
         while self.next < self.end && self.scenario.ticks[self.next].capture_nanos <= closes_nanos {
             self.compute()?;
         }
         for arrived in self.delivery.until(closes_nanos) {
             self.take_in(arrived);
         }
-        let computed = self.computed.pop_front().expect("a tick closes after it began");
-        let Computed { own: Some(own), senders, frames, poses } = computed else { return Ok(None) };
-        let decided_nanos = self.complete_nanos(capture_nanos, &senders).unwrap_or(closes_nanos).max(ready_nanos);
-        let done_nanos = decided_nanos.max(self.ego_free_nanos).saturating_add(compute.fuse_nanos());
+        let computed = self
+            .computed
+            .pop_front()
+            .expect("a tick closes after it began");
+        let Computed {
+            own: Some(own),
+            senders,
+            frames,
+            poses,
+        } = computed
+        else {
+            return Ok(None);
+        };
+        let decided_nanos = self
+            .complete_nanos(capture_nanos, &senders)
+            .unwrap_or(closes_nanos)
+            .max(ready_nanos);
+        let done_nanos = decided_nanos
+            .max(self.ego_free_nanos)
+            .saturating_add(compute.fuse_nanos());
         self.ego_free_nanos = done_nanos;
         let mut result = self.fuse(tick, &own, &senders)?;
         // Measured times would differ in every run.
-        let stage = |name: &str, nanos| StageTiming { stage: name.into(), nanos };
+        let stage = |name: &str, nanos| StageTiming {
+            stage: name.into(),
+            nanos,
+        };
         result.stages = vec![
             stage("pose", compute.pose_nanos()),
             stage("map", compute.map_nanos()),
             stage("wait", decided_nanos - ready_nanos),
             stage("fuse", done_nanos - decided_nanos),
         ];
-        let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
+        let objects =
+            ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
         let objects = objects.into_iter().map(|(_, object)| object).collect();
-        let stamp = protocol::Stamp { publish_nanos: done_nanos, ..stamp(&own.cav, capture_nanos) };
-        Ok(Some(EvaluatedFrame { tick, stamp, result, frames, poses, objects }))
+        let stamp = protocol::Stamp {
+            publish_nanos: done_nanos,
+            ..stamp(&own.cav, capture_nanos)
+        };
+        Ok(Some(EvaluatedFrame {
+            tick,
+            stamp,
+            result,
+            frames,
+            poses,
+            objects,
+        }))
     }
 
     /// Queues an arrived message for its tick.
@@ -308,19 +401,37 @@ impl<'a> Run<'a> {
         if self.evaluator.ego.method().exchange() == Exchange::Nothing {
             return Some(capture_nanos);
         }
-        let of_tick = |(time, _): &&(u64, u64)| time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos;
+        let of_tick = |(time, _): &&(u64, u64)| {
+            time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos
+        };
         let mut complete_nanos = capture_nanos;
         for cav in senders {
             let arrivals = self.arrivals.get(cav)?;
-            complete_nanos = complete_nanos.max(arrivals.iter().filter(of_tick).map(|(_, nanos)| *nanos).min()?);
+            complete_nanos = complete_nanos.max(
+                arrivals
+                    .iter()
+                    .filter(of_tick)
+                    .map(|(_, nanos)| *nanos)
+                    .min()?,
+            );
         }
         Some(complete_nanos)
     }
 
-    fn fuse(&mut self, tick: usize, own: &View, senders: &[CavId]) -> Result<protocol::Detections, EvaluateError> {
+    fn fuse(
+        &mut self,
+        tick: usize,
+        own: &View,
+        senders: &[CavId],
+    ) -> Result<protocol::Detections, EvaluateError> {
         let (paired, dropped) = self.pairing.pair(own.capture_nanos);
         let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
-        for Paired { is_first_use, message, .. } in paired {
+        for Paired {
+            is_first_use,
+            message,
+            ..
+        } in paired
+        {
             // A copy, as the message may serve the next tick too.
             views.push(message.view.clone());
             bytes.push((message.payload_bytes, message.wire_bytes));
@@ -330,18 +441,34 @@ impl<'a> Run<'a> {
         for lost in &dropped {
             self.delivery.dropped(&lost.cav, lost.reason);
         }
-        for (index, view) in views.iter().enumerate().filter(|(index, _)| first_uses[*index]) {
+        for (index, view) in views
+            .iter()
+            .enumerate()
+            .filter(|(index, _)| first_uses[*index])
+        {
             let left_out = output.skipped.iter().find(|(skipped, _)| *skipped == index);
             match left_out {
                 Some((_, Skipped::Unusable(reason))) => self.delivery.dropped(&view.cav, *reason),
                 Some((_, Skipped::NotNeeded)) | None => self.delivery.received(&view.cav),
             }
         }
-        let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
+        let mut result =
+            self.evaluator
+                .report(tick - self.config.ticks.start, own, &views, &bytes, output);
         if self.evaluator.ego.method().exchange() != Exchange::Nothing {
-            for cav in senders.iter().filter(|cav| views.iter().all(|view| view.cav != **cav)) {
-                let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);
-                result.skipped.push(SkippedNeighbour { cav: cav.clone(), reason });
+            for cav in senders
+                .iter()
+                .filter(|cav| views.iter().all(|view| view.cav != **cav))
+            {
+                let reason = dropped
+                    .iter()
+                    .rev()
+                    .find(|lost| lost.cav == *cav)
+                    .map(|lost| lost.reason);
+                result.skipped.push(SkippedNeighbour {
+                    cav: cav.clone(),
+                    reason,
+                });
             }
         }
         Ok(result)
@@ -360,7 +487,13 @@ impl<'a> Run<'a> {
 }
 
 /// Hands over a neighbour's messages for a tick: its pose as soon as it is known, the rest when it is computed.
-fn enqueue(delivery: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
+fn enqueue(
+    delivery: &mut DelayedDelivery,
+    compute: &ComputeTimes,
+    tick: usize,
+    sent: Sent,
+    distance_m: f64,
+) {
     let sequence = tick as u64;
     let pose_nanos = sent.capture_nanos.saturating_add(compute.pose_nanos());
     let (cav, pose_bytes) = (sent.cav.clone(), sent.pose_bytes);
@@ -376,8 +509,19 @@ fn enqueue(delivery: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, 
         delivery.adapted(&cav, stream, reason);
     }
     if let Some(view) = sent.into_view() {
-        let envelope = Envelope { view, payload_bytes, wire_bytes };
-        delivery.enqueue(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, envelope);
+        let envelope = Envelope {
+            view,
+            payload_bytes,
+            wire_bytes,
+        };
+        delivery.enqueue(
+            stream,
+            sequence,
+            wire_bytes - pose_bytes,
+            sent_nanos,
+            distance_m,
+            envelope,
+        );
     }
 }
 
@@ -385,9 +529,10 @@ fn enqueue(delivery: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, 
 fn places(scenario: &Scenario, crew: &AgentPool) -> Vec<usize> {
     match crew {
         AgentPool::First(count) => (0..scenario.agents.len()).take(*count).collect(),
-        AgentPool::Named(names) => {
-            names.iter().filter_map(|name| scenario.agents.iter().position(|agent| agent == name)).collect()
-        }
+        AgentPool::Named(names) => names
+            .iter()
+            .filter_map(|name| scenario.agents.iter().position(|agent| agent == name))
+            .collect(),
     }
 }
 

@@ -35,7 +35,9 @@ impl Evaluator {
         for (place, frame) in loaded.frames {
             match self.map_of(scenario, place, tick, with_maps(place)) {
                 Ok(map) => sweeps.push(Sweep { place, frame, map }),
-                Err(FeatureStoreError::Read(error)) => self.left_out.add_unreadable(place, Problem::from(&error)),
+                Err(FeatureStoreError::Read(error)) => {
+                    self.left_out.add_unreadable(place, Problem::from(&error))
+                }
                 Err(other) => return Err(Box::new(other).into()),
             }
         }
@@ -61,8 +63,12 @@ impl Evaluator {
         tick: usize,
         is_needed: bool,
     ) -> Result<Option<Tensor>, FeatureStoreError> {
-        let Some(maps) = self.maps.as_mut().filter(|_| is_needed) else { return Ok(None) };
-        let Some(index) = maps.index_of(&scenario.name) else { return Ok(None) };
+        let Some(maps) = self.maps.as_mut().filter(|_| is_needed) else {
+            return Ok(None);
+        };
+        let Some(index) = maps.index_of(&scenario.name) else {
+            return Ok(None);
+        };
         maps.map(index, scenario, agent, tick).map(Some)
     }
 }

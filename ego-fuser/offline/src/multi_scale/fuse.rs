@@ -24,9 +24,15 @@ impl Placement {
     /// # Errors
     /// [`TchError`] when there is no pose.
     pub(crate) fn of_poses(ego_from_cav: &[Pose], grid: &BevGrid) -> Result<Self, TchError> {
-        let entries: Vec<f32> = ego_from_cav.iter().flat_map(|pose| cav_from_ego_normalized(pose, grid)).collect();
+        let entries: Vec<f32> = ego_from_cav
+            .iter()
+            .flat_map(|pose| cav_from_ego_normalized(pose, grid))
+            .collect();
         let agents = ego_from_cav.len() as i64;
-        Ok(Self { agents, theta: Some(Tensor::f_from_slice(&entries)?.f_view([agents, 2, 3])?) })
+        Ok(Self {
+            agents,
+            theta: Some(Tensor::f_from_slice(&entries)?.f_view([agents, 2, 3])?),
+        })
     }
 }
 
@@ -46,7 +52,11 @@ pub struct Levels<'a> {
 ///
 /// # Errors
 /// [`TchError`] when the samples do not add up to the canvases.
-pub fn fuse_levels(backbone: &BevBackbone, canvas: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> {
+pub fn fuse_levels(
+    backbone: &BevBackbone,
+    canvas: &Tensor,
+    levels: &Levels<'_>,
+) -> Result<Tensor, TchError> {
     let mut maps = canvas.shallow_clone();
     let mut fused = Vec::with_capacity(backbone.levels());
     for level in 0..backbone.levels() {
@@ -71,16 +81,20 @@ pub(super) fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>
 
 fn fuse_samples(maps: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> {
     let counts: Vec<i64> = levels.samples.iter().map(|sample| sample.agents).collect();
-    let fused = maps.f_split_with_sizes(&counts, 0)?.into_iter().zip(levels.samples).map(|(maps, sample)| {
-        let maps = match &sample.theta {
-            Some(theta) => coalign::warp_affine(&maps, theta)?,
-            None => maps,
-        };
-        match levels.aggregation {
-            Aggregation::Attention => attend_ego(&maps, None),
-            Aggregation::Max => maps.f_amax([0i64].as_slice(), false),
-        }
-    });
+    let fused = maps
+        .f_split_with_sizes(&counts, 0)?
+        .into_iter()
+        .zip(levels.samples)
+        .map(|(maps, sample)| {
+            let maps = match &sample.theta {
+                Some(theta) => coalign::warp_affine(&maps, theta)?,
+                None => maps,
+            };
+            match levels.aggregation {
+                Aggregation::Attention => attend_ego(&maps, None),
+                Aggregation::Max => maps.f_amax([0i64].as_slice(), false),
+            }
+        });
     Tensor::f_stack(&fused.collect::<Result<Vec<_>, _>>()?, 0)
 }
 
@@ -95,23 +109,63 @@ mod tests {
     #[test]
     fn ego_only_it_is_the_backbone_and_wrong_counts_are_rejected() {
         tch::set_num_threads(1);
-        let config = DetectorConfig { lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0], ..DetectorConfig::lean() };
+        let config = DetectorConfig {
+            lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0],
+            ..DetectorConfig::lean()
+        };
         let variables = VarStore::new(Device::Cpu);
         let backbone = BevBackbone::new(&variables.root(), &config);
-        let canvas = Tensor::randn([2, config.pillar_channels, 32, 32], (Kind::Float, Device::Cpu));
+        let canvas = Tensor::randn(
+            [2, config.pillar_channels, 32, 32],
+            (Kind::Float, Device::Cpu),
+        );
         let fused = |samples: &[Placement], aggregation| {
-            no_grad(|| fuse_levels(&backbone, &canvas, &Levels { samples, aggregation, sent: None }))
+            no_grad(|| {
+                fuse_levels(
+                    &backbone,
+                    &canvas,
+                    &Levels {
+                        samples,
+                        aggregation,
+                        sent: None,
+                    },
+                )
+            })
         };
         let expected = no_grad(|| backbone.forward(&canvas, false));
         let grid = config.feature_grid();
         let alone = || Placement::of_poses(&[Pose::IDENTITY], &grid).unwrap();
         for aggregation in [Aggregation::Attention, Aggregation::Max] {
             let alone = fused(&[alone(), alone()], aggregation).unwrap();
-            assert!(alone.allclose(&expected, 1e-4, 1e-4, false), "{aggregation:?}");
-            let together = fused(&[Placement { agents: 2, theta: None }], aggregation).unwrap();
+            assert!(
+                alone.allclose(&expected, 1e-4, 1e-4, false),
+                "{aggregation:?}"
+            );
+            let together = fused(
+                &[Placement {
+                    agents: 2,
+                    theta: None,
+                }],
+                aggregation,
+            )
+            .unwrap();
             assert_eq!(together.size()[0], 1);
-            assert!(!together.get(0).allclose(&expected.get(0), 1e-3, 1e-3, false), "{aggregation:?}");
+            assert!(
+                !together
+                    .get(0)
+                    .allclose(&expected.get(0), 1e-3, 1e-3, false),
+                "{aggregation:?}"
+            );
         }
-        assert!(fused(&[Placement { agents: 3, theta: None }], Aggregation::Max).is_err());
+        assert!(
+            fused(
+                &[Placement {
+                    agents: 3,
+                    theta: None
+                }],
+                Aggregation::Max
+            )
+            .is_err()
+        );
     }
 }

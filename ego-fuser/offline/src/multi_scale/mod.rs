@@ -12,5 +12,7 @@ mod network;
 mod offline;
 
 pub use fuse::{Levels, Placement, fuse_levels};
-pub use network::{MULTI_SCALE_KIND, MultiScaleConfig, MultiScaleNetwork, MultiScaleOutput, Senders};
+pub use network::{
+    MULTI_SCALE_KIND, MultiScaleConfig, MultiScaleNetwork, MultiScaleOutput, Senders,
+};
 pub use offline::OfflineDetector;

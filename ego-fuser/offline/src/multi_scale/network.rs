@@ -76,17 +76,33 @@ impl MultiScaleNetwork {
     ///
     /// # Errors
     /// [`ConfigError`] when none can be built.
-    pub fn new(detector: &DetectorConfig, config: &MultiScaleConfig, device: Device) -> Result<Self, ConfigError> {
+    pub fn new(
+        detector: &DetectorConfig,
+        config: &MultiScaleConfig,
+        device: Device,
+    ) -> Result<Self, ConfigError> {
         if detector.compress_ratio.is_some() {
             let (field, value) = ("compress_ratio", format!("{:?}", detector.compress_ratio));
-            return Err(ConfigError::Value { field, value, must: "absent where levels are fused" });
+            return Err(ConfigError::Value {
+                field,
+                value,
+                must: "absent where levels are fused",
+            });
         }
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), detector)?;
         let path = variables.root() / "fusion_net" / "naive_communication";
-        let communication =
-            config.communication.as_ref().map(|config| Communication::new(&path, config)).transpose()?;
-        Ok(Self { variables, config: config.clone(), network, communication })
+        let communication = config
+            .communication
+            .as_ref()
+            .map(|config| Communication::new(&path, config))
+            .transpose()?;
+        Ok(Self {
+            variables,
+            config: config.clone(),
+            network,
+            communication,
+        })
     }
 
     /// Reads a weights file whose metadata hold the configurations of detector (`config`) and fusion (`fusion`).
@@ -96,7 +112,11 @@ impl MultiScaleNetwork {
     pub fn load(path: &Path, device: Device) -> Result<Self, ModelError> {
         let weights = Weights::load(path)?;
         weights.check_kind(MULTI_SCALE_KIND)?;
-        let model = Self::new(&weights.config()?, &weights.metadata_json(FUSION_KEY)?, device)?;
+        let model = Self::new(
+            &weights.config()?,
+            &weights.metadata_json(FUSION_KEY)?,
+            device,
+        )?;
         weights.copy_into(&model.variables)?;
         Ok(model)
     }
@@ -117,9 +137,16 @@ impl MultiScaleNetwork {
     ///
     /// # Errors
     /// [`TchError`] when the samples do not add up to the sweeps.
-    pub fn forward(&self, pillars: &PillarBatch, samples: &[Placement]) -> Result<MultiScaleOutput, TchError> {
+    pub fn forward(
+        &self,
+        pillars: &PillarBatch,
+        samples: &[Placement],
+    ) -> Result<MultiScaleOutput, TchError> {
         let network = &self.network;
-        let canvas = pillars.scatter(&network.encoder.forward(pillars, false), network.pillar_grid());
+        let canvas = pillars.scatter(
+            &network.encoder.forward(pillars, false),
+            network.pillar_grid(),
+        );
         let (sent, rate) = match &self.communication {
             Some(communication) => {
                 let alone = network.heads(&network.features_of_canvas(&canvas, false))?;
@@ -130,35 +157,63 @@ impl MultiScaleNetwork {
             None => (None, 1.0),
         };
         let sent_bytes = self.sent_bytes(sent.as_ref(), samples)?;
-        let levels = Levels { samples, aggregation: self.config.aggregation, sent: sent.as_ref() };
+        let levels = Levels {
+            samples,
+            aggregation: self.config.aggregation,
+            sent: sent.as_ref(),
+        };
         let fused = fuse_levels(&network.backbone, &canvas, &levels)?;
         let fused = match &network.shrink {
             Some(shrink) => shrink.forward(&fused, false),
             None => fused,
         };
-        Ok(MultiScaleOutput { heads: network.heads(&fused)?, rate, sent_bytes })
+        Ok(MultiScaleOutput {
+            heads: network.heads(&fused)?,
+            rate,
+            sent_bytes,
+        })
     }
 
     /// Bytes of the first level's map of each agent.
-    fn sent_bytes(&self, sent: Option<&Tensor>, samples: &[Placement]) -> Result<Vec<u64>, TchError> {
+    fn sent_bytes(
+        &self,
+        sent: Option<&Tensor>,
+        samples: &[Placement],
+    ) -> Result<Vec<u64>, TchError> {
         let (pillar_grid, config) = (self.network.pillar_grid(), &self.network.config);
         let stride = config.layer_strides[0];
         let [height, width] = [pillar_grid.height, pillar_grid.width].map(|extent| extent as u64);
         let [height, width] = [height, width].map(|extent| extent.div_ceil(stride.unsigned_abs()));
         let (cells, cell_bytes) = (height * width, 4 * config.num_filters[0].unsigned_abs());
         let agents = samples.iter().map(|sample| sample.agents).sum::<i64>();
-        let Some(sent) = sent else { return Ok(vec![cells * cell_bytes; agents.unsigned_abs() as usize]) };
-        let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
-        let selected: Vec<i64> =
-            Vec::try_from(&selected.f_sum_dim_intlist([1i64, 2, 3].as_slice(), false, Kind::Int64)?)?;
-        let bytes = |selected: u64| {
-            if selected == cells { cells * cell_bytes } else { cells.div_ceil(8) + selected * cell_bytes }
+        let Some(sent) = sent else {
+            return Ok(vec![cells * cell_bytes; agents.unsigned_abs() as usize]);
         };
-        Ok(selected.into_iter().map(|selected| bytes(selected.unsigned_abs())).collect())
+        let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
+        let selected: Vec<i64> = Vec::try_from(&selected.f_sum_dim_intlist(
+            [1i64, 2, 3].as_slice(),
+            false,
+            Kind::Int64,
+        )?)?;
+        let bytes = |selected: u64| {
+            if selected == cells {
+                cells * cell_bytes
+            } else {
+                cells.div_ceil(8) + selected * cell_bytes
+            }
+        };
+        Ok(selected
+            .into_iter()
+            .map(|selected| bytes(selected.unsigned_abs()))
+            .collect())
     }
 
     /// The masks with ones everywhere for agents that send all cells.
-    fn without_the_exempt(&self, masks: &Tensor, samples: &[Placement]) -> Result<Tensor, TchError> {
+    fn without_the_exempt(
+        &self,
+        masks: &Tensor,
+        samples: &[Placement],
+    ) -> Result<Tensor, TchError> {
         let sends_all = samples.iter().flat_map(|sample| {
             (0..sample.agents).map(|agent| match self.config.senders {
                 Senders::Neighbours => agent == 0,
@@ -166,7 +221,9 @@ impl MultiScaleNetwork {
             })
         });
         let sends_all: Vec<f32> = sends_all.map(|all| if all { 1.0 } else { 0.0 }).collect();
-        let sends_all = Tensor::f_from_slice(&sends_all)?.f_view([-1, 1, 1, 1])?.f_to_device(masks.device())?;
+        let sends_all = Tensor::f_from_slice(&sends_all)?
+            .f_view([-1, 1, 1, 1])?
+            .f_to_device(masks.device())?;
         masks.f_maximum(&sends_all)
     }
 }
@@ -175,6 +232,9 @@ impl MultiScaleNetwork {
 fn mean_rate(masks: &Tensor, samples: &[Placement]) -> Result<f64, TchError> {
     let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
     let shares = masks.f_split_with_sizes(&counts, 0)?;
-    let sum: f64 = shares.iter().map(|sample| sample.mean(Kind::Double).double_value(&[])).sum();
+    let sum: f64 = shares
+        .iter()
+        .map(|sample| sample.mean(Kind::Double).double_value(&[]))
+        .sum();
     Ok(sum / samples.len().max(1) as f64)
 }

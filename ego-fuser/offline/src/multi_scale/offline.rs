@@ -66,7 +66,9 @@ impl OfflineDetector {
     /// # Errors
     /// [`ModelError`] when the tensor library reports an error.
     pub fn detect(&mut self, frames: &[Frame]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
-        let Some((ego, others)) = frames.split_first() else { return Ok((Vec::new(), Vec::new())) };
+        let Some((ego, others)) = frames.split_first() else {
+            return Ok((Vec::new(), Vec::new()));
+        };
         let placed = |frame: &Frame| {
             let pose = ego.world_from_lidar?.from_world(&frame.world_from_lidar?);
             let [x, y, _] = pose.translation_m;
@@ -86,7 +88,11 @@ impl OfflineDetector {
     /// The pillars of a vehicle's sweep, in the frame that its network encodes in.
     fn pillars(&mut self, cloud: &PointCloud, ego_from_cav: &Pose) -> Pillars {
         let cloud = self.crop.without_own_body(cloud);
-        let cloud = if self.network.config().one_frame { merge_points([&cloud], &[*ego_from_cav]) } else { cloud };
+        let cloud = if self.network.config().one_frame {
+            merge_points([&cloud], &[*ego_from_cav])
+        } else {
+            cloud
+        };
         let mut kept = Vec::new();
         self.crop.range_only().keep(&cloud.xyzi, &mut kept);
         if self.is_mirrored() {
@@ -99,28 +105,51 @@ impl OfflineDetector {
         self.network.network().config.y_axis == YAxis::Right
     }
 
-    fn boxes(&self, sweeps: &[Pillars], poses: &[Pose]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
+    fn boxes(
+        &self,
+        sweeps: &[Pillars],
+        poses: &[Pose],
+    ) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
         let network = self.network.network();
         let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.pillar_grid());
         let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
         let poses = if self.is_mirrored() { &mirrored } else { poses };
         let placement = if self.network.config().one_frame {
-            Placement { agents: poses.len() as i64, theta: None }
+            Placement {
+                agents: poses.len() as i64,
+                theta: None,
+            }
         } else {
             Placement::of_poses(poses, &network.config.feature_grid())?
         };
-        let MultiScaleOutput { heads, sent_bytes, .. } = no_grad(|| self.network.forward(&batch, &[placement]))?;
+        let MultiScaleOutput {
+            heads, sent_bytes, ..
+        } = no_grad(|| self.network.forward(&batch, &[placement]))?;
         let (scores, offsets) = (flat(&heads.scores, 0)?, flat(&heads.offsets, 0)?);
-        let mut boxes = decode(&scores, &offsets, &self.anchors, self.limits.score_threshold)?;
+        let mut boxes = decode(
+            &scores,
+            &offsets,
+            &self.anchors,
+            self.limits.score_threshold,
+        )?;
         if self.is_mirrored() {
             for found in &mut boxes {
                 found.box3d = found.box3d.mirrored_y();
             }
         }
-        let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
+        let own = AgentBoxes {
+            boxes: &boxes,
+            output_from_agent: Isometry3::identity(),
+        };
         let found = postprocess(&[own], &self.limits);
         // The ego's own map is not transmitted.
         let sent_bytes = sent_bytes.into_iter().skip(1).collect();
-        Ok((found.iter().map(|candidate| candidate.detection(None)).collect(), sent_bytes))
+        Ok((
+            found
+                .iter()
+                .map(|candidate| candidate.detection(None))
+                .collect(),
+            sent_bytes,
+        ))
     }
 }

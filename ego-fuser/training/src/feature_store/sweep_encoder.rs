@@ -9,7 +9,9 @@ use perception::detector::Detector;
 use perception::weights::Weights;
 use protocol::codec::encode_features;
 use protocol::message::Bev;
-use protocol::{BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, WireError, wire};
+use protocol::{
+    BevFeatures, CavId, CodecConfig, Dtype, NoPoseReason, PoseEstimate, Stamp, WireError, wire,
+};
 use tch::Device;
 
 use super::FeatureStoreError;
@@ -53,15 +55,20 @@ impl SweepEncoder {
     /// Those of the network and of the wire format.
     pub(super) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, FeatureStoreError> {
         let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
-        let Some(of) = self.scenarios.get(scenario) else { return Ok(Vec::new()) };
+        let Some(of) = self.scenarios.get(scenario) else {
+            return Ok(Vec::new());
+        };
         let within = sweep - self.first[scenario];
         let (agent, tick) = (within / of.ticks.len(), within % of.ticks.len());
-        let Ok(frame) = of.load(agent, tick, &LoadOptions::default()) else { return Ok(Vec::new()) };
+        let Ok(frame) = of.load(agent, tick, &LoadOptions::default()) else {
+            return Ok(Vec::new());
+        };
         let detector = match &mut self.detector {
             Some(detector) => detector,
             None => {
                 let config = self.weights.detector_config()?;
-                self.detector.insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
+                self.detector
+                    .insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };
         let map = detector.encode(&frame.points)?.features;
@@ -72,16 +79,35 @@ impl SweepEncoder {
 
 impl SweepEncoder {
     fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
-        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(ZSTD_LEVEL), ..CodecConfig::default() };
+        let codec = CodecConfig {
+            dtype: self.dtype,
+            zstd_level: Some(ZSTD_LEVEL),
+            ..CodecConfig::default()
+        };
         // Sender and time of a map follow from its index.
-        let invalid = |_| FeatureStoreError::Io { path: self.path.clone(), source: io::ErrorKind::InvalidInput.into() };
+        let invalid = |_| FeatureStoreError::Io {
+            path: self.path.clone(),
+            source: io::ErrorKind::InvalidInput.into(),
+        };
         let cav = CavId::new("0").map_err(invalid)?;
-        let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
-        let pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+        let stamp = Stamp {
+            cav,
+            epoch: 0,
+            sequence: 0,
+            capture_nanos: 0,
+            publish_nanos: 0,
+        };
+        let pose = PoseEstimate::NoPose {
+            reason: NoPoseReason::NoSource,
+            inlier_count: 0,
+        };
         let encode = || -> Result<_, WireError> {
             let features = encode_features(features, &codec, None)?;
             Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
         };
-        encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
+        encode().map_err(|source| FeatureStoreError::Wire {
+            path: self.path.clone(),
+            source,
+        })
     }
 }

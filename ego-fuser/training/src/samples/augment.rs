@@ -22,18 +22,30 @@ pub struct Augmentation {
 
 impl Augmentation {
     /// No changes.
-    pub(crate) const OFF: Self = Self { mirror: 0.0, turn_rad: 0.0, scale: 0.0 };
+    pub(crate) const OFF: Self = Self {
+        mirror: 0.0,
+        turn_rad: 0.0,
+        scale: 0.0,
+    };
 
     /// Draws the common changes of a scene.
     pub fn scene(&self, rng: &mut impl Rng) -> SceneAugment {
         let mirrored = rng.random_bool(self.mirror);
-        SceneAugment { mirrored, scale: 1.0 + self.scale * (2.0 * rng.random::<f64>() - 1.0), turn_rad: self.turn_rad }
+        SceneAugment {
+            mirrored,
+            scale: 1.0 + self.scale * (2.0 * rng.random::<f64>() - 1.0),
+            turn_rad: self.turn_rad,
+        }
     }
 }
 
 impl Default for Augmentation {
     fn default() -> Self {
-        Self { mirror: 0.5, turn_rad: PI / 4.0, scale: 0.05 }
+        Self {
+            mirror: 0.5,
+            turn_rad: PI / 4.0,
+            scale: 0.05,
+        }
     }
 }
 
@@ -68,7 +80,11 @@ impl ViewAugment {
     /// Changes points of that frame in place.
     pub fn points(&self, points: &mut [[f32; 4]]) {
         let (sin, cos) = self.turn_rad.sin_cos();
-        let (sin, cos, scale) = ((sin * self.scale) as f32, (cos * self.scale) as f32, self.scale as f32);
+        let (sin, cos, scale) = (
+            (sin * self.scale) as f32,
+            (cos * self.scale) as f32,
+            self.scale as f32,
+        );
         let side = if self.mirrored { -1.0f32 } else { 1.0 };
         for [x, y, z, _] in points {
             let (old_x, old_y) = (*x, *y * side);
@@ -94,14 +110,20 @@ impl ViewAugment {
     #[must_use]
     pub fn pose(&self, ego_from_cav: &Pose, cav: &Self) -> Pose {
         let isometry = ego_from_cav.isometry();
-        let translation = self.turn() * Vector3::from(self.mirror(ego_from_cav.translation_m)) * self.scale;
+        let translation =
+            self.turn() * Vector3::from(self.mirror(ego_from_cav.translation_m)) * self.scale;
         let mut rotation = *isometry.rotation.to_rotation_matrix().matrix();
         if self.mirrored {
             let side = Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, 1.0));
             rotation = side * rotation * side;
         }
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
-        Isometry3::from_parts(translation.into(), self.turn() * rotation * cav.turn().inverse()).into()
+        let rotation =
+            UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        Isometry3::from_parts(
+            translation.into(),
+            self.turn() * rotation * cav.turn().inverse(),
+        )
+        .into()
     }
 
     fn turn(&self) -> UnitQuaternion<f64> {
@@ -134,7 +156,8 @@ mod tests {
             cav.points(&mut points);
             let pose = ego.pose(&ego_from_cav, &cav);
             pose.validate().unwrap();
-            let through_cav = pose.isometry() * Point3::from([points[0][0], points[0][1], points[0][2]].map(f64::from));
+            let through_cav = pose.isometry()
+                * Point3::from([points[0][0], points[0][1], points[0][2]].map(f64::from));
             let mut points = [[in_ego.x as f32, in_ego.y as f32, in_ego.z as f32, 0.0]];
             ego.points(&mut points);
             let direct = Point3::from([points[0][0], points[0][1], points[0][2]].map(f64::from));
@@ -145,15 +168,25 @@ mod tests {
     #[test]
     fn the_corners_of_a_box_move_like_points() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let car = Box3d { center_m: [5.0, 7.0, -1.0], size_m: [4.0, 1.8, 1.5], heading_rad: 0.7 };
+        let car = Box3d {
+            center_m: [5.0, 7.0, -1.0],
+            size_m: [4.0, 1.8, 1.5],
+            heading_rad: 0.7,
+        };
         for _ in 0..20 {
             let view = Augmentation::default().scene(&mut rng).view(&mut rng);
-            let mut moved: Vec<[f32; 4]> =
-                car.corners().iter().map(|[x, y, z]| [*x as f32, *y as f32, *z as f32, 0.0]).collect();
+            let mut moved: Vec<[f32; 4]> = car
+                .corners()
+                .iter()
+                .map(|[x, y, z]| [*x as f32, *y as f32, *z as f32, 0.0])
+                .collect();
             view.points(&mut moved);
             for corner in view.box3d(&car).corners() {
                 let nearest = moved.iter().map(|point| {
-                    (0..3).map(|axis| (f64::from(point[axis]) - corner[axis]).powi(2)).sum::<f64>().sqrt()
+                    (0..3)
+                        .map(|axis| (f64::from(point[axis]) - corner[axis]).powi(2))
+                        .sum::<f64>()
+                        .sqrt()
                 });
                 assert!(nearest.fold(f64::INFINITY, f64::min) < 1e-4);
             }

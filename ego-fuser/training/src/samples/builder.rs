@@ -140,13 +140,24 @@ impl SampleBuilder {
     ) -> Self {
         let voxeliser = Voxeliser::for_detector(&detector);
         let crop = Crop::for_detector(&detector);
-        Self { scenes, config, detector, assigner, crop, voxeliser, maps: None }
+        Self {
+            scenes,
+            config,
+            detector,
+            assigner,
+            crop,
+            voxeliser,
+            maps: None,
+        }
     }
 
     /// The same with maps of a frozen encoder, in place of pillars.
     #[must_use]
     pub fn with_maps(self, maps: MapSource) -> Self {
-        Self { maps: Some(maps), ..self }
+        Self {
+            maps: Some(maps),
+            ..self
+        }
     }
 
     /// The scenes it draws from.
@@ -161,7 +172,9 @@ impl SampleBuilder {
     /// [`SampleError`] when a file is missing or malformed, or a vehicle has no pose.
     pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, SampleError> {
         let frames = self.scenes.annotations(tick);
-        let present: Vec<usize> = (0..frames.len()).filter(|&agent| frames[agent].is_some()).collect();
+        let present: Vec<usize> = (0..frames.len())
+            .filter(|&agent| frames[agent].is_some())
+            .collect();
         if present.is_empty() {
             return Err(SampleError::Empty(format!(
                 "no readable frame at tick {} of scenario {}",
@@ -172,7 +185,11 @@ impl SampleBuilder {
         let ego = present[rng.random_range(0..present.len())];
         let agents = self.choose_agents(tick, &frames, ego, rng)?;
         let single = self.config.kind == SampleKind::Single;
-        let annotators = if single && !self.config.merged_truth { &agents[..1] } else { &agents[..] };
+        let annotators = if single && !self.config.merged_truth {
+            &agents[..1]
+        } else {
+            &agents[..]
+        };
         let entries = self.entries(tick, if single { &agents[..1] } else { &agents[..] }, rng)?;
         let scene = self.config.augmentation.scene(rng);
         let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
@@ -183,39 +200,86 @@ impl SampleBuilder {
         let views = match &mut self.maps {
             Some(maps) => {
                 let scenario = self.scenes.scenario(tick);
-                let map = |entry: &Entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick);
+                let map =
+                    |entry: &Entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick);
                 let maps: Vec<Tensor> = entries.iter().map(map).collect::<Result<_, _>>()?;
                 SampleViews::Maps(Tensor::f_cat(&maps, 0)?)
             }
-            None => SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?),
+            None => {
+                SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?)
+            }
         };
-        Ok(Sample { views, facts, offsets, labels: self.assigner.assign(&objects), objects })
+        Ok(Sample {
+            views,
+            facts,
+            offsets,
+            labels: self.assigner.assign(&objects),
+            objects,
+        })
     }
 
     /// Views of a sample: the newest of every vehicle, the ego first, then older ones. Vehicles without a pose have no
     /// part; an ego without a pose is alone with its newest view.
-    fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<Entry>, SampleError> {
+    fn entries(
+        &self,
+        now: TickRef,
+        agents: &[usize],
+        rng: &mut impl Rng,
+    ) -> Result<Vec<Entry>, SampleError> {
         let ticks = &self.scenes.scenario(now).ticks;
         let gap = self.config.moments.draw_gap(rng);
         let error = self.config.poses.draw(rng)?;
         let (mut newest, mut older) = (Vec::new(), Vec::new());
         for (index, &agent) in agents.iter().enumerate() {
             let is_ego = index == 0;
-            let last = if is_ego { now.tick } else { self.config.moments.draw_newest(ticks, now.tick, rng) };
+            let last = if is_ego {
+                now.tick
+            } else {
+                self.config.moments.draw_newest(ticks, now.tick, rng)
+            };
             let place = newest.len();
-            for (step, tick) in self.config.moments.steps(ticks, now.tick, last, gap).into_iter().enumerate() {
-                let [found, pose] = self.pose_at(TickRef { tick, ..now }, agent, [index, agents.len()], &error)?;
-                let PoseEstimate::Pose { world_from_cav, confidence, .. } = pose else {
+            for (step, tick) in self
+                .config
+                .moments
+                .steps(ticks, now.tick, last, gap)
+                .into_iter()
+                .enumerate()
+            {
+                let [found, pose] = self.pose_at(
+                    TickRef { tick, ..now },
+                    agent,
+                    [index, agents.len()],
+                    &error,
+                )?;
+                let PoseEstimate::Pose {
+                    world_from_cav,
+                    confidence,
+                    ..
+                } = pose
+                else {
                     match step {
                         0 => break,
                         _ => continue,
                     }
                 };
-                let age_secs = (ticks[now.tick].capture_nanos - ticks[tick].capture_nanos) as f64 * 1e-9;
+                let age_secs =
+                    (ticks[now.tick].capture_nanos - ticks[tick].capture_nanos) as f64 * 1e-9;
                 let found = found.world_from_cav().copied().unwrap_or(world_from_cav);
                 let confidence = f64::from(confidence);
-                let entry = Entry { agent, place, tick, world_from_cav, found, confidence, age_secs };
-                if step == 0 { newest.push(entry) } else { older.push(entry) }
+                let entry = Entry {
+                    agent,
+                    place,
+                    tick,
+                    world_from_cav,
+                    found,
+                    confidence,
+                    age_secs,
+                };
+                if step == 0 {
+                    newest.push(entry)
+                } else {
+                    older.push(entry)
+                }
             }
             if is_ego && newest.is_empty() {
                 let world_from_cav = Pose::IDENTITY;
@@ -244,11 +308,20 @@ impl SampleBuilder {
     ) -> Result<[PoseEstimate; 2], SampleError> {
         let frames = self.scenes.annotations(tick);
         let Some(frame) = &frames[agent] else {
-            let absent = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+            let absent = PoseEstimate::NoPose {
+                reason: NoPoseReason::NoSource,
+                inlier_count: 0,
+            };
             return Ok([absent; 2]);
         };
-        let found = self.config.poses.found(&self.scenes.scenario(tick).name, frame)?;
-        Ok([found, error.added(found, &frame.cav, frame.capture_nanos, place)])
+        let found = self
+            .config
+            .poses
+            .found(&self.scenes.scenario(tick).name, frame)?;
+        Ok([
+            found,
+            error.added(found, &frame.cav, frame.capture_nanos, place),
+        ])
     }
 
     /// The pillars of all views; of one view where all points are merged.
@@ -261,7 +334,13 @@ impl SampleBuilder {
     ) -> Result<Vec<Pillars>, SampleError> {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
-            let points = self.scenes.points(TickRef { scenario, tick: entry.tick }, entry.agent)?;
+            let points = self.scenes.points(
+                TickRef {
+                    scenario,
+                    tick: entry.tick,
+                },
+                entry.agent,
+            )?;
             // Hits on the vehicle that carries the LiDAR are removed before any rotation.
             let mut points = self.crop.without_own_body(&points);
             change.points(&mut points.xyzi);
@@ -272,7 +351,10 @@ impl SampleBuilder {
             clouds = vec![merge_points(&clouds, &poses)];
             facts.truncate(1);
         }
-        Ok(clouds.iter().map(|cloud| self.voxeliser.voxelise(&cloud.xyzi)).collect())
+        Ok(clouds
+            .iter()
+            .map(|cloud| self.voxeliser.voxelise(&cloud.xyzi))
+            .collect())
     }
 
     /// The ego, then the neighbours in range that are not dropped.
@@ -284,9 +366,15 @@ impl SampleBuilder {
         rng: &mut impl Rng,
     ) -> Result<Vec<usize>, SampleError> {
         let mut agents = vec![ego];
-        let Some(ego_frame) = &frames[ego] else { return Ok(agents) };
+        let Some(ego_frame) = &frames[ego] else {
+            return Ok(agents);
+        };
         let [ego_x, ego_y, _] = self.world_from_lidar(tick, ego_frame)?.translation_m;
-        for (agent, frame) in frames.iter().enumerate().filter_map(|(agent, frame)| Some((agent, frame.as_ref()?))) {
+        for (agent, frame) in frames
+            .iter()
+            .enumerate()
+            .filter_map(|(agent, frame)| Some((agent, frame.as_ref()?)))
+        {
             let [x, y, _] = self.world_from_lidar(tick, frame)?.translation_m;
             let in_reach = (x - ego_x).hypot(y - ego_y) <= self.config.comm_range_m;
             let dropped = rng.random_bool(self.config.drop_neighbour);
@@ -306,7 +394,12 @@ impl SampleBuilder {
     }
 
     /// Objects annotated by `annotators`, the ego first, in the changed ego frame, on the BEV grid.
-    fn objects(&self, frames: &[Option<Frame>], annotators: &[usize], ego_view: &ViewAugment) -> Vec<Box3d> {
+    fn objects(
+        &self,
+        frames: &[Option<Frame>],
+        annotators: &[usize],
+        ego_view: &ViewAugment,
+    ) -> Vec<Box3d> {
         let range = self.detector.lidar_range_m;
         let rule = GroundTruthRule {
             x_m: ANYWHERE_M,
@@ -316,22 +409,45 @@ impl SampleBuilder {
             min_corners: 8,
             classes: self.config.classes,
         };
-        let views: Vec<&Frame> = annotators.iter().filter_map(|&agent| frames[agent].as_ref()).collect();
-        let on_lattice =
-            |object: &Box3d| (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]));
+        let views: Vec<&Frame> = annotators
+            .iter()
+            .filter_map(|&agent| frames[agent].as_ref())
+            .collect();
+        let on_lattice = |object: &Box3d| {
+            (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]))
+        };
         let merged = ground_truth::merge(&views, 0, &rule);
-        merged.iter().map(|(_, object)| ego_view.box3d(object)).filter(on_lattice).collect()
+        merged
+            .iter()
+            .map(|(_, object)| ego_view.box3d(object))
+            .filter(on_lattice)
+            .collect()
     }
 }
 
 /// Metadata of the views, and their pose errors; both after the changes of the scene.
 fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<Offset>) {
-    let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| changes[0].pose(&ego.from_world(cav), change);
+    let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| {
+        changes[0].pose(&ego.from_world(cav), change)
+    };
     let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
-        let Entry { place: agent, confidence, age_secs, .. } = *entry;
+        let Entry {
+            place: agent,
+            confidence,
+            age_secs,
+            ..
+        } = *entry;
         let ego_from_cav = relative(&entries[0].world_from_cav, &entry.world_from_cav, change);
         let real = relative(&entries[0].found, &entry.found, change);
-        (MapMetadata { agent, ego_from_cav, confidence, age_secs }, Offset::between(&ego_from_cav, &real))
+        (
+            MapMetadata {
+                agent,
+                ego_from_cav,
+                confidence,
+                age_secs,
+            },
+            Offset::between(&ego_from_cav, &real),
+        )
     };
     entries.iter().zip(changes).map(of_entry).unzip()
 }

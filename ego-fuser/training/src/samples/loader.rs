@@ -42,7 +42,10 @@ impl Batch {
     ///
     /// # Errors
     /// [`SampleError::Torch`] when maps are of different shapes.
-    pub(crate) fn collate(samples: Vec<Sample>, pillar_grid: &PillarGrid) -> Result<Self, SampleError> {
+    pub(crate) fn collate(
+        samples: Vec<Sample>,
+        pillar_grid: &PillarGrid,
+    ) -> Result<Self, SampleError> {
         let (mut pillars, mut maps) = (Vec::new(), Vec::new());
         for sample in &samples {
             match &sample.views {
@@ -55,7 +58,12 @@ impl Batch {
         } else {
             BatchViews::Maps(Tensor::f_cat(&maps, 0)?)
         };
-        let mut batch = Self { views, facts: Vec::new(), offsets: Vec::new(), labels: Vec::new() };
+        let mut batch = Self {
+            views,
+            facts: Vec::new(),
+            offsets: Vec::new(),
+            labels: Vec::new(),
+        };
         for sample in samples {
             batch.facts.push(sample.facts);
             batch.offsets.push(sample.offsets);
@@ -68,12 +76,22 @@ impl Batch {
     ///
     /// # Errors
     /// [`ModelError`] when the numbers of facts and views differ.
-    pub fn output(&self, model: &CooperativeModel, train: bool) -> Result<CooperativeOutput, ModelError> {
+    pub fn output(
+        &self,
+        model: &CooperativeModel,
+        train: bool,
+    ) -> Result<CooperativeOutput, ModelError> {
         match &self.views {
-            BatchViews::Pillars(pillars) => model.forward(&pillars.to_device(model.device()), &self.facts, train),
+            BatchViews::Pillars(pillars) => {
+                model.forward(&pillars.to_device(model.device()), &self.facts, train)
+            }
             BatchViews::Maps(maps) => {
                 let maps = maps.f_to_device(model.device())?;
-                model.fuse_and_detect(&model.network().through_compressor(&maps, train), &self.facts, train)
+                model.fuse_and_detect(
+                    &model.network().through_compressor(&maps, train),
+                    &self.facts,
+                    train,
+                )
             }
         }
     }
@@ -97,7 +115,8 @@ pub fn batches(
             rng.set_stream(index + 1);
             builder.build(order.tick(index), &mut rng)
         };
-        let samples: Result<Vec<Sample>, _> = (number * size..(number + 1) * size).map(sample).collect();
+        let samples: Result<Vec<Sample>, _> =
+            (number * size..(number + 1) * size).map(sample).collect();
         Batch::collate(samples?, &pillar_grid)
     })
 }
@@ -113,7 +132,12 @@ struct Order {
 
 impl Order {
     fn new(ticks: Vec<TickRef>, seed: u64) -> Self {
-        Self { ticks, shuffled: Vec::new(), epoch: None, seed }
+        Self {
+            ticks,
+            shuffled: Vec::new(),
+            epoch: None,
+            seed,
+        }
     }
 
     fn tick(&mut self, index: u64) -> TickRef {
@@ -121,7 +145,10 @@ impl Order {
         let epoch = index / count;
         if self.epoch != Some(epoch) {
             self.shuffled.clone_from(&self.ticks);
-            let mut rng = ChaCha8Rng::seed_from_u64(self.seed.wrapping_add(epoch.wrapping_mul(0x9E37_79B9_7F4A_7C15)));
+            let mut rng = ChaCha8Rng::seed_from_u64(
+                self.seed
+                    .wrapping_add(epoch.wrapping_mul(0x9E37_79B9_7F4A_7C15)),
+            );
             self.shuffled.shuffle(&mut rng);
             self.epoch = Some(epoch);
         }

@@ -20,7 +20,11 @@ pub struct Moments {
 impl Default for Moments {
     /// The current tick only.
     fn default() -> Self {
-        Self { frames: 1, gap: 1, max_delay_nanos: 0 }
+        Self {
+            frames: 1,
+            gap: 1,
+            max_delay_nanos: 0,
+        }
     }
 }
 
@@ -32,15 +36,25 @@ impl Moments {
 
     /// Draws the newest tick that has arrived from a neighbour when the ego is at tick `now`.
     pub(super) fn draw_newest(&self, ticks: &[Tick], now: usize, rng: &mut impl Rng) -> usize {
-        let is_young = |tick: &&Tick| ticks[now].capture_nanos - tick.capture_nanos <= self.max_delay_nanos;
+        let is_young =
+            |tick: &&Tick| ticks[now].capture_nanos - tick.capture_nanos <= self.max_delay_nanos;
         let arrived = ticks[..=now].iter().rev().take_while(is_young).count();
         now - rng.random_range(0..arrived.max(1))
     }
 
     /// The ticks of a vehicle whose newest is `newest`, that first, when the ego is at tick `now`.
-    pub(super) fn steps(&self, ticks: &[Tick], now: usize, newest: usize, gap: usize) -> Vec<usize> {
-        let is_young = |tick: &usize| ticks[now].capture_nanos - ticks[*tick].capture_nanos <= MAX_AGE_NANOS;
-        let earlier = (1..self.frames.max(1)).map_while(|step| newest.checked_sub(step * gap)).take_while(is_young);
+    pub(super) fn steps(
+        &self,
+        ticks: &[Tick],
+        now: usize,
+        newest: usize,
+        gap: usize,
+    ) -> Vec<usize> {
+        let is_young =
+            |tick: &usize| ticks[now].capture_nanos - ticks[*tick].capture_nanos <= MAX_AGE_NANOS;
+        let earlier = (1..self.frames.max(1))
+            .map_while(|step| newest.checked_sub(step * gap))
+            .take_while(is_young);
         std::iter::once(newest).chain(earlier).collect()
     }
 }
@@ -53,16 +67,29 @@ mod tests {
     use super::*;
 
     fn ticks(count: u64, period_nanos: u64) -> Vec<Tick> {
-        (0..count).map(|tick| Tick { stem: tick.to_string(), capture_nanos: tick * period_nanos }).collect()
+        (0..count)
+            .map(|tick| Tick {
+                stem: tick.to_string(),
+                capture_nanos: tick * period_nanos,
+            })
+            .collect()
     }
 
     #[test]
     fn steps_go_back_to_the_beginning_or_to_a_second() {
-        let moments = Moments { frames: 3, gap: 2, ..Moments::default() };
+        let moments = Moments {
+            frames: 3,
+            gap: 2,
+            ..Moments::default()
+        };
         let tenths = ticks(20, 100_000_000);
         assert_eq!(moments.steps(&tenths, 9, 8, 2), [8, 6, 4]);
         assert_eq!(moments.steps(&tenths, 3, 3, 2), [3, 1]);
-        assert_eq!(moments.steps(&tenths, 19, 13, 5), [13], "a second is the limit");
+        assert_eq!(
+            moments.steps(&tenths, 19, 13, 5),
+            [13],
+            "a second is the limit"
+        );
         assert_eq!(moments.steps(&ticks(20, 1_500_000_000), 9, 9, 1), [9]);
         assert_eq!(Moments::default().steps(&tenths, 9, 9, 1), [9]);
     }
@@ -71,8 +98,13 @@ mod tests {
     fn delays_are_drawn_up_to_their_limit_and_not_before_the_scene() {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let tenths = ticks(20, 100_000_000);
-        let moments = Moments { max_delay_nanos: 500_000_000, ..Moments::default() };
-        let mut drawn: Vec<usize> = (0..200).map(|_| moments.draw_newest(&tenths, 10, &mut rng)).collect();
+        let moments = Moments {
+            max_delay_nanos: 500_000_000,
+            ..Moments::default()
+        };
+        let mut drawn: Vec<usize> = (0..200)
+            .map(|_| moments.draw_newest(&tenths, 10, &mut rng))
+            .collect();
         drawn.sort_unstable();
         drawn.dedup();
         assert_eq!(drawn, [5, 6, 7, 8, 9, 10]);

@@ -4,7 +4,9 @@ use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
 use dataset::frame::Frame;
-use localization::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
+use localization::pose_source::{
+    NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable,
+};
 use protocol::config::within;
 use protocol::{CavId, Pose, PoseEstimate};
 use rand::Rng;
@@ -33,30 +35,50 @@ impl SamplePoses {
     /// # Errors
     /// [`PoseSourceError`] names the field.
     pub fn validate(&self) -> Result<(), PoseSourceError> {
-        for (field, value) in [("noise_share", self.noise_share), ("lost_share", self.lost_share)] {
+        for (field, value) in [
+            ("noise_share", self.noise_share),
+            ("lost_share", self.lost_share),
+        ] {
             within(field, value, 0.0, 1.0)?;
         }
-        self.noise.as_ref().map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
+        self.noise
+            .as_ref()
+            .map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
     }
 
     /// The same without an added error.
     #[must_use]
     pub(crate) fn without_noise(&self) -> Self {
-        Self { noise: None, lost_share: 0.0, ..self.clone() }
+        Self {
+            noise: None,
+            lost_share: 0.0,
+            ..self.clone()
+        }
     }
 
     /// Draws the error of one sample.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
         // One draw fewer where the share is all or nothing: earlier samples stay the same.
-        let lost = (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
+        let lost =
+            (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
         let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
         let seed = rng.random();
         let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else {
-            return Ok(DrawnError { lost, ..DrawnError::default() });
+            return Ok(DrawnError {
+                lost,
+                ..DrawnError::default()
+            });
         };
         let spares_ego = noise.mode == NoiseMode::Fixed;
-        let noise = NoisyPose::new(&NoisyPoseConfig { seed, ..noise.clone() })?;
-        Ok(DrawnError { noise: Some(noise), spares_ego, lost })
+        let noise = NoisyPose::new(&NoisyPoseConfig {
+            seed,
+            ..noise.clone()
+        })?;
+        Ok(DrawnError {
+            noise: Some(noise),
+            spares_ego,
+            lost,
+        })
     }
 
     /// Pose of a vehicle without the added error.
@@ -67,9 +89,15 @@ impl SamplePoses {
             cav: frame.cav.to_string(),
         };
         if self.tables.is_empty() {
-            return Ok(PoseEstimate::new(frame.world_from_lidar.ok_or_else(missing)?, 1.0));
+            return Ok(PoseEstimate::new(
+                frame.world_from_lidar.ok_or_else(missing)?,
+                1.0,
+            ));
         }
-        let found = self.tables.iter().find_map(|table| table.get(scenario, &frame.cav, frame.capture_nanos));
+        let found = self
+            .tables
+            .iter()
+            .find_map(|table| table.get(scenario, &frame.cav, frame.capture_nanos));
         found.copied().ok_or_else(missing)
     }
 }
@@ -109,10 +137,21 @@ struct Lost {
 
 impl Lost {
     fn draw(rng: &mut impl Rng) -> Self {
-        let (distance_m, (sin, cos)) = (rng.random_range(LOST_M), rng.random_range(0.0..TAU).sin_cos());
+        let (distance_m, (sin, cos)) = (
+            rng.random_range(LOST_M),
+            rng.random_range(0.0..TAU).sin_cos(),
+        );
         // Half of them have the right heading.
-        let turn_rad = if rng.random_bool(0.5) { rng.random_range(-PI..PI) } else { 0.0 };
-        Self { draw: rng.random_range(0..usize::MAX), shift_m: [distance_m * cos, distance_m * sin], turn_rad }
+        let turn_rad = if rng.random_bool(0.5) {
+            rng.random_range(-PI..PI)
+        } else {
+            0.0
+        };
+        Self {
+            draw: rng.random_range(0..usize::MAX),
+            shift_m: [distance_m * cos, distance_m * sin],
+            turn_rad,
+        }
     }
 }
 
@@ -130,26 +169,52 @@ impl DrawnError {
         let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
         let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
         match (self.lost.as_ref().filter(is_lost), noisy) {
-            (Some(lost), PoseEstimate::Pose { world_from_cav, confidence, .. }) => {
+            (
+                Some(lost),
+                PoseEstimate::Pose {
+                    world_from_cav,
+                    confidence,
+                    ..
+                },
+            ) => {
                 let [x, y, z] = world_from_cav.translation_m;
                 let shifted = [x + lost.shift_m[0], y + lost.shift_m[1], z];
-                PoseEstimate::new(Pose::from_xyz_yaw(shifted, world_from_cav.yaw_rad() + lost.turn_rad), confidence)
+                PoseEstimate::new(
+                    Pose::from_xyz_yaw(shifted, world_from_cav.yaw_rad() + lost.turn_rad),
+                    confidence,
+                )
             }
             _ => noisy,
         }
     }
 
-    fn noisy(&self, found: PoseEstimate, cav: &CavId, capture_nanos: u64, is_ego: bool) -> PoseEstimate {
-        let (Some(noise), PoseEstimate::Pose { world_from_cav, confidence, .. }) = (&self.noise, found) else {
+    fn noisy(
+        &self,
+        found: PoseEstimate,
+        cav: &CavId,
+        capture_nanos: u64,
+        is_ego: bool,
+    ) -> PoseEstimate {
+        let (
+            Some(noise),
+            PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            },
+        ) = (&self.noise, found)
+        else {
             return found;
         };
         if is_ego && self.spares_ego {
             return found;
         }
         match noise.disturbed(cav, capture_nanos, &world_from_cav) {
-            PoseEstimate::Pose { world_from_cav, confidence: of_error, .. } => {
-                PoseEstimate::new(world_from_cav, confidence * of_error)
-            }
+            PoseEstimate::Pose {
+                world_from_cav,
+                confidence: of_error,
+                ..
+            } => PoseEstimate::new(world_from_cav, confidence * of_error),
             none @ PoseEstimate::NoPose { .. } => none,
         }
     }
@@ -163,8 +228,16 @@ mod tests {
     use super::*;
 
     fn drawn(mode: NoiseMode, noise_share: f64, seed: u64) -> DrawnError {
-        let noise = NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() };
-        let poses = SamplePoses { noise: Some(noise), noise_share, ..SamplePoses::default() };
+        let noise = NoisyPoseConfig {
+            mode,
+            position_std_m: 1.0,
+            ..NoisyPoseConfig::default()
+        };
+        let poses = SamplePoses {
+            noise: Some(noise),
+            noise_share,
+            ..SamplePoses::default()
+        };
         poses.validate().unwrap();
         poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap()
     }
@@ -176,7 +249,14 @@ mod tests {
         let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, [0, 2]);
         assert_eq!(off(1), off(1));
         assert_ne!(off(1), off(2));
-        let PoseEstimate::Pose { world_from_cav, confidence, .. } = off(1) else { panic!() };
+        let PoseEstimate::Pose {
+            world_from_cav,
+            confidence,
+            ..
+        } = off(1)
+        else {
+            panic!()
+        };
         let [x, y, z] = world_from_cav.translation_m;
         let square = x * x + y * y + z * z;
         assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
@@ -186,8 +266,20 @@ mod tests {
     fn a_share_that_is_none_is_refused_by_name() {
         for share in [-0.1, 1.1, f64::NAN] {
             let refused = |poses: SamplePoses| poses.validate().unwrap_err().to_string();
-            assert!(refused(SamplePoses { lost_share: share, ..SamplePoses::default() }).contains("lost_share"));
-            assert!(refused(SamplePoses { noise_share: share, ..SamplePoses::default() }).contains("noise_share"));
+            assert!(
+                refused(SamplePoses {
+                    lost_share: share,
+                    ..SamplePoses::default()
+                })
+                .contains("lost_share")
+            );
+            assert!(
+                refused(SamplePoses {
+                    noise_share: share,
+                    ..SamplePoses::default()
+                })
+                .contains("noise_share")
+            );
         }
     }
 
@@ -195,16 +287,31 @@ mod tests {
     fn one_neighbour_is_lost_at_all_moments_and_does_not_know() {
         let cav = CavId::new("a").unwrap();
         let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
-        let poses = SamplePoses { lost_share: 1.0, ..SamplePoses::default() };
+        let poses = SamplePoses {
+            lost_share: 1.0,
+            ..SamplePoses::default()
+        };
         for seed in 0..20 {
             let error = poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap();
-            let reported: Vec<_> = (0..4).map(|agent| error.added(found, &cav, 5, [agent, 4])).collect();
+            let reported: Vec<_> = (0..4)
+                .map(|agent| error.added(found, &cav, 5, [agent, 4]))
+                .collect();
             let lost: Vec<_> = (0..4).filter(|&agent| reported[agent] != found).collect();
             assert!(lost.len() == 1 && lost[0] > 0, "{lost:?}");
-            let PoseEstimate::Pose { world_from_cav, confidence, .. } = reported[lost[0]] else { panic!() };
+            let PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            } = reported[lost[0]]
+            else {
+                panic!()
+            };
             let [x, y, _] = world_from_cav.translation_m;
             assert!(LOST_M.contains(&x.hypot(y)) && (confidence - 0.8).abs() < 1e-6);
-            assert_eq!(error.added(found, &cav, 99, [lost[0], 4]), reported[lost[0]]);
+            assert_eq!(
+                error.added(found, &cav, 99, [lost[0], 4]),
+                reported[lost[0]]
+            );
             assert_eq!(error.added(found, &cav, 5, [0, 1]), found, "ego-only");
         }
     }
@@ -215,7 +322,10 @@ mod tests {
         let reported = Pose::from_xyz_yaw([21.0, -5.5, 0.0], -3.1);
         let Offset([dx, dy, turn_rad]) = Offset::between(&reported, &real);
         assert!((dx + 1.0).abs() < 1e-9 && (dy - 0.5).abs() < 1e-9);
-        assert!((turn_rad - (6.2 - std::f64::consts::TAU)).abs() < 1e-9, "{turn_rad}");
+        assert!(
+            (turn_rad - (6.2 - std::f64::consts::TAU)).abs() < 1e-9,
+            "{turn_rad}"
+        );
         assert_eq!(Offset::between(&real, &real), Offset::default());
     }
 
@@ -226,7 +336,9 @@ mod tests {
         let fixed = drawn(NoiseMode::Fixed, 1.0, 3);
         assert_eq!(fixed.added(found, &cav, 5, [0, 2]), found);
         assert_ne!(fixed.added(found, &cav, 5, [1, 2]), found);
-        let noisy = (0..200).filter(|&seed| drawn(NoiseMode::Independent, 0.25, seed).noise.is_some()).count();
+        let noisy = (0..200)
+            .filter(|&seed| drawn(NoiseMode::Independent, 0.25, seed).noise.is_some())
+            .count();
         assert!((30..70).contains(&noisy), "{noisy}");
     }
 }

@@ -44,18 +44,37 @@ impl SceneSet {
     /// # Errors
     /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts
     /// itself, [`SampleError::Empty`] when there is no tick in any of them.
-    pub fn open(folders: &[PathBuf], options: &OpenOptions, protocol: &ProtocolConfig) -> Result<Self, SampleError> {
+    pub fn open(
+        folders: &[PathBuf],
+        options: &OpenOptions,
+        protocol: &ProtocolConfig,
+    ) -> Result<Self, SampleError> {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
             let dataset = dataset::open_with(folder, options)?;
-            let protocol = protocol.resolve(dataset.layout).map_err(SampleError::Protocol)?;
-            let protocol = EvaluationProtocol { max_agents: usize::MAX, ..protocol };
-            scenarios.extend(dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)));
+            let protocol = protocol
+                .resolve(dataset.layout)
+                .map_err(SampleError::Protocol)?;
+            let protocol = EvaluationProtocol {
+                max_agents: usize::MAX,
+                ..protocol
+            };
+            scenarios.extend(
+                dataset
+                    .scenarios
+                    .iter()
+                    .filter_map(|scenario| protocol.arrange(scenario)),
+            );
             problems.extend(dataset.problems.iter().map(ToString::to_string));
         }
-        let set = Self { problems, ..Self::new(scenarios) };
+        let set = Self {
+            problems,
+            ..Self::new(scenarios)
+        };
         if set.ticks.is_empty() {
-            return Err(SampleError::Empty(format!("no tick of any scenario in {folders:?}")));
+            return Err(SampleError::Empty(format!(
+                "no tick of any scenario in {folders:?}"
+            )));
         }
         Ok(set)
     }
@@ -64,7 +83,9 @@ impl SceneSet {
     #[must_use]
     pub fn new(scenarios: Vec<Scenario>) -> Self {
         let of_scenario = |(scenario, found): (usize, &Scenario)| {
-            (0..found.ticks.len()).map(move |tick| TickRef { scenario, tick }).collect::<Vec<_>>()
+            (0..found.ticks.len())
+                .map(move |tick| TickRef { scenario, tick })
+                .collect::<Vec<_>>()
         };
         let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
         Self {
@@ -103,15 +124,24 @@ impl SceneSet {
         if let Some(frames) = known(self) {
             return frames;
         }
-        let options = LoadOptions { points: false, ..LoadOptions::default() };
+        let options = LoadOptions {
+            points: false,
+            ..LoadOptions::default()
+        };
         let scenario = self.scenario(tick);
         let loaded = scenario.load_tick(tick.tick, 0..scenario.agents.len(), &options);
         let mut frames: Vec<Option<Frame>> = scenario.agents.iter().map(|_| None).collect();
         for (agent, frame) in loaded.frames {
-            lock(&self.unreadable).extend(frame.problems.iter().map(|problem| problem.message.clone()));
+            lock(&self.unreadable)
+                .extend(frame.problems.iter().map(|problem| problem.message.clone()));
             frames[agent] = Some(frame);
         }
-        lock(&self.unreadable).extend(loaded.unreadable.into_iter().map(|(_, problem)| problem.message));
+        lock(&self.unreadable).extend(
+            loaded
+                .unreadable
+                .into_iter()
+                .map(|(_, problem)| problem.message),
+        );
         let frames = Arc::new(frames);
         lock(&self.known).insert(tick, Arc::clone(&frames));
         frames
@@ -122,15 +152,30 @@ impl SceneSet {
     /// # Errors
     /// [`SampleError::Read`] when a file is missing or malformed.
     pub fn points(&self, tick: TickRef, agent: usize) -> Result<PointCloud, SampleError> {
-        Ok(self.scenario(tick).load(agent, tick.tick, &LoadOptions::default())?.points)
+        Ok(self
+            .scenario(tick)
+            .load(agent, tick.tick, &LoadOptions::default())?
+            .points)
     }
 
     /// Identification of the data, and their problems.
     #[must_use]
     pub fn data(&self) -> DataListing {
-        let sha256 = self.sha256.get_or_init(|| dataset::content_sha256(&self.scenarios)).clone();
-        let problems = self.problems.iter().chain(lock(&self.unreadable).iter()).cloned().collect();
-        DataListing { sha256, problems, without_pose: 0 }
+        let sha256 = self
+            .sha256
+            .get_or_init(|| dataset::content_sha256(&self.scenarios))
+            .clone();
+        let problems = self
+            .problems
+            .iter()
+            .chain(lock(&self.unreadable).iter())
+            .cloned()
+            .collect();
+        DataListing {
+            sha256,
+            problems,
+            without_pose: 0,
+        }
     }
 }
 

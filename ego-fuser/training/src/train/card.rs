@@ -9,23 +9,50 @@ use crate::samples::{SampleConfig, SceneSet};
 use fusion::model::CooperativeModel;
 
 /// The card of a detector.
-pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &SceneSet, summary: &Summary) -> ModelCard {
+pub(super) fn card(
+    config: &TrainConfig,
+    model: &CooperativeModel,
+    scenes: &SceneSet,
+    summary: &Summary,
+) -> ModelCard {
     let (detector, method) = (model.config(), model.method);
     let mut card = ModelCard::new(
         &format!("{} detector, method `{method}`", detector.name),
-        &format!("PointPillars over {:?} m, trained for `{method}`: {}.", detector.lidar_range_m, method.summary()),
+        &format!(
+            "PointPillars over {:?} m, trained for `{method}`: {}.",
+            detector.lidar_range_m,
+            method.summary()
+        ),
     );
-    let data = format!("{} ticks of {} scenarios", scenes.ticks().len(), scenes.scenarios().len());
+    let data = format!(
+        "{} ticks of {} scenarios",
+        scenes.ticks().len(),
+        scenes.scenarios().len()
+    );
     let run = &config.run;
     card.trained(run, &summary.trained, &data, "samples");
     card.row(
         "peak learning rate",
-        format_args!("{:e}, weight decay {:e}", run.learning_rate, run.optimizer.weight_decay),
+        format_args!(
+            "{:e}, weight decay {:e}",
+            run.learning_rate, run.optimizer.weight_decay
+        ),
     );
-    card.row("anchors between the thresholds", format_args!("{:?}", config.loss.unassigned));
+    card.row(
+        "anchors between the thresholds",
+        format_args!("{:?}", config.loss.unassigned),
+    );
     let samples = sample_config(config, model);
-    let SampleConfig { augmentation, drop_neighbour, poses, moments, max_agents, comm_range_m, merged_truth, .. } =
-        &samples;
+    let SampleConfig {
+        augmentation,
+        drop_neighbour,
+        poses,
+        moments,
+        max_agents,
+        comm_range_m,
+        merged_truth,
+        ..
+    } = &samples;
     card.row(
         "augmentation",
         format_args!(
@@ -44,13 +71,26 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         ),
     );
     if *merged_truth {
-        card.row("ego-only", "samples of one vehicle, its neighbours' annotations are targets too");
+        card.row(
+            "ego-only",
+            "samples of one vehicle, its neighbours' annotations are targets too",
+        );
     }
     card.row(
         "moments",
-        format_args!("{} frames of each vehicle, up to {} ticks from one to the next", moments.frames, moments.gap),
+        format_args!(
+            "{} frames of each vehicle, up to {} ticks from one to the next",
+            moments.frames, moments.gap
+        ),
     );
-    card.row("poses", if poses.tables.is_empty() { "true" } else { "found by a pose generator" });
+    card.row(
+        "poses",
+        if poses.tables.is_empty() {
+            "true"
+        } else {
+            "found by a pose generator"
+        },
+    );
     if let Some(noise) = &poses.noise {
         card.row(
             "error on top of poses",
@@ -67,12 +107,17 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         let share = 100.0 * poses.lost_share;
         card.row(
             "lost vehicles",
-            format_args!("one neighbour in {share:.0} % of the samples, overconfident in a wrong pose"),
+            format_args!(
+                "one neighbour in {share:.0} % of the samples, overconfident in a wrong pose"
+            ),
         );
     }
     if config.loss.alignment_weight > 0.0 {
         let weight = config.loss.alignment_weight;
-        card.row("alignment", format_args!("learns to undo that error, loss with weight {weight}"));
+        card.row(
+            "alignment",
+            format_args!("learns to undo that error, loss with weight {weight}"),
+        );
     }
     if config.frozen_encoder.is_some() {
         card.row("encoder", "frozen, its maps kept");
@@ -82,8 +127,9 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
             "Validation on {} frames, ground truth of all vehicles within {comm_range_m} m, area of the network:",
             accuracy.frames
         ));
-        let row =
-            |name: &str, [ap_30, ap_50, ap_70]: [f64; 3]| format!("| {name} | {ap_30:.4} | {ap_50:.4} | {ap_70:.4} |");
+        let row = |name: &str, [ap_30, ap_50, ap_70]: [f64; 3]| {
+            format!("| {name} | {ap_30:.4} | {ap_50:.4} | {ap_70:.4} |")
+        };
         card.paragraph(&format!(
             "| AP | 0.3 | 0.5 | 0.7 |\n| --- | --- | --- | --- |\n{}\n{}",
             row("global", accuracy.ap_global),

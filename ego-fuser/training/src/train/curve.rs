@@ -9,8 +9,7 @@ use super::accuracy::Accuracy;
 use super::error::TrainError;
 use super::observer::StepReport;
 
-const HEADER: &str =
-    "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";
+const HEADER: &str = "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";
 /// Points of a line in the picture: losses of single batches are noisy and are averaged to about this number.
 const SMOOTH_POINTS: usize = 150;
 
@@ -25,7 +24,15 @@ impl DetectorCurve {
 
     pub(super) fn step(&mut self, report: &StepReport) -> Result<(), TrainingError> {
         let StepReport {
-            step, epoch, seconds, learning_rate, score_loss, box_loss, samples_per_second, waiting, ..
+            step,
+            epoch,
+            seconds,
+            learning_rate,
+            score_loss,
+            box_loss,
+            samples_per_second,
+            waiting,
+            ..
         } = *report;
         let loss = score_loss + box_loss;
         self.0.row(&format!(
@@ -33,52 +40,107 @@ impl DetectorCurve {
         ))
     }
 
-    pub(super) fn validation(&mut self, step: u64, seconds: f64, accuracy: &Accuracy) -> Result<(), TrainingError> {
+    pub(super) fn validation(
+        &mut self,
+        step: u64,
+        seconds: f64,
+        accuracy: &Accuracy,
+    ) -> Result<(), TrainingError> {
         let [ap_30, ap_50, ap_70] = accuracy.ap_global;
-        self.0.row(&format!("{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"))
+        self.0.row(&format!(
+            "{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"
+        ))
     }
 
     /// Draws the curve so far, including rows of an interrupted training, into a PNG file beside it.
     pub(super) fn draw(&self, title: &str) -> Result<(), TrainError> {
         let path = self.0.path();
-        let text =
-            std::fs::read_to_string(path).map_err(|source| TrainingError::Io { path: path.to_owned(), source })?;
-        Ok(figures::save_png(&charts(title, &text), &path.with_extension("png"))?)
+        let text = std::fs::read_to_string(path).map_err(|source| TrainingError::Io {
+            path: path.to_owned(),
+            source,
+        })?;
+        Ok(figures::save_png(
+            &charts(title, &text),
+            &path.with_extension("png"),
+        )?)
     }
 }
 
 fn charts(title: &str, csv: &str) -> Vec<Chart> {
-    let series = |name: &str, points, mark| Series { name: name.into(), points, mark };
-    let loss = |name: &str, column: &str| series(name, smooth(&column_over_steps(csv, column)), Mark::Line);
-    let accuracy = |name: &str, column: &str| series(name, column_over_steps(csv, column), Mark::LineAndDots);
-    let losses = vec![loss("sum", "loss"), loss("classes", "score_loss"), loss("boxes", "box_loss")];
-    let accuracies = vec![accuracy("0.3", "ap_30"), accuracy("0.5", "ap_50"), accuracy("0.7", "ap_70")];
-    let steps = column_over_steps(csv, "step").iter().map(|point| point.1).fold(1.0, f64::max);
-    let highest = losses.iter().flat_map(|series| &series.points).map(|point| point.1).fold(0.1, f64::max);
-    let over_steps = |y: Axis, series| Chart { title: title.into(), x: Axis::linear("step", [0.0, steps]), y, series };
+    let series = |name: &str, points, mark| Series {
+        name: name.into(),
+        points,
+        mark,
+    };
+    let loss = |name: &str, column: &str| {
+        series(name, smooth(&column_over_steps(csv, column)), Mark::Line)
+    };
+    let accuracy =
+        |name: &str, column: &str| series(name, column_over_steps(csv, column), Mark::LineAndDots);
+    let losses = vec![
+        loss("sum", "loss"),
+        loss("classes", "score_loss"),
+        loss("boxes", "box_loss"),
+    ];
+    let accuracies = vec![
+        accuracy("0.3", "ap_30"),
+        accuracy("0.5", "ap_50"),
+        accuracy("0.7", "ap_70"),
+    ];
+    let steps = column_over_steps(csv, "step")
+        .iter()
+        .map(|point| point.1)
+        .fold(1.0, f64::max);
+    let highest = losses
+        .iter()
+        .flat_map(|series| &series.points)
+        .map(|point| point.1)
+        .fold(0.1, f64::max);
+    let over_steps = |y: Axis, series| Chart {
+        title: title.into(),
+        x: Axis::linear("step", [0.0, steps]),
+        y,
+        series,
+    };
     let mut charts = vec![over_steps(Axis::linear("loss", [0.0, highest]), losses)];
     if accuracies.iter().any(|series| !series.points.is_empty()) {
-        charts.push(over_steps(Axis::linear("validation AP at IoU", [0.0, 1.0]), accuracies));
+        charts.push(over_steps(
+            Axis::linear("validation AP at IoU", [0.0, 1.0]),
+            accuracies,
+        ));
     }
     charts
 }
 
 /// Step and value of all rows that have one in `column`.
 fn column_over_steps(csv: &str, column: &str) -> Vec<(f64, f64)> {
-    let Some(place) = HEADER.split(',').position(|name| name == column) else { return Vec::new() };
+    let Some(place) = HEADER.split(',').position(|name| name == column) else {
+        return Vec::new();
+    };
     // A row that was truncated by the end of a process has no such column.
     let number = |row: &StringRecord, place| row.get(place)?.parse::<f64>().ok();
-    csv_file::records(csv).filter_map(|(_, row)| Some((number(&row, 0)?, number(&row, place)?))).collect()
+    csv_file::records(csv)
+        .filter_map(|(_, row)| Some((number(&row, 0)?, number(&row, place)?)))
+        .collect()
 }
 
 /// Means over so many neighbours that about [`SMOOTH_POINTS`] points are left.
 fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let finite: Vec<(f64, f64)> = points.iter().copied().filter(|point| point.1.is_finite()).collect();
+    let finite: Vec<(f64, f64)> = points
+        .iter()
+        .copied()
+        .filter(|point| point.1.is_finite())
+        .collect();
     let mean = |few: &[(f64, f64)]| {
-        let [x, y] = few.iter().fold([0.0; 2], |sum, point| [sum[0] + point.0, sum[1] + point.1]);
+        let [x, y] = few
+            .iter()
+            .fold([0.0; 2], |sum, point| [sum[0] + point.0, sum[1] + point.1]);
         (x / few.len() as f64, y / few.len() as f64)
     };
-    finite.chunks(finite.len().div_ceil(SMOOTH_POINTS).max(1)).map(mean).collect()
+    finite
+        .chunks(finite.len().div_ceil(SMOOTH_POINTS).max(1))
+        .map(mean)
+        .collect()
 }
 
 #[cfg(test)]
@@ -103,25 +165,43 @@ mod tests {
     fn the_picture_shows_what_the_file_holds_also_after_a_break() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("curve.csv");
-        DetectorCurve(Curve::open(&path, HEADER, None).unwrap()).step(&report(10, 2.0)).unwrap();
+        DetectorCurve(Curve::open(&path, HEADER, None).unwrap())
+            .step(&report(10, 2.0))
+            .unwrap();
         let mut curve = DetectorCurve(Curve::open(&path, HEADER, Some(10)).unwrap());
         curve.step(&report(20, f64::NAN)).unwrap();
         curve.step(&report(30, 1.0)).unwrap();
         curve
-            .validation(30, 4.0, &Accuracy { frames: 5, ap_global: [0.6, 0.5, 0.25], ap_frame_order: [0.0; 3] })
+            .validation(
+                30,
+                4.0,
+                &Accuracy {
+                    frames: 5,
+                    ap_global: [0.6, 0.5, 0.25],
+                    ap_frame_order: [0.0; 3],
+                },
+            )
             .unwrap();
         curve.draw("none").unwrap();
-        assert!(std::fs::read(path.with_extension("png")).unwrap().starts_with(b"\x89PNG"));
+        assert!(
+            std::fs::read(path.with_extension("png"))
+                .unwrap()
+                .starts_with(b"\x89PNG")
+        );
 
         let drawn = charts("none", &std::fs::read_to_string(&path).unwrap());
-        let [losses, accuracies] = &drawn[..] else { panic!("{drawn:?}") };
+        let [losses, accuracies] = &drawn[..] else {
+            panic!("{drawn:?}")
+        };
         assert_eq!(losses.series[0].points, [(10.0, 2.5), (30.0, 1.5)]);
         assert_eq!(accuracies.series[2].points, [(30.0, 0.25)]);
     }
 
     #[test]
     fn many_points_become_means_of_neighbours() {
-        let points: Vec<(f64, f64)> = (0..600).map(|step| (f64::from(step), f64::from(step % 2))).collect();
+        let points: Vec<(f64, f64)> = (0..600)
+            .map(|step| (f64::from(step), f64::from(step % 2)))
+            .collect();
         let smoothed = smooth(&points);
         assert_eq!((smoothed.len(), smoothed[1]), (150, (5.5, 0.5)));
         assert!(smooth(&[]).is_empty());

@@ -25,7 +25,9 @@ pub enum TrainError {
     #[error("a frozen encoder needs weights to begin with")]
     NothingToFreeze,
     /// Points are merged before they are encoded, so there are no maps to store.
-    #[error("method {0} puts points together before the encoder and cannot be trained behind a frozen one")]
+    #[error(
+        "method {0} puts points together before the encoder and cannot be trained behind a frozen one"
+    )]
     NothingToKeep(Method),
     /// The picture of the curve cannot be written.
     #[error(transparent)]

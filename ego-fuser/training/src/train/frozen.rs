@@ -21,22 +21,43 @@ pub(super) struct FrozenEncoder<'a> {
 
 impl<'a> FrozenEncoder<'a> {
     /// Excludes the encoder of `model` from the training, if that is configured. Call it before the optimizer is built.
-    pub(super) fn of(config: &'a TrainConfig, model: &CooperativeModel) -> Result<Option<Self>, TrainError> {
-        let Some(kept) = &config.frozen_encoder else { return Ok(None) };
+    pub(super) fn of(
+        config: &'a TrainConfig,
+        model: &CooperativeModel,
+    ) -> Result<Option<Self>, TrainError> {
+        let Some(kept) = &config.frozen_encoder else {
+            return Ok(None);
+        };
         let init = config.init.as_ref().ok_or(TrainError::NothingToFreeze)?;
         for (name, variable) in model.variables.variables() {
             if is_encoder(&name) {
                 let _ = variable.f_set_requires_grad(false)?;
             }
         }
-        let weights = Weights::load(init).map_err(ModelError::from)?.with_precision(InferencePrecision::Float);
-        Ok(Some(Self { kept, weights: Arc::new(weights), threads: config.run.loader_threads }))
+        let weights = Weights::load(init)
+            .map_err(ModelError::from)?
+            .with_precision(InferencePrecision::Float);
+        Ok(Some(Self {
+            kept,
+            weights: Arc::new(weights),
+            threads: config.run.loader_threads,
+        }))
     }
 
     /// The maps of all sweeps of some scenes; missing ones are encoded now.
-    pub(super) fn maps(&self, scenes: &SceneSet, observer: &mut dyn Observer) -> Result<MapSource, TrainError> {
+    pub(super) fn maps(
+        &self,
+        scenes: &SceneSet,
+        observer: &mut dyn Observer,
+    ) -> Result<MapSource, TrainError> {
         let on_sweep = &mut |done, all| observer.encoded(done, all);
-        let open = FeatureStore::open(self.kept, &self.weights, scenes.scenarios(), self.threads, on_sweep);
+        let open = FeatureStore::open(
+            self.kept,
+            &self.weights,
+            scenes.scenarios(),
+            self.threads,
+            on_sweep,
+        );
         let store = open.map_err(|error: FeatureStoreError| SampleError::from(error))?;
         Ok(MapSource::new(Arc::new(store), Arc::clone(&self.weights)))
     }

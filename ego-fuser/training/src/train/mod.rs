@@ -25,7 +25,9 @@ pub(crate) use validation::Validator;
 
 use self::curve::DetectorCurve;
 use crate::loss::{LabelTensors, alignment_loss, detection_loss};
-use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet, batches};
+use crate::samples::{
+    Batch, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet, batches,
+};
 use fusion::method::{Exchange, Method};
 use fusion::model::{CooperativeModel, ModelError};
 
@@ -40,7 +42,11 @@ pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary,
 }
 
 /// The views that a method is trained on; `is_frozen`: its encoder is frozen, `is_ego_only`: ego-only training.
-fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<SampleKind, TrainError> {
+fn sample_kind(
+    method: Method,
+    is_frozen: bool,
+    is_ego_only: bool,
+) -> Result<SampleKind, TrainError> {
     match method.exchange() {
         Exchange::Nothing => Ok(SampleKind::Single),
         Exchange::Points if is_frozen => Err(TrainError::NothingToKeep(method)),
@@ -53,13 +59,20 @@ fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<Sam
 
 /// The initial model of a training.
 fn first_model(config: &TrainConfig) -> Result<CooperativeModel, TrainError> {
-    let TrainConfig { method, run, fusion, .. } = config;
+    let TrainConfig {
+        method,
+        run,
+        fusion,
+        ..
+    } = config;
     Ok(match (&config.init, fusion) {
         (Some(path), fusion) => {
             let weights = Weights::load(path).map_err(ModelError::from)?;
             CooperativeModel::from_weights(&weights, Some(*method), fusion.as_ref(), run.device)?
         }
-        (None, Some(fusion)) => CooperativeModel::with_fusion(&config.detector, *method, fusion, run.device)?,
+        (None, Some(fusion)) => {
+            CooperativeModel::with_fusion(&config.detector, *method, fusion, run.device)?
+        }
         (None, None) => CooperativeModel::new(&config.detector, *method, run.device)?,
     })
 }
@@ -77,22 +90,43 @@ struct Training<'a> {
 
 impl<'a> Training<'a> {
     fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, TrainError> {
-        let kind = sample_kind(config.method, config.frozen_encoder.is_some(), config.samples.merged_truth)?;
+        let kind = sample_kind(
+            config.method,
+            config.frozen_encoder.is_some(),
+            config.samples.merged_truth,
+        )?;
         let run = &config.run;
         run.start()?;
         let mut model = first_model(config)?;
         let frozen = frozen::FrozenEncoder::of(config, &model)?;
-        let samples = SampleConfig { kind, ..frozen::sample_config(config, &model) };
+        let samples = SampleConfig {
+            kind,
+            ..frozen::sample_config(config, &model)
+        };
         samples.poses.validate().map_err(SampleError::from)?;
         model.set_precision(run.precision);
-        let scenes = Arc::new(SceneSet::open(&config.data, &config.open, &config.protocol)?);
+        let scenes = Arc::new(SceneSet::open(
+            &config.data,
+            &config.open,
+            &config.protocol,
+        )?);
         let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
-        let mut builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), model.config().clone(), assigner);
+        let mut builder = SampleBuilder::new(
+            Arc::clone(&scenes),
+            samples.clone(),
+            model.config().clone(),
+            assigner,
+        );
         let mut validator = match config.validation.as_slice() {
             [] => None,
             folders => {
                 let scenes = SceneSet::open(folders, &config.open, &config.protocol)?;
-                Some(Validator::open(scenes, &samples, &model, config.validation_frames)?)
+                Some(Validator::open(
+                    scenes,
+                    &samples,
+                    &model,
+                    config.validation_frames,
+                )?)
             }
         };
         if let Some(frozen) = &frozen {
@@ -101,15 +135,34 @@ impl<'a> Training<'a> {
                 validator.use_maps(frozen.maps(validator.scenes(), observer)?);
             }
         }
-        let trainer = Trainer::begin(run, &model.variables, Some(config.method.name()), Instant::now())?;
+        let trainer = Trainer::begin(
+            run,
+            &model.variables,
+            Some(config.method.name()),
+            Instant::now(),
+        )?;
         let curve = DetectorCurve::open(&trainer)?;
-        Ok(Self { config, model, trainer, scenes, builder, validator, curve, accuracy: None })
+        Ok(Self {
+            config,
+            model,
+            trainer,
+            scenes,
+            builder,
+            validator,
+            curve,
+            accuracy: None,
+        })
     }
 
     fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
         observer.opened(&self.scenes.data());
         let pillar_grid = *self.model.network().pillar_grid();
-        let mut loader = batches(&self.builder, pillar_grid, &self.config.run, self.trainer.steps());
+        let mut loader = batches(
+            &self.builder,
+            pillar_grid,
+            &self.config.run,
+            self.trainer.steps(),
+        );
         let mut window = Window::new();
         while self.share_done() < 1.0 {
             let asked = Instant::now();
@@ -122,11 +175,19 @@ impl<'a> Training<'a> {
                 self.curve.step(&report)?;
                 observer.stepped(&report);
             }
-            if self.trainer.steps().is_multiple_of(self.config.validate_every) {
+            if self
+                .trainer
+                .steps()
+                .is_multiple_of(self.config.validate_every)
+            {
                 self.look_back(observer)?;
             }
         }
-        if !self.trainer.steps().is_multiple_of(self.config.validate_every) {
+        if !self
+            .trainer
+            .steps()
+            .is_multiple_of(self.config.validate_every)
+        {
             self.look_back(observer)?;
         }
         self.finish()
@@ -137,20 +198,31 @@ impl<'a> Training<'a> {
         let device = self.config.run.device;
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
         let output = batch.output(&self.model, true)?;
-        let loss = detection_loss(&output.head.scores, &output.head.offsets, &labels, &self.config.loss)?;
+        let loss = detection_loss(
+            &output.head.scores,
+            &output.head.offsets,
+            &labels,
+            &self.config.loss,
+        )?;
         let share_done = self.share_done();
         let total = match self.config.loss.alignment_weight {
-            weight if weight > 0.0 => loss.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight,
+            weight if weight > 0.0 => {
+                loss.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight
+            }
             _ => loss.total(),
         };
         Ok(match self.trainer.step(&total, share_done)? {
-            true => Some([loss.score.f_double_value(&[])?, loss.boxes.f_double_value(&[])?]),
+            true => Some([
+                loss.score.f_double_value(&[])?,
+                loss.boxes.f_double_value(&[])?,
+            ]),
             false => None,
         })
     }
 
     fn epoch(&self) -> f64 {
-        (self.trainer.steps() * self.config.run.batch as u64) as f64 / self.scenes.ticks().len() as f64
+        (self.trainer.steps() * self.config.run.batch as u64) as f64
+            / self.scenes.ticks().len() as f64
     }
 
     fn share_done(&self) -> f64 {
@@ -182,7 +254,8 @@ impl<'a> Training<'a> {
             let accuracy = validator.measure(&self.model);
             self.model.set_precision(self.config.run.precision);
             let (accuracy, step) = (accuracy?, self.trainer.steps());
-            self.curve.validation(step, self.trainer.seconds(), &accuracy)?;
+            self.curve
+                .validation(step, self.trainer.seconds(), &accuracy)?;
             self.draw_curve()?;
             observer.validated(step, &accuracy);
             self.accuracy = Some(accuracy);
@@ -192,14 +265,28 @@ impl<'a> Training<'a> {
 
     fn draw_curve(&self) -> Result<(), TrainError> {
         let TrainConfig { method, run, .. } = self.config;
-        self.curve.draw(&format!("{method}, {} samples a step, seed {}", run.batch, run.seed))
+        self.curve.draw(&format!(
+            "{method}, {} samples a step, seed {}",
+            run.batch, run.seed
+        ))
     }
 
     fn finish(self) -> Result<Summary, TrainError> {
         self.draw_curve()?;
-        let Self { config, model, scenes, accuracy, .. } = &self;
-        let trained = self.trainer.save_weights(&model.variables, model.about(), scenes.data())?;
-        let summary = Summary { trained, accuracy: *accuracy };
+        let Self {
+            config,
+            model,
+            scenes,
+            accuracy,
+            ..
+        } = &self;
+        let trained = self
+            .trainer
+            .save_weights(&model.variables, model.about(), scenes.data())?;
+        let summary = Summary {
+            trained,
+            accuracy: *accuracy,
+        };
         card::card(config, model, scenes, &summary).write(&config.run.out)?;
         Ok(summary)
     }
@@ -216,14 +303,23 @@ struct Window {
 
 impl Window {
     fn new() -> Self {
-        Self { since: Instant::now(), waited: Duration::ZERO, steps: 0, losses: [0.0; 2], finite: 0 }
+        Self {
+            since: Instant::now(),
+            waited: Duration::ZERO,
+            steps: 0,
+            losses: [0.0; 2],
+            finite: 0,
+        }
     }
 
     fn add(&mut self, losses: Option<[f64; 2]>) {
         self.steps += 1;
         if let Some(losses) = losses {
             self.finite += 1;
-            self.losses.iter_mut().zip(losses).for_each(|(sum, loss)| *sum += loss);
+            self.losses
+                .iter_mut()
+                .zip(losses)
+                .for_each(|(sum, loss)| *sum += loss);
         }
     }
 
@@ -241,14 +337,24 @@ mod tests {
         assert!(
             matches!(sample_kind(Method::EARLY, true, false), Err(TrainError::NothingToKeep(method)) if method == Method::EARLY)
         );
-        assert_eq!(sample_kind(Method::EARLY, false, false).unwrap(), SampleKind::Merged);
-        assert_eq!(sample_kind(Method::MAX, true, false).unwrap(), SampleKind::Cooperative);
+        assert_eq!(
+            sample_kind(Method::EARLY, false, false).unwrap(),
+            SampleKind::Merged
+        );
+        assert_eq!(
+            sample_kind(Method::MAX, true, false).unwrap(),
+            SampleKind::Cooperative
+        );
     }
 
     #[test]
     fn ego_only_every_method_that_is_trained_learns_from_single_vehicles() {
         for method in [Method::NONE, Method::EARLY, Method::MAX, Method::PASTAT] {
-            assert_eq!(sample_kind(method, false, true).unwrap(), SampleKind::Single, "{method}");
+            assert_eq!(
+                sample_kind(method, false, true).unwrap(),
+                SampleKind::Single,
+                "{method}"
+            );
         }
         assert!(
             matches!(sample_kind(Method::LATE, false, true), Err(TrainError::NotTrained(method)) if method == Method::LATE)

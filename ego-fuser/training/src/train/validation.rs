@@ -12,7 +12,9 @@ use tch::no_grad;
 use super::accuracy::Accuracy;
 use super::error::TrainError;
 use crate::feature_store::MapSource;
-use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
+use crate::samples::{
+    Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef,
+};
 
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
 /// error.
@@ -36,12 +38,18 @@ impl Validator {
         let scenes = Arc::new(scenes);
         let all = scenes.ticks();
         let frames = frames.clamp(1, all.len());
-        let ticks = (0..frames).map(|frame| all[frame * all.len() / frames]).collect();
+        let ticks = (0..frames)
+            .map(|frame| all[frame * all.len() / frames])
+            .collect();
         let samples = SampleConfig {
             augmentation: Augmentation::OFF,
             drop_neighbour: 0.0,
             poses: samples.poses.without_noise(),
-            moments: Moments { max_delay_nanos: 0, gap: 1, ..samples.moments },
+            moments: Moments {
+                max_delay_nanos: 0,
+                gap: 1,
+                ..samples.moments
+            },
             merged_truth: true,
             ..samples.clone()
         };
@@ -74,7 +82,9 @@ impl Validator {
             let inside = |object: &&Box3d| {
                 let corners = object.corners();
                 corners_within(&corners, limits.keep_range_m)
-                    && corners.iter().all(|corner| (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2]))
+                    && corners.iter().all(|corner| {
+                        (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2])
+                    })
             };
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
             let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;

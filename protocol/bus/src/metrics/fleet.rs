@@ -25,17 +25,37 @@ pub(super) fn fleet_exposition(own: &str, others: &[MetricsPeer]) -> String {
     let texts: Vec<Option<String>> = thread::scope(|scope| {
         let fetch = |peer: &MetricsPeer| {
             let (status, body) = web::fetch_within(peer.address, "/metrics", WAIT_LIMIT).ok()?;
-            status.contains(" 200 ").then(|| String::from_utf8(body).ok()).flatten()
+            status
+                .contains(" 200 ")
+                .then(|| String::from_utf8(body).ok())
+                .flatten()
         };
-        let threads: Vec<_> = others.iter().map(|peer| scope.spawn(move || fetch(peer))).collect();
-        threads.into_iter().map(|thread| thread.join().ok().flatten()).collect()
+        let threads: Vec<_> = others
+            .iter()
+            .map(|peer| scope.spawn(move || fetch(peer)))
+            .collect();
+        threads
+            .into_iter()
+            .map(|thread| thread.join().ok().flatten())
+            .collect()
     });
-    let mut up = String::from("# HELP v2vloc_process_up Process serves its series.\n# TYPE v2vloc_process_up gauge\n");
+    let mut up = String::from(
+        "# HELP v2vloc_process_up Process serves its series.\n# TYPE v2vloc_process_up gauge\n",
+    );
     for (peer, text) in others.iter().zip(&texts) {
         // Writing to a string cannot fail. Names of processes need no escape.
-        let _ = writeln!(up, "v2vloc_process_up{{process=\"{}\"}} {}", peer.process, u8::from(text.is_some()));
+        let _ = writeln!(
+            up,
+            "v2vloc_process_up{{process=\"{}\"}} {}",
+            peer.process,
+            u8::from(text.is_some())
+        );
     }
-    merged([own, &up].into_iter().chain(texts.iter().flatten().map(String::as_str)))
+    merged(
+        [own, &up]
+            .into_iter()
+            .chain(texts.iter().flatten().map(String::as_str)),
+    )
 }
 
 /// Several documents as one: OpenMetrics wants the samples of a family together, described once.
@@ -44,7 +64,10 @@ fn merged<'a>(texts: impl Iterator<Item = &'a str>) -> String {
     let mut families: BTreeMap<&str, [String; 2]> = BTreeMap::new();
     for text in texts {
         let (mut family, mut is_known) = ("", false);
-        for line in text.lines().filter(|line| !line.is_empty() && *line != "# EOF") {
+        for line in text
+            .lines()
+            .filter(|line| !line.is_empty() && *line != "# EOF")
+        {
             if let Some(described) = line.strip_prefix("# ") {
                 let name = described.split(' ').nth(1).unwrap_or_default();
                 if name != family {
@@ -60,7 +83,11 @@ fn merged<'a>(texts: impl Iterator<Item = &'a str>) -> String {
             }
         }
     }
-    families.into_values().flatten().chain(["# EOF\n".to_owned()]).collect()
+    families
+        .into_values()
+        .flatten()
+        .chain(["# EOF\n".to_owned()])
+        .collect()
 }
 
 #[cfg(test)]
@@ -89,14 +116,30 @@ mod tests {
     #[test]
     fn a_process_that_does_not_answer_is_down_and_delays_nobody() {
         let silent = TcpListener::bind("127.0.0.1:0").unwrap();
-        let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
-        let peer = |process: &str, address| MetricsPeer { process: process.into(), address };
+        let closed = TcpListener::bind("127.0.0.1:0")
+            .unwrap()
+            .local_addr()
+            .unwrap();
+        let peer = |process: &str, address| MetricsPeer {
+            process: process.into(),
+            address,
+        };
         let began = std::time::Instant::now();
-        let others = [peer("agent-1", silent.local_addr().unwrap()), peer("ego-1", closed)];
+        let others = [
+            peer("agent-1", silent.local_addr().unwrap()),
+            peer("ego-1", closed),
+        ];
         let text = fleet_exposition("# TYPE a gauge\na 1\n# EOF\n", &others);
         assert!(began.elapsed() < 3 * WAIT_LIMIT, "{:?}", began.elapsed());
-        for line in ["a 1", "v2vloc_process_up{process=\"agent-1\"} 0", "v2vloc_process_up{process=\"ego-1\"} 0"] {
-            assert!(text.lines().any(|found| found == line), "{line} is not in\n{text}");
+        for line in [
+            "a 1",
+            "v2vloc_process_up{process=\"agent-1\"} 0",
+            "v2vloc_process_up{process=\"ego-1\"} 0",
+        ] {
+            assert!(
+                text.lines().any(|found| found == line),
+                "{line} is not in\n{text}"
+            );
         }
     }
 }

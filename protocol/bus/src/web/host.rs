@@ -19,16 +19,32 @@ pub(super) fn check(local: SocketAddr, uri: &Uri, headers: &HeaderMap) -> Result
     if !local.ip().is_loopback() {
         return Ok(());
     }
-    let named = headers.get_all(HOST).iter().map(|host| String::from_utf8_lossy(host.as_bytes()).into_owned());
-    let mut requested = uri.authority().map(ToString::to_string).into_iter().chain(named);
-    requested.find(|name| !is_here(name, local.ip())).map_or(Ok(()), Err)
+    let named = headers
+        .get_all(HOST)
+        .iter()
+        .map(|host| String::from_utf8_lossy(host.as_bytes()).into_owned());
+    let mut requested = uri
+        .authority()
+        .map(ToString::to_string)
+        .into_iter()
+        .chain(named);
+    requested
+        .find(|name| !is_here(name, local.ip()))
+        .map_or(Ok(()), Err)
 }
 
 fn is_here(name: &str, local: IpAddr) -> bool {
-    let Ok(authority) = name.parse::<Authority>() else { return false };
+    let Ok(authority) = name.parse::<Authority>() else {
+        return false;
+    };
     let host = authority.host();
-    let address = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
-    let is_address = address.parse().is_ok_and(|address: IpAddr| address.is_loopback() || address == local);
+    let address = host
+        .strip_prefix('[')
+        .and_then(|host| host.strip_suffix(']'))
+        .unwrap_or(host);
+    let is_address = address
+        .parse()
+        .is_ok_and(|address: IpAddr| address.is_loopback() || address == local);
     is_address || host.eq_ignore_ascii_case("localhost")
 }
 
@@ -43,14 +59,34 @@ mod tests {
 
     #[test]
     fn over_the_loopback_only_names_of_the_loopback_are_served() {
-        for host in ["localhost:8088", "LOCALHOST", "127.0.0.1:8088", "[::1]:8088", "127.0.0.1:9000"] {
-            assert!(is_served("127.0.0.1:8088", "/", host) && is_served("[::1]:8088", "/", host), "{host}");
+        for host in [
+            "localhost:8088",
+            "LOCALHOST",
+            "127.0.0.1:8088",
+            "[::1]:8088",
+            "127.0.0.1:9000",
+        ] {
+            assert!(
+                is_served("127.0.0.1:8088", "/", host) && is_served("[::1]:8088", "/", host),
+                "{host}"
+            );
         }
-        for host in ["evil.example:8088", "evil.example", "localhost.evil.example", "10.0.0.1:8088", "", "[::1"] {
+        for host in [
+            "evil.example:8088",
+            "evil.example",
+            "localhost.evil.example",
+            "10.0.0.1:8088",
+            "",
+            "[::1",
+        ] {
             assert!(!is_served("127.0.0.1:8088", "/", host), "{host}");
             assert!(is_served("10.0.0.1:8088", "/", host), "{host}");
         }
-        assert!(!is_served("127.0.0.1:8088", "http://evil.example/", "localhost"));
+        assert!(!is_served(
+            "127.0.0.1:8088",
+            "http://evil.example/",
+            "localhost"
+        ));
     }
 
     #[test]
@@ -61,6 +97,9 @@ mod tests {
         assert_eq!(check(local, &Uri::from_static("/"), &headers), Ok(()));
         headers.append(HOST, "localhost".parse().unwrap());
         headers.append(HOST, "evil.example".parse().unwrap());
-        assert_eq!(check(local, &Uri::from_static("/"), &headers), Err("evil.example".to_owned()));
+        assert_eq!(
+            check(local, &Uri::from_static("/"), &headers),
+            Err("evil.example".to_owned())
+        );
     }
 }

@@ -18,7 +18,12 @@ pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, frame_id);
         cdr.write_sequence_length(detections.len());
-        for Detection { box3d, score, source } in detections {
+        for Detection {
+            box3d,
+            score,
+            source,
+        } in detections
+        {
             let pose = Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad);
             cdr::header(cdr, nanos, frame_id);
             cdr.write_sequence_length(1);
@@ -76,14 +81,35 @@ fn marker_id(id: i64) -> i32 {
 }
 
 /// All boxes of a capture time: the first marker deletes those of the previous one.
-pub(crate) fn markers(nanos: u64, frame_id: &str, ns: &str, rgb: [f32; 3], boxes: &[Marked]) -> Vec<u8> {
-    let nothing = Box3d { center_m: [0.0; 3], size_m: [0.0; 3], heading_rad: 0.0 };
-    let sweep = Marked { id: Some(0), box3d: nothing, alpha: 0.0, text: String::new() };
+pub(crate) fn markers(
+    nanos: u64,
+    frame_id: &str,
+    ns: &str,
+    rgb: [f32; 3],
+    boxes: &[Marked],
+) -> Vec<u8> {
+    let nothing = Box3d {
+        center_m: [0.0; 3],
+        size_m: [0.0; 3],
+        heading_rad: 0.0,
+    };
+    let sweep = Marked {
+        id: Some(0),
+        box3d: nothing,
+        alpha: 0.0,
+        text: String::new(),
+    };
     cdr::message(|cdr| {
         cdr.write_sequence_length(boxes.len() + 1);
         marker(cdr, (frame_id, ns, nanos), (0, DELETE_ALL), rgb, &sweep);
         for (place, marked) in (0..).zip(boxes) {
-            marker(cdr, (frame_id, ns, nanos), (marked.id.unwrap_or(place), ADD), rgb, marked);
+            marker(
+                cdr,
+                (frame_id, ns, nanos),
+                (marked.id.unwrap_or(place), ADD),
+                rgb,
+                marked,
+            );
         }
     })
 }
@@ -95,7 +121,12 @@ fn marker(
     rgb: [f32; 3],
     marked: &Marked,
 ) {
-    let Marked { id: _, box3d, alpha, text } = marked;
+    let Marked {
+        id: _,
+        box3d,
+        alpha,
+        text,
+    } = marked;
     cdr::header(cdr, nanos, frame_id);
     cdr.write_string(ns);
     cdr.write_i32(id);
@@ -103,7 +134,9 @@ fn marker(
     cdr.write_i32(action);
     cdr::pose(cdr, &Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad));
     cdr::xyz(cdr, box3d.size_m);
-    rgb.into_iter().chain([*alpha]).for_each(|value| cdr.write_f32(value));
+    rgb.into_iter()
+        .chain([*alpha])
+        .for_each(|value| cdr.write_f32(value));
     // Lifetime: until it is deleted.
     cdr.write_i32(0);
     cdr.write_u32(0);
@@ -128,9 +161,26 @@ mod tests {
 
     #[test]
     fn a_detection_is_laid_out_as_vision_msgs_lays_it_out() {
-        let box3d = Box3d { center_m: [1.0, 2.0, 3.0], size_m: [4.0, 5.0, 6.0], heading_rad: 0.0 };
-        let cdr = detections(7_000_000_008, "f", &[Detection { box3d, score: 0.5, source: None }]);
-        let f64s = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
+        let box3d = Box3d {
+            center_m: [1.0, 2.0, 3.0],
+            size_m: [4.0, 5.0, 6.0],
+            heading_rad: 0.0,
+        };
+        let cdr = detections(
+            7_000_000_008,
+            "f",
+            &[Detection {
+                box3d,
+                score: 0.5,
+                source: None,
+            }],
+        );
+        let f64s = |values: &[f64]| {
+            values
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect::<Vec<u8>>()
+        };
         let header = b"\x07\0\0\0\x08\0\0\0\x02\0\0\0f\0";
         let mut expected = vec![0, 1, 0, 0];
         expected.extend(header);

@@ -15,11 +15,23 @@ pub(crate) fn compressed_image(nanos: u64, frame_id: &str, camera: &Camera) -> V
 }
 
 /// The projection of a camera without distortion; `pinhole` is that of `metadata`.
-pub(crate) fn camera_info(nanos: u64, frame_id: &str, metadata: &CameraMetadata, pinhole: &Pinhole) -> Vec<u8> {
-    let Pinhole { fx_px, fy_px, cx_px, cy_px } = *pinhole;
+pub(crate) fn camera_info(
+    nanos: u64,
+    frame_id: &str,
+    metadata: &CameraMetadata,
+    pinhole: &Pinhole,
+) -> Vec<u8> {
+    let Pinhole {
+        fx_px,
+        fy_px,
+        cx_px,
+        cy_px,
+    } = *pinhole;
     let intrinsic = [fx_px, 0.0, cx_px, 0.0, fy_px, cy_px, 0.0, 0.0, 1.0];
     let rectification = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
-    let projection = [fx_px, 0.0, cx_px, 0.0, 0.0, fy_px, cy_px, 0.0, 0.0, 0.0, 1.0, 0.0];
+    let projection = [
+        fx_px, 0.0, cx_px, 0.0, 0.0, fy_px, cy_px, 0.0, 0.0, 0.0, 1.0, 0.0,
+    ];
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, frame_id);
         cdr.write_u32(metadata.height_px);
@@ -27,7 +39,12 @@ pub(crate) fn camera_info(nanos: u64, frame_id: &str, metadata: &CameraMetadata,
         cdr.write_string("plumb_bob");
         let distortion = [0.0; 5];
         cdr.write_sequence_length(distortion.len());
-        for number in distortion.iter().chain(&intrinsic).chain(&rectification).chain(&projection) {
+        for number in distortion
+            .iter()
+            .chain(&intrinsic)
+            .chain(&rectification)
+            .chain(&projection)
+        {
             cdr.write_f64(*number);
         }
         // No binning, and all of the image is of interest.

@@ -47,7 +47,13 @@ pub(crate) fn odometry(
 fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
     let mut rows = diagonal([UNMEASURED; 6]);
     let [x, y, _, _, _, yaw] = &mut rows;
-    if let Some(PlanarCovariance { xx_m2, xy_m2, yy_m2, yaw_rad2 }) = planar {
+    if let Some(PlanarCovariance {
+        xx_m2,
+        xy_m2,
+        yy_m2,
+        yaw_rad2,
+    }) = planar
+    {
         (x[0], x[1]) = (f64::from(*xx_m2), f64::from(*xy_m2));
         (y[0], y[1]) = (f64::from(*xy_m2), f64::from(*yy_m2));
         yaw[5] = f64::from(*yaw_rad2);
@@ -58,38 +64,63 @@ fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
 /// Covariance of a motion of which speed and yaw rate are measured, or not.
 fn twist_covariance(motion: EgoMotion) -> [[f64; 6]; 6] {
     let speed = motion.speed_mps.map_or(UNMEASURED, |_| SPEED_VARIANCE);
-    let yaw_rate = motion.yaw_rate_rad_s.map_or(UNMEASURED, |_| YAW_RATE_VARIANCE);
-    diagonal([speed, UNMEASURED, UNMEASURED, UNMEASURED, UNMEASURED, yaw_rate])
+    let yaw_rate = motion
+        .yaw_rate_rad_s
+        .map_or(UNMEASURED, |_| YAW_RATE_VARIANCE);
+    diagonal([
+        speed, UNMEASURED, UNMEASURED, UNMEASURED, UNMEASURED, yaw_rate,
+    ])
 }
 
 fn diagonal(variances: [f64; 6]) -> [[f64; 6]; 6] {
     let mut rows = [[0.0; 6]; 6];
     for (index, (row, variance)) in rows.iter_mut().zip(variances).enumerate() {
-        row.iter_mut().skip(index).take(1).for_each(|place| *place = variance);
+        row.iter_mut()
+            .skip(index)
+            .take(1)
+            .for_each(|place| *place = variance);
     }
     rows
 }
 
 /// `tf2_msgs/TFMessage`: frames in the world, each with `world_from_child`.
 pub(crate) fn transforms(nanos: u64, children: &[(String, Pose)]) -> Vec<u8> {
-    tf_message(nanos, children.iter().map(|(child, pose)| (MAP_FRAME.to_owned(), child.clone(), *pose)))
+    tf_message(
+        nanos,
+        children
+            .iter()
+            .map(|(child, pose)| (MAP_FRAME.to_owned(), child.clone(), *pose)),
+    )
 }
 
 /// `tf2_msgs/TFMessage`: one frame mounted on another, with `parent_from_child`.
 pub(crate) fn mounted(nanos: u64, parent: &str, child: &str, parent_from_child: &Pose) -> Vec<u8> {
-    tf_message(nanos, [(parent.to_owned(), child.to_owned(), *parent_from_child)].into_iter())
+    tf_message(
+        nanos,
+        [(parent.to_owned(), child.to_owned(), *parent_from_child)].into_iter(),
+    )
 }
 
 /// `tf2_msgs/TFMessage` for `/tf_static`: the bodies of vehicles, fixed to their LiDARs. The LiDAR is the parent, as its
 /// pose is the one that is estimated.
 #[must_use]
-pub fn static_transforms<'a>(nanos: u64, vehicles: impl ExactSizeIterator<Item = &'a CavId>, mount: &Mount) -> Vec<u8> {
+pub fn static_transforms<'a>(
+    nanos: u64,
+    vehicles: impl ExactSizeIterator<Item = &'a CavId>,
+    mount: &Mount,
+) -> Vec<u8> {
     let lidar_from_base = Pose::from(mount.base_from_lidar.isometry().inverse());
-    tf_message(nanos, vehicles.map(|cav| (lidar_frame(cav), base_frame(cav), lidar_from_base)))
+    tf_message(
+        nanos,
+        vehicles.map(|cav| (lidar_frame(cav), base_frame(cav), lidar_from_base)),
+    )
 }
 
 /// Transforms of parent, child and `parent_from_child`.
-fn tf_message(nanos: u64, transforms: impl ExactSizeIterator<Item = (String, String, Pose)>) -> Vec<u8> {
+fn tf_message(
+    nanos: u64,
+    transforms: impl ExactSizeIterator<Item = (String, String, Pose)>,
+) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr.write_sequence_length(transforms.len());
         for (parent, child, parent_from_child) in transforms {
@@ -111,12 +142,18 @@ mod tests {
     use super::*;
 
     fn f64s(values: &[f64]) -> Vec<u8> {
-        values.iter().flat_map(|value| value.to_le_bytes()).collect()
+        values
+            .iter()
+            .flat_map(|value| value.to_le_bytes())
+            .collect()
     }
 
     #[test]
     fn a_transform_is_laid_out_as_ros_lays_it_out() {
-        let cdr = transforms(1_000_000_002, &[("ab".into(), Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0))]);
+        let cdr = transforms(
+            1_000_000_002,
+            &[("ab".into(), Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0))],
+        );
         let mut expected = vec![0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0];
         expected.extend(b"\x04\0\0\0map\0\x03\0\0\0ab\0");
         // Numbers are aligned to multiples of their size, counted from the end of the header.
@@ -127,32 +164,52 @@ mod tests {
 
     #[test]
     fn a_pose_has_the_covariance_of_the_plane_and_claims_nothing_else() {
-        let planar = PlanarCovariance { xx_m2: 0.25, xy_m2: 0.125, yy_m2: 0.5, yaw_rad2: 0.0625 };
-        let cdr = pose(3_000_000_004, &Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0), Some(&planar));
+        let planar = PlanarCovariance {
+            xx_m2: 0.25,
+            xy_m2: 0.125,
+            yy_m2: 0.5,
+            yaw_rad2: 0.0625,
+        };
+        let cdr = pose(
+            3_000_000_004,
+            &Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0),
+            Some(&planar),
+        );
         let mut expected = vec![0, 1, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0];
         expected.extend(b"\x04\0\0\0map\0");
         expected.extend(f64s(&[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]));
         let mut covariance = [0.0; 36];
         (covariance[0], covariance[1], covariance[6], covariance[7]) = (0.25, 0.125, 0.125, 0.5);
         covariance[35] = 0.0625;
-        [14, 21, 28].into_iter().for_each(|place| covariance[place] = 1e6);
+        [14, 21, 28]
+            .into_iter()
+            .for_each(|place| covariance[place] = 1e6);
         expected.extend(f64s(&covariance));
         assert_eq!(cdr, expected);
     }
 
     #[test]
     fn odometry_ends_with_the_motion() {
-        let motion = EgoMotion { speed_mps: Some(8.0), yaw_rate_rad_s: None };
+        let motion = EgoMotion {
+            speed_mps: Some(8.0),
+            yaw_rate_rad_s: None,
+        };
         let cdr = odometry(0, &CavId::new("1").unwrap(), &Pose::IDENTITY, None, motion);
         let twist = cdr.len() - 8 * (6 + 36);
         assert_eq!(cdr[twist..][..48], f64s(&[8.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
-        assert_eq!(cdr[twist + 48..][..8], f64s(&[1e-2]), "the speed is measured");
+        assert_eq!(
+            cdr[twist + 48..][..8],
+            f64s(&[1e-2]),
+            "the speed is measured"
+        );
         assert_eq!(cdr[cdr.len() - 8..], f64s(&[1e6]), "the yaw rate is not");
     }
 
     #[test]
     fn a_body_hangs_below_its_lidar() {
-        let mount = Mount { base_from_lidar: Pose::from_xyz_yaw([1.5, 0.0, 1.9], 0.0) };
+        let mount = Mount {
+            base_from_lidar: Pose::from_xyz_yaw([1.5, 0.0, 1.9], 0.0),
+        };
         let cdr = static_transforms(0, [CavId::new("7").unwrap()].iter(), &mount);
         assert!(cdr.windows(11).any(|bytes| bytes == b"cav_7/lidar"));
         assert!(cdr.windows(15).any(|bytes| bytes == b"cav_7/base_link"));

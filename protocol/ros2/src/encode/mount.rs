@@ -17,7 +17,9 @@ pub struct Mount {
 /// The origin of the body is the LiDAR.
 impl Default for Mount {
     fn default() -> Self {
-        Self { base_from_lidar: Pose::IDENTITY }
+        Self {
+            base_from_lidar: Pose::IDENTITY,
+        }
     }
 }
 
@@ -35,17 +37,28 @@ impl FromStr for Mount {
     type Err = MountError;
 
     fn from_str(text: &str) -> Result<Self, MountError> {
-        let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+        let numbers: Option<Vec<f64>> = text
+            .split(',')
+            .map(|part| part.trim().parse().ok())
+            .collect();
         let (xyz, yaw_deg) = match numbers.as_deref() {
             Some(&[x, y, z]) => ([x, y, z], 0.0),
             Some(&[x, y, z, yaw_deg]) => ([x, y, z], yaw_deg),
-            _ => return Err(MountError { text: text.chars().take(100).collect() }),
+            _ => {
+                return Err(MountError {
+                    text: text.chars().take(100).collect(),
+                });
+            }
         };
         // A number that is none is in no range.
         let is_place = xyz.iter().all(|value| value.abs() <= MAX_M) && yaw_deg.abs() <= 360.0;
         match is_place {
-            true => Ok(Self { base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()) }),
-            false => Err(MountError { text: text.chars().take(100).collect() }),
+            true => Ok(Self {
+                base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()),
+            }),
+            false => Err(MountError {
+                text: text.chars().take(100).collect(),
+            }),
         }
     }
 }
@@ -60,7 +73,15 @@ mod tests {
         assert_eq!(mount.base_from_lidar.translation_m, [1.5, 0.0, 1.9]);
         let turned: Mount = "0,0,2,90".parse().unwrap();
         assert!((turned.base_from_lidar.yaw_rad() - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
-        for text in ["", "1,2", "1,2,3,4,5", "a,0,0", "nan,0,0", "0,0,101", "0,0,0,361"] {
+        for text in [
+            "",
+            "1,2",
+            "1,2,3,4,5",
+            "a,0,0",
+            "nan,0,0",
+            "0,0,101",
+            "0,0,0,361",
+        ] {
             assert!(text.parse::<Mount>().is_err(), "{text}");
         }
     }

@@ -13,7 +13,8 @@ const FLOAT32: u8 = 7;
 pub(crate) fn point_cloud(nanos: u64, frame_id: &str, cloud: &PointCloud) -> Vec<u8> {
     let count = u32::try_from(cloud.len()).unwrap_or(u32::MAX);
     cdr::message(|cdr| {
-        cdr.buffer_mut().reserve(cloud.len() * POINT_STEP as usize + 256);
+        cdr.buffer_mut()
+            .reserve(cloud.len() * POINT_STEP as usize + 256);
         cdr::header(cdr, nanos, frame_id);
         cdr.write_u32(1);
         cdr.write_u32(count);

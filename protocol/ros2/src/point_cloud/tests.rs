@@ -5,7 +5,10 @@ use re_cdr::{BigEndian, ByteOrder, CdrWriter, LittleEndian};
 
 use super::*;
 
-const LIMITS: SweepLimits = SweepLimits { max_points: 1 << 20, max_abs_value: 1e6 };
+const LIMITS: SweepLimits = SweepLimits {
+    max_points: 1 << 20,
+    max_abs_value: 1e6,
+};
 
 /// A cloud as a driver lays it out.
 #[derive(Debug, Clone)]
@@ -44,7 +47,12 @@ impl Cloud {
             let (row, column) = (index / self.width as usize, index % self.width as usize);
             let begin = row * self.row_step as usize + column * self.point_step as usize;
             for (name, offset, datatype) in &self.fields {
-                let Some(axis) = ["x", "y", "z", "intensity"].iter().position(|known| known == name) else { continue };
+                let Some(axis) = ["x", "y", "z", "intensity"]
+                    .iter()
+                    .position(|known| known == name)
+                else {
+                    continue;
+                };
                 let value = &mut data[begin + *offset as usize..];
                 match self.is_big_endian {
                     true => write_value::<BigEndian>(value, *datatype, point[axis]),
@@ -98,7 +106,9 @@ fn write_value<BO: ByteOrder>(place: &mut [u8], datatype: u8, value: f64) {
 
 #[test]
 fn what_is_written_for_ros_is_read_back() {
-    let points = PointCloud { xyzi: vec![[1.5, -2.0, 0.25, 0.5], [-70.0, 3.0, -1.8, 1.0]] };
+    let points = PointCloud {
+        xyzi: vec![[1.5, -2.0, 0.25, 0.5], [-70.0, 3.0, -1.8, 1.0]],
+    };
     let bytes = crate::encode::point_cloud(1_700_000_000_123_456_789, "cav_1/lidar", &points);
     let sweep = read_point_cloud(&bytes, LIMITS).unwrap();
     let expected = Sweep {
@@ -125,8 +135,14 @@ fn points_without_return_or_out_of_range_are_left_out_and_counted() {
     ]);
     (cloud.height, cloud.width, cloud.row_step) = (2, 3, 64);
     let sweep = cloud.read().unwrap();
-    assert_eq!(sweep.points.xyzi, [[1.0, 2.0, 3.0, 0.0], [4.0, 5.0, 6.0, 7.0]]);
-    assert_eq!((sweep.without_return, sweep.too_far, sweep.capture_nanos), (3, 1, 1_000_000_005));
+    assert_eq!(
+        sweep.points.xyzi,
+        [[1.0, 2.0, 3.0, 0.0], [4.0, 5.0, 6.0, 7.0]]
+    );
+    assert_eq!(
+        (sweep.without_return, sweep.too_far, sweep.capture_nanos),
+        (3, 1, 1_000_000_005)
+    );
 }
 
 #[test]
@@ -137,7 +153,13 @@ fn layouts_of_drivers_are_read() {
     let clouds = [
         // PCL: 16 bytes of coordinates, intensity, ring, padding.
         Cloud {
-            fields: vec![("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 16, 7), ("ring", 20, 4)],
+            fields: vec![
+                ("x", 0, 7),
+                ("y", 4, 7),
+                ("z", 8, 7),
+                ("intensity", 16, 7),
+                ("ring", 20, 4),
+            ],
             point_step: 32,
             row_step: 64,
             ..plain.clone()
@@ -150,16 +172,37 @@ fn layouts_of_drivers_are_read() {
             ..plain.clone()
         },
         // No step of rows for the only row.
-        Cloud { row_step: 32, ..plain.clone() },
-        Cloud { is_big_endian: true, ..plain.clone() },
+        Cloud {
+            row_step: 32,
+            ..plain.clone()
+        },
+        Cloud {
+            is_big_endian: true,
+            ..plain.clone()
+        },
     ];
     for cloud in clouds {
         assert_eq!(cloud.read().unwrap().points.xyzi, expected, "{cloud:?}");
         let bytes = cloud.bytes::<BigEndian>([0, 0, 0, 0]);
-        assert_eq!(read_point_cloud(&bytes, LIMITS).unwrap().points.xyzi, expected, "{cloud:?}");
+        assert_eq!(
+            read_point_cloud(&bytes, LIMITS).unwrap().points.xyzi,
+            expected,
+            "{cloud:?}"
+        );
     }
-    let without = Cloud { fields: plain.fields[..3].to_vec(), ..plain };
-    assert!(without.read().unwrap().points.xyzi.iter().all(|point| point[3] == 0.0));
+    let without = Cloud {
+        fields: plain.fields[..3].to_vec(),
+        ..plain
+    };
+    assert!(
+        without
+            .read()
+            .unwrap()
+            .points
+            .xyzi
+            .iter()
+            .all(|point| point[3] == 0.0)
+    );
 }
 
 #[test]
@@ -169,19 +212,70 @@ fn a_wrong_message_is_named_with_field_and_values() {
     let xyz = |index: usize, field| {
         let mut fields = plain.fields.clone();
         fields[index] = field;
-        Cloud { fields, ..plain.clone() }
+        Cloud {
+            fields,
+            ..plain.clone()
+        }
     };
     let cases = [
-        (error(Cloud { stamp: (-1, 0), ..plain.clone() }), "header.stamp is -1 s and 0 ns"),
-        (error(Cloud { stamp: (1, 1_000_000_000), ..plain.clone() }), "1000000000 ns"),
-        (error(xyz(1, ("range", 4, 7))), r#"no field "y" among ["x", "range", "z", "intensity"]"#),
-        (error(xyz(2, ("z", 8, 4))), r#"field "z" has datatype 4 and count 1, not datatype 7 or 8"#),
-        (error(xyz(3, ("intensity", 8, 9))), r#"field "intensity" has datatype 9"#),
-        (error(Cloud { point_step: 15, ..plain.clone() }), "point_step is 15, not at least 16"),
-        (error(Cloud { width: 4, ..plain.clone() }), "length of data is 48, not at least 64"),
-        (error(Cloud { height: 3, width: 2, row_step: 31, points: Vec::new(), ..plain.clone() }), "row_step is 31"),
         (
-            error(Cloud { height: 1 << 16, width: 17, row_step: 0, points: Vec::new(), ..plain.clone() }),
+            error(Cloud {
+                stamp: (-1, 0),
+                ..plain.clone()
+            }),
+            "header.stamp is -1 s and 0 ns",
+        ),
+        (
+            error(Cloud {
+                stamp: (1, 1_000_000_000),
+                ..plain.clone()
+            }),
+            "1000000000 ns",
+        ),
+        (
+            error(xyz(1, ("range", 4, 7))),
+            r#"no field "y" among ["x", "range", "z", "intensity"]"#,
+        ),
+        (
+            error(xyz(2, ("z", 8, 4))),
+            r#"field "z" has datatype 4 and count 1, not datatype 7 or 8"#,
+        ),
+        (
+            error(xyz(3, ("intensity", 8, 9))),
+            r#"field "intensity" has datatype 9"#,
+        ),
+        (
+            error(Cloud {
+                point_step: 15,
+                ..plain.clone()
+            }),
+            "point_step is 15, not at least 16",
+        ),
+        (
+            error(Cloud {
+                width: 4,
+                ..plain.clone()
+            }),
+            "length of data is 48, not at least 64",
+        ),
+        (
+            error(Cloud {
+                height: 3,
+                width: 2,
+                row_step: 31,
+                points: Vec::new(),
+                ..plain.clone()
+            }),
+            "row_step is 31",
+        ),
+        (
+            error(Cloud {
+                height: 1 << 16,
+                width: 17,
+                row_step: 0,
+                points: Vec::new(),
+                ..plain.clone()
+            }),
             "1114112, at most 1048576",
         ),
     ];
@@ -189,11 +283,16 @@ fn a_wrong_message_is_named_with_field_and_values() {
         assert!(found.contains(expected), "{found}");
     }
     let bytes = plain.bytes::<LittleEndian>([0, 1, 0, 0]);
-    let error = read_point_cloud(&bytes[..bytes.len() - 10], LIMITS).unwrap_err().to_string();
+    let error = read_point_cloud(&bytes[..bytes.len() - 10], LIMITS)
+        .unwrap_err()
+        .to_string();
     assert!(error.starts_with("data at byte "), "{error}");
     for bytes in [&[][..], &[0, 1], &[0, 3, 0, 0, 1], &[9; 40]] {
         assert!(
-            matches!(read_point_cloud(bytes, LIMITS), Err(PointCloudError::Message(ReadError::Encoding { .. }))),
+            matches!(
+                read_point_cloud(bytes, LIMITS),
+                Err(PointCloudError::Message(ReadError::Encoding { .. }))
+            ),
             "{bytes:?}"
         );
     }
@@ -204,34 +303,49 @@ fn any_cloud() -> impl Strategy<Value = Cloud> {
     let types = (prop::bool::ANY, prop::bool::ANY, prop::bool::ANY, 1_u8..=8);
     let paddings = prop::array::uniform5(0_u32..6);
     let order = Just([0_usize, 1, 2, 3]).prop_shuffle();
-    (types, paddings, order, 1_u32..5, 1_u32..6, any::<bool>(), 0_u32..20).prop_flat_map(
-        |((x, y, z, intensity), paddings, order, height, width, is_big_endian, row_padding)| {
-            let float = |is_double| if is_double { 8 } else { 7 };
-            let datatypes = [float(x), float(y), float(z), intensity];
-            let mut fields = Vec::new();
-            let mut end = 0;
-            for (index, padding) in order.into_iter().zip(paddings) {
-                let offset = end + padding;
-                fields.push((["x", "y", "z", "intensity"][index], offset, datatypes[index]));
-                end = offset + Datatype::of(datatypes[index]).unwrap().size();
-            }
-            let point_step = end + paddings[4];
-            let value = -127_i32..=127;
-            let intensity = 0_i32..=127;
-            let point = (value.clone(), value.clone(), value, intensity);
-            let point = point.prop_map(|(x, y, z, i)| [x, y, z, i].map(f64::from));
-            prop::collection::vec(point, (height * width) as usize).prop_map(move |points| Cloud {
-                stamp: (7, 8),
-                height,
-                width,
-                fields: fields.clone(),
-                is_big_endian,
-                point_step,
-                row_step: width * point_step + row_padding,
-                points,
-            })
-        },
+    (
+        types,
+        paddings,
+        order,
+        1_u32..5,
+        1_u32..6,
+        any::<bool>(),
+        0_u32..20,
     )
+        .prop_flat_map(
+            |((x, y, z, intensity), paddings, order, height, width, is_big_endian, row_padding)| {
+                let float = |is_double| if is_double { 8 } else { 7 };
+                let datatypes = [float(x), float(y), float(z), intensity];
+                let mut fields = Vec::new();
+                let mut end = 0;
+                for (index, padding) in order.into_iter().zip(paddings) {
+                    let offset = end + padding;
+                    fields.push((
+                        ["x", "y", "z", "intensity"][index],
+                        offset,
+                        datatypes[index],
+                    ));
+                    end = offset + Datatype::of(datatypes[index]).unwrap().size();
+                }
+                let point_step = end + paddings[4];
+                let value = -127_i32..=127;
+                let intensity = 0_i32..=127;
+                let point = (value.clone(), value.clone(), value, intensity);
+                let point = point.prop_map(|(x, y, z, i)| [x, y, z, i].map(f64::from));
+                prop::collection::vec(point, (height * width) as usize).prop_map(move |points| {
+                    Cloud {
+                        stamp: (7, 8),
+                        height,
+                        width,
+                        fields: fields.clone(),
+                        is_big_endian,
+                        point_step,
+                        row_step: width * point_step + row_padding,
+                        points,
+                    }
+                })
+            },
+        )
 }
 
 proptest! {

@@ -10,7 +10,10 @@ use crate::ReadError;
 use crate::json::{self, Field};
 
 /// Folders of the vehicle's calibration: from LiDAR to its GNSS and IMU unit (NovAtel), and from there to the world.
-pub(super) const VEHICLE: [&str; 2] = ["vehicle-side/calib/lidar_to_novatel", "vehicle-side/calib/novatel_to_world"];
+pub(super) const VEHICLE: [&str; 2] = [
+    "vehicle-side/calib/lidar_to_novatel",
+    "vehicle-side/calib/novatel_to_world",
+];
 /// Folder of the roadside unit's calibration. Its LiDAR frame is level: a virtual one.
 pub(super) const INFRASTRUCTURE: &str = "infrastructure-side/calib/virtuallidar_to_world";
 
@@ -33,7 +36,8 @@ impl VehiclePoses {
 
 /// Reads the poses of the vehicle.
 pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses, ReadError> {
-    let [novatel_from_lidar, world_from_novatel] = VEHICLE.map(|folder| sides.calibration(folder, &pair.vehicle));
+    let [novatel_from_lidar, world_from_novatel] =
+        VEHICLE.map(|folder| sides.calibration(folder, &pair.vehicle));
     Ok(VehiclePoses {
         world_from_novatel: read_transform(&world_from_novatel)?.0,
         novatel_from_lidar: read_transform(&novatel_from_lidar)?.0,
@@ -61,16 +65,26 @@ pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64
 fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2]), ReadError> {
     let value = json::read(path)?;
     let root = Field::root(path, &value);
-    let offset_m = root.optional("relative_error")?.map(|offset| self::offset_m(&offset)).transpose()?;
+    let offset_m = root
+        .optional("relative_error")?
+        .map(|offset| self::offset_m(&offset))
+        .transpose()?;
     let transform = root.optional("transform")?.unwrap_or(root);
     let rotation = nearest_rotation(&transform.required("rotation")?)?;
     let translation = Translation3::from(transform.required("translation")?.numbers::<3>()?);
-    Ok((Isometry3::from_parts(translation, rotation), offset_m.unwrap_or_default()))
+    Ok((
+        Isometry3::from_parts(translation, rotation),
+        offset_m.unwrap_or_default(),
+    ))
 }
 
 /// `{delta_x, delta_y}` in metres. A missing one or an empty text is 0.
 pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2], ReadError> {
-    let delta = |key| offset.optional(key)?.map_or(Ok(0.0), |delta| delta.number());
+    let delta = |key| {
+        offset
+            .optional(key)?
+            .map_or(Ok(0.0), |delta| delta.number())
+    };
     Ok([delta("delta_x")?, delta("delta_y")?])
 }
 
@@ -88,7 +102,9 @@ fn nearest_rotation(field: &Field<'_>) -> Result<UnitQuaternion<f64>, ReadError>
         return Err(field.error(reason));
     }
     let parts = matrix.svd(true, true);
-    let (Some(u), Some(v_transposed)) = (parts.u, parts.v_t) else { return Err(field.error("no rotation")) };
+    let (Some(u), Some(v_transposed)) = (parts.u, parts.v_t) else {
+        return Err(field.error("no rotation"));
+    };
     let rotation = Rotation3::from_matrix_unchecked(u * v_transposed);
     Ok(UnitQuaternion::from_rotation_matrix(&rotation))
 }

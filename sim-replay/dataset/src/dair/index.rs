@@ -68,7 +68,11 @@ impl Index {
     ///
     /// # Errors
     /// If there is no pair at all.
-    pub(super) fn read(root: &Path, period_nanos: u64, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+    pub(super) fn read(
+        root: &Path,
+        period_nanos: u64,
+        problems: &mut Vec<ReadError>,
+    ) -> Result<Self, ReadError> {
         let path = root.join(COOPERATIVE);
         let (kind, pairs) = read_pairs(&path, problems)?;
         if pairs.is_empty() {
@@ -83,21 +87,38 @@ impl Index {
             match captures.get(&pair.vehicle) {
                 Some(Capture { micros, group }) => {
                     let group = group.as_ref().or(pair.sequence.as_ref());
-                    groups.entry(group_name(kind, group)).or_default().push((*micros, pair));
+                    groups
+                        .entry(group_name(kind, group))
+                        .or_default()
+                        .push((*micros, pair));
                 }
                 // Without any time stamp the order of the list is the best available.
                 None if captures.is_empty() => {
-                    let group = groups.entry(group_name(kind, pair.sequence.as_ref())).or_default();
+                    let group = groups
+                        .entry(group_name(kind, pair.sequence.as_ref()))
+                        .or_default();
                     let micros = (group.len() as u64).saturating_mul(period_nanos / 1000);
                     group.push((micros, pair));
                 }
                 None => {
-                    let reason = format!("no entry for vehicle frame {}: the pair is left out", pair.vehicle);
-                    problems.push(ReadError::malformed(&root.join(VEHICLE_SIDE).join("data_info.json"), reason));
+                    let reason = format!(
+                        "no entry for vehicle frame {}: the pair is left out",
+                        pair.vehicle
+                    );
+                    problems.push(ReadError::malformed(
+                        &root.join(VEHICLE_SIDE).join("data_info.json"),
+                        reason,
+                    ));
                 }
             }
         }
-        Ok(Self { kind, groups: groups.into_iter().map(|(name, group)| (name, in_order(group))).collect() })
+        Ok(Self {
+            kind,
+            groups: groups
+                .into_iter()
+                .map(|(name, group)| (name, in_order(group)))
+                .collect(),
+        })
     }
 }
 
@@ -112,7 +133,13 @@ fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
     let start = pairs.first().map_or(0, |(micros, _)| *micros);
     let tick = |(micros, pair): (u64, Pair)| {
         let capture_nanos = (micros - start).saturating_mul(1000);
-        (Tick { stem: pair.vehicle.clone(), capture_nanos }, pair)
+        (
+            Tick {
+                stem: pair.vehicle.clone(),
+                capture_nanos,
+            },
+            pair,
+        )
     };
     pairs.into_iter().map(tick).collect()
 }
@@ -129,7 +156,10 @@ fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<P
         |entry| {
             let pair = pair(entry, &mut kind)?;
             if !seen.insert(pair.vehicle.clone()) {
-                return Err(entry.error(format!("vehicle frame {} is in a pair already", pair.vehicle)));
+                return Err(entry.error(format!(
+                    "vehicle frame {} is in a pair already",
+                    pair.vehicle
+                )));
             }
             pairs.push(pair);
             Ok(())
@@ -141,14 +171,28 @@ fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<P
 /// The first entry decides which of the two data sets it is.
 fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair, ReadError> {
     let is_sequence = entry.optional("vehicle_frame")?.is_some();
-    let kind = *kind.get_or_insert(if is_sequence { Kind::V2xSeq } else { Kind::Dair });
+    let kind = *kind.get_or_insert(if is_sequence {
+        Kind::V2xSeq
+    } else {
+        Kind::Dair
+    });
     let id = |side: Side| {
-        let name = if side == Side::Vehicle { "vehicle" } else { "infrastructure" };
+        let name = if side == Side::Vehicle {
+            "vehicle"
+        } else {
+            "infrastructure"
+        };
         match kind {
             Kind::V2xSeq => frame_id(&entry.required(&format!("{name}_frame"))?),
             Kind::Dair => match entry.optional(&format!("{name}_image_path"))? {
                 // Points are read by the same id.
-                Some(image) if entry.optional(&format!("{name}_pointcloud_path"))?.is_none() => stem(&image),
+                Some(image)
+                    if entry
+                        .optional(&format!("{name}_pointcloud_path"))?
+                        .is_none() =>
+                {
+                    stem(&image)
+                }
                 _ => stem(&entry.required(&format!("{name}_pointcloud_path"))?),
             },
         }
@@ -156,8 +200,14 @@ fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair, ReadError> {
     Ok(Pair {
         vehicle: id(Side::Vehicle)?,
         infrastructure: id(Side::Infrastructure)?,
-        offset_m: entry.optional("system_error_offset")?.map(|offset| offset_m(&offset)).transpose()?,
-        sequence: entry.optional("vehicle_sequence")?.map(|sequence| frame_id(&sequence)).transpose()?,
+        offset_m: entry
+            .optional("system_error_offset")?
+            .map(|offset| offset_m(&offset))
+            .transpose()?,
+        sequence: entry
+            .optional("vehicle_sequence")?
+            .map(|sequence| frame_id(&sequence))
+            .transpose()?,
     })
 }
 
@@ -177,13 +227,19 @@ fn checked_id(field: &Field<'_>, id: &str) -> Result<String, ReadError> {
     let is_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_' || letter == '-';
     if id.is_empty() || id.len() > 64 || !id.chars().all(is_name) {
         let shown: String = id.chars().take(40).collect();
-        return Err(field.error(format!("{shown:?} is no id of a frame: expected up to 64 letters, digits, _ and -")));
+        return Err(field.error(format!(
+            "{shown:?} is no id of a frame: expected up to 64 letters, digits, _ and -"
+        )));
     }
     Ok(id.to_owned())
 }
 
 /// Captures of the vehicle by frame id. Entries that cannot be read are left out, with a problem.
-fn read_captures(root: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> HashMap<String, Capture> {
+fn read_captures(
+    root: &Path,
+    kind: Kind,
+    problems: &mut Vec<ReadError>,
+) -> HashMap<String, Capture> {
     let path = root.join(VEHICLE_SIDE).join("data_info.json");
     let mut captures = HashMap::new();
     let read = json_table::read(
@@ -199,8 +255,7 @@ fn read_captures(root: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> Hash
     );
     problems.extend(read.err());
     if captures.is_empty() {
-        let reason =
-            "no time stamps: frames are taken as evenly spaced, in the order of the pairs, and all in one scenario";
+        let reason = "no time stamps: frames are taken as evenly spaced, in the order of the pairs, and all in one scenario";
         problems.push(ReadError::malformed(&path, reason));
     }
     captures
@@ -212,6 +267,15 @@ fn capture(entry: &Field<'_>, kind: Kind) -> Result<(String, Capture), ReadError
         None => stem(&entry.required("pointcloud_path")?)?,
     };
     let (_, group_key) = kind.group();
-    let group = entry.optional(group_key)?.map(|group| frame_id(&group)).transpose()?;
-    Ok((id, Capture { micros: entry.required("pointcloud_timestamp")?.count()?, group }))
+    let group = entry
+        .optional(group_key)?
+        .map(|group| frame_id(&group))
+        .transpose()?;
+    Ok((
+        id,
+        Capture {
+            micros: entry.required("pointcloud_timestamp")?.count()?,
+            group,
+        },
+    ))
 }

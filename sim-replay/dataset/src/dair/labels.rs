@@ -44,7 +44,8 @@ impl Block {
 /// and does not identify the object at another tick.
 pub(super) fn in_world(path: &Path) -> Result<Objects, ReadError> {
     read(path, |number, label| {
-        let Some((world_from_object, size_m)) = from_corners(&label.required("world_8_points")?)? else {
+        let Some((world_from_object, size_m)) = from_corners(&label.required("world_8_points")?)?
+        else {
             return Ok(None);
         };
         Ok(Some(Object {
@@ -59,18 +60,41 @@ pub(super) fn in_world(path: &Path) -> Result<Objects, ReadError> {
 
 /// Labels in the LiDAR frame of a side: all of V2X-Seq, and those of one side of DAIR-V2X. Ids are track ids if there
 /// are any.
-pub(super) fn in_frame(path: &Path, world_from_lidar: &Isometry3<f64>, block: Block) -> Result<Objects, ReadError> {
+pub(super) fn in_frame(
+    path: &Path,
+    world_from_lidar: &Isometry3<f64>,
+    block: Block,
+) -> Result<Objects, ReadError> {
     read(path, |number, label| {
-        let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else { return Ok(None) };
+        let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else {
+            return Ok(None);
+        };
         let location = label.required("3d_location")?;
         let axis = |key| location.required(key)?.number();
         let center = Translation3::new(axis("x")?, axis("y")?, axis("z")?);
-        let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), label.required("rotation")?.number()?);
-        let world_from_object: Pose = (world_from_lidar * Isometry3::from_parts(center, yaw)).into();
-        world_from_object.validate().map_err(|error| location.error(error.to_string()))?;
-        let track = label.optional("track_id")?.and_then(|track| track.count().ok());
-        let number = track.and_then(|track| i64::try_from(track).ok()).filter(|track| *track < BLOCK).unwrap_or(number);
-        Ok(Some(Object { id: block.id(number), class: class(label)?, world_from_object, size_m, speed_mps: None }))
+        let yaw = UnitQuaternion::from_axis_angle(
+            &Vector3::z_axis(),
+            label.required("rotation")?.number()?,
+        );
+        let world_from_object: Pose =
+            (world_from_lidar * Isometry3::from_parts(center, yaw)).into();
+        world_from_object
+            .validate()
+            .map_err(|error| location.error(error.to_string()))?;
+        let track = label
+            .optional("track_id")?
+            .and_then(|track| track.count().ok());
+        let number = track
+            .and_then(|track| i64::try_from(track).ok())
+            .filter(|track| *track < BLOCK)
+            .unwrap_or(number);
+        Ok(Some(Object {
+            id: block.id(number),
+            class: class(label)?,
+            world_from_object,
+            size_m,
+            speed_mps: None,
+        }))
     })
 }
 
@@ -82,7 +106,10 @@ fn read(
     let labels = Field::root(path, &value);
     let labels = labels.items()?;
     if labels.len() > MAX_BOXES {
-        return Err(ReadError::malformed(path, format!("{} boxes, expected at most {MAX_BOXES}", labels.len())));
+        return Err(ReadError::malformed(
+            path,
+            format!("{} boxes, expected at most {MAX_BOXES}", labels.len()),
+        ));
     }
     let (mut objects, mut problems) = (Vec::with_capacity(labels.len()), Vec::new());
     for (number, label) in (0..).zip(labels) {
@@ -92,7 +119,9 @@ fn read(
                 objects.push(object);
             }
             Ok(None) => {}
-            Err(error) => problems.push(Problem::from(&error.with_consequence("the object is left out"))),
+            Err(error) => problems.push(Problem::from(
+                &error.with_consequence("the object is left out"),
+            )),
         }
     }
     Ok((objects, problems))
@@ -104,9 +133,18 @@ fn class(label: &Field<'_>) -> Result<ObjectClass, ReadError> {
 }
 
 fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
-    let kind = label.required("type").ok()?.text().ok().filter(|kind| classes::of_name(kind).is_none())?;
+    let kind = label
+        .required("type")
+        .ok()?
+        .text()
+        .ok()
+        .filter(|kind| classes::of_name(kind).is_none())?;
     let shown: String = kind.chars().take(40).collect();
-    Some(classes::unknown(path.parent().unwrap_or(path), "type", &format!("{shown:?}")))
+    Some(classes::unknown(
+        path.parent().unwrap_or(path),
+        "type",
+        &format!("{shown:?}"),
+    ))
 }
 
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
@@ -123,7 +161,9 @@ fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3], ReadError
     if size_m.iter().all(|size| *size > 0.0 && *size <= MAX_SIZE_M) {
         return Ok(size_m);
     }
-    Err(field.error(format!("{size_m:?} are no sizes in metres, expected up to {MAX_SIZE_M}")))
+    Err(field.error(format!(
+        "{size_m:?} are no sizes in metres, expected up to {MAX_SIZE_M}"
+    )))
 }
 
 /// Pose and size of a box from its corners: four of the bottom, in order around it from the front, then those above
@@ -135,7 +175,11 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
     let (corners, _) = numbers.as_chunks::<3>();
     let corner = |index: usize| Vector3::from(corners[index]);
     let mean = |pairs: [(usize, usize); 4]| {
-        pairs.iter().map(|&(to, from)| corner(to) - corner(from)).sum::<Vector3<f64>>() / 4.0
+        pairs
+            .iter()
+            .map(|&(to, from)| corner(to) - corner(from))
+            .sum::<Vector3<f64>>()
+            / 4.0
     };
     let ahead = mean([(0, 3), (1, 2), (4, 7), (5, 6)]);
     let aside = mean([(0, 1), (3, 2), (4, 5), (7, 6)]);
@@ -145,16 +189,24 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
         return Ok(None);
     }
     let size_m = check_size(field, size_m)?;
-    let skew = [(ahead, aside), (aside, above), (above, ahead)].map(|(a, b)| (a.normalize().dot(&b.normalize())).abs());
+    let skew = [(ahead, aside), (aside, above), (above, ahead)]
+        .map(|(a, b)| (a.normalize().dot(&b.normalize())).abs());
     if !skew.iter().all(|cosine| *cosine <= MAX_SKEW) {
-        return Err(field.error(format!("no box: cosines {skew:.2?} between its edges, expected at most {MAX_SKEW}")));
+        return Err(field.error(format!(
+            "no box: cosines {skew:.2?} between its edges, expected at most {MAX_SKEW}"
+        )));
     }
     let x = ahead.normalize();
     let y = above.cross(&x).normalize();
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
     let center = (0..8).map(corner).sum::<Vector3<f64>>() / 8.0;
-    let pose: Pose = Isometry3::from_parts(center.into(), UnitQuaternion::from_rotation_matrix(&rotation)).into();
-    pose.validate().map_err(|error| field.error(error.to_string()))?;
+    let pose: Pose = Isometry3::from_parts(
+        center.into(),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    )
+    .into();
+    pose.validate()
+        .map_err(|error| field.error(error.to_string()))?;
     Ok(Some((pose, size_m)))
 }
 
@@ -162,9 +214,17 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
 ///
 /// The two sides are labelled independently. Of several candidates the one with the largest overlap is used; each id is
 /// given once.
-#[expect(clippy::indexing_slicing, reason = "indices of the lists that they were taken from")]
-pub(super) fn share_ids(objects: &mut [Object], others: &[Object], lidar_from_world: &Isometry3<f64>) {
-    let footprint = |object: &Object| Polygon::footprint(&upright_box(object, lidar_from_world).corners());
+#[expect(
+    clippy::indexing_slicing,
+    reason = "indices of the lists that they were taken from"
+)]
+pub(super) fn share_ids(
+    objects: &mut [Object],
+    others: &[Object],
+    lidar_from_world: &Isometry3<f64>,
+) {
+    let footprint =
+        |object: &Object| Polygon::footprint(&upright_box(object, lidar_from_world).corners());
     let own: Vec<Polygon> = objects.iter().map(footprint).collect();
     let theirs: Vec<Polygon> = others.iter().map(footprint).collect();
     let mut overlaps = Vec::new();

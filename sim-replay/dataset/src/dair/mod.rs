@@ -26,7 +26,10 @@ use self::labels::{Block, Objects};
 use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
-use super::{Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Scenario, Tick, files, roots};
+use super::{
+    Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Scenario, Tick, files,
+    roots,
+};
 use crate::frame::{Frame, Object};
 use crate::pcd::PcdCloud;
 
@@ -58,21 +61,38 @@ const INFRASTRUCTURE: &str = "infrastructure";
 
 /// Opens the data sets at or below `dir`; `None` where there are none.
 pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
-    if let Some(root) = files::above(dir).find(|above| is_root(above)).filter(|_| is_side(dir)) {
-        let reason = format!("this is a part of a DAIR-V2X data set: open {}", root.display());
-        return Err(ReadError::Layout { path: dir.to_owned(), reason });
+    if let Some(root) = files::above(dir)
+        .find(|above| is_root(above))
+        .filter(|_| is_side(dir))
+    {
+        let reason = format!(
+            "this is a part of a DAIR-V2X data set: open {}",
+            root.display()
+        );
+        return Err(ReadError::Layout {
+            path: dir.to_owned(),
+            reason,
+        });
     }
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for root in &roots::find(dir, is_root) {
         scenarios.extend(open_root(dir, root, options, &mut problems)?);
     }
-    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else { return Ok(None) };
-    Ok(Some(Dataset { layout, scenarios, problems }))
+    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else {
+        return Ok(None);
+    };
+    Ok(Some(Dataset {
+        layout,
+        scenarios,
+        problems,
+    }))
 }
 
 fn is_root(dir: &Path) -> bool {
     dir.join(index::COOPERATIVE).is_file()
-        && [VEHICLE_SIDE, INFRASTRUCTURE_SIDE].iter().all(|side| dir.join(side).is_dir())
+        && [VEHICLE_SIDE, INFRASTRUCTURE_SIDE]
+            .iter()
+            .all(|side| dir.join(side).is_dir())
 }
 
 fn is_side(dir: &Path) -> bool {
@@ -89,8 +109,21 @@ fn open_root(
 ) -> Result<Vec<Scenario>, ReadError> {
     let Index { kind, groups } = Index::read(root, options.period_nanos, problems)?;
     let scenarios = groups.into_iter().map(|(group, pairs)| {
-        let name = if root == opened { group } else { format!("{}/{group}", files::name_below(opened, root)) };
-        scenario(name, Sides { root: root.to_owned(), kind }, pairs, options, problems)
+        let name = if root == opened {
+            group
+        } else {
+            format!("{}/{group}", files::name_below(opened, root))
+        };
+        scenario(
+            name,
+            Sides {
+                root: root.to_owned(),
+                kind,
+            },
+            pairs,
+            options,
+            problems,
+        )
     });
     Ok(scenarios.collect())
 }
@@ -103,31 +136,55 @@ fn scenario(
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
 ) -> Scenario {
-    let agents = [VEHICLE, INFRASTRUCTURE].map(|name| CavId::new(name).expect("a word is an identifier"));
+    let agents =
+        [VEHICLE, INFRASTRUCTURE].map(|name| CavId::new(name).expect("a word is an identifier"));
     let (mut moments, mut missing, mut kept) = (Vec::<Tick>::new(), Vec::new(), HashMap::new());
     for (tick, pair) in pairs {
-        if moments.last().is_some_and(|last| last.capture_nanos == tick.capture_nanos) {
-            let reason = format!("vehicle frame {} has the time stamp of the one before: left out", tick.stem);
-            problems.push(ReadError::malformed(&sides.root.join(index::COOPERATIVE), reason));
+        if moments
+            .last()
+            .is_some_and(|last| last.capture_nanos == tick.capture_nanos)
+        {
+            let reason = format!(
+                "vehicle frame {} has the time stamp of the one before: left out",
+                tick.stem
+            );
+            problems.push(ReadError::malformed(
+                &sides.root.join(index::COOPERATIVE),
+                reason,
+            ));
             continue;
         }
         for agent in &agents {
             if let Some(path) = sides.missing_file(&pair, Side::of(agent)) {
                 let reason = format!("does not exist: {agent} is absent at {}", tick.stem);
                 problems.push(ReadError::malformed(&path, reason));
-                missing.push(MissingFrame { agent: agent.clone(), stem: tick.stem.clone() });
+                missing.push(MissingFrame {
+                    agent: agent.clone(),
+                    stem: tick.stem.clone(),
+                });
             }
         }
         kept.insert(tick.stem.clone(), pair);
         moments.push(tick);
     }
-    let lacks_vehicle =
-        |tick: &&Tick| missing.contains(&MissingFrame { agent: agents[0].clone(), stem: tick.stem.clone() });
-    let ticks: Vec<Tick> = moments.iter().filter(|tick| !lacks_vehicle(tick)).cloned().collect();
-    let sweeps = agents.iter().fold(Sweeps::new(SweepStorage::ByName, options), |sweeps, agent| {
-        let file = |tick: &Tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent)));
-        sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
-    });
+    let lacks_vehicle = |tick: &&Tick| {
+        missing.contains(&MissingFrame {
+            agent: agents[0].clone(),
+            stem: tick.stem.clone(),
+        })
+    };
+    let ticks: Vec<Tick> = moments
+        .iter()
+        .filter(|tick| !lacks_vehicle(tick))
+        .cloned()
+        .collect();
+    let sweeps = agents.iter().fold(
+        Sweeps::new(SweepStorage::ByName, options),
+        |sweeps, agent| {
+            let file = |tick: &Tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent)));
+            sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
+        },
+    );
     Scenario {
         name,
         absences: Absences::new(&agents, &ticks, &missing).among(moments),
@@ -140,7 +197,11 @@ fn scenario(
         cameras: Vec::new(),
         layout: sides.kind.layout(),
         source_handedness: Handedness::Right,
-        source: Arc::new(Source { sides, pairs: kept, sweeps }),
+        source: Arc::new(Source {
+            sides,
+            pairs: kept,
+            sweeps,
+        }),
     }
 }
 
@@ -153,7 +214,11 @@ enum Side {
 
 impl Side {
     fn of(agent: &CavId) -> Self {
-        if agent.as_str() == VEHICLE { Self::Vehicle } else { Self::Infrastructure }
+        if agent.as_str() == VEHICLE {
+            Self::Vehicle
+        } else {
+            Self::Infrastructure
+        }
     }
 }
 
@@ -170,14 +235,20 @@ impl Sides {
             Side::Vehicle => (VEHICLE_SIDE, &pair.vehicle),
             Side::Infrastructure => (INFRASTRUCTURE_SIDE, &pair.infrastructure),
         };
-        self.root.join(folder).join("velodyne").join(format!("{id}.pcd"))
+        self.root
+            .join(folder)
+            .join("velodyne")
+            .join(format!("{id}.pcd"))
     }
 
     /// Labels of a side's own sweep.
     fn labels(&self, pair: &Pair, side: Side) -> PathBuf {
         let (folder, id) = match side {
             Side::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
-            Side::Infrastructure => ("infrastructure-side/label/virtuallidar", &pair.infrastructure),
+            Side::Infrastructure => (
+                "infrastructure-side/label/virtuallidar",
+                &pair.infrastructure,
+            ),
         };
         self.root.join(folder).join(format!("{id}.json"))
     }
@@ -187,7 +258,9 @@ impl Sides {
             Kind::Dair => "cooperative/label_world",
             Kind::V2xSeq => "cooperative/label",
         };
-        self.root.join(folder).join(format!("{}.json", pair.vehicle))
+        self.root
+            .join(folder)
+            .join(format!("{}.json", pair.vehicle))
     }
 
     fn calibration(&self, folder: &str, id: &str) -> PathBuf {
@@ -197,10 +270,16 @@ impl Sides {
     /// The first required file of a side that does not exist.
     fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
         let calibrations = match side {
-            Side::Vehicle => calibration::VEHICLE.map(|folder| self.calibration(folder, &pair.vehicle)).to_vec(),
-            Side::Infrastructure => vec![self.calibration(calibration::INFRASTRUCTURE, &pair.infrastructure)],
+            Side::Vehicle => calibration::VEHICLE
+                .map(|folder| self.calibration(folder, &pair.vehicle))
+                .to_vec(),
+            Side::Infrastructure => {
+                vec![self.calibration(calibration::INFRASTRUCTURE, &pair.infrastructure)]
+            }
         };
-        std::iter::once(self.points(pair, side)).chain(calibrations).find(|path| !path.is_file())
+        std::iter::once(self.points(pair, side))
+            .chain(calibrations)
+            .find(|path| !path.is_file())
     }
 }
 
@@ -215,7 +294,12 @@ struct Source {
 
 impl Source {
     fn pair(&self, tick: &Tick) -> Result<&Pair, ReadError> {
-        let unknown = || ReadError::malformed(&self.sides.root, format!("no pair of vehicle frame {}", tick.stem));
+        let unknown = || {
+            ReadError::malformed(
+                &self.sides.root,
+                format!("no pair of vehicle frame {}", tick.stem),
+            )
+        };
         self.pairs.get(&tick.stem).ok_or_else(unknown)
     }
 
@@ -248,10 +332,18 @@ impl Source {
         frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
         // Faults of the vehicle's labels are problems of its frame.
         let vehicle = calibration::vehicle(&self.sides, pair).and_then(|poses| {
-            labels::in_frame(&self.sides.labels(pair, Side::Vehicle), &poses.world_from_lidar(), Block::Vehicle)
+            labels::in_frame(
+                &self.sides.labels(pair, Side::Vehicle),
+                &poses.world_from_lidar(),
+                Block::Vehicle,
+            )
         });
         if let Ok((vehicle_objects, _)) = vehicle {
-            labels::share_ids(&mut frame.objects, &vehicle_objects, &world_from_lidar.inverse());
+            labels::share_ids(
+                &mut frame.objects,
+                &vehicle_objects,
+                &world_from_lidar.inverse(),
+            );
         }
         Ok(frame)
     }
@@ -279,8 +371,14 @@ impl FrameSource for Source {
         }
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        self.sweeps
+            .read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
@@ -293,8 +391,9 @@ impl FrameSource for Source {
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
         // A tick of another scenario has no file here.
-        self.pairs
-            .get(&tick.stem)
-            .map_or_else(|| self.sides.root.clone(), |pair| self.sides.points(pair, Side::of(agent)))
+        self.pairs.get(&tick.stem).map_or_else(
+            || self.sides.root.clone(),
+            |pair| self.sides.points(pair, Side::of(agent)),
+        )
     }
 }

@@ -32,9 +32,15 @@ struct DataSet {
 impl DataSet {
     fn new(kind: Kind) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let set = Self { root: dir.path().join("cooperative-vehicle-infrastructure"), dir };
+        let set = Self {
+            root: dir.path().join("cooperative-vehicle-infrastructure"),
+            dir,
+        };
         // Not in the order of time, unlike the index.
-        set.write("cooperative/data_info.json", &json!([set.pair(kind, 1), set.pair(kind, 0)]));
+        set.write(
+            "cooperative/data_info.json",
+            &json!([set.pair(kind, 1), set.pair(kind, 0)]),
+        );
         let capture = |number: u64| {
             json!({
                 "pointcloud_path": format!("velodyne/{:06}.pcd", 10 + number), "frame_id": format!("{:06}", 10 + number),
@@ -42,13 +48,19 @@ impl DataSet {
                 "batch_id": "7", "sequence_id": "0003",
             })
         };
-        set.write("vehicle-side/data_info.json", &json!([capture(0), capture(1), capture(2)]));
+        set.write(
+            "vehicle-side/data_info.json",
+            &json!([capture(0), capture(1), capture(2)]),
+        );
         (0..2).for_each(|number| set.write_frames(kind, number));
         set
     }
 
     fn pair(&self, kind: Kind, number: u64) -> Value {
-        let [vehicle, unit] = [format!("{:06}", 10 + number), format!("{:06}", 500 + number)];
+        let [vehicle, unit] = [
+            format!("{:06}", 10 + number),
+            format!("{:06}", 500 + number),
+        ];
         let offset = json!({"delta_x": "1.5", "delta_y": -0.5});
         match kind {
             Kind::Dair => json!({
@@ -67,9 +79,14 @@ impl DataSet {
     }
 
     fn write_frames(&self, kind: Kind, number: u64) {
-        let [vehicle, unit] = [format!("{:06}", 10 + number), format!("{:06}", 500 + number)];
+        let [vehicle, unit] = [
+            format!("{:06}", 10 + number),
+            format!("{:06}", 500 + number),
+        ];
         for (side, id, x) in [("vehicle", &vehicle, 1.0), ("infrastructure", &unit, 7.0)] {
-            let cloud = PointCloud { xyzi: vec![[x, 2.0, -1.0, 51.0], [3.0, 4.0, -1.0, 255.0]] };
+            let cloud = PointCloud {
+                xyzi: vec![[x, 2.0, -1.0, 51.0], [3.0, 4.0, -1.0, 255.0]],
+            };
             let bytes = pcd::encode(&cloud, Encoding::Binary, IntensityField::Intensity);
             self.write_bytes(&format!("{side}-side/velodyne/{id}.pcd"), &bytes);
         }
@@ -90,13 +107,25 @@ impl DataSet {
                 "relative_error": {"delta_x": 9.0, "delta_y": ""},
             }),
         );
-        self.write(&format!("vehicle-side/label/lidar/{vehicle}.json"), &json!([label("Car", [10.0, 1.0, -1.0], 0.1)]));
+        self.write(
+            &format!("vehicle-side/label/lidar/{vehicle}.json"),
+            &json!([label("Car", [10.0, 1.0, -1.0], 0.1)]),
+        );
         // The vehicle's car seen from (131.5, 199.5, 24), and a truck of its own.
         let turned = 0.1 + std::f64::consts::FRAC_PI_2;
-        let seen = json!([label("Car", [-32.5, 10.5, -3.2], turned), label("Truck", [10.0, 0.0, -2.0], 0.0)]);
-        self.write(&format!("infrastructure-side/label/virtuallidar/{unit}.json"), &seen);
+        let seen = json!([
+            label("Car", [-32.5, 10.5, -3.2], turned),
+            label("Truck", [10.0, 0.0, -2.0], 0.0)
+        ]);
+        self.write(
+            &format!("infrastructure-side/label/virtuallidar/{unit}.json"),
+            &seen,
+        );
         match kind {
-            Kind::Dair => self.write(&format!("cooperative/label_world/{vehicle}.json"), &json!([world_label()])),
+            Kind::Dair => self.write(
+                &format!("cooperative/label_world/{vehicle}.json"),
+                &json!([world_label()]),
+            ),
             Kind::V2xSeq => {
                 let mut car = label("Car", [30.0, 0.0, -0.8], 0.0);
                 car["track_id"] = json!("004242");
@@ -129,12 +158,17 @@ impl DataSet {
     /// Messages below the root.
     fn shown(&self, messages: impl IntoIterator<Item = impl ToString>) -> Vec<String> {
         let root = format!("{}/", self.root.display());
-        messages.into_iter().map(|message| message.to_string().replace(&root, "")).collect()
+        messages
+            .into_iter()
+            .map(|message| message.to_string().replace(&root, ""))
+            .collect()
     }
 
     /// Problems of a frame.
     fn problems_of(&self, agent: usize) -> (Frame, Vec<String>) {
-        let frame = self.open().scenarios[0].load(agent, 0, &LoadOptions::default()).unwrap();
+        let frame = self.open().scenarios[0]
+            .load(agent, 0, &LoadOptions::default())
+            .unwrap();
         let problems = self.shown(frame.problems.iter().map(|problem| &problem.message));
         (frame, problems)
     }
@@ -150,17 +184,29 @@ fn label(kind: &str, [x, y, z]: [f64; 3], rotation: f64) -> Value {
 
 /// A van of 4 x 2 x 1.5 m at (100, 230, 21) that faces y.
 fn world_label() -> Value {
-    let corners = |z: f64| [[99.0, 232.0, z], [101.0, 232.0, z], [101.0, 228.0, z], [99.0, 228.0, z]];
+    let corners = |z: f64| {
+        [
+            [99.0, 232.0, z],
+            [101.0, 232.0, z],
+            [101.0, 228.0, z],
+            [99.0, 228.0, z],
+        ]
+    };
     let all: Vec<[f64; 3]> = corners(20.25).into_iter().chain(corners(21.75)).collect();
     json!({"type": "Van", "world_8_points": all})
 }
 
 fn close(found: [f64; 3], expected: [f64; 3]) -> bool {
-    found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-9)
+    found
+        .iter()
+        .zip(expected)
+        .all(|(found, expected)| (found - expected).abs() < 1e-9)
 }
 
 fn frames(scenario: &Scenario, tick: usize) -> Vec<Frame> {
-    (0..2).map(|agent| scenario.load(agent, tick, &LoadOptions::default()).unwrap()).collect()
+    (0..2)
+        .map(|agent| scenario.load(agent, tick, &LoadOptions::default()).unwrap())
+        .collect()
 }
 
 #[test]
@@ -169,18 +215,56 @@ fn a_pair_is_a_tick_with_the_poses_of_both_sides() {
     let dataset = set.open();
     assert_eq!((dataset.layout, dataset.problems.len()), (Layout::DAIR, 0));
     let scenario = &dataset.scenarios[0];
-    assert_eq!((dataset.scenarios.len(), scenario.name.as_str()), (1, "batch_7"));
-    assert_eq!(scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>(), ["vehicle", "infrastructure"]);
+    assert_eq!(
+        (dataset.scenarios.len(), scenario.name.as_str()),
+        (1, "batch_7")
+    );
+    assert_eq!(
+        scenario
+            .agents
+            .iter()
+            .map(CavId::as_str)
+            .collect::<Vec<_>>(),
+        ["vehicle", "infrastructure"]
+    );
     assert_eq!(scenario.roadside_units, [scenario.agents[1].clone()]);
-    let ticks: Vec<_> = scenario.ticks.iter().map(|tick| (tick.stem.as_str(), tick.capture_nanos)).collect();
-    assert_eq!(ticks, [("000010", 0), ("000011", 100_000_000)], "frame 000012 has no partner");
-    let [vehicle, unit] = &frames(scenario, 1)[..] else { panic!("two agents") };
-    assert!(close(vehicle.world_from_lidar.unwrap().translation_m, [100.0, 200.0, 21.8]));
+    let ticks: Vec<_> = scenario
+        .ticks
+        .iter()
+        .map(|tick| (tick.stem.as_str(), tick.capture_nanos))
+        .collect();
+    assert_eq!(
+        ticks,
+        [("000010", 0), ("000011", 100_000_000)],
+        "frame 000012 has no partner"
+    );
+    let [vehicle, unit] = &frames(scenario, 1)[..] else {
+        panic!("two agents")
+    };
+    assert!(close(
+        vehicle.world_from_lidar.unwrap().translation_m,
+        [100.0, 200.0, 21.8]
+    ));
     assert!((vehicle.world_from_lidar.unwrap().yaw_rad().to_degrees() - 90.0).abs() < 1e-9);
-    assert!(close(vehicle.world_from_vehicle.unwrap().translation_m, [100.0, 200.0, 20.0]));
-    assert!(close(unit.world_from_lidar.unwrap().translation_m, [131.5, 199.5, 24.0]), "the offset of the pair");
-    assert_eq!((vehicle.capture_nanos, unit.capture_nanos), (100_000_000, 100_000_000));
-    assert_eq!(vehicle.points.xyzi, [[1.0, 2.0, -1.0, 0.2], [3.0, 4.0, -1.0, 1.0]]);
+    assert!(close(
+        vehicle.world_from_vehicle.unwrap().translation_m,
+        [100.0, 200.0, 20.0]
+    ));
+    assert!(
+        close(
+            unit.world_from_lidar.unwrap().translation_m,
+            [131.5, 199.5, 24.0]
+        ),
+        "the offset of the pair"
+    );
+    assert_eq!(
+        (vehicle.capture_nanos, unit.capture_nanos),
+        (100_000_000, 100_000_000)
+    );
+    assert_eq!(
+        vehicle.points.xyzi,
+        [[1.0, 2.0, -1.0, 0.2], [3.0, 4.0, -1.0, 1.0]]
+    );
     assert_eq!(unit.points.xyzi[0][0], 7.0);
 }
 
@@ -190,48 +274,99 @@ fn cooperative_labels_are_the_ground_truth_of_a_pair() {
     let frames = frames(&set.open().scenarios[0], 0);
     for present in [frames.iter().collect::<Vec<_>>(), vec![&frames[0]]] {
         let merged = merge(&present, 0, &RULE);
-        let [(id, van)] = &merged[..] else { panic!("{merged:?}") };
+        let [(id, van)] = &merged[..] else {
+            panic!("{merged:?}")
+        };
         // 30 m ahead of the LiDAR, 0.8 m below it.
-        assert!(*id == 0 && close(van.center_m, [30.0, 0.0, -0.8]) && close(van.size_m, [4.0, 2.0, 1.5]), "{van:?}");
+        assert!(
+            *id == 0
+                && close(van.center_m, [30.0, 0.0, -0.8])
+                && close(van.size_m, [4.0, 2.0, 1.5]),
+            "{van:?}"
+        );
         assert!(van.heading_rad.abs() < 1e-9);
     }
-    assert_eq!(frames[0].cooperative_objects.as_ref().unwrap()[0].class, ObjectClass::Van);
-    assert_eq!((frames[0].objects.len(), frames[1].objects.len()), (1, 2), "each side has its own list as well");
+    assert_eq!(
+        frames[0].cooperative_objects.as_ref().unwrap()[0].class,
+        ObjectClass::Van
+    );
+    assert_eq!(
+        (frames[0].objects.len(), frames[1].objects.len()),
+        (1, 2),
+        "each side has its own list as well"
+    );
 }
 
 #[test]
 fn without_cooperative_labels_both_sides_count_and_common_objects_once() {
     let set = DataSet::new(Kind::Dair);
-    set.write_bytes("cooperative/label_world/000010.json", b"[{\"type\": \"Van\",");
+    set.write_bytes(
+        "cooperative/label_world/000010.json",
+        b"[{\"type\": \"Van\",",
+    );
     let (vehicle, problems) = set.problems_of(0);
     assert_eq!(problems.len(), 1);
-    assert!(problems[0].starts_with("cooperative/label_world/000010.json:1: no sound JSON: EOF"), "{problems:?}");
-    assert_eq!((vehicle.points.len(), vehicle.cooperative_objects.as_ref()), (2, None), "the frame is still read");
+    assert!(
+        problems[0].starts_with("cooperative/label_world/000010.json:1: no sound JSON: EOF"),
+        "{problems:?}"
+    );
+    assert_eq!(
+        (vehicle.points.len(), vehicle.cooperative_objects.as_ref()),
+        (2, None),
+        "the frame is still read"
+    );
     let (unit, _) = set.problems_of(1);
     let merged = merge(&[&vehicle, &unit], 0, &RULE);
-    let [(car, car_box), (truck, truck_box)] = &merged[..] else { panic!("{merged:?}") };
-    assert_eq!((*car, *truck), (Block::Vehicle.id(0), Block::Infrastructure.id(1)));
+    let [(car, car_box), (truck, truck_box)] = &merged[..] else {
+        panic!("{merged:?}")
+    };
+    assert_eq!(
+        (*car, *truck),
+        (Block::Vehicle.id(0), Block::Infrastructure.id(1))
+    );
     assert!(close(car_box.center_m, [10.0, 1.0, -1.0]) && (car_box.heading_rad - 0.1).abs() < 1e-9);
     // The truck is at (141.5, 199.5, 22) in the world.
-    assert!(close(truck_box.center_m, [-0.5, -41.5, 0.2]), "{truck_box:?}");
+    assert!(
+        close(truck_box.center_m, [-0.5, -41.5, 0.2]),
+        "{truck_box:?}"
+    );
     let seen_by_unit = merge(&[&unit], 0, &RULE);
-    assert!(close(seen_by_unit[0].1.center_m, [-32.5, 10.5, -3.2]), "{seen_by_unit:?}");
+    assert!(
+        close(seen_by_unit[0].1.center_m, [-32.5, 10.5, -3.2]),
+        "{seen_by_unit:?}"
+    );
 }
 
 #[test]
 fn sequences_have_track_ids_and_their_offset_in_the_frame_of_the_vehicle() {
     let set = DataSet::new(Kind::V2xSeq);
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::V2XSEQ, 0));
+    assert_eq!(
+        (dataset.layout, dataset.problems.len()),
+        (Layout::V2XSEQ, 0)
+    );
     let scenario = &dataset.scenarios[0];
-    assert_eq!((scenario.name.as_str(), scenario.ticks.len()), ("sequence_0003", 2));
+    assert_eq!(
+        (scenario.name.as_str(), scenario.ticks.len()),
+        ("sequence_0003", 2)
+    );
     let frames = frames(scenario, 1);
     // (0, -30, 2.2) in the LiDAR frame of the vehicle, and the offset (1.5, -0.5) there: (30.5, 1.5) in the world.
-    assert!(close(frames[1].world_from_lidar.unwrap().translation_m, [130.5, 201.5, 24.0]));
+    assert!(close(
+        frames[1].world_from_lidar.unwrap().translation_m,
+        [130.5, 201.5, 24.0]
+    ));
     let merged = merge(&frames.iter().collect::<Vec<_>>(), 0, &RULE);
-    let [(id, car)] = &merged[..] else { panic!("cyclists are no vehicles: {merged:?}") };
-    assert!(*id == 4242 && close(car.center_m, [30.0, 0.0, -0.8]) && close(car.size_m, [4.4, 1.9, 1.5]));
-    assert_eq!(frames[0].cooperative_objects.as_ref().unwrap()[1].class, ObjectClass::TwoWheeler);
+    let [(id, car)] = &merged[..] else {
+        panic!("cyclists are no vehicles: {merged:?}")
+    };
+    assert!(
+        *id == 4242 && close(car.center_m, [30.0, 0.0, -0.8]) && close(car.size_m, [4.4, 1.9, 1.5])
+    );
+    assert_eq!(
+        frames[0].cooperative_objects.as_ref().unwrap()[1].class,
+        ObjectClass::TwoWheeler
+    );
 }
 
 #[test]
@@ -247,11 +382,32 @@ fn missing_files_are_absent_and_reported() {
     ];
     assert_eq!(set.shown(&dataset.problems), expected);
     let scenario = &dataset.scenarios[0];
-    assert_eq!((scenario.ticks.len(), scenario.is_present(0, 0), scenario.is_present(1, 0)), (1, true, false));
-    assert!(scenario.load(1, 0, &LoadOptions::default()).unwrap_err().is_absence());
+    assert_eq!(
+        (
+            scenario.ticks.len(),
+            scenario.is_present(0, 0),
+            scenario.is_present(1, 0)
+        ),
+        (1, true, false)
+    );
+    assert!(
+        scenario
+            .load(1, 0, &LoadOptions::default())
+            .unwrap_err()
+            .is_absence()
+    );
     let (frame, problems) = set.problems_of(0);
-    assert!(problems[0].starts_with("vehicle-side/label/lidar/000010.json: No such file"), "{problems:?}");
-    assert_eq!((frame.objects.len(), frame.cooperative_objects.unwrap().len()), (0, 1));
+    assert!(
+        problems[0].starts_with("vehicle-side/label/lidar/000010.json: No such file"),
+        "{problems:?}"
+    );
+    assert_eq!(
+        (
+            frame.objects.len(),
+            frame.cooperative_objects.unwrap().len()
+        ),
+        (0, 1)
+    );
 }
 
 #[test]
@@ -265,13 +421,22 @@ fn labels_that_cannot_be_right_are_left_out_one_by_one() {
     nowhere["3d_location"]["y"] = json!("left");
     set.write(
         "vehicle-side/label/lidar/000010.json",
-        &json!([flat, huge, nowhere, label("Spaceship", [1.0, 2.0, 0.0], 0.0), 3]),
+        &json!([
+            flat,
+            huge,
+            nowhere,
+            label("Spaceship", [1.0, 2.0, 0.0], 0.0),
+            3
+        ]),
     );
     let mut crumpled = world_label();
     crumpled["world_8_points"][0] = json!([50.0, 232.0, 20.25]);
     let mut cut = world_label();
     cut["world_8_points"].as_array_mut().unwrap().pop();
-    set.write("cooperative/label_world/000010.json", &json!([crumpled, cut, world_label()]));
+    set.write(
+        "cooperative/label_world/000010.json",
+        &json!([crumpled, cut, world_label()]),
+    );
     let (frame, problems) = set.problems_of(0);
     let own = "vehicle-side/label/lidar/000010.json: ";
     assert_eq!(
@@ -284,10 +449,22 @@ fn labels_that_cannot_be_right_are_left_out_one_by_one() {
         ]
     );
     let cooperative = "cooperative/label_world/000010.json: ";
-    assert!(problems[4].starts_with(&format!("{cooperative}0.world_8_points: no box: cosines")), "{problems:?}");
-    assert_eq!(problems[5], format!("{cooperative}1.world_8_points: 21 numbers, expected 24: the object is left out"));
+    assert!(
+        problems[4].starts_with(&format!("{cooperative}0.world_8_points: no box: cosines")),
+        "{problems:?}"
+    );
+    assert_eq!(
+        problems[5],
+        format!("{cooperative}1.world_8_points: 21 numbers, expected 24: the object is left out")
+    );
     assert_eq!(frame.objects[0].class, ObjectClass::Other);
-    assert_eq!((frame.objects.len(), frame.cooperative_objects.unwrap()[0].id), (1, 2));
+    assert_eq!(
+        (
+            frame.objects.len(),
+            frame.cooperative_objects.unwrap()[0].id
+        ),
+        (1, 2)
+    );
 }
 
 #[test]
@@ -295,9 +472,15 @@ fn either_order_of_corners_is_the_same_box() {
     let set = DataSet::new(Kind::Dair);
     let mut mirrored = world_label();
     for (a, b) in [(0, 1), (2, 3), (4, 5), (6, 7)] {
-        mirrored["world_8_points"].as_array_mut().unwrap().swap(a, b);
+        mirrored["world_8_points"]
+            .as_array_mut()
+            .unwrap()
+            .swap(a, b);
     }
-    set.write("cooperative/label_world/000010.json", &json!([mirrored, world_label()]));
+    set.write(
+        "cooperative/label_world/000010.json",
+        &json!([mirrored, world_label()]),
+    );
     let objects = set.problems_of(0).0.cooperative_objects.unwrap();
     let [a, b] = [0, 1].map(|index: usize| objects[index].world_from_object);
     assert!(close(a.translation_m, b.translation_m) && (a.yaw_rad() - b.yaw_rad()).abs() < 1e-9);
@@ -310,7 +493,9 @@ fn calibrations_that_are_none_are_named() {
     let name = "infrastructure-side/calib/virtuallidar_to_world/000500.json";
     let load = |value: &Value| {
         set.write(name, value);
-        let error = set.open().scenarios[0].load(1, 0, &LoadOptions::default()).unwrap_err();
+        let error = set.open().scenarios[0]
+            .load(1, 0, &LoadOptions::default())
+            .unwrap_err();
         set.shown([error]).remove(0)
     };
     let mirror = json!({"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, 1]], "translation": [1, 2, 3]});
@@ -320,7 +505,10 @@ fn calibrations_that_are_none_are_named() {
             "{name}: rotation: no rotation: off orthonormal by 0.000, determinant -1.000, expected at most 0.05 and 1"
         )
     );
-    assert_eq!(load(&json!({"rotation": [1, 2, 3]})), format!("{name}: rotation: 3 numbers, expected 9"));
+    assert_eq!(
+        load(&json!({"rotation": [1, 2, 3]})),
+        format!("{name}: rotation: 3 numbers, expected 9")
+    );
     assert_eq!(load(&json!({})), format!("{name}: rotation: missing"));
 }
 
@@ -331,19 +519,33 @@ fn the_offset_of_the_calibration_counts_where_the_pair_has_none() {
     pair.as_object_mut().unwrap().remove("system_error_offset");
     set.write("cooperative/data_info.json", &json!([pair]));
     let unit = set.problems_of(1).0;
-    assert!(close(unit.world_from_lidar.unwrap().translation_m, [139.0, 200.0, 24.0]));
+    assert!(close(
+        unit.world_from_lidar.unwrap().translation_m,
+        [139.0, 200.0, 24.0]
+    ));
 }
 
 #[test]
 fn it_is_found_from_its_root_and_from_above_and_parts_point_to_it() {
     let set = DataSet::new(Kind::Dair);
     let above = crate::open(set.dir.path()).unwrap();
-    assert_eq!(above.scenarios[0].name, "cooperative-vehicle-infrastructure/batch_7");
+    assert_eq!(
+        above.scenarios[0].name,
+        "cooperative-vehicle-infrastructure/batch_7"
+    );
     let renamed = set.dir.path().join("any name");
     fs::rename(&set.root, &renamed).unwrap();
     assert_eq!(crate::open(&renamed).unwrap().layout, Layout::DAIR);
-    let error = crate::open(&renamed.join("vehicle-side")).unwrap_err().to_string();
-    assert!(error.ends_with(&format!("this is a part of a DAIR-V2X data set: open {}", renamed.display())), "{error}");
+    let error = crate::open(&renamed.join("vehicle-side"))
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.ends_with(&format!(
+            "this is a part of a DAIR-V2X data set: open {}",
+            renamed.display()
+        )),
+        "{error}"
+    );
 }
 
 #[test]
@@ -354,7 +556,10 @@ fn pairs_that_cannot_be_used_are_left_out() {
     let mut unknown = set.pair(Kind::Dair, 1);
     unknown["vehicle_pointcloud_path"] = json!("vehicle-side/velodyne/000099.pcd");
     let first = set.pair(Kind::Dair, 0);
-    set.write("cooperative/data_info.json", &json!([first, elsewhere, first, unknown, {}]));
+    set.write(
+        "cooperative/data_info.json",
+        &json!([first, elsewhere, first, unknown, {}]),
+    );
     let dataset = set.open();
     let index = "cooperative/data_info.json: ";
     assert_eq!(
@@ -365,7 +570,8 @@ fn pairs_that_cannot_be_used_are_left_out() {
             ),
             format!("{index}2: vehicle frame 000010 is in a pair already"),
             format!("{index}4.vehicle_pointcloud_path: missing"),
-            "vehicle-side/data_info.json: no entry for vehicle frame 000099: the pair is left out".into(),
+            "vehicle-side/data_info.json: no entry for vehicle frame 000099: the pair is left out"
+                .into(),
         ]
     );
     assert_eq!(dataset.scenarios[0].ticks.len(), 1);
@@ -373,7 +579,9 @@ fn pairs_that_cannot_be_used_are_left_out() {
     let error = set.shown([crate::open(&set.root).unwrap_err()]).remove(0);
     assert_eq!(
         error,
-        format!("{index}lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)")
+        format!(
+            "{index}lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)"
+        )
     );
 }
 
@@ -383,10 +591,22 @@ fn without_time_stamps_frames_are_evenly_spaced() {
     set.write("vehicle-side/data_info.json", &json!([]));
     let dataset = set.open();
     let scenario = &dataset.scenarios[0];
-    let times: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
-    assert_eq!((scenario.name.as_str(), times), ("batch", vec![0, 100_000_000]));
-    assert_eq!(scenario.ticks[0].stem, "000011", "in the order of the pairs");
-    assert!(set.shown(&dataset.problems)[0].starts_with("vehicle-side/data_info.json: no time stamps"));
+    let times: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
+    assert_eq!(
+        (scenario.name.as_str(), times),
+        ("batch", vec![0, 100_000_000])
+    );
+    assert_eq!(
+        scenario.ticks[0].stem, "000011",
+        "in the order of the pairs"
+    );
+    assert!(
+        set.shown(&dataset.problems)[0].starts_with("vehicle-side/data_info.json: no time stamps")
+    );
 }
 
 /// All files of the data set that are JSON.

@@ -62,14 +62,17 @@ impl ProtocolConfig {
             format!("unknown protocol {name:?}; there are {}", known.join(", "))
         })?;
         let rule = &mut protocol.ground_truth;
-        rule.comm_range_m = checked("comm_range_m", self.comm_range_m, 0.0..=1e5)?.unwrap_or(rule.comm_range_m);
-        rule.min_corners = counted("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
+        rule.comm_range_m =
+            checked("comm_range_m", self.comm_range_m, 0.0..=1e5)?.unwrap_or(rule.comm_range_m);
+        rule.min_corners =
+            counted("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
         rule.classes = self.classes.unwrap_or(rule.classes);
         if let Some(range) = &self.ground_truth_range_m {
             [rule.x_m, rule.y_m, rule.z_m] = intervals(range)?;
             protocol.exact_range = true;
         }
-        protocol.max_agents = counted("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
+        protocol.max_agents =
+            counted("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
         protocol.agents = self.agents.unwrap_or(protocol.agents);
         protocol.ego = self.ego.unwrap_or(protocol.ego);
         protocol.ap_order = self.ap_order.unwrap_or(protocol.ap_order);
@@ -77,16 +80,32 @@ impl ProtocolConfig {
     }
 }
 
-fn checked(name: &str, value: Option<f64>, range: std::ops::RangeInclusive<f64>) -> Result<Option<f64>, String> {
+fn checked(
+    name: &str,
+    value: Option<f64>,
+    range: std::ops::RangeInclusive<f64>,
+) -> Result<Option<f64>, String> {
     match value.filter(|value| !range.contains(value)) {
-        Some(value) => Err(format!("{name}: {value}, expected {} to {}", range.start(), range.end())),
+        Some(value) => Err(format!(
+            "{name}: {value}, expected {} to {}",
+            range.start(),
+            range.end()
+        )),
         None => Ok(value),
     }
 }
 
-fn counted(name: &str, value: Option<usize>, range: std::ops::RangeInclusive<usize>) -> Result<Option<usize>, String> {
+fn counted(
+    name: &str,
+    value: Option<usize>,
+    range: std::ops::RangeInclusive<usize>,
+) -> Result<Option<usize>, String> {
     match value.filter(|value| !range.contains(value)) {
-        Some(value) => Err(format!("{name}: {value}, expected {} to {}", range.start(), range.end())),
+        Some(value) => Err(format!(
+            "{name}: {value}, expected {} to {}",
+            range.start(),
+            range.end()
+        )),
         None => Ok(value),
     }
 }
@@ -94,12 +113,17 @@ fn counted(name: &str, value: Option<usize>, range: std::ops::RangeInclusive<usi
 /// Low and high of x, y and z.
 fn intervals(range: &[f64]) -> Result<[[f64; 2]; 3], String> {
     let &[x_low, y_low, z_low, x_high, y_high, z_high] = range else {
-        return Err(format!("ground_truth_range_m: {} numbers, expected 6", range.len()));
+        return Err(format!(
+            "ground_truth_range_m: {} numbers, expected 6",
+            range.len()
+        ));
     };
     let intervals = [[x_low, x_high], [y_low, y_high], [z_low, z_high]];
     let is_wrong = |[low, high]: &[f64; 2]| !(low.is_finite() && high.is_finite() && low < high);
     match intervals.iter().find(|interval| is_wrong(interval)) {
-        Some([low, high]) => Err(format!("ground_truth_range_m: from {low} to {high} is no range")),
+        Some([low, high]) => Err(format!(
+            "ground_truth_range_m: from {low} to {high} is no range"
+        )),
         None => Ok(intervals),
     }
 }

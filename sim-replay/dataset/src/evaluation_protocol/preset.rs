@@ -13,12 +13,18 @@ pub const PRESETS: [(&str, &str); 14] = [
     ("v2v4real", "V2V4Real"),
     ("dair", "DAIR-V2X-C"),
     ("v2xseq", "V2X-Seq (SPD)"),
-    ("v2xreal", "V2X-Real and V2XPnP, vehicles and roadside units"),
+    (
+        "v2xreal",
+        "V2X-Real and V2XPnP, vehicles and roadside units",
+    ),
     ("v2xreal-v2v", "V2X-Real, vehicles only"),
     ("v2xreal-i2i", "V2X-Real, roadside units only"),
     ("v2xsim", "V2X-Sim 2.0"),
     ("v2xradar", "V2X-Radar-C"),
-    ("rcooper", "RCooper, in the layouts of its public converters"),
+    (
+        "rcooper",
+        "RCooper, in the layouts of its public converters",
+    ),
     ("mars", "Open MARS, multi-agent subset"),
 ];
 
@@ -38,7 +44,11 @@ pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {
             agents,
             ego,
             max_agents: max_agents(name),
-            ap_order: if name == "v2v4real" { ApOrder::Frame } else { ApOrder::Global },
+            ap_order: if name == "v2v4real" {
+                ApOrder::Frame
+            } else {
+                ApOrder::Global
+            },
         }
     })
 }

@@ -9,7 +9,11 @@ fn agent(root: &Path, id: &str, stems: std::ops::Range<u32>) {
     let dir = root.join(id);
     fs::create_dir_all(&dir).unwrap();
     for stem in stems {
-        fs::write(dir.join(format!("{stem:06}.yaml")), "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n").unwrap();
+        fs::write(
+            dir.join(format!("{stem:06}.yaml")),
+            "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles: {}\n",
+        )
+        .unwrap();
         fs::write(dir.join(format!("{stem:06}.pcd")), "").unwrap();
     }
 }
@@ -25,9 +29,14 @@ fn scenario(root: &Path) -> Scenario {
 
 fn arranged(config: ProtocolConfig) -> Option<(Vec<String>, usize, Vec<usize>)> {
     let dir = tempfile::tempdir().unwrap();
-    let arranged = config.resolve(Layout::OPV2V).unwrap().arrange(&scenario(dir.path()))?;
+    let arranged = config
+        .resolve(Layout::OPV2V)
+        .unwrap()
+        .arrange(&scenario(dir.path()))?;
     let agents = arranged.agents.iter().map(ToString::to_string).collect();
-    let present = (0..arranged.ticks.len()).map(|tick| arranged.present_agents(tick).count()).collect();
+    let present = (0..arranged.ticks.len())
+        .map(|tick| arranged.present_agents(tick).count())
+        .collect();
     Some((agents, arranged.ticks.len(), present))
 }
 
@@ -50,7 +59,10 @@ fn the_layout_decides_without_options() {
     let resolve = |layout| ProtocolConfig::default().resolve(layout).unwrap();
     assert_eq!(resolve(Layout::OPV2V).ground_truth, GroundTruthRule::OPV2V);
     let v2v4real = resolve(Layout::V2V4REAL);
-    assert_eq!((v2v4real.ground_truth, v2v4real.ap_order), (GroundTruthRule::V2V4REAL, ApOrder::Frame));
+    assert_eq!(
+        (v2v4real.ground_truth, v2v4real.ap_order),
+        (GroundTruthRule::V2V4REAL, ApOrder::Frame)
+    );
 }
 
 #[test]
@@ -61,8 +73,15 @@ fn single_options_change_the_preset() {
     .unwrap();
     let protocol = config.resolve(Layout::OPV2V).unwrap();
     let rule = protocol.rule_within([-10.0, -10.0, -1.0, 10.0, 10.0, 1.0]);
-    assert_eq!((rule.x_m, rule.y_m, rule.z_m), ([0.0, 1.0], [-1.0, 2.0], [-2.0, 3.0]), "asked for, so not cut");
-    assert_eq!((rule.comm_range_m, rule.classes), (80.0, "car".parse::<ClassSet>().unwrap()));
+    assert_eq!(
+        (rule.x_m, rule.y_m, rule.z_m),
+        ([0.0, 1.0], [-1.0, 2.0], [-2.0, 3.0]),
+        "asked for, so not cut"
+    );
+    assert_eq!(
+        (rule.comm_range_m, rule.classes),
+        (80.0, "car".parse::<ClassSet>().unwrap())
+    );
     assert_eq!((protocol.name.as_str(), protocol.max_agents), ("dair", 2));
 }
 
@@ -70,16 +89,35 @@ fn single_options_change_the_preset() {
 fn the_range_of_a_preset_ends_with_the_area_of_the_network() {
     let rule = ProtocolConfig::default().resolve(Layout::OPV2V).unwrap();
     let rule = rule.rule_within([-51.2, -38.4, -5.0, 51.2, 38.4, 0.5]);
-    assert_eq!((rule.x_m, rule.y_m, rule.z_m), ([-51.2, 51.2], [-38.4, 38.4], [-3.0, 0.5]));
+    assert_eq!(
+        (rule.x_m, rule.y_m, rule.z_m),
+        ([-51.2, 51.2], [-38.4, 38.4], [-3.0, 0.5])
+    );
 }
 
 #[test]
 fn wrong_options_are_named_with_both_values() {
-    let error = |json: &str| serde_json::from_str::<ProtocolConfig>(json).unwrap().resolve(Layout::OPV2V).unwrap_err();
-    assert!(error(r#"{"preset": "kitty"}"#).starts_with("unknown protocol \"kitty\"; there are opv2v,"));
-    assert_eq!(error(r#"{"min_corners": 9}"#), "min_corners: 9, expected 1 to 8");
-    assert_eq!(error(r#"{"comm_range_m": -1}"#), "comm_range_m: -1, expected 0 to 100000");
-    assert_eq!(error(r#"{"ground_truth_range_m": [1, 2]}"#), "ground_truth_range_m: 2 numbers, expected 6");
+    let error = |json: &str| {
+        serde_json::from_str::<ProtocolConfig>(json)
+            .unwrap()
+            .resolve(Layout::OPV2V)
+            .unwrap_err()
+    };
+    assert!(
+        error(r#"{"preset": "kitty"}"#).starts_with("unknown protocol \"kitty\"; there are opv2v,")
+    );
+    assert_eq!(
+        error(r#"{"min_corners": 9}"#),
+        "min_corners: 9, expected 1 to 8"
+    );
+    assert_eq!(
+        error(r#"{"comm_range_m": -1}"#),
+        "comm_range_m: -1, expected 0 to 100000"
+    );
+    assert_eq!(
+        error(r#"{"ground_truth_range_m": [1, 2]}"#),
+        "ground_truth_range_m: 2 numbers, expected 6"
+    );
     let reversed = error(r#"{"ground_truth_range_m": [1, 0, 0, -1, 1, 1]}"#);
     assert_eq!(reversed, "ground_truth_range_m: from 1 to -1 is no range");
 }
@@ -87,13 +125,35 @@ fn wrong_options_are_named_with_both_values() {
 #[test]
 fn agents_are_arranged_and_the_ticks_are_those_of_the_ego() {
     let config = ProtocolConfig::default;
-    assert_eq!(arranged(config()).unwrap(), (names(&["1", "2", "-1", "-2"]), 4, vec![2, 3, 4, 4]));
-    let units_first = ProtocolConfig { ego: Some(EgoKind::Unit), ..config() };
-    assert_eq!(arranged(units_first).unwrap(), (names(&["-1", "-2", "1", "2"]), 5, vec![3, 4, 4, 1, 1]));
-    let vehicles = ProtocolConfig { agents: Some(AgentKinds::Vehicles), ..config() };
-    assert_eq!(arranged(vehicles).unwrap(), (names(&["1", "2"]), 4, vec![1, 1, 2, 2]));
-    let two = ProtocolConfig { max_agents: Some(2), agents: Some(AgentKinds::Units), ..config() };
-    assert_eq!(arranged(two).unwrap(), (names(&["-1", "-2"]), 5, vec![2, 2, 2, 1, 1]));
+    assert_eq!(
+        arranged(config()).unwrap(),
+        (names(&["1", "2", "-1", "-2"]), 4, vec![2, 3, 4, 4])
+    );
+    let units_first = ProtocolConfig {
+        ego: Some(EgoKind::Unit),
+        ..config()
+    };
+    assert_eq!(
+        arranged(units_first).unwrap(),
+        (names(&["-1", "-2", "1", "2"]), 5, vec![3, 4, 4, 1, 1])
+    );
+    let vehicles = ProtocolConfig {
+        agents: Some(AgentKinds::Vehicles),
+        ..config()
+    };
+    assert_eq!(
+        arranged(vehicles).unwrap(),
+        (names(&["1", "2"]), 4, vec![1, 1, 2, 2])
+    );
+    let two = ProtocolConfig {
+        max_agents: Some(2),
+        agents: Some(AgentKinds::Units),
+        ..config()
+    };
+    assert_eq!(
+        arranged(two).unwrap(),
+        (names(&["-1", "-2"]), 5, vec![2, 2, 2, 1, 1])
+    );
 }
 
 #[test]
@@ -101,22 +161,39 @@ fn a_scenario_without_agents_of_the_kind_is_left_out() {
     let dir = tempfile::tempdir().unwrap();
     agent(dir.path(), "1", 0..2);
     let scenario = crate::open(dir.path()).unwrap().scenarios.remove(0);
-    let units = ProtocolConfig { agents: Some(AgentKinds::Units), ..ProtocolConfig::default() };
-    assert!(units.resolve(Layout::OPV2V).unwrap().arrange(&scenario).is_none());
+    let units = ProtocolConfig {
+        agents: Some(AgentKinds::Units),
+        ..ProtocolConfig::default()
+    };
+    assert!(
+        units
+            .resolve(Layout::OPV2V)
+            .unwrap()
+            .arrange(&scenario)
+            .is_none()
+    );
 }
 
 #[test]
 fn the_page_of_data_sets_names_every_layout_and_protocol() {
     let page = include_str!("../../../../deploy/docs/reference/datasets.md").replace('`', "");
     for layout in &crate::LAYOUTS {
-        let row = format!("| {} | {} | {} |", layout.name, layout.data_sets, layout.files);
-        assert!(page.contains(&row), "deploy/docs/reference/datasets.md lacks {row}");
+        let row = format!(
+            "| {} | {} | {} |",
+            layout.name, layout.data_sets, layout.files
+        );
+        assert!(
+            page.contains(&row),
+            "deploy/docs/reference/datasets.md lacks {row}"
+        );
     }
     for (name, _) in PRESETS {
         let protocol = EvaluationProtocol::preset(name).unwrap();
-        let row =
-            page.lines().find(|line| line.starts_with('|') && line.split(['|', ',']).any(|cell| cell.trim() == name));
-        let row = row.unwrap_or_else(|| panic!("deploy/docs/reference/datasets.md lacks protocol {name}"));
+        let row = page.lines().find(|line| {
+            line.starts_with('|') && line.split(['|', ',']).any(|cell| cell.trim() == name)
+        });
+        let row = row
+            .unwrap_or_else(|| panic!("deploy/docs/reference/datasets.md lacks protocol {name}"));
         let range = format!("| {} m |", protocol.ground_truth.comm_range_m);
         assert!(row.contains(&range), "{row} lacks {range}");
     }

@@ -39,23 +39,45 @@ pub(super) fn read_dtype(field: &Field<'_>) -> Result<Dtype, ReadError> {
         "u2" => (Kind::Unsigned, 2),
         "u4" => (Kind::Unsigned, 4),
         "u8" => (Kind::Unsigned, 8),
-        other => return Err(name.error(format!("dtype {other:?}, expected f2 to f8, i1 to i8, u1 to u8 or b1"))),
+        other => {
+            return Err(name.error(format!(
+                "dtype {other:?}, expected f2 to f8, i1 to i8, u1 to u8 or b1"
+            )));
+        }
     };
     let state = field.required("state")?;
     expect_tag(&state, "python/tuple")?;
-    let order = state.items()?.into_iter().nth(1).ok_or_else(|| state.error("no byte order"))?;
+    let order = state
+        .items()?
+        .into_iter()
+        .nth(1)
+        .ok_or_else(|| state.error("no byte order"))?;
     match order.text()? {
         // `=` is the order of the machine that wrote it, `|` that of single bytes.
-        "<" | "=" | "|" => Ok(Dtype { kind, size, is_big_endian: false }),
-        ">" => Ok(Dtype { kind, size, is_big_endian: true }),
-        other => Err(order.error(format!("byte order {other:?}, expected \"<\", \">\", \"=\" or \"|\""))),
+        "<" | "=" | "|" => Ok(Dtype {
+            kind,
+            size,
+            is_big_endian: false,
+        }),
+        ">" => Ok(Dtype {
+            kind,
+            size,
+            is_big_endian: true,
+        }),
+        other => Err(order.error(format!(
+            "byte order {other:?}, expected \"<\", \">\", \"=\" or \"|\""
+        ))),
     }
 }
 
 /// Bytes in base64, on their own or as the one argument of `bytearray`.
 pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
-    let is_bytearray =
-        field.node().tag.as_deref().and_then(|tag| tag.strip_prefix(APPLY)) == Some("builtins.bytearray");
+    let is_bytearray = field
+        .node()
+        .tag
+        .as_deref()
+        .and_then(|tag| tag.strip_prefix(APPLY))
+        == Some("builtins.bytearray");
     if is_bytearray && !matches!(field.node().value, Value::Text(_)) {
         let [inner] = items::<1>(&args(field)?)?;
         return base64(&inner);
@@ -67,16 +89,29 @@ fn base64(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
     expect_tag(field, "binary")?;
     // The lines of a block are part of the text.
     let text: String = field.text()?.split_ascii_whitespace().collect();
-    STANDARD.decode(text).map_err(|error| field.error(format!("no base64: {error}")))
+    STANDARD
+        .decode(text)
+        .map_err(|error| field.error(format!("no base64: {error}")))
 }
 
 /// Exactly `count` numbers.
-pub(super) fn numbers(field: &Field<'_>, dtype: Dtype, count: usize) -> Result<Vec<f64>, ReadError> {
+pub(super) fn numbers(
+    field: &Field<'_>,
+    dtype: Dtype,
+    count: usize,
+) -> Result<Vec<f64>, ReadError> {
     let bytes = binary(field)?;
     if count.checked_mul(dtype.size) != Some(bytes.len()) {
-        return Err(field.error(format!("{} bytes for {count} numbers of {} bytes", bytes.len(), dtype.size)));
+        return Err(field.error(format!(
+            "{} bytes for {count} numbers of {} bytes",
+            bytes.len(),
+            dtype.size
+        )));
     }
-    Ok(bytes.chunks_exact(dtype.size).map(|chunk| dtype.number(chunk)).collect())
+    Ok(bytes
+        .chunks_exact(dtype.size)
+        .map(|chunk| dtype.number(chunk))
+        .collect())
 }
 
 impl Dtype {
@@ -91,7 +126,12 @@ impl Dtype {
             *place = *byte;
         }
         if self.is_big_endian {
-            little.iter_mut().take(self.size).rev().zip(bytes).for_each(|(place, byte)| *place = *byte);
+            little
+                .iter_mut()
+                .take(self.size)
+                .rev()
+                .zip(bytes)
+                .for_each(|(place, byte)| *place = *byte);
         }
         let bits = u64::from_le_bytes(little);
         match (self.kind, self.size) {
@@ -124,7 +164,12 @@ mod tests {
     use super::*;
 
     fn number(kind: Kind, bytes: &[u8], is_big_endian: bool) -> f64 {
-        Dtype { kind, size: bytes.len(), is_big_endian }.number(bytes)
+        Dtype {
+            kind,
+            size: bytes.len(),
+            is_big_endian,
+        }
+        .number(bytes)
     }
 
     #[test]
@@ -132,18 +177,31 @@ mod tests {
         assert_eq!(number(Kind::Signed, &[0xfe], false), -2.0);
         assert_eq!(number(Kind::Unsigned, &[0xfe], false), 254.0);
         assert_eq!(number(Kind::Signed, &(-300i16).to_be_bytes(), true), -300.0);
-        assert_eq!(number(Kind::Signed, &(-70_000i32).to_le_bytes(), false), -70_000.0);
-        assert_eq!(number(Kind::Signed, &i64::MIN.to_be_bytes(), true), i64::MIN as f64);
-        assert_eq!(number(Kind::Unsigned, &u64::MAX.to_le_bytes(), false), u64::MAX as f64);
+        assert_eq!(
+            number(Kind::Signed, &(-70_000i32).to_le_bytes(), false),
+            -70_000.0
+        );
+        assert_eq!(
+            number(Kind::Signed, &i64::MIN.to_be_bytes(), true),
+            i64::MIN as f64
+        );
+        assert_eq!(
+            number(Kind::Unsigned, &u64::MAX.to_le_bytes(), false),
+            u64::MAX as f64
+        );
         assert_eq!(number(Kind::Float, &1.5f32.to_be_bytes(), true), 1.5);
         assert_eq!(number(Kind::Float, &(-0.1f64).to_be_bytes(), true), -0.1);
     }
 
     #[test]
     fn halves_are_those_of_ieee() {
-        for (bits, expected) in
-            [(0x3c00, 1.0), (0xc000, -2.0), (0x7bff, 65504.0), (0x0001, 2f64.powi(-24)), (0x3555, 0.333_251_953_125)]
-        {
+        for (bits, expected) in [
+            (0x3c00, 1.0),
+            (0xc000, -2.0),
+            (0x7bff, 65504.0),
+            (0x0001, 2f64.powi(-24)),
+            (0x3555, 0.333_251_953_125),
+        ] {
             assert_eq!(half(bits), expected);
         }
         assert_eq!(half(0xfc00), f64::NEG_INFINITY);

@@ -29,17 +29,23 @@ pub(super) struct NumpyArray {
 
 /// True if the node carries a tag of Python's.
 pub(super) fn is_python(node: &Node) -> bool {
-    node.tag.as_deref().is_some_and(|tag| tag.starts_with("python/"))
+    node.tag
+        .as_deref()
+        .is_some_and(|tag| tag.starts_with("python/"))
 }
 
 /// True if the node is a pickled call, and not a tuple or list of Python's.
 pub(super) fn is_call(node: &Node) -> bool {
-    node.tag.as_deref().is_some_and(|tag| tag.starts_with(APPLY))
+    node.tag
+        .as_deref()
+        .is_some_and(|tag| tag.starts_with(APPLY))
 }
 
 /// The text of a key that is a NumPy scalar; `None` if it is none.
 pub(super) fn key_text(node: &Node) -> Option<String> {
-    scalar(&Field::root(Path::new(""), node)).ok().map(|number| number.to_string())
+    scalar(&Field::root(Path::new(""), node))
+        .ok()
+        .map(|number| number.to_string())
 }
 
 /// Reads `_reconstruct` and `_frombuffer`; a scalar is an array without dimensions.
@@ -47,7 +53,10 @@ pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
     match function(field)? {
         Function::Reconstruct => reconstruct(field),
         Function::FromBuffer => from_buffer(field),
-        Function::Scalar => Ok(NumpyArray { shape: vec![], values: vec![scalar_value(field)?] }),
+        Function::Scalar => Ok(NumpyArray {
+            shape: vec![],
+            values: vec![scalar_value(field)?],
+        }),
     }
 }
 
@@ -75,15 +84,25 @@ fn function(field: &Field<'_>) -> Result<Function, ReadError> {
         ("numeric._frombuffer", Function::FromBuffer),
         ("multiarray.scalar", Function::Scalar),
     ];
-    let call = field.node().tag.as_deref().and_then(|tag| tag.strip_prefix(APPLY));
+    let call = field
+        .node()
+        .tag
+        .as_deref()
+        .and_then(|tag| tag.strip_prefix(APPLY));
     let in_package = |call: &str| {
-        PACKAGES.iter().find_map(|package| call.strip_prefix(package)?.strip_prefix('.').map(str::to_owned))
+        PACKAGES.iter().find_map(|package| {
+            call.strip_prefix(package)?
+                .strip_prefix('.')
+                .map(str::to_owned)
+        })
     };
     let name = call.and_then(in_package);
     let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
     known.map(|(_, function)| *function).ok_or_else(|| {
         let tag = shown(field.node().tag.as_deref());
-        field.error(format!("tag {tag} is not supported, expected numbers or NumPy's arrays of them"))
+        field.error(format!(
+            "tag {tag} is not supported, expected numbers or NumPy's arrays of them"
+        ))
     })
 }
 
@@ -126,12 +145,19 @@ fn from_buffer(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
 fn scalar_value(field: &Field<'_>) -> Result<f64, ReadError> {
     let [dtype, data] = items::<2>(&args(field)?)?;
     let values = numbers(&data, read_dtype(&dtype)?, 1)?;
-    values.first().copied().ok_or_else(|| data.error("no number"))
+    values
+        .first()
+        .copied()
+        .ok_or_else(|| data.error("no number"))
 }
 
 /// Arguments of a call without state are its items, or the entry `args`.
 fn args<'a>(field: &Field<'a>) -> Result<Field<'a>, ReadError> {
-    if matches!(field.node().value, Value::Map(_)) { field.required("args") } else { Ok(field.clone()) }
+    if matches!(field.node().value, Value::Map(_)) {
+        field.required("args")
+    } else {
+        Ok(field.clone())
+    }
 }
 
 fn expect_tag(field: &Field<'_>, expected: &str) -> Result<(), ReadError> {
@@ -142,13 +168,17 @@ fn expect_tag(field: &Field<'_>, expected: &str) -> Result<(), ReadError> {
 }
 
 fn shown(tag: Option<&str>) -> String {
-    tag.map_or("is missing".into(), |tag| format!("{:?}", tag.chars().take(80).collect::<String>()))
+    tag.map_or("is missing".into(), |tag| {
+        format!("{:?}", tag.chars().take(80).collect::<String>())
+    })
 }
 
 fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadError> {
     let items = field.items()?;
     let found = items.len();
-    items.try_into().map_err(|_| field.error(format!("{found} items, expected {N}")))
+    items
+        .try_into()
+        .map_err(|_| field.error(format!("{found} items, expected {N}")))
 }
 
 fn tuple<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadError> {
@@ -175,17 +205,27 @@ fn read_shape(field: &Field<'_>) -> Result<Vec<usize>, ReadError> {
     let shape: Vec<usize> = field
         .items()?
         .iter()
-        .map(|item| usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative")))
+        .map(|item| {
+            usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative"))
+        })
         .collect::<Result<_, _>>()?;
-    let count = shape.iter().try_fold(1usize, |count, &size| count.checked_mul(size));
+    let count = shape
+        .iter()
+        .try_fold(1usize, |count, &size| count.checked_mul(size));
     match count.filter(|&count| count <= MAX_NUMBERS && shape.len() <= 4) {
         Some(_) => Ok(shape),
-        None => Err(field.error(format!("shape {shape:?} is larger than {MAX_NUMBERS} numbers"))),
+        None => Err(field.error(format!(
+            "shape {shape:?} is larger than {MAX_NUMBERS} numbers"
+        ))),
     }
 }
 
 fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray {
-    let values = if is_fortran { row_major(&shape, &values) } else { values };
+    let values = if is_fortran {
+        row_major(&shape, &values)
+    } else {
+        values
+    };
     NumpyArray { shape, values }
 }
 
@@ -204,7 +244,9 @@ fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
         place
     };
     // Every place is below the product of the sizes, the number of values.
-    (0..values.len()).map(|index| values.get(place(index)).copied().unwrap_or(f64::NAN)).collect()
+    (0..values.len())
+        .map(|index| values.get(place(index)).copied().unwrap_or(f64::NAN))
+        .collect()
 }
 
 #[cfg(test)]

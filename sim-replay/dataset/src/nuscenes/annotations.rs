@@ -58,7 +58,10 @@ struct Instance {
     class: ObjectClass,
 }
 
-fn read_instances(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Instance>, ReadError> {
+fn read_instances(
+    version: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<HashMap<String, Instance>, ReadError> {
     let (mut names, mut unknown) = (HashMap::new(), Vec::new());
     read_rows(
         version,
@@ -83,8 +86,9 @@ fn read_instances(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashM
         |_| true,
         |row| {
             let category = row.required("category_token")?;
-            let name =
-                names.get(&category.id()?).ok_or_else(|| category.error("no row of category.json has this token"))?;
+            let name = names
+                .get(&category.id()?)
+                .ok_or_else(|| category.error("no row of category.json has this token"))?;
             let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
             let id = instances.len() as i64;
             instances.insert(row.required("token")?.id()?, Instance { id, class });
@@ -96,21 +100,36 @@ fn read_instances(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashM
 
 fn unknown_type(name: &Field<'_>) -> ReadError {
     let shown: String = name.text().unwrap_or_default().chars().take(40).collect();
-    name.error(format!("{shown:?} is an unknown type of object: it counts as other, not as a vehicle"))
+    name.error(format!(
+        "{shown:?} is an unknown type of object: it counts as other, not as a vehicle"
+    ))
 }
 
 fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object, ReadError> {
     let token = row.required("instance_token")?;
-    let Instance { id, class } =
-        instances.get(&token.id()?).ok_or_else(|| token.error("no row of instance.json has this token"))?;
+    let Instance { id, class } = instances
+        .get(&token.id()?)
+        .ok_or_else(|| token.error("no row of instance.json has this token"))?;
     let size = row.required("size")?;
     let [width, length, height] = size.numbers::<3>()?;
-    if ![width, length, height].iter().all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M) {
-        let reason = format!("{:?} are no sizes in metres, expected up to {MAX_SIZE_M}", [width, length, height]);
+    if ![width, length, height]
+        .iter()
+        .all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M)
+    {
+        let reason = format!(
+            "{:?} are no sizes in metres, expected up to {MAX_SIZE_M}",
+            [width, length, height]
+        );
         return Err(size.error(reason));
     }
     let world_from_object: Pose = transform(row)?.into();
-    Ok(Object { id: *id, class: *class, world_from_object, size_m: [length, width, height], speed_mps: None })
+    Ok(Object {
+        id: *id,
+        class: *class,
+        world_from_object,
+        size_m: [length, width, height],
+        speed_mps: None,
+    })
 }
 
 /// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle
@@ -123,12 +142,20 @@ pub(super) fn seen<'a>(
 ) -> impl Iterator<Item = &'a Object> {
     let (points, world_from_lidar) = (points.xyzi.as_slice(), *world_from_lidar);
     objects.iter().filter(move |object| {
-        let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar);
+        let object_from_lidar = object
+            .world_from_object
+            .isometry()
+            .inv_mul(&world_from_lidar);
         let lidar = object_from_lidar.translation.vector;
         let half_m = object.size_m.map(|size| size / 2.0);
         let roof_m = [0.0, 0.0, MAX_MOUNT_M];
         let carries_lidar = (0..3).all(|axis| lidar[axis].abs() <= half_m[axis] + roof_m[axis]);
-        !carries_lidar && is_hit(points, &object_from_lidar, half_m.map(|half| half + HIT_MARGIN_M))
+        !carries_lidar
+            && is_hit(
+                points,
+                &object_from_lidar,
+                half_m.map(|half| half + HIT_MARGIN_M),
+            )
     })
 }
 

@@ -23,7 +23,10 @@ use self::tables::{Sample, Scene, Sweep, Tables};
 use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
-use super::{Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick, files, roots};
+use super::{
+    Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick, files,
+    roots,
+};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
 
@@ -68,8 +71,14 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>,
     for version in &roots::find(dir, is_version) {
         scenarios.extend(open_version(dir, version, options, &mut problems)?);
     }
-    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else { return Ok(None) };
-    Ok(Some(Dataset { layout, scenarios, problems }))
+    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else {
+        return Ok(None);
+    };
+    Ok(Some(Dataset {
+        layout,
+        scenarios,
+        problems,
+    }))
 }
 
 fn is_version(dir: &Path) -> bool {
@@ -82,8 +91,14 @@ fn open_version(
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
 ) -> Result<Vec<Scenario>, ReadError> {
-    let root = files::above(version).find(|root| root.is_dir()).unwrap_or_else(|| version.to_owned());
-    let Tables { scenes, samples, objects } = tables::read(version, problems)?;
+    let root = files::above(version)
+        .find(|root| root.is_dir())
+        .unwrap_or_else(|| version.to_owned());
+    let Tables {
+        scenes,
+        samples,
+        objects,
+    } = tables::read(version, problems)?;
     let layout = layout(version, &samples)?;
     let mut moments: Vec<Vec<(Sample, Vec<Object>)>> = scenes.iter().map(|_| Vec::new()).collect();
     for (sample, objects) in samples.into_iter().zip(objects) {
@@ -99,7 +114,16 @@ fn open_version(
         if !taken.insert(name.clone()) {
             name = format!("{name}_{index}");
         }
-        scenarios.extend(Builder { root: &root, version, layout, scene, name }.build(moments, options, problems)?);
+        scenarios.extend(
+            Builder {
+                root: &root,
+                version,
+                layout,
+                scene,
+                name,
+            }
+            .build(moments, options, problems)?,
+        );
     }
     scenarios.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(scenarios)
@@ -107,7 +131,10 @@ fn open_version(
 
 /// The layout of the first supported channel.
 fn layout(version: &Path, samples: &[Sample]) -> Result<Layout, ReadError> {
-    let channels: BTreeSet<&str> = samples.iter().flat_map(|sample| sample.sweeps.keys().map(String::as_str)).collect();
+    let channels: BTreeSet<&str> = samples
+        .iter()
+        .flat_map(|sample| sample.sweeps.keys().map(String::as_str))
+        .collect();
     channels.iter().find_map(|channel| Some(rig::agent_of(channel)?.0)).ok_or_else(|| {
         let reason = format!(
             "nuScenes tables without a supported LiDAR: {channels:?}, expected LIDAR_TOP_id_<agent> (V2X-Sim), \
@@ -149,15 +176,26 @@ impl Builder<'_> {
         samples.sort_by_key(|(sample, _)| sample.micros);
         let agents = self.agents(&samples)?;
         let Some((ego, _)) = agents.first() else {
-            let reason = format!("scene {}: no sweep of a supported LiDAR: left out", self.scene.name);
-            problems.push(ReadError::malformed(&self.version.join("sample_data.json"), reason));
+            let reason = format!(
+                "scene {}: no sweep of a supported LiDAR: left out",
+                self.scene.name
+            );
+            problems.push(ReadError::malformed(
+                &self.version.join("sample_data.json"),
+                reason,
+            ));
             return Ok(None);
         };
         let capture_nanos = self.capture_times(&samples, options, problems);
         let mut scenario = Parts::default();
         for ((sample, objects), capture_nanos) in samples.into_iter().zip(capture_nanos) {
-            let stem = agents.iter().find_map(|(_, channel)| Some(sample.sweeps.get(channel)?.stem()));
-            let tick = Tick { stem: stem.unwrap_or_else(|| sample.micros.to_string()), capture_nanos };
+            let stem = agents
+                .iter()
+                .find_map(|(_, channel)| Some(sample.sweeps.get(channel)?.stem()));
+            let tick = Tick {
+                stem: stem.unwrap_or_else(|| sample.micros.to_string()),
+                capture_nanos,
+            };
             let mut sweeps = HashMap::new();
             for (agent, channel) in &agents {
                 match sample.sweeps.get(channel) {
@@ -166,17 +204,23 @@ impl Builder<'_> {
                         continue;
                     }
                     Some(sweep) => {
-                        let reason = format!("does not exist: agent {agent} is absent at {}", tick.stem);
+                        let reason =
+                            format!("does not exist: agent {agent} is absent at {}", tick.stem);
                         problems.push(ReadError::malformed(&self.root.join(&sweep.file), reason));
                     }
                     None => {}
                 }
-                scenario.missing.push(MissingFrame { agent: agent.clone(), stem: tick.stem.clone() });
+                scenario.missing.push(MissingFrame {
+                    agent: agent.clone(),
+                    stem: tick.stem.clone(),
+                });
             }
             if sweeps.contains_key(ego) {
                 scenario.ticks.push(tick.clone());
             }
-            scenario.contents.insert(tick.stem.clone(), Moment { sweeps, objects });
+            scenario
+                .contents
+                .insert(tick.stem.clone(), Moment { sweeps, objects });
             scenario.moments.push(tick);
         }
         let agents: Vec<CavId> = agents.into_iter().map(|(agent, _)| agent).collect();
@@ -184,12 +228,25 @@ impl Builder<'_> {
     }
 
     fn scenario(self, agents: Vec<CavId>, parts: Parts, options: &OpenOptions) -> Scenario {
-        let Parts { ticks, moments, missing, contents } = parts;
+        let Parts {
+            ticks,
+            moments,
+            missing,
+            contents,
+        } = parts;
         let is_unit = |agent: &&CavId| rig::is_roadside_unit(self.layout, agent.as_str());
-        let sweeps = agents.iter().fold(Sweeps::new(SweepStorage::FiveFloats, options), |sweeps, agent| {
-            let file = |tick: &Tick| Some(self.root.join(&contents.get(&tick.stem)?.sweeps.get(agent)?.file));
-            sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
-        });
+        let sweeps = agents.iter().fold(
+            Sweeps::new(SweepStorage::FiveFloats, options),
+            |sweeps, agent| {
+                let file = |tick: &Tick| {
+                    Some(
+                        self.root
+                            .join(&contents.get(&tick.stem)?.sweeps.get(agent)?.file),
+                    )
+                };
+                sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
+            },
+        );
         Scenario {
             absences: Absences::new(&agents, &ticks, &missing).among(moments),
             roadside_units: agents.iter().filter(is_unit).cloned().collect(),
@@ -202,24 +259,42 @@ impl Builder<'_> {
             cameras: Vec::new(),
             layout: self.layout,
             source_handedness: Handedness::Right,
-            source: Arc::new(Source { root: self.root.to_owned(), layout: self.layout, moments: contents, sweeps }),
+            source: Arc::new(Source {
+                root: self.root.to_owned(),
+                layout: self.layout,
+                moments: contents,
+                sweeps,
+            }),
         }
     }
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a
     /// roadside unit last.
     fn agents(&self, moments: &[(Sample, Vec<Object>)]) -> Result<Vec<(CavId, String)>, ReadError> {
-        let channels: BTreeSet<&String> = moments.iter().flat_map(|(sample, _)| sample.sweeps.keys()).collect();
+        let channels: BTreeSet<&String> = moments
+            .iter()
+            .flat_map(|(sample, _)| sample.sweeps.keys())
+            .collect();
         let mut agents = Vec::new();
         for channel in channels {
-            let Some((_, name)) = rig::agent_of(channel).filter(|(layout, _)| *layout == self.layout) else { continue };
+            let Some((_, name)) =
+                rig::agent_of(channel).filter(|(layout, _)| *layout == self.layout)
+            else {
+                continue;
+            };
             let id = CavId::new(name).map_err(|error| {
                 let reason = format!("channel {channel}: {error}");
                 ReadError::malformed(&self.version.join("sensor.json"), reason)
             })?;
             agents.push((id, channel.clone()));
         }
-        let listed = |name: &str| self.scene.vehicles.iter().position(|vehicle| vehicle == name).unwrap_or(usize::MAX);
+        let listed = |name: &str| {
+            self.scene
+                .vehicles
+                .iter()
+                .position(|vehicle| vehicle == name)
+                .unwrap_or(usize::MAX)
+        };
         agents.sort_by_key(|(id, _)| {
             let name = id.as_str();
             (
@@ -242,12 +317,22 @@ impl Builder<'_> {
         let micros: Vec<u64> = moments.iter().map(|(sample, _)| sample.micros).collect();
         if micros.array_windows().all(|[a, b]| a < b) {
             let start = micros.first().copied().unwrap_or(0);
-            return micros.iter().map(|micros| (micros - start).saturating_mul(1000)).collect();
+            return micros
+                .iter()
+                .map(|micros| (micros - start).saturating_mul(1000))
+                .collect();
         }
-        let reason =
-            format!("scene {}: time stamps that repeat: its moments are taken as evenly spaced", self.scene.name);
-        problems.push(ReadError::malformed(&self.version.join("sample.json"), reason));
-        (0..moments.len() as u64).map(|index| index.saturating_mul(options.period_nanos)).collect()
+        let reason = format!(
+            "scene {}: time stamps that repeat: its moments are taken as evenly spaced",
+            self.scene.name
+        );
+        problems.push(ReadError::malformed(
+            &self.version.join("sample.json"),
+            reason,
+        ));
+        (0..moments.len() as u64)
+            .map(|index| index.saturating_mul(options.period_nanos))
+            .collect()
     }
 }
 
@@ -255,7 +340,9 @@ impl Sweep {
     /// The name of its file without suffixes.
     fn stem(&self) -> String {
         let name = self.file.rsplit('/').next().unwrap_or(&self.file);
-        name.trim_end_matches(".bin").trim_end_matches(".pcd").to_owned()
+        name.trim_end_matches(".bin")
+            .trim_end_matches(".pcd")
+            .to_owned()
     }
 
     fn turns(&self) -> QuarterTurns {
@@ -287,15 +374,30 @@ struct Source {
 
 impl Source {
     fn sweep(&self, agent: &CavId, tick: &Tick) -> Result<(&Moment, &Sweep), ReadError> {
-        let found = self.moments.get(&tick.stem).and_then(|moment| Some((moment, moment.sweeps.get(agent)?)));
-        found.ok_or_else(|| ReadError::malformed(&self.root, format!("no sweep of agent {agent} at {}", tick.stem)))
+        let found = self
+            .moments
+            .get(&tick.stem)
+            .and_then(|moment| Some((moment, moment.sweeps.get(agent)?)));
+        found.ok_or_else(|| {
+            ReadError::malformed(
+                &self.root,
+                format!("no sweep of agent {agent} at {}", tick.stem),
+            )
+        })
     }
 
     /// V2X-Sim classifies all wheeled objects as vehicles.
     fn with_class(&self, object: &Object) -> Object {
         let is_narrow = self.layout == Layout::V2XSIM && object.size_m[1] <= TWO_WHEELER_WIDTH_M;
-        let class = if is_narrow && object.class.is_vehicle() { ObjectClass::TwoWheeler } else { object.class };
-        Object { class, ..object.clone() }
+        let class = if is_narrow && object.class.is_vehicle() {
+            ObjectClass::TwoWheeler
+        } else {
+            object.class
+        };
+        Object {
+            class,
+            ..object.clone()
+        }
     }
 }
 
@@ -315,7 +417,12 @@ impl FrameSource for Source {
         Ok(frame)
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        _variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
         let (_, sweep) = self.sweep(agent, tick)?;
         let mut cloud = self.sweeps.read(agent, &self.root.join(&sweep.file))?;
         sweep.turns().apply(&mut cloud.points);
@@ -323,6 +430,9 @@ impl FrameSource for Source {
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
-        self.sweep(agent, tick).map_or_else(|_| self.root.clone(), |(_, sweep)| self.root.join(&sweep.file))
+        self.sweep(agent, tick).map_or_else(
+            |_| self.root.clone(),
+            |(_, sweep)| self.root.join(&sweep.file),
+        )
     }
 }

@@ -16,7 +16,10 @@ pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
         return Some((Layout::V2XSIM, agent));
     }
     if let Some(vehicle) = channel.strip_prefix("LIDAR_FRONT_CENTER") {
-        return Some((Layout::MARS, vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT)));
+        return Some((
+            Layout::MARS,
+            vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT),
+        ));
     }
     (channel == "LIDAR_TOP").then_some((Layout::NUSCENES, ONLY_AGENT))
 }
@@ -43,7 +46,10 @@ impl QuarterTurns {
     /// The transform from the turned frame to the LiDAR's own.
     pub(super) fn lidar_from_turned(self) -> Isometry3<f64> {
         let angle = -f64::from(self.0) * FRAC_PI_2;
-        Isometry3::from_parts(Default::default(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle))
+        Isometry3::from_parts(
+            Default::default(),
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle),
+        )
     }
 
     /// Transforms points from the LiDAR's own frame to the turned one, exactly.
@@ -69,7 +75,10 @@ mod tests {
     #[test]
     fn channels_name_layout_and_agent() {
         assert_eq!(agent_of("LIDAR_TOP_id_3"), Some((Layout::V2XSIM, "3")));
-        assert_eq!(agent_of("LIDAR_FRONT_CENTER_maisy"), Some((Layout::MARS, "maisy")));
+        assert_eq!(
+            agent_of("LIDAR_FRONT_CENTER_maisy"),
+            Some((Layout::MARS, "maisy"))
+        );
         assert_eq!(agent_of("LIDAR_FRONT_CENTER"), Some((Layout::MARS, "0")));
         assert_eq!(agent_of("LIDAR_TOP"), Some((Layout::NUSCENES, "0")));
         assert_eq!(agent_of("LIDAR_FRONT_LEFT"), None);
@@ -78,15 +87,24 @@ mod tests {
     #[test]
     fn turned_points_and_turned_pose_are_the_same_place_with_x_forward() {
         for degrees in [0.0, 3.0, 88.0, 92.0, 180.0, -179.0, -90.0, -47.0] {
-            let vehicle_from_lidar = Pose::from_xyz_yaw([1.0, 0.0, 2.0], f64::to_radians(degrees)).isometry();
+            let vehicle_from_lidar =
+                Pose::from_xyz_yaw([1.0, 0.0, 2.0], f64::to_radians(degrees)).isometry();
             let turns = QuarterTurns::to_forward(&vehicle_from_lidar);
             let vehicle_from_turned = vehicle_from_lidar * turns.lidar_from_turned();
-            assert!(Pose::from(vehicle_from_turned).yaw_rad().abs() <= 45.0f64.to_radians(), "{degrees}");
-            let mut cloud = PointCloud { xyzi: vec![[10.0, 1.0, -1.0, 0.5]] };
+            assert!(
+                Pose::from(vehicle_from_turned).yaw_rad().abs() <= 45.0f64.to_radians(),
+                "{degrees}"
+            );
+            let mut cloud = PointCloud {
+                xyzi: vec![[10.0, 1.0, -1.0, 0.5]],
+            };
             turns.apply(&mut cloud);
             let [x, y, z, _] = cloud.xyzi[0].map(f64::from);
             let before = vehicle_from_lidar * Point3::new(10.0, 1.0, -1.0);
-            assert!((vehicle_from_turned * Point3::new(x, y, z) - before).norm() < 1e-9, "{degrees}");
+            assert!(
+                (vehicle_from_turned * Point3::new(x, y, z) - before).norm() < 1e-9,
+                "{degrees}"
+            );
         }
     }
 }

@@ -79,7 +79,11 @@ pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tabl
     let rows = read_sweeps(version, &mounts, &sample_indices, problems)?;
     place(version, rows, &mut samples, problems)?;
     let objects = annotations::read(version, &sample_indices, problems);
-    Ok(Tables { scenes, samples, objects })
+    Ok(Tables {
+        scenes,
+        samples,
+        objects,
+    })
 }
 
 /// Reads the rows of a table that are needed.
@@ -94,7 +98,10 @@ pub(super) fn read_rows(
 }
 
 /// LiDARs by the token of their calibration.
-fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Mount>, ReadError> {
+fn read_mounts(
+    version: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<HashMap<String, Mount>, ReadError> {
     let mut channels = HashMap::new();
     read_rows(
         version,
@@ -103,9 +110,14 @@ fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<
         |_| true,
         |row| {
             let channel = row.required("channel")?.text()?;
-            let modality = row.optional("modality")?.map(|modality| modality.text()).transpose()?;
-            if modality.map_or_else(|| channel.starts_with("LIDAR"), |modality| modality.eq_ignore_ascii_case("lidar"))
-            {
+            let modality = row
+                .optional("modality")?
+                .map(|modality| modality.text())
+                .transpose()?;
+            if modality.map_or_else(
+                || channel.starts_with("LIDAR"),
+                |modality| modality.eq_ignore_ascii_case("lidar"),
+            ) {
                 channels.insert(row.required("token")?.id()?, channel.to_owned());
             }
             Ok(())
@@ -119,7 +131,10 @@ fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<
         |_| true,
         |row| {
             if let Some(channel) = channels.get(&row.required("sensor_token")?.id()?) {
-                let mount = Mount { channel: channel.clone(), vehicle_from_lidar: transform(row)? };
+                let mount = Mount {
+                    channel: channel.clone(),
+                    vehicle_from_lidar: transform(row)?,
+                };
                 mounts.insert(row.required("token")?.id()?, mount);
             }
             Ok(())
@@ -130,7 +145,10 @@ fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<
 
 type Indices = HashMap<String, usize>;
 
-fn read_scenes(version: &Path, problems: &mut Vec<ReadError>) -> Result<(Vec<Scene>, Indices), ReadError> {
+fn read_scenes(
+    version: &Path,
+    problems: &mut Vec<ReadError>,
+) -> Result<(Vec<Scene>, Indices), ReadError> {
     let (mut scenes, mut indices) = (Vec::new(), Indices::new());
     read_rows(
         version,
@@ -139,7 +157,10 @@ fn read_scenes(version: &Path, problems: &mut Vec<ReadError>) -> Result<(Vec<Sce
         |_| true,
         |row| {
             let vehicles = match row.optional("vehicle_list")? {
-                Some(list) => list.items()?.map(|vehicle| vehicle.id()).collect::<Result<_, _>>()?,
+                Some(list) => list
+                    .items()?
+                    .map(|vehicle| vehicle.id())
+                    .collect::<Result<_, _>>()?,
                 None => Vec::new(),
             };
             let name = row.required("name")?.id()?;
@@ -166,7 +187,11 @@ fn read_samples(
             let scene = referred(row, "scene_token", scenes)?;
             let micros = row.required("timestamp")?.count()?;
             indices.insert(row.required("token")?.id()?, samples.len());
-            samples.push(Sample { scene, micros, sweeps: HashMap::new() });
+            samples.push(Sample {
+                scene,
+                micros,
+                sweeps: HashMap::new(),
+            });
             Ok(())
         },
     )?;
@@ -181,19 +206,34 @@ fn read_sweeps(
     problems: &mut Vec<ReadError>,
 ) -> Result<HashMap<String, Vec<SweepRow>>, ReadError> {
     let mut sweeps: HashMap<String, Vec<SweepRow>> = HashMap::new();
-    let is_needed =
-        |keys: &Keys<'_>| keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token);
+    let is_needed = |keys: &Keys<'_>| {
+        keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token)
+    };
     read_rows(version, "sample_data.json", problems, is_needed, |row| {
         let token = row.required("calibrated_sensor_token")?;
-        let mount = mounts.get(&token.id()?).ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
+        let mount = mounts
+            .get(&token.id()?)
+            .ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
         let file = row.required("filename")?;
-        let is_below = Path::new(file.text()?).components().all(|part| matches!(part, Component::Normal(_)));
+        let is_below = Path::new(file.text()?)
+            .components()
+            .all(|part| matches!(part, Component::Normal(_)));
         if !is_below {
-            return Err(file.error(format!("{:?}, expected a path below the data set", file.text()?)));
+            return Err(file.error(format!(
+                "{:?}, expected a path below the data set",
+                file.text()?
+            )));
         }
         let sample = referred(row, "sample_token", samples)?;
-        let sweep = SweepRow { sample, file: file.text()?.to_owned(), mount: mount.clone() };
-        sweeps.entry(row.required("ego_pose_token")?.id()?).or_default().push(sweep);
+        let sweep = SweepRow {
+            sample,
+            file: file.text()?.to_owned(),
+            mount: mount.clone(),
+        };
+        sweeps
+            .entry(row.required("ego_pose_token")?.id()?)
+            .or_default()
+            .push(sweep);
         Ok(())
     })?;
     Ok(sweeps)
@@ -210,18 +250,36 @@ fn place(
     let is_needed = |keys: &Keys<'_>| tokens.contains(&*keys.token);
     read_rows(version, "ego_pose.json", problems, is_needed, |row| {
         let world_from_vehicle = transform(row)?;
-        for SweepRow { sample, file, mount } in rows.remove(&row.required("token")?.id()?).unwrap_or_default() {
-            let sweep = Sweep { file, world_from_vehicle, vehicle_from_lidar: mount.vehicle_from_lidar };
+        for SweepRow {
+            sample,
+            file,
+            mount,
+        } in rows
+            .remove(&row.required("token")?.id()?)
+            .unwrap_or_default()
+        {
+            let sweep = Sweep {
+                file,
+                world_from_vehicle,
+                vehicle_from_lidar: mount.vehicle_from_lidar,
+            };
             if let Some(sample) = samples.get_mut(sample) {
                 sample.sweeps.insert(mount.channel, sweep);
             }
         }
         Ok(())
     })?;
-    let mut without_pose: Vec<&str> = rows.values().flatten().map(|row| row.file.as_str()).collect();
+    let mut without_pose: Vec<&str> = rows
+        .values()
+        .flatten()
+        .map(|row| row.file.as_str())
+        .collect();
     without_pose.sort_unstable();
     if let Some(first) = without_pose.first() {
-        let reason = format!("no pose for {} sweeps, the first {first}: left out", without_pose.len());
+        let reason = format!(
+            "no pose for {} sweeps, the first {first}: left out",
+            without_pose.len()
+        );
         problems.push(ReadError::malformed(&version.join("ego_pose.json"), reason));
     }
     Ok(())
@@ -231,7 +289,12 @@ fn place(
 pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize, ReadError> {
     let token = row.required(key)?;
     let text = token.id()?;
-    let unknown = || token.error(format!("no row has the token {:?}", text.chars().take(40).collect::<String>()));
+    let unknown = || {
+        token.error(format!(
+            "no row has the token {:?}",
+            text.chars().take(40).collect::<String>()
+        ))
+    };
     indices.get(&text).copied().ok_or_else(unknown)
 }
 
@@ -240,12 +303,20 @@ pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>, ReadError> {
     let translation_m = row.required("translation")?.numbers::<3>()?;
     let rotation = row.required("rotation")?;
     let rotation_wxyz = rotation.numbers::<4>()?;
-    let length = rotation_wxyz.iter().map(|part| part * part).sum::<f64>().sqrt();
+    let length = rotation_wxyz
+        .iter()
+        .map(|part| part * part)
+        .sum::<f64>()
+        .sqrt();
     let is_unit = (length - 1.0).abs() <= QUATERNION_TOLERANCE;
     if !is_unit {
         return Err(rotation.error(format!("a quaternion of length {length}, expected 1")));
     }
-    let pose = Pose { translation_m, rotation_wxyz: rotation_wxyz.map(|part| part / length) };
-    pose.validate().map_err(|error| row.error(error.to_string()))?;
+    let pose = Pose {
+        translation_m,
+        rotation_wxyz: rotation_wxyz.map(|part| part / length),
+    };
+    pose.validate()
+        .map_err(|error| row.error(error.to_string()))?;
     Ok(pose.isometry())
 }

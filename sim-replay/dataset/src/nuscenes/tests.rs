@@ -34,7 +34,10 @@ struct DataSet {
 
 impl DataSet {
     fn new(version: &'static str, rigs: &[Rig], annotations: &[(&str, Value)]) -> Self {
-        let set = Self { dir: tempfile::tempdir().unwrap(), version };
+        let set = Self {
+            dir: tempfile::tempdir().unwrap(),
+            version,
+        };
         let token = |index: usize| format!("sensor{index}");
         let mut sensors: Vec<Value> = (rigs.iter().enumerate())
             .map(|(index, rig)| json!({"token": token(index), "channel": rig.channel, "modality": "lidar"}))
@@ -51,7 +54,10 @@ impl DataSet {
             .collect();
         mounts.push(json!({"token": "mount_camera", "sensor_token": "camera", "translation": [], "rotation": []}));
         set.table("calibrated_sensor", json!(mounts));
-        set.table("scene", json!([{"token": "scene", "name": "scene_5", "vehicle_list": ["mike", "maisy"]}]));
+        set.table(
+            "scene",
+            json!([{"token": "scene", "name": "scene_5", "vehicle_list": ["mike", "maisy"]}]),
+        );
         // Not in the order of time.
         let sample = |number: u64| json!({"token": number.to_string(), "scene_token": "scene", "timestamp": T0_MICROS + 200_000 * number});
         set.table("sample", json!([sample(1), sample(0)]));
@@ -62,7 +68,11 @@ impl DataSet {
                 let file = format!("sweeps/{}/scene_5_{number:06}.pcd.bin", rig.channel);
                 set.write(
                     &file,
-                    &rig.points.iter().flatten().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>(),
+                    &rig.points
+                        .iter()
+                        .flatten()
+                        .flat_map(|value| value.to_le_bytes())
+                        .collect::<Vec<u8>>(),
                 );
                 data.push(json!({
                     "token": pose, "sample_token": number.to_string(), "ego_pose_token": pose, "is_key_frame": true,
@@ -74,7 +84,9 @@ impl DataSet {
             }
             data.push(json!({"token": "c", "calibrated_sensor_token": "mount_camera", "is_key_frame": true}));
             // A sweep between two samples, and a pose that is not needed.
-            data.push(json!({"token": "s", "calibrated_sensor_token": "mount0", "is_key_frame": false}));
+            data.push(
+                json!({"token": "s", "calibrated_sensor_token": "mount0", "is_key_frame": false}),
+            );
             poses.push(json!({"token": "c"}));
         }
         set.table("sample_data", json!(data));
@@ -84,7 +96,9 @@ impl DataSet {
     }
 
     fn annotate(&self, annotations: &[(&str, Value)]) {
-        let names = annotations.iter().map(|(name, _)| json!({"token": format!("c_{name}"), "name": name}));
+        let names = annotations
+            .iter()
+            .map(|(name, _)| json!({"token": format!("c_{name}"), "name": name}));
         self.table("category", json!(names.collect::<Vec<_>>()));
         let instances = annotations.iter().enumerate();
         let instances = instances
@@ -103,7 +117,10 @@ impl DataSet {
     }
 
     fn table(&self, name: &str, rows: Value) {
-        self.write(&format!("{}/{name}.json", self.version), rows.to_string().as_bytes());
+        self.write(
+            &format!("{}/{name}.json", self.version),
+            rows.to_string().as_bytes(),
+        );
     }
 
     fn write(&self, name: &str, bytes: &[u8]) {
@@ -118,13 +135,19 @@ impl DataSet {
 
     fn problems(&self, dataset: &Dataset) -> Vec<String> {
         let root = format!("{}/", self.dir.path().display());
-        dataset.problems.iter().map(|problem| problem.to_string().replace(&root, "")).collect()
+        dataset
+            .problems
+            .iter()
+            .map(|problem| problem.to_string().replace(&root, ""))
+            .collect()
     }
 }
 
 fn quaternion(degrees: f64) -> [f64; 4] {
     // The negative one is the same rotation; Open MARS has it.
-    Pose::from_xyz_yaw([0.0; 3], degrees.to_radians()).rotation_wxyz.map(|part| -part)
+    Pose::from_xyz_yaw([0.0; 3], degrees.to_radians())
+        .rotation_wxyz
+        .map(|part| -part)
 }
 
 fn place(translation_m: [f64; 3], size_wlh: [f64; 3], degrees: f64) -> Value {
@@ -143,43 +166,90 @@ fn v2x_sim() -> DataSet {
     DataSet::new(
         "v1.0-mini",
         &[
-            rig("LIDAR_TOP_id_0", [0.0; 3], 0.0, vec![[30.0, 0.0, -1.0, 0.1, 3.0]]),
+            rig(
+                "LIDAR_TOP_id_0",
+                [0.0; 3],
+                0.0,
+                vec![[30.0, 0.0, -1.0, 0.1, 3.0]],
+            ),
             // On the car, on its own roof, on the pedestrian.
             rig(
                 "LIDAR_TOP_id_1",
                 [10.0, 20.0, 0.0],
                 90.0,
-                vec![[19.5, 0.5, -1.25, 0.5, 7.0], [0.2, 0.0, -0.6, 0.2, 1.0], [4.5, 0.0, -1.0, 0.3, 2.0]],
+                vec![
+                    [19.5, 0.5, -1.25, 0.5, 7.0],
+                    [0.2, 0.0, -0.6, 0.2, 1.0],
+                    [4.5, 0.0, -1.0, 0.3, 2.0],
+                ],
             ),
             // On the motorcycle.
-            rig("LIDAR_TOP_id_2", [10.0, 50.0, 0.0], 0.0, vec![[9.5, 0.0, -1.2, 0.5, 7.0]]),
+            rig(
+                "LIDAR_TOP_id_2",
+                [10.0, 50.0, 0.0],
+                0.0,
+                vec![[9.5, 0.0, -1.2, 0.5, 7.0]],
+            ),
         ],
         &[
-            ("vehicle.audi.tt", place([10.0, 40.0, 0.75], [2.0, 4.0, 1.5], 90.0)),
-            ("vehicle.car", place([10.0, 20.0, 0.75], [2.0, 4.0, 1.5], 90.0)),
-            ("human.pedestrian.adult", place([10.0, 25.0, 0.9], [0.6, 0.6, 1.8], 0.0)),
-            ("vehicle.narrow.one", place([20.0, 50.0, 0.8], [0.8, 2.0, 1.6], 0.0)),
+            (
+                "vehicle.audi.tt",
+                place([10.0, 40.0, 0.75], [2.0, 4.0, 1.5], 90.0),
+            ),
+            (
+                "vehicle.car",
+                place([10.0, 20.0, 0.75], [2.0, 4.0, 1.5], 90.0),
+            ),
+            (
+                "human.pedestrian.adult",
+                place([10.0, 25.0, 0.9], [0.6, 0.6, 1.8], 0.0),
+            ),
+            (
+                "vehicle.narrow.one",
+                place([20.0, 50.0, 0.8], [0.8, 2.0, 1.6], 0.0),
+            ),
             // Not hit by any sweep.
-            ("vehicle.truck", place([-5.0, 20.0, 1.5], [2.5, 8.0, 3.0], 0.0)),
+            (
+                "vehicle.truck",
+                place([-5.0, 20.0, 1.5], [2.5, 8.0, 3.0], 0.0),
+            ),
         ],
     )
 }
 
 fn close(found: [f64; 3], expected: [f64; 3]) -> bool {
-    found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-9)
+    found
+        .iter()
+        .zip(expected)
+        .all(|(found, expected)| (found - expected).abs() < 1e-9)
 }
 
 fn load(scenario: &Scenario, tick: usize) -> Vec<Frame> {
-    scenario.present_agents(tick).map(|agent| scenario.load(agent, tick, &LoadOptions::default()).unwrap()).collect()
+    scenario
+        .present_agents(tick)
+        .map(|agent| scenario.load(agent, tick, &LoadOptions::default()).unwrap())
+        .collect()
 }
 
 #[test]
 fn v2x_sim_has_numbered_vehicles_and_a_roadside_unit() {
     let dataset = v2x_sim().open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::V2XSIM, 0), "{:?}", dataset.problems);
+    assert_eq!(
+        (dataset.layout, dataset.problems.len()),
+        (Layout::V2XSIM, 0),
+        "{:?}",
+        dataset.problems
+    );
     let scenario = &dataset.scenarios[0];
     assert_eq!(scenario.name, "v1.0-mini/scene_5");
-    assert_eq!(scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>(), ["1", "2", "0"]);
+    assert_eq!(
+        scenario
+            .agents
+            .iter()
+            .map(CavId::as_str)
+            .collect::<Vec<_>>(),
+        ["1", "2", "0"]
+    );
     assert_eq!(scenario.roadside_units, [scenario.agents[2].clone()]);
 }
 
@@ -187,14 +257,33 @@ fn v2x_sim_has_numbered_vehicles_and_a_roadside_unit() {
 fn samples_are_ticks_with_poses_and_five_floats_per_point() {
     let set = v2x_sim();
     let scenario = &set.open().scenarios[0];
-    let ticks: Vec<_> = scenario.ticks.iter().map(|tick| (tick.stem.as_str(), tick.capture_nanos)).collect();
-    assert_eq!(ticks, [("scene_5_000000", 0), ("scene_5_000001", 200_000_000)]);
+    let ticks: Vec<_> = scenario
+        .ticks
+        .iter()
+        .map(|tick| (tick.stem.as_str(), tick.capture_nanos))
+        .collect();
+    assert_eq!(
+        ticks,
+        [("scene_5_000000", 0), ("scene_5_000001", 200_000_000)]
+    );
     let frames = load(scenario, 1);
     let ego = frames[0].world_from_lidar.unwrap();
-    assert!(close(ego.translation_m, [10.0, 20.5, 2.0]) && (ego.yaw_rad().to_degrees() - 90.0).abs() < 1e-9);
-    assert!(close(frames[0].world_from_vehicle.unwrap().translation_m, [10.0, 20.0, 0.0]));
-    assert!(close(frames[1].world_from_lidar.unwrap().translation_m, [10.5, 50.0, 2.0]));
-    assert_eq!(frames[0].points.xyzi[..2], [[19.5, 0.5, -1.25, 0.5], [0.2, 0.0, -0.6, 0.2]]);
+    assert!(
+        close(ego.translation_m, [10.0, 20.5, 2.0])
+            && (ego.yaw_rad().to_degrees() - 90.0).abs() < 1e-9
+    );
+    assert!(close(
+        frames[0].world_from_vehicle.unwrap().translation_m,
+        [10.0, 20.0, 0.0]
+    ));
+    assert!(close(
+        frames[1].world_from_lidar.unwrap().translation_m,
+        [10.5, 50.0, 2.0]
+    ));
+    assert_eq!(
+        frames[0].points.xyzi[..2],
+        [[19.5, 0.5, -1.25, 0.5], [0.2, 0.0, -0.6, 0.2]]
+    );
     assert_eq!(frames[0].capture_nanos, 200_000_000);
 }
 
@@ -202,21 +291,49 @@ fn samples_are_ticks_with_poses_and_five_floats_per_point() {
 fn agents_list_what_their_sweeps_hit_but_not_themselves() {
     let set = v2x_sim();
     let frames = load(&set.open().scenarios[0], 0);
-    let listed = |frame: &Frame| frame.objects.iter().map(|object| (object.id, object.class)).collect::<Vec<_>>();
-    assert_eq!(listed(&frames[0]), [(0, ObjectClass::Car), (2, ObjectClass::Pedestrian)]);
-    assert_eq!(listed(&frames[1]), [(3, ObjectClass::TwoWheeler)], "narrower than 1.5 m");
+    let listed = |frame: &Frame| {
+        frame
+            .objects
+            .iter()
+            .map(|object| (object.id, object.class))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(
+        listed(&frames[0]),
+        [(0, ObjectClass::Car), (2, ObjectClass::Pedestrian)]
+    );
+    assert_eq!(
+        listed(&frames[1]),
+        [(3, ObjectClass::TwoWheeler)],
+        "narrower than 1.5 m"
+    );
     assert!(listed(&frames[2]).is_empty());
     let merged = merge(&frames.iter().collect::<Vec<_>>(), 0, &RULE);
-    let [(0, car)] = &merged[..] else { panic!("{merged:?}") };
-    assert!(close(car.center_m, [19.5, 0.0, -1.25]) && close(car.size_m, [4.0, 2.0, 1.5]), "{car:?}");
+    let [(0, car)] = &merged[..] else {
+        panic!("{merged:?}")
+    };
+    assert!(
+        close(car.center_m, [19.5, 0.0, -1.25]) && close(car.size_m, [4.0, 2.0, 1.5]),
+        "{car:?}"
+    );
     assert!(car.heading_rad.abs() < 1e-9);
 }
 
 #[test]
 fn a_missing_sweep_is_an_absent_agent_and_the_egos_a_missing_tick() {
     let set = v2x_sim();
-    fs::remove_file(set.dir.path().join("sweeps/LIDAR_TOP_id_2/scene_5_000000.pcd.bin")).unwrap();
-    fs::remove_file(set.dir.path().join("sweeps/LIDAR_TOP_id_1/scene_5_000001.pcd.bin")).unwrap();
+    fs::remove_file(
+        set.dir
+            .path()
+            .join("sweeps/LIDAR_TOP_id_2/scene_5_000000.pcd.bin"),
+    )
+    .unwrap();
+    fs::remove_file(
+        set.dir
+            .path()
+            .join("sweeps/LIDAR_TOP_id_1/scene_5_000001.pcd.bin"),
+    )
+    .unwrap();
     let dataset = set.open();
     assert_eq!(
         set.problems(&dataset),
@@ -226,7 +343,13 @@ fn a_missing_sweep_is_an_absent_agent_and_the_egos_a_missing_tick() {
         ]
     );
     let scenario = &dataset.scenarios[0];
-    assert_eq!((scenario.ticks.len(), scenario.present_agents(0).collect::<Vec<_>>()), (1, vec![0, 2]));
+    assert_eq!(
+        (
+            scenario.ticks.len(),
+            scenario.present_agents(0).collect::<Vec<_>>()
+        ),
+        (1, vec![0, 2])
+    );
 }
 
 #[test]
@@ -238,21 +361,40 @@ fn mars_names_its_vehicles_and_has_no_annotations() {
         mount_degrees: -2.0,
         points: vec![[3.0, -6.0, -1.5, 9.0, 4.0], [5.0, -8.0, -0.3, 204.0, 53.0]],
     };
-    let rigs = [rig("LIDAR_FRONT_CENTER_maisy", 20.0), rig("LIDAR_FRONT_CENTER_mike", -146.0)];
+    let rigs = [
+        rig("LIDAR_FRONT_CENTER_maisy", 20.0),
+        rig("LIDAR_FRONT_CENTER_mike", -146.0),
+    ];
     let set = DataSet::new("v1.0", &rigs, &[]);
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.problems.len()), (Layout::MARS, 0), "{:?}", dataset.problems);
+    assert_eq!(
+        (dataset.layout, dataset.problems.len()),
+        (Layout::MARS, 0),
+        "{:?}",
+        dataset.problems
+    );
     let scenario = &dataset.scenarios[0];
     assert_eq!(
-        scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>(),
+        scenario
+            .agents
+            .iter()
+            .map(CavId::as_str)
+            .collect::<Vec<_>>(),
         ["mike", "maisy"],
         "as the scene lists them"
     );
     assert!(scenario.roadside_units.is_empty());
     let frames = load(scenario, 0);
     let pose = frames[0].world_from_lidar.unwrap();
-    assert!(close(pose.translation_m, [-146.5, 0.0, 2.0]) && (pose.yaw_rad().to_degrees() - 178.0).abs() < 1e-9);
-    assert_eq!((frames[0].points.xyzi[1], frames[0].objects.len()), ([5.0, -8.0, -0.3, 0.8], 0), "intensities to 255");
+    assert!(
+        close(pose.translation_m, [-146.5, 0.0, 2.0])
+            && (pose.yaw_rad().to_degrees() - 178.0).abs() < 1e-9
+    );
+    assert_eq!(
+        (frames[0].points.xyzi[1], frames[0].objects.len()),
+        ([5.0, -8.0, -0.3, 0.8], 0),
+        "intensities to 255"
+    );
     // Releases without the tables of annotations open as well.
     for table in ["sample_annotation", "instance", "category"] {
         fs::remove_file(set.dir.path().join(format!("v1.0/{table}.json"))).unwrap();
@@ -270,28 +412,44 @@ fn nuscenes_is_turned_so_that_x_points_ahead() {
         // 10 m ahead of the LiDAR: its y.
         points: vec![[1.0, 10.0, -1.25, 0.5, 7.0]],
     };
-    let set =
-        DataSet::new("v1.0-mini", &[rig], &[("vehicle.bus.rigid", place([110.5, 199.0, 1.5], [3.0, 12.0, 3.0], 0.0))]);
+    let set = DataSet::new(
+        "v1.0-mini",
+        &[rig],
+        &[(
+            "vehicle.bus.rigid",
+            place([110.5, 199.0, 1.5], [3.0, 12.0, 3.0], 0.0),
+        )],
+    );
     let dataset = set.open();
-    assert_eq!((dataset.layout, dataset.scenarios[0].agents[0].as_str()), (Layout::NUSCENES, "0"));
+    assert_eq!(
+        (dataset.layout, dataset.scenarios[0].agents[0].as_str()),
+        (Layout::NUSCENES, "0")
+    );
     let frame = &load(&dataset.scenarios[0], 0)[0];
     assert_eq!(frame.points.xyzi, [[10.0, -1.0, -1.25, 0.5]]);
     assert!(frame.world_from_lidar.unwrap().yaw_rad().abs() < 1e-9);
     let merged = merge(&[frame], 0, &RULE);
-    assert!(close(merged[0].1.center_m, [10.0, -1.0, -0.5]), "{merged:?}");
+    assert!(
+        close(merged[0].1.center_m, [10.0, -1.0, -0.5]),
+        "{merged:?}"
+    );
 }
 
 #[test]
 fn rows_that_cannot_be_used_are_left_out_one_by_one() {
     let set = v2x_sim();
-    let mut rows: Vec<Value> =
-        serde_json::from_slice(&fs::read(set.dir.path().join("v1.0-mini/sample_annotation.json")).unwrap()).unwrap();
+    let mut rows: Vec<Value> = serde_json::from_slice(
+        &fs::read(set.dir.path().join("v1.0-mini/sample_annotation.json")).unwrap(),
+    )
+    .unwrap();
     rows[0]["size"] = json!([2.0, 4.0, -1.5]);
     rows[1]["instance_token"] = json!("nobody");
     rows[2]["rotation"] = json!([1.0, 1.0, 0.0, 0.0]);
     set.table("sample_annotation", json!(rows));
-    let mut data: Vec<Value> =
-        serde_json::from_slice(&fs::read(set.dir.path().join("v1.0-mini/sample_data.json")).unwrap()).unwrap();
+    let mut data: Vec<Value> = serde_json::from_slice(
+        &fs::read(set.dir.path().join("v1.0-mini/sample_data.json")).unwrap(),
+    )
+    .unwrap();
     data[1]["filename"] = json!("../elsewhere.pcd.bin");
     set.table("sample_data", json!(data));
     let dataset = set.open();
@@ -306,17 +464,27 @@ fn rows_that_cannot_be_used_are_left_out_one_by_one() {
             format!("{table}2.rotation: a quaternion of length 1.4142135623730951, expected 1"),
         ]
     );
-    assert_eq!(dataset.scenarios[0].ticks.len(), 1, "the ego has no sweep at the first sample");
+    assert_eq!(
+        dataset.scenarios[0].ticks.len(),
+        1,
+        "the ego has no sweep at the first sample"
+    );
 }
 
 #[test]
 fn unknown_categories_are_no_vehicles_and_reported() {
     let set = v2x_sim();
-    set.annotate(&[("spaceship", place([10.0, 40.0, 0.75], [2.0, 4.0, 1.5], 90.0))]);
+    set.annotate(&[(
+        "spaceship",
+        place([10.0, 40.0, 0.75], [2.0, 4.0, 1.5], 90.0),
+    )]);
     let dataset = set.open();
     let expected = "v1.0-mini/category.json: 0.name: \"spaceship\" is an unknown type of object: it counts as other, not as a vehicle";
     assert_eq!(set.problems(&dataset), [expected]);
-    assert_eq!(load(&dataset.scenarios[0], 0)[0].objects[0].class, ObjectClass::Other);
+    assert_eq!(
+        load(&dataset.scenarios[0], 0)[0].objects[0].class,
+        ObjectClass::Other
+    );
 }
 
 #[test]
@@ -326,28 +494,44 @@ fn tables_that_are_no_data_set_are_reported() {
         let error = crate::open(set.dir.path()).unwrap_err().to_string();
         error.replace(&format!("{}/", set.dir.path().display()), "")
     };
-    set.table("sensor", json!([{"token": "sensor0", "channel": "LIDAR_FRONT_LEFT", "modality": "lidar"}]));
+    set.table(
+        "sensor",
+        json!([{"token": "sensor0", "channel": "LIDAR_FRONT_LEFT", "modality": "lidar"}]),
+    );
     assert!(
-        message().contains("no row of calibrated_sensor.json") || message().contains("LIDAR_FRONT_LEFT"),
+        message().contains("no row of calibrated_sensor.json")
+            || message().contains("LIDAR_FRONT_LEFT"),
         "{}",
         message()
     );
     fs::remove_file(set.dir.path().join("v1.0-mini/scene.json")).unwrap();
-    assert!(message().starts_with("v1.0-mini/scene.json: No such file"), "{}", message());
+    assert!(
+        message().starts_with("v1.0-mini/scene.json: No such file"),
+        "{}",
+        message()
+    );
 }
 
 #[test]
 fn the_folder_of_the_tables_opens_as_well_and_versions_are_distinguished() {
     let set = v2x_sim();
     let own = crate::open(&set.dir.path().join("v1.0-mini")).unwrap();
-    assert_eq!((own.scenarios[0].name.as_str(), own.scenarios[0].ticks.len()), ("v1.0-mini/scene_5", 2));
+    assert_eq!(
+        (own.scenarios[0].name.as_str(), own.scenarios[0].ticks.len()),
+        ("v1.0-mini/scene_5", 2)
+    );
     let copy = set.dir.path().join("v1.0-test");
     fs::create_dir(&copy).unwrap();
     for entry in fs::read_dir(set.dir.path().join("v1.0-mini")).unwrap() {
         let path = entry.unwrap().path();
         fs::copy(&path, copy.join(path.file_name().unwrap())).unwrap();
     }
-    let names: Vec<String> = set.open().scenarios.into_iter().map(|scenario| scenario.name).collect();
+    let names: Vec<String> = set
+        .open()
+        .scenarios
+        .into_iter()
+        .map(|scenario| scenario.name)
+        .collect();
     assert_eq!(names, ["v1.0-mini/scene_5", "v1.0-test/scene_5"]);
 }
 

@@ -25,7 +25,10 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
     let mut labels = Vec::with_capacity(if is_labelled { points.capacity() } else { 0 });
     let mut first_dropped = None;
     let mut lines = Lines::new(header, body);
-    while let Some((point, label)) = lines.next_point().map_err(|error| lines.cut_off(error, points.len()))? {
+    while let Some((point, label)) = lines
+        .next_point()
+        .map_err(|error| lines.cut_off(error, points.len()))?
+    {
         if points.len() == header.points {
             let reason = format!("{} stated, but here is another point", header.points);
             return Err(PcdError::at(lines.line, "POINTS", reason));
@@ -37,10 +40,17 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
         labels.extend(is_labelled.then_some(label));
     }
     if points.len() != header.points {
-        let reason = format!("{} stated, {} found: the file is cut off", header.points, points.len());
+        let reason = format!(
+            "{} stated, {} found: the file is cut off",
+            header.points,
+            points.len()
+        );
         return Err(PcdError::of("POINTS", reason));
     }
-    Ok(PcdCloud { first_dropped, ..PcdCloud::of_finite(points, labels) })
+    Ok(PcdCloud {
+        first_dropped,
+        ..PcdCloud::of_finite(points, labels)
+    })
 }
 
 /// The lines that are left to read.
@@ -58,7 +68,14 @@ struct Lines<'a> {
 impl<'a> Lines<'a> {
     fn new(header: &'a Header, body: &'a [u8]) -> Self {
         let columns = columns(header);
-        Self { header, columns, rest: body, begun: body, line: header.lines + 1, colours: Colours::default() }
+        Self {
+            header,
+            columns,
+            rest: body,
+            begun: body,
+            line: header.lines + 1,
+            colours: Colours::default(),
+        }
     }
 
     /// The point of the next line that is not blank, and its label.
@@ -105,7 +122,11 @@ impl<'a> Lines<'a> {
     }
 
     fn token(&mut self) -> &'a [u8] {
-        let end = self.rest.iter().position(|&byte| is_separator(byte)).unwrap_or(self.rest.len());
+        let end = self
+            .rest
+            .iter()
+            .position(|&byte| is_separator(byte))
+            .unwrap_or(self.rest.len());
         let (token, rest) = self.rest.split_at(end);
         self.rest = rest;
         token
@@ -121,7 +142,11 @@ impl<'a> Lines<'a> {
     }
 
     /// Red and green of a packed colour.
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the low 32 bits are the colour")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "the low 32 bits are the colour"
+    )]
     fn colour(&mut self, column: Column, field: usize) -> Result<(f32, u8), PcdError> {
         let token = self.token();
         if let Some(colour) = self.colours.find(token) {
@@ -146,14 +171,25 @@ impl<'a> Lines<'a> {
 
     fn no_number(&self, field: usize, token: &[u8]) -> PcdError {
         let token: String = String::from_utf8_lossy(token).chars().take(40).collect();
-        let name = self.header.fields.get(field).map_or("", |field| &field.name);
+        let name = self
+            .header
+            .fields
+            .get(field)
+            .map_or("", |field| &field.name);
         PcdError::at(self.line, name, format!("{token:?} is no number"))
     }
 
     /// The line has fewer or more values than the header states. They are counted from its start.
     fn wrong_count(&self) -> PcdError {
-        let line = self.begun.split(|&byte| byte == b'\n').next().unwrap_or_default();
-        let found = line.split(|&byte| is_separator(byte)).filter(|token| !token.is_empty()).count();
+        let line = self
+            .begun
+            .split(|&byte| byte == b'\n')
+            .next()
+            .unwrap_or_default();
+        let found = line
+            .split(|&byte| is_separator(byte))
+            .filter(|token| !token.is_empty())
+            .count();
         let expected = self.header.columns();
         let mut end = 0;
         let field = self.header.fields.iter().find(|field| {
@@ -161,7 +197,11 @@ impl<'a> Lines<'a> {
             found.min(expected.saturating_sub(1)) < end
         });
         let name = field.map_or("", |field| &field.name);
-        PcdError::at(self.line, name, format!("{found} values in the line, expected {expected}"))
+        PcdError::at(
+            self.line,
+            name,
+            format!("{found} values in the line, expected {expected}"),
+        )
     }
 
     /// A malformed last line without line end means a truncated file.
@@ -169,8 +209,10 @@ impl<'a> Lines<'a> {
         if self.begun.contains(&b'\n') {
             return error;
         }
-        let reason =
-            format!("{}: the file is cut off here, after {read} of {} POINTS", error.reason, self.header.points);
+        let reason = format!(
+            "{}: the file is cut off here, after {read} of {} POINTS",
+            error.reason, self.header.points
+        );
         PcdError { reason, ..error }
     }
 }
@@ -178,9 +220,15 @@ impl<'a> Lines<'a> {
 fn columns(header: &Header) -> Vec<Column> {
     let column = |(index, field): (usize, &Field)| match header.intensity {
         IntensitySource::Value(intensity) if intensity == index => Column::Component(3),
-        IntensitySource::Red(colour) if colour == index && field.kind == Kind::Float => Column::FloatColour,
+        IntensitySource::Red(colour) if colour == index && field.kind == Kind::Float => {
+            Column::FloatColour
+        }
         IntensitySource::Red(colour) if colour == index => Column::IntegerColour,
-        _ => header.xyz.iter().position(|&xyz| xyz == index).map_or(Column::Ignored, Column::Component),
+        _ => header
+            .xyz
+            .iter()
+            .position(|&xyz| xyz == index)
+            .map_or(Column::Ignored, Column::Component),
     };
     header.fields.iter().enumerate().map(column).collect()
 }
@@ -266,7 +314,11 @@ mod tests {
     fn a_colour_may_be_an_integer_with_alpha() {
         let word = 0xff40_0000_u32;
         for (kind, token) in [("U", word.to_string()), ("I", (word as i32).to_string())] {
-            let file = file("x y z rgb", &format!("F F F {kind}"), &[&format!("1 2 3 {token}")]);
+            let file = file(
+                "x y z rgb",
+                &format!("F F F {kind}"),
+                &[&format!("1 2 3 {token}")],
+            );
             assert_eq!(decode(&file).unwrap().points.xyzi[0][3], 64.0 / 255.0);
         }
     }
@@ -293,25 +345,51 @@ mod tests {
 
     #[test]
     fn points_that_are_not_finite_are_dropped_and_counted() {
-        let file = file("x y z intensity", "F F F F", &["1 2 3 0", "nan 2 3 0", "1 2 inf 0", "4 5 6 0"]);
+        let file = file(
+            "x y z intensity",
+            "F F F F",
+            &["1 2 3 0", "nan 2 3 0", "1 2 inf 0", "4 5 6 0"],
+        );
         let cloud = decode(&file).unwrap();
-        assert_eq!(cloud.points.xyzi, [[1.0, 2.0, 3.0, 0.0], [4.0, 5.0, 6.0, 0.0]]);
-        assert_eq!((cloud.dropped, cloud.first_dropped), (2, Some(Place::Line(12))));
+        assert_eq!(
+            cloud.points.xyzi,
+            [[1.0, 2.0, 3.0, 0.0], [4.0, 5.0, 6.0, 0.0]]
+        );
+        assert_eq!(
+            (cloud.dropped, cloud.first_dropped),
+            (2, Some(Place::Line(12)))
+        );
     }
 
     #[test]
     fn a_fault_in_a_line_is_reported() {
-        let message = |lines: &[&str]| decode(&file("x y z rgb", "F F F F", lines)).unwrap_err().to_string();
-        assert_eq!(message(&["1 2 3 0", "1 2 three 0"]), "line 12: z: \"three\" is no number");
-        assert_eq!(message(&["1 2 3"]), "line 11: rgb: 3 values in the line, expected 4");
-        assert_eq!(message(&["1 2 3 4 5"]), "line 11: rgb: 5 values in the line, expected 4");
+        let message = |lines: &[&str]| {
+            decode(&file("x y z rgb", "F F F F", lines))
+                .unwrap_err()
+                .to_string()
+        };
+        assert_eq!(
+            message(&["1 2 3 0", "1 2 three 0"]),
+            "line 12: z: \"three\" is no number"
+        );
+        assert_eq!(
+            message(&["1 2 3"]),
+            "line 11: rgb: 3 values in the line, expected 4"
+        );
+        assert_eq!(
+            message(&["1 2 3 4 5"]),
+            "line 11: rgb: 5 values in the line, expected 4"
+        );
     }
 
     #[test]
     fn too_few_and_too_many_lines_are_named() {
         let text = String::from_utf8(file("x y z", "F F F", &["1 2 3", "4 5 6"])).unwrap();
         let cut = text.replace("4 5 6\n", "");
-        assert_eq!(decode(cut.as_bytes()).unwrap_err().to_string(), "POINTS: 2 stated, 1 found: the file is cut off");
+        assert_eq!(
+            decode(cut.as_bytes()).unwrap_err().to_string(),
+            "POINTS: 2 stated, 1 found: the file is cut off"
+        );
         let inside = text.strip_suffix("5 6\n").unwrap();
         assert_eq!(
             decode(inside.as_bytes()).unwrap_err().to_string(),

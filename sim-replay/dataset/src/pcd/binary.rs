@@ -18,50 +18,83 @@ struct Column {
 /// Points one after another.
 pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
     let (points, stride) = (header.points, header.stride());
-    if points.checked_mul(stride).is_none_or(|expected| body.len() < expected) {
+    if points
+        .checked_mul(stride)
+        .is_none_or(|expected| body.len() < expected)
+    {
         let reason = format!(
             "{points} points of {stride} bytes stated, but only {} bytes follow the header: the file is cut off",
             body.len()
         );
         return Err(PcdError::of("POINTS", reason));
     }
-    Ok(gather(header, body, |field, first| column_of(field, first, stride)))
+    Ok(gather(header, body, |field, first| {
+        column_of(field, first, stride)
+    }))
 }
 
 /// Two lengths, then LZF; once unpacked, fields one after another, each for all points.
 pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
     let Some((lengths, packed)) = body.split_first_chunk::<8>() else {
-        return Err(PcdError::of("DATA", format!("{} bytes after the header, expected two lengths", body.len())));
+        return Err(PcdError::of(
+            "DATA",
+            format!(
+                "{} bytes after the header, expected two lengths",
+                body.len()
+            ),
+        ));
     };
     let [a, b, c, d, e, f, g, h] = *lengths;
     let packed_len = u32::from_le_bytes([a, b, c, d]) as usize;
     let unpacked_len = u32::from_le_bytes([e, f, g, h]) as usize;
     let Some(packed) = packed.get(..packed_len) else {
-        let reason = format!("{packed_len} packed bytes stated, but only {} follow: the file is cut off", packed.len());
+        let reason = format!(
+            "{packed_len} packed bytes stated, but only {} follow: the file is cut off",
+            packed.len()
+        );
         return Err(PcdError::of("DATA", reason));
     };
     let (points, stride) = (header.points, header.stride());
     let expected = points.checked_mul(stride);
     if expected != Some(unpacked_len) {
-        let way = if expected.is_none_or(|expected| unpacked_len < expected) { "fewer" } else { "more" };
-        let reason =
-            format!("{points} points of {stride} bytes stated, but unpacked they are {unpacked_len} bytes: {way}");
+        let way = if expected.is_none_or(|expected| unpacked_len < expected) {
+            "fewer"
+        } else {
+            "more"
+        };
+        let reason = format!(
+            "{points} points of {stride} bytes stated, but unpacked they are {unpacked_len} bytes: {way}"
+        );
         return Err(PcdError::of("DATA", reason));
     }
-    let unpacked = lzf::decompress(packed, unpacked_len).map_err(|error| PcdError::of("DATA", error.to_string()))?;
-    Ok(gather(header, &unpacked, |field, first| column_of(field, first * points, field.size * field.count)))
+    let unpacked = lzf::decompress(packed, unpacked_len)
+        .map_err(|error| PcdError::of("DATA", error.to_string()))?;
+    Ok(gather(header, &unpacked, |field, first| {
+        column_of(field, first * points, field.size * field.count)
+    }))
 }
 
 fn column_of(field: &Field, first: usize, step: usize) -> Column {
-    Column { first, step, kind: field.kind, size: field.size }
+    Column {
+        first,
+        step,
+        kind: field.kind,
+        size: field.size,
+    }
 }
 
 /// `column` gives the place of a field from the bytes of a point before it. `data` holds every number that it points
 /// at: its length has been checked.
-#[expect(clippy::indexing_slicing, reason = "the header's indices are of its fields")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "the header's indices are of its fields"
+)]
 fn gather(header: &Header, data: &[u8], column: impl Fn(&Field, usize) -> Column) -> PcdCloud {
     let column = |index: usize| {
-        let before = header.fields[..index].iter().map(|field| field.size * field.count).sum();
+        let before = header.fields[..index]
+            .iter()
+            .map(|field| field.size * field.count)
+            .sum();
         column(&header.fields[index], before)
     };
     let mut points = vec![[0.0; 4]; header.points];
@@ -91,17 +124,33 @@ impl Column {
     fn fill(self, data: &[u8], points: &mut [[f32; 4]], component: usize) {
         match (self.kind, self.size) {
             (Kind::Float, 4) => self.numbers(data, points, component, f32::from_le_bytes),
-            (Kind::Float, _) => self.numbers(data, points, component, |bytes| f64::from_le_bytes(bytes) as f32),
+            (Kind::Float, _) => self.numbers(data, points, component, |bytes| {
+                f64::from_le_bytes(bytes) as f32
+            }),
             (Kind::Unsigned, 1) => self.numbers(data, points, component, |[byte]| f32::from(byte)),
-            (Kind::Unsigned, 2) => self.numbers(data, points, component, |bytes| f32::from(u16::from_le_bytes(bytes))),
-            (Kind::Unsigned, 4) => self.numbers(data, points, component, |bytes| u32::from_le_bytes(bytes) as f32),
-            (Kind::Signed, 1) => self.numbers(data, points, component, |bytes| f32::from(i8::from_le_bytes(bytes))),
-            (Kind::Signed, 2) => self.numbers(data, points, component, |bytes| f32::from(i16::from_le_bytes(bytes))),
-            (Kind::Signed, 4) => self.numbers(data, points, component, |bytes| i32::from_le_bytes(bytes) as f32),
-            (Kind::Signed, _) => self.numbers(data, points, component, |bytes| i64::from_le_bytes(bytes) as f32),
+            (Kind::Unsigned, 2) => self.numbers(data, points, component, |bytes| {
+                f32::from(u16::from_le_bytes(bytes))
+            }),
+            (Kind::Unsigned, 4) => self.numbers(data, points, component, |bytes| {
+                u32::from_le_bytes(bytes) as f32
+            }),
+            (Kind::Signed, 1) => self.numbers(data, points, component, |bytes| {
+                f32::from(i8::from_le_bytes(bytes))
+            }),
+            (Kind::Signed, 2) => self.numbers(data, points, component, |bytes| {
+                f32::from(i16::from_le_bytes(bytes))
+            }),
+            (Kind::Signed, 4) => self.numbers(data, points, component, |bytes| {
+                i32::from_le_bytes(bytes) as f32
+            }),
+            (Kind::Signed, _) => self.numbers(data, points, component, |bytes| {
+                i64::from_le_bytes(bytes) as f32
+            }),
             // The header accepts no other type.
             (Kind::Unsigned | Kind::Other, _) => {
-                self.numbers(data, points, component, |bytes| u64::from_le_bytes(bytes) as f32);
+                self.numbers(data, points, component, |bytes| {
+                    u64::from_le_bytes(bytes) as f32
+                });
             }
         }
     }
@@ -114,11 +163,18 @@ impl Column {
         component: usize,
         number: impl Fn([u8; N]) -> f32,
     ) {
-        self.each(data, points, |point, bytes| point[component] = number(bytes));
+        self.each(data, points, |point, bytes| {
+            point[component] = number(bytes)
+        });
     }
 
     /// Passes on each point with its bytes.
-    fn each<const N: usize>(self, data: &[u8], points: &mut [[f32; 4]], mut take: impl FnMut(&mut [f32; 4], [u8; N])) {
+    fn each<const N: usize>(
+        self,
+        data: &[u8],
+        points: &mut [[f32; 4]],
+        mut take: impl FnMut(&mut [f32; 4], [u8; N]),
+    ) {
         let chunks = data.get(self.first..).unwrap_or_default().chunks(self.step);
         for (point, chunk) in points.iter_mut().zip(chunks) {
             if let Some(&bytes) = chunk.first_chunk() {
@@ -134,7 +190,14 @@ pub(super) mod tests {
 
     use crate::pcd::{Place, decode, lzf};
 
-    fn header(fields: &str, sizes: &str, types: &str, counts: &str, points: usize, data: &str) -> Vec<u8> {
+    fn header(
+        fields: &str,
+        sizes: &str,
+        types: &str,
+        counts: &str,
+        points: usize,
+        data: &str,
+    ) -> Vec<u8> {
         format!(
             "VERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\nCOUNT {counts}\nWIDTH {points}\nHEIGHT 1\n\
              VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
@@ -144,10 +207,23 @@ pub(super) mod tests {
 
     /// The cloud as PCL packs it: fields one after another.
     pub(in crate::pcd) fn compressed(cloud: &PointCloud) -> Vec<u8> {
-        let columns: Vec<u8> =
-            (0..4).flat_map(|field| cloud.xyzi.iter().flat_map(move |point| point[field].to_le_bytes())).collect();
+        let columns: Vec<u8> = (0..4)
+            .flat_map(|field| {
+                cloud
+                    .xyzi
+                    .iter()
+                    .flat_map(move |point| point[field].to_le_bytes())
+            })
+            .collect();
         let packed = lzf::tests::compress(&columns);
-        let mut file = header("x y z intensity", "4 4 4 4", "F F F F", "1 1 1 1", cloud.len(), "binary_compressed");
+        let mut file = header(
+            "x y z intensity",
+            "4 4 4 4",
+            "F F F F",
+            "1 1 1 1",
+            cloud.len(),
+            "binary_compressed",
+        );
         file.extend((packed.len() as u32).to_le_bytes());
         file.extend((columns.len() as u32).to_le_bytes());
         file.extend(packed);
@@ -156,7 +232,11 @@ pub(super) mod tests {
 
     #[test]
     fn compressed_fields_come_back_as_points() {
-        let cloud = PointCloud { xyzi: (0..500).map(|i| [i as f32, 0.0, -(i as f32), 0.5]).collect() };
+        let cloud = PointCloud {
+            xyzi: (0..500)
+                .map(|i| [i as f32, 0.0, -(i as f32), 0.5])
+                .collect(),
+        };
         let file = compressed(&cloud);
         assert!(file.len() < 500 * 16, "something was packed");
         assert_eq!(decode(&file).unwrap().points, cloud);
@@ -164,14 +244,24 @@ pub(super) mod tests {
 
     #[test]
     fn widths_types_and_padding_are_honoured() {
-        let mut file = header("x _ y z rgb ring", "8 1 2 4 4 2", "F U I F U U", "1 3 1 1 1 2", 1, "binary");
+        let mut file = header(
+            "x _ y z rgb ring",
+            "8 1 2 4 4 2",
+            "F U I F U U",
+            "1 3 1 1 1 2",
+            1,
+            "binary",
+        );
         file.extend(1.5f64.to_le_bytes());
         file.extend([9, 9, 9]);
         file.extend((-7i16).to_le_bytes());
         file.extend(2.5f32.to_le_bytes());
         file.extend(0x0033_0000_u32.to_le_bytes());
         file.extend([1, 0, 2, 0]);
-        assert_eq!(decode(&file).unwrap().points.xyzi, [[1.5, -7.0, 2.5, 51.0 / 255.0]]);
+        assert_eq!(
+            decode(&file).unwrap().points.xyzi,
+            [[1.5, -7.0, 2.5, 51.0 / 255.0]]
+        );
     }
 
     #[test]
@@ -195,12 +285,17 @@ pub(super) mod tests {
             file.extend(value.to_le_bytes());
         }
         let cloud = decode(&file).unwrap();
-        assert_eq!((cloud.points.len(), cloud.dropped, cloud.first_dropped), (2, 1, Some(Place::Point(1))));
+        assert_eq!(
+            (cloud.points.len(), cloud.dropped, cloud.first_dropped),
+            (2, 1, Some(Place::Point(1)))
+        );
     }
 
     #[test]
     fn lengths_of_a_packed_body_must_fit() {
-        let cloud = PointCloud { xyzi: vec![[1.0; 4]; 10] };
+        let cloud = PointCloud {
+            xyzi: vec![[1.0; 4]; 10],
+        };
         let file = compressed(&cloud);
         let lengths_at = file.len() - decode_packed_len(&file) - 8;
         let mut cut = file.clone();
@@ -208,7 +303,10 @@ pub(super) mod tests {
         let packed = decode_packed_len(&file);
         assert_eq!(
             decode(&cut).unwrap_err().to_string(),
-            format!("DATA: {packed} packed bytes stated, but only {} follow: the file is cut off", packed - 1)
+            format!(
+                "DATA: {packed} packed bytes stated, but only {} follow: the file is cut off",
+                packed - 1
+            )
         );
         let stretched = [&file[..], &[0; 3731]].concat();
         assert_eq!(decode(&stretched).unwrap().points, cloud);
@@ -221,7 +319,11 @@ pub(super) mod tests {
     }
 
     fn decode_packed_len(file: &[u8]) -> usize {
-        let start = file.windows(18).position(|window| window == b"binary_compressed\n").unwrap() + 18;
+        let start = file
+            .windows(18)
+            .position(|window| window == b"binary_compressed\n")
+            .unwrap()
+            + 18;
         u32::from_le_bytes(file[start..start + 4].try_into().unwrap()) as usize
     }
 }

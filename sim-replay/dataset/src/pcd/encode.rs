@@ -40,15 +40,21 @@ pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z {field}\nSIZE 4 4 4 4\nTYPE F F F F\n\
          COUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
     );
-    let stored = cloud.xyzi.iter().enumerate().map(|(index, &[x, y, z, fourth])| {
-        let packed = |green: u8| f32::from_bits(red_byte(fourth) << 16 | u32::from(green) << 8);
-        let fourth = match intensity {
-            IntensityField::Intensity => fourth,
-            IntensityField::Red => packed(0),
-            IntensityField::RedAndLabel(labels) => packed(labels.get(index).copied().unwrap_or(0)),
-        };
-        [x, y, z, fourth]
-    });
+    let stored = cloud
+        .xyzi
+        .iter()
+        .enumerate()
+        .map(|(index, &[x, y, z, fourth])| {
+            let packed = |green: u8| f32::from_bits(red_byte(fourth) << 16 | u32::from(green) << 8);
+            let fourth = match intensity {
+                IntensityField::Intensity => fourth,
+                IntensityField::Red => packed(0),
+                IntensityField::RedAndLabel(labels) => {
+                    packed(labels.get(index).copied().unwrap_or(0))
+                }
+            };
+            [x, y, z, fourth]
+        });
     match encoding {
         Encoding::Ascii => {
             let mut text = header;
@@ -68,7 +74,11 @@ pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<
     }
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cast from a float saturates")]
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a cast from a float saturates"
+)]
 fn red_byte(intensity: f32) -> u32 {
     // NaN becomes 0.
     (intensity.clamp(0.0, 1.0) * 255.0).round() as u32
@@ -108,11 +118,30 @@ mod tests {
 
     #[test]
     fn labels_come_back_beside_intensity() {
-        let cloud = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.2], [4.0, 5.0, 6.0, 1.0], [7.0, 8.0, 9.0, 0.0]] };
+        let cloud = PointCloud {
+            xyzi: vec![
+                [1.0, 2.0, 3.0, 0.2],
+                [4.0, 5.0, 6.0, 1.0],
+                [7.0, 8.0, 9.0, 0.0],
+            ],
+        };
         for encoding in [Encoding::Ascii, Encoding::Binary] {
-            let back = decode(&encode(&cloud, encoding, IntensityField::RedAndLabel(&[0, 1]))).unwrap();
-            assert_eq!((back.points, back.labels), (cloud.clone(), Some(vec![0, 1, 0])));
-            let back = decode(&encode(&cloud, encoding, IntensityField::RedAndLabel(&[0; 3]))).unwrap();
+            let back = decode(&encode(
+                &cloud,
+                encoding,
+                IntensityField::RedAndLabel(&[0, 1]),
+            ))
+            .unwrap();
+            assert_eq!(
+                (back.points, back.labels),
+                (cloud.clone(), Some(vec![0, 1, 0]))
+            );
+            let back = decode(&encode(
+                &cloud,
+                encoding,
+                IntensityField::RedAndLabel(&[0; 3]),
+            ))
+            .unwrap();
             assert_eq!(back.labels, None);
         }
     }

@@ -16,8 +16,16 @@ const MAX_COUNT: u64 = 65_536;
 /// Most bytes of one number.
 const MAX_SIZE: usize = 8;
 /// Names of intensity, the preferred first, compared without case.
-pub(crate) const INTENSITY: [&str; 8] =
-    ["intensity", "i", "scalar_intensity", "reflectivity", "scalar_reflectivity", "reflectance", "remission", "signal"];
+pub(crate) const INTENSITY: [&str; 8] = [
+    "intensity",
+    "i",
+    "scalar_intensity",
+    "reflectivity",
+    "scalar_reflectivity",
+    "reflectance",
+    "remission",
+    "signal",
+];
 /// Names of packed colours, whose red byte is an intensity.
 const COLOURS: [&str; 2] = ["rgb", "rgba"];
 
@@ -103,8 +111,18 @@ struct Entries<'a> {
     found: Vec<(&'static str, Entry<'a>)>,
 }
 
-const KEYS: [&str; 10] =
-    ["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"];
+const KEYS: [&str; 10] = [
+    "VERSION",
+    "FIELDS",
+    "SIZE",
+    "TYPE",
+    "COUNT",
+    "WIDTH",
+    "HEIGHT",
+    "VIEWPOINT",
+    "POINTS",
+    "DATA",
+];
 const VERSIONS: [&str; 6] = ["0.7", ".7", "0.6", ".6", "0.5", ".5"];
 
 impl Header {
@@ -116,7 +134,11 @@ impl Header {
         while !entries.has("DATA") {
             line += 1;
             let Some(end) = rest.iter().take(MAX_LINE).position(|&byte| byte == b'\n') else {
-                return Err(PcdError::at(line, "DATA", "the header ends before a DATA line"));
+                return Err(PcdError::at(
+                    line,
+                    "DATA",
+                    "the header ends before a DATA line",
+                ));
             };
             let (text, after) = rest.split_at(end);
             entries.add(line, without_comment(text))?;
@@ -133,7 +155,14 @@ impl Header {
         let line = entries.get("FIELDS")?.line;
         let xyz = find_xyz(&fields, line)?;
         let intensity = find_intensity(&fields);
-        let header = Self { xyz, intensity, points, data: entries.data()?, fields, lines };
+        let header = Self {
+            xyz,
+            intensity,
+            points,
+            data: entries.data()?,
+            fields,
+            lines,
+        };
         header.check_formats(entries)?;
         Ok(header)
     }
@@ -145,35 +174,55 @@ impl Header {
 
     /// Bytes per point.
     pub(super) fn stride(&self) -> usize {
-        self.fields.iter().map(|field| field.count * field.size).sum()
+        self.fields
+            .iter()
+            .map(|field| field.count * field.size)
+            .sum()
     }
 
     /// Name and number type of the field from which intensity is read.
     pub(super) fn intensity_origin(&self) -> Option<(&str, IntensityKind)> {
         match self.intensity {
-            IntensitySource::Red(index) => Some((&self.fields.get(index)?.name, IntensityKind::RedByte)),
+            IntensitySource::Red(index) => {
+                Some((&self.fields.get(index)?.name, IntensityKind::RedByte))
+            }
             IntensitySource::Value(index) => {
                 let field = self.fields.get(index)?;
                 let is_byte = field.kind == Kind::Unsigned && field.size == 1;
-                Some((&field.name, if is_byte { IntensityKind::Byte } else { IntensityKind::Number }))
+                Some((
+                    &field.name,
+                    if is_byte {
+                        IntensityKind::Byte
+                    } else {
+                        IntensityKind::Number
+                    },
+                ))
             }
             IntensitySource::None => None,
         }
     }
 
     /// The fields that are read must be numbers; of all others only the size is needed.
-    #[expect(clippy::indexing_slicing, reason = "indices of the fields, of which each has one type")]
+    #[expect(
+        clippy::indexing_slicing,
+        reason = "indices of the fields, of which each has one type"
+    )]
     fn check_formats(&self, entries: &Entries<'_>) -> Result<(), PcdError> {
         let intensity = match self.intensity {
             IntensitySource::Value(index) | IntensitySource::Red(index) => Some(index),
             IntensitySource::None => None,
         };
         for index in self.xyz.into_iter().chain(intensity) {
-            let Field { name, kind, size, .. } = &self.fields[index];
+            let Field {
+                name, kind, size, ..
+            } = &self.fields[index];
             let (kinds, sizes) = (entries.get("TYPE")?, entries.get("SIZE")?);
             let allowed: &[usize] = match kind {
                 Kind::Other => {
-                    let reason = format!("{:?} of field {name}, expected F, I or U", kinds.values[index]);
+                    let reason = format!(
+                        "{:?} of field {name}, expected F, I or U",
+                        kinds.values[index]
+                    );
                     return Err(PcdError::at(kinds.line, "TYPE", reason));
                 }
                 _ if self.intensity == IntensitySource::Red(index) => &[4],
@@ -181,8 +230,10 @@ impl Header {
                 Kind::Signed | Kind::Unsigned => &[1, 2, 4, 8],
             };
             if !allowed.contains(size) {
-                let reason =
-                    format!("{size} of field {name}, expected one of {allowed:?} for TYPE {}", kinds.values[index]);
+                let reason = format!(
+                    "{size} of field {name}, expected one of {allowed:?} for TYPE {}",
+                    kinds.values[index]
+                );
                 return Err(PcdError::at(sizes.line, "SIZE", reason));
             }
         }
@@ -193,7 +244,10 @@ impl Header {
 /// A header line as text. Comments may be in any encoding.
 fn without_comment(line: &[u8]) -> &[u8] {
     let before = std::iter::once(&b' ').chain(line);
-    let begin = line.iter().zip(before).position(|(&byte, before)| byte == b'#' && before.is_ascii_whitespace());
+    let begin = line
+        .iter()
+        .zip(before)
+        .position(|(&byte, before)| byte == b'#' && before.is_ascii_whitespace());
     begin.and_then(|begin| line.get(..begin)).unwrap_or(line)
 }
 
@@ -205,32 +259,56 @@ impl<'a> Entries<'a> {
     fn add(&mut self, line: u64, text: &'a [u8]) -> Result<(), PcdError> {
         let text = std::str::from_utf8(text).map_err(|_| not_text(line))?;
         let mut words = text.split_ascii_whitespace();
-        let Some(word) = words.next() else { return Ok(()) };
-        let asked = if word.eq_ignore_ascii_case("COLUMNS") { "FIELDS" } else { word };
+        let Some(word) = words.next() else {
+            return Ok(());
+        };
+        let asked = if word.eq_ignore_ascii_case("COLUMNS") {
+            "FIELDS"
+        } else {
+            word
+        };
         let Some(key) = KEYS.into_iter().find(|key| key.eq_ignore_ascii_case(asked)) else {
             let word: String = word.chars().take(40).collect();
-            return Err(PcdError { line: Some(line), field: None, reason: format!("{word:?} is no PCD header key") });
+            return Err(PcdError {
+                line: Some(line),
+                field: None,
+                reason: format!("{word:?} is no PCD header key"),
+            });
         };
         if self.has(key) {
             return Err(PcdError::at(line, key, "is given a second time"));
         }
-        self.found.push((key, Entry { line, values: words.collect() }));
+        self.found.push((
+            key,
+            Entry {
+                line,
+                values: words.collect(),
+            },
+        ));
         Ok(())
     }
 
     fn get(&self, key: &str) -> Result<&Entry<'a>, PcdError> {
-        self.find(key).ok_or_else(|| PcdError::of(key, "missing in the header"))
+        self.find(key)
+            .ok_or_else(|| PcdError::of(key, "missing in the header"))
     }
 
     fn find(&self, key: &str) -> Option<&Entry<'a>> {
-        self.found.iter().find(|(found, _)| *found == key).map(|(_, entry)| entry)
+        self.found
+            .iter()
+            .find(|(found, _)| *found == key)
+            .map(|(_, entry)| entry)
     }
 
     fn single(&self, key: &str) -> Result<(u64, &'a str), PcdError> {
         let entry = self.get(key)?;
         match entry.values[..] {
             [value] => Ok((entry.line, value)),
-            _ => Err(PcdError::at(entry.line, key, format!("{} values, expected 1", entry.values.len()))),
+            _ => Err(PcdError::at(
+                entry.line,
+                key,
+                format!("{} values, expected 1", entry.values.len()),
+            )),
         }
     }
 
@@ -242,7 +320,11 @@ impl<'a> Entries<'a> {
         if VERSIONS.contains(&version) {
             return Ok(());
         }
-        Err(PcdError::at(line, "VERSION", format!("{version:?}, expected 0.7, 0.6 or 0.5")))
+        Err(PcdError::at(
+            line,
+            "VERSION",
+            format!("{version:?}, expected 0.7, 0.6 or 0.5"),
+        ))
     }
 
     /// One value for each field, or an error with both counts.
@@ -251,10 +333,17 @@ impl<'a> Entries<'a> {
         if entry.values.len() == fields {
             return Ok(entry);
         }
-        Err(PcdError::at(entry.line, key, format!("{} values for {fields} FIELDS", entry.values.len())))
+        Err(PcdError::at(
+            entry.line,
+            key,
+            format!("{} values for {fields} FIELDS", entry.values.len()),
+        ))
     }
 
-    #[expect(clippy::indexing_slicing, reason = "as many sizes, types and counts as names")]
+    #[expect(
+        clippy::indexing_slicing,
+        reason = "as many sizes, types and counts as names"
+    )]
     fn fields(&self) -> Result<Vec<Field>, PcdError> {
         let names = self.get("FIELDS")?;
         if names.values.is_empty() || names.values.len() > MAX_FIELDS {
@@ -263,7 +352,11 @@ impl<'a> Entries<'a> {
         }
         let sizes = self.per_field("SIZE", names.values.len())?;
         let kinds = self.per_field("TYPE", names.values.len())?;
-        let counts = if self.has("COUNT") { Some(self.per_field("COUNT", names.values.len())?) } else { None };
+        let counts = if self.has("COUNT") {
+            Some(self.per_field("COUNT", names.values.len())?)
+        } else {
+            None
+        };
         (0..names.values.len())
             .map(|index| {
                 let name = names.values[index];
@@ -272,34 +365,65 @@ impl<'a> Entries<'a> {
                     Some(counts) => field_count(name, counts.line, counts.values[index])?,
                     None => 1,
                 };
-                Ok(Field { name: name.to_owned(), kind: number_kind(kinds.values[index]), size, count })
+                Ok(Field {
+                    name: name.to_owned(),
+                    kind: number_kind(kinds.values[index]),
+                    size,
+                    count,
+                })
             })
             .collect()
     }
 
     /// The sensor's pose is not applied to the points (PCL does not either), but must be valid.
     fn check_viewpoint(&self) -> Result<(), PcdError> {
-        let Some(entry) = self.find("VIEWPOINT") else { return Ok(()) };
+        let Some(entry) = self.find("VIEWPOINT") else {
+            return Ok(());
+        };
         if entry.values.len() != 7 {
-            return Err(PcdError::at(entry.line, "VIEWPOINT", format!("{} values, expected 7", entry.values.len())));
+            return Err(PcdError::at(
+                entry.line,
+                "VIEWPOINT",
+                format!("{} values, expected 7", entry.values.len()),
+            ));
         }
-        match entry.values.iter().find(|value| !value.parse::<f64>().is_ok_and(f64::is_finite)) {
-            Some(value) => Err(PcdError::at(entry.line, "VIEWPOINT", format!("{value:?} is no finite number"))),
+        match entry
+            .values
+            .iter()
+            .find(|value| !value.parse::<f64>().is_ok_and(f64::is_finite))
+        {
+            Some(value) => Err(PcdError::at(
+                entry.line,
+                "VIEWPOINT",
+                format!("{value:?} is no finite number"),
+            )),
             None => Ok(()),
         }
     }
 
     fn data(&self) -> Result<Data, PcdError> {
         let (line, data) = self.single("DATA")?;
-        let kinds = [("ascii", Data::Ascii), ("binary", Data::Binary), ("binary_compressed", Data::BinaryCompressed)];
-        let found = kinds.into_iter().find(|(name, _)| name.eq_ignore_ascii_case(data));
+        let kinds = [
+            ("ascii", Data::Ascii),
+            ("binary", Data::Binary),
+            ("binary_compressed", Data::BinaryCompressed),
+        ];
+        let found = kinds
+            .into_iter()
+            .find(|(name, _)| name.eq_ignore_ascii_case(data));
         let reason = || format!("{data:?}, expected ascii, binary or binary_compressed");
-        found.map(|(_, data)| data).ok_or_else(|| PcdError::at(line, "DATA", reason()))
+        found
+            .map(|(_, data)| data)
+            .ok_or_else(|| PcdError::at(line, "DATA", reason()))
     }
 }
 
 fn not_text(line: u64) -> PcdError {
-    PcdError { line: Some(line), field: None, reason: "the header is not text: is this a PCD file?".into() }
+    PcdError {
+        line: Some(line),
+        field: None,
+        reason: "the header is not text: is this a PCD file?".into(),
+    }
 }
 
 fn number_kind(kind: &str) -> Kind {
@@ -312,26 +436,54 @@ fn number_kind(kind: &str) -> Kind {
 }
 
 fn number_size(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
-    let size = value.parse().ok().filter(|size| (1..=MAX_SIZE).contains(size));
-    size.ok_or_else(|| PcdError::at(line, "SIZE", format!("{value:?} of field {name}, expected 1 to {MAX_SIZE}")))
+    let size = value
+        .parse()
+        .ok()
+        .filter(|size| (1..=MAX_SIZE).contains(size));
+    size.ok_or_else(|| {
+        PcdError::at(
+            line,
+            "SIZE",
+            format!("{value:?} of field {name}, expected 1 to {MAX_SIZE}"),
+        )
+    })
 }
 
 fn field_count(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
     let count = value.parse().ok().filter(|&count: &u64| count <= MAX_COUNT);
     count
         .and_then(|count| usize::try_from(count).ok())
-        .ok_or_else(|| PcdError::at(line, "COUNT", format!("{value:?} of field {name}, expected 0 to {MAX_COUNT}")))
+        .ok_or_else(|| {
+            PcdError::at(
+                line,
+                "COUNT",
+                format!("{value:?} of field {name}, expected 0 to {MAX_COUNT}"),
+            )
+        })
 }
 
 /// The only coordinate of that name, which must hold one number.
 fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, PcdError> {
-    let mut found = fields.iter().enumerate().filter(|(_, field)| field.name.eq_ignore_ascii_case(name));
-    let (index, field) = found.next().ok_or_else(|| PcdError::at(line, "FIELDS", format!("no field {name}")))?;
+    let mut found = fields
+        .iter()
+        .enumerate()
+        .filter(|(_, field)| field.name.eq_ignore_ascii_case(name));
+    let (index, field) = found
+        .next()
+        .ok_or_else(|| PcdError::at(line, "FIELDS", format!("no field {name}")))?;
     if found.next().is_some() {
-        return Err(PcdError::at(line, "FIELDS", format!("{name} is given twice")));
+        return Err(PcdError::at(
+            line,
+            "FIELDS",
+            format!("{name} is given twice"),
+        ));
     }
     if field.count != 1 {
-        return Err(PcdError::at(line, "COUNT", format!("{} of field {name}, expected 1", field.count)));
+        return Err(PcdError::at(
+            line,
+            "COUNT",
+            format!("{} of field {name}, expected 1", field.count),
+        ));
     }
     Ok(index)
 }
@@ -343,9 +495,15 @@ fn find_xyz(fields: &[Field], line: u64) -> Result<[usize; 3], PcdError> {
 
 /// The first field of the most preferred name that holds one number.
 fn find_intensity(fields: &[Field]) -> IntensitySource {
-    let find = |name: &&str| fields.iter().position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name));
+    let find = |name: &&str| {
+        fields
+            .iter()
+            .position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name))
+    };
     let value = INTENSITY.iter().find_map(find).map(IntensitySource::Value);
-    value.or_else(|| COLOURS.iter().find_map(find).map(IntensitySource::Red)).unwrap_or(IntensitySource::None)
+    value
+        .or_else(|| COLOURS.iter().find_map(find).map(IntensitySource::Red))
+        .unwrap_or(IntensitySource::None)
 }
 
 #[cfg(test)]

@@ -23,14 +23,20 @@ pub(super) enum LzfError {
 /// Unpacks exactly `unpacked_len` bytes.
 pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, LzfError> {
     if packed.len().saturating_mul(MAX_RATIO) < unpacked_len {
-        return Err(LzfError::Ratio { packed: packed.len(), unpacked: unpacked_len });
+        return Err(LzfError::Ratio {
+            packed: packed.len(),
+            unpacked: unpacked_len,
+        });
     }
     let mut output = Vec::with_capacity(unpacked_len);
     let mut input = packed;
     while let Some((&control, rest)) = input.split_first() {
         let control = usize::from(control);
-        input =
-            if control < 32 { literals(&mut output, rest, control + 1)? } else { repeat(&mut output, rest, control)? };
+        input = if control < 32 {
+            literals(&mut output, rest, control + 1)?
+        } else {
+            repeat(&mut output, rest, control)?
+        };
         if output.len() > unpacked_len {
             break;
         }
@@ -38,7 +44,10 @@ pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, 
     if output.len() == unpacked_len {
         Ok(output)
     } else {
-        Err(LzfError::Length { found: output.len(), stated: unpacked_len })
+        Err(LzfError::Length {
+            found: output.len(),
+            stated: unpacked_len,
+        })
     }
 }
 
@@ -48,17 +57,26 @@ fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&
     Ok(rest)
 }
 
-#[expect(clippy::indexing_slicing, reason = "`at` is below the growing length: it begins `distance` before it")]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "`at` is below the growing length: it begins `distance` before it"
+)]
 fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], LzfError> {
     let mut next = input.iter();
-    let mut byte = || next.next().map(|&byte| usize::from(byte)).ok_or(LzfError::CutOff);
+    let mut byte = || {
+        next.next()
+            .map(|&byte| usize::from(byte))
+            .ok_or(LzfError::CutOff)
+    };
     let mut count = (control >> 5) + 2;
     if count == 9 {
         count += byte()?;
     }
     let distance = ((control & 31) << 8) + byte()? + 1;
     let len = output.len();
-    let start = len.checked_sub(distance).ok_or(LzfError::Distance { distance, len })?;
+    let start = len
+        .checked_sub(distance)
+        .ok_or(LzfError::Distance { distance, len })?;
     // The repeated range may overlap the output: copied byte by byte, unless it does not.
     if distance >= count {
         output.extend_from_within(start..start + count);
@@ -89,9 +107,14 @@ pub(super) mod tests {
         };
         let mut at = 0;
         while at < data.len() {
-            let match_len =
-                |start: usize| (0..264.min(data.len() - at)).take_while(|&i| data[start + i] == data[at + i]).count();
-            let best = (at.saturating_sub(512)..at).map(|start| (match_len(start), start)).max();
+            let match_len = |start: usize| {
+                (0..264.min(data.len() - at))
+                    .take_while(|&i| data[start + i] == data[at + i])
+                    .count()
+            };
+            let best = (at.saturating_sub(512)..at)
+                .map(|start| (match_len(start), start))
+                .max();
             match best.filter(|&(length, _)| length >= 3) {
                 Some((length, start)) => {
                     flush(&mut packed, &mut pending);
@@ -137,9 +160,27 @@ pub(super) mod tests {
 
     #[test]
     fn an_impossible_stream_is_refused() {
-        assert_eq!(decompress(&[0, b'a'], 1_000_000), Err(LzfError::Ratio { packed: 2, unpacked: 1_000_000 }));
+        assert_eq!(
+            decompress(&[0, b'a'], 1_000_000),
+            Err(LzfError::Ratio {
+                packed: 2,
+                unpacked: 1_000_000
+            })
+        );
         assert_eq!(decompress(&[3, b'a'], 4), Err(LzfError::CutOff));
-        assert_eq!(decompress(&[0, b'a', 0x20, 9], 4), Err(LzfError::Distance { distance: 10, len: 1 }));
-        assert_eq!(decompress(&[0, b'a'], 2), Err(LzfError::Length { found: 1, stated: 2 }));
+        assert_eq!(
+            decompress(&[0, b'a', 0x20, 9], 4),
+            Err(LzfError::Distance {
+                distance: 10,
+                len: 1
+            })
+        );
+        assert_eq!(
+            decompress(&[0, b'a'], 2),
+            Err(LzfError::Length {
+                found: 1,
+                stated: 2
+            })
+        );
     }
 }

@@ -96,11 +96,19 @@ pub struct PcdError {
 
 impl PcdError {
     fn at(line: u64, field: impl Into<String>, reason: impl Into<String>) -> Self {
-        Self { line: Some(line), field: Some(field.into()), reason: reason.into() }
+        Self {
+            line: Some(line),
+            field: Some(field.into()),
+            reason: reason.into(),
+        }
     }
 
     fn of(field: impl Into<String>, reason: impl Into<String>) -> Self {
-        Self { line: None, field: Some(field.into()), reason: reason.into() }
+        Self {
+            line: None,
+            field: Some(field.into()),
+            reason: reason.into(),
+        }
     }
 }
 
@@ -110,9 +118,17 @@ impl PcdError {
 /// [`PcdError`] with line, field and both values of the fault. No allocation relies on the header alone.
 pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let mut cloud = decode_stored(bytes)?;
-    if let Some(origin) = cloud.intensity.as_mut().filter(|origin| origin.kind == IntensityKind::RedByte) {
+    if let Some(origin) = cloud
+        .intensity
+        .as_mut()
+        .filter(|origin| origin.kind == IntensityKind::RedByte)
+    {
         origin.divisor = RED_SCALE;
-        cloud.points.xyzi.iter_mut().for_each(|point| point[3] /= RED_SCALE);
+        cloud
+            .points
+            .xyzi
+            .iter_mut()
+            .for_each(|point| point[3] /= RED_SCALE);
     }
     Ok(cloud)
 }
@@ -128,14 +144,24 @@ pub(crate) fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
         Data::Binary => binary::decode(&header, body),
         Data::BinaryCompressed => binary::decode_compressed(&header, body),
     }?;
-    let intensity = header.intensity_origin().map(|(field, kind)| IntensityOrigin::stored(field, kind));
-    Ok(PcdCloud { intensity, form: header.data.name(), ..cloud })
+    let intensity = header
+        .intensity_origin()
+        .map(|(field, kind)| IntensityOrigin::stored(field, kind));
+    Ok(PcdCloud {
+        intensity,
+        form: header.data.name(),
+        ..cloud
+    })
 }
 
 impl IntensityOrigin {
     /// A field whose numbers are used as stored.
     pub(crate) fn stored(field: &str, kind: IntensityKind) -> Self {
-        Self { field: field.to_owned(), kind, divisor: 1.0 }
+        Self {
+            field: field.to_owned(),
+            kind,
+            divisor: 1.0,
+        }
     }
 }
 
@@ -143,7 +169,10 @@ impl PcdCloud {
     /// Removes points that are not finite. `labels`: one for each point, or none.
     pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
         let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
-        let (all, first) = (points.len(), points.iter().position(|point| !is_finite(point)));
+        let (all, first) = (
+            points.len(),
+            points.iter().position(|point| !is_finite(point)),
+        );
         if first.is_some() {
             let mut kept = points.iter().map(is_finite);
             labels.retain(|_| kept.next().unwrap_or(false));

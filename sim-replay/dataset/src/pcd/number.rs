@@ -6,8 +6,8 @@
 
 /// Powers of ten that are exact as `f64`.
 const EXACT_POWERS: [f64; 23] = [
-    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20,
-    1e21, 1e22,
+    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16,
+    1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
 ];
 /// Largest number of digits that always fits `u64`.
 const MOST_DIGITS: usize = 19;
@@ -24,7 +24,10 @@ pub(super) fn is_separator(byte: u8) -> bool {
 /// The number of a token at the start of `text` and the token's length, if the number is an ordinary one.
 pub(super) fn ordinary(text: &[u8]) -> Option<(f32, usize)> {
     let is_negative = text.first() == Some(&b'-');
-    let mut mantissa = Digits { value: 0, at: usize::from(is_negative) };
+    let mut mantissa = Digits {
+        value: 0,
+        at: usize::from(is_negative),
+    };
     mantissa.read(text);
     let mut digits = mantissa.at - usize::from(is_negative);
     let mut exponent = 0;
@@ -58,7 +61,11 @@ fn exact(is_negative: bool, mantissa: u64, exponent: i32) -> Option<f32> {
         return None;
     }
     let power = *EXACT_POWERS.get(exponent.unsigned_abs() as usize)?;
-    let value = if exponent < 0 { mantissa as f64 / power } else { mantissa as f64 * power };
+    let value = if exponent < 0 {
+        mantissa as f64 / power
+    } else {
+        mantissa as f64 * power
+    };
     if value.to_bits() & LOST_BITS == MIDDLE {
         return None;
     }
@@ -69,7 +76,10 @@ fn exact(is_negative: bool, mantissa: u64, exponent: i32) -> Option<f32> {
 /// The exponent from `at` on and its end.
 fn exponent_of(text: &[u8], at: usize) -> Option<(i32, usize)> {
     let sign = text.get(at).filter(|byte| matches!(byte, b'-' | b'+'));
-    let mut digits = Digits { value: 0, at: at + usize::from(sign.is_some()) };
+    let mut digits = Digits {
+        value: 0,
+        at: at + usize::from(sign.is_some()),
+    };
     let from = digits.at;
     digits.read(text);
     if !(1..=3).contains(&(digits.at - from)) {
@@ -87,11 +97,19 @@ struct Digits {
 
 impl Digits {
     fn read(&mut self, text: &[u8]) {
-        while let Some(eight) = text.get(self.at..).and_then(|rest| rest.first_chunk::<8>()).and_then(eight_digits) {
+        while let Some(eight) = text
+            .get(self.at..)
+            .and_then(|rest| rest.first_chunk::<8>())
+            .and_then(eight_digits)
+        {
             self.value = self.value.wrapping_mul(100_000_000).wrapping_add(eight);
             self.at += 8;
         }
-        while let Some(digit) = text.get(self.at).map(|byte| byte.wrapping_sub(b'0')).filter(|&digit| digit < 10) {
+        while let Some(digit) = text
+            .get(self.at)
+            .map(|byte| byte.wrapping_sub(b'0'))
+            .filter(|&digit| digit < 10)
+        {
             self.value = self.value.wrapping_mul(10).wrapping_add(u64::from(digit));
             self.at += 1;
         }
@@ -123,7 +141,10 @@ pub(super) fn unusual(token: &[u8]) -> Option<f32> {
         return Some(number);
     }
     let text = text.trim_start_matches(['-', '+']).to_ascii_lowercase();
-    let is_nan = text.starts_with("nan(") || ["1.#qnan", "1.#snan", "1.#ind"].iter().any(|nan| text.starts_with(nan));
+    let is_nan = text.starts_with("nan(")
+        || ["1.#qnan", "1.#snan", "1.#ind"]
+            .iter()
+            .any(|nan| text.starts_with(nan));
     match (is_nan, text.starts_with("1.#inf")) {
         (true, _) => Some(f32::NAN),
         (_, true) => Some(f32::INFINITY),
@@ -142,7 +163,11 @@ mod tests {
         for behind in ["", " 7", "\n", "\r\n", "\t"] {
             if let Some((number, len)) = ordinary(format!("{token}{behind}").as_bytes()) {
                 assert_eq!(len, token.len(), "{token}");
-                assert_eq!(number.to_bits(), token.parse::<f32>().unwrap().to_bits(), "{token}");
+                assert_eq!(
+                    number.to_bits(),
+                    token.parse::<f32>().unwrap().to_bits(),
+                    "{token}"
+                );
             }
         }
     }
@@ -186,24 +211,62 @@ mod tests {
 
     #[test]
     fn the_numbers_of_sweeps_are_ordinary() {
-        for token in ["-68.34235382", "0", "-0", "-1.954882282e-05", "0.5", "5.", ".5", "1e-22", "39719", "1.5e+3"] {
+        for token in [
+            "-68.34235382",
+            "0",
+            "-0",
+            "-1.954882282e-05",
+            "0.5",
+            "5.",
+            ".5",
+            "1e-22",
+            "39719",
+            "1.5e+3",
+        ] {
             assert!(ordinary(token.as_bytes()).is_some(), "{token}");
             check(token);
         }
-        for token in ["", "-", ".", "1.781608625e-38", "1e", "1e+", "+1", "nan", "1.0.0", "0x10", "1_0"] {
+        for token in [
+            "",
+            "-",
+            ".",
+            "1.781608625e-38",
+            "1e",
+            "1e+",
+            "+1",
+            "nan",
+            "1.0.0",
+            "0x10",
+            "1_0",
+        ] {
             assert!(ordinary(token.as_bytes()).is_none(), "{token}");
         }
     }
 
     #[test]
     fn c_libraries_have_many_spellings_of_nan() {
-        for nan in ["nan", "-nan", "NaN", "nan(ind)", "-nan(0x8000)", "1.#QNAN", "-1.#IND", "1.#QNAN0"] {
+        for nan in [
+            "nan",
+            "-nan",
+            "NaN",
+            "nan(ind)",
+            "-nan(0x8000)",
+            "1.#QNAN",
+            "-1.#IND",
+            "1.#QNAN0",
+        ] {
             assert!(unusual(nan.as_bytes()).unwrap().is_nan(), "{nan}");
         }
         for infinite in ["inf", "-inf", "Infinity", "1.#INF"] {
-            assert!(unusual(infinite.as_bytes()).unwrap().is_infinite(), "{infinite}");
+            assert!(
+                unusual(infinite.as_bytes()).unwrap().is_infinite(),
+                "{infinite}"
+            );
         }
-        assert_eq!(unusual(b"1.781608625e-38").unwrap().to_bits(), "1.781608625e-38".parse::<f32>().unwrap().to_bits());
+        assert_eq!(
+            unusual(b"1.781608625e-38").unwrap().to_bits(),
+            "1.781608625e-38".parse::<f32>().unwrap().to_bits()
+        );
         assert!(unusual(b"nano").is_none() && unusual(b"1.#").is_none());
     }
 }

@@ -28,7 +28,9 @@ impl Eq for IntensityScale {}
 
 /// Reasons why a text is no [`IntensityScale`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?}, expected auto or a positive number that intensities are divided by, for example 1 or 255")]
+#[error(
+    "{0:?}, expected auto or a positive number that intensities are divided by, for example 1 or 255"
+)]
 pub struct IntensityScaleError(String);
 
 impl FromStr for IntensityScale {
@@ -38,8 +40,15 @@ impl FromStr for IntensityScale {
         if text == "auto" {
             return Ok(Self::AUTO);
         }
-        let divisor = text.parse().ok().filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0);
-        divisor.map(|divisor| Self { divisor: Some(divisor) }).ok_or_else(|| IntensityScaleError(text.to_owned()))
+        let divisor = text
+            .parse()
+            .ok()
+            .filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0);
+        divisor
+            .map(|divisor| Self {
+                divisor: Some(divisor),
+            })
+            .ok_or_else(|| IntensityScaleError(text.to_owned()))
     }
 }
 
@@ -72,7 +81,9 @@ impl IntensityScale {
 
     /// Divides the stored values. `by_range` gives the divisor of numbers whose type does not determine their scale.
     pub(super) fn apply(self, cloud: &mut PcdCloud, by_range: impl FnOnce() -> f32) {
-        let Some(origin) = &mut cloud.intensity else { return };
+        let Some(origin) = &mut cloud.intensity else {
+            return;
+        };
         origin.divisor = match (self.divisor, origin.kind) {
             (Some(divisor), _) => divisor,
             (None, IntensityKind::RedByte | IntensityKind::Byte) => BYTE,
@@ -81,7 +92,11 @@ impl IntensityScale {
         let divisor = origin.divisor;
         #[expect(clippy::float_cmp, reason = "a division by exactly 1 changes nothing")]
         if divisor != 1.0 {
-            cloud.points.xyzi.iter_mut().for_each(|point| point[3] /= divisor);
+            cloud
+                .points
+                .xyzi
+                .iter_mut()
+                .for_each(|point| point[3] /= divisor);
         }
     }
 }
@@ -92,7 +107,10 @@ pub(super) fn divisor_of_range(largest: f32) -> f32 {
         return 1.0;
     }
     // 2^9 - 1 and so on have no more than 24 bits up to 2^24 - 1, and are rounded up from there.
-    (8..=32).map(|bits| ((1_u64 << bits) - 1) as f32).find(|&limit| largest <= limit).unwrap_or(u32::MAX as f32)
+    (8..=32)
+        .map(|bits| ((1_u64 << bits) - 1) as f32)
+        .find(|&limit| largest <= limit)
+        .unwrap_or(u32::MAX as f32)
 }
 
 #[cfg(test)]
@@ -103,9 +121,19 @@ mod tests {
     use crate::pcd::IntensityOrigin;
 
     fn scaled(scale: IntensityScale, kind: IntensityKind, stored: f32) -> (f32, f32) {
-        let intensity = Some(IntensityOrigin { field: "intensity".into(), kind, divisor: 1.0 });
-        let points = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, stored]] };
-        let mut cloud = PcdCloud { points, intensity, ..PcdCloud::default() };
+        let intensity = Some(IntensityOrigin {
+            field: "intensity".into(),
+            kind,
+            divisor: 1.0,
+        });
+        let points = PointCloud {
+            xyzi: vec![[1.0, 2.0, 3.0, stored]],
+        };
+        let mut cloud = PcdCloud {
+            points,
+            intensity,
+            ..PcdCloud::default()
+        };
         scale.apply(&mut cloud, || divisor_of_range(stored));
         (cloud.points.xyzi[0][3], cloud.intensity.unwrap().divisor)
     }
@@ -121,7 +149,10 @@ mod tests {
         assert_eq!(auto(IntensityKind::Number, 256.0).1, 511.0);
         assert_eq!(auto(IntensityKind::Number, 40_000.0).1, 65_535.0);
         assert_eq!(auto(IntensityKind::Number, f32::MAX).1, u32::MAX as f32);
-        assert_eq!(scaled("100".parse().unwrap(), IntensityKind::Byte, 50.0), (0.5, 100.0));
+        assert_eq!(
+            scaled("100".parse().unwrap(), IntensityKind::Byte, 50.0),
+            (0.5, 100.0)
+        );
     }
 
     #[test]
@@ -130,7 +161,10 @@ mod tests {
         assert_eq!("255".parse::<IntensityScale>().unwrap().to_string(), "255");
         for wrong in ["", "0", "-1", "nan", "inf", "byte"] {
             let error = wrong.parse::<IntensityScale>().unwrap_err().to_string();
-            assert!(error.starts_with(&format!("{wrong:?}, expected auto or a positive number")), "{error}");
+            assert!(
+                error.starts_with(&format!("{wrong:?}, expected auto or a positive number")),
+                "{error}"
+            );
         }
     }
 }

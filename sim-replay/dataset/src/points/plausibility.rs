@@ -29,7 +29,10 @@ impl Plausibility {
             // Infinite where the square is too large for a float.
             self.beyond_range += usize::from(x * x + y * y + z * z > RANGE_M * RANGE_M);
             self.at_origin += usize::from([x, y, z] == [0.0; 3]);
-            self.tiny += [x, y, z].into_iter().filter(|&value| value != 0.0 && value.abs() < TINY).count();
+            self.tiny += [x, y, z]
+                .into_iter()
+                .filter(|&value| value != 0.0 && value.abs() < TINY)
+                .count();
         }
         self.points += cloud.len();
     }
@@ -62,7 +65,12 @@ impl Plausibility {
             ));
         }
         let at_origin = of(self.at_origin, self.points);
-        let fault = || format!("{} of the points lie exactly at the origin, usual is none", percent(at_origin));
+        let fault = || {
+            format!(
+                "{} of the points lie exactly at the origin, usual is none",
+                percent(at_origin)
+            )
+        };
         (at_origin > AT_ORIGIN).then(fault)
     }
 }
@@ -73,7 +81,9 @@ mod tests {
 
     fn fault(points: &[[f32; 4]]) -> Option<String> {
         let mut counted = Plausibility::default();
-        counted.add(&PointCloud { xyzi: points.to_vec() });
+        counted.add(&PointCloud {
+            xyzi: points.to_vec(),
+        });
         counted.fault()
     }
 
@@ -84,12 +94,22 @@ mod tests {
         assert_eq!(fault(&[]), None);
         let mut far = sound.clone();
         far[..6].fill([0.0, 301.0, 0.0, 0.5]);
-        assert_eq!(fault(&far).unwrap(), "94.0 % of the points lie within 300 m, usual are 95.0 % or more");
+        assert_eq!(
+            fault(&far).unwrap(),
+            "94.0 % of the points lie within 300 m, usual are 95.0 % or more"
+        );
         let mut origin = sound.clone();
         origin[..51].fill([0.0, 0.0, 0.0, 0.5]);
-        assert_eq!(fault(&origin).unwrap(), "51.0 % of the points lie exactly at the origin, usual is none");
+        assert_eq!(
+            fault(&origin).unwrap(),
+            "51.0 % of the points lie exactly at the origin, usual is none"
+        );
         let mut tiny = sound;
         tiny[..6].fill([f32::from_bits(7), 1.0, 1.0, 0.5]);
-        assert!(fault(&tiny).unwrap().starts_with("2.0 % of the coordinates are tiny (below 1e-30 m, not zero)"));
+        assert!(
+            fault(&tiny)
+                .unwrap()
+                .starts_with("2.0 % of the coordinates are tiny (below 1e-30 m, not zero)")
+        );
     }
 }

@@ -8,7 +8,10 @@ fn id() -> CavId {
 }
 
 fn floats(values: &[f32]) -> Vec<u8> {
-    values.iter().flat_map(|value| value.to_le_bytes()).collect()
+    values
+        .iter()
+        .flat_map(|value| value.to_le_bytes())
+        .collect()
 }
 
 /// Files of one agent in a folder, and the reader of its sweeps.
@@ -17,7 +20,10 @@ fn agent(storage: SweepStorage, files: &[(&str, Vec<u8>)]) -> (tempfile::TempDir
     for (name, bytes) in files {
         fs::write(dir.path().join(name), bytes).unwrap();
     }
-    let paths: Vec<PathBuf> = files.iter().map(|(name, _)| dir.path().join(name)).collect();
+    let paths: Vec<PathBuf> = files
+        .iter()
+        .map(|(name, _)| dir.path().join(name))
+        .collect();
     let sweeps = Sweeps::new(storage, &OpenOptions::default()).with_agent(id(), paths);
     (dir, sweeps)
 }
@@ -31,33 +37,52 @@ fn read(storage: SweepStorage, bytes: &[u8]) -> PcdCloud {
 fn interleaved_and_planar_differ_in_order_only() {
     let expected = [[1.0, 2.0, 3.0, 0.25], [5.0, 6.0, 7.0, 0.5]];
     let interleaved = floats(&[1.0, 2.0, 3.0, 0.25, 5.0, 6.0, 7.0, 0.5]);
-    assert_eq!(read(SweepStorage::ByName, &interleaved).points.xyzi, expected);
+    assert_eq!(
+        read(SweepStorage::ByName, &interleaved).points.xyzi,
+        expected
+    );
     let planar = floats(&[1.0, 5.0, 2.0, 6.0, 3.0, 7.0, 0.25, 0.5]);
     assert_eq!(read(SweepStorage::Planar, &planar).points.xyzi, expected);
 }
 
 #[test]
 fn raw_points_are_in_steps_of_five_millimetres() {
-    let cloud = read(SweepStorage::NcltRaw, &[0, 0, 0x20, 0x4e, 0xff, 0xff, 51, 31]);
+    let cloud = read(
+        SweepStorage::NcltRaw,
+        &[0, 0, 0x20, 0x4e, 0xff, 0xff, 51, 31],
+    );
     assert_eq!(cloud.points.xyzi, [[-100.0, 0.0, 227.675, 0.2]]);
 }
 
 #[test]
 fn a_cut_file_and_a_nan_are_named() {
     let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", vec![0; 17])]);
-    let message = sweeps.read(&id(), &dir.path().join("0.bin")).unwrap_err().to_string();
-    assert!(message.contains("17 bytes are not a whole number of points of 16 bytes"), "{message}");
+    let message = sweeps
+        .read(&id(), &dir.path().join("0.bin"))
+        .unwrap_err()
+        .to_string();
+    assert!(
+        message.contains("17 bytes are not a whole number of points of 16 bytes"),
+        "{message}"
+    );
     let mut bytes = vec![0; 16];
     bytes.extend(f32::NAN.to_le_bytes().repeat(4));
     let cloud = read(SweepStorage::ByName, &bytes);
-    assert_eq!((cloud.points.len(), cloud.dropped, cloud.first_dropped), (1, 1, Some(Place::Point(1))));
+    assert_eq!(
+        (cloud.points.len(), cloud.dropped, cloud.first_dropped),
+        (1, 1, Some(Place::Point(1)))
+    );
 }
 
 /// Points all round like those of a LiDAR of 32 lasers, with any numbers after x, y, z.
 fn turn(points: usize, behind: impl Fn(usize) -> Vec<f32>) -> Vec<u8> {
     let point = |index: usize| {
         let (angle, range) = (index as f32 * 0.37, 5.0 + (index * 7919 % 400) as f32 * 0.1);
-        let position = [range * angle.cos(), range * angle.sin(), -1.9 + (index % 32) as f32 * 0.1];
+        let position = [
+            range * angle.cos(),
+            range * angle.sin(),
+            -1.9 + (index % 32) as f32 * 0.1,
+        ];
         floats(&[&position[..], &behind(index)].concat())
     };
     (0..points).flat_map(point).collect()
@@ -78,7 +103,9 @@ fn four_and_five_floats_are_distinguished_also_if_both_fit() {
     for points in [40, 400, 41, 35_000] {
         let with_ring = turn(points, |index| vec![17.0, (index % 32) as f32]);
         assert_eq!(form_of(&with_ring), (FIVE, points));
-        let with_bytes = turn(points, |index| vec![(index % 256) as f32, (index % 32) as f32]);
+        let with_bytes = turn(points, |index| {
+            vec![(index % 256) as f32, (index % 32) as f32]
+        });
         assert_eq!(form_of(&with_bytes), (FIVE, points));
         let with_time = turn(points, |index| vec![intensity(index), index as f32 * 1e-5]);
         assert_eq!(form_of(&with_time), (FIVE, points));
@@ -95,29 +122,71 @@ fn four_and_five_floats_are_distinguished_also_if_both_fit() {
 fn the_first_sweeps_decide_for_all() {
     let five = turn(40, |index| vec![0.5, (index % 32) as f32]);
     let few = floats(&[1.0, 2.0, 3.0, 0.5, 7.0]);
-    let files = [("0.bin", vec![]), ("1.bin", five[..797].to_vec()), ("2.bin", five), ("4.bin", few)];
+    let files = [
+        ("0.bin", vec![]),
+        ("1.bin", five[..797].to_vec()),
+        ("2.bin", five),
+        ("4.bin", few),
+    ];
     let (dir, sweeps) = agent(SweepStorage::ByName, &files);
     let read = |name: &str| sweeps.read(&id(), &dir.path().join(name));
     assert_eq!(read("4.bin").unwrap().points.xyzi, [[1.0, 2.0, 3.0, 0.5]]);
-    assert_eq!((read("0.bin").unwrap().points.len(), read("2.bin").unwrap().points.len()), (0, 40));
+    assert_eq!(
+        (
+            read("0.bin").unwrap().points.len(),
+            read("2.bin").unwrap().points.len()
+        ),
+        (0, 40)
+    );
     let message = read("1.bin").unwrap_err().to_string();
-    assert!(message.contains("797 bytes are not a whole number of points of 20 bytes"), "{message}");
+    assert!(
+        message.contains("797 bytes are not a whole number of points of 20 bytes"),
+        "{message}"
+    );
 }
 
 #[test]
 fn other_forms_are_refused_with_the_figure() {
-    let doubles: Vec<u8> = (0..400).flat_map(|index| (f64::from(index) * 0.317 - 60.0).to_le_bytes()).collect();
-    let integers: Vec<u8> = (0..800_u32).flat_map(|index| (index % 500).to_le_bytes()).collect();
+    let doubles: Vec<u8> = (0..400)
+        .flat_map(|index| (f64::from(index) * 0.317 - 60.0).to_le_bytes())
+        .collect();
+    let integers: Vec<u8> = (0..800_u32)
+        .flat_map(|index| (index % 500).to_le_bytes())
+        .collect();
     for bytes in [doubles, integers] {
         let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", bytes)]);
-        let message = sweeps.read(&id(), &dir.path().join("0.bin")).unwrap_err().to_string();
-        assert!(message.contains("no sweep of x y z intensity or x y z intensity ring as f32: "), "{message}");
-        assert!(message.contains("% of the numbers are beyond 1e7 or below 1e-30, usual is none"), "{message}");
+        let message = sweeps
+            .read(&id(), &dir.path().join("0.bin"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("no sweep of x y z intensity or x y z intensity ring as f32: "),
+            "{message}"
+        );
+        assert!(
+            message.contains("% of the numbers are beyond 1e7 or below 1e-30, usual is none"),
+            "{message}"
+        );
     }
-    for (count, behind) in [(3, vec![]), (6, vec![0.5, 3.0, 0.01]), (7, vec![0.5, 3.0, 0.01, 9.0])] {
-        let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", turn(400, |_| behind.clone()))]);
-        let message = sweeps.read(&id(), &dir.path().join("0.bin")).unwrap_err().to_string();
-        assert!(message.contains(&format!("it looks like {count} floats per point, expected 4")), "{message}");
+    for (count, behind) in [
+        (3, vec![]),
+        (6, vec![0.5, 3.0, 0.01]),
+        (7, vec![0.5, 3.0, 0.01, 9.0]),
+    ] {
+        let (dir, sweeps) = agent(
+            SweepStorage::ByName,
+            &[("0.bin", turn(400, |_| behind.clone()))],
+        );
+        let message = sweeps
+            .read(&id(), &dir.path().join("0.bin"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains(&format!(
+                "it looks like {count} floats per point, expected 4"
+            )),
+            "{message}"
+        );
     }
 }
 
@@ -126,17 +195,34 @@ fn intensities_of_all_files_are_scaled_alike() {
     let sweep = |largest: f32| turn(40, |index| vec![if index == 7 { largest } else { 0.5 }]);
     let largest = |sweeps: &Sweeps, path: &Path| {
         let cloud = sweeps.read(&id(), path).unwrap();
-        let largest = cloud.points.xyzi.iter().map(|point| point[3]).fold(0.0, f32::max);
+        let largest = cloud
+            .points
+            .xyzi
+            .iter()
+            .map(|point| point[3])
+            .fold(0.0, f32::max);
         (largest, cloud.intensity.unwrap().divisor)
     };
-    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep(1.0)), ("1.bin", sweep(51.0))]);
-    assert_eq!(largest(&sweeps, &dir.path().join("0.bin")), (1.0 / 255.0, 255.0));
+    let (dir, sweeps) = agent(
+        SweepStorage::ByName,
+        &[("0.bin", sweep(1.0)), ("1.bin", sweep(51.0))],
+    );
+    assert_eq!(
+        largest(&sweeps, &dir.path().join("0.bin")),
+        (1.0 / 255.0, 255.0)
+    );
     assert_eq!(largest(&sweeps, &dir.path().join("1.bin")), (0.2, 255.0));
     let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep(1.0))]);
     assert_eq!(largest(&sweeps, &dir.path().join("0.bin")), (1.0, 1.0));
     let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", sweep(1000.0))]);
-    assert_eq!(largest(&sweeps, &dir.path().join("0.bin")), (1000.0 / 1023.0, 1023.0));
-    let forced = OpenOptions { intensity_scale: "100".parse().unwrap(), ..OpenOptions::default() };
+    assert_eq!(
+        largest(&sweeps, &dir.path().join("0.bin")),
+        (1000.0 / 1023.0, 1023.0)
+    );
+    let forced = OpenOptions {
+        intensity_scale: "100".parse().unwrap(),
+        ..OpenOptions::default()
+    };
     let sweeps = Sweeps::new(SweepStorage::ByName, &forced).with_agent(id(), []);
     assert_eq!(largest(&sweeps, &dir.path().join("0.bin")), (10.0, 100.0));
 }
@@ -144,11 +230,20 @@ fn intensities_of_all_files_are_scaled_alike() {
 #[test]
 fn a_packed_colour_and_a_byte_need_no_other_sweep() {
     let file = |number: &str, bytes: &[u8]| {
-        let (name, kind, size) = if number == "rgb" { ("rgb", 'F', 4) } else { ("Intensity", 'U', 1) };
-        let head = format!("FIELDS x y z {name}\nSIZE 4 4 4 {size}\nTYPE F F F {kind}\nWIDTH 1\nDATA binary\n");
+        let (name, kind, size) = if number == "rgb" {
+            ("rgb", 'F', 4)
+        } else {
+            ("Intensity", 'U', 1)
+        };
+        let head = format!(
+            "FIELDS x y z {name}\nSIZE 4 4 4 {size}\nTYPE F F F {kind}\nWIDTH 1\nDATA binary\n"
+        );
         [head.as_bytes(), &floats(&[1.0, 2.0, 3.0]), bytes].concat()
     };
-    let files = [("0.pcd", file("rgb", &[9, 9, 1, 0])), ("1.pcd", file("byte", &[1]))];
+    let files = [
+        ("0.pcd", file("rgb", &[9, 9, 1, 0])),
+        ("1.pcd", file("byte", &[1])),
+    ];
     let (dir, sweeps) = agent(SweepStorage::ByName, &files);
     for name in ["0.pcd", "1.pcd"] {
         let cloud = sweeps.read(&id(), &dir.path().join(name)).unwrap();

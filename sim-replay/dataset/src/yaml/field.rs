@@ -20,7 +20,11 @@ pub(crate) struct Field<'a> {
 impl<'a> Field<'a> {
     /// The whole document.
     pub(crate) fn root(path: &'a Path, node: &'a Node) -> Self {
-        Self { path, name: String::new(), node }
+        Self {
+            path,
+            name: String::new(),
+            node,
+        }
     }
 
     pub(crate) fn node(&self) -> &'a Node {
@@ -53,16 +57,25 @@ impl<'a> Field<'a> {
     }
 
     fn child(&self, key: &str, node: &'a Node) -> Self {
-        let name = if self.name.is_empty() { key.to_owned() } else { format!("{}.{key}", self.name) };
-        Self { path: self.path, name, node }
+        let name = if self.name.is_empty() {
+            key.to_owned()
+        } else {
+            format!("{}.{key}", self.name)
+        };
+        Self {
+            path: self.path,
+            name,
+            node,
+        }
     }
 
     /// The entries of a map.
     pub(crate) fn entries(&self) -> Result<Vec<(&'a str, Self)>, ReadError> {
         match &self.node.value {
-            Value::Map(entries) => {
-                Ok(entries.iter().map(|(key, node)| (key.as_str(), self.child(key, node))).collect())
-            }
+            Value::Map(entries) => Ok(entries
+                .iter()
+                .map(|(key, node)| (key.as_str(), self.child(key, node)))
+                .collect()),
             _ => Err(self.expected("a map")),
         }
     }
@@ -70,9 +83,11 @@ impl<'a> Field<'a> {
     /// The items of a list.
     pub(crate) fn items(&self) -> Result<Vec<Self>, ReadError> {
         match &self.node.value {
-            Value::List(items) => {
-                Ok(items.iter().enumerate().map(|(index, node)| self.child(&index.to_string(), node)).collect())
-            }
+            Value::List(items) => Ok(items
+                .iter()
+                .enumerate()
+                .map(|(index, node)| self.child(&index.to_string(), node))
+                .collect()),
             _ => Err(self.expected("a list")),
         }
     }
@@ -84,14 +99,19 @@ impl<'a> Field<'a> {
 
     /// An entry that may be missing or null. Of equal keys the last is used, as in Python.
     pub(crate) fn optional(&self, key: &str) -> Result<Option<Self>, ReadError> {
-        let Value::Map(entries) = &self.node.value else { return Err(self.expected("a map")) };
-        let found = entries.iter().rfind(|(found, node)| found == key && node.value != Value::Null);
+        let Value::Map(entries) = &self.node.value else {
+            return Err(self.expected("a map"));
+        };
+        let found = entries
+            .iter()
+            .rfind(|(found, node)| found == key && node.value != Value::Null);
         Ok(found.map(|(_, node)| self.child(key, node)))
     }
 
     /// A required entry.
     pub(crate) fn required(&self, key: &str) -> Result<Self, ReadError> {
-        self.optional(key)?.ok_or_else(|| self.child(key, self.node).error("missing"))
+        self.optional(key)?
+            .ok_or_else(|| self.child(key, self.node).error("missing"))
     }
 
     /// A finite number, in any notation.
@@ -99,7 +119,9 @@ impl<'a> Field<'a> {
         if numpy_tags::is_python(self.node) && !matches!(self.node.value, Value::Text(_)) {
             return numpy_tags::scalar(self);
         }
-        plain_number(self.node).filter(|number| number.is_finite()).ok_or_else(|| self.expected("a finite number"))
+        plain_number(self.node)
+            .filter(|number| number.is_finite())
+            .ok_or_else(|| self.expected("a finite number"))
     }
 
     /// An integer, or a float without fraction: ids are written as `-1.0` where they went through an array of floats.
@@ -108,8 +130,13 @@ impl<'a> Field<'a> {
         if let Value::Integer(value) = self.node.value {
             return Ok(value);
         }
-        let number = self.number().ok().filter(|number| number.fract() == 0.0 && number.abs() < 1e15);
-        number.map(|number| number as i64).ok_or_else(|| self.expected("an integer"))
+        let number = self
+            .number()
+            .ok()
+            .filter(|number| number.fract() == 0.0 && number.abs() < 1e15);
+        number
+            .map(|number| number as i64)
+            .ok_or_else(|| self.expected("an integer"))
     }
 
     pub(crate) fn text(&self) -> Result<&'a str, ReadError> {
@@ -138,7 +165,9 @@ impl<'a> Field<'a> {
                 let NumpyArray { shape, values } = numpy_tags::array(self)?;
                 let is_row = shape.iter().filter(|&&size| size != 1).count() <= 1;
                 let found = values.as_slice().try_into().ok().filter(|_| is_row);
-                numbers = found.ok_or_else(|| self.error(format!("an array of shape {shape:?}, expected [{N}]")))?;
+                numbers = found.ok_or_else(|| {
+                    self.error(format!("an array of shape {shape:?}, expected [{N}]"))
+                })?;
                 if let Some(number) = numbers.iter().find(|number| !number.is_finite()) {
                     return Err(self.error(format!("{number}, expected {N} finite numbers")));
                 }
@@ -155,24 +184,46 @@ impl<'a> Field<'a> {
             _ if numpy_tags::is_python(self.node) => return numpy_tags::array(self),
             _ => return Err(self.expected("numbers")),
         };
-        let rows: Vec<NumpyArray> = self.items()?.iter().map(Self::row).collect::<Result<_, _>>()?;
-        let inner = rows.first().map(|row| row.shape.clone()).unwrap_or_default();
+        let rows: Vec<NumpyArray> = self
+            .items()?
+            .iter()
+            .map(Self::row)
+            .collect::<Result<_, _>>()?;
+        let inner = rows
+            .first()
+            .map(|row| row.shape.clone())
+            .unwrap_or_default();
         if rows.iter().any(|row| row.shape != inner) {
             return Err(self.error("rows of different lengths"));
         }
         let shape = [vec![items.len()], inner].concat();
-        Ok(NumpyArray { shape, values: rows.into_iter().flat_map(|row| row.values).collect() })
+        Ok(NumpyArray {
+            shape,
+            values: rows.into_iter().flat_map(|row| row.values).collect(),
+        })
     }
 
     /// An item of a list: a number, or a row of numbers.
     fn row(&self) -> Result<NumpyArray, ReadError> {
         match &self.node.value {
             Value::List(items) if !numpy_tags::is_call(self.node) => {
-                let values = self.items()?.iter().map(Self::number).collect::<Result<_, _>>()?;
-                Ok(NumpyArray { shape: vec![items.len()], values })
+                let values = self
+                    .items()?
+                    .iter()
+                    .map(Self::number)
+                    .collect::<Result<_, _>>()?;
+                Ok(NumpyArray {
+                    shape: vec![items.len()],
+                    values,
+                })
             }
-            Value::Map(_) | Value::List(_) if numpy_tags::is_python(self.node) => numpy_tags::array(self),
-            _ => Ok(NumpyArray { shape: vec![], values: vec![self.number()?] }),
+            Value::Map(_) | Value::List(_) if numpy_tags::is_python(self.node) => {
+                numpy_tags::array(self)
+            }
+            _ => Ok(NumpyArray {
+                shape: vec![],
+                values: vec![self.number()?],
+            }),
         }
     }
 }

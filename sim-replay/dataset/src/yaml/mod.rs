@@ -47,12 +47,27 @@ pub(super) fn read(path: &Path) -> Result<Node, ReadError> {
 
 /// Parses a document; `path` is for messages.
 pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node, ReadError> {
-    let malformed = |line, reason: String| ReadError::Malformed { path: path.to_owned(), line, field: None, reason };
+    let malformed = |line, reason: String| ReadError::Malformed {
+        path: path.to_owned(),
+        line,
+        field: None,
+        reason,
+    };
     let text = std::str::from_utf8(bytes).map_err(|error| {
-        let line = bytes.iter().take(error.valid_up_to()).filter(|&&byte| byte == b'\n').count() as u64 + 1;
+        let line = bytes
+            .iter()
+            .take(error.valid_up_to())
+            .filter(|&&byte| byte == b'\n')
+            .count() as u64
+            + 1;
         malformed(Some(line), "the text is not UTF-8".into())
     })?;
-    tree::build(text).map_err(|unsound| malformed(Some(unsound.line), format!("no sound YAML: {}", unsound.reason)))
+    tree::build(text).map_err(|unsound| {
+        malformed(
+            Some(unsound.line),
+            format!("no sound YAML: {}", unsound.reason),
+        )
+    })
 }
 
 impl Value {
@@ -89,40 +104,69 @@ mod tests {
     #[test]
     fn numbers_come_in_every_spelling() {
         let node = parsed("a: [1, 2.5, 1e-06, 1.0e-06, -3, .5, '7', +8, 1., 0x10]");
-        let field = Field::root(Path::new("a.yaml"), &node).required("a").unwrap();
-        assert_eq!(field.numbers::<10>().unwrap(), [1.0, 2.5, 1e-6, 1e-6, -3.0, 0.5, 7.0, 8.0, 1.0, 16.0]);
+        let field = Field::root(Path::new("a.yaml"), &node)
+            .required("a")
+            .unwrap();
+        assert_eq!(
+            field.numbers::<10>().unwrap(),
+            [1.0, 2.5, 1e-6, 1e-6, -3.0, 0.5, 7.0, 8.0, 1.0, 16.0]
+        );
     }
 
     #[test]
     fn integer_keys_unknown_keys_and_anchors() {
-        let node = parsed("vehicles:\n  4335: &a\n    speed: 1\n    color: 1, 2\n  4336: *a\nunknown: {x: [~]}\n");
+        let node = parsed(
+            "vehicles:\n  4335: &a\n    speed: 1\n    color: 1, 2\n  4336: *a\nunknown: {x: [~]}\n",
+        );
         let root = Field::root(Path::new("a.yaml"), &node);
         let vehicles = root.required("vehicles").unwrap().entries().unwrap();
-        assert_eq!(vehicles.iter().map(|(key, _)| *key).collect::<Vec<_>>(), ["4335", "4336"]);
-        assert_eq!(vehicles[1].1.required("speed").unwrap().number().unwrap(), 1.0);
+        assert_eq!(
+            vehicles.iter().map(|(key, _)| *key).collect::<Vec<_>>(),
+            ["4335", "4336"]
+        );
+        assert_eq!(
+            vehicles[1].1.required("speed").unwrap().number().unwrap(),
+            1.0
+        );
     }
 
     #[test]
     fn tags_are_text_and_binary_stays_base64() {
-        let node = parsed("a: !!python/tuple\n- 1\n- !!binary |\n  Yg==\n- !!python/name:numpy.ndarray ''\n");
+        let node = parsed(
+            "a: !!python/tuple\n- 1\n- !!binary |\n  Yg==\n- !!python/name:numpy.ndarray ''\n",
+        );
         let root = Field::root(Path::new("a.yaml"), &node);
         let tuple = root.required("a").unwrap();
         assert_eq!(tuple.node().tag.as_deref(), Some("python/tuple"));
         let items = tuple.items().unwrap();
         assert_eq!(items[1].text().unwrap().trim(), "Yg==");
-        assert_eq!(items[2].node().tag.as_deref(), Some("python/name:numpy.ndarray"));
+        assert_eq!(
+            items[2].node().tag.as_deref(),
+            Some("python/name:numpy.ndarray")
+        );
     }
 
     #[test]
     fn errors_name_file_line_and_field() {
-        let node = parsed("lidar_pose: [1, 2, 3]\nvehicles:\n  7:\n    extent:\n    - 1\n    - .nan\n    - x\n");
+        let node = parsed(
+            "lidar_pose: [1, 2, 3]\nvehicles:\n  7:\n    extent:\n    - 1\n    - .nan\n    - x\n",
+        );
         let root = Field::root(Path::new("a.yaml"), &node);
         let pose = root.required("lidar_pose").unwrap();
-        assert_eq!(message(pose.numbers::<6>()), "a.yaml:1: lidar_pose: a list of 3, expected 6 numbers");
+        assert_eq!(
+            message(pose.numbers::<6>()),
+            "a.yaml:1: lidar_pose: a list of 3, expected 6 numbers"
+        );
         let car = root.required("vehicles").unwrap().required("7").unwrap();
         let extent = car.required("extent").unwrap();
-        assert_eq!(message(extent.numbers::<3>()), "a.yaml:6: vehicles.7.extent.1: NaN, expected a finite number");
-        assert_eq!(message(car.required("angle")), "a.yaml:4: vehicles.7.angle: missing");
+        assert_eq!(
+            message(extent.numbers::<3>()),
+            "a.yaml:6: vehicles.7.extent.1: NaN, expected a finite number"
+        );
+        assert_eq!(
+            message(car.required("angle")),
+            "a.yaml:4: vehicles.7.angle: missing"
+        );
         assert_eq!(
             message(root.required("vehicles").unwrap().number()),
             "a.yaml:3: vehicles: a map of 1, expected a finite number"
@@ -134,9 +178,18 @@ mod tests {
         let error = parse(Path::new("a.yaml"), b"a: 1\nb: [1, 2\nc: 3\n").unwrap_err();
         assert!(error.line().is_some_and(|line| line > 1), "{error}");
         let text = error.to_string();
-        assert!(text.starts_with("a.yaml:") && text.contains("no sound YAML: "), "{text}");
-        assert!(!text.contains("saphyr") && !text.contains("granit") && !text.contains('\n'), "{text}");
-        assert_eq!(message(parse(Path::new("a.yaml"), b"a: 1\nb: \xff\n")), "a.yaml:2: the text is not UTF-8");
+        assert!(
+            text.starts_with("a.yaml:") && text.contains("no sound YAML: "),
+            "{text}"
+        );
+        assert!(
+            !text.contains("saphyr") && !text.contains("granit") && !text.contains('\n'),
+            "{text}"
+        );
+        assert_eq!(
+            message(parse(Path::new("a.yaml"), b"a: 1\nb: \xff\n")),
+            "a.yaml:2: the text is not UTF-8"
+        );
         assert_eq!(
             message(parse(Path::new("a.yaml"), b"a: 1\n---\nb: 2\n")),
             "a.yaml:2: no sound YAML: a second document begins here, expected one"
@@ -153,15 +206,27 @@ mod tests {
     #[test]
     fn the_last_of_two_equal_keys_counts_as_in_python() {
         let node = parsed("a: 1\na: 2\n");
-        assert_eq!(Field::root(Path::new("a.yaml"), &node).required("a").unwrap().integer().unwrap(), 2);
+        assert_eq!(
+            Field::root(Path::new("a.yaml"), &node)
+                .required("a")
+                .unwrap()
+                .integer()
+                .unwrap(),
+            2
+        );
     }
 
     #[test]
     fn merged_maps_give_missing_entries() {
         let node = parsed("base: &b {x: 1, y: 2}\na:\n  <<: *b\n  x: 3\n");
-        let a = Field::root(Path::new("a.yaml"), &node).required("a").unwrap();
+        let a = Field::root(Path::new("a.yaml"), &node)
+            .required("a")
+            .unwrap();
         let value = |key: &str| a.required(key).unwrap().integer().unwrap();
-        assert_eq!((value("x"), value("y"), a.entries().unwrap().len()), (3, 2, 2));
+        assert_eq!(
+            (value("x"), value("y"), a.entries().unwrap().len()),
+            (3, 2, 2)
+        );
     }
 
     #[test]

@@ -7,9 +7,13 @@ pub(super) fn plain(text: &str) -> Value {
     let known = match text.as_bytes().first() {
         None => Some(Value::Null),
         Some(b'0'..=b'9' | b'+' | b'-' | b'.') => number(text),
-        Some(b'~' | b'n' | b'N') => matches!(text, "~" | "null" | "Null" | "NULL").then_some(Value::Null),
+        Some(b'~' | b'n' | b'N') => {
+            matches!(text, "~" | "null" | "Null" | "NULL").then_some(Value::Null)
+        }
         Some(b't' | b'T') => matches!(text, "true" | "True" | "TRUE").then_some(Value::Bool(true)),
-        Some(b'f' | b'F') => matches!(text, "false" | "False" | "FALSE").then_some(Value::Bool(false)),
+        Some(b'f' | b'F') => {
+            matches!(text, "false" | "False" | "FALSE").then_some(Value::Bool(false))
+        }
         Some(_) => None,
     };
     known.unwrap_or_else(|| Value::Text(text.to_owned()))
@@ -20,7 +24,11 @@ fn number(text: &str) -> Option<Value> {
     let unsigned = text.strip_prefix(['+', '-']).unwrap_or(text);
     if !unsigned.is_empty() && unsigned.bytes().all(|byte| byte.is_ascii_digit()) {
         // Beyond 64 bits it is still a number.
-        return text.parse().map(Value::Integer).or_else(|_| text.parse().map(Value::Float)).ok();
+        return text
+            .parse()
+            .map(Value::Integer)
+            .or_else(|_| text.parse().map(Value::Float))
+            .ok();
     }
     match unsigned {
         ".inf" | ".Inf" | ".INF" => {
@@ -37,8 +45,12 @@ fn number(text: &str) -> Option<Value> {
         return i64::from_str_radix(digits, 8).map(Value::Integer).ok();
     }
     // Letters other than the exponent are rejected: Rust would parse `infinity` too. It parses no `1_0`.
-    let is_decimal = |byte: u8| byte.is_ascii_digit() || matches!(byte, b'+' | b'-' | b'.' | b'e' | b'E');
-    text.bytes().all(is_decimal).then(|| text.parse().map(Value::Float).ok()).flatten()
+    let is_decimal =
+        |byte: u8| byte.is_ascii_digit() || matches!(byte, b'+' | b'-' | b'.' | b'e' | b'E');
+    text.bytes()
+        .all(is_decimal)
+        .then(|| text.parse().map(Value::Float).ok())
+        .flatten()
 }
 
 #[cfg(test)]
@@ -55,14 +67,31 @@ mod tests {
             ("False", Value::Bool(false)),
             ("-7", Value::Integer(-7)),
             ("000069", Value::Integer(69)),
-            ("18446744073709551616", Value::Float(18_446_744_073_709_551_616.0)),
+            (
+                "18446744073709551616",
+                Value::Float(18_446_744_073_709_551_616.0),
+            ),
             ("1e-06", Value::Float(1e-6)),
             ("-.inf", Value::Float(f64::NEG_INFINITY)),
             ("0x1F", Value::Integer(31)),
         ] {
             assert_eq!(plain(text), expected, "{text}");
         }
-        for text in ["-", ".", "1-2", "2024-01-01", "inf", "nan", "1, 2, 3", "no", "none", "-e", "12abc", "0x", "+"] {
+        for text in [
+            "-",
+            ".",
+            "1-2",
+            "2024-01-01",
+            "inf",
+            "nan",
+            "1, 2, 3",
+            "no",
+            "none",
+            "-e",
+            "12abc",
+            "0x",
+            "+",
+        ] {
             assert_eq!(plain(text), Value::Text(text.into()));
         }
         assert!(matches!(plain(".nan"), Value::Float(value) if value.is_nan()));

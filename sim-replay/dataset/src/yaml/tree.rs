@@ -32,7 +32,14 @@ pub(super) fn build(text: &str) -> Result<Node, Unsound> {
     };
     options.set_emit_comments(false);
     let parser = Parser::new_from_str_with_options(text, options);
-    Builder { parser, line: 1, anchors: HashMap::new(), nodes: 0, aliased: 0 }.document()
+    Builder {
+        parser,
+        line: 1,
+        anchors: HashMap::new(),
+        nodes: 0,
+        aliased: 0,
+    }
+    .document()
 }
 
 struct Builder<'t> {
@@ -58,7 +65,11 @@ impl<'t> Builder<'t> {
                 event => root = Some(self.node(event, 0)?),
             }
         }
-        Ok(root.unwrap_or(Node { line: 1, tag: None, value: Value::Null }))
+        Ok(root.unwrap_or(Node {
+            line: 1,
+            tag: None,
+            value: Value::Null,
+        }))
     }
 
     fn next(&mut self) -> Result<Event<'t>, Unsound> {
@@ -67,13 +78,19 @@ impl<'t> Builder<'t> {
                 self.line = line(&span);
                 Ok(event)
             }
-            Some(Err(error)) => Err(Unsound { line: error.marker().line().max(1) as u64, reason: error.info() }),
+            Some(Err(error)) => Err(Unsound {
+                line: error.marker().line().max(1) as u64,
+                reason: error.info(),
+            }),
             None => Ok(Event::StreamEnd),
         }
     }
 
     fn unsound(&self, reason: impl Into<String>) -> Unsound {
-        Unsound { line: self.line, reason: reason.into() }
+        Unsound {
+            line: self.line,
+            reason: reason.into(),
+        }
     }
 
     /// The node that begins with an event.
@@ -91,13 +108,24 @@ impl<'t> Builder<'t> {
                 let tag = tag.as_deref().map(tag_text);
                 let is_resolved = match tag.as_deref() {
                     None => style == ScalarStyle::Plain,
-                    Some(tag) => matches!(tag, "int" | "float" | "bool" | "null" | "python/int" | "python/float"),
+                    Some(tag) => matches!(
+                        tag,
+                        "int" | "float" | "bool" | "null" | "python/int" | "python/float"
+                    ),
                 };
-                let value = if is_resolved { scalar::plain(&text) } else { Value::Text(text.into_owned()) };
+                let value = if is_resolved {
+                    scalar::plain(&text)
+                } else {
+                    Value::Text(text.into_owned())
+                };
                 (anchor, tag, value)
             }
-            Event::SequenceStart(_, anchor, tag) => (anchor, tag.as_deref().map(tag_text), self.list(depth)?),
-            Event::MappingStart(_, anchor, tag) => (anchor, tag.as_deref().map(tag_text), self.map(depth)?),
+            Event::SequenceStart(_, anchor, tag) => {
+                (anchor, tag.as_deref().map(tag_text), self.list(depth)?)
+            }
+            Event::MappingStart(_, anchor, tag) => {
+                (anchor, tag.as_deref().map(tag_text), self.map(depth)?)
+            }
             Event::Alias(anchor) => return self.alias(anchor, line),
             _ => return Err(self.unsound("expected a scalar, a list or a map")),
         };
@@ -151,7 +179,10 @@ impl<'t> Builder<'t> {
         let size = self.anchors.get(&anchor).map(|(_, size)| *size);
         self.count_aliased(size.unwrap_or(0))?;
         match self.anchors.get(&anchor) {
-            Some((node, _)) => Ok(Node { line, ..node.clone() }),
+            Some((node, _)) => Ok(Node {
+                line,
+                ..node.clone()
+            }),
             None => Err(self.unsound("an alias within its own anchor")),
         }
     }
@@ -159,7 +190,9 @@ impl<'t> Builder<'t> {
     fn count_aliased(&mut self, size: usize) -> Result<(), Unsound> {
         self.aliased += size;
         if self.aliased > MAX_ALIASED_NODES {
-            return Err(self.unsound(format!("aliases repeat more than {MAX_ALIASED_NODES} nodes")));
+            return Err(self.unsound(format!(
+                "aliases repeat more than {MAX_ALIASED_NODES} nodes"
+            )));
         }
         Ok(())
     }

@@ -22,7 +22,13 @@ fn packet(from: &str, sequence: u64, bytes: u64, submitted_nanos: u64) -> Packet
 }
 
 fn shaped(rate_mbps: f64) -> LinkConfig {
-    LinkConfig { capacity: CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 }, ..LinkConfig::default() }
+    LinkConfig {
+        capacity: CapacityConfig::TokenBucket {
+            rate_mbps,
+            burst_bytes: 0,
+        },
+        ..LinkConfig::default()
+    }
 }
 
 fn emulator(config: &LinkConfig) -> LinkEmulator {
@@ -31,56 +37,136 @@ fn emulator(config: &LinkConfig) -> LinkEmulator {
 
 fn all(config: &LinkConfig, packets: impl IntoIterator<Item = Packet>) -> Vec<Outcome> {
     let mut emulator = emulator(config);
-    packets.into_iter().for_each(|packet| emulator.submit(packet));
+    packets
+        .into_iter()
+        .for_each(|packet| emulator.submit(packet));
     emulator.advance(u64::MAX / 4)
 }
 
 fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Delivery)> {
-    outcomes.iter().map(|outcome| (outcome.packet.sequence, outcome.nanos / MS, outcome.delivery)).collect()
+    outcomes
+        .iter()
+        .map(|outcome| {
+            (
+                outcome.packet.sequence,
+                outcome.nanos / MS,
+                outcome.delivery,
+            )
+        })
+        .collect()
 }
 
-const ARRIVED: Delivery = Delivery::Arrived { is_copy: false, is_repeated: false };
+const ARRIVED: Delivery = Delivery::Arrived {
+    is_copy: false,
+    is_repeated: false,
+};
 
 #[test]
 fn an_ideal_link_delivers_at_once_and_in_order() {
-    let outcomes = all(&LinkConfig::default(), (0..5).map(|k| packet("a", k, 1 << 20, 7 * MS)));
-    assert_eq!(times_ms(&outcomes), (0..5).map(|k| (k, 7, ARRIVED)).collect::<Vec<_>>());
+    let outcomes = all(
+        &LinkConfig::default(),
+        (0..5).map(|k| packet("a", k, 1 << 20, 7 * MS)),
+    );
+    assert_eq!(
+        times_ms(&outcomes),
+        (0..5).map(|k| (k, 7, ARRIVED)).collect::<Vec<_>>()
+    );
 }
 
 #[test]
 fn messages_queue_behind_each_other() {
     // 8 Mbit/s: 1,000 bytes a millisecond.
-    let outcomes =
-        all(&shaped(8.0), [packet("a", 0, 20_000, 0), packet("a", 1, 20_000, 0), packet("a", 2, 20_000, 90 * MS)]);
-    assert_eq!(times_ms(&outcomes), [(0, 20, ARRIVED), (1, 40, ARRIVED), (2, 110, ARRIVED)]);
+    let outcomes = all(
+        &shaped(8.0),
+        [
+            packet("a", 0, 20_000, 0),
+            packet("a", 1, 20_000, 0),
+            packet("a", 2, 20_000, 90 * MS),
+        ],
+    );
+    assert_eq!(
+        times_ms(&outcomes),
+        [(0, 20, ARRIVED), (1, 40, ARRIVED), (2, 110, ARRIVED)]
+    );
     // Every pair has its own link, unless the medium is shared.
     let both = [packet("a", 0, 20_000, 0), packet("b", 1, 20_000, 0)];
-    assert_eq!(times_ms(&all(&shaped(8.0), both.clone())), [(0, 20, ARRIVED), (1, 20, ARRIVED)]);
-    let shared = LinkConfig { medium: Medium::Shared, ..shaped(8.0) };
-    assert_eq!(times_ms(&all(&shared, both)), [(0, 20, ARRIVED), (1, 40, ARRIVED)]);
+    assert_eq!(
+        times_ms(&all(&shaped(8.0), both.clone())),
+        [(0, 20, ARRIVED), (1, 20, ARRIVED)]
+    );
+    let shared = LinkConfig {
+        medium: Medium::Shared,
+        ..shaped(8.0)
+    };
+    assert_eq!(
+        times_ms(&all(&shared, both)),
+        [(0, 20, ARRIVED), (1, 40, ARRIVED)]
+    );
 }
 
 #[test]
 fn small_messages_do_not_wait_and_cost_their_time() {
-    let outcomes =
-        all(&shaped(8.0), [packet("a", 0, 20_000, 0), packet("a", 1, 1_000, 5 * MS), packet("a", 2, 1_000, 5 * MS)]);
-    assert_eq!(times_ms(&outcomes), [(1, 6, ARRIVED), (2, 7, ARRIVED), (0, 22, ARRIVED)]);
+    let outcomes = all(
+        &shaped(8.0),
+        [
+            packet("a", 0, 20_000, 0),
+            packet("a", 1, 1_000, 5 * MS),
+            packet("a", 2, 1_000, 5 * MS),
+        ],
+    );
+    assert_eq!(
+        times_ms(&outcomes),
+        [(1, 6, ARRIVED), (2, 7, ARRIVED), (0, 22, ARRIVED)]
+    );
 }
 
 #[test]
 fn a_full_queue_drops_the_newcomer_or_the_oldest() {
     let packets = || (0..4).map(|k| packet("a", k, 20_000, k * MS));
     let dropped = Delivery::Dropped(DropReason::LinkQueue);
-    let queue = QueueConfig { bytes: 40_000, ..QueueConfig::default() };
-    let tail = LinkConfig { queue, ..shaped(8.0) };
-    let expected = [(3, 3, dropped), (0, 20, ARRIVED), (1, 40, ARRIVED), (2, 60, ARRIVED)];
+    let queue = QueueConfig {
+        bytes: 40_000,
+        ..QueueConfig::default()
+    };
+    let tail = LinkConfig {
+        queue,
+        ..shaped(8.0)
+    };
+    let expected = [
+        (3, 3, dropped),
+        (0, 20, ARRIVED),
+        (1, 40, ARRIVED),
+        (2, 60, ARRIVED),
+    ];
     assert_eq!(times_ms(&all(&tail, packets())), expected);
-    let head = LinkConfig { queue: QueueConfig { drop: QueueDrop::Head, ..queue }, ..shaped(8.0) };
-    let expected = [(1, 3, dropped), (0, 20, ARRIVED), (2, 40, ARRIVED), (3, 60, ARRIVED)];
+    let head = LinkConfig {
+        queue: QueueConfig {
+            drop: QueueDrop::Head,
+            ..queue
+        },
+        ..shaped(8.0)
+    };
+    let expected = [
+        (1, 3, dropped),
+        (0, 20, ARRIVED),
+        (2, 40, ARRIVED),
+        (3, 60, ARRIVED),
+    ];
     assert_eq!(times_ms(&all(&head, packets())), expected);
-    let newest = LinkConfig { queue: QueueConfig { keep_last: true, ..queue }, ..shaped(8.0) };
+    let newest = LinkConfig {
+        queue: QueueConfig {
+            keep_last: true,
+            ..queue
+        },
+        ..shaped(8.0)
+    };
     let superseded = Delivery::Dropped(DropReason::Superseded);
-    let expected = [(1, 2, superseded), (2, 3, superseded), (0, 20, ARRIVED), (3, 40, ARRIVED)];
+    let expected = [
+        (1, 2, superseded),
+        (2, 3, superseded),
+        (0, 20, ARRIVED),
+        (3, 40, ARRIVED),
+    ];
     assert_eq!(times_ms(&all(&newest, packets())), expected);
 }
 
@@ -89,39 +175,75 @@ fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
     let (rate_mbps, bytes) = (27.0, 30_000);
     for burst_bytes in [0, 100_000] {
         let config = LinkConfig {
-            capacity: CapacityConfig::TokenBucket { rate_mbps, burst_bytes },
-            queue: QueueConfig { bytes: u64::MAX, ..QueueConfig::default() },
+            capacity: CapacityConfig::TokenBucket {
+                rate_mbps,
+                burst_bytes,
+            },
+            queue: QueueConfig {
+                bytes: u64::MAX,
+                ..QueueConfig::default()
+            },
             ..LinkConfig::default()
         };
-        let outcomes = all(&config, (0..2000).map(|k| packet("a", k, bytes, 1_000 * MS + k * MS)));
+        let outcomes = all(
+            &config,
+            (0..2000).map(|k| packet("a", k, bytes, 1_000 * MS + k * MS)),
+        );
         let span_s = (outcomes[1999].nanos - 1_000 * MS) as f64 * 1e-9;
         let rate = (2000 * bytes - burst_bytes) as f64 * 8e-6 / span_s;
-        assert!((rate - rate_mbps).abs() < 0.01 * rate_mbps, "{rate} Mbit/s with a burst of {burst_bytes}");
-        let at_once = outcomes.iter().take_while(|outcome| outcome.nanos == outcome.packet.submitted_nanos).count();
+        assert!(
+            (rate - rate_mbps).abs() < 0.01 * rate_mbps,
+            "{rate} Mbit/s with a burst of {burst_bytes}"
+        );
+        let at_once = outcomes
+            .iter()
+            .take_while(|outcome| outcome.nanos == outcome.packet.submitted_nanos)
+            .count();
         assert_eq!(at_once > 0, burst_bytes > 0);
     }
 }
 
 #[test]
 fn outages_lose_packets_in_flight() {
-    let config = LinkConfig { outages: vec![Outage { from_s: 0.05, to_s: 0.1 }], ..shaped(8.0) };
+    let config = LinkConfig {
+        outages: vec![Outage {
+            from_s: 0.05,
+            to_s: 0.1,
+        }],
+        ..shaped(8.0)
+    };
     let lost = Delivery::Dropped(DropReason::LinkLoss);
-    let packets = [packet("a", 0, 20_000, 0), packet("a", 1, 20_000, 40 * MS), packet("a", 2, 20_000, 110 * MS)];
-    assert_eq!(times_ms(&all(&config, packets)), [(0, 20, ARRIVED), (1, 60, lost), (2, 130, ARRIVED)]);
+    let packets = [
+        packet("a", 0, 20_000, 0),
+        packet("a", 1, 20_000, 40 * MS),
+        packet("a", 2, 20_000, 110 * MS),
+    ];
+    assert_eq!(
+        times_ms(&all(&config, packets)),
+        [(0, 20, ARRIVED), (1, 60, lost), (2, 130, ARRIVED)]
+    );
 }
 
 #[test]
 fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
     // 1.06 Mbit, as in OpenCOOD's configuration.
     let config = LinkConfig::preset("opencood-real").unwrap();
-    let outcomes = all(&config, (0..2000).map(|k| packet("a", k, 132_500, k * 100 * MS)));
+    let outcomes = all(
+        &config,
+        (0..2000).map(|k| packet("a", k, 132_500, k * 100 * MS)),
+    );
     let frames = |count: u64| {
-        let late = |outcome: &&Outcome| outcome.nanos - outcome.packet.submitted_nanos == count * 100 * MS;
+        let late =
+            |outcome: &&Outcome| outcome.nanos - outcome.packet.submitted_nanos == count * 100 * MS;
         outcomes.iter().filter(late).count()
     };
     assert_eq!(frames(0) + frames(1), 2000);
     // U(0, 100) + 39.3 + 10 ms is below 100 ms in 50.7 of 100 cases.
-    assert!((frames(0) as f64 / 2000.0 - 0.507).abs() < 0.035, "{}", frames(0));
+    assert!(
+        (frames(0) as f64 / 2000.0 - 0.507).abs() < 0.035,
+        "{}",
+        frames(0)
+    );
     for delay_ms in [0, 100, 200, 300, 400, 500] {
         let config = LinkConfig {
             delay: DelayModel::ConstantMs(delay_ms as f64 + 30.0),
@@ -135,7 +257,10 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
 
 #[test]
 fn jitter_reorders_unless_order_is_kept() {
-    let jitter = LinkConfig { delay: DelayModel::UniformMs([0.0, 50.0]), ..LinkConfig::default() };
+    let jitter = LinkConfig {
+        delay: DelayModel::UniformMs([0.0, 50.0]),
+        ..LinkConfig::default()
+    };
     let order = |config: &LinkConfig| -> Vec<u64> {
         all(config, (0..200).map(|k| packet("a", k, 10, k * MS)))
             .iter()
@@ -143,25 +268,48 @@ fn jitter_reorders_unless_order_is_kept() {
             .collect()
     };
     assert!(!order(&jitter).is_sorted());
-    assert!(order(&LinkConfig { keep_order: true, ..jitter.clone() }).is_sorted());
-    let late = Some(ReorderConfig { probability: 0.1, extra_ms: 5.0 });
-    let some = LinkConfig { keep_order: true, reorder: late, ..LinkConfig::default() };
+    assert!(
+        order(&LinkConfig {
+            keep_order: true,
+            ..jitter.clone()
+        })
+        .is_sorted()
+    );
+    let late = Some(ReorderConfig {
+        probability: 0.1,
+        extra_ms: 5.0,
+    });
+    let some = LinkConfig {
+        keep_order: true,
+        reorder: late,
+        ..LinkConfig::default()
+    };
     assert!(!order(&some).is_sorted());
 }
 
 #[test]
 fn a_link_is_independent_of_other_links() {
     let config = LinkConfig {
-        delay: DelayModel::Normal { mean_ms: 20.0, std_ms: 8.0 },
+        delay: DelayModel::Normal {
+            mean_ms: 20.0,
+            std_ms: 8.0,
+        },
         loss: LossModel::Bernoulli(0.2),
         duplicate: 0.1,
         ..shaped(27.0)
     };
     let of_a = |outcomes: Vec<Outcome>| -> Vec<Outcome> {
-        outcomes.into_iter().filter(|outcome| outcome.packet.from.as_str() == "a").collect()
+        outcomes
+            .into_iter()
+            .filter(|outcome| outcome.packet.from.as_str() == "a")
+            .collect()
     };
-    let single = of_a(all(&config, (0..300).map(|k| packet("a", k, 40_000, k * 10 * MS))));
-    let together = (0..300).flat_map(|k| ["b", "a", "c"].map(|from| packet(from, k, 40_000, k * 10 * MS)));
+    let single = of_a(all(
+        &config,
+        (0..300).map(|k| packet("a", k, 40_000, k * 10 * MS)),
+    ));
+    let together =
+        (0..300).flat_map(|k| ["b", "a", "c"].map(|from| packet(from, k, 40_000, k * 10 * MS)));
     assert_eq!(of_a(all(&config, together)), single);
     let other_seed = LinkEmulator::new(config, Path::new("."), 6).map(|mut emulator| {
         (0..300).for_each(|k| emulator.submit(packet("a", k, 40_000, k * 10 * MS)));

@@ -11,7 +11,10 @@ fn rewritten(recording: &Recording, options: WriteOptions) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     let mut writer = options.create(&mut bytes).unwrap();
     for messages in recording.all() {
-        messages.unwrap().iter().for_each(|message| writer.write(message).unwrap());
+        messages
+            .unwrap()
+            .iter()
+            .for_each(|message| writer.write(message).unwrap());
     }
     writer.finish().unwrap();
     drop(writer);
@@ -20,7 +23,9 @@ fn rewritten(recording: &Recording, options: WriteOptions) -> Vec<u8> {
 
 /// Compressed by lz4, some messages per chunk.
 fn lz4() -> WriteOptions {
-    WriteOptions::new().compression(Some(Compression::Lz4)).chunk_size(Some(2_000))
+    WriteOptions::new()
+        .compression(Some(Compression::Lz4))
+        .chunk_size(Some(2_000))
 }
 
 /// Without chunks.
@@ -32,7 +37,11 @@ fn unchunked() -> WriteOptions {
 fn a_recording_that_another_program_has_rewritten_is_read_alike() {
     for options in [lz4(), unchunked()] {
         let folder = tempfile::tempdir().unwrap();
-        let own = Recording::open(&write(folder.path(), &recorded(3, 100, RecordingOptions::default()))).unwrap();
+        let own = Recording::open(&write(
+            folder.path(),
+            &recorded(3, 100, RecordingOptions::default()),
+        ))
+        .unwrap();
         let (own_messages, bytes) = (messages_of(&own), rewritten(&own, options));
         let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
         assert_eq!(recording.damage(), []);
@@ -40,9 +49,18 @@ fn a_recording_that_another_program_has_rewritten_is_read_alike() {
         let expected: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 100)).collect();
         assert_eq!(recording.entries().len(), expected.len());
         for (entry, (key, payload)) in recording.entries().iter().zip(&expected) {
-            assert_eq!((&entry.key, &recording.read(entry).unwrap()), (key, payload));
+            assert_eq!(
+                (&entry.key, &recording.read(entry).unwrap()),
+                (key, payload)
+            );
         }
-        assert_eq!(dataset::open(folder.path()).unwrap().scenarios[0].ticks.len(), 3, "and is a scene");
+        assert_eq!(
+            dataset::open(folder.path()).unwrap().scenarios[0]
+                .ticks
+                .len(),
+            3,
+            "and is a scene"
+        );
     }
 }
 
@@ -69,17 +87,37 @@ fn chunks_after_a_damaged_one_are_read() {
         let mut bytes = sound.clone();
         bytes[chunks[1] + place] ^= bit;
         let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
-        let [damage] = recording.damage() else { panic!("{place}: {:?}", recording.damage()) };
+        let [damage] = recording.damage() else {
+            panic!("{place}: {:?}", recording.damage())
+        };
         assert_eq!(damage.begin_bytes as usize, chunks[1], "{place}: {damage}");
-        assert_eq!(damage.lost_bytes as usize, chunks[2] - chunks[1], "{place}: {damage}");
+        assert_eq!(
+            damage.lost_bytes as usize,
+            chunks[2] - chunks[1],
+            "{place}: {damage}"
+        );
         // They arrived a nanosecond apart.
-        assert_eq!((damage.from_s, damage.to_s), (Some(0.0), Some(2e-9)), "{place}: {damage}");
-        let expected: Vec<_> = [0, 2, 3].into_iter().flat_map(|tick| tick_messages(tick, 100)).collect();
-        let read: Vec<_> =
-            recording.entries().iter().map(|entry| (entry.key.clone(), recording.read(entry).unwrap())).collect();
+        assert_eq!(
+            (damage.from_s, damage.to_s),
+            (Some(0.0), Some(2e-9)),
+            "{place}: {damage}"
+        );
+        let expected: Vec<_> = [0, 2, 3]
+            .into_iter()
+            .flat_map(|tick| tick_messages(tick, 100))
+            .collect();
+        let read: Vec<_> = recording
+            .entries()
+            .iter()
+            .map(|entry| (entry.key.clone(), recording.read(entry).unwrap()))
+            .collect();
         assert_eq!(read, expected, "{place}");
-        let report =
-            recover(recording.path(), &folder.path().join(format!("{place}.mcap")), Default::default()).unwrap();
+        let report = recover(
+            recording.path(),
+            &folder.path().join(format!("{place}.mcap")),
+            Default::default(),
+        )
+        .unwrap();
         assert_eq!((report.messages, report.damage.len()), (3 * 5, 1));
     }
 }
@@ -91,53 +129,97 @@ fn channels_that_a_damaged_chunk_describes_are_known_from_the_summary() {
     let first = chunk_places(&bytes)[0];
     bytes[first + 100] ^= 1;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
-    assert_eq!((recording.entries().len(), recording.damage().len()), (2 * 5, 1));
+    assert_eq!(
+        (recording.entries().len(), recording.damage().len()),
+        (2 * 5, 1)
+    );
     // Without a summary their names are unknown, which is reported.
     let cut = &bytes[..bytes.len() - 8];
-    let error = Recording::open(&write(folder.path(), cut)).unwrap_err().to_string();
-    assert!(error.contains("none of its messages can be read") && !error.contains("no channel"), "{error}");
+    let error = Recording::open(&write(folder.path(), cut))
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.contains("none of its messages can be read") && !error.contains("no channel"),
+        "{error}"
+    );
 }
 
 #[test]
 fn only_the_damaged_message_outside_of_chunks_is_left_out() {
     let folder = tempfile::tempdir().unwrap();
-    let own = Recording::open(&write(folder.path(), &recorded(3, 10, RecordingOptions::default()))).unwrap();
+    let own = Recording::open(&write(
+        folder.path(),
+        &recorded(3, 10, RecordingOptions::default()),
+    ))
+    .unwrap();
     let sound = rewritten(&own, unchunked());
-    let payloads: Vec<usize> = (0..sound.len() - 4).filter(|at| sound[*at..].starts_with(b"V2VL")).collect();
+    let payloads: Vec<usize> = (0..sound.len() - 4)
+        .filter(|at| sound[*at..].starts_with(b"V2VL"))
+        .collect();
     assert_eq!(payloads.len(), 15);
     // The length of its record, which precedes 22 bytes of times and numbers.
     let mut bytes = sound.clone();
     bytes[payloads[4] - 22 - 7] ^= 2;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
-    assert_eq!((recording.entries().len(), recording.damage().len()), (14, 1), "{:?}", recording.damage());
+    assert_eq!(
+        (recording.entries().len(), recording.damage().len()),
+        (14, 1),
+        "{:?}",
+        recording.damage()
+    );
     // A bit without any other checksum: the time of arrival.
     let mut bytes = sound;
     bytes[payloads[4] - 10] ^= 2;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
-    let [damage] = recording.damage() else { panic!("{:?}", recording.damage()) };
-    assert!(recording.entries().len() == 15 && damage.reason.contains("checksum of the data"), "{damage}");
+    let [damage] = recording.damage() else {
+        panic!("{:?}", recording.damage())
+    };
+    assert!(
+        recording.entries().len() == 15 && damage.reason.contains("checksum of the data"),
+        "{damage}"
+    );
 }
 
 #[test]
 fn a_chunk_that_asks_for_a_huge_window_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let options = RecordingOptions { zstd_level: Some(1), contents: Contents::Messages };
+    let options = RecordingOptions {
+        zstd_level: Some(1),
+        contents: Contents::Messages,
+    };
     let mut bytes = recorded(3, 100, options);
-    let frame = bytes.windows(4).position(|bytes| bytes == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
+    let frame = bytes
+        .windows(4)
+        .position(|bytes| bytes == [0x28, 0xb5, 0x2f, 0xfd])
+        .unwrap();
     // The window descriptor of the frame: 2 GiB. zstd itself allows a stream 128 MiB, and checks before it allocates.
     assert_eq!(bytes[frame + 4] & 0x20, 0, "a frame with a window");
     bytes[frame + 5] = 21 << 3;
     let recording = Recording::open(&write(folder.path(), &bytes)).unwrap();
-    let [damage] = recording.damage() else { panic!("{:?}", recording.damage()) };
+    let [damage] = recording.damage() else {
+        panic!("{:?}", recording.damage())
+    };
     assert!(damage.reason.contains("too much memory"), "{damage}");
-    assert_eq!(recording.entries().len(), 2 * 5, "the other chunks are read");
+    assert_eq!(
+        recording.entries().len(),
+        2 * 5,
+        "the other chunks are read"
+    );
 }
 
 #[test]
 fn a_record_that_reaches_beyond_its_chunk_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    let mut bytes = recorded(1, 100, RecordingOptions { zstd_level: None, contents: Contents::Messages });
-    let number = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
+    let mut bytes = recorded(
+        1,
+        100,
+        RecordingOptions {
+            zstd_level: None,
+            contents: Contents::Messages,
+        },
+    );
+    let number =
+        |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
     // Two times are followed by the unpacked length, the checksum (0: none), an empty name of the compression, the
     // length.
     let chunk = chunk_places(&bytes)[0] + 9;
@@ -146,7 +228,12 @@ fn a_record_that_reaches_beyond_its_chunk_is_refused() {
     let shorter = number(&bytes, chunk + 32) - 4;
     bytes[chunk + 32..chunk + 40].copy_from_slice(&shorter.to_le_bytes());
     let error = Recording::open(&write(folder.path(), &bytes)).unwrap_err();
-    assert!(error.to_string().contains("differs in length from its contents"), "{error}");
+    assert!(
+        error
+            .to_string()
+            .contains("differs in length from its contents"),
+        "{error}"
+    );
 }
 
 proptest! {

@@ -10,8 +10,8 @@ use std::sync::{Arc, Mutex};
 
 use protocol::message::AgentTruth;
 use protocol::{
-    CavId, DetectionsReport, Gnss, GnssSource, Key, Lidar, PointCloud, Pose, RunId, Stamp, Stream, TrueObject, Truth,
-    wire,
+    CavId, DetectionsReport, Gnss, GnssSource, Key, Lidar, PointCloud, Pose, RunId, Stamp, Stream,
+    TrueObject, Truth, wire,
 };
 
 use super::*;
@@ -21,11 +21,21 @@ const AGENTS: [&str; 2] = ["4279", "4288"];
 
 fn stamp(cav: &str, tick: u64) -> Stamp {
     let cav = CavId::new(cav).unwrap();
-    Stamp { cav, epoch: 1, sequence: tick, capture_nanos: 100_000_000 * (tick + 1), publish_nanos: 7 }
+    Stamp {
+        cav,
+        epoch: 1,
+        sequence: tick,
+        capture_nanos: 100_000_000 * (tick + 1),
+        publish_nanos: 7,
+    }
 }
 
 fn cloud(tick: u64, points: usize) -> PointCloud {
-    PointCloud { xyzi: (0..points).map(|k| [k as f32, tick as f32, 0.5, 0.25]).collect() }
+    PointCloud {
+        xyzi: (0..points)
+            .map(|k| [k as f32, tick as f32, 0.5, 0.25])
+            .collect(),
+    }
 }
 
 fn pose(tick: u64) -> Pose {
@@ -45,7 +55,10 @@ fn truth(tick: u64) -> Truth {
         world_from_lidar: pose(tick),
         objects: vec![object.clone()],
     };
-    Truth { tick, agents: AGENTS.map(agent).into() }
+    Truth {
+        tick,
+        agents: AGENTS.map(agent).into(),
+    }
 }
 
 /// The messages of one tick, as they come from the network.
@@ -60,11 +73,24 @@ fn tick_messages(tick: u64, points: usize) -> Vec<(Key, Vec<u8>)> {
             heading_std_rad: 0.0,
             source: GnssSource::Recorded,
         };
-        messages.push((key(Stream::Gnss), wire::encode(&stamp(cav, tick), gnss).unwrap().to_vec()));
-        let lidar = Lidar { points: cloud(tick, points) };
-        messages.push((key(Stream::Lidar), wire::encode(&stamp(cav, tick), lidar).unwrap().to_vec()));
+        messages.push((
+            key(Stream::Gnss),
+            wire::encode(&stamp(cav, tick), gnss).unwrap().to_vec(),
+        ));
+        let lidar = Lidar {
+            points: cloud(tick, points),
+        };
+        messages.push((
+            key(Stream::Lidar),
+            wire::encode(&stamp(cav, tick), lidar).unwrap().to_vec(),
+        ));
     }
-    messages.push((Key::truth(&run), wire::encode(&stamp("replay", tick), truth(tick)).unwrap().to_vec()));
+    messages.push((
+        Key::truth(&run),
+        wire::encode(&stamp("replay", tick), truth(tick))
+            .unwrap()
+            .to_vec(),
+    ));
     messages
 }
 
@@ -77,7 +103,10 @@ struct Disk {
 
 impl Disk {
     fn new(capacity: usize) -> Self {
-        Self { bytes: Arc::default(), capacity }
+        Self {
+            bytes: Arc::default(),
+            capacity,
+        }
     }
 
     fn bytes(&self) -> Vec<u8> {
@@ -128,7 +157,11 @@ fn messages_of(recording: &Recording) -> Vec<(String, String, Vec<u8>)> {
     for held in recording.all() {
         for message in held.unwrap().iter() {
             let channel = &message.channel;
-            messages.push((channel.topic.clone(), channel.message_encoding.clone(), message.data.to_vec()));
+            messages.push((
+                channel.topic.clone(),
+                channel.message_encoding.clone(),
+                message.data.to_vec(),
+            ));
         }
     }
     messages
@@ -148,18 +181,27 @@ fn write(folder: &Path, bytes: &[u8]) -> PathBuf {
 fn messages_read_equal_those_written() {
     for zstd_level in [None, Some(1)] {
         let folder = tempfile::tempdir().unwrap();
-        let options = RecordingOptions { zstd_level, contents: Contents::All };
+        let options = RecordingOptions {
+            zstd_level,
+            contents: Contents::All,
+        };
         let path = write(folder.path(), &recorded(3, 100, options));
         let recording = Recording::open(&path).unwrap();
         assert_eq!(recording.damage(), []);
         let expected: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 100)).collect();
         assert_eq!(recording.entries().len(), expected.len());
         for (entry, (key, payload)) in recording.entries().iter().zip(&expected) {
-            assert_eq!((&entry.key, &recording.read(entry).unwrap()), (key, payload));
+            assert_eq!(
+                (&entry.key, &recording.read(entry).unwrap()),
+                (key, payload)
+            );
             assert_eq!(entry.arrived_nanos, 1_000 + entry.header.stamp.sequence);
         }
         let names: Vec<_> = AGENTS.map(|cav| format!("/cav_{cav}/points")).into();
-        let topics: Vec<String> = messages_of(&recording).into_iter().map(|(topic, _, _)| topic).collect();
+        let topics: Vec<String> = messages_of(&recording)
+            .into_iter()
+            .map(|(topic, _, _)| topic)
+            .collect();
         assert!(names.iter().all(|name| topics.contains(name)), "{topics:?}");
         assert!(has_index(&path));
     }
@@ -168,20 +210,41 @@ fn messages_read_equal_those_written() {
 #[test]
 fn sweeps_in_map_coordinates_are_converted_for_ros_tools_too() {
     let disk = Disk::new(usize::MAX);
-    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let mut writer =
+        RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     // UTM: east, north, height.
-    let far = PointCloud { xyzi: vec![[458_000.0, 5_428_000.0, 115.0, 0.5]] };
-    let key = Key::stream(&RunId::new("test").unwrap(), &CavId::new("4279").unwrap(), Stream::Lidar);
-    for points in [far, PointCloud { xyzi: vec![[f32::NAN; 4]] }] {
-        let payload = wire::encode(&stamp("4279", 0), Lidar { points }).unwrap().to_vec();
+    let far = PointCloud {
+        xyzi: vec![[458_000.0, 5_428_000.0, 115.0, 0.5]],
+    };
+    let key = Key::stream(
+        &RunId::new("test").unwrap(),
+        &CavId::new("4279").unwrap(),
+        Stream::Lidar,
+    );
+    for points in [
+        far,
+        PointCloud {
+            xyzi: vec![[f32::NAN; 4]],
+        },
+    ] {
+        let payload = wire::encode(&stamp("4279", 0), Lidar { points })
+            .unwrap()
+            .to_vec();
         writer.write(&key, 5, &payload).unwrap();
     }
     writer.finish().unwrap();
     let folder = tempfile::tempdir().unwrap();
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     let messages = messages_of(&recording);
-    let converted: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/cav_4279/points").collect();
-    assert_eq!((messages.len(), converted.len()), (3, 1), "a NaN is recorded unchanged");
+    let converted: Vec<_> = messages
+        .iter()
+        .filter(|(topic, ..)| topic == "/cav_4279/points")
+        .collect();
+    assert_eq!(
+        (messages.len(), converted.len()),
+        (3, 1),
+        "a NaN is recorded unchanged"
+    );
     let north = 5_428_000.0_f32.to_le_bytes();
     assert!(converted[0].2.windows(4).any(|bytes| bytes == north));
 }
@@ -193,19 +256,30 @@ fn a_recording_is_a_scene() {
     // The run folder is accepted as well as the file.
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     assert_eq!(scenario.agents, AGENTS.map(|cav| CavId::new(cav).unwrap()));
-    let captures: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let captures: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
     assert_eq!(captures, [100_000_000, 200_000_000, 300_000_000]);
     let frame = scenario.load(1, 2, &LoadOptions::default()).unwrap();
-    assert_eq!((frame.points, frame.world_from_lidar), (cloud(2, 50), Some(pose(2))));
+    assert_eq!(
+        (frame.points, frame.world_from_lidar),
+        (cloud(2, 50), Some(pose(2)))
+    );
     let object = &frame.objects[0];
-    assert_eq!((object.id, object.class, object.speed_mps), (7, dataset::frame::ObjectClass::Truck, Some(3.5)));
+    assert_eq!(
+        (object.id, object.class, object.speed_mps),
+        (7, dataset::frame::ObjectClass::Truck, Some(3.5))
+    );
 }
 
 #[test]
 fn a_truth_that_cannot_be_read_is_a_problem_and_no_end() {
     let folder = tempfile::tempdir().unwrap();
     let disk = Disk::new(usize::MAX);
-    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let mut writer =
+        RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     for tick in 0..2 {
         for (key, mut payload) in tick_messages(tick, 10) {
             if tick == 1 && key.topic == protocol::Topic::Truth {
@@ -233,7 +307,10 @@ fn a_recovered_recording_has_an_index_and_the_same_messages() {
     let to = folder.path().join("whole.mcap");
     let report = recover(&path, &to, RecordingOptions::default()).unwrap();
     assert_eq!(report.damage.len(), 1);
-    let (cut, recovered) = (Recording::open(&path).unwrap(), Recording::open(&to).unwrap());
+    let (cut, recovered) = (
+        Recording::open(&path).unwrap(),
+        Recording::open(&to).unwrap(),
+    );
     assert_eq!(recovered.damage(), []);
     assert_eq!(report.messages as usize, cut.entries().len());
     assert!(has_index(&to) && !has_index(&path));
@@ -247,10 +324,14 @@ fn a_recovered_recording_has_an_index_and_the_same_messages() {
 #[test]
 fn json_stands_beside_our_own_messages() {
     let disk = Disk::new(usize::MAX);
-    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let mut writer =
+        RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     let key: Key = "v2v/test/4279/detections/json".parse().unwrap();
     let text = br#"{"tick": 0}"#;
-    assert!(serde_json::from_slice::<DetectionsReport>(text).is_err(), "any JSON will do");
+    assert!(
+        serde_json::from_slice::<DetectionsReport>(text).is_err(),
+        "any JSON will do"
+    );
     writer.write(&key, 5, text).unwrap();
     for (key, payload) in tick_messages(0, 1) {
         writer.write(&key, 6, &payload).unwrap();
@@ -259,35 +340,59 @@ fn json_stands_beside_our_own_messages() {
     let folder = tempfile::tempdir().unwrap();
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     assert_eq!(recording.entries().len(), 5, "JSON is no message of ours");
-    assert_eq!(messages_of(&recording)[0], (key.to_string(), "json".to_owned(), text.to_vec()));
+    assert_eq!(
+        messages_of(&recording)[0],
+        (key.to_string(), "json".to_owned(), text.to_vec())
+    );
 }
 
 #[test]
 fn a_first_message_that_is_none_spoils_none_after_it() {
     let disk = Disk::new(usize::MAX);
-    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let mut writer =
+        RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     let messages = tick_messages(0, 1);
-    messages.iter().for_each(|(key, _)| writer.write(key, 5, b"garbage").unwrap());
-    messages.iter().for_each(|(key, payload)| writer.write(key, 6, payload).unwrap());
+    messages
+        .iter()
+        .for_each(|(key, _)| writer.write(key, 5, b"garbage").unwrap());
+    messages
+        .iter()
+        .for_each(|(key, payload)| writer.write(key, 6, payload).unwrap());
     writer.finish().unwrap();
     let folder = tempfile::tempdir().unwrap();
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     let keys: Vec<&Key> = recording.entries().iter().map(|entry| &entry.key).collect();
-    assert_eq!(keys, messages.iter().map(|(key, _)| key).collect::<Vec<_>>());
+    assert_eq!(
+        keys,
+        messages.iter().map(|(key, _)| key).collect::<Vec<_>>()
+    );
 }
 
 #[test]
 fn the_first_of_two_replays_of_one_tick_is_used_with_its_own_truth() {
     let disk = Disk::new(usize::MAX);
-    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let mut writer =
+        RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     for (key, payload) in tick_messages(0, 1) {
         writer.write(&key, 5, &payload).unwrap();
         if key.topic == protocol::Topic::Truth {
-            let second = Stamp { epoch: 2, ..stamp("replay", 0) };
-            let nothing = Truth { tick: 0, agents: Vec::new() };
+            let second = Stamp {
+                epoch: 2,
+                ..stamp("replay", 0)
+            };
+            let nothing = Truth {
+                tick: 0,
+                agents: Vec::new(),
+            };
             // The same again is a duplicate.
             for stamp in [stamp("replay", 0), second] {
-                writer.write(&key, 6, &wire::encode(&stamp, nothing.clone()).unwrap().to_vec()).unwrap();
+                writer
+                    .write(
+                        &key,
+                        6,
+                        &wire::encode(&stamp, nothing.clone()).unwrap().to_vec(),
+                    )
+                    .unwrap();
             }
         }
     }
@@ -295,8 +400,16 @@ fn the_first_of_two_replays_of_one_tick_is_used_with_its_own_truth() {
     let folder = tempfile::tempdir().unwrap();
     let mut dataset = dataset::open(&write(folder.path(), &disk.bytes())).unwrap();
     assert_eq!(dataset.problems.len(), 1, "{:?}", dataset.problems);
-    assert!(dataset.problems[0].to_string().contains("1 ticks"), "{}", dataset.problems[0]);
-    let frame = dataset.scenarios.remove(0).load(0, 0, &LoadOptions::default()).unwrap();
+    assert!(
+        dataset.problems[0].to_string().contains("1 ticks"),
+        "{}",
+        dataset.problems[0]
+    );
+    let frame = dataset
+        .scenarios
+        .remove(0)
+        .load(0, 0, &LoadOptions::default())
+        .unwrap();
     assert_eq!(frame.objects.len(), 1);
 }
 
@@ -305,7 +418,12 @@ fn a_full_disk_leaves_whole_chunks() {
     let folder = tempfile::tempdir().unwrap();
     let one = recorded(1, 2_000, RecordingOptions::default()).len();
     let disk = Disk::new(5 * one / 2);
-    let mut writer = RecordingWriter::over(disk.clone(), Path::new("full.mcap"), RecordingOptions::default()).unwrap();
+    let mut writer = RecordingWriter::over(
+        disk.clone(),
+        Path::new("full.mcap"),
+        RecordingOptions::default(),
+    )
+    .unwrap();
     let mut failures = Vec::new();
     for tick in 0..6 {
         for (key, payload) in tick_messages(tick, 2_000) {
@@ -314,30 +432,56 @@ fn a_full_disk_leaves_whole_chunks() {
         failures.extend(writer.flush().err());
     }
     let messages: Vec<String> = failures.iter().map(ToString::to_string).collect();
-    assert!(matches!(failures[0], RecordingError::Io { .. }), "{messages:?}");
-    assert!(messages[0].contains("full.mcap") && messages[0].contains("storage"), "{messages:?}");
-    assert!(failures[1..].iter().all(|error| matches!(error, RecordingError::Ended { .. })), "{messages:?}");
+    assert!(
+        matches!(failures[0], RecordingError::Io { .. }),
+        "{messages:?}"
+    );
+    assert!(
+        messages[0].contains("full.mcap") && messages[0].contains("storage"),
+        "{messages:?}"
+    );
+    assert!(
+        failures[1..]
+            .iter()
+            .all(|error| matches!(error, RecordingError::Ended { .. })),
+        "{messages:?}"
+    );
     assert!(writer.finish().is_err());
     assert_eq!(writer.whole_messages(), 2 * 5, "two ticks were whole");
     drop(writer);
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     assert_eq!(recording.entries().len(), 2 * 5);
-    let [damage] = recording.damage() else { panic!("{:?}", recording.damage()) };
-    assert_eq!((damage.lost_bytes, damage.to_s), (0, None), "only the index is missing");
+    let [damage] = recording.damage() else {
+        panic!("{:?}", recording.damage())
+    };
+    assert_eq!(
+        (damage.lost_bytes, damage.to_s),
+        (0, None),
+        "only the index is missing"
+    );
 }
 
 #[test]
 fn a_file_that_is_no_recording_is_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
-    for bytes in
-        [b"".as_slice(), b"\x89MCAP", b"hello, hello, hello", &recorded(1, 1, RecordingOptions::default())[..8]]
-    {
+    for bytes in [
+        b"".as_slice(),
+        b"\x89MCAP",
+        b"hello, hello, hello",
+        &recorded(1, 1, RecordingOptions::default())[..8],
+    ] {
         let error = Recording::open(&write(folder.path(), bytes)).unwrap_err();
         assert!(matches!(error, RecordingError::NotOurs { .. }), "{error}");
     }
     // A complete file of another program, without a channel of this one.
     let disk = Disk::new(usize::MAX);
-    RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap().finish().unwrap();
+    RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default())
+        .unwrap()
+        .finish()
+        .unwrap();
     let error = Recording::open(&write(folder.path(), &disk.bytes())).unwrap_err();
-    assert!(error.to_string().contains("no channel of encoding"), "{error}");
+    assert!(
+        error.to_string().contains("no channel of encoding"),
+        "{error}"
+    );
 }

@@ -55,21 +55,51 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
     let scenarios = read(folder)?;
     let differs = |setting, found: String, wanted: String| {
         let folder = folder.to_owned();
-        Err(SynthError::Kept { folder, setting, found, wanted })
+        Err(SynthError::Kept {
+            folder,
+            setting,
+            found,
+            wanted,
+        })
     };
     let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
     for made in &scenarios {
-        let Generator { subset, seed, map, map_seed, agents, frames, period_seconds, weather, layout } = made;
+        let Generator {
+            subset,
+            seed,
+            map,
+            map_seed,
+            agents,
+            frames,
+            period_seconds,
+            weather,
+            layout,
+        } = made;
         let settings = [
             ("subset", subset.clone(), options.subset.name().to_owned()),
             ("seed", seed.to_string(), options.seed.to_string()),
             ("frames", frames.to_string(), options.frames.to_string()),
-            ("period_seconds", period_seconds.to_string(), options.period_s.to_string()),
-            ("weather", weather.clone(), options.weather.name().to_owned()),
-            ("map_seed", map_seed.to_string(), options.map_seed.to_string()),
+            (
+                "period_seconds",
+                period_seconds.to_string(),
+                options.period_s.to_string(),
+            ),
+            (
+                "weather",
+                weather.clone(),
+                options.weather.name().to_owned(),
+            ),
+            (
+                "map_seed",
+                map_seed.to_string(),
+                options.map_seed.to_string(),
+            ),
             ("layout", layout.clone(), options.layout.name().to_owned()),
         ];
-        if let Some((setting, found, wanted)) = settings.into_iter().find(|(_, found, wanted)| found != wanted) {
+        if let Some((setting, found, wanted)) = settings
+            .into_iter()
+            .find(|(_, found, wanted)| found != wanted)
+        {
             return differs(setting, found, wanted);
         }
         if !maps.contains(map) {
@@ -81,7 +111,11 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         }
     }
     if scenarios.len() != options.scenarios() {
-        return differs("scenarios", scenarios.len().to_string(), options.scenarios().to_string());
+        return differs(
+            "scenarios",
+            scenarios.len().to_string(),
+            options.scenarios().to_string(),
+        );
     }
     Ok(true)
 }
@@ -91,21 +125,38 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
 ///
 /// # Errors
 /// As [`generate`].
-pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
+pub fn generate_whole(
+    options: &SynthOptions,
+    progress: &(dyn Fn(u64) + Sync),
+) -> Result<Summary, SynthError> {
     let unfinished = options.out.with_added_extension("unfinished");
-    let write = |path: &Path, source| SynthError::Write { path: path.to_owned(), source };
+    let write = |path: &Path, source| SynthError::Write {
+        path: path.to_owned(),
+        source,
+    };
     match fs::remove_dir_all(&unfinished) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(write(&unfinished, error)),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            return Err(write(&unfinished, error));
+        }
         Ok(()) | Err(_) => {}
     }
-    let summary = generate(&SynthOptions { out: unfinished.clone(), ..options.clone() }, progress)?;
+    let summary = generate(
+        &SynthOptions {
+            out: unfinished.clone(),
+            ..options.clone()
+        },
+        progress,
+    )?;
     fs::rename(&unfinished, &options.out).map_err(|source| write(&options.out, source))?;
     Ok(summary)
 }
 
 /// Settings with which the scenarios in a folder were made; an error if a scenario has no file with its settings.
 fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
-    let at = |path: &Path, problem: String| SynthError::Read { path: path.to_owned(), problem };
+    let at = |path: &Path, problem: String| SynthError::Read {
+        path: path.to_owned(),
+        problem,
+    };
     let entries = fs::read_dir(folder).map_err(|error| at(folder, error.to_string()))?;
     let mut generators = Vec::new();
     for entry in entries {
@@ -114,9 +165,19 @@ fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
             continue;
         }
         let file = scenario.join(FILE_NAME);
-        let text = bounded_file::read_text(&file, MAX_FILE_BYTES).map_err(|error| at(&file, error.to_string()))?;
+        let text = bounded_file::read_text(&file, MAX_FILE_BYTES)
+            .map_err(|error| at(&file, error.to_string()))?;
         let made: MadeWith = serde_saphyr::from_str(&text).map_err(|error| {
-            at(&file, error.without_snippet().to_string().lines().next().unwrap_or_default().into())
+            at(
+                &file,
+                error
+                    .without_snippet()
+                    .to_string()
+                    .lines()
+                    .next()
+                    .unwrap_or_default()
+                    .into(),
+            )
         })?;
         generators.push(made.generator);
     }
@@ -132,29 +193,83 @@ mod tests {
     fn cached_scenes_are_used_only_for_their_own_options() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("scenes");
-        let options =
-            SynthOptions { scenes: 2, frames: 2, agents: 2..=2, ..SynthOptions::new(Subset::V2vdet, 7, out.clone()) };
+        let options = SynthOptions {
+            scenes: 2,
+            frames: 2,
+            agents: 2..=2,
+            ..SynthOptions::new(Subset::V2vdet, 7, out.clone())
+        };
         assert!(!are_kept(&options).unwrap());
         // Left by an interrupted run with another seed.
         fs::create_dir_all(folder.path().join("scenes.unfinished/v2vdet_town1_s8_0000")).unwrap();
         generate_whole(&options, &|_| {}).unwrap();
         assert!(are_kept(&options).unwrap());
-        assert!(are_kept(&SynthOptions { agents: 1..=3, threads: 2, ..options.clone() }).unwrap());
+        assert!(
+            are_kept(&SynthOptions {
+                agents: 1..=3,
+                threads: 2,
+                ..options.clone()
+            })
+            .unwrap()
+        );
         for (asked, words) in [
-            (SynthOptions { seed: 8, ..options.clone() }, "seed 7, not 8"),
-            (SynthOptions { frames: 3, ..options.clone() }, "frames 2, not 3"),
-            (SynthOptions { agents: 3..=4, ..options.clone() }, "agents 2, not 3 to 4"),
-            (SynthOptions { scenes: 3, ..options.clone() }, "scenarios 2, not 3"),
-            (SynthOptions { weather: Weather::Fog, ..options.clone() }, "weather sunny, not fog"),
-            (SynthOptions { map: Some(RoadMapSource::Town1), ..options.clone() }, "map town4, not town1"),
+            (
+                SynthOptions {
+                    seed: 8,
+                    ..options.clone()
+                },
+                "seed 7, not 8",
+            ),
+            (
+                SynthOptions {
+                    frames: 3,
+                    ..options.clone()
+                },
+                "frames 2, not 3",
+            ),
+            (
+                SynthOptions {
+                    agents: 3..=4,
+                    ..options.clone()
+                },
+                "agents 2, not 3 to 4",
+            ),
+            (
+                SynthOptions {
+                    scenes: 3,
+                    ..options.clone()
+                },
+                "scenarios 2, not 3",
+            ),
+            (
+                SynthOptions {
+                    weather: Weather::Fog,
+                    ..options.clone()
+                },
+                "weather sunny, not fog",
+            ),
+            (
+                SynthOptions {
+                    map: Some(RoadMapSource::Town1),
+                    ..options.clone()
+                },
+                "map town4, not town1",
+            ),
         ] {
             let problem = are_kept(&asked).unwrap_err().to_string();
-            assert!(problem.contains(words) && problem.contains(&*out.to_string_lossy()), "{problem}");
+            assert!(
+                problem.contains(words) && problem.contains(&*out.to_string_lossy()),
+                "{problem}"
+            );
         }
         fs::create_dir(out.join("other")).unwrap();
         let problem = are_kept(&options).unwrap_err().to_string();
         assert!(problem.contains("other/data_protocol.yaml"), "{problem}");
-        fs::write(out.join("other/data_protocol.yaml"), vec![b' '; MAX_FILE_BYTES as usize + 1]).unwrap();
+        fs::write(
+            out.join("other/data_protocol.yaml"),
+            vec![b' '; MAX_FILE_BYTES as usize + 1],
+        )
+        .unwrap();
         let problem = are_kept(&options).unwrap_err().to_string();
         assert!(problem.contains("larger than"), "{problem}");
     }

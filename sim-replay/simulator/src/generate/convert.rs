@@ -11,7 +11,8 @@ use rayon::prelude::*;
 use super::data_protocol::converted_yaml;
 use super::error::SynthError;
 use super::layout::{
-    AgentFrame, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant, Unfinished, locked,
+    AgentFrame, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant,
+    Unfinished, locked,
 };
 use super::scenes::check_folder;
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
@@ -60,14 +61,24 @@ pub fn convert(
     let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
     locked(&left_out).add_files(&dataset.problems);
     let mut converted = Converted::default();
-    let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
+    let total = dataset
+        .scenarios
+        .iter()
+        .map(|scenario| scenario.ticks.len())
+        .sum();
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
         let holds_images = options.layout == SceneLayout::Opv2v;
-        let frames = write_moments(scenario, writer.as_ref(), holds_images, (&omitted, &left_out), &|| {
-            progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
-        })?;
+        let frames = write_moments(
+            scenario,
+            writer.as_ref(),
+            holds_images,
+            (&omitted, &left_out),
+            &|| {
+                progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+            },
+        )?;
         writer.end()?;
         converted.scenarios += 1;
         converted.agent_frames += frames;
@@ -80,16 +91,34 @@ pub fn convert(
 }
 
 fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthError> {
-    let capture_nanos: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let capture_nanos: Vec<u64> = scenario
+        .ticks
+        .iter()
+        .map(|tick| tick.capture_nanos)
+        .collect();
     let divides = |tick: &u64| capture_nanos.iter().all(|nanos| nanos % tick == 0);
-    let tick_nanos = TICKS_NANOS.into_iter().find(divides).unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
-    if let Some(pair) = capture_nanos.windows(2).find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos) {
-        let reason =
-            format!("scenario {}: two moments at {} and {} ns: times do not rise", scenario.name, pair[0], pair[1]);
-        return Err(SynthError::Layout { layout: "of the input", reason });
+    let tick_nanos = TICKS_NANOS
+        .into_iter()
+        .find(divides)
+        .unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
+    if let Some(pair) = capture_nanos
+        .windows(2)
+        .find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos)
+    {
+        let reason = format!(
+            "scenario {}: two moments at {} and {} ns: times do not rise",
+            scenario.name, pair[0], pair[1]
+        );
+        return Err(SynthError::Layout {
+            layout: "of the input",
+            reason,
+        });
     }
     let is_roadside = |id: &CavId| scenario.roadside_units.contains(id);
-    let agents = scenario.agents.iter().map(|id| SceneAgent { id: id.clone(), is_roadside: is_roadside(id) });
+    let agents = scenario.agents.iter().map(|id| SceneAgent {
+        id: id.clone(),
+        is_roadside: is_roadside(id),
+    });
     Ok(SceneHeader {
         name: scenario.name.clone(),
         agents: agents.collect(),
@@ -116,11 +145,23 @@ fn write_moments(
         }
         let frames = loaded.frames.into_iter().map(|(agent, frame)| {
             let variants = variants(scenario, agent, index, left_out);
-            AgentFrame { agent, frame, variants, simulated: None }
+            AgentFrame {
+                agent,
+                frame,
+                variants,
+                simulated: None,
+            }
         });
-        let moment = Moment { index, frames: frames.collect() };
+        let moment = Moment {
+            index,
+            frames: frames.collect(),
+        };
         if !holds_images {
-            let images = moment.frames.iter().map(|agent| agent.frame.cameras.len()).sum();
+            let images = moment
+                .frames
+                .iter()
+                .map(|agent| agent.frame.cameras.len())
+                .sum();
             omitted.add("camera images, which the layout does not have", images);
         }
         writer.write(&moment, omitted)?;
@@ -131,9 +172,17 @@ fn write_moments(
 
 /// The frames of a capture time. No layout can hold sweeps without a pose.
 fn read(scenario: &Scenario, index: usize) -> LoadedTick {
-    let options = LoadOptions { lidar_variant: None, points: true, radar: true, cameras: true };
+    let options = LoadOptions {
+        lidar_variant: None,
+        points: true,
+        radar: true,
+        cameras: true,
+    };
     let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
-    for (agent, _) in loaded.frames.extract_if(.., |(_, frame)| frame.world_from_lidar.is_none()) {
+    for (agent, _) in loaded
+        .frames
+        .extract_if(.., |(_, frame)| frame.world_from_lidar.is_none())
+    {
         let path = scenario.points_path(agent, index, None).unwrap_or_default();
         let error = ReadError::malformed(&path, "there is no pose for this sweep");
         loaded.unreadable.push((agent, Problem::from(&error)));
@@ -142,15 +191,26 @@ fn read(scenario: &Scenario, index: usize) -> LoadedTick {
 }
 
 /// The copies of a sweep that can be read.
-fn variants(scenario: &Scenario, agent: usize, index: usize, left_out: &Mutex<LeftOut>) -> Vec<SweepVariant> {
+fn variants(
+    scenario: &Scenario,
+    agent: usize,
+    index: usize,
+    left_out: &Mutex<LeftOut>,
+) -> Vec<SweepVariant> {
     let read = |name: &String| {
-        let cloud = scenario.load_points(agent, index, Some(name)).map_err(|error| {
-            // Counted as a file, since a copy is part of its frame.
-            locked(left_out).add_files([&error]);
-        });
+        let cloud = scenario
+            .load_points(agent, index, Some(name))
+            .map_err(|error| {
+                // Counted as a file, since a copy is part of its frame.
+                locked(left_out).add_files([&error]);
+            });
         let cloud = cloud.ok()?;
         let labels = cloud.labels.unwrap_or_else(|| vec![0; cloud.points.len()]);
-        Some(SweepVariant { name: name.clone(), points: cloud.points.xyzi, labels })
+        Some(SweepVariant {
+            name: name.clone(),
+            points: cloud.points.xyzi,
+            labels,
+        })
     };
     scenario.lidar_variants.iter().filter_map(read).collect()
 }

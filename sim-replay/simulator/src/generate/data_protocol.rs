@@ -29,9 +29,22 @@ world:
 
 /// The text of the file. It holds every setting that determines the bytes of the scenario, and the sensors in the terms
 /// of OpenCDA.
-pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, map_model: &MapModel) -> String {
-    let SynthOptions { subset, seed, map_seed, weather, frames, period_s, .. } = options;
-    let (name, map_name, scene_seed, agents) = (&spec.name, &map_model.name, spec.seed, spec.agents);
+pub(crate) fn protocol_yaml(
+    options: &SynthOptions,
+    spec: &SceneSpec,
+    map_model: &MapModel,
+) -> String {
+    let SynthOptions {
+        subset,
+        seed,
+        map_seed,
+        weather,
+        frames,
+        period_s,
+        ..
+    } = options;
+    let (name, map_name, scene_seed, agents) =
+        (&spec.name, &map_model.name, spec.seed, spec.agents);
     let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
     // Without the entry the layout is OPV2V's.
     let layout = match options.layout {
@@ -98,8 +111,12 @@ fn map_yaml(findings: &[Finding]) -> String {
         return String::new();
     }
     // JSON is valid YAML, and its strings need no further escaping.
-    let lines = findings.iter().filter_map(|finding| serde_json::to_string(finding).ok());
-    lines.fold("map_findings:\n".to_owned(), |yaml, line| yaml + "  - " + &line + "\n")
+    let lines = findings
+        .iter()
+        .filter_map(|finding| serde_json::to_string(finding).ok());
+    lines.fold("map_findings:\n".to_owned(), |yaml, line| {
+        yaml + "  - " + &line + "\n"
+    })
 }
 
 #[cfg(test)]
@@ -116,7 +133,10 @@ mod tests {
             action: "treated as absent".into(),
             count: 2,
         };
-        let findings = [finding(Some("road 1: '2'"), "max=\"-1\" #{[: \u{e9}"), finding(None, "- x")];
+        let findings = [
+            finding(Some("road 1: '2'"), "max=\"-1\" #{[: \u{e9}"),
+            finding(None, "- x"),
+        ];
         let read: serde_json::Value = serde_saphyr::from_str(&map_yaml(&findings)).unwrap();
         assert_eq!(read, serde_json::json!({ "map_findings": findings }));
         assert_eq!(map_yaml(&[]), "");

@@ -69,7 +69,12 @@ pub struct LidarSweep<'a> {
 
 impl Default for Lidar {
     fn default() -> Self {
-        Self { caster: Caster::new(lidar_pattern()), points: Vec::new(), hits: Vec::new(), labels: Vec::new() }
+        Self {
+            caster: Caster::new(lidar_pattern()),
+            points: Vec::new(),
+            hits: Vec::new(),
+            labels: Vec::new(),
+        }
     }
 }
 
@@ -91,20 +96,31 @@ impl Lidar {
 
     /// The last sweep again, in another weather or with other noise: `sensor` and `bodies` are those of
     /// [`Self::sweep`].
-    pub fn again(&mut self, sensor: &Sweep, bodies: &[Body<'_>], weather: Weather, seed: u64) -> LidarSweep<'_> {
+    pub fn again(
+        &mut self,
+        sensor: &Sweep,
+        bodies: &[Body<'_>],
+        weather: Weather,
+        seed: u64,
+    ) -> LidarSweep<'_> {
         self.points.clear();
         self.labels.clear();
         self.hits.clear();
         self.hits.resize(bodies.len(), 0);
         let mut random = SplitMix64::new(seed);
         let image = self.caster.image();
-        let rows = image.depths_m.chunks_exact(CHANNELS).zip(image.hits.chunks_exact(CHANNELS));
+        let rows = image
+            .depths_m
+            .chunks_exact(CHANNELS)
+            .zip(image.hits.chunks_exact(CHANNELS));
         for (column, (depths, hits)) in self.caster.columns_at_end(sensor).zip(rows) {
             for ((elevation, &depth), &hit) in self.caster.elevations().zip(depths).zip(hits) {
                 if hit == MISS && weather == Weather::Sunny {
                     continue;
                 }
-                let Some((range_m, intensity, hit)) = measure(depth, hit, bodies, weather, &mut random) else {
+                let Some((range_m, intensity, hit)) =
+                    measure(depth, hit, bodies, weather, &mut random)
+                else {
                     continue;
                 };
                 let [x, y, z] = column.point_m(elevation, range_m);
@@ -115,7 +131,11 @@ impl Lidar {
                 }
             }
         }
-        LidarSweep { points: &self.points, hits: &self.hits, labels: &self.labels }
+        LidarSweep {
+            points: &self.points,
+            hits: &self.hits,
+            labels: &self.labels,
+        }
     }
 }
 
@@ -164,9 +184,18 @@ mod tests {
 
     #[test]
     fn a_pole_stands_straight_while_the_sensor_drives_past() {
-        let pole =
-            BodyShape::new(vec![Part::Cylinder { center_m: [0.0, 0.0, 2.0], radius_m: 0.15, half_height_m: 2.0 }], 0.5);
-        let place = |x: f64, y: f64| Body { shape: &pole, motion: Sweep::still(Placement::level([x, y, 0.0], 0.0)) };
+        let pole = BodyShape::new(
+            vec![Part::Cylinder {
+                center_m: [0.0, 0.0, 2.0],
+                radius_m: 0.15,
+                half_height_m: 2.0,
+            }],
+            0.5,
+        );
+        let place = |x: f64, y: f64| Body {
+            shape: &pole,
+            motion: Sweep::still(Placement::level([x, y, 0.0], 0.0)),
+        };
         let bodies = [place(8.0, 6.0), place(-7.0, 5.0), place(3.0, -9.0)];
         // 30 m/s and 60 degrees a second.
         let vehicle = Sweep {
@@ -182,28 +211,55 @@ mod tests {
             let offsets: Vec<f64> = sweep
                 .points
                 .iter()
-                .map(|&[x, y, z, _]| world_from_lidar * nalgebra::Point3::new(x, y, z).cast::<f64>())
-                .filter(|point| point.z > 0.3 && (point.x - center.x).hypot(point.y - center.y) < 1.0)
+                .map(|&[x, y, z, _]| {
+                    world_from_lidar * nalgebra::Point3::new(x, y, z).cast::<f64>()
+                })
+                .filter(|point| {
+                    point.z > 0.3 && (point.x - center.x).hypot(point.y - center.y) < 1.0
+                })
                 .map(|point| (point.x - center.x).hypot(point.y - center.y))
                 .collect();
             assert!(offsets.len() > 30, "{}", offsets.len());
             // On the surface of the pole up to the noise of the range.
-            assert!(offsets.iter().all(|offset| (offset - 0.15).abs() < 0.12), "{offsets:?}");
+            assert!(
+                offsets.iter().all(|offset| (offset - 0.15).abs() < 0.12),
+                "{offsets:?}"
+            );
         }
         assert!(sweep.hits.iter().all(|&hits| hits > 30));
     }
 
     #[test]
     fn noise_and_losses_have_the_stated_shares() {
-        let shell = BodyShape::new(vec![Part::Box(Bounds::centered([0.0, 0.0, 0.0], [0.5, 200.0, 200.0]))], 0.5);
-        let wall = |x: f64| Body { shape: &shell, motion: Sweep::still(Placement::level([x, 0.0, 0.0], 0.0)) };
+        let shell = BodyShape::new(
+            vec![Part::Box(Bounds::centered(
+                [0.0, 0.0, 0.0],
+                [0.5, 200.0, 200.0],
+            ))],
+            0.5,
+        );
+        let wall = |x: f64| Body {
+            shape: &shell,
+            motion: Sweep::still(Placement::level([x, 0.0, 0.0], 0.0)),
+        };
         let sensor = Sweep::still(Placement::level([0.0; 3], 0.0));
         let mut lidar = Lidar::default();
         let near = [wall(20.5)];
         let sweep = lidar.sweep(&sensor, &Plane(-500.0), &near, Weather::Sunny, 1);
-        let ahead: Vec<_> = sweep.points.iter().filter(|p| p[1].abs() < 8.0 && p[0] > 0.0).collect();
-        let ranges: Vec<f64> = ahead.iter().map(|p| f64::from(p[0] / (p[0].hypot(p[1]).hypot(p[2])))).collect();
-        let errors: Vec<f64> = ahead.iter().zip(&ranges).map(|(p, cos)| (f64::from(p[0]) - 20.0) / cos).collect();
+        let ahead: Vec<_> = sweep
+            .points
+            .iter()
+            .filter(|p| p[1].abs() < 8.0 && p[0] > 0.0)
+            .collect();
+        let ranges: Vec<f64> = ahead
+            .iter()
+            .map(|p| f64::from(p[0] / (p[0].hypot(p[1]).hypot(p[2]))))
+            .collect();
+        let errors: Vec<f64> = ahead
+            .iter()
+            .zip(&ranges)
+            .map(|(p, cos)| (f64::from(p[0]) - 20.0) / cos)
+            .collect();
         let deviation = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
         assert!((deviation - NOISE_M).abs() < 0.002, "{deviation}");
         // Nearly all returns in this fan are nearer than 89 m, where only the general loss applies.
@@ -216,9 +272,18 @@ mod tests {
     fn the_same_seed_gives_the_same_points() {
         let mut lidar = Lidar::default();
         let sensor = Sweep::still(Placement::level([0.0, 0.0, 1.95], 0.0));
-        let once = lidar.sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5).points.to_vec();
-        let twice = lidar.sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5).points.to_vec();
-        let other = lidar.sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 6).points.to_vec();
+        let once = lidar
+            .sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5)
+            .points
+            .to_vec();
+        let twice = lidar
+            .sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5)
+            .points
+            .to_vec();
+        let other = lidar
+            .sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 6)
+            .points
+            .to_vec();
         assert_eq!(once, twice);
         assert_ne!(once, other);
     }

@@ -108,7 +108,11 @@ impl SynthOptions {
     /// Scenarios that will be written.
     #[must_use]
     pub fn scenarios(&self) -> usize {
-        if self.subset == Subset::V2vdet { self.scenes } else { self.traversals }
+        if self.subset == Subset::V2vdet {
+            self.scenes
+        } else {
+            self.traversals
+        }
     }
 
     /// Steps of the simulation from one stored frame to the next.
@@ -123,13 +127,36 @@ impl SynthOptions {
     /// [`SynthError::Option`] with the first invalid option.
     pub fn validate(&self) -> Result<(), SynthError> {
         let check = |is_good: bool, option: &'static str, value: String, expected: &'static str| {
-            if is_good { Ok(()) } else { Err(SynthError::Option { option, value, expected }) }
+            if is_good {
+                Ok(())
+            } else {
+                Err(SynthError::Option {
+                    option,
+                    value,
+                    expected,
+                })
+            }
         };
         let steps = self.period_s / STEP_S;
         let is_multiple = (1.0..=1e4).contains(&steps) && (steps - steps.round()).abs() < 1e-6;
-        check(is_multiple, "--period", self.period_s.to_string(), "expected a multiple of 0.05 s up to 500 s")?;
-        check((1..=100_000).contains(&self.frames), "--frames", self.frames.to_string(), "expected 1 to 100000")?;
-        check((1..=10_000).contains(&self.scenes), "--scenes", self.scenes.to_string(), "expected 1 to 10000")?;
+        check(
+            is_multiple,
+            "--period",
+            self.period_s.to_string(),
+            "expected a multiple of 0.05 s up to 500 s",
+        )?;
+        check(
+            (1..=100_000).contains(&self.frames),
+            "--frames",
+            self.frames.to_string(),
+            "expected 1 to 100000",
+        )?;
+        check(
+            (1..=10_000).contains(&self.scenes),
+            "--scenes",
+            self.scenes.to_string(),
+            "expected 1 to 10000",
+        )?;
         check(
             (1..=1000).contains(&self.traversals),
             "--traversals",
@@ -137,8 +164,16 @@ impl SynthOptions {
             "expected 1 to 1000",
         )?;
         let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
-        let have_names = self.copies.iter().all(|weather| weather.variant().is_some());
-        check(have_names, "--copies", copies.join(","), "expected fog, snow or both")?;
+        let have_names = self
+            .copies
+            .iter()
+            .all(|weather| weather.variant().is_some());
+        check(
+            have_names,
+            "--copies",
+            copies.join(","),
+            "expected fog, snow or both",
+        )?;
         let have_place = self.copies.is_empty() || self.layout == SceneLayout::Opv2v;
         check(
             have_place,
@@ -146,19 +181,52 @@ impl SynthOptions {
             copies.join(","),
             "expected none, as the layout opv2v alone has copies of sweeps",
         )?;
-        let images = self.cameras.map_or("none".to_owned(), |size| size.to_string());
-        let are_small = self.cameras.is_none_or(|size| size.edges_px().iter().all(|edge| (16..=4096).contains(edge)));
-        check(are_small, "--cameras", images.clone(), "expected 16 to 4096 pixels along each edge")?;
+        let images = self
+            .cameras
+            .map_or("none".to_owned(), |size| size.to_string());
+        let are_small = self.cameras.is_none_or(|size| {
+            size.edges_px()
+                .iter()
+                .all(|edge| (16..=4096).contains(edge))
+        });
+        check(
+            are_small,
+            "--cameras",
+            images.clone(),
+            "expected 16 to 4096 pixels along each edge",
+        )?;
         let have_place = self.cameras.is_none() || self.layout == SceneLayout::Opv2v;
-        check(have_place, "--cameras", images, "expected none, as images are written in the layout opv2v alone")?;
+        check(
+            have_place,
+            "--cameras",
+            images,
+            "expected none, as images are written in the layout opv2v alone",
+        )?;
         let agents = format!("{}-{}", self.agents.start(), self.agents.end());
-        let is_range = *self.agents.start() >= 1 && self.agents.start() <= self.agents.end() && *self.agents.end() <= 7;
-        check(is_range, "--agents", agents.clone(), "expected a number or a range within 1-7")?;
+        let is_range = *self.agents.start() >= 1
+            && self.agents.start() <= self.agents.end()
+            && *self.agents.end() <= 7;
+        check(
+            is_range,
+            "--agents",
+            agents.clone(),
+            "expected a number or a range within 1-7",
+        )?;
         if !self.layout.needs_two_agents() {
             return Ok(());
         }
         let subset = self.subset.name().to_owned();
-        check(self.subset == Subset::V2vdet, "--subset", subset, "expected v2vdet, as the layout needs two agents")?;
-        check(*self.agents.start() >= 2, "--agents", agents, "expected 2 or more, as the layout needs two agents")
+        check(
+            self.subset == Subset::V2vdet,
+            "--subset",
+            subset,
+            "expected v2vdet, as the layout needs two agents",
+        )?;
+        check(
+            *self.agents.start() >= 2,
+            "--agents",
+            agents,
+            "expected 2 or more, as the layout needs two agents",
+        )
     }
 }

@@ -30,43 +30,84 @@ pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<Pa
         if !random.chance(occupancy) {
             continue;
         }
-        let Some(vehicle) = fitting(spot, &mut random) else { continue };
+        let Some(vehicle) = fitting(spot, &mut random) else {
+            continue;
+        };
         let placement = place(spot, &vehicle, &mut random);
         let rectangle = Rectangle::new(&placement, &vehicle.size_m);
         let touches = |other: &ParkedVehicle| {
-            rectangle.grown(0.1).overlaps(&Rectangle::new(&other.placement, &other.vehicle.size_m))
+            rectangle
+                .grown(0.1)
+                .overlaps(&Rectangle::new(&other.placement, &other.vehicle.size_m))
         };
         if stands_on_a_lane(map_model, lanes, &rectangle) || parked.iter().any(touches) {
             continue;
         }
-        parked.push(ParkedVehicle { id: FIRST_ID + number as i64, vehicle, placement });
+        parked.push(ParkedVehicle {
+            id: FIRST_ID + number as i64,
+            vehicle,
+            placement,
+        });
     }
     parked
 }
 
 fn fitting(spot: &ParkingSpot, random: &mut SplitMix64) -> Option<Vehicle> {
-    let fits = |vehicle: &Vehicle| vehicle.size_m[0] + 0.3 < spot.length_m && vehicle.size_m[1] < spot.width_m;
+    let fits = |vehicle: &Vehicle| {
+        vehicle.size_m[0] + 0.3 < spot.length_m && vehicle.size_m[1] < spot.width_m
+    };
     (0..8).map(|_| Vehicle::random_parked(random)).find(fits)
 }
 
 fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Placement {
     let along = (spot.length_m - vehicle.size_m[0]) * 0.4 * random.between(-1.0, 1.0);
     let aside = (spot.width_m - vehicle.size_m[1]).min(0.4) * 0.5 * random.between(-1.0, 1.0);
-    let reversed = if random.chance(0.15) { std::f64::consts::PI } else { 0.0 };
+    let reversed = if random.chance(0.15) {
+        std::f64::consts::PI
+    } else {
+        0.0
+    };
     let yaw = spot.yaw_rad + random.between(-0.03, 0.03);
     let (sin, cos) = spot.yaw_rad.sin_cos();
     let [x, y, z] = spot.center_m;
-    let position_m = [x + along * cos - aside * sin, y + along * sin + aside * cos, z + aside * spot.roll_rad.tan()];
-    let roll_rad = if reversed > 0.0 { -spot.roll_rad } else { spot.roll_rad };
-    Placement { roll_rad, ..Placement::level(position_m, wrapped(yaw + reversed)) }
+    let position_m = [
+        x + along * cos - aside * sin,
+        y + along * sin + aside * cos,
+        z + aside * spot.roll_rad.tan(),
+    ];
+    let roll_rad = if reversed > 0.0 {
+        -spot.roll_rad
+    } else {
+        spot.roll_rad
+    };
+    Placement {
+        roll_rad,
+        ..Placement::level(position_m, wrapped(yaw + reversed))
+    }
 }
 
 fn stands_on_a_lane(map_model: &MapModel, lanes: &LaneIndex, rectangle: &Rectangle) -> bool {
     let ([x, y], [c, s], [length, width]) = (rectangle.center_m, rectangle.axis, rectangle.half_m);
-    let outline = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0), (0.0, -1.0), (0.0, 1.0), (0.0, 0.0)];
+    let outline = [
+        (-1.0, -1.0),
+        (-1.0, 1.0),
+        (1.0, -1.0),
+        (1.0, 1.0),
+        (0.0, -1.0),
+        (0.0, 1.0),
+        (0.0, 0.0),
+    ];
     outline.iter().any(|&(along, aside)| {
         let (dx, dy) = (along * length, aside * width);
         let point = [x + dx * c - dy * s, y + dx * s + dy * c];
-        lanes.nearest(&map_model.lanes, point, LANE_ROOM_M, None, Some(rectangle.z_m)).is_some()
+        lanes
+            .nearest(
+                &map_model.lanes,
+                point,
+                LANE_ROOM_M,
+                None,
+                Some(rectangle.z_m),
+            )
+            .is_some()
     })
 }

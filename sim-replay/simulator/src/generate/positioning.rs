@@ -39,7 +39,11 @@ pub(crate) struct Fix {
 impl Fix {
     /// GNSS latitude and longitude in degrees (the map's origin is at 0, 0; north is +y) and altitude in metres.
     pub(crate) fn geodetic(&self) -> [f64; 3] {
-        [self.gnss_m[1] / METRES_PER_DEG, self.gnss_m[0] / METRES_PER_DEG, self.gnss_m[2]]
+        [
+            self.gnss_m[1] / METRES_PER_DEG,
+            self.gnss_m[0] / METRES_PER_DEG,
+            self.gnss_m[2],
+        ]
     }
 }
 
@@ -55,7 +59,12 @@ pub(crate) struct Positioning {
 impl Positioning {
     pub(crate) fn new(seed: u64) -> Self {
         let gyroscope = Gyroscope::new(SplitMix64::derived(seed, &[1]));
-        Self { random: SplitMix64::new(seed), gyroscope, state: None, last_yaw_rad: None }
+        Self {
+            random: SplitMix64::new(seed),
+            gyroscope,
+            state: None,
+            last_yaw_rad: None,
+        }
     }
 
     /// The next fix of a vehicle at the end of `motion`, one step of the traffic, and `elapsed_s` after the last fix.
@@ -63,8 +72,11 @@ impl Positioning {
         let truth = &motion.end;
         let planar_m = LATITUDE_DEG * METRES_PER_DEG;
         let deviations = [planar_m, planar_m, ALTITUDE_M];
-        let gnss_m = std::array::from_fn(|axis| truth.position_m[axis] + deviations[axis] * self.random.normal());
-        let heading_rad = wrapped(truth.yaw_rad + (HEADING_DEG * self.random.normal()).to_radians());
+        let gnss_m = std::array::from_fn(|axis| {
+            truth.position_m[axis] + deviations[axis] * self.random.normal()
+        });
+        let heading_rad =
+            wrapped(truth.yaw_rad + (HEADING_DEG * self.random.normal()).to_radians());
         let speed_mps = speed_mps + SPEED_MPS * self.random.normal();
         let true_radps = match self.last_yaw_rad.replace(truth.yaw_rad) {
             Some(last_rad) => wrapped(truth.yaw_rad - last_rad) / elapsed_s,
@@ -78,7 +90,8 @@ impl Positioning {
                 let (sin, cos) = heading_rad.sin_cos();
                 let moved = speed_mps * elapsed_s;
                 // A bend driven as a chord, in addition to the noise of the speed.
-                let drift = (SPEED_MPS * elapsed_s).powi(2) + (0.5 * true_radps * elapsed_s * moved).powi(2);
+                let drift = (SPEED_MPS * elapsed_s).powi(2)
+                    + (0.5 * true_radps * elapsed_s * moved).powi(2);
                 let predicted = [position[0] + moved * cos, position[1] + moved * sin];
                 let gain = (variance + drift) / (variance + drift + measured);
                 let mix = |axis: usize| predicted[axis] + gain * (gnss_m[axis] - predicted[axis]);
@@ -88,7 +101,13 @@ impl Positioning {
         self.state = Some((position, variance));
         let estimate = Placement::level([position[0], position[1], gnss_m[2]], heading_rad);
         let yaw_rate_radps = self.gyroscope.measured(true_radps);
-        Fix { gnss_m, heading_rad, speed_mps, yaw_rate_radps, estimate }
+        Fix {
+            gnss_m,
+            heading_rad,
+            speed_mps,
+            yaw_rate_radps,
+            estimate,
+        }
     }
 }
 
@@ -119,9 +138,15 @@ mod tests {
     fn on_a_circle(time_s: f64) -> Sweep {
         let at = |time_s: f64| {
             let angle = time_s * 10.0 / 60.0;
-            Placement::level([60.0 * angle.sin(), -60.0 * angle.cos(), 0.0], wrapped(angle))
+            Placement::level(
+                [60.0 * angle.sin(), -60.0 * angle.cos(), 0.0],
+                wrapped(angle),
+            )
         };
-        Sweep { start: at(time_s - STEP_S), end: at(time_s) }
+        Sweep {
+            start: at(time_s - STEP_S),
+            end: at(time_s),
+        }
     }
 
     #[test]
@@ -132,12 +157,18 @@ mod tests {
             let motion = on_a_circle(f64::from(step) * 0.1);
             let (truth, fix) = (motion.end, positioning.fix(&motion, 10.0, 0.1));
             if step > 20 {
-                let off = |x: f64, y: f64| (x - truth.position_m.x).powi(2) + (y - truth.position_m.y).powi(2);
+                let off = |x: f64, y: f64| {
+                    (x - truth.position_m.x).powi(2) + (y - truth.position_m.y).powi(2)
+                };
                 raw += off(fix.gnss_m[0], fix.gnss_m[1]);
                 filtered += off(fix.estimate.position_m.x, fix.estimate.position_m.y);
             }
         }
-        assert!((raw / 1979.0 / 2.0 - 0.111f64.powi(2)).abs() < 0.002, "{}", raw / 1979.0);
+        assert!(
+            (raw / 1979.0 / 2.0 - 0.111f64.powi(2)).abs() < 0.002,
+            "{}",
+            raw / 1979.0
+        );
         assert!(filtered < 0.6 * raw, "{filtered} {raw}");
     }
     #[test]
@@ -146,23 +177,53 @@ mod tests {
         let errors = |seed: u64| {
             let mut positioning = Positioning::new(seed);
             let error_degps: Vec<f64> = (0..2000)
-                .map(|step| positioning.fix(&on_a_circle(f64::from(step) * 0.1), 10.0, 0.1).yaw_rate_radps - 1.0 / 6.0)
+                .map(|step| {
+                    positioning
+                        .fix(&on_a_circle(f64::from(step) * 0.1), 10.0, 0.1)
+                        .yaw_rate_radps
+                        - 1.0 / 6.0
+                })
                 .map(f64::to_degrees)
                 .collect();
             let mean = error_degps.iter().sum::<f64>() / 2000.0;
-            (mean, (error_degps.iter().map(|error| (error - mean).powi(2)).sum::<f64>() / 2000.0).sqrt())
+            (
+                mean,
+                (error_degps
+                    .iter()
+                    .map(|error| (error - mean).powi(2))
+                    .sum::<f64>()
+                    / 2000.0)
+                    .sqrt(),
+            )
         };
         let drives: Vec<(f64, f64)> = (0..100).map(errors).collect();
-        assert!(drives.iter().all(|(_, noise)| (noise - GYROSCOPE_NOISE_DEGPS).abs() < 0.01), "from the first fix on");
+        assert!(
+            drives
+                .iter()
+                .all(|(_, noise)| (noise - GYROSCOPE_NOISE_DEGPS).abs() < 0.01),
+            "from the first fix on"
+        );
         let bias_degps = (drives.iter().map(|(bias, _)| bias * bias).sum::<f64>() / 100.0).sqrt();
-        assert!((bias_degps - GYROSCOPE_BIAS_DEGPS).abs() < 0.02, "{bias_degps}");
+        assert!(
+            (bias_degps - GYROSCOPE_BIAS_DEGPS).abs() < 0.02,
+            "{bias_degps}"
+        );
     }
 
     #[test]
     fn a_vehicle_that_stands_has_a_yaw_rate_of_noise_and_bias_alone() {
         let mut positioning = Positioning::new(9);
         let still = Sweep::still(Placement::level([5.0, 6.0, 0.0], 3.0));
-        let rates = (0..50).map(|_| positioning.fix(&still, 0.0, 0.1).yaw_rate_radps.to_degrees());
-        assert!(rates.into_iter().all(|rate| rate != 0.0 && rate.abs() < 1.0));
+        let rates = (0..50).map(|_| {
+            positioning
+                .fix(&still, 0.0, 0.1)
+                .yaw_rate_radps
+                .to_degrees()
+        });
+        assert!(
+            rates
+                .into_iter()
+                .all(|rate| rate != 0.0 && rate.abs() < 1.0)
+        );
     }
 }

@@ -41,7 +41,10 @@ impl Default for Radar {
             range_m: 150.0,
             rolling: false,
         };
-        Self { caster: Caster::new(pattern), points: Vec::new() }
+        Self {
+            caster: Caster::new(pattern),
+            points: Vec::new(),
+        }
     }
 }
 
@@ -50,7 +53,10 @@ impl Radar {
     /// (growing distance is positive), in the (right-handed) frame of a sensor at `reference_m` on the same vehicle.
     ///
     /// `half_length_m` is the vehicle's; `sweep_s` the time that the motions take.
-    #[allow(clippy::too_many_arguments, reason = "two sensors' frames and one scene; a struct would hide none of it")]
+    #[allow(
+        clippy::too_many_arguments,
+        reason = "two sensors' frames and one scene; a struct would hide none of it"
+    )]
     pub fn returns(
         &mut self,
         vehicle: &Sweep,
@@ -82,14 +88,22 @@ impl Radar {
                     GROUND => Vector3::zeros(),
                     body => velocity_mps(&bodies[body as usize].motion, sweep_s),
                 };
-                let exact = Vector3::from(column.point_m(elevation, image.depths_m[ray])).cast::<f64>();
+                let exact =
+                    Vector3::from(column.point_m(elevation, image.depths_m[ray])).cast::<f64>();
                 let direction = exact / exact.norm();
                 let radial = (rotation.transpose() * (velocity - own_velocity)).dot(&direction);
                 let mut noise = |deviation: f64| deviation * random.normal();
-                let aside = Vector3::new(noise(1.0), noise(1.0), noise(1.0)) * DIRECTION_NOISE_RAD * exact.norm();
+                let aside = Vector3::new(noise(1.0), noise(1.0), noise(1.0))
+                    * DIRECTION_NOISE_RAD
+                    * exact.norm();
                 let point = exact + direction * noise(RANGE_NOISE_M) + aside + shift;
                 let radial = radial + noise(VELOCITY_NOISE_MPS);
-                self.points.push([point.x as f32, point.y as f32, point.z as f32, radial as f32]);
+                self.points.push([
+                    point.x as f32,
+                    point.y as f32,
+                    point.z as f32,
+                    radial as f32,
+                ]);
             }
         }
         &self.points
@@ -119,21 +133,50 @@ mod tests {
 
     #[test]
     fn velocities_are_relative_and_along_the_ray() {
-        let block = BodyShape::new(vec![Part::Box(Bounds::centered([0.0, 0.0, 1.0], [1.0, 1.0, 1.0]))], 0.5);
-        let drive =
-            |from: [f64; 3], to: [f64; 3]| Sweep { start: Placement::level(from, 0.0), end: Placement::level(to, 0.0) };
+        let block = BodyShape::new(
+            vec![Part::Box(Bounds::centered(
+                [0.0, 0.0, 1.0],
+                [1.0, 1.0, 1.0],
+            ))],
+            0.5,
+        );
+        let drive = |from: [f64; 3], to: [f64; 3]| Sweep {
+            start: Placement::level(from, 0.0),
+            end: Placement::level(to, 0.0),
+        };
         let own = drive([-0.5, 0.0, 0.0], [0.0, 0.0, 0.0]);
         // One comes towards us at 5 m/s, one stands beside the road.
         let bodies = [
-            Body { shape: &block, motion: drive([40.25, 0.0, 0.0], [40.0, 0.0, 0.0]) },
-            Body { shape: &block, motion: Sweep::still(Placement::level([20.0, 20.0, 0.0], 0.0)) },
+            Body {
+                shape: &block,
+                motion: drive([40.25, 0.0, 0.0], [40.0, 0.0, 0.0]),
+            },
+            Body {
+                shape: &block,
+                motion: Sweep::still(Placement::level([20.0, 20.0, 0.0], 0.0)),
+            },
         ];
         let mut radar = Radar::default();
-        let points = radar.returns(&own, 2.2, [-0.5, 0.0, 1.95], 0.05, &Plane(-500.0), &bodies, 1);
+        let points = radar.returns(
+            &own,
+            2.2,
+            [-0.5, 0.0, 1.95],
+            0.05,
+            &Plane(-500.0),
+            &bodies,
+            1,
+        );
         assert!(points.len() > 8);
         for point in points {
-            let expected = if point[1].abs() < 3.0 { -15.0 } else { -10.0 * 17.75 / 17.75f64.hypot(20.0) };
-            assert!((f64::from(point[3]) - expected).abs() < 0.8, "{point:?} {expected}");
+            let expected = if point[1].abs() < 3.0 {
+                -15.0
+            } else {
+                -10.0 * 17.75 / 17.75f64.hypot(20.0)
+            };
+            assert!(
+                (f64::from(point[3]) - expected).abs() < 0.8,
+                "{point:?} {expected}"
+            );
         }
         let ahead = points.iter().find(|point| point[1].abs() < 3.0).unwrap();
         // The face at 39 m, seen from a LiDAR half a metre behind the vehicle's origin.

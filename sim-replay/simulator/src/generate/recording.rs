@@ -67,24 +67,44 @@ pub(crate) struct Moving {
 impl RecordedFrame {
     /// The motion of a vehicle that is present.
     pub(crate) fn of(&self, vehicle: usize) -> Option<&Moving> {
-        let place = self.moving.binary_search_by_key(&vehicle, |moving| moving.vehicle).ok()?;
+        let place = self
+            .moving
+            .binary_search_by_key(&vehicle, |moving| moving.vehicle)
+            .ok()?;
         Some(&self.moving[place])
     }
 }
 
 /// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
 pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
-    let parked = park(world.map_model, &world.lane_index, derive_seed(spec.seed, &[1]));
+    let parked = park(
+        world.map_model,
+        &world.lane_index,
+        derive_seed(spec.seed, &[1]),
+    );
     let mut best: Option<(f64, Recording)> = None;
     for attempt in 0..ATTEMPTS {
-        let (vehicles, frames) = simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
+        let (vehicles, frames) =
+            simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
         let mut random = SplitMix64::derived(spec.seed, &[3, attempt]);
         let (together, agents) = choose_agents(&vehicles, &frames, spec.agents, &mut random);
         // A drive that ends in a permanent jam shows one place again and again.
         let standing_s = longest_stand_s(&frames);
-        let quality = if standing_s > LONGEST_STAND_S { together.min(0.0) - standing_s } else { together };
+        let quality = if standing_s > LONGEST_STAND_S {
+            together.min(0.0) - standing_s
+        } else {
+            together
+        };
         if best.as_ref().is_none_or(|(least, _)| quality > *least) {
-            best = Some((quality, Recording { vehicles, parked: Vec::new(), frames, agents }));
+            best = Some((
+                quality,
+                Recording {
+                    vehicles,
+                    parked: Vec::new(),
+                    frames,
+                    agents,
+                },
+            ));
         }
         if quality >= TOGETHER {
             break;
@@ -99,7 +119,10 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
             range_m: COMM_RANGE_M,
         });
     }
-    Ok(Recording { parked, ..recording })
+    Ok(Recording {
+        parked,
+        ..recording
+    })
 }
 
 fn simulate(
@@ -113,15 +136,23 @@ fn simulate(
     if spawns.is_empty() {
         return Err(SynthError::NoRoad(world.map_model.name.clone()));
     }
-    let footprints: Vec<Rectangle> =
-        parked.iter().map(|parked| Rectangle::new(&parked.placement, &parked.vehicle.size_m)).collect();
+    let footprints: Vec<Rectangle> = parked
+        .iter()
+        .map(|parked| Rectangle::new(&parked.placement, &parked.vehicle.size_m))
+        .collect();
     let options = TrafficOptions {
         vehicles_per_km: random.between(7.0, 21.0),
         radius_m: TRAFFIC_RADIUS_M,
         focus_explores: spec.explores,
     };
     let start = spawns[random.below(spawns.len())];
-    let mut traffic = Traffic::new(&world.roads, &footprints, options, start, derive_seed(seed, &[1]));
+    let mut traffic = Traffic::new(
+        &world.roads,
+        &footprints,
+        options,
+        start,
+        derive_seed(seed, &[1]),
+    );
     // Until gaps and speeds are those of traffic rather than of the random initial state.
     let settling_steps = (random.between(6.0, 12.0) / STEP_S) as usize;
     (0..settling_steps).for_each(|_| traffic.step());
@@ -130,12 +161,26 @@ fn simulate(
         let steps = if frame == 0 { 1 } else { spec.steps_per_frame };
         (0..steps).for_each(|_| traffic.step());
         let tick = FIRST_TICK + (frame * spec.steps_per_frame) as u64;
-        let present = traffic.cars.iter().enumerate().filter(|(_, car)| car.is_present);
-        let moving =
-            present.map(|(vehicle, car)| Moving { vehicle, id: car.id, motion: car.motion, speed_mps: car.speed_mps });
-        frames.push(RecordedFrame { tick, moving: moving.collect() });
+        let present = traffic
+            .cars
+            .iter()
+            .enumerate()
+            .filter(|(_, car)| car.is_present);
+        let moving = present.map(|(vehicle, car)| Moving {
+            vehicle,
+            id: car.id,
+            motion: car.motion,
+            speed_mps: car.speed_mps,
+        });
+        frames.push(RecordedFrame {
+            tick,
+            moving: moving.collect(),
+        });
     }
-    Ok((traffic.cars.into_iter().map(|car| car.vehicle).collect(), frames))
+    Ok((
+        traffic.cars.into_iter().map(|car| car.vehicle).collect(),
+        frames,
+    ))
 }
 
 /// Chooses the ego's companions at random among those that stay near it. Also returns the smallest share of frames in
@@ -147,7 +192,10 @@ fn choose_agents(
     random: &mut SplitMix64,
 ) -> (f64, Vec<usize>) {
     let carries_a_lidar = |vehicle: usize| {
-        matches!(vehicles[vehicle].kind, VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv)
+        matches!(
+            vehicles[vehicle].kind,
+            VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv
+        )
     };
     let mut together: Vec<(f64, usize)> = (1..vehicles.len())
         .filter(|&vehicle| carries_a_lidar(vehicle))
@@ -163,17 +211,24 @@ fn choose_agents(
     } else {
         together.iter().map(|(share, _)| *share).fold(1.0, f64::min)
     };
-    let mut agents: Vec<usize> = std::iter::once(0).chain(together.into_iter().map(|(_, vehicle)| vehicle)).collect();
+    let mut agents: Vec<usize> = std::iter::once(0)
+        .chain(together.into_iter().map(|(_, vehicle)| vehicle))
+        .collect();
     agents.sort_unstable();
     (quality, agents)
 }
 
 /// Share of the frames in which a vehicle is near the ego; 0 for one that was replaced by another on the way.
 fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
-    let id = frames.first().and_then(|frame| frame.of(vehicle)).map(|moving| moving.id);
+    let id = frames
+        .first()
+        .and_then(|frame| frame.of(vehicle))
+        .map(|moving| moving.id);
     let mut near = 0;
     for frame in frames {
-        let (Some(ego), Some(other)) = (frame.of(0), frame.of(vehicle)) else { return 0.0 };
+        let (Some(ego), Some(other)) = (frame.of(0), frame.of(vehicle)) else {
+            return 0.0;
+        };
         if Some(other.id) != id {
             return 0.0;
         }
@@ -186,7 +241,10 @@ fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
 fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
     let mut since: Option<(&Moving, u64)> = None;
     let mut longest = 0;
-    for (frame, own) in frames.iter().filter_map(|frame| Some((frame, frame.of(0)?))) {
+    for (frame, own) in frames
+        .iter()
+        .filter_map(|frame| Some((frame, frame.of(0)?)))
+    {
         match since {
             Some((before, tick)) if distance_m(&before.motion.end, &own.motion.end) < 0.1 => {
                 longest = longest.max(frame.tick - tick);
@@ -209,10 +267,22 @@ mod tests {
     fn a_stand_is_as_long_as_the_place_is_the_same() {
         let frame = |tick: u64, x_m: f64| {
             let motion = Sweep::still(Placement::level([x_m, 0.0, 0.0], 0.0));
-            RecordedFrame { tick, moving: vec![Moving { vehicle: 0, id: 1000, motion, speed_mps: 0.0 }] }
+            RecordedFrame {
+                tick,
+                moving: vec![Moving {
+                    vehicle: 0,
+                    id: 1000,
+                    motion,
+                    speed_mps: 0.0,
+                }],
+            }
         };
         let places = [0.0, 5.0, 5.0, 5.05, 5.0, 9.0, 9.0];
-        let frames: Vec<_> = places.iter().zip(0..).map(|(&x_m, k)| frame(60 + 20 * k, x_m)).collect();
+        let frames: Vec<_> = places
+            .iter()
+            .zip(0..)
+            .map(|(&x_m, k)| frame(60 + 20 * k, x_m))
+            .collect();
         assert!((longest_stand_s(&frames) - 3.0).abs() < 1e-9);
         assert_eq!(longest_stand_s(&[]), 0.0);
     }

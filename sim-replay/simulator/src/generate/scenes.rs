@@ -9,7 +9,9 @@ use protocol::CavId;
 
 use super::data_protocol::protocol_yaml;
 use super::error::SynthError;
-use super::layout::{Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, make_folder};
+use super::layout::{
+    Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, make_folder,
+};
 use super::options::{Subset, SynthOptions};
 use super::positioning::{Fix, Positioning};
 use super::recording::{RecordedFrame, Recording, SceneSpec, record};
@@ -55,13 +57,19 @@ impl Summary {
 ///
 /// # Errors
 /// [`SynthError`] if an option is invalid, the map cannot be built or a file cannot be written.
-pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
+pub fn generate(
+    options: &SynthOptions,
+    progress: &(dyn Fn(u64) + Sync),
+) -> Result<Summary, SynthError> {
     options.validate()?;
     check_folder(&options.out, options.force)?;
     let unfinished = Unfinished::mark(&options.out)?;
     let mut writer = options.layout.writer(&options.out);
     let omitted = Omissions::default();
-    let mut total = Summary { layout: options.layout, ..Summary::default() };
+    let mut total = Summary {
+        layout: options.layout,
+        ..Summary::default()
+    };
     for (place, source) in sources(options).iter().enumerate() {
         let map_model = map::build(source, options.map_seed)?;
         total.findings.extend(map_model.findings.iter().cloned());
@@ -70,7 +78,11 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
         for number in (place..options.scenarios()).step_by(places) {
             let before = total.scenarios as u64 * 1000;
             let spec = spec(options, &map_model, number);
-            let scene = Scene { options, world: &world, spec };
+            let scene = Scene {
+                options,
+                world: &world,
+                spec,
+            };
             let progress = |thousandths| progress(before + thousandths);
             total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
         }
@@ -98,7 +110,12 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
     let is_detection = options.subset == Subset::V2vdet;
     let choice = (derive_seed(seed, &[0]) % (high - low + 1) as u64) as usize;
     SceneSpec {
-        name: format!("{}_{}_s{}_{number:04}", options.subset.name(), map_model.name.to_lowercase(), options.seed),
+        name: format!(
+            "{}_{}_s{}_{number:04}",
+            options.subset.name(),
+            map_model.name.to_lowercase(),
+            options.seed
+        ),
         seed,
         agents: if is_detection { low + choice } else { 1 },
         frames: options.frames,
@@ -111,7 +128,10 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
 pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), SynthError> {
     make_folder(out)?;
     let entries = fs::read_dir(out);
-    let mut entries = entries.map_err(|source| SynthError::Write { path: out.to_owned(), source })?;
+    let mut entries = entries.map_err(|source| SynthError::Write {
+        path: out.to_owned(),
+        source,
+    })?;
     if entries.next().is_some() && !force {
         return Err(SynthError::NotEmpty(out.to_owned()));
     }
@@ -154,7 +174,13 @@ impl Scene<'_, '_> {
     fn header(&self, recording: &Recording, agents: &[Agent]) -> SceneHeader {
         SceneHeader {
             name: self.spec.name.clone(),
-            agents: agents.iter().map(|agent| SceneAgent { id: agent.cav.clone(), is_roadside: false }).collect(),
+            agents: agents
+                .iter()
+                .map(|agent| SceneAgent {
+                    id: agent.cav.clone(),
+                    is_roadside: false,
+                })
+                .collect(),
             capture_nanos: recording.frames.iter().map(capture_nanos).collect(),
             tick_nanos: STEP_NANOS,
             origin: protocol_yaml(self.options, &self.spec, self.world.map_model),
@@ -165,15 +191,27 @@ impl Scene<'_, '_> {
         let mut agents = Vec::new();
         for &vehicle in &recording.agents {
             // Agents are chosen among those that are present from the first frame to the last.
-            let id = recording.frames[0].of(vehicle).map_or(0, |moving| moving.id);
+            let id = recording.frames[0]
+                .of(vehicle)
+                .map_or(0, |moving| moving.id);
             let mut positioning = Positioning::new(derive_seed(self.spec.seed, &[4, id as u64]));
-            let moving = recording.frames.iter().filter_map(|frame| frame.of(vehicle));
-            let fixes = moving.map(|moving| positioning.fix(&moving.motion, moving.speed_mps, self.options.period_s));
+            let moving = recording
+                .frames
+                .iter()
+                .filter_map(|frame| frame.of(vehicle));
+            let fixes = moving.map(|moving| {
+                positioning.fix(&moving.motion, moving.speed_mps, self.options.period_s)
+            });
             let cav = CavId::new(&id.to_string()).map_err(|error| SynthError::Layout {
                 layout: self.options.layout.name(),
                 reason: error.to_string(),
             })?;
-            agents.push(Agent { vehicle, id, cav, fixes: fixes.collect() });
+            agents.push(Agent {
+                vehicle,
+                id,
+                cav,
+                fixes: fixes.collect(),
+            });
         }
         Ok(agents)
     }
@@ -199,7 +237,9 @@ impl Scene<'_, '_> {
                 }
                 let moment = self.moment(recording, agents, index, &mut bench);
                 let result = writer.write(&moment, omitted).map(|()| counts(&moment));
-                let mut total = total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                let mut total = total
+                    .lock()
+                    .unwrap_or_else(std::sync::PoisonError::into_inner);
                 match (&mut *total, result) {
                     (Ok(total), Ok(summary)) => total.add(&summary),
                     (Ok(_), Err(error)) => *total = Err(error),
@@ -215,7 +255,9 @@ impl Scene<'_, '_> {
             }
             work();
         });
-        total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
+        total
+            .into_inner()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 }
 
@@ -225,7 +267,8 @@ pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
 }
 
 fn counts(moment: &Moment) -> Summary {
-    let sum = |count: fn(&Frame) -> usize| moment.frames.iter().map(|agent| count(&agent.frame)).sum();
+    let sum =
+        |count: fn(&Frame) -> usize| moment.frames.iter().map(|agent| count(&agent.frame)).sum();
     Summary {
         agent_frames: moment.frames.len(),
         points: sum(|frame| frame.points.len()),

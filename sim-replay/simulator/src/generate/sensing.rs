@@ -39,7 +39,11 @@ impl<'w> Bench<'w> {
     /// Sensors in a world, with cameras of this image size.
     pub(super) fn new(world: &'w World<'w>, cameras: Option<ImageSize>) -> Self {
         let cameras = cameras.map(|size| (CameraRig::new(size), GroundPaint::new(world)));
-        Self { lidar: Lidar::default(), radar: Radar::default(), cameras }
+        Self {
+            lidar: Lidar::default(),
+            radar: Radar::default(),
+            cameras,
+        }
     }
 }
 
@@ -63,7 +67,10 @@ impl Scene<'_, '_> {
             let own = recording.frames[index].of(agent.vehicle)?;
             Some(self.agent_frame(recording, (place, agent), (index, own), bench))
         });
-        Moment { index, frames: frames.collect() }
+        Moment {
+            index,
+            frames: frames.collect(),
+        }
     }
 
     fn agent_frame(
@@ -76,20 +83,31 @@ impl Scene<'_, '_> {
         let moment = &recording.frames[index];
         let (mut bodies, seen) = vehicles_around(recording, moment, agent.vehicle);
         let here = own.motion.end.position_m;
-        self.world.standing_near(here.x, here.y, SIGHT_M, &mut bodies);
+        self.world
+            .standing_near(here.x, here.y, SIGHT_M, &mut bodies);
 
-        let noise = |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, moment.tick]);
-        let LidarSweeps { points, variants, hits } = self.lidar_sweeps(&own.motion, &bodies, bench, &noise);
+        let noise =
+            |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, moment.tick]);
+        let LidarSweeps {
+            points,
+            variants,
+            hits,
+        } = self.lidar_sweeps(&own.motion, &bodies, bench, &noise);
         let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
         // No other layout can hold radar.
         let has_radar = self.options.layout == SceneLayout::Opv2v;
-        let radar = has_radar.then(|| self.radar_points(&own.motion, half_length_m, &bodies, bench, noise(6)));
+        let radar = has_radar
+            .then(|| self.radar_points(&own.motion, half_length_m, &bodies, bench, noise(6)));
 
         let cameras = self.images(&own.motion.end, &bodies, &seen, bench, noise(8));
 
         let is_hit = |(_, hits): &(Annotation<'_>, &u32)| **hits > 0;
-        let mut annotations: Vec<Annotation<'_>> =
-            seen.into_iter().zip(&hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
+        let mut annotations: Vec<Annotation<'_>> = seen
+            .into_iter()
+            .zip(&hits)
+            .filter(is_hit)
+            .map(|(annotation, _)| annotation)
+            .collect();
         annotations.sort_unstable_by_key(|annotation| annotation.id);
         let fix = agent.fixes[index];
         let frame = Frame {
@@ -104,7 +122,12 @@ impl Scene<'_, '_> {
             ..Frame::empty(agent.cav.clone(), capture_nanos(moment), Handedness::Right)
         };
         let anchors = annotations.iter().map(anchor).collect();
-        AgentFrame { agent: place, frame, variants, simulated: Some(Simulated { fix, anchors }) }
+        AgentFrame {
+            agent: place,
+            frame,
+            variants,
+            simulated: Some(Simulated { fix, anchors }),
+        }
     }
 
     fn lidar_sweeps(
@@ -115,14 +138,39 @@ impl Scene<'_, '_> {
         noise: &dyn Fn(u64) -> u64,
     ) -> LidarSweeps {
         let sensor = lidar_motion(vehicle);
-        let sweep = bench.lidar.sweep(&sensor, self.world.ground(), bodies, self.options.weather, noise(5));
-        let (points, hits) = (PointCloud { xyzi: sweep.points.to_vec() }, sweep.hits.to_vec());
-        let named = self.options.copies.iter().filter_map(|weather| Some((*weather, weather.variant()?)));
+        let sweep = bench.lidar.sweep(
+            &sensor,
+            self.world.ground(),
+            bodies,
+            self.options.weather,
+            noise(5),
+        );
+        let (points, hits) = (
+            PointCloud {
+                xyzi: sweep.points.to_vec(),
+            },
+            sweep.hits.to_vec(),
+        );
+        let named = self
+            .options
+            .copies
+            .iter()
+            .filter_map(|weather| Some((*weather, weather.variant()?)));
         let variants = named.map(|(weather, name)| {
-            let copy = bench.lidar.again(&sensor, bodies, weather, noise(7 + weather as u64));
-            SweepVariant { name: name.to_owned(), points: copy.points.to_vec(), labels: copy.labels.to_vec() }
+            let copy = bench
+                .lidar
+                .again(&sensor, bodies, weather, noise(7 + weather as u64));
+            SweepVariant {
+                name: name.to_owned(),
+                points: copy.points.to_vec(),
+                labels: copy.labels.to_vec(),
+            }
         });
-        LidarSweeps { points, variants: variants.collect(), hits }
+        LidarSweeps {
+            points,
+            variants: variants.collect(),
+            hits,
+        }
     }
 
     /// The images of the cameras; `seen` are the annotations of the first bodies.
@@ -134,14 +182,31 @@ impl Scene<'_, '_> {
         bench: &mut Bench<'_>,
         noise: u64,
     ) -> Vec<(u8, Camera)> {
-        let Some((rig, ground_paint)) = &mut bench.cameras else { return Vec::new() };
+        let Some((rig, ground_paint)) = &mut bench.cameras else {
+            return Vec::new();
+        };
         let standing = bodies.iter().skip(seen.len()).map(|body| {
-            let [x, y] = [body.motion.end.position_m.x, body.motion.end.position_m.y].map(f64::to_bits);
+            let [x, y] =
+                [body.motion.end.position_m.x, body.motion.end.position_m.y].map(f64::to_bits);
             camera::of_shape(body.shape, x ^ y.rotate_left(17))
         });
-        let paints: Vec<_> = seen.iter().map(|annotation| camera::of_vehicle(annotation.id)).chain(standing).collect();
+        let paints: Vec<_> = seen
+            .iter()
+            .map(|annotation| camera::of_vehicle(annotation.id))
+            .chain(standing)
+            .collect();
         let (ground, weather) = (self.world.ground(), self.options.weather);
-        rig.images(vehicle, &Surroundings { ground, bodies, paints: &paints, weather }, ground_paint, noise)
+        rig.images(
+            vehicle,
+            &Surroundings {
+                ground,
+                bodies,
+                paints: &paints,
+                weather,
+            },
+            ground_paint,
+            noise,
+        )
     }
 
     /// The radar's points; the fourth value is the radial velocity as stored in the red channel.
@@ -154,26 +219,46 @@ impl Scene<'_, '_> {
         noise: u64,
     ) -> PointCloud {
         let ground = self.world.ground();
-        let returns = bench.radar.returns(vehicle, half_length_m, LIDAR_MOUNT_M, STEP_S, ground, bodies, noise);
+        let returns = bench.radar.returns(
+            vehicle,
+            half_length_m,
+            LIDAR_MOUNT_M,
+            STEP_S,
+            ground,
+            bodies,
+            noise,
+        );
         let red = |&[x, y, z, velocity]: &[f32; 4]| [x, y, z, velocity_to_red(velocity)];
-        PointCloud { xyzi: returns.iter().map(red).collect() }
+        PointCloud {
+            xyzi: returns.iter().map(red).collect(),
+        }
     }
 }
 
 /// The origin of a vehicle, and the offset from there to the centre of its box.
 fn anchor(annotation: &Annotation<'_>) -> BoxAnchor {
-    let up = annotation.placement.rotation() * Vector3::new(0.0, 0.0, annotation.vehicle.size_m[2] / 2.0);
-    BoxAnchor { location_m: annotation.placement.position_m.into(), center_offset_m: up.into() }
+    let up = annotation.placement.rotation()
+        * Vector3::new(0.0, 0.0, annotation.vehicle.size_m[2] / 2.0);
+    BoxAnchor {
+        location_m: annotation.placement.position_m.into(),
+        center_offset_m: up.into(),
+    }
 }
 
 fn object(annotation: &Annotation<'_>) -> Object {
-    let BoxAnchor { location_m, center_offset_m } = anchor(annotation);
+    let BoxAnchor {
+        location_m,
+        center_offset_m,
+    } = anchor(annotation);
     let pose: Pose = annotation.placement.isometry().into();
     let translation_m = std::array::from_fn(|axis| location_m[axis] + center_offset_m[axis]);
     Object {
         id: annotation.id,
         class: class(annotation.vehicle.kind),
-        world_from_object: Pose { translation_m, ..pose },
+        world_from_object: Pose {
+            translation_m,
+            ..pose
+        },
         size_m: annotation.vehicle.size_m,
         speed_mps: Some(annotation.speed_mps),
     }
@@ -181,7 +266,9 @@ fn object(annotation: &Annotation<'_>) -> Object {
 
 fn class(kind: VehicleKind) -> ObjectClass {
     match kind {
-        VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv | VehicleKind::Pickup => ObjectClass::Car,
+        VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv | VehicleKind::Pickup => {
+            ObjectClass::Car
+        }
         VehicleKind::Van => ObjectClass::Van,
         VehicleKind::Truck => ObjectClass::Truck,
         VehicleKind::Bus => ObjectClass::Bus,
@@ -194,21 +281,43 @@ fn vehicles_around<'a>(
     frame: &'a RecordedFrame,
     own: usize,
 ) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
-    let here = frame.of(own).map_or_else(Default::default, |moving| moving.motion.end.position_m);
+    let here = frame
+        .of(own)
+        .map_or_else(Default::default, |moving| moving.motion.end.position_m);
     let near = |motion: &Sweep| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0;
-    let moving = frame.moving.iter().filter(|moving| moving.vehicle != own && near(&moving.motion));
+    let moving = frame
+        .moving
+        .iter()
+        .filter(|moving| moving.vehicle != own && near(&moving.motion));
     let moving = moving.map(|moving| {
         let vehicle: &Vehicle = &recording.vehicles[moving.vehicle];
         (vehicle, moving.motion, moving.id, moving.speed_mps)
     });
-    let parked =
-        recording.parked.iter().map(|parked| (&parked.vehicle, Sweep::still(parked.placement), parked.id, 0.0));
+    let parked = recording.parked.iter().map(|parked| {
+        (
+            &parked.vehicle,
+            Sweep::still(parked.placement),
+            parked.id,
+            0.0,
+        )
+    });
     let parked = parked.filter(|(_, motion, ..)| near(motion));
     moving
         .chain(parked)
         .map(|(vehicle, motion, id, speed_mps)| {
-            let annotation = Annotation { id, vehicle, placement: motion.end, speed_mps };
-            (Body { shape: &vehicle.shape, motion }, annotation)
+            let annotation = Annotation {
+                id,
+                vehicle,
+                placement: motion.end,
+                speed_mps,
+            };
+            (
+                Body {
+                    shape: &vehicle.shape,
+                    motion,
+                },
+                annotation,
+            )
         })
         .unzip()
 }

@@ -52,10 +52,17 @@ impl Tops {
         let top = |square: usize| {
             let (column, row) = (square % columns * cells, square / columns * cells);
             let nodes = (0..=cells).flat_map(|v| (0..=cells).map(move |u| (column + u, row + v)));
-            nodes.map(|(i, j)| grid.node_m(i, j)).fold(f64::MIN, f64::max)
+            nodes
+                .map(|(i, j)| grid.node_m(i, j))
+                .fold(f64::MIN, f64::max)
         };
         let values = (0..columns * rows).map(top).collect();
-        Self { cells: cells as f64, columns: columns as i64, rows: rows as i64, values }
+        Self {
+            cells: cells as f64,
+            columns: columns as i64,
+            rows: rows as i64,
+            values,
+        }
     }
 
     /// The highest of each square and the eight around it.
@@ -63,20 +70,31 @@ impl Tops {
         let around = |square: i64| {
             let (column, row) = (square % self.columns, square / self.columns);
             let squares = (-1..=1).flat_map(|v| (-1..=1).map(move |u| (column + u, row + v)));
-            squares.map(|(column, row)| self.at(column, row)).fold(f64::MIN, f64::max)
+            squares
+                .map(|(column, row)| self.at(column, row))
+                .fold(f64::MIN, f64::max)
         };
-        Self { values: (0..self.columns * self.rows).map(around).collect(), ..*self }
+        Self {
+            values: (0..self.columns * self.rows).map(around).collect(),
+            ..*self
+        }
     }
 
     /// Beyond its edge the ground goes on at the height of the edge, which the outermost squares hold.
     fn at(&self, column: i64, row: i64) -> f64 {
-        let (column, row) = (column.clamp(0, self.columns - 1), row.clamp(0, self.rows - 1));
+        let (column, row) = (
+            column.clamp(0, self.columns - 1),
+            row.clamp(0, self.rows - 1),
+        );
         self.values[(row * self.columns + column) as usize]
     }
 
     /// The square under a place given in cells.
     fn under(&self, [x, y]: [f64; 2]) -> f64 {
-        self.at((x / self.cells).floor() as i64, (y / self.cells).floor() as i64)
+        self.at(
+            (x / self.cells).floor() as i64,
+            (y / self.cells).floor() as i64,
+        )
     }
 }
 
@@ -98,7 +116,11 @@ impl TerrainSurface {
         let leave = |axis: usize, cell: i64| {
             let border = (cell + i64::from(forward[axis])) as f64;
             // Along the other axis no border is ever reached.
-            if inverse[axis].is_finite() { (border - ray.origin[axis]) * inverse[axis] } else { f64::MAX }
+            if inverse[axis].is_finite() {
+                (border - ray.origin[axis]) * inverse[axis]
+            } else {
+                f64::MAX
+            }
         };
         let mut leaves = [leave(0, cell[0]), leave(1, cell[1])];
         let mut at = from_m;
@@ -139,8 +161,13 @@ impl TerrainSurface {
         let meet = |from: f64, to: f64| {
             let (u, v) = local(0.5 * (from + to));
             let (start, end) = (above(from, u >= v), above(to, u >= v));
-            (end <= 0.0 && start >= end)
-                .then(|| if start <= 0.0 { from } else { from + (to - from) * start / (start - end) })
+            (end <= 0.0 && start >= end).then(|| {
+                if start <= 0.0 {
+                    from
+                } else {
+                    from + (to - from) * start / (start - end)
+                }
+            })
         };
         let (u, v) = local(from);
         let diagonal = from + (v - u) / off_zero(ray.slope[0] - ray.slope[1]);
@@ -151,7 +178,8 @@ impl TerrainSurface {
     }
 
     fn node_m(&self, column: i64, row: i64) -> f64 {
-        self.grid.node_m(column.max(0) as usize, row.max(0) as usize)
+        self.grid
+            .node_m(column.max(0) as usize, row.max(0) as usize)
     }
 }
 
@@ -173,15 +201,25 @@ impl Surface for TerrainSurface {
     /// The elevations must grow from ray to ray, as they do in every column of a caster.
     fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]) {
         let cell_m = self.grid.cell_m;
-        let start = [rays.origin.x - self.grid.origin_m[0], rays.origin.y - self.grid.origin_m[1]];
+        let start = [
+            rays.origin.x - self.grid.origin_m[0],
+            rays.origin.y - self.grid.origin_m[1],
+        ];
         let origin = start.map(|metres| metres / cell_m);
         let range_m = depth.iter().copied().fold(0.0, f32::max);
         let mut strip = Strip::new(self, rays, origin, f64::from(range_m));
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
             let direction: Vector3<f64> = (rays.forward * *cos + rays.up * *sin).cast();
             let slope = [direction.x / cell_m, direction.y / cell_m];
-            let ray = GridRay { origin, slope, z_m: rays.origin.z, rise: direction.z };
-            let Some(from_m) = strip.clear_m(&ray, direction.xy().norm()) else { return };
+            let ray = GridRay {
+                origin,
+                slope,
+                z_m: rays.origin.z,
+                rise: direction.z,
+            };
+            let Some(from_m) = strip.clear_m(&ray, direction.xy().norm()) else {
+                return;
+            };
             if let Some(at) = self.meet(&ray, from_m, f64::from(*depth)) {
                 (*depth, *hit) = (at as f32, GROUND);
             }
@@ -204,13 +242,21 @@ struct Strip<'a> {
 }
 
 impl<'a> Strip<'a> {
-    fn new(surface: &'a TerrainSurface, rays: &SurfaceRays<'_>, origin: [f64; 2], range_m: f64) -> Self {
+    fn new(
+        surface: &'a TerrainSurface,
+        rays: &SurfaceRays<'_>,
+        origin: [f64; 2],
+        range_m: f64,
+    ) -> Self {
         let along: Vector3<f64> = rays.forward.cast();
         let step = along.xy() / along.xy().norm().max(1e-6) / surface.grid.cell_m;
         let tilt = f64::from(rays.up.xy().norm());
         let aside_m = 0.5 * PIECE_M + range_m * tilt * STEEPEST;
-        let is_steep =
-            rays.sin.iter().zip(rays.cos).any(|(sin, cos)| f64::from(sin.abs()) > STEEPEST * f64::from(*cos));
+        let is_steep = rays
+            .sin
+            .iter()
+            .zip(rays.cos)
+            .any(|(sin, cos)| f64::from(sin.abs()) > STEEPEST * f64::from(*cos));
         let mut strip = Self {
             surface,
             origin,
@@ -244,7 +290,9 @@ impl<'a> Strip<'a> {
 
     fn next_top_m(&self) -> f64 {
         let middle_m = (self.clear as f64 + 0.5) * PIECE_M;
-        self.surface.wide_tops.under(std::array::from_fn(|axis| self.origin[axis] + self.step[axis] * middle_m))
+        self.surface.wide_tops.under(std::array::from_fn(|axis| {
+            self.origin[axis] + self.step[axis] * middle_m
+        }))
     }
 }
 
@@ -252,27 +300,53 @@ impl<'a> Strip<'a> {
 ///
 /// Returns nothing for a triangle without extent.
 pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
-    let center: [f64; 3] = std::array::from_fn(|axis| triangle.iter().map(|corner| corner[axis]).sum::<f64>() / 3.0);
+    let center: [f64; 3] =
+        std::array::from_fn(|axis| triangle.iter().map(|corner| corner[axis]).sum::<f64>() / 3.0);
     let local = triangle.map(|corner| Vector3::from(corner) - Vector3::from(center));
-    let normal = (local[1] - local[0]).cross(&(local[2] - local[0])).try_normalize(1e-9)?;
+    let normal = (local[1] - local[0])
+        .cross(&(local[2] - local[0]))
+        .try_normalize(1e-9)?;
     let normal = if normal.z < 0.0 { -normal } else { normal };
     let plane = |normal: &Vector3<f64>, point: &Vector3<f64>| {
-        [normal.x as f32, normal.y as f32, normal.z as f32, normal.dot(point) as f32]
+        [
+            normal.x as f32,
+            normal.y as f32,
+            normal.z as f32,
+            normal.dot(point) as f32,
+        ]
     };
     let top = plane(&normal, &local[0]);
     let mut planes = vec![top, [-top[0], -top[1], -top[2], DECK_M - top[3]]];
     for (from, to, opposite) in [(0, 1, 2), (1, 2, 0), (2, 0, 1)] {
-        let outward = (local[to] - local[from]).cross(&Vector3::z()).try_normalize(1e-9)?;
-        let outward = if outward.dot(&(local[opposite] - local[from])) > 0.0 { -outward } else { outward };
+        let outward = (local[to] - local[from])
+            .cross(&Vector3::z())
+            .try_normalize(1e-9)?;
+        let outward = if outward.dot(&(local[opposite] - local[from])) > 0.0 {
+            -outward
+        } else {
+            outward
+        };
         planes.push(plane(&outward, &local[from]));
     }
     let corners = local.map(|corner| corner.map(|metres| metres as f32));
-    let mut bounds = corners.iter().fold(Bounds { min_m: [f32::MAX; 3], max_m: [f32::MIN; 3] }, |bounds, corner| {
-        bounds.union(&Bounds { min_m: (*corner).into(), max_m: (*corner).into() })
-    });
+    let mut bounds = corners.iter().fold(
+        Bounds {
+            min_m: [f32::MAX; 3],
+            max_m: [f32::MIN; 3],
+        },
+        |bounds, corner| {
+            bounds.union(&Bounds {
+                min_m: (*corner).into(),
+                max_m: (*corner).into(),
+            })
+        },
+    );
     // Below a steep face the slab reaches a little deeper than its thickness.
     bounds.min_m[2] -= DECK_M / (normal.z as f32).max(0.2);
-    Some((BodyShape::new(vec![Part::Hull { planes, bounds }], 0.25), center))
+    Some((
+        BodyShape::new(vec![Part::Hull { planes, bounds }], 0.25),
+        center,
+    ))
 }
 
 #[cfg(test)]
@@ -293,7 +367,13 @@ mod tests {
                 *value += (height * (-(dx * dx + dy * dy) / (width * width)).exp()) as f32;
             }
         }
-        HeightGrid { origin_m: [-70.0, -55.0], cell_m: 4.0, columns, rows, heights_m }
+        HeightGrid {
+            origin_m: [-70.0, -55.0],
+            cell_m: 4.0,
+            columns,
+            rows,
+            heights_m,
+        }
     }
 
     #[test]
@@ -310,7 +390,13 @@ mod tests {
                 let forward = Vector3::new(yaw.cos(), yaw.sin(), 0.0).cast::<f32>();
                 let elevation = random.between(-0.4, 0.1) as f32;
                 let (cos, sin) = ([elevation.cos()], [elevation.sin()]);
-                let rays = SurfaceRays { origin, forward, up: Vector3::z(), cos: &cos, sin: &sin };
+                let rays = SurfaceRays {
+                    origin,
+                    forward,
+                    up: Vector3::z(),
+                    cos: &cos,
+                    sin: &sin,
+                };
                 let (mut depth, mut hit) = ([120.0f32], [0]);
                 surface.cast(&rays, &mut depth, &mut hit);
 
@@ -319,7 +405,9 @@ mod tests {
                     let point = origin + direction * at;
                     point.z <= grid.height_m(point.x, point.y)
                 };
-                let expected = (1..24_000).map(|step| 0.005 * f64::from(step)).find(|&at| below(at));
+                let expected = (1..24_000)
+                    .map(|step| 0.005 * f64::from(step))
+                    .find(|&at| below(at));
                 match expected {
                     Some(at) => assert!((at - f64::from(depth[0])).abs() < 0.011, "{at} {depth:?}"),
                     None => assert_eq!(hit[0], 0, "{depth:?}"),
@@ -333,7 +421,9 @@ mod tests {
     #[test]
     fn columns_of_a_tilted_sensor_hit_the_same_as_single_rays() {
         let mut random = SplitMix64::new(23);
-        let elevations: Vec<f32> = (0..64).map(|channel| (-25.0 + 27.0 / 63.0 * channel as f32).to_radians()).collect();
+        let elevations: Vec<f32> = (0..64)
+            .map(|channel| (-25.0 + 27.0 / 63.0 * channel as f32).to_radians())
+            .collect();
         let cos: Vec<f32> = elevations.iter().map(|elevation| elevation.cos()).collect();
         let sin: Vec<f32> = elevations.iter().map(|elevation| elevation.sin()).collect();
         for seed in 0..20 {
@@ -348,17 +438,31 @@ mod tests {
                     roll_rad: random.between(-0.12, 0.12),
                 };
                 let azimuth = random.between(-3.2, 3.2);
-                let forward = (place.rotation() * Vector3::new(azimuth.cos(), azimuth.sin(), 0.0)).cast();
+                let forward =
+                    (place.rotation() * Vector3::new(azimuth.cos(), azimuth.sin(), 0.0)).cast();
                 let up = (place.rotation() * Vector3::z()).cast();
-                let rays = SurfaceRays { origin: place.position_m, forward, up, cos: &cos, sin: &sin };
+                let rays = SurfaceRays {
+                    origin: place.position_m,
+                    forward,
+                    up,
+                    cos: &cos,
+                    sin: &sin,
+                };
                 let (mut depth, mut hit) = ([120.0f32; 64], [0; 64]);
                 surface.cast(&rays, &mut depth, &mut hit);
                 for ray in 0..64 {
                     let (mut lone_depth, mut lone_hit) = ([120.0f32], [0]);
                     let direction: Vector3<f64> = (forward * cos[ray] + up * sin[ray]).cast();
                     let slope = [direction.x / grid.cell_m, direction.y / grid.cell_m];
-                    let origin = [0, 1].map(|axis: usize| (place.position_m[axis] - grid.origin_m[axis]) / grid.cell_m);
-                    let whole = GridRay { origin, slope, z_m: place.position_m.z, rise: direction.z };
+                    let origin = [0, 1].map(|axis: usize| {
+                        (place.position_m[axis] - grid.origin_m[axis]) / grid.cell_m
+                    });
+                    let whole = GridRay {
+                        origin,
+                        slope,
+                        z_m: place.position_m.z,
+                        rise: direction.z,
+                    };
                     if let Some(at) = surface.meet(&whole, 0.0, 120.0) {
                         (lone_depth[0], lone_hit[0]) = (at as f32, GROUND);
                     }
@@ -377,7 +481,10 @@ mod tests {
         let shapes = square.map(|triangle| deck_shape(&triangle).unwrap());
         let bodies = [0, 1].map(|index: usize| {
             let (shape, center) = &shapes[index];
-            Body { shape, motion: Sweep::still(Placement::level(*center, 0.0)) }
+            Body {
+                shape,
+                motion: Sweep::still(Placement::level(*center, 0.0)),
+            }
         });
         let pattern = RayPattern {
             first_azimuth_rad: -0.1,

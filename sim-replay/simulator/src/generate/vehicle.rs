@@ -116,8 +116,16 @@ impl Vehicle {
     /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
     #[must_use]
     pub(crate) fn random_connected(random: &mut SplitMix64) -> Self {
-        let low = |kind| matches!(kind, VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv);
-        Self::random(random, |stock| if low(stock.kind) { stock.driving } else { 0.0 })
+        let low = |kind| {
+            matches!(
+                kind,
+                VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv
+            )
+        };
+        Self::random(
+            random,
+            |stock| if low(stock.kind) { stock.driving } else { 0.0 },
+        )
     }
 
     fn random(random: &mut SplitMix64, weight: impl Fn(&Stock) -> f64) -> Self {
@@ -127,8 +135,9 @@ impl Vehicle {
             draw < 0.0
         });
         let stock = chosen.unwrap_or(&STOCK[0]);
-        let size_m =
-            std::array::from_fn(|axis| stock.size_m[axis] * (1.0 + stock.spread[axis] * random.between(-1.0, 1.0)));
+        let size_m = std::array::from_fn(|axis| {
+            stock.size_m[axis] * (1.0 + stock.spread[axis] * random.between(-1.0, 1.0))
+        });
         Self::new(stock.kind, size_m, random)
     }
 
@@ -136,8 +145,13 @@ impl Vehicle {
     #[must_use]
     pub fn new(kind: VehicleKind, size_m: [f64; 3], random: &mut SplitMix64) -> Self {
         let [length, width, height] = size_m.map(|size| size as f32);
-        let mut vary = |value: f32, share: f32| value * (1.0 + share * random.between(-1.0, 1.0) as f32);
-        let form = Form { half: 0.5 * length, side: 0.5 * width, height };
+        let mut vary =
+            |value: f32, share: f32| value * (1.0 + share * random.between(-1.0, 1.0) as f32);
+        let form = Form {
+            half: 0.5 * length,
+            side: 0.5 * width,
+            height,
+        };
         let parts = match kind {
             VehicleKind::Sedan => form.car(&Profile {
                 belt: vary(0.62, 0.04),
@@ -177,7 +191,11 @@ impl Vehicle {
             VehicleKind::Truck => form.truck(vary(0.24, 0.1), vary(0.84, 0.06)),
             VehicleKind::Bus => form.bus(),
         };
-        Self { kind, size_m, shape: BodyShape::new(parts, vary(0.5, 0.5)) }
+        Self {
+            kind,
+            size_m,
+            shape: BodyShape::new(parts, vary(0.5, 0.5)),
+        }
     }
 }
 
@@ -209,20 +227,35 @@ impl Form {
         let mut parts = vec![
             frustum(
                 [floor, bumper],
-                [[0.05 - self.half, self.half - 0.08, side - 0.07], [-self.half, self.half, side]],
+                [
+                    [0.05 - self.half, self.half - 0.08, side - 0.07],
+                    [-self.half, self.half, side],
+                ],
             ),
             frustum(
                 [bumper, belt],
                 [
                     [-self.half, self.half, side],
-                    [profile.boot * length - self.half, self.half - profile.bonnet * length, side - 0.05],
+                    [
+                        profile.boot * length - self.half,
+                        self.half - profile.bonnet * length,
+                        side - 0.05,
+                    ],
                 ],
             ),
             frustum(
                 [belt, height],
                 [
-                    [profile.cabin[0] * length, profile.cabin[1] * length, side - 0.07],
-                    [profile.roof[0] * length, profile.roof[1] * length, side - 0.26],
+                    [
+                        profile.cabin[0] * length,
+                        profile.cabin[1] * length,
+                        side - 0.07,
+                    ],
+                    [
+                        profile.roof[0] * length,
+                        profile.roof[1] * length,
+                        side - 0.26,
+                    ],
                 ],
             ),
         ];
@@ -236,12 +269,33 @@ impl Form {
         let front = self.half - cab * length;
         let mut parts = vec![
             // Frame, cargo, cab, windscreen.
-            frustum([0.55, 0.95], [[-self.half, front, side * 0.5], [-self.half, front, side * 0.5]]),
-            frustum([0.95, height], [[-self.half, front - 0.15, side], [-self.half, front - 0.15, side]]),
-            frustum([0.35, 0.5 * height], [[front, self.half, side - 0.08], [front, self.half, side - 0.05]]),
+            frustum(
+                [0.55, 0.95],
+                [
+                    [-self.half, front, side * 0.5],
+                    [-self.half, front, side * 0.5],
+                ],
+            ),
+            frustum(
+                [0.95, height],
+                [
+                    [-self.half, front - 0.15, side],
+                    [-self.half, front - 0.15, side],
+                ],
+            ),
+            frustum(
+                [0.35, 0.5 * height],
+                [
+                    [front, self.half, side - 0.08],
+                    [front, self.half, side - 0.05],
+                ],
+            ),
             frustum(
                 [0.5 * height, cab_height * height],
-                [[front, self.half, side - 0.05], [front, self.half - 0.45, side - 0.2]],
+                [
+                    [front, self.half, side - 0.05],
+                    [front, self.half - 0.45, side - 0.2],
+                ],
             ),
         ];
         parts.extend(self.wheels(0.48, self.half - 0.55 * cab * length, -0.32 * length));
@@ -251,8 +305,20 @@ impl Form {
     fn bus(&self) -> Vec<Part> {
         let (side, height) = (self.side, self.height);
         let mut parts = vec![
-            frustum([0.30, 1.10], [[-self.half, self.half, side - 0.03], [-self.half, self.half, side]]),
-            frustum([1.10, height], [[-self.half, self.half, side], [0.1 - self.half, self.half - 0.25, side - 0.12]]),
+            frustum(
+                [0.30, 1.10],
+                [
+                    [-self.half, self.half, side - 0.03],
+                    [-self.half, self.half, side],
+                ],
+            ),
+            frustum(
+                [1.10, height],
+                [
+                    [-self.half, self.half, side],
+                    [0.1 - self.half, self.half - 0.25, side - 0.12],
+                ],
+            ),
         ];
         parts.extend(self.wheels(0.48, 0.30 * 2.0 * self.half, -0.26 * 2.0 * self.half));
         parts
@@ -260,19 +326,35 @@ impl Form {
 
     fn wheels(&self, radius: f32, front: f32, rear: f32) -> Vec<Part> {
         let at = |x, side: f32| wheel([x, side * (self.side - 0.14), radius], radius, 0.12);
-        vec![at(front, 1.0), at(front, -1.0), at(rear, 1.0), at(rear, -1.0)]
+        vec![
+            at(front, 1.0),
+            at(front, -1.0),
+            at(rear, 1.0),
+            at(rear, -1.0),
+        ]
     }
 }
 
 /// A solid between two level rectangles: heights `[bottom, top]`, and for each `[rear x, front x, half width]`.
-fn frustum([bottom, top]: [f32; 2], [[rear0, front0, side0], [rear1, front1, side1]]: [[f32; 3]; 2]) -> Part {
+fn frustum(
+    [bottom, top]: [f32; 2],
+    [[rear0, front0, side0], [rear1, front1, side1]]: [[f32; 3]; 2],
+) -> Part {
     let rise = top - bottom;
     // A face through (at0, bottom) and (at1, top), with its normal towards growing `at`.
     let slant = |at0: f32, at1: f32| {
         let norm = rise.hypot(at0 - at1);
-        (rise / norm, (at0 - at1) / norm, (rise * at0 + (at0 - at1) * bottom) / norm)
+        (
+            rise / norm,
+            (at0 - at1) / norm,
+            (rise * at0 + (at0 - at1) * bottom) / norm,
+        )
     };
-    let (front, rear, left) = (slant(front0, front1), slant(-rear0, -rear1), slant(side0, side1));
+    let (front, rear, left) = (
+        slant(front0, front1),
+        slant(-rear0, -rear1),
+        slant(side0, side1),
+    );
     let planes = vec![
         [front.0, 0.0, front.1, front.2],
         [-rear.0, 0.0, rear.1, rear.2],
@@ -282,7 +364,10 @@ fn frustum([bottom, top]: [f32; 2], [[rear0, front0, side0], [rear1, front1, sid
         [0.0, 0.0, -1.0, -bottom],
     ];
     let side = side0.max(side1);
-    let bounds = Bounds { min_m: [rear0.min(rear1), -side, bottom], max_m: [front0.max(front1), side, top] };
+    let bounds = Bounds {
+        min_m: [rear0.min(rear1), -side, bottom],
+        max_m: [front0.max(front1), side, top],
+    };
     Part::Hull { planes, bounds }
 }
 
@@ -292,8 +377,14 @@ fn wheel(center: [f32; 3], radius: f32, half_width: f32) -> Part {
         let (sin, cos) = (face as f32 * PI / 4.0).sin_cos();
         [cos, 0.0, sin, cos * center[0] + sin * center[2] + radius]
     });
-    let sides = [[0.0, 1.0, 0.0, center[1] + half_width], [0.0, -1.0, 0.0, half_width - center[1]]];
-    Part::Hull { planes: rim.chain(sides).collect(), bounds: Bounds::centered(center, [radius, half_width, radius]) }
+    let sides = [
+        [0.0, 1.0, 0.0, center[1] + half_width],
+        [0.0, -1.0, 0.0, half_width - center[1]],
+    ];
+    Part::Hull {
+        planes: rim.chain(sides).collect(),
+        bounds: Bounds::centered(center, [radius, half_width, radius]),
+    }
 }
 
 #[cfg(test)]
@@ -302,22 +393,39 @@ mod tests {
 
     fn fleet() -> Vec<Vehicle> {
         let mut random = SplitMix64::new(5);
-        (0..2000).map(|_| Vehicle::random_driving(&mut random)).collect()
+        (0..2000)
+            .map(|_| Vehicle::random_driving(&mut random))
+            .collect()
     }
 
     #[test]
     fn every_kind_occurs_and_fills_its_box() {
         let fleet = fleet();
         for stock in &STOCK {
-            assert!(fleet.iter().any(|vehicle| vehicle.kind == stock.kind), "{:?}", stock.kind);
+            assert!(
+                fleet.iter().any(|vehicle| vehicle.kind == stock.kind),
+                "{:?}",
+                stock.kind
+            );
         }
         for vehicle in &fleet {
             let bounds = vehicle.shape.bounds;
             let [length, width, height] = vehicle.size_m;
-            let expected = [-length / 2.0, -width / 2.0, 0.0, length / 2.0, width / 2.0, height];
+            let expected = [
+                -length / 2.0,
+                -width / 2.0,
+                0.0,
+                length / 2.0,
+                width / 2.0,
+                height,
+            ];
             let actual = bounds.min_m.into_iter().chain(bounds.max_m);
             for (expected, actual) in expected.into_iter().zip(actual) {
-                assert!((expected - f64::from(actual)).abs() < 1e-4, "{:?}: {expected} {actual}", vehicle.kind);
+                assert!(
+                    (expected - f64::from(actual)).abs() < 1e-4,
+                    "{:?}: {expected} {actual}",
+                    vehicle.kind
+                );
             }
             assert!(height < 2.9);
         }
@@ -325,14 +433,29 @@ mod tests {
 
     #[test]
     fn a_frustum_is_bounded_by_its_rectangles() {
-        let Part::Hull { planes, .. } = frustum([0.5, 1.5], [[-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7]]) else {
+        let Part::Hull { planes, .. } = frustum([0.5, 1.5], [[-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7]])
+        else {
             panic!("a frustum is a hull");
         };
-        for corner in [[2.0, 1.0, 0.5], [-2.0, -1.0, 0.5], [0.5, 0.7, 1.5], [-1.0, -0.7, 1.5]] {
-            let slack: Vec<f32> =
-                planes.iter().map(|p| p[3] - (0..3).map(|axis| p[axis] * corner[axis]).sum::<f32>()).collect();
-            assert!(slack.iter().all(|&slack| slack > -1e-5), "{corner:?} lies outside");
-            assert_eq!(slack.iter().filter(|&&slack| slack.abs() < 1e-5).count(), 3, "{corner:?} is no corner");
+        for corner in [
+            [2.0, 1.0, 0.5],
+            [-2.0, -1.0, 0.5],
+            [0.5, 0.7, 1.5],
+            [-1.0, -0.7, 1.5],
+        ] {
+            let slack: Vec<f32> = planes
+                .iter()
+                .map(|p| p[3] - (0..3).map(|axis| p[axis] * corner[axis]).sum::<f32>())
+                .collect();
+            assert!(
+                slack.iter().all(|&slack| slack > -1e-5),
+                "{corner:?} lies outside"
+            );
+            assert_eq!(
+                slack.iter().filter(|&&slack| slack.abs() < 1e-5).count(),
+                3,
+                "{corner:?} is no corner"
+            );
         }
     }
 }

@@ -66,7 +66,12 @@ impl Weather {
     }
 
     /// Return of a beam whose target has this range (`None`: open sky) and reflectivity.
-    pub(crate) fn echo(self, target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
+    pub(crate) fn echo(
+        self,
+        target_m: Option<f32>,
+        reflectivity: f32,
+        random: &mut SplitMix64,
+    ) -> Echo {
         match self {
             Self::Sunny => target_m.map_or(Echo::Lost, |_| Echo::Target(1.0)),
             Self::Fog => Self::fog(target_m, reflectivity, random),
@@ -89,7 +94,10 @@ impl Weather {
 
     fn snow(target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
         let flake_m = (1.5 - 110.0 * (1.0 - random.unit()).ln()) as f32;
-        if flake_m < 30.0 && target_m.is_none_or(|target_m| flake_m < target_m) && random.chance(0.7) {
+        if flake_m < 30.0
+            && target_m.is_none_or(|target_m| flake_m < target_m)
+            && random.chance(0.7)
+        {
             return Echo::Backscatter(flake_m, random.between(0.02, 0.25) as f32);
         }
         seen(target_m, reflectivity, 0.008).map_or(Echo::Lost, Echo::Target)

@@ -24,17 +24,28 @@ struct Standing {
 
 impl<'t> World<'t> {
     pub(crate) fn new(map_model: &'t MapModel) -> Self {
-        let decks = map_model.ground.decks.iter().filter_map(deck_shape).map(|(shape, center_m)| Standing {
-            radius_m: shape.bounds.radius_m(),
-            shape,
-            placement: Placement::level(center_m, 0.0),
-        });
+        let decks =
+            map_model
+                .ground
+                .decks
+                .iter()
+                .filter_map(deck_shape)
+                .map(|(shape, center_m)| Standing {
+                    radius_m: shape.bounds.radius_m(),
+                    shape,
+                    placement: Placement::level(center_m, 0.0),
+                });
         Self {
             map_model,
             roads: Roads::new(&map_model.lanes),
             lane_index: LaneIndex::new(&map_model.lanes),
             ground: ground_surface(map_model),
-            standing: map_model.solids.iter().map(Standing::from).chain(decks).collect(),
+            standing: map_model
+                .solids
+                .iter()
+                .map(Standing::from)
+                .chain(decks)
+                .collect(),
         }
     }
 
@@ -43,12 +54,25 @@ impl<'t> World<'t> {
     }
 
     /// Appends static objects within `radius_m` of a position.
-    pub(crate) fn standing_near<'a>(&'a self, x_m: f64, y_m: f64, radius_m: f64, bodies: &mut Vec<Body<'a>>) {
+    pub(crate) fn standing_near<'a>(
+        &'a self,
+        x_m: f64,
+        y_m: f64,
+        radius_m: f64,
+        bodies: &mut Vec<Body<'a>>,
+    ) {
         bodies.extend(self.standing.iter().filter_map(|standing| {
             let position = standing.placement.position_m;
-            let (dx, dy, reach) = (position.x - x_m, position.y - y_m, radius_m + standing.radius_m);
+            let (dx, dy, reach) = (
+                position.x - x_m,
+                position.y - y_m,
+                radius_m + standing.radius_m,
+            );
             let is_near = dx * dx + dy * dy < reach * reach;
-            is_near.then(|| Body { shape: &standing.shape, motion: Sweep::still(standing.placement) })
+            is_near.then(|| Body {
+                shape: &standing.shape,
+                motion: Sweep::still(standing.placement),
+            })
         }));
     }
 }
@@ -65,13 +89,21 @@ pub fn ground_surface(map_model: &MapModel) -> Box<dyn Surface + Send + Sync> {
 impl From<&Solid> for BodyShape {
     fn from(solid: &Solid) -> Self {
         let part = match solid.shape {
-            Shape::Box { half_m } => Part::Box(Bounds::centered([0.0; 3], half_m.map(|half| half as f32))),
-            Shape::Cylinder { radius_m, half_height_m } => {
-                Part::Cylinder { center_m: [0.0; 3], radius_m: radius_m as f32, half_height_m: half_height_m as f32 }
+            Shape::Box { half_m } => {
+                Part::Box(Bounds::centered([0.0; 3], half_m.map(|half| half as f32)))
             }
-            Shape::Ellipsoid { radii_m } => {
-                Part::Ellipsoid { center_m: [0.0; 3], radii_m: radii_m.map(|radius| radius as f32) }
-            }
+            Shape::Cylinder {
+                radius_m,
+                half_height_m,
+            } => Part::Cylinder {
+                center_m: [0.0; 3],
+                radius_m: radius_m as f32,
+                half_height_m: half_height_m as f32,
+            },
+            Shape::Ellipsoid { radii_m } => Part::Ellipsoid {
+                center_m: [0.0; 3],
+                radii_m: radii_m.map(|radius| radius as f32),
+            },
         };
         Self::new(vec![part], solid.reflectivity)
     }
@@ -81,6 +113,10 @@ impl From<&Solid> for Standing {
     fn from(solid: &Solid) -> Self {
         let shape = BodyShape::from(solid);
         let placement = Placement::level(solid.center_m, solid.yaw_rad);
-        Self { radius_m: shape.bounds.radius_m(), shape, placement }
+        Self {
+            radius_m: shape.bounds.radius_m(),
+            shape,
+            placement,
+        }
     }
 }

@@ -14,8 +14,16 @@ const CELL_M: f64 = 10.0;
 pub(crate) fn outline(solid: &Solid) -> Rectangle {
     let half_m = solid.shape.half_footprint_m();
     // A round outline needs no turning.
-    let yaw_rad = if matches!(solid.shape, Shape::Cylinder { .. }) { 0.0 } else { solid.yaw_rad };
-    Rectangle { center_m: [solid.center_m[0], solid.center_m[1]], half_m, yaw_rad }
+    let yaw_rad = if matches!(solid.shape, Shape::Cylinder { .. }) {
+        0.0
+    } else {
+        solid.yaw_rad
+    };
+    Rectangle {
+        center_m: [solid.center_m[0], solid.center_m[1]],
+        half_m,
+        yaw_rad,
+    }
 }
 
 impl MapModel {
@@ -23,7 +31,11 @@ impl MapModel {
     /// `LANE_HEADROOM_M` over it. Empty for a valid map.
     #[must_use]
     pub fn obstructions(&self) -> Vec<(LaneId, usize)> {
-        let outlines: Vec<_> = self.solids.iter().map(|solid| outline(solid).corners()).collect();
+        let outlines: Vec<_> = self
+            .solids
+            .iter()
+            .map(|solid| outline(solid).corners())
+            .collect();
         let corners: Vec<[f64; 2]> = outlines.iter().flatten().copied().collect();
         let mut found = Vec::new();
         if corners.is_empty() {
@@ -40,10 +52,16 @@ impl MapModel {
                 let center_m = [(from[0] + to[0]) / 2.0, (from[1] + to[1]) / 2.0];
                 // Two centimetres of tolerance at the edges: lanes are sampled.
                 let half_m = [dx.hypot(dy) / 2.0, (width / 2.0 - 0.02).max(0.01)];
-                let piece = Rectangle { center_m, half_m, yaw_rad: dy.atan2(dx) }.corners();
+                let piece = Rectangle {
+                    center_m,
+                    half_m,
+                    yaw_rad: dy.atan2(dx),
+                }
+                .corners();
                 index.any(bounds(&piece), |number| {
                     let solid = &self.solids[number as usize];
-                    let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M || solid.top_m() < from[2] + SURFACE_M;
+                    let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M
+                        || solid.top_m() < from[2] + SURFACE_M;
                     if !clear && overlap(&outlines[number as usize], &piece) {
                         found.push((lane.id, number as usize));
                     }
@@ -66,11 +84,25 @@ mod tests {
     fn a_pole_on_the_lane_is_found_and_a_sign_above_it_is_not() {
         let line = (0..=20).map(|i| [f64::from(i), 0.0, 0.0]).collect();
         let lanes = LaneGraph::new(vec![Lane::new(LaneId(0), line, 3.5, 10.0)]);
-        let shape = Shape::Box { half_m: [0.3, 0.3, 0.5] };
+        let shape = Shape::Box {
+            half_m: [0.3, 0.3, 0.5],
+        };
         let solid = |y: f64, z: f64| Solid::new(SolidKind::Sign, shape, [10.0, y, z], 0.3, 0.5);
-        let solids = vec![solid(0.0, 5.6), solid(1.5, 1.0), solid(2.5, 1.0), solid(0.0, -0.6)];
+        let solids = vec![
+            solid(0.0, 5.6),
+            solid(1.5, 1.0),
+            solid(2.5, 1.0),
+            solid(0.0, -0.6),
+        ];
         let ground = Ground::plane(0.0);
-        let map_model = MapModel { name: "line".into(), lanes, ground, solids, parking: vec![], findings: vec![] };
+        let map_model = MapModel {
+            name: "line".into(),
+            lanes,
+            ground,
+            solids,
+            parking: vec![],
+            findings: vec![],
+        };
         assert_eq!(map_model.obstructions(), [(LaneId(0), 1)]);
     }
 }

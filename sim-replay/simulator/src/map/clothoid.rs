@@ -16,9 +16,17 @@ use super::lane::wrap_angle;
 pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
     let distance = from.distance_m(&to);
     let chord = (to.y - from.y).atan2(to.x - from.x);
-    let (phi0, phi1) = (wrap_angle(from.heading_rad - chord), wrap_angle(to.heading_rad - chord));
+    let (phi0, phi1) = (
+        wrap_angle(from.heading_rad - chord),
+        wrap_angle(to.heading_rad - chord),
+    );
     if phi0.abs() < 1e-9 && phi1.abs() < 1e-9 {
-        return Curve { s_m, start: from, length_m: distance, shape: CurveShape::Line };
+        return Curve {
+            s_m,
+            start: from,
+            length_m: distance,
+            shape: CurveShape::Line,
+        };
     }
     let delta = phi1 - phi0;
     let mut a = 3.0 * (phi0 + phi1);
@@ -33,9 +41,17 @@ pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
     let length_m = distance / along;
     let (start, end) = ((delta - a) / length_m, (delta + a) / length_m);
     let straightness = (end - start).abs() * length_m;
-    let shape =
-        if straightness < 1e-9 { CurveShape::Arc { curvature: start } } else { CurveShape::Spiral { start, end } };
-    Curve { s_m, start: from, length_m, shape }
+    let shape = if straightness < 1e-9 {
+        CurveShape::Arc { curvature: start }
+    } else {
+        CurveShape::Spiral { start, end }
+    };
+    Curve {
+        s_m,
+        start: from,
+        length_m,
+        shape,
+    }
 }
 
 /// Integrals over 0..1 of sin(heading), of its derivative by `a`, and of cos(heading); composite Simpson.
@@ -81,10 +97,21 @@ mod tests {
 
     #[test]
     fn straight_and_circular_ways_are_lines_and_arcs() {
-        let line = between(Pose2::new(0.0, 0.0, 0.5), Pose2::new(0.0, 0.0, 0.5).moved(30.0, 0.0, 0.0), 0.0);
+        let line = between(
+            Pose2::new(0.0, 0.0, 0.5),
+            Pose2::new(0.0, 0.0, 0.5).moved(30.0, 0.0, 0.0),
+            0.0,
+        );
         assert_eq!(line.shape, CurveShape::Line);
         assert!((line.length_m - 30.0).abs() < 1e-12);
-        let quarter = between(Pose2::new(0.0, 0.0, 0.0), Pose2::new(10.0, 10.0, std::f64::consts::FRAC_PI_2), 0.0);
-        assert!((quarter.length_m - 5.0 * std::f64::consts::PI).abs() < 1e-6, "{quarter:?}");
+        let quarter = between(
+            Pose2::new(0.0, 0.0, 0.0),
+            Pose2::new(10.0, 10.0, std::f64::consts::FRAC_PI_2),
+            0.0,
+        );
+        assert!(
+            (quarter.length_m - 5.0 * std::f64::consts::PI).abs() < 1e-6,
+            "{quarter:?}"
+        );
     }
 }

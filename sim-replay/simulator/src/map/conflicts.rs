@@ -10,7 +10,12 @@ const OVERLAP: f64 = 0.75;
 /// Fills [`Lane::conflicts`]: pairs of lanes of one junction that cross or merge. Lanes with a common predecessor
 /// diverge and do not conflict, nor do neighbours that run side by side.
 pub(crate) fn find(graph: &mut LaneGraph) {
-    let junction_count = graph.lanes.iter().filter_map(|lane| lane.junction).map(|j| j.0 as usize + 1).max();
+    let junction_count = graph
+        .lanes
+        .iter()
+        .filter_map(|lane| lane.junction)
+        .map(|j| j.0 as usize + 1)
+        .max();
     let mut members: Vec<Vec<usize>> = vec![Vec::new(); junction_count.unwrap_or(0)];
     for (index, lane) in graph.lanes.iter().enumerate() {
         if let Some(junction) = lane.junction {
@@ -30,7 +35,10 @@ pub(crate) fn find(graph: &mut LaneGraph) {
 }
 
 fn in_conflict(a: &Lane, b: &Lane) -> bool {
-    if a.left == Some(b.id) || a.right == Some(b.id) || a.predecessors.iter().any(|id| b.predecessors.contains(id)) {
+    if a.left == Some(b.id)
+        || a.right == Some(b.id)
+        || a.predecessors.iter().any(|id| b.predecessors.contains(id))
+    {
         return false;
     }
     let follows = a.successors.contains(&b.id) || b.successors.contains(&a.id);
@@ -40,9 +48,11 @@ fn in_conflict(a: &Lane, b: &Lane) -> bool {
 
 fn crosses(a: &Lane, b: &Lane) -> bool {
     let near = OVERLAP * (a.width_m + b.width_m) / 2.0;
-    a.centerline
-        .iter()
-        .any(|p| b.centerline.iter().any(|q| (p[0] - q[0]).hypot(p[1] - q[1]) < near && (p[2] - q[2]).abs() < LEVEL_M))
+    a.centerline.iter().any(|p| {
+        b.centerline
+            .iter()
+            .any(|q| (p[0] - q[0]).hypot(p[1] - q[1]) < near && (p[2] - q[2]).abs() < LEVEL_M)
+    })
 }
 
 #[cfg(test)]
@@ -52,7 +62,12 @@ mod tests {
 
     fn lane(id: u32, from: [f64; 2], to: [f64; 2]) -> Lane {
         let at = |i: u32, axis: usize| from[axis] + (to[axis] - from[axis]) * f64::from(i) / 20.0;
-        let mut lane = Lane::new(LaneId(id), (0..=20).map(|i| [at(i, 0), at(i, 1), 0.0]).collect(), 3.5, 10.0);
+        let mut lane = Lane::new(
+            LaneId(id),
+            (0..=20).map(|i| [at(i, 0), at(i, 1), 0.0]).collect(),
+            3.5,
+            10.0,
+        );
         (lane.junction, lane.in_junction) = (Some(JunctionId(0)), true);
         lane
     }

@@ -14,25 +14,40 @@ pub(crate) struct Rectangle {
 impl Rectangle {
     /// The same rectangle, larger by `margin_m` on every side.
     pub(crate) fn grown(&self, margin_m: f64) -> Self {
-        Self { half_m: self.half_m.map(|half| half + margin_m), ..*self }
+        Self {
+            half_m: self.half_m.map(|half| half + margin_m),
+            ..*self
+        }
     }
 
     /// The position `u` along and `v` across, from the centre.
     pub(crate) fn at(&self, u: f64, v: f64) -> [f64; 2] {
         let (sin, cos) = self.yaw_rad.sin_cos();
-        [self.center_m[0] + u * cos - v * sin, self.center_m[1] + u * sin + v * cos]
+        [
+            self.center_m[0] + u * cos - v * sin,
+            self.center_m[1] + u * sin + v * cos,
+        ]
     }
 
     pub(crate) fn corners(&self) -> Quad {
         let [x, y] = self.half_m;
-        [self.at(-x, -y), self.at(x, -y), self.at(x, y), self.at(-x, y)]
+        [
+            self.at(-x, -y),
+            self.at(x, -y),
+            self.at(x, y),
+            self.at(-x, y),
+        ]
     }
 }
 
 /// Lowest and highest x and y of some points.
 pub(crate) fn bounds(points: &[[f64; 2]]) -> [[f64; 2]; 2] {
-    let low = points.iter().fold([f64::INFINITY; 2], |low, p| [low[0].min(p[0]), low[1].min(p[1])]);
-    let high = points.iter().fold([f64::NEG_INFINITY; 2], |high, p| [high[0].max(p[0]), high[1].max(p[1])]);
+    let low = points.iter().fold([f64::INFINITY; 2], |low, p| {
+        [low[0].min(p[0]), low[1].min(p[1])]
+    });
+    let high = points.iter().fold([f64::NEG_INFINITY; 2], |high, p| {
+        [high[0].max(p[0]), high[1].max(p[1])]
+    });
     [low, high]
 }
 
@@ -56,7 +71,9 @@ fn separated_by_edge_of(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
 
 fn span(points: &[[f64; 2]], axis: [f64; 2]) -> [f64; 2] {
     let along = points.iter().map(|p| p[0] * axis[0] + p[1] * axis[1]);
-    along.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
+    along.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
+        [low.min(value), high.max(value)]
+    })
 }
 
 /// Numbered outlines by the cells of a square grid that their bounds touch.
@@ -76,7 +93,13 @@ impl CellIndex {
         let cell_m = cell_m.max((high[0] - low[0]).max(high[1] - low[1]) / 2000.0);
         let count = |axis: usize| ((high[axis] - low[axis]).max(0.0) / cell_m) as usize + 1;
         let (columns, rows) = (count(0), count(1));
-        Self { origin_m: low, cell_m, columns, rows, cells: vec![Vec::new(); columns * rows] }
+        Self {
+            origin_m: low,
+            cell_m,
+            columns,
+            rows,
+            cells: vec![Vec::new(); columns * rows],
+        }
     }
 
     pub(crate) fn insert(&mut self, number: u32, [low, high]: [[f64; 2]; 2]) {
@@ -89,15 +112,29 @@ impl CellIndex {
     }
 
     /// True if `test` is true for any outline whose cells touch the bounds. One outline may be tested several times.
-    pub(crate) fn any(&self, [low, high]: [[f64; 2]; 2], mut test: impl FnMut(u32) -> bool) -> bool {
+    pub(crate) fn any(
+        &self,
+        [low, high]: [[f64; 2]; 2],
+        mut test: impl FnMut(u32) -> bool,
+    ) -> bool {
         let ([c0, r0], [c1, r1]) = (self.cell(low), self.cell(high));
-        (r0..=r1).any(|row| (c0..=c1).any(|column| self.cells[row * self.columns + column].iter().any(|&n| test(n))))
+        (r0..=r1).any(|row| {
+            (c0..=c1).any(|column| {
+                self.cells[row * self.columns + column]
+                    .iter()
+                    .any(|&n| test(n))
+            })
+        })
     }
 
     fn cell(&self, [x, y]: [f64; 2]) -> [usize; 2] {
-        let place =
-            |value: f64, origin: f64, count: usize| (((value - origin) / self.cell_m).max(0.0) as usize).min(count - 1);
-        [place(x, self.origin_m[0], self.columns), place(y, self.origin_m[1], self.rows)]
+        let place = |value: f64, origin: f64, count: usize| {
+            (((value - origin) / self.cell_m).max(0.0) as usize).min(count - 1)
+        };
+        [
+            place(x, self.origin_m[0], self.columns),
+            place(y, self.origin_m[1], self.rows),
+        ]
     }
 }
 
@@ -107,7 +144,14 @@ mod tests {
 
     #[test]
     fn turned_squares_overlap_only_when_they_do() {
-        let square = |x: f64, yaw_rad| Rectangle { center_m: [x, 0.0], half_m: [1.0, 1.0], yaw_rad }.corners();
+        let square = |x: f64, yaw_rad| {
+            Rectangle {
+                center_m: [x, 0.0],
+                half_m: [1.0, 1.0],
+                yaw_rad,
+            }
+            .corners()
+        };
         let diamond = std::f64::consts::FRAC_PI_4;
         assert!(overlap(&square(0.0, 0.0), &square(1.9, 0.0)));
         assert!(!overlap(&square(0.0, 0.0), &square(2.1, 0.0)));

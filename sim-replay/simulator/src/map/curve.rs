@@ -78,7 +78,11 @@ impl Pose2 {
     #[must_use]
     pub fn moved(&self, u: f64, v: f64, turn_rad: f64) -> Self {
         let (sin, cos) = self.heading_rad.sin_cos();
-        Self::new(self.x + u * cos - v * sin, self.y + u * sin + v * cos, wrap_angle(self.heading_rad + turn_rad))
+        Self::new(
+            self.x + u * cos - v * sin,
+            self.y + u * sin + v * cos,
+            wrap_angle(self.heading_rad + turn_rad),
+        )
     }
 
     /// The pose turned round on the spot.
@@ -101,11 +105,17 @@ impl Curve {
         let (u, v, turn) = match self.shape {
             CurveShape::Line => (s_m, 0.0, 0.0),
             CurveShape::Arc { curvature } => clothoid(curvature, 0.0, s_m),
-            CurveShape::Spiral { start, end } => clothoid(start, (end - start) / self.length_m, s_m),
+            CurveShape::Spiral { start, end } => {
+                clothoid(start, (end - start) / self.length_m, s_m)
+            }
             CurveShape::Poly3(v) => poly3(v, s_m),
             CurveShape::ParamPoly3 { u, v, normalized } => {
                 let p = if normalized { s_m / self.length_m } else { s_m };
-                (cubic(u, p), cubic(v, p), cubic_slope(v, p).atan2(cubic_slope(u, p)))
+                (
+                    cubic(u, p),
+                    cubic(v, p),
+                    cubic_slope(v, p).atan2(cubic_slope(u, p)),
+                )
             }
         };
         self.start.moved(u, v, turn)
@@ -125,7 +135,11 @@ fn clothoid(k: f64, rate: f64, s: f64) -> (f64, f64, f64) {
     if rate == 0.0 {
         let turn = heading(s);
         // Half-angle form: no loss of digits when the arc is nearly straight.
-        let chord = if turn.abs() < 1e-9 { s } else { s * (turn / 2.0).sin() / (turn / 2.0) };
+        let chord = if turn.abs() < 1e-9 {
+            s
+        } else {
+            s * (turn / 2.0).sin() / (turn / 2.0)
+        };
         return (chord * (turn / 2.0).cos(), chord * (turn / 2.0).sin(), turn);
     }
     let turned = s.abs() * k.abs().max((k + rate * s).abs());
@@ -171,13 +185,25 @@ mod tests {
     use super::*;
 
     fn curve(shape: CurveShape, length_m: f64) -> Curve {
-        Curve { s_m: 0.0, start: Pose2::new(0.0, 0.0, 0.0), length_m, shape }
+        Curve {
+            s_m: 0.0,
+            start: Pose2::new(0.0, 0.0, 0.0),
+            length_m,
+            shape,
+        }
     }
 
     #[test]
     fn spiral_ends_at_the_fresnel_integrals() {
         // With heading pi/2 t^2 the clothoid of length 1 ends at (C(1), S(1)); tabulated values.
-        let end = curve(CurveShape::Spiral { start: 0.0, end: PI }, 1.0).end();
+        let end = curve(
+            CurveShape::Spiral {
+                start: 0.0,
+                end: PI,
+            },
+            1.0,
+        )
+        .end();
         assert!((end.x - 0.779_893_400_376_822_8).abs() < 1e-11, "{}", end.x);
         assert!((end.y - 0.438_259_147_390_354_8).abs() < 1e-11, "{}", end.y);
         assert!((end.heading_rad - FRAC_PI_2).abs() < 1e-12);
@@ -211,17 +237,34 @@ mod tests {
         let shapes = [
             CurveShape::Line,
             CurveShape::Arc { curvature: 0.05 },
-            CurveShape::Spiral { start: -0.03, end: 0.06 },
+            CurveShape::Spiral {
+                start: -0.03,
+                end: 0.06,
+            },
             CurveShape::Poly3([0.0, 0.0, 0.01, -0.0001]),
         ];
         for shape in shapes {
-            let curve = Curve { s_m: 0.0, start: Pose2::new(5.0, -3.0, 2.0), length_m: 40.0, shape };
+            let curve = Curve {
+                s_m: 0.0,
+                start: Pose2::new(5.0, -3.0, 2.0),
+                length_m: 40.0,
+                shape,
+            };
             for i in 1..39 {
-                let (before, at, after) =
-                    (curve.at(f64::from(i) - 0.01), curve.at(f64::from(i)), curve.at(f64::from(i) + 0.01));
-                assert!((before.distance_m(&after) / 0.02 - 1.0).abs() < 1e-3, "{shape:?} at {i}");
+                let (before, at, after) = (
+                    curve.at(f64::from(i) - 0.01),
+                    curve.at(f64::from(i)),
+                    curve.at(f64::from(i) + 0.01),
+                );
+                assert!(
+                    (before.distance_m(&after) / 0.02 - 1.0).abs() < 1e-3,
+                    "{shape:?} at {i}"
+                );
                 let chord = (after.y - before.y).atan2(after.x - before.x);
-                assert!(wrap_angle(chord - at.heading_rad).abs() < 1e-3, "{shape:?} at {i}");
+                assert!(
+                    wrap_angle(chord - at.heading_rad).abs() < 1e-3,
+                    "{shape:?} at {i}"
+                );
             }
         }
     }
@@ -230,10 +273,22 @@ mod tests {
     fn param_poly3_reaches_its_end_for_both_ranges() {
         let u = [0.0, 10.0, 0.0, 0.0];
         let v = [0.0, 0.0, 3.0, -2.0];
-        let normalized = curve(CurveShape::ParamPoly3 { u, v, normalized: true }, 11.0).end();
+        let normalized = curve(
+            CurveShape::ParamPoly3 {
+                u,
+                v,
+                normalized: true,
+            },
+            11.0,
+        )
+        .end();
         assert!((normalized.x - 10.0).abs() < 1e-12 && (normalized.y - 1.0).abs() < 1e-12);
         let scaled = |c: [f64; 4]| [c[0], c[1] / 11.0, c[2] / 121.0, c[3] / 1331.0];
-        let plain = CurveShape::ParamPoly3 { u: scaled(u), v: scaled(v), normalized: false };
+        let plain = CurveShape::ParamPoly3 {
+            u: scaled(u),
+            v: scaled(v),
+            normalized: false,
+        };
         assert!(curve(plain, 11.0).end().distance_m(&normalized) < 1e-9);
     }
 }

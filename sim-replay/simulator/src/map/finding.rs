@@ -36,7 +36,11 @@ impl fmt::Display for Finding {
             write!(out, "{within}: ")?;
         }
         write!(out, "<{}> {}; {}", self.element, self.found, self.action)?;
-        if self.count > 1 { write!(out, " ({} times)", self.count) } else { Ok(()) }
+        if self.count > 1 {
+            write!(out, " ({} times)", self.count)
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -61,13 +65,24 @@ impl FindingLog {
     }
 
     pub(super) fn add(&mut self, line: u32, element: &str, found: &str, action: &str) {
-        let key = [self.within.clone().unwrap_or_default(), shortened(element), shortened(action)];
+        let key = [
+            self.within.clone().unwrap_or_default(),
+            shortened(element),
+            shortened(action),
+        ];
         if let Some(&place) = self.places.get(&key) {
             self.list[place].count += 1;
             return;
         }
         let [_, element, action] = key.clone();
-        let finding = Finding { line, within: self.within.clone(), element, found: shortened(found), action, count: 1 };
+        let finding = Finding {
+            line,
+            within: self.within.clone(),
+            element,
+            found: shortened(found),
+            action,
+            count: 1,
+        };
         if self.list.len() < MAX_FINDINGS {
             self.places.insert(key, self.list.len());
             self.list.push(finding);
@@ -75,7 +90,12 @@ impl FindingLog {
             last.count += 1;
         } else {
             let (found, action) = ("and more findings".to_owned(), "counted only".to_owned());
-            self.list.push(Finding { within: None, found, action, ..finding });
+            self.list.push(Finding {
+                within: None,
+                found,
+                action,
+                ..finding
+            });
         }
     }
 
@@ -85,7 +105,16 @@ impl FindingLog {
 }
 
 fn shortened(text: &str) -> String {
-    text.chars().take(MAX_TEXT).map(|character| if character.is_control() { ' ' } else { character }).collect()
+    text.chars()
+        .take(MAX_TEXT)
+        .map(|character| {
+            if character.is_control() {
+                ' '
+            } else {
+                character
+            }
+        })
+        .collect()
 }
 
 #[cfg(test)]
@@ -100,14 +129,23 @@ mod tests {
         log.leave();
         log.add(9, "include", "file=\"a\"", "left out");
         assert_eq!(log.list.len(), 2);
-        assert_eq!(log.list[0].to_string(), "line 1: road 7: <speed> max=\"-1\"; treated as absent (3 times)");
-        assert_eq!(log.list[1].to_string(), "line 9: <include> file=\"a\"; left out");
+        assert_eq!(
+            log.list[0].to_string(),
+            "line 1: road 7: <speed> max=\"-1\"; treated as absent (3 times)"
+        );
+        assert_eq!(
+            log.list[1].to_string(),
+            "line 9: <include> file=\"a\"; left out"
+        );
         for road in 0..2 * MAX_FINDINGS {
             log.enter("road", &road.to_string());
             log.add(1, "speed", "max=\"-1\"", "treated as absent");
         }
         let list = log.into_list();
         assert_eq!(list.len(), MAX_FINDINGS + 1);
-        assert_eq!(list.iter().map(|finding| finding.count).sum::<usize>(), 4 + 2 * MAX_FINDINGS);
+        assert_eq!(
+            list.iter().map(|finding| finding.count).sum::<usize>(),
+            4 + 2 * MAX_FINDINGS
+        );
     }
 }

@@ -44,7 +44,10 @@ impl Ground {
     /// Level ground without decks.
     #[must_use]
     pub fn plane(z_m: f64) -> Self {
-        Self { terrain: Terrain::Plane { z_m }, decks: Vec::new() }
+        Self {
+            terrain: Terrain::Plane { z_m },
+            decks: Vec::new(),
+        }
     }
 
     /// Height of the terrain (not of decks) at `x`, `y`, metres.
@@ -70,7 +73,9 @@ impl HeightGrid {
     /// Height of the node in `column` and `row`, clamped to the grid, metres.
     #[must_use]
     pub(crate) fn node_m(&self, column: usize, row: usize) -> f64 {
-        f64::from(self.heights_m[row.min(self.rows - 1) * self.columns + column.min(self.columns - 1)])
+        f64::from(
+            self.heights_m[row.min(self.rows - 1) * self.columns + column.min(self.columns - 1)],
+        )
     }
 
     /// Height of the surface at `x`, `y`, metres.
@@ -81,7 +86,11 @@ impl HeightGrid {
         let (i, j) = (column as usize, row as usize);
         let (u, v) = (column - i as f64, row - j as f64);
         let (low, high) = (self.node_m(i, j), self.node_m(i + 1, j + 1));
-        let corner = if u >= v { self.node_m(i + 1, j) } else { self.node_m(i, j + 1) };
+        let corner = if u >= v {
+            self.node_m(i + 1, j)
+        } else {
+            self.node_m(i, j + 1)
+        };
         // Barycentric weights on the triangle's two legs.
         if u >= v {
             low + u * (corner - low) + v * (high - corner)
@@ -97,8 +106,16 @@ mod tests {
 
     #[test]
     fn grid_reproduces_an_inclined_plane_and_goes_on_level() {
-        let heights_m = (0..4).flat_map(|row| (0..5).map(move |column| (column * 2 + row * 3) as f32)).collect();
-        let grid = HeightGrid { origin_m: [-1.0, 2.0], cell_m: 2.0, columns: 5, rows: 4, heights_m };
+        let heights_m = (0..4)
+            .flat_map(|row| (0..5).map(move |column| (column * 2 + row * 3) as f32))
+            .collect();
+        let grid = HeightGrid {
+            origin_m: [-1.0, 2.0],
+            cell_m: 2.0,
+            columns: 5,
+            rows: 4,
+            heights_m,
+        };
         for (x, y) in [(-1.0, 2.0), (0.3, 2.9), (3.3, 6.1), (6.9, 7.9)] {
             let expected = (x + 1.0) + (y - 2.0) * 1.5;
             assert!((grid.height_m(x, y) - expected).abs() < 1e-9, "{x} {y}");

@@ -70,7 +70,10 @@ impl Lane {
     /// A lane of one width outside junctions, not yet linked. `centerline` holds at least two points.
     #[must_use]
     pub fn new(id: LaneId, centerline: Vec<[f64; 3]>, width_m: f64, speed_limit_mps: f64) -> Self {
-        let length_m = centerline.windows(2).map(|pair| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1])).sum();
+        let length_m = centerline
+            .windows(2)
+            .map(|pair| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1]))
+            .sum();
         let widths_m = vec![width_m; centerline.len()];
         Self {
             id,
@@ -101,7 +104,11 @@ impl Lane {
         let (from, to) = (self.centerline[index], self.centerline[index + 1]);
         let point = std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]));
         // Headings belong to the middles of the steps; between them they turn evenly, so that a vehicle does not jerk.
-        let neighbour = if share < 0.5 { index.saturating_sub(1) } else { (index + 1).min(last - 1) };
+        let neighbour = if share < 0.5 {
+            index.saturating_sub(1)
+        } else {
+            (index + 1).min(last - 1)
+        };
         let own = self.step_heading_rad(index);
         let turn = wrap_angle(self.step_heading_rad(neighbour) - own);
         (point, wrap_angle(own + turn * (share - 0.5).abs()))
@@ -110,7 +117,9 @@ impl Lane {
     /// Slope across the lane at `s_m`, radians; see [`Lane::banks_rad`].
     #[must_use]
     pub(crate) fn bank_rad(&self, s_m: f64) -> f64 {
-        let Some(last) = self.banks_rad.len().checked_sub(1).filter(|&last| last > 0) else { return 0.0 };
+        let Some(last) = self.banks_rad.len().checked_sub(1).filter(|&last| last > 0) else {
+            return 0.0;
+        };
         let step = (s_m / self.length_m * last as f64).clamp(0.0, last as f64);
         let index = (step as usize).min(last - 1);
         let share = step - index as f64;
@@ -139,7 +148,12 @@ impl LaneGraph {
     /// A graph of `lanes`, whose ids are their places.
     #[must_use]
     pub fn new(lanes: Vec<Lane>) -> Self {
-        debug_assert!(lanes.iter().enumerate().all(|(index, lane)| lane.id.0 as usize == index));
+        debug_assert!(
+            lanes
+                .iter()
+                .enumerate()
+                .all(|(index, lane)| lane.id.0 as usize == index)
+        );
         Self { lanes }
     }
 
@@ -154,7 +168,11 @@ impl LaneGraph {
 #[must_use]
 pub(crate) fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = angle_rad.rem_euclid(2.0 * PI);
-    if wrapped > PI { wrapped - 2.0 * PI } else { wrapped }
+    if wrapped > PI {
+        wrapped - 2.0 * PI
+    } else {
+        wrapped
+    }
 }
 
 #[cfg(test)]
@@ -165,13 +183,19 @@ mod tests {
     fn position_and_heading_on_a_circle() {
         let radius = 20.0;
         let points: Vec<_> = (0..=31).map(|i| f64::from(i) / 31.0 * PI / 2.0).collect();
-        let centerline = points.iter().map(|a| [radius * a.sin(), radius * (1.0 - a.cos()), 0.0]).collect();
+        let centerline = points
+            .iter()
+            .map(|a| [radius * a.sin(), radius * (1.0 - a.cos()), 0.0])
+            .collect();
         let lane = Lane::new(LaneId(0), centerline, 3.5, 10.0);
         assert!((lane.length_m - radius * PI / 2.0).abs() < 0.01);
         for share in [0.0, 0.21, 0.5, 0.77, 1.0] {
             let angle = share * PI / 2.0;
             let (point, heading) = lane.at(share * lane.length_m);
-            assert!((point[0] - radius * angle.sin()).abs() < 0.02, "{share}: {point:?}");
+            assert!(
+                (point[0] - radius * angle.sin()).abs() < 0.02,
+                "{share}: {point:?}"
+            );
             assert!((point[1] - radius * (1.0 - angle.cos())).abs() < 0.02);
             // Half a step is missing at both ends.
             assert!((heading - angle).abs() < 0.03, "{share}: {heading}");

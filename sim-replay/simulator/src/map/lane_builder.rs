@@ -34,14 +34,21 @@ pub(super) struct Origin {
 /// traffic keeps right or left, road by road.
 #[must_use]
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
-    let mut table = LaneTable { first_section: Vec::new(), ids: Vec::new() };
+    let mut table = LaneTable {
+        first_section: Vec::new(),
+        ids: Vec::new(),
+    };
     let (mut lanes, mut origins) = (Vec::new(), Vec::new());
     for (road_index, road) in network.roads.iter().enumerate() {
         table.first_section.push(table.ids.len());
         for section in 0..road.sections.len() {
             let mut ids = Vec::new();
             for lane_id in road.sections[section].lane_ids() {
-                let origin = Origin { road: road_index, section, lane: lane_id };
+                let origin = Origin {
+                    road: road_index,
+                    section,
+                    lane: lane_id,
+                };
                 let lane = build_lane(road, origin, LaneId(lanes.len() as u32));
                 ids.push(lane.as_ref().map(|lane| lane.id));
                 if let Some(lane) = lane {
@@ -49,7 +56,9 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
                     origins.push(origin);
                 }
             }
-            table.ids.push((-(road.sections[section].right.len() as i32), ids));
+            table
+                .ids
+                .push((-(road.sections[section].right.len() as i32), ids));
         }
     }
     let mut graph = LaneGraph::new(lanes);
@@ -64,11 +73,19 @@ impl LaneTable {
         let (lowest, ids) = &self.ids[self.first_section[road] + section];
         // Ids run from the lowest upwards and leave out 0.
         let place = lane - lowest - i32::from(lane > 0);
-        if lane == 0 || place < 0 { None } else { ids.get(place as usize).copied().flatten() }
+        if lane == 0 || place < 0 {
+            None
+        } else {
+            ids.get(place as usize).copied().flatten()
+        }
     }
 
     fn section_count(&self, road: usize) -> usize {
-        self.first_section.get(road + 1).copied().unwrap_or(self.ids.len()) - self.first_section[road]
+        self.first_section
+            .get(road + 1)
+            .copied()
+            .unwrap_or(self.ids.len())
+            - self.first_section[road]
     }
 
     /// The section of a road at one of its ends.
@@ -86,15 +103,30 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     if source.kind != LaneKind::Driving {
         return None;
     }
-    let (from, to) = (section.s_m.min(road.length_m), road.section_end_m(origin.section));
-    let CenterLine { points, widths_m, banks_rad, length_m } = center_line(road, origin, from, to)?;
+    let (from, to) = (
+        section.s_m.min(road.length_m),
+        road.section_end_m(origin.section),
+    );
+    let CenterLine {
+        points,
+        widths_m,
+        banks_rad,
+        length_m,
+    } = center_line(road, origin, from, to)?;
     let middle = (from + to) / 2.0;
-    let limit = source.speed_limit_mps.or_else(|| road.speed_limit_mps(middle)).unwrap_or(DEFAULT_LIMIT_MPS);
+    let limit = source
+        .speed_limit_mps
+        .or_else(|| road.speed_limit_mps(middle))
+        .unwrap_or(DEFAULT_LIMIT_MPS);
     let mut sorted = widths_m.clone();
     sorted.sort_unstable_by(f64::total_cmp);
     let mut lane = Lane::new(id, points, sorted[sorted.len() / 2], limit);
     (lane.widths_m, lane.length_m) = (widths_m, length_m);
-    lane.banks_rad = if road.lateral.is_level() { Vec::new() } else { banks_rad };
+    lane.banks_rad = if road.lateral.is_level() {
+        Vec::new()
+    } else {
+        banks_rad
+    };
     lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
     lane.in_junction = road.junction.is_some();
     if lane.in_junction {
@@ -148,16 +180,24 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<Center
         return None;
     }
     let steps = (total / STEP_M).round().max(1.0) as usize;
-    let mut line = CenterLine { points: Vec::new(), widths_m: Vec::new(), banks_rad: Vec::new(), length_m: total };
+    let mut line = CenterLine {
+        points: Vec::new(),
+        widths_m: Vec::new(),
+        banks_rad: Vec::new(),
+        length_m: total,
+    };
     let mut place = 0;
     for i in 0..=steps {
         let wanted = total * i as f64 / steps as f64;
         while place + 2 < lengths.len() && lengths[place + 1] < wanted {
             place += 1;
         }
-        let share = ((wanted - lengths[place]) / (lengths[place + 1] - lengths[place]).max(1e-12)).clamp(0.0, 1.0);
+        let share = ((wanted - lengths[place]) / (lengths[place + 1] - lengths[place]).max(1e-12))
+            .clamp(0.0, 1.0);
         let ((a, [width_a, bank_a]), (b, [width_b, bank_b])) = (samples[place], samples[place + 1]);
-        line.points.push(std::array::from_fn(|axis| a[axis] + share * (b[axis] - a[axis])));
+        line.points.push(std::array::from_fn(|axis| {
+            a[axis] + share * (b[axis] - a[axis])
+        }));
         line.widths_m.push(width_a + share * (width_b - width_a));
         line.banks_rad.push(bank_a + share * (bank_b - bank_a));
     }

@@ -33,16 +33,29 @@ impl LaneIndex {
     #[must_use]
     pub(crate) fn new(graph: &LaneGraph) -> Self {
         let points = || graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
-        let low = points().fold([f64::INFINITY; 2], |low, p| [low[0].min(p[0]), low[1].min(p[1])]);
-        let high = points().fold([f64::NEG_INFINITY; 2], |high, p| [high[0].max(p[0]), high[1].max(p[1])]);
+        let low = points().fold([f64::INFINITY; 2], |low, p| {
+            [low[0].min(p[0]), low[1].min(p[1])]
+        });
+        let high = points().fold([f64::NEG_INFINITY; 2], |high, p| {
+            [high[0].max(p[0]), high[1].max(p[1])]
+        });
         let cells = |axis: usize| ((high[axis] - low[axis]).max(0.0) / CELL_M) as usize + 1;
-        let mut index =
-            Self { origin_m: low, columns: cells(0), rows: cells(1), starts: Vec::new(), entries: Vec::new() };
+        let mut index = Self {
+            origin_m: low,
+            columns: cells(0),
+            rows: cells(1),
+            starts: Vec::new(),
+            entries: Vec::new(),
+        };
         let mut tagged: Vec<(usize, LaneId, u32)> = Vec::new();
         for lane in &graph.lanes {
             for (place, point) in lane.centerline.iter().enumerate() {
                 let [column, row] = index.cell(point[0], point[1]);
-                tagged.push((row as usize * index.columns + column as usize, lane.id, place as u32));
+                tagged.push((
+                    row as usize * index.columns + column as usize,
+                    lane.id,
+                    place as u32,
+                ));
             }
         }
         tagged.sort_unstable();
@@ -53,7 +66,10 @@ impl LaneIndex {
             }
             index.starts.push(filled as u32);
         }
-        index.entries = tagged.into_iter().map(|(_, lane, place)| (lane, place)).collect();
+        index.entries = tagged
+            .into_iter()
+            .map(|(_, lane, place)| (lane, place))
+            .collect();
         index
     }
 
@@ -76,7 +92,9 @@ impl LaneIndex {
             }
             let position = project_near(lane, place, x, y);
             let (point, heading) = lane.at(position.s_m);
-            if heading_rad.is_some_and(|wanted| wrap_angle(wanted - heading).abs() > 60f64.to_radians()) {
+            if heading_rad
+                .is_some_and(|wanted| wrap_angle(wanted - heading).abs() > 60f64.to_radians())
+            {
                 return;
             }
             let distance = (x - point[0]).hypot(y - point[1]);
@@ -101,7 +119,9 @@ impl LaneIndex {
         for row in clamp(low[1], self.rows)..=clamp(high[1], self.rows) {
             for column in clamp(low[0], self.columns)..=clamp(high[0], self.columns) {
                 let cell = row * self.columns + column;
-                for &(lane, place) in &self.entries[self.starts[cell] as usize..self.starts[cell + 1] as usize] {
+                for &(lane, place) in
+                    &self.entries[self.starts[cell] as usize..self.starts[cell + 1] as usize]
+                {
                     found(lane, place as usize);
                 }
             }
@@ -109,7 +129,10 @@ impl LaneIndex {
     }
 
     fn cell(&self, x: f64, y: f64) -> [i64; 2] {
-        [((x - self.origin_m[0]) / CELL_M).floor() as i64, ((y - self.origin_m[1]) / CELL_M).floor() as i64]
+        [
+            ((x - self.origin_m[0]) / CELL_M).floor() as i64,
+            ((y - self.origin_m[1]) / CELL_M).floor() as i64,
+        ]
     }
 }
 
@@ -124,9 +147,20 @@ fn project_near(lane: &Lane, place: usize, x: f64, y: f64) -> LanePosition {
         let share = (((x - from[0]) * dx + (y - from[1]) * dy) / squared).clamp(0.0, 1.0);
         let distance = (x - from[0] - share * dx).hypot(y - from[1] - share * dy);
         let offset_m = (dx * (y - from[1]) - dy * (x - from[0])) / squared.sqrt();
-        (distance, LanePosition { lane: lane.id, s_m: (index as f64 + share) * step_m, offset_m })
+        (
+            distance,
+            LanePosition {
+                lane: lane.id,
+                s_m: (index as f64 + share) * step_m,
+                offset_m,
+            },
+        )
     });
-    if candidates[0].0 <= candidates[1].0 { candidates[0].1 } else { candidates[1].1 }
+    if candidates[0].0 <= candidates[1].0 {
+        candidates[0].1
+    } else {
+        candidates[1].1
+    }
 }
 
 #[cfg(test)]
@@ -135,7 +169,19 @@ mod tests {
 
     fn two_way() -> LaneGraph {
         let line = |y: f64, forward: bool| {
-            (0..=100).map(|i| [if forward { f64::from(i) } else { f64::from(100 - i) }, y, 0.0]).collect()
+            (0..=100)
+                .map(|i| {
+                    [
+                        if forward {
+                            f64::from(i)
+                        } else {
+                            f64::from(100 - i)
+                        },
+                        y,
+                        0.0,
+                    ]
+                })
+                .collect()
         };
         LaneGraph::new(vec![
             Lane::new(LaneId(0), line(-2.0, true), 3.5, 10.0),
@@ -147,13 +193,25 @@ mod tests {
     fn nearest_lane_with_and_without_heading() {
         let graph = two_way();
         let index = LaneIndex::new(&graph);
-        let found = index.nearest(&graph, [30.3, -1.2], 5.0, None, None).unwrap();
+        let found = index
+            .nearest(&graph, [30.3, -1.2], 5.0, None, None)
+            .unwrap();
         assert_eq!(found.lane, LaneId(0));
         assert!((found.s_m - 30.3).abs() < 1e-9 && (found.offset_m - 0.8).abs() < 1e-9);
-        let found = index.nearest(&graph, [30.3, -1.2], 5.0, Some(3.0), Some(0.5)).unwrap();
+        let found = index
+            .nearest(&graph, [30.3, -1.2], 5.0, Some(3.0), Some(0.5))
+            .unwrap();
         assert_eq!(found.lane, LaneId(1));
         assert!((found.s_m - 69.7).abs() < 1e-9 && (found.offset_m - 3.2).abs() < 1e-9);
-        assert!(index.nearest(&graph, [30.3, 40.0], 5.0, None, None).is_none());
-        assert!(index.nearest(&graph, [30.3, -1.2], 5.0, None, Some(6.0)).is_none());
+        assert!(
+            index
+                .nearest(&graph, [30.3, 40.0], 5.0, None, None)
+                .is_none()
+        );
+        assert!(
+            index
+                .nearest(&graph, [30.3, -1.2], 5.0, None, Some(6.0))
+                .is_none()
+        );
     }
 }

@@ -40,16 +40,25 @@ impl LateralProfile {
     /// True if every cross-section is a straight line, level or not.
     #[must_use]
     pub fn is_flat(&self) -> bool {
-        self.crossfall_rad.iter().all(|side| side.records.is_empty()) && self.shapes.is_empty()
+        self.crossfall_rad
+            .iter()
+            .all(|side| side.records.is_empty())
+            && self.shapes.is_empty()
     }
 
     /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m`,
     /// metres.
     #[must_use]
     pub fn at(&self, s_m: f64, t_m: f64) -> [f64; 2] {
-        let fall = self.crossfall_rad[usize::from(t_m < 0.0)].at(s_m).clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD);
+        let fall = self.crossfall_rad[usize::from(t_m < 0.0)]
+            .at(s_m)
+            .clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD);
         let height = self.shape_m(s_m, t_m) - t_m.abs() * fall.tan();
-        let (sin, cos) = self.superelevation_rad.at(s_m).clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD).sin_cos();
+        let (sin, cos) = self
+            .superelevation_rad
+            .at(s_m)
+            .clamp(-MAX_SLOPE_RAD, MAX_SLOPE_RAD)
+            .sin_cos();
         [t_m * cos - height * sin, t_m * sin + height * cos]
     }
 
@@ -70,8 +79,14 @@ impl LateralProfile {
 impl CrossShape {
     /// Height at `t_m`; before the first record as at its start.
     fn at(&self, t_m: f64) -> f64 {
-        let first = self.height_m.records.first().map_or(t_m, |&(start, _)| start);
-        self.height_m.at(t_m.max(first)).clamp(-MAX_SHAPE_M, MAX_SHAPE_M)
+        let first = self
+            .height_m
+            .records
+            .first()
+            .map_or(t_m, |&(start, _)| start);
+        self.height_m
+            .at(t_m.max(first))
+            .clamp(-MAX_SHAPE_M, MAX_SHAPE_M)
     }
 }
 
@@ -81,10 +96,16 @@ mod tests {
 
     #[test]
     fn superelevation_turns_the_section_about_the_reference_line() {
-        let lateral = LateralProfile { superelevation_rad: Profile::constant(0.1), ..LateralProfile::default() };
+        let lateral = LateralProfile {
+            superelevation_rad: Profile::constant(0.1),
+            ..LateralProfile::default()
+        };
         for t in [-6.0, -1.5, 4.0] {
             let [aside, height] = lateral.at(3.0, t);
-            assert!((aside - t * 0.1f64.cos()).abs() < 1e-12 && (height - t * 0.1f64.sin()).abs() < 1e-12);
+            assert!(
+                (aside - t * 0.1f64.cos()).abs() < 1e-12
+                    && (height - t * 0.1f64.sin()).abs() < 1e-12
+            );
         }
         assert!(lateral.is_flat() && !lateral.is_level() && LateralProfile::default().is_level());
     }
@@ -92,7 +113,10 @@ mod tests {
     #[test]
     fn crossfall_falls_on_both_sides_of_the_line() {
         let crossfall_rad = [Profile::constant(0.02), Profile::constant(0.04)];
-        let lateral = LateralProfile { crossfall_rad, ..LateralProfile::default() };
+        let lateral = LateralProfile {
+            crossfall_rad,
+            ..LateralProfile::default()
+        };
         assert!((lateral.at(0.0, 5.0)[1] + 5.0 * 0.02f64.tan()).abs() < 1e-12);
         assert!((lateral.at(0.0, -5.0)[1] + 5.0 * 0.04f64.tan()).abs() < 1e-12);
         assert_eq!(lateral.at(0.0, 0.0), [0.0, 0.0]);
@@ -101,14 +125,33 @@ mod tests {
     #[test]
     fn shapes_change_evenly_from_one_cross_section_to_the_next() {
         let roof = |height: f64| {
-            let records = vec![(-4.0, [0.0, height / 4.0, 0.0, 0.0]), (0.0, [height, -height / 4.0, 0.0, 0.0])];
+            let records = vec![
+                (-4.0, [0.0, height / 4.0, 0.0, 0.0]),
+                (0.0, [height, -height / 4.0, 0.0, 0.0]),
+            ];
             Profile { records }
         };
-        let shapes = vec![CrossShape { s_m: 0.0, height_m: roof(0.4) }, CrossShape { s_m: 100.0, height_m: roof(0.8) }];
-        let lateral = LateralProfile { shapes, ..LateralProfile::default() };
-        for (s, t, expected) in
-            [(0.0, 0.0, 0.4), (50.0, 0.0, 0.6), (100.0, 2.0, 0.4), (150.0, 0.0, 0.8), (0.0, -9.0, 0.0)]
-        {
+        let shapes = vec![
+            CrossShape {
+                s_m: 0.0,
+                height_m: roof(0.4),
+            },
+            CrossShape {
+                s_m: 100.0,
+                height_m: roof(0.8),
+            },
+        ];
+        let lateral = LateralProfile {
+            shapes,
+            ..LateralProfile::default()
+        };
+        for (s, t, expected) in [
+            (0.0, 0.0, 0.4),
+            (50.0, 0.0, 0.6),
+            (100.0, 2.0, 0.4),
+            (150.0, 0.0, 0.8),
+            (0.0, -9.0, 0.0),
+        ] {
             assert!((lateral.at(s, t)[1] - expected).abs() < 1e-12, "{s} {t}");
         }
     }

@@ -78,7 +78,10 @@ impl RoadMapSource {
     /// The name of the map made from it: its kind, or the stem of the map's file in small letters.
     #[must_use]
     pub fn name(&self) -> String {
-        let stem = |path: &Path| path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase());
+        let stem = |path: &Path| {
+            path.file_stem()
+                .map(|stem| stem.to_string_lossy().to_lowercase())
+        };
         match self {
             Self::Town1 => "town1".into(),
             Self::Town4 => "town4".into(),
@@ -153,7 +156,14 @@ pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, RoadMapE
         RoadMapSource::OpenDrive(path) => {
             let Map { network, lanes } = read_map(path)?;
             check_extent(path, &network, &lanes)?;
-            Ok(place_roadside(name, &Layout { network, islands: Vec::new() }, map_seed))
+            Ok(place_roadside(
+                name,
+                &Layout {
+                    network,
+                    islands: Vec::new(),
+                },
+                map_seed,
+            ))
         }
     }
 }
@@ -166,11 +176,18 @@ fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result
         values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
     };
     if graph.lanes.is_empty() {
-        return Err(RoadMapError::NoLanes { path: path.into(), roads: network.roads.len() });
+        return Err(RoadMapError::NoLanes {
+            path: path.into(),
+            roads: network.roads.len(),
+        });
     }
     let extent_m = extent(0).max(extent(1));
     if extent_m > MAX_EXTENT_M {
-        return Err(RoadMapError::TooLarge { path: path.into(), extent_m, limit_m: MAX_EXTENT_M });
+        return Err(RoadMapError::TooLarge {
+            path: path.into(),
+            extent_m,
+            limit_m: MAX_EXTENT_M,
+        });
     }
     Ok(())
 }
@@ -190,9 +207,15 @@ pub struct Map {
 /// [`RoadMapError::Read`] and [`RoadMapError::OpenDrive`].
 pub fn read_map(path: &Path) -> Result<Map, RoadMapError> {
     let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64);
-    let bytes = bytes.map_err(|source| RoadMapError::Read { path: path.into(), source })?;
+    let bytes = bytes.map_err(|source| RoadMapError::Read {
+        path: path.into(),
+        source,
+    })?;
     let network = opendrive::read_bytes(&bytes);
-    let mut network = network.map_err(|source| RoadMapError::OpenDrive { path: path.into(), source })?;
+    let mut network = network.map_err(|source| RoadMapError::OpenDrive {
+        path: path.into(),
+        source,
+    })?;
     let (lanes, counts) = lane_builder::lane_graph(&network);
     network.findings.extend(counts.findings);
     Ok(Map { network, lanes })
@@ -203,7 +226,14 @@ fn place_roadside(name: String, layout: &Layout, map_seed: u64) -> MapModel {
     let surface = Surface::new(&layout.network);
     let ground = terrain::ground(&surface, map_seed);
     let (solids, parking) = roadside::place_roadside(layout, &surface, &ground, map_seed);
-    MapModel { name, lanes, ground, solids, parking, findings: layout.network.findings.clone() }
+    MapModel {
+        name,
+        lanes,
+        ground,
+        solids,
+        parking,
+        findings: layout.network.findings.clone(),
+    }
 }
 
 #[cfg(test)]
@@ -228,17 +258,33 @@ mod tests {
     #[test]
     fn procedural_maps_are_unchanged() {
         for (source, counts, sums) in [
-            (RoadMapSource::Town1, [168, 4221, 445, 0], [4735203.0653, 2410977.6519, 244239.8916]),
-            (RoadMapSource::Town4, [172, 11365, 286, 192], [2554837.7919, 1465742.7106, 139175.4820]),
+            (
+                RoadMapSource::Town1,
+                [168, 4221, 445, 0],
+                [4735203.0653, 2410977.6519, 244239.8916],
+            ),
+            (
+                RoadMapSource::Town4,
+                [172, 11365, 286, 192],
+                [2554837.7919, 1465742.7106, 139175.4820],
+            ),
         ] {
             let map_model = build(&source, 0).unwrap();
             let sum = |values: &mut dyn Iterator<Item = [f64; 3]>| -> f64 {
                 values.map(|[x, y, z]| x + 2.0 * y + 3.0 * z).sum()
             };
             let found = [
-                sum(&mut map_model.lanes.lanes.iter().flat_map(|lane| &lane.centerline).copied()),
+                sum(&mut map_model
+                    .lanes
+                    .lanes
+                    .iter()
+                    .flat_map(|lane| &lane.centerline)
+                    .copied()),
                 sum(&mut map_model.solids.iter().map(|solid| solid.center_m)),
-                sum(&mut map_model.parking.iter().map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
+                sum(&mut map_model
+                    .parking
+                    .iter()
+                    .map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
             ];
             let counted = [
                 map_model.lanes.lanes.len(),
@@ -247,9 +293,20 @@ mod tests {
                 map_model.ground.decks.len(),
             ];
             assert_eq!(counted, counts, "{source:?}");
-            assert!(found.iter().zip(sums).all(|(found, sum): (&f64, f64)| (found - sum).abs() < 0.01), "{found:?}");
             assert!(
-                map_model.findings.is_empty() && map_model.lanes.lanes.iter().all(|lane| lane.banks_rad.is_empty())
+                found
+                    .iter()
+                    .zip(sums)
+                    .all(|(found, sum): (&f64, f64)| (found - sum).abs() < 0.01),
+                "{found:?}"
+            );
+            assert!(
+                map_model.findings.is_empty()
+                    && map_model
+                        .lanes
+                        .lanes
+                        .iter()
+                        .all(|lane| lane.banks_rad.is_empty())
             );
         }
     }
@@ -258,10 +315,26 @@ mod tests {
     fn unusable_maps_are_refused_with_their_path() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("town.xodr");
-        let error = || build(&RoadMapSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
-        assert!(error().starts_with(&path.display().to_string()), "{}", error());
-        std::fs::write(&path, "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>").unwrap();
-        assert!(error().ends_with("line 1: <road> has no <planView>"), "{}", error());
+        let error = || {
+            build(&RoadMapSource::OpenDrive(path.clone()), 0)
+                .unwrap_err()
+                .to_string()
+        };
+        assert!(
+            error().starts_with(&path.display().to_string()),
+            "{}",
+            error()
+        );
+        std::fs::write(
+            &path,
+            "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>",
+        )
+        .unwrap();
+        assert!(
+            error().ends_with("line 1: <road> has no <planView>"),
+            "{}",
+            error()
+        );
         let road = |lanes: &str, length: u32| {
             format!(
                 "<OpenDRIVE><road id=\"1\" length=\"{length}\"><planView><geometry s=\"0\" x=\"0\" y=\"0\" hdg=\"0\" \
@@ -269,16 +342,34 @@ mod tests {
                  </laneSection></lanes></road></OpenDRIVE>"
             )
         };
-        std::fs::File::create(&path).unwrap().set_len(opendrive::MAX_BYTES as u64 + 1).unwrap();
-        assert!(error().ends_with("larger than 67108864 bytes, the most that is read"), "{}", error());
+        std::fs::File::create(&path)
+            .unwrap()
+            .set_len(opendrive::MAX_BYTES as u64 + 1)
+            .unwrap();
+        assert!(
+            error().ends_with("larger than 67108864 bytes, the most that is read"),
+            "{}",
+            error()
+        );
         std::fs::write(&path, road("", 10)).unwrap();
-        assert!(error().ends_with("none of its 1 roads has a driving lane"), "{}", error());
+        assert!(
+            error().ends_with("none of its 1 roads has a driving lane"),
+            "{}",
+            error()
+        );
         let lane = "<lane id=\"-1\" type=\"driving\"><width sOffset=\"0\" a=\"3\" b=\"0\" c=\"0\" d=\"0\"/></lane>";
         std::fs::write(&path, road(lane, 60_000)).unwrap();
-        assert!(error().ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"), "{}", error());
+        assert!(
+            error().ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"),
+            "{}",
+            error()
+        );
         std::fs::write(&path, road(lane, 400)).unwrap();
         let map_model = build(&RoadMapSource::OpenDrive(path.clone()), 0).unwrap();
-        assert_eq!((map_model.name.as_str(), map_model.lanes.lanes.len()), ("town", 1));
+        assert_eq!(
+            (map_model.name.as_str(), map_model.lanes.lanes.len()),
+            ("town", 1)
+        );
         assert!(map_model.obstructions().is_empty() && map_model.solids.len() > 50);
     }
 }

@@ -20,8 +20,9 @@ fn value_noise(x: f64, y: f64, seed: u64) -> f64 {
 
 /// A value 0..1 from two whole numbers and a seed; the mixing steps are those of splitmix64.
 fn hashed(x: i64, y: i64, seed: u64) -> f64 {
-    let mut state =
-        seed ^ (x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
+    let mut state = seed
+        ^ (x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15)
+        ^ (y as u64).wrapping_mul(0xc2b2_ae3d_27d4_eb4f);
     state = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     state = (state ^ (state >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     state ^= state >> 31;

@@ -13,7 +13,9 @@ impl Profile {
     /// The same value everywhere.
     #[must_use]
     pub fn constant(value: f64) -> Self {
-        Self { records: vec![(0.0, [value, 0.0, 0.0, 0.0])] }
+        Self {
+            records: vec![(0.0, [value, 0.0, 0.0, 0.0])],
+        }
     }
 
     /// The cubic that leads from one value and slope to another over `length` from `start` on.
@@ -33,13 +35,16 @@ impl Profile {
     /// Value at `s`; the first cubic also holds before its start, and an empty profile is 0.
     #[must_use]
     pub fn at(&self, s: f64) -> f64 {
-        self.record_at(s).map_or(0.0, |(start, coefficients)| cubic(coefficients, s - start))
+        self.record_at(s)
+            .map_or(0.0, |(start, coefficients)| cubic(coefficients, s - start))
     }
 
     /// Slope at `s`.
     #[must_use]
     pub(crate) fn slope_at(&self, s: f64) -> f64 {
-        self.record_at(s).map_or(0.0, |(start, coefficients)| cubic_slope(coefficients, s - start))
+        self.record_at(s).map_or(0.0, |(start, coefficients)| {
+            cubic_slope(coefficients, s - start)
+        })
     }
 
     fn record_at(&self, s: f64) -> Option<(f64, [f64; 4])> {
@@ -55,7 +60,13 @@ mod tests {
     #[test]
     fn profile_switches_cubics_and_hermite_meets_both_ends() {
         let ramp = Profile::hermite(10.0, 20.0, [1.0, 0.0], [5.0, 0.1]);
-        let profile = Profile { records: vec![(0.0, [1.0, 0.0, 0.0, 0.0]), ramp, (30.0, [5.0, 0.1, 0.0, 0.0])] };
+        let profile = Profile {
+            records: vec![
+                (0.0, [1.0, 0.0, 0.0, 0.0]),
+                ramp,
+                (30.0, [5.0, 0.1, 0.0, 0.0]),
+            ],
+        };
         assert!((profile.at(-3.0) - 1.0).abs() < 1e-12);
         assert!((profile.at(30.0 - 1e-9) - profile.at(30.0)).abs() < 1e-6);
         assert!((profile.slope_at(30.0 - 1e-9) - 0.1).abs() < 1e-6);

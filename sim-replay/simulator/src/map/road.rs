@@ -116,7 +116,15 @@ impl RoadLane {
     /// A lane without links and speed limit of its own.
     #[must_use]
     pub fn new(kind: LaneKind, width: Profile) -> Self {
-        Self { kind, width, predecessor: None, successor: None, speed_limit_mps: None, level: false, reversed: false }
+        Self {
+            kind,
+            width,
+            predecessor: None,
+            successor: None,
+            speed_limit_mps: None,
+            level: false,
+            reversed: false,
+        }
     }
 }
 
@@ -271,7 +279,10 @@ impl Road {
 
     /// Inner border of the lanes of one side that stay level, metres.
     fn level_from_m(&self, section: usize, s_m: f64, left: bool) -> Option<f64> {
-        let lanes = self.sections.get(section).map(|section| if left { &section.left } else { &section.right })?;
+        let lanes = self
+            .sections
+            .get(section)
+            .map(|section| if left { &section.left } else { &section.right })?;
         let place = lanes.iter().position(|lane| lane.level)? as i32 + 1;
         let [low, high] = self.lane_span_m(section, if left { place } else { -place }, s_m);
         Some(if left { low } else { high })
@@ -287,28 +298,36 @@ impl Road {
         let [low, high] = self.lane_span_m(section, id, s_m);
         // A lane of no width yet lies as the lane around its place.
         let half_m = (high - low).max(0.2) / 2.0;
-        let [right, left] = [-half_m, half_m].map(|offset| self.aside_m(section, s_m, (low + high) / 2.0 + offset));
+        let [right, left] =
+            [-half_m, half_m].map(|offset| self.aside_m(section, s_m, (low + high) / 2.0 + offset));
         (left[1] - right[1]).atan2(left[0] - right[0])
     }
 
     /// True if traffic on lane `id` of section `section` leads along the road.
     #[must_use]
     pub(crate) fn leads_along(&self, section: usize, id: i32) -> bool {
-        let reversed =
-            self.sections.get(section).and_then(|section| section.lane(id)).is_some_and(|lane| lane.reversed);
+        let reversed = self
+            .sections
+            .get(section)
+            .and_then(|section| section.lane(id))
+            .is_some_and(|lane| lane.reversed);
         ((id < 0) != self.left_hand) != reversed
     }
 
     /// End of section `index`, metres.
     #[must_use]
     pub(crate) fn section_end_m(&self, index: usize) -> f64 {
-        self.sections.get(index + 1).map_or(self.length_m, |next| next.s_m.min(self.length_m))
+        self.sections
+            .get(index + 1)
+            .map_or(self.length_m, |next| next.s_m.min(self.length_m))
     }
 
     /// Index of the section at `s_m` in [`Road::sections`].
     #[must_use]
     pub(crate) fn section_at(&self, s_m: f64) -> usize {
-        self.sections.partition_point(|section| section.s_m <= s_m).saturating_sub(1)
+        self.sections
+            .partition_point(|section| section.s_m <= s_m)
+            .saturating_sub(1)
     }
 
     /// Shift of the lanes' origin across the road at `s_m`, metres, clamped to the limits of a road since cubics of a
@@ -322,20 +341,32 @@ impl Road {
     #[must_use]
     pub(crate) fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
-        let side = if id > 0 { &section.left } else { &section.right };
+        let side = if id > 0 {
+            &section.left
+        } else {
+            &section.right
+        };
         let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M);
         let place = id.unsigned_abs() as usize;
         let inner: f64 = side.iter().take(place - 1).map(width).sum();
         let outer = inner + side.get(place - 1).map_or(0.0, width);
         let origin = self.lane_offset_m(s_m);
-        if id > 0 { [origin + inner, origin + outer] } else { [origin - outer, origin - inner] }
+        if id > 0 {
+            [origin + inner, origin + outer]
+        } else {
+            [origin - outer, origin - inner]
+        }
     }
 
     /// Speed limit at `s_m` where the road has one, metres per second.
     #[must_use]
     pub(crate) fn speed_limit_mps(&self, s_m: f64) -> Option<f64> {
-        let after = self.speed_limits.partition_point(|&(start, _)| start <= s_m);
-        self.speed_limits.get(after.saturating_sub(1)).map(|&(_, limit)| limit)
+        let after = self
+            .speed_limits
+            .partition_point(|&(start, _)| start <= s_m);
+        self.speed_limits
+            .get(after.saturating_sub(1))
+            .map(|&(_, limit)| limit)
     }
 }
 
@@ -346,9 +377,15 @@ mod tests {
     #[test]
     fn lane_spans_stack_outwards_from_the_offset() {
         let lane = |width: f64| RoadLane::new(LaneKind::Driving, Profile::constant(width));
-        let section = LaneSection { s_m: 0.0, left: vec![lane(3.0)], right: vec![lane(3.5), lane(2.0)] };
+        let section = LaneSection {
+            s_m: 0.0,
+            left: vec![lane(3.0)],
+            right: vec![lane(3.5), lane(2.0)],
+        };
         assert_eq!(section.lane_ids().collect::<Vec<_>>(), [-2, -1, 1]);
-        assert!(section.lane(0).is_none() && section.lane(2).is_none() && section.lane(-2).is_some());
+        assert!(
+            section.lane(0).is_none() && section.lane(2).is_none() && section.lane(-2).is_some()
+        );
         let road = Road {
             id: "1".into(),
             length_m: 10.0,

@@ -61,8 +61,16 @@ impl Shape {
     #[must_use]
     pub(crate) fn half_height_m(&self) -> f64 {
         match *self {
-            Self::Box { half_m: [_, _, half] } | Self::Cylinder { half_height_m: half, .. } => half,
-            Self::Ellipsoid { radii_m: [_, _, radius] } => radius,
+            Self::Box {
+                half_m: [_, _, half],
+            }
+            | Self::Cylinder {
+                half_height_m: half,
+                ..
+            } => half,
+            Self::Ellipsoid {
+                radii_m: [_, _, radius],
+            } => radius,
         }
     }
 
@@ -94,8 +102,20 @@ pub struct Solid {
 impl Solid {
     /// A solid by its parts.
     #[must_use]
-    pub fn new(kind: SolidKind, shape: Shape, center_m: [f64; 3], yaw_rad: f64, reflectivity: f32) -> Self {
-        Self { kind, shape, center_m, yaw_rad, reflectivity }
+    pub fn new(
+        kind: SolidKind,
+        shape: Shape,
+        center_m: [f64; 3],
+        yaw_rad: f64,
+        reflectivity: f32,
+    ) -> Self {
+        Self {
+            kind,
+            shape,
+            center_m,
+            yaw_rad,
+            reflectivity,
+        }
     }
 
     /// Height of its lowest point, metres in the world frame.
@@ -116,11 +136,15 @@ impl Solid {
         let [half_x, half_y] = self.shape.half_footprint_m();
         let (sin, cos) = self.yaw_rad.sin_cos();
         let half = match self.shape {
-            Shape::Box { .. } => {
-                [(half_x * cos).abs() + (half_y * sin).abs(), (half_x * sin).abs() + (half_y * cos).abs()]
-            }
+            Shape::Box { .. } => [
+                (half_x * cos).abs() + (half_y * sin).abs(),
+                (half_x * sin).abs() + (half_y * cos).abs(),
+            ],
             Shape::Cylinder { radius_m, .. } => [radius_m, radius_m],
-            Shape::Ellipsoid { .. } => [(half_x * cos).hypot(half_y * sin), (half_x * sin).hypot(half_y * cos)],
+            Shape::Ellipsoid { .. } => [
+                (half_x * cos).hypot(half_y * sin),
+                (half_x * sin).hypot(half_y * cos),
+            ],
         };
         let half = [half[0], half[1], self.shape.half_height_m()];
         (
@@ -136,14 +160,27 @@ mod tests {
 
     #[test]
     fn bounds_of_a_turned_box_and_of_an_ellipsoid() {
-        let shape = Shape::Box { half_m: [2.0, 1.0, 3.0] };
-        let solid = Solid::new(SolidKind::Building, shape, [10.0, 0.0, 3.0], std::f64::consts::FRAC_PI_2, 0.4);
+        let shape = Shape::Box {
+            half_m: [2.0, 1.0, 3.0],
+        };
+        let solid = Solid::new(
+            SolidKind::Building,
+            shape,
+            [10.0, 0.0, 3.0],
+            std::f64::consts::FRAC_PI_2,
+            0.4,
+        );
         let (low, high) = solid.bounds_m();
         let expected = ([9.0, -2.0, 0.0], [11.0, 2.0, 6.0]);
         for axis in 0..3 {
-            assert!((low[axis] - expected.0[axis]).abs() < 1e-12 && (high[axis] - expected.1[axis]).abs() < 1e-12);
+            assert!(
+                (low[axis] - expected.0[axis]).abs() < 1e-12
+                    && (high[axis] - expected.1[axis]).abs() < 1e-12
+            );
         }
-        let shape = Shape::Ellipsoid { radii_m: [2.0, 2.0, 1.0] };
+        let shape = Shape::Ellipsoid {
+            radii_m: [2.0, 2.0, 1.0],
+        };
         let (low, _) = Solid::new(SolidKind::TreeCrown, shape, [0.0; 3], 0.7, 0.3).bounds_m();
         assert!((low[0] + 2.0).abs() < 1e-12 && (low[1] + 2.0).abs() < 1e-12);
     }

@@ -77,12 +77,15 @@ impl CrossSection {
 
     /// Height at `t`, metres; straight from one side of the road to the other.
     pub(crate) fn height_m(&self, t_m: f64) -> f64 {
-        self.across(t_m, 2).map_or(self.z_m, |height| self.z_m + height)
+        self.across(t_m, 2)
+            .map_or(self.z_m, |height| self.z_m + height)
     }
 
     /// Slope across, radians; positive where the left side is higher.
     pub(crate) fn bank_rad(&self) -> f64 {
-        self.bank.map_or(0.0, |[right, left]| (left[2] - right[2]).atan2(left[1] - right[1]))
+        self.bank.map_or(0.0, |[right, left]| {
+            (left[2] - right[2]).atan2(left[1] - right[1])
+        })
     }
 
     /// Lowest and highest of both paved edges, metres.
@@ -101,18 +104,27 @@ impl CrossSection {
 impl Patch {
     /// Height of the surface at (or beside) a place, metres.
     pub(crate) fn height_m(&self, [x, y]: [f64; 2]) -> f64 {
-        let mix = |a: [f64; 2], b: [f64; 2], share: f64| [0, 1].map(|axis| a[axis] + share * (b[axis] - a[axis]));
+        let mix = |a: [f64; 2], b: [f64; 2], share: f64| {
+            [0, 1].map(|axis| a[axis] + share * (b[axis] - a[axis]))
+        };
         let middle = |a: [f64; 2], b: [f64; 2]| [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
-        let (start, end) = (middle(self.quad[0], self.quad[3]), middle(self.quad[1], self.quad[2]));
+        let (start, end) = (
+            middle(self.quad[0], self.quad[3]),
+            middle(self.quad[1], self.quad[2]),
+        );
         let (dx, dy) = (end[0] - start[0], end[1] - start[1]);
         let share = ((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy).max(1e-9);
         let share = share.clamp(0.0, 1.0);
-        let [right_z, left_z] = [[0, 1], [3, 2]].map(|[a, b]| self.z_m[a] + share * (self.z_m[b] - self.z_m[a]));
+        let [right_z, left_z] =
+            [[0, 1], [3, 2]].map(|[a, b]| self.z_m[a] + share * (self.z_m[b] - self.z_m[a]));
         if right_z == left_z {
             return right_z;
         }
         // A slope across goes on beside the road, so that a grid of heights meets it up to its edge.
-        let (right, left) = (mix(self.quad[0], self.quad[1], share), mix(self.quad[3], self.quad[2], share));
+        let (right, left) = (
+            mix(self.quad[0], self.quad[1], share),
+            mix(self.quad[3], self.quad[2], share),
+        );
         let (dx, dy) = (left[0] - right[0], left[1] - right[1]);
         let width_m = dx.hypot(dy).max(1e-3);
         let across_m = ((x - right[0]) * dx + (y - right[1]) * dy) / width_m;
@@ -143,7 +155,13 @@ impl Surface {
                 let mut strip = |a: [f64; 2], b: [f64; 2], carriageway| {
                     if a[1] - a[0] > 0.01 || b[1] - b[0] > 0.01 {
                         strips(road, [(from, a), (to, b)], most_pieces, |quad, z_m| {
-                            patches.push(Patch { quad, z_m, top_m: f64::NAN, road: place as u32, carriageway });
+                            patches.push(Patch {
+                                quad,
+                                z_m,
+                                top_m: f64::NAN,
+                                road: place as u32,
+                                carriageway,
+                            });
                         });
                     }
                 };
@@ -153,17 +171,29 @@ impl Surface {
                 strip(right(from), right(to), false);
                 strip(left(from), left(to), false);
                 let own = &mut patches[before..];
-                let top_m = own.iter().map(Patch::high_m).fold(f64::NEG_INFINITY, f64::max);
+                let top_m = own
+                    .iter()
+                    .map(Patch::high_m)
+                    .fold(f64::NEG_INFINITY, f64::max);
                 own.iter_mut().for_each(|patch| patch.top_m = top_m);
             }
         }
         let corners: Vec<[f64; 2]> = patches.iter().flat_map(|patch| patch.quad).collect();
-        let bounds_m = if corners.is_empty() { [[0.0; 2]; 2] } else { bounds(&corners) };
+        let bounds_m = if corners.is_empty() {
+            [[0.0; 2]; 2]
+        } else {
+            bounds(&corners)
+        };
         let mut index = CellIndex::new(bounds_m, cell_m(&patches, CELL_M));
         for (number, patch) in patches.iter().enumerate() {
             index.insert(number as u32, bounds(&patch.quad));
         }
-        Self { roads, patches, index, bounds_m }
+        Self {
+            roads,
+            patches,
+            index,
+            bounds_m,
+        }
     }
 
     /// True if `test` is true for any patch that overlaps `rectangle`.
@@ -195,8 +225,12 @@ impl Surface {
 /// memory.
 fn most_pieces(network: &RoadNetwork) -> f64 {
     let banked = network.roads.iter().filter(|road| !road.lateral.is_level());
-    let cuts: f64 = banked.map(|road| road.length_m / STEP_M + road.sections.len() as f64).sum();
-    (MAX_ALL_PIECES / (3.0 * cuts).max(1.0)).floor().clamp(1.0, MAX_PIECES)
+    let cuts: f64 = banked
+        .map(|road| road.length_m / STEP_M + road.sections.len() as f64)
+        .sum();
+    (MAX_ALL_PIECES / (3.0 * cuts).max(1.0))
+        .floor()
+        .clamp(1.0, MAX_PIECES)
 }
 
 /// The pieces of a road's surface between two cross-sections and, in each, two `t`: one, or several side by side where
@@ -213,14 +247,22 @@ fn strips(
     }
     let is_straight = road.lateral.is_flat() && !road.sections[from.section].has_level_lanes();
     let width_m = (a[1] - a[0]).max(b[1] - b[0]);
-    let count = if is_straight { 1 } else { (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize };
+    let count = if is_straight {
+        1
+    } else {
+        (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize
+    };
     let corner = |cut: &CrossSection, range: [f64; 2], place: usize| {
         let t_m = range[0] + (range[1] - range[0]) * place as f64 / count as f64;
         road.point_at(cut.section, cut.s_m, t_m)
     };
     for place in 0..count {
-        let corners =
-            [corner(&from, a, place), corner(&to, b, place), corner(&to, b, place + 1), corner(&from, a, place + 1)];
+        let corners = [
+            corner(&from, a, place),
+            corner(&to, b, place),
+            corner(&to, b, place + 1),
+            corner(&from, a, place + 1),
+        ];
         piece(corners.map(|[x, y, _]| [x, y]), corners.map(|[_, _, z]| z));
     }
 }
@@ -230,7 +272,10 @@ fn strips(
 pub(super) fn cell_m(patches: &[Patch], least_m: f64) -> f64 {
     let touched = |cell_m: f64| -> f64 {
         let boxes = patches.iter().map(|patch| bounds(&patch.quad));
-        boxes.map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0)).map(|[x, y]| x * y).sum()
+        boxes
+            .map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0))
+            .map(|[x, y]| x * y)
+            .sum()
     };
     let mut cell_m = least_m;
     // Every patch touches one cell at least, and there are far fewer patches than that.
@@ -259,7 +304,9 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
     let range = |wanted: fn(LaneKind) -> bool| {
         let mut range: Option<[f64; 2]> = None;
         for id in road.sections[section].lane_ids() {
-            let Some(lane) = road.sections[section].lane(id) else { continue };
+            let Some(lane) = road.sections[section].lane(id) else {
+                continue;
+            };
             let [low, high] = road.lane_span_m(section, id, inside_m);
             if wanted(lane.kind) && high > low {
                 range = Some(range.map_or([low, high], |[a, b]| [a.min(low), b.max(high)]));
@@ -268,7 +315,12 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
         range
     };
     let driving = range(|kind| kind == LaneKind::Driving);
-    let carriageway = range(|kind| matches!(kind, LaneKind::Driving | LaneKind::Shoulder | LaneKind::Parking));
+    let carriageway = range(|kind| {
+        matches!(
+            kind,
+            LaneKind::Driving | LaneKind::Shoulder | LaneKind::Parking
+        )
+    });
     let paved = range(|kind| kind != LaneKind::Other && kind != LaneKind::Median);
     let carriageway_m = carriageway.or(driving).unwrap_or([origin; 2]);
     let paved_m = paved.unwrap_or(carriageway_m);
@@ -278,7 +330,15 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
             [t_m, aside_m, height_m]
         })
     });
-    CrossSection { s_m, pose: road.pose_at(s_m), z_m: road.elevation.at(s_m), bank, carriageway_m, paved_m, section }
+    CrossSection {
+        s_m,
+        pose: road.pose_at(s_m),
+        z_m: road.elevation.at(s_m),
+        bank,
+        carriageway_m,
+        paved_m,
+        section,
+    }
 }
 
 #[cfg(test)]
@@ -290,19 +350,37 @@ mod tests {
         let surface = Surface::new(&super::super::layout::town1(1).network);
         assert_eq!(cell_m(&surface.patches, CELL_M), CELL_M);
         let (right, left) = ([0.0, 0.0], [9_000.0, 9_000.0]);
-        let wide = Patch { quad: [right, right, left, left], z_m: [0.0; 4], top_m: 0.0, road: 0, carriageway: true };
+        let wide = Patch {
+            quad: [right, right, left, left],
+            z_m: [0.0; 4],
+            top_m: 0.0,
+            road: 0,
+            carriageway: true,
+        };
         let cells = (9_000.0 / cell_m(&[wide; 100], CELL_M) + 1.0).powi(2) * 100.0;
-        assert!((MAX_TOUCHED / 5.0..=MAX_TOUCHED).contains(&cells), "{cells}");
+        assert!(
+            (MAX_TOUCHED / 5.0..=MAX_TOUCHED).contains(&cells),
+            "{cells}"
+        );
     }
 
     #[test]
     fn patches_follow_a_street_and_leave_headroom() {
         let layout = super::super::layout::town1(1);
         let surface = Surface::new(&layout.network);
-        let road = layout.network.roads.iter().position(|road| road.junction.is_none()).unwrap();
+        let road = layout
+            .network
+            .roads
+            .iter()
+            .position(|road| road.junction.is_none())
+            .unwrap();
         let cut = surface.roads[road][5];
         let above = |t: f64, z: [f64; 2]| {
-            let rectangle = Rectangle { center_m: cut.at(t), half_m: [0.2, 0.2], yaw_rad: 0.0 };
+            let rectangle = Rectangle {
+                center_m: cut.at(t),
+                half_m: [0.2, 0.2],
+                yaw_rad: 0.0,
+            };
             surface.is_clear(&rectangle, z, 4.5, false)
         };
         assert!(!above(1.0, [0.0, 3.0]) && above(1.0, [4.6, 8.0]) && above(1.0, [-3.0, -0.2]));

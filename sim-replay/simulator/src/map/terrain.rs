@@ -31,7 +31,9 @@ const SMOOTHING: usize = 12;
 /// The ground under and between the roads.
 pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
     let heights = surface.patches.iter().flat_map(|patch| patch.z_m);
-    let [low, high] = heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)]);
+    let [low, high] = heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| {
+        [low.min(z), high.max(z)]
+    });
     if high - low < LEVEL_M {
         return Ground::plane((low + high) / 2.0);
     }
@@ -40,16 +42,28 @@ pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
     fill(&mut grid, &fixed);
     raise_hills(&mut grid, &fixed, seed);
     let decks = decks(&grid, surface);
-    Ground { terrain: Terrain::Grid(grid), decks }
+    Ground {
+        terrain: Terrain::Grid(grid),
+        decks,
+    }
 }
 
 fn empty_grid(surface: &Surface) -> HeightGrid {
     let [low, high] = surface.bounds_m;
     let extent = [0, 1].map(|axis| high[axis] - low[axis] + 2.0 * MARGIN_M);
-    let cell_m = cell_m(&surface.patches, CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt()));
+    let cell_m = cell_m(
+        &surface.patches,
+        CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt()),
+    );
     let [columns, rows] = extent.map(|extent| (extent / cell_m).ceil() as usize + 1);
     let origin_m = low.map(|low| low - MARGIN_M);
-    HeightGrid { origin_m, cell_m, columns, rows, heights_m: vec![f32::NAN; columns * rows] }
+    HeightGrid {
+        origin_m,
+        cell_m,
+        columns,
+        rows,
+        heights_m: vec![f32::NAN; columns * rows],
+    }
 }
 
 /// Sets every node within a cell of a road to the height of the nearest road there, or of the lowest where roads pass
@@ -59,7 +73,10 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
     let (mut nearest_m, mut lowest_m) = (vec![f32::INFINITY; nodes], vec![f32::INFINITY; nodes]);
     for patch in &surface.patches {
         for (place, node) in nodes_within(grid, &patch.quad, grid.cell_m) {
-            let (height, distance) = (patch.height_m(node) as f32, distance_m(node, &patch.quad) as f32);
+            let (height, distance) = (
+                patch.height_m(node) as f32,
+                distance_m(node, &patch.quad) as f32,
+            );
             lowest_m[place] = lowest_m[place].min(height);
             if distance < nearest_m[place] {
                 (nearest_m[place], grid.heights_m[place]) = (distance, height);
@@ -72,7 +89,10 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
         }
     }
     open_under_bridges(grid, surface);
-    grid.heights_m.iter().map(|height| !height.is_nan()).collect()
+    grid.heights_m
+        .iter()
+        .map(|height| !height.is_nan())
+        .collect()
 }
 
 /// Clears nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
@@ -91,13 +111,22 @@ fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
 fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f64; 2])> {
     let [low, high] = bounds(quad);
     let place = |value: f64, axis: usize| ((value - grid.origin_m[axis]) / grid.cell_m).max(0.0);
-    let range =
-        |axis: usize| place(low[axis] - reach_m, axis).ceil() as usize..=place(high[axis] + reach_m, axis) as usize;
+    let range = |axis: usize| {
+        place(low[axis] - reach_m, axis).ceil() as usize
+            ..=place(high[axis] + reach_m, axis) as usize
+    };
     let mut nodes = Vec::new();
     for row in range(1) {
         for column in range(0) {
-            let node = [grid.origin_m[0] + column as f64 * grid.cell_m, grid.origin_m[1] + row as f64 * grid.cell_m];
-            let around = Rectangle { center_m: node, half_m: [reach_m; 2], yaw_rad: 0.0 };
+            let node = [
+                grid.origin_m[0] + column as f64 * grid.cell_m,
+                grid.origin_m[1] + row as f64 * grid.cell_m,
+            ];
+            let around = Rectangle {
+                center_m: node,
+                half_m: [reach_m; 2],
+                yaw_rad: 0.0,
+            };
             if overlap(&around.corners(), quad) {
                 nodes.push((row * grid.columns + column, node));
             }
@@ -131,9 +160,16 @@ fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) 
         return;
     }
     if columns <= 2 && rows <= 2 {
-        let known: Vec<f32> = heights.iter().copied().filter(|height| !height.is_nan()).collect();
+        let known: Vec<f32> = heights
+            .iter()
+            .copied()
+            .filter(|height| !height.is_nan())
+            .collect();
         let mean = known.iter().sum::<f32>() / known.len().max(1) as f32;
-        heights.iter_mut().filter(|height| height.is_nan()).for_each(|height| *height = mean);
+        heights
+            .iter_mut()
+            .filter(|height| height.is_nan())
+            .for_each(|height| *height = mean);
         return;
     }
     let (half_columns, half_rows) = (columns.div_ceil(2), rows.div_ceil(2));
@@ -147,8 +183,16 @@ fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) 
             }
         }
     }
-    let mut coarse: Vec<f32> =
-        sums.iter().map(|&(sum, count)| if count > 0 { sum / count as f32 } else { f32::NAN }).collect();
+    let mut coarse: Vec<f32> = sums
+        .iter()
+        .map(|&(sum, count)| {
+            if count > 0 {
+                sum / count as f32
+            } else {
+                f32::NAN
+            }
+        })
+        .collect();
     let coarse_fixed: Vec<bool> = sums.iter().map(|&(_, count)| count > 0).collect();
     fill_level(&mut coarse, &coarse_fixed, half_columns, half_rows);
     for row in 0..rows {
@@ -175,7 +219,11 @@ fn smooth(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
             let left = heights[place - usize::from(column > 0)];
             let right = heights[place + usize::from(column + 1 < columns)];
             let below = heights[if row > 0 { place - columns } else { place }];
-            let above = heights[if row + 1 < rows { place + columns } else { place }];
+            let above = heights[if row + 1 < rows {
+                place + columns
+            } else {
+                place
+            }];
             heights[place] = (left + right + below + above) / 4.0;
         }
     }
@@ -188,16 +236,24 @@ fn raise_hills(grid: &mut HeightGrid, fixed: &[bool], seed: u64) {
         for column in 0..grid.columns {
             let place = row * grid.columns + column;
             let distance_m = f64::from(distances[place]) * grid.cell_m;
-            let share = ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0])).clamp(0.0, 1.0);
-            let (x, y) = (grid.origin_m[0] + column as f64 * grid.cell_m, grid.origin_m[1] + row as f64 * grid.cell_m);
-            grid.heights_m[place] += (share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed)) as f32;
+            let share = ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0]))
+                .clamp(0.0, 1.0);
+            let (x, y) = (
+                grid.origin_m[0] + column as f64 * grid.cell_m,
+                grid.origin_m[1] + row as f64 * grid.cell_m,
+            );
+            grid.heights_m[place] +=
+                (share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed)) as f32;
         }
     }
 }
 
 /// Distance of every node from the nearest set one, in cells: two sweeps over the neighbours (chamfer distance).
 fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
-    let mut distances: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { f32::MAX / 4.0 }).collect();
+    let mut distances: Vec<f32> = fixed
+        .iter()
+        .map(|&fixed| if fixed { 0.0 } else { f32::MAX / 4.0 })
+        .collect();
     let mut relax = |place: usize, column: usize, row: usize, steps: [(i64, i64, f32); 4]| {
         for (dx, dy, cost) in steps {
             let (x, y) = (column as i64 + dx, row as i64 + dy);
@@ -210,13 +266,23 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
     const DIAGONAL: f32 = std::f32::consts::SQRT_2;
     for row in 0..rows {
         for column in 0..columns {
-            let back = [(-1, 0, 1.0), (0, -1, 1.0), (-1, -1, DIAGONAL), (1, -1, DIAGONAL)];
+            let back = [
+                (-1, 0, 1.0),
+                (0, -1, 1.0),
+                (-1, -1, DIAGONAL),
+                (1, -1, DIAGONAL),
+            ];
             relax(row * columns + column, column, row, back);
         }
     }
     for row in (0..rows).rev() {
         for column in (0..columns).rev() {
-            let ahead = [(1, 0, 1.0), (0, 1, 1.0), (1, 1, DIAGONAL), (-1, 1, DIAGONAL)];
+            let ahead = [
+                (1, 0, 1.0),
+                (0, 1, 1.0),
+                (1, 1, DIAGONAL),
+                (-1, 1, DIAGONAL),
+            ];
             relax(row * columns + column, column, row, ahead);
         }
     }
@@ -226,10 +292,19 @@ fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
 /// Triangles of the road surfaces that lie above the terrain.
 fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
     let mut triangles = Vec::new();
-    for patch in surface.patches.iter().filter(|patch| is_deck(patch, |x, y| grid.height_m(x, y))) {
+    for patch in surface
+        .patches
+        .iter()
+        .filter(|patch| is_deck(patch, |x, y| grid.height_m(x, y)))
+    {
         let [a, b, c, d] = patch.quad;
         let [za, zb, zc, zd] = patch.z_m;
-        let corners = [[a[0], a[1], za], [b[0], b[1], zb], [c[0], c[1], zc], [d[0], d[1], zd]];
+        let corners = [
+            [a[0], a[1], za],
+            [b[0], b[1], zb],
+            [c[0], c[1], zc],
+            [d[0], d[1], zd],
+        ];
         for [i, j, k] in [[0, 1, 2], [0, 2, 3]] {
             let (p, q, r): ([f64; 3], [f64; 3], [f64; 3]) = (corners[i], corners[j], corners[k]);
             let area = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]);
@@ -245,8 +320,20 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
 pub(crate) fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
     let [a, b, c, d] = patch.quad;
     let middle = |p: [f64; 2], q: [f64; 2]| [(p[0] + q[0]) / 2.0, (p[1] + q[1]) / 2.0];
-    let probes = [a, b, c, d, middle(a, b), middle(c, d), middle(a, d), middle(b, c), middle(a, c)];
-    probes.iter().any(|&p| patch.height_m(p) - height_m(p[0], p[1]) > DECK_M)
+    let probes = [
+        a,
+        b,
+        c,
+        d,
+        middle(a, b),
+        middle(c, d),
+        middle(a, d),
+        middle(b, c),
+        middle(a, c),
+    ];
+    probes
+        .iter()
+        .any(|&p| patch.height_m(p) - height_m(p[0], p[1]) > DECK_M)
 }
 
 #[cfg(test)]
@@ -270,11 +357,18 @@ mod tests {
         let fixed: Vec<bool> = heights.iter().map(|height| !height.is_nan()).collect();
         fill_level(&mut heights, &fixed, columns, rows);
         for row in 0..rows {
-            assert_eq!((heights[row * columns + 3], heights[row * columns + 33]), (0.0, 6.0));
+            assert_eq!(
+                (heights[row * columns + 3], heights[row * columns + 33]),
+                (0.0, 6.0)
+            );
             let middle = heights[row * columns + 18];
             assert!((2.0..4.0).contains(&middle), "{middle}");
         }
-        assert!(heights.iter().all(|height| (-0.001..=6.001).contains(height)));
+        assert!(
+            heights
+                .iter()
+                .all(|height| (-0.001..=6.001).contains(height))
+        );
     }
 
     #[test]
@@ -282,11 +376,16 @@ mod tests {
         let mut surface = Surface::new(&super::super::layout::town1(2).network);
         assert_eq!(empty_grid(&surface).cell_m, CELL_M);
         let (right, left) = ([0.0, 0.0], [3_000.0, 3_000.0]);
-        surface.patches =
-            vec![
-                Patch { quad: [right, right, left, left], z_m: [0.0; 4], top_m: 0.0, road: 0, carriageway: true };
-                500
-            ];
+        surface.patches = vec![
+            Patch {
+                quad: [right, right, left, left],
+                z_m: [0.0; 4],
+                top_m: 0.0,
+                road: 0,
+                carriageway: true
+            };
+            500
+        ];
         surface.bounds_m = [right, left];
         assert!(empty_grid(&surface).cell_m > 4.0 * CELL_M);
     }

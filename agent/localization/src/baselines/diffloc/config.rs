@@ -61,7 +61,8 @@ impl DiffLocConfig {
     /// Number of tokens of a sweep.
     #[must_use]
     pub fn tokens(&self) -> i64 {
-        (self.image.rows as i64 / self.patch[0].max(1)) * (self.image.columns as i64 / self.patch[1].max(1))
+        (self.image.rows as i64 / self.patch[0].max(1))
+            * (self.image.columns as i64 / self.patch[1].max(1))
     }
 
     /// Checks sizes that come from a file.
@@ -70,36 +71,68 @@ impl DiffLocConfig {
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn validate(&self) -> Result<(), LocalizerError> {
         let wrong = |text: String| Err(LocalizerError::Config(format!("DiffLoc: {text}")));
-        let RangeImageConfig { rows, columns, elevations_deg: [low, high], .. } = self.image;
+        let RangeImageConfig {
+            rows,
+            columns,
+            elevations_deg: [low, high],
+            ..
+        } = self.image;
         let side = 1..=4096;
         if !side.contains(&rows) || !side.contains(&columns) {
-            return wrong(format!("image of {rows} x {columns}, expected 1 to 4096 rows and columns"));
+            return wrong(format!(
+                "image of {rows} x {columns}, expected 1 to 4096 rows and columns"
+            ));
         }
         if !(-90.0..=90.0).contains(&low) || !(-90.0..=90.0).contains(&high) || low >= high {
             return wrong(format!("elevations_deg from {low} to {high}"));
         }
         let [height, width] = self.patch;
         if height < 1 || width < 1 || rows as i64 % height != 0 || columns as i64 % width != 0 {
-            return wrong(format!("patch {height} x {width} does not divide an image of {rows} x {columns}"));
+            return wrong(format!(
+                "patch {height} x {width} does not divide an image of {rows} x {columns}"
+            ));
         }
-        for (name, width) in [("width", self.width), ("denoiser_width", self.denoiser_width)] {
+        for (name, width) in [
+            ("width", self.width),
+            ("denoiser_width", self.denoiser_width),
+        ] {
             if self.heads < 1 || !(1..=4096).contains(&width) || width % self.heads != 0 {
                 return wrong(format!("{name} {width} for {} heads", self.heads));
             }
         }
-        if self.stem.iter().any(|channels| !(1..=1024).contains(channels)) {
-            return wrong(format!("stem of {:?} channels, expected 1 to 1024", self.stem));
+        if self
+            .stem
+            .iter()
+            .any(|channels| !(1..=1024).contains(channels))
+        {
+            return wrong(format!(
+                "stem of {:?} channels, expected 1 to 1024",
+                self.stem
+            ));
         }
         if self.layers > 64 || self.denoiser_layers > 64 || !(1..=16).contains(&self.frames) {
-            let Self { layers, denoiser_layers, frames, .. } = self;
-            return wrong(format!("{layers} and {denoiser_layers} layers for {frames} frames"));
+            let Self {
+                layers,
+                denoiser_layers,
+                frames,
+                ..
+            } = self;
+            return wrong(format!(
+                "{layers} and {denoiser_layers} layers for {frames} frames"
+            ));
         }
         if !(0.0..1.0).contains(&self.drop_path) {
             return wrong(format!("drop_path {}, expected 0 to 1", self.drop_path));
         }
-        let scaled = self.scale_m.iter().all(|axis| axis.is_finite() && *axis > 0.0);
+        let scaled = self
+            .scale_m
+            .iter()
+            .all(|axis| axis.is_finite() && *axis > 0.0);
         if !scaled || !self.origin_m.iter().all(|axis| axis.is_finite()) {
-            return wrong(format!("origin_m {:?}, scale_m {:?}", self.origin_m, self.scale_m));
+            return wrong(format!(
+                "origin_m {:?}, scale_m {:?}",
+                self.origin_m, self.scale_m
+            ));
         }
         Ok(())
     }

@@ -20,7 +20,11 @@ struct Convolution {
 impl Convolution {
     fn new(path: &nn::Path<'_>, [inputs, outputs]: [i64; 2], kernel: i64, dilation: i64) -> Self {
         Self {
-            weight: path.var("weight", &[outputs, inputs, kernel, kernel], nn::init::DEFAULT_KAIMING_UNIFORM),
+            weight: path.var(
+                "weight",
+                &[outputs, inputs, kernel, kernel],
+                nn::init::DEFAULT_KAIMING_UNIFORM,
+            ),
             bias: path.var("bias", &[outputs], Init::Const(0.0)),
             padding: dilation * (kernel / 2),
             dilation,
@@ -28,9 +32,20 @@ impl Convolution {
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let (weight, bias) = (self.weight.f_to_kind(x.kind())?, self.bias.f_to_kind(x.kind())?);
+        let (weight, bias) = (
+            self.weight.f_to_kind(x.kind())?,
+            self.bias.f_to_kind(x.kind())?,
+        );
         let [padding, dilation] = [self.padding, self.dilation];
-        x.f_conv2d(&weight, Some(bias), [1, 1], [padding, padding], [dilation, dilation], 1)?.f_leaky_relu()
+        x.f_conv2d(
+            &weight,
+            Some(bias),
+            [1, 1],
+            [padding, padding],
+            [dilation, dilation],
+            1,
+        )?
+        .f_leaky_relu()
     }
 }
 
@@ -47,7 +62,10 @@ impl ContextBlock {
         let normed = |name: &str, dilation| {
             let below = path / name;
             let norm = Norm::with_defaults(&(&below / "norm"), outputs);
-            (Convolution::new(&below, [outputs, outputs], 3, dilation), norm)
+            (
+                Convolution::new(&below, [outputs, outputs], 3, dilation),
+                norm,
+            )
         };
         Self {
             shortcut: Convolution::new(&(path / "shortcut"), [inputs, outputs], 1, 1),
@@ -77,7 +95,8 @@ impl ContextStem {
     pub(super) fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Self {
         let [first, last] = config.stem;
         let widths = [CHANNELS as i64, first, first, first, last];
-        let block = |number: usize| ContextBlock::new(&(path / number), widths[number], widths[number + 1]);
+        let block =
+            |number: usize| ContextBlock::new(&(path / number), widths[number], widths[number + 1]);
         Self {
             blocks: (0..4).map(block).collect(),
             patch: config.patch,
@@ -100,6 +119,9 @@ impl ContextStem {
 fn channels_last(x: &Tensor) -> Result<Tensor, TchError> {
     match x.kind() {
         Kind::Float => Ok(x.shallow_clone()),
-        _ => x.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
+        _ => x
+            .f_permute([0, 2, 3, 1])?
+            .f_contiguous()?
+            .f_permute([0, 3, 1, 2]),
     }
 }

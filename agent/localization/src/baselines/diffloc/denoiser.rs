@@ -51,12 +51,23 @@ impl PoseDenoiser {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, TchError> {
-        let DiffLocConfig { denoiser_width: width, heads, denoiser_layers, .. } = *config;
+        let DiffLocConfig {
+            denoiser_width: width,
+            heads,
+            denoiser_layers,
+            ..
+        } = *config;
         let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + config.width + 1;
-        let layer = |number: usize| TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, 0.0);
+        let layer = |number: usize| {
+            TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, 0.0)
+        };
         let half = STEP_CHANNELS / 2;
-        let harmonics: Vec<f32> = (0..HARMONICS).map(|power| (1_u32 << power) as f32).collect();
-        let of_step: Vec<f32> = (0..half).map(|k| LONGEST.powf(-(k as f64) / half as f64) as f32).collect();
+        let harmonics: Vec<f32> = (0..HARMONICS)
+            .map(|power| (1_u32 << power) as f32)
+            .collect();
+        let of_step: Vec<f32> = (0..half)
+            .map(|k| LONGEST.powf(-(k as f64) / half as f64) as f32)
+            .collect();
         let table = |values: &[f32]| Tensor::f_from_slice(values)?.f_to_device(path.device());
         Ok(Self {
             inward: Dense::new(&(path / "inward"), inputs, width, 0.7),
@@ -86,21 +97,34 @@ impl PoseDenoiser {
         let (count, frames, _) = poses.size3()?;
         let on = (Kind::Float, poses.device());
         let (mask, age) = match windows {
-            Windows::Single => {
-                (single_mask(frames, on.1)?.f_view([1, 1, frames, frames])?, Tensor::f_ones([1, 1, 1], on)?)
-            }
+            Windows::Single => (
+                single_mask(frames, on.1)?.f_view([1, 1, frames, frames])?,
+                Tensor::f_ones([1, 1, 1], on)?,
+            ),
             Windows::Joint(joint) => {
                 let alone = joint.f_neg()?.f_add_scalar(1.0)?;
-                let mask = single_mask(frames, on.1)?.f_view([1, 1, frames, frames])? * alone.f_view([-1, 1, 1, 1])?;
+                let mask = single_mask(frames, on.1)?.f_view([1, 1, frames, frames])?
+                    * alone.f_view([-1, 1, 1, 1])?;
                 // The newest sweep is marked by 1, as one that is alone.
                 let place = Tensor::f_linspace(0.0, 1.0, frames, on)?.f_view([1, -1, 1])?;
                 let alone = alone.f_view([-1, 1, 1])?;
                 (mask, place.f_maximum(&alone)?)
             }
         };
-        let steps = self.embed_steps(steps)?.f_view([-1, 1, STEP_CHANNELS])?.f_expand([count, frames, -1], false)?;
+        let steps = self
+            .embed_steps(steps)?
+            .f_view([-1, 1, STEP_CHANNELS])?
+            .f_expand([count, frames, -1], false)?;
         let age = age.f_expand([count, frames, 1], false)?;
-        let inputs = Tensor::f_cat(&[self.embed_poses(poses)?, steps, features.shallow_clone(), age], 2)?;
+        let inputs = Tensor::f_cat(
+            &[
+                self.embed_poses(poses)?,
+                steps,
+                features.shallow_clone(),
+                age,
+            ],
+            2,
+        )?;
         let mut x = dense(&self.inward, &inputs)?;
         for layer in &self.layers {
             x = layer.forward(&x, Some(&mask), false)?;
@@ -111,13 +135,22 @@ impl PoseDenoiser {
 
     /// A pose with sine and cosine of its multiples.
     fn embed_poses(&self, poses: &Tensor) -> Result<Tensor, TchError> {
-        let angles = poses.f_unsqueeze(3)?.f_mul(&self.frequencies)?.f_flatten(2, 3)?;
-        Tensor::f_cat(&[poses.shallow_clone(), angles.f_sin()?, angles.f_cos()?], 2)
+        let angles = poses
+            .f_unsqueeze(3)?
+            .f_mul(&self.frequencies)?
+            .f_flatten(2, 3)?;
+        Tensor::f_cat(
+            &[poses.shallow_clone(), angles.f_sin()?, angles.f_cos()?],
+            2,
+        )
     }
 
     /// Sine and cosine of the step `[W]` at falling frequencies.
     fn embed_steps(&self, steps: &Tensor) -> Result<Tensor, TchError> {
-        let angles = steps.f_to_kind(Kind::Float)?.f_unsqueeze(1)?.f_mul(&self.step_frequencies)?;
+        let angles = steps
+            .f_to_kind(Kind::Float)?
+            .f_unsqueeze(1)?
+            .f_mul(&self.step_frequencies)?;
         Tensor::f_cat(&[angles.f_sin()?, angles.f_cos()?], 1)
     }
 }
@@ -125,5 +158,8 @@ impl PoseDenoiser {
 /// `[F, F]`: 0 on the diagonal, [`UNSEEN`] elsewhere.
 fn single_mask(frames: i64, device: Device) -> Result<Tensor, TchError> {
     let on = (Kind::Float, device);
-    Tensor::f_eye(frames, on)?.f_neg()?.f_add_scalar(1.0)?.f_mul_scalar(UNSEEN)
+    Tensor::f_eye(frames, on)?
+        .f_neg()?
+        .f_add_scalar(1.0)?
+        .f_mul_scalar(UNSEEN)
 }

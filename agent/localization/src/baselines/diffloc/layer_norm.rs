@@ -24,7 +24,10 @@ impl LayerNorm {
 
     /// `[.., width]` to the same.
     pub(super) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let (weight, bias) = (self.weight.f_to_kind(x.kind())?, self.bias.f_to_kind(x.kind())?);
+        let (weight, bias) = (
+            self.weight.f_to_kind(x.kind())?,
+            self.bias.f_to_kind(x.kind())?,
+        );
         x.f_layer_norm(self.weight.size(), Some(weight), Some(bias), EPS, true)
     }
 }

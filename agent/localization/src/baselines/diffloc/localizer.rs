@@ -43,7 +43,11 @@ impl DiffLocLocalizer {
         let network = DiffLoc::new(&variables.root(), &config)?;
         weights.copy_into(&variables)?;
         variables.freeze();
-        Ok(Self { network, device, sha256: weights.sha256().to_owned() })
+        Ok(Self {
+            network,
+            device,
+            sha256: weights.sha256().to_owned(),
+        })
     }
 
     /// SHA-256 of the weights.
@@ -60,36 +64,62 @@ impl DiffLocLocalizer {
 }
 
 impl Localize for DiffLocLocalizer {
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(
+        &mut self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let start = Instant::now();
         let config = self.network.config();
         let values = config.image.image(&cloud.xyzi);
         times.voxelise = start.elapsed();
-        if values[..config.image.pixels()].iter().filter(|&&range| range > 0.0).count() < MIN_CELLS {
+        if values[..config.image.pixels()]
+            .iter()
+            .filter(|&&range| range > 0.0)
+            .count()
+            < MIN_CELLS
+        {
             return Ok(no_pose(NoPoseReason::TooFewPoints, times));
         }
         let start = Instant::now();
-        let shape = [1, CHANNELS as i64, config.image.rows as i64, config.image.columns as i64];
-        let image = Tensor::f_from_slice(&values)?.f_view(shape)?.f_to_device(self.device)?;
+        let shape = [
+            1,
+            CHANNELS as i64,
+            config.image.rows as i64,
+            config.image.columns as i64,
+        ];
+        let image = Tensor::f_from_slice(&values)?
+            .f_view(shape)?
+            .f_to_device(self.device)?;
         let features = no_grad(|| self.network.encoder().forward(&image, false))?.features;
         times.encode = start.elapsed();
         let start = Instant::now();
-        let poses = self.network.poses(&features.f_unsqueeze(1)?, Windows::Single)?;
+        let poses = self
+            .network
+            .poses(&features.f_unsqueeze(1)?, Windows::Single)?;
         let answer: Vec<f32> = Vec::try_from(&poses.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
         times.regress = start.elapsed();
-        Ok(match upright(&scaled(&answer, config.scale_m), config.origin_m) {
-            Some(pose) => Localization::from_estimate(PoseEstimate::new(pose.into(), FULL_CONFIDENCE), times),
-            None => no_pose(NoPoseReason::Failed, times),
-        })
+        Ok(
+            match upright(&scaled(&answer, config.scale_m), config.origin_m) {
+                Some(pose) => Localization::from_estimate(
+                    PoseEstimate::new(pose.into(), FULL_CONFIDENCE),
+                    times,
+                ),
+                None => no_pose(NoPoseReason::Failed, times),
+            },
+        )
     }
 }
 
 /// A normalised pose with its position in metres.
 fn scaled(answer: &[f32], scale_m: [f64; 3]) -> Vec<f32> {
     let scales = scale_m.iter().map(|&scale| scale as f32).chain([1.0; 2]);
-    answer.iter().zip(scales).map(|(value, scale)| value * scale).collect()
+    answer
+        .iter()
+        .zip(scales)
+        .map(|(value, scale)| value * scale)
+        .collect()
 }
 
 #[cfg(test)]
@@ -108,7 +138,11 @@ mod tests {
         DiffLocConfig {
             origin_m: [1000.0, -2000.0, 30.0],
             scale_m: [50.0, 20.0, 1.0],
-            image: RangeImageConfig { rows: 4, columns: 16, ..RangeImageConfig::default() },
+            image: RangeImageConfig {
+                rows: 4,
+                columns: 16,
+                ..RangeImageConfig::default()
+            },
             patch: [2, 4],
             stem: [2, 4],
             width: 8,
@@ -129,7 +163,10 @@ mod tests {
 
     fn write(folder: &Path, variables: &VarStore, kind: &str) -> PathBuf {
         let about = BTreeMap::from([
-            (CONFIG_KEY.to_owned(), serde_json::to_string(&config()).unwrap()),
+            (
+                CONFIG_KEY.to_owned(),
+                serde_json::to_string(&config()).unwrap(),
+            ),
             (KIND_KEY.to_owned(), kind.to_owned()),
         ]);
         let path = folder.join("weights.safetensors");
@@ -138,8 +175,17 @@ mod tests {
     }
 
     fn sweep() -> PointCloud {
-        let wall = (0..4000).map(|k| [9.0 * (k as f32).cos(), 9.0 * (k as f32).sin(), -(k % 30) as f32 * 0.1, 0.2]);
-        PointCloud { xyzi: wall.collect() }
+        let wall = (0..4000).map(|k| {
+            [
+                9.0 * (k as f32).cos(),
+                9.0 * (k as f32).sin(),
+                -(k % 30) as f32 * 0.1,
+                0.2,
+            ]
+        });
+        PointCloud {
+            xyzi: wall.collect(),
+        }
     }
 
     #[test]
@@ -158,11 +204,21 @@ mod tests {
         let answer = localizer.localize(&sweep()).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let expected = [1200.0, -1920.0, 26.0];
-        assert!(pose.translation_m.iter().zip(expected).all(|(found, wanted)| (found - wanted).abs() < 1e-3));
+        assert!(
+            pose.translation_m
+                .iter()
+                .zip(expected)
+                .all(|(found, wanted)| (found - wanted).abs() < 1e-3)
+        );
         assert!((pose.yaw_rad() - std::f64::consts::FRAC_PI_4).abs() < 1e-6);
         assert_eq!(answer.estimate.confidence(), 1.0);
-        let few = PointCloud { xyzi: sweep().xyzi[..5].to_vec() };
-        let none = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };
+        let few = PointCloud {
+            xyzi: sweep().xyzi[..5].to_vec(),
+        };
+        let none = PoseEstimate::NoPose {
+            reason: NoPoseReason::TooFewPoints,
+            inlier_count: 0,
+        };
         assert_eq!(localizer.localize(&few).unwrap().estimate, none);
     }
 
@@ -170,13 +226,25 @@ mod tests {
     fn a_saved_network_comes_back() {
         let (variables, network) = random_network();
         let folder = tempfile::tempdir().unwrap();
-        let loaded = DiffLocLocalizer::load(&write(folder.path(), &variables, DiffLocLocalizer::KIND), Device::Cpu);
+        let loaded = DiffLocLocalizer::load(
+            &write(folder.path(), &variables, DiffLocLocalizer::KIND),
+            Device::Cpu,
+        );
         let loaded = loaded.unwrap();
         assert_eq!(loaded.config(), &config());
-        let image = Tensor::from_slice(&config().image.image(&sweep().xyzi)).view([1, CHANNELS as i64, 4, 16]);
+        let image = Tensor::from_slice(&config().image.image(&sweep().xyzi)).view([
+            1,
+            CHANNELS as i64,
+            4,
+            16,
+        ]);
         let poses = |network: &DiffLoc| {
-            let features = no_grad(|| network.encoder().forward(&image, false)).unwrap().features;
-            network.poses(&features.unsqueeze(1), Windows::Single).unwrap()
+            let features = no_grad(|| network.encoder().forward(&image, false))
+                .unwrap()
+                .features;
+            network
+                .poses(&features.unsqueeze(1), Windows::Single)
+                .unwrap()
         };
         assert_eq!(poses(&network), poses(&loaded.network));
         assert_eq!(poses(&network).size(), [1, 1, 5]);
@@ -188,20 +256,65 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &variables, "scene encoder");
         for message in [
-            DiffLocLocalizer::load(&path, Device::Cpu).unwrap_err().to_string(),
-            load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap_err().to_string(),
+            DiffLocLocalizer::load(&path, Device::Cpu)
+                .unwrap_err()
+                .to_string(),
+            load_baseline(&path, Device::Cpu, PoseSolver::default())
+                .unwrap_err()
+                .to_string(),
         ] {
-            assert!(message.contains("weights.safetensors") && message.contains("scene encoder"), "{message}");
+            assert!(
+                message.contains("weights.safetensors") && message.contains("scene encoder"),
+                "{message}"
+            );
         }
         for (wrong, named) in [
-            (DiffLocConfig { patch: [3, 4], ..config() }, "patch 3 x 4"),
-            (DiffLocConfig { patch: [0, 4], ..config() }, "patch 0 x 4"),
-            (DiffLocConfig { heads: 3, ..config() }, "width 8 for 3 heads"),
-            (DiffLocConfig { denoiser_width: 13, ..config() }, "denoiser_width 13 for 2 heads"),
-            (DiffLocConfig { scale_m: [0.0; 3], ..config() }, "scale_m [0.0"),
-            (DiffLocConfig { layers: 1000, ..config() }, "1000"),
+            (
+                DiffLocConfig {
+                    patch: [3, 4],
+                    ..config()
+                },
+                "patch 3 x 4",
+            ),
+            (
+                DiffLocConfig {
+                    patch: [0, 4],
+                    ..config()
+                },
+                "patch 0 x 4",
+            ),
+            (
+                DiffLocConfig {
+                    heads: 3,
+                    ..config()
+                },
+                "width 8 for 3 heads",
+            ),
+            (
+                DiffLocConfig {
+                    denoiser_width: 13,
+                    ..config()
+                },
+                "denoiser_width 13 for 2 heads",
+            ),
+            (
+                DiffLocConfig {
+                    scale_m: [0.0; 3],
+                    ..config()
+                },
+                "scale_m [0.0",
+            ),
+            (
+                DiffLocConfig {
+                    layers: 1000,
+                    ..config()
+                },
+                "1000",
+            ),
         ] {
-            let message = DiffLoc::new(&VarStore::new(Device::Cpu).root(), &wrong).unwrap_err().to_string();
+            let message = DiffLoc::new(&VarStore::new(Device::Cpu).root(), &wrong)
+                .unwrap_err()
+                .to_string();
             assert!(message.contains(named), "{message}");
         }
     }

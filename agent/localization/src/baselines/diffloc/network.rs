@@ -74,13 +74,18 @@ impl DiffLoc {
         let (count, frames, _) = features.size3()?;
         let device = features.device();
         let mut random = ChaCha8Rng::seed_from_u64(START_SEED);
-        let noise: Vec<f32> = (0..POSE).map(|_| StandardNormal.sample(&mut random)).collect();
-        let start = Tensor::f_from_slice(&noise)?.f_to_device(device)?.f_expand([count, frames, POSE], false)?;
+        let noise: Vec<f32> = (0..POSE)
+            .map(|_| StandardNormal.sample(&mut random))
+            .collect();
+        let start = Tensor::f_from_slice(&noise)?
+            .f_to_device(device)?
+            .f_expand([count, frames, POSE], false)?;
         no_grad(|| {
-            self.schedule.denoise(&start, DENOISING_STEPS, |noisy, step| {
-                let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
-                self.denoiser.forward(noisy, &steps, features, windows)
-            })
+            self.schedule
+                .denoise(&start, DENOISING_STEPS, |noisy, step| {
+                    let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
+                    self.denoiser.forward(noisy, &steps, features, windows)
+                })
         })
     }
 }

@@ -24,7 +24,8 @@ impl NoiseSchedule {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(device: Device) -> Result<Self, TchError> {
-        let beta = |step: usize| BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
+        let beta =
+            |step: usize| BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
         let kept: Vec<f64> = (0..STEPS)
             .scan(1.0, |product, step| {
                 *product *= 1.0 - beta(step);
@@ -49,10 +50,17 @@ impl NoiseSchedule {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn add_noise(&self, poses: &Tensor, noise: &Tensor, steps: &Tensor) -> Result<Tensor, TchError> {
+    pub fn add_noise(
+        &self,
+        poses: &Tensor,
+        noise: &Tensor,
+        steps: &Tensor,
+    ) -> Result<Tensor, TchError> {
         let factor = |table: &Tensor| table.f_index_select(0, steps)?.f_view([-1, 1, 1]);
         let [signal, deviation] = &self.factors;
-        poses.f_mul(&factor(signal)?)?.f_add(&noise.f_mul(&factor(deviation)?)?)
+        poses
+            .f_mul(&factor(signal)?)?
+            .f_add(&noise.f_mul(&factor(deviation)?)?)
     }
 
     /// Poses `[W, F, D]` that `noisy` poses come from if their velocity at steps `[W]` is this (Salimans and Ho 2022).
@@ -60,7 +68,12 @@ impl NoiseSchedule {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn poses(&self, noisy: &Tensor, velocity: &Tensor, steps: &Tensor) -> Result<Tensor, TchError> {
+    pub fn poses(
+        &self,
+        noisy: &Tensor,
+        velocity: &Tensor,
+        steps: &Tensor,
+    ) -> Result<Tensor, TchError> {
         self.add_noise(noisy, &velocity.f_neg()?, steps)
     }
 
@@ -77,7 +90,9 @@ impl NoiseSchedule {
     ) -> Result<Tensor, TchError> {
         let last = (self.kept.len() - 1) as f64;
         let mut steps: Vec<usize> = (0..count.max(1))
-            .map(|number| (last * (1.0 - number as f64 / (count.max(2) - 1) as f64)).round() as usize)
+            .map(|number| {
+                (last * (1.0 - number as f64 / (count.max(2) - 1) as f64)).round() as usize
+            })
             .collect();
         steps.dedup();
         let mut noisy = noise.shallow_clone();
@@ -85,7 +100,9 @@ impl NoiseSchedule {
         for (place, &step) in steps.iter().enumerate() {
             let kept = self.kept[step];
             let predicted = predict(&noisy, step as i64)?;
-            poses = noisy.f_mul_scalar(kept.sqrt())?.f_sub(&(predicted * (1.0 - kept).sqrt()))?;
+            poses = noisy
+                .f_mul_scalar(kept.sqrt())?
+                .f_sub(&(predicted * (1.0 - kept).sqrt()))?;
             poses = poses.f_clamp(-LIMIT, LIMIT)?;
             if let Some(&next) = steps.get(place + 1) {
                 // The noise that leads from these poses to where they came from.
@@ -130,7 +147,13 @@ mod tests {
         let schedule = NoiseSchedule::new(Device::Cpu).unwrap();
         let poses = Tensor::ones([2, 3, 5], (Kind::Float, Device::Cpu));
         let noise = -&poses;
-        let noisy = schedule.add_noise(&poses, &noise, &Tensor::from_slice(&[0_i64, schedule.steps() - 1])).unwrap();
+        let noisy = schedule
+            .add_noise(
+                &poses,
+                &noise,
+                &Tensor::from_slice(&[0_i64, schedule.steps() - 1]),
+            )
+            .unwrap();
         let value = |window| noisy.double_value(&[window, 2, 4]);
         assert!((value(0) - (0.9999_f64.sqrt() - 0.01)).abs() < 1e-6);
         assert!(value(1) < -0.9, "{}", value(1));
@@ -144,7 +167,13 @@ mod tests {
         let velocity = noisy.zeros_like();
         let found = |velocity: &Tensor| schedule.poses(&noisy, velocity, &steps).unwrap();
         let moved = found(&velocity) - found(&(&velocity + 1.0));
-        assert!((moved.double_value(&[0, 0, 0]) - 0.01).abs() < 1e-3, "{moved}");
-        assert!((moved.double_value(&[1, 0, 0]) - 1.0).abs() < 0.01, "{moved}");
+        assert!(
+            (moved.double_value(&[0, 0, 0]) - 0.01).abs() < 1e-3,
+            "{moved}"
+        );
+        assert!(
+            (moved.double_value(&[1, 0, 0]) - 1.0).abs() < 0.01,
+            "{moved}"
+        );
     }
 }

@@ -28,7 +28,11 @@ impl Default for RangeImageConfig {
     /// 16 x 256; each row holds four of 64 channels from -25 to 2 degrees, the LiDAR of the generated scenes and of
     /// OPV2V.
     fn default() -> Self {
-        Self { rows: 16, columns: 256, elevations_deg: [-25.214, 2.214] }
+        Self {
+            rows: 16,
+            columns: 256,
+            elevations_deg: [-25.214, 2.214],
+        }
     }
 }
 
@@ -71,9 +75,17 @@ impl RangeImageConfig {
             }
         }
         let mut image = vec![0.0; CHANNELS * pixels];
-        for (pixel, &(range_m, index)) in closest.iter().enumerate().filter(|(_, (range_m, _))| range_m.is_finite()) {
+        for (pixel, &(range_m, index)) in closest
+            .iter()
+            .enumerate()
+            .filter(|(_, (range_m, _))| range_m.is_finite())
+        {
             let [x, y, z, intensity] = xyzi[index];
-            let intensity = if intensity.is_finite() { intensity.clamp(0.0, 1.0) } else { 0.0 };
+            let intensity = if intensity.is_finite() {
+                intensity.clamp(0.0, 1.0)
+            } else {
+                0.0
+            };
             for (channel, value) in [range_m, x, y, z, intensity].into_iter().enumerate() {
                 image[channel * pixels + pixel] = value / UNITS[channel];
             }
@@ -86,11 +98,18 @@ impl RangeImageConfig {
 mod tests {
     use super::*;
 
-    const SMALL: RangeImageConfig = RangeImageConfig { rows: 4, columns: 8, elevations_deg: [-40.0, 40.0] };
+    const SMALL: RangeImageConfig = RangeImageConfig {
+        rows: 4,
+        columns: 8,
+        elevations_deg: [-40.0, 40.0],
+    };
 
     fn occupied(image: &[f32]) -> Vec<(usize, f32)> {
         let ranges = image[..SMALL.pixels()].iter().copied().enumerate();
-        ranges.filter(|(_, range)| *range > 0.0).map(|(pixel, range)| (pixel, range * UNITS[0])).collect()
+        ranges
+            .filter(|(_, range)| *range > 0.0)
+            .map(|(pixel, range)| (pixel, range * UNITS[0]))
+            .collect()
     }
 
     #[test]
@@ -107,12 +126,22 @@ mod tests {
         ];
         let image = SMALL.image(&cloud);
         let found = occupied(&image);
-        assert_eq!(found.iter().map(|(pixel, _)| *pixel).collect::<Vec<_>>(), [8 + 7, 2 * 8 + 4]);
+        assert_eq!(
+            found.iter().map(|(pixel, _)| *pixel).collect::<Vec<_>>(),
+            [8 + 7, 2 * 8 + 4]
+        );
         let (pixel, range_m) = found[1];
         assert!((range_m - (100.0f32 + 0.01 + 4.0).sqrt()).abs() < 1e-4);
-        let values: Vec<f32> =
-            (1..CHANNELS).map(|channel| image[channel * SMALL.pixels() + pixel] * UNITS[channel]).collect();
-        assert!(values.iter().zip(ahead).all(|(value, wanted)| (value - wanted).abs() < 1e-5), "{values:?}");
+        let values: Vec<f32> = (1..CHANNELS)
+            .map(|channel| image[channel * SMALL.pixels() + pixel] * UNITS[channel])
+            .collect();
+        assert!(
+            values
+                .iter()
+                .zip(ahead)
+                .all(|(value, wanted)| (value - wanted).abs() < 1e-5),
+            "{values:?}"
+        );
     }
 
     #[test]
@@ -120,7 +149,9 @@ mod tests {
         let config = RangeImageConfig::default();
         let row = |channel: usize| {
             let elevation = (-25.0 + 27.0 / 63.0 * channel as f32).to_radians();
-            config.pixel([10.0 * elevation.cos(), 0.0, 10.0 * elevation.sin()]).map(|(pixel, _)| pixel / config.columns)
+            config
+                .pixel([10.0 * elevation.cos(), 0.0, 10.0 * elevation.sin()])
+                .map(|(pixel, _)| pixel / config.columns)
         };
         assert!(
             (0..64).all(|channel| row(channel) == Some(15 - channel / 4)),

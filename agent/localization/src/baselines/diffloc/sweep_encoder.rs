@@ -37,14 +37,27 @@ impl SweepEncoder {
     /// Builds the layers below `path`.
     #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Self {
-        let DiffLocConfig { width, heads, layers, drop_path, .. } = *config;
+        let DiffLocConfig {
+            width,
+            heads,
+            layers,
+            drop_path,
+            ..
+        } = *config;
         let layer = |number: usize| {
             let drop = drop_path * number as f64 / (layers.max(2) - 1) as f64;
             TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, drop)
         };
         Self {
             stem: ContextStem::new(&(path / "stem"), config),
-            places: path.var("places", &[config.tokens(), width], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            places: path.var(
+                "places",
+                &[config.tokens(), width],
+                Init::Randn {
+                    mean: 0.0,
+                    stdev: 0.02,
+                },
+            ),
             layers: (0..layers).map(layer).collect(),
             norm: LayerNorm::new(&(path / "norm"), width),
             mask: Dense::new(&(path / "mask"), width, 1, 0.1),
@@ -57,7 +70,10 @@ impl SweepEncoder {
     /// # Errors
     /// Those of the tensor library.
     pub fn forward(&self, images: &Tensor, train: bool) -> Result<EncodedSweeps, TchError> {
-        let mut x = self.stem.forward(images, train)?.f_add(&self.places.f_to_kind(images.kind())?)?;
+        let mut x = self
+            .stem
+            .forward(images, train)?
+            .f_add(&self.places.f_to_kind(images.kind())?)?;
         for layer in &self.layers {
             x = layer.forward(&x, None, train)?;
         }

@@ -27,7 +27,13 @@ pub(super) struct TransformerLayer {
 impl TransformerLayer {
     /// Layer with a perceptron of `expansion * width` channels; `drop_path` is the share of samples without each branch
     /// in training.
-    pub(super) fn new(path: &nn::Path<'_>, width: i64, heads: i64, expansion: i64, drop_path: f64) -> Self {
+    pub(super) fn new(
+        path: &nn::Path<'_>,
+        width: i64,
+        heads: i64,
+        expansion: i64,
+        drop_path: f64,
+    ) -> Self {
         let hidden = expansion * width;
         Self {
             before_attention: LayerNorm::new(&(path / "norm1"), width),
@@ -43,7 +49,12 @@ impl TransformerLayer {
 
     /// `[B, T, width]` to the same; `mask` is added to the logits of the attention,
     /// `[B or 1, 1, T, T]`; products are in the precision of `x`, which has to be single with a mask.
-    pub(super) fn forward(&self, x: &Tensor, mask: Option<&Tensor>, train: bool) -> Result<Tensor, TchError> {
+    pub(super) fn forward(
+        &self,
+        x: &Tensor,
+        mask: Option<&Tensor>,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let attended = self.attend(&self.before_attention.forward(x)?, mask)?;
         let x = x.f_add(&self.keep_some(attended, train)?)?;
         let hidden = dense(&self.up, &self.before_perceptron.forward(&x)?)?.f_gelu("none")?;
@@ -53,21 +64,34 @@ impl TransformerLayer {
 
     fn attend(&self, x: &Tensor, mask: Option<&Tensor>) -> Result<Tensor, TchError> {
         let (batch, tokens, width) = x.size3()?;
-        let parts = dense(&self.qkv, x)?.f_view([batch, tokens, 3, self.heads, width / self.heads])?;
+        let parts =
+            dense(&self.qkv, x)?.f_view([batch, tokens, 3, self.heads, width / self.heads])?;
         let parts = parts.f_permute([2, 0, 3, 1, 4])?;
-        let [query, key, value] = [parts.f_select(0, 0)?, parts.f_select(0, 1)?, parts.f_select(0, 2)?];
+        let [query, key, value] = [
+            parts.f_select(0, 0)?,
+            parts.f_select(0, 1)?,
+            parts.f_select(0, 2)?,
+        ];
         let found = match mask {
             None => {
                 let none = None::<Tensor>;
-                Tensor::f_scaled_dot_product_attention(&query, &key, &value, none, 0.0, false, None, false)?
+                Tensor::f_scaled_dot_product_attention(
+                    &query, &key, &value, none, 0.0, false, None, false,
+                )?
             }
             Some(mask) => {
                 let scale = 1.0 / ((width / self.heads) as f64).sqrt();
-                let logits = query.f_matmul(&key.f_transpose(2, 3)?)?.f_mul_scalar(scale)?.f_add(mask)?;
+                let logits = query
+                    .f_matmul(&key.f_transpose(2, 3)?)?
+                    .f_mul_scalar(scale)?
+                    .f_add(mask)?;
                 logits.f_softmax(3, Kind::Float)?.f_matmul(&value)?
             }
         };
-        dense(&self.outward, &found.f_transpose(1, 2)?.f_reshape([batch, tokens, width])?)
+        dense(
+            &self.outward,
+            &found.f_transpose(1, 2)?.f_reshape([batch, tokens, width])?,
+        )
     }
 
     /// Stochastic depth: zeroes the branch of some samples and scales the others.
@@ -77,7 +101,10 @@ impl TransformerLayer {
         }
         let keep = 1.0 - self.drop_path;
         let drawn = Tensor::f_rand([branch.size()[0], 1, 1], (Kind::Float, branch.device()))?;
-        let kept = drawn.f_lt(keep)?.f_to_kind(branch.kind())?.f_div_scalar(keep)?;
+        let kept = drawn
+            .f_lt(keep)?
+            .f_to_kind(branch.kind())?
+            .f_div_scalar(keep)?;
         branch.f_mul(&kept)
     }
 }
@@ -85,5 +112,7 @@ impl TransformerLayer {
 /// A dense layer on the last dimension of `[B, T, inputs]`.
 pub(super) fn dense(layer: &Dense, x: &Tensor) -> Result<Tensor, TchError> {
     let (batch, tokens, inputs) = x.size3()?;
-    layer.forward(&x.f_reshape([batch * tokens, inputs])?)?.f_view([batch, tokens, -1])
+    layer
+        .forward(&x.f_reshape([batch * tokens, inputs])?)?
+        .f_view([batch, tokens, -1])
 }

@@ -26,7 +26,11 @@ impl HypLiLocConfig {
         if !self.origin_m.iter().all(|axis| axis.is_finite()) {
             return error(format!("origin_m is {:?}, must be finite", self.origin_m));
         }
-        if !self.scale_m.iter().all(|axis| axis.is_finite() && *axis > 0.0) {
+        if !self
+            .scale_m
+            .iter()
+            .all(|axis| axis.is_finite() && *axis > 0.0)
+        {
             return error(format!("scale_m is {:?}, must be above 0", self.scale_m));
         }
         Ok(())
@@ -39,12 +43,22 @@ mod tests {
 
     #[test]
     fn numbers_that_are_no_positions_are_named() {
-        let config = HypLiLocConfig { scene_name: "town".into(), origin_m: [0.0; 3], scale_m: [1.0; 3] };
+        let config = HypLiLocConfig {
+            scene_name: "town".into(),
+            origin_m: [0.0; 3],
+            scale_m: [1.0; 3],
+        };
         assert!(config.validate().is_ok());
         let message = |config: HypLiLocConfig| config.validate().unwrap_err().to_string();
-        let lost = HypLiLocConfig { origin_m: [0.0, f64::NAN, 0.0], ..config.clone() };
+        let lost = HypLiLocConfig {
+            origin_m: [0.0, f64::NAN, 0.0],
+            ..config.clone()
+        };
         assert!(message(lost).contains("origin_m is [0.0, NaN, 0.0]"));
-        let flat = HypLiLocConfig { scale_m: [1.0, 0.0, 1.0], ..config };
+        let flat = HypLiLocConfig {
+            scale_m: [1.0, 0.0, 1.0],
+            ..config
+        };
         assert!(message(flat).contains("scale_m is [1.0, 0.0, 1.0]"));
     }
 }

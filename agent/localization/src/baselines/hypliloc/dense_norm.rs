@@ -16,10 +16,17 @@ impl BatchNormed {
     /// Builds a chain of layers of these channels below `path`.
     pub(super) fn chain(path: &nn::Path<'_>, channels: &[i64]) -> Vec<Self> {
         // Not by cuDNN, which is slow on a million rows of few channels.
-        let config = BatchNormConfig { ws_init: Init::Const(1.0), cudnn_enabled: false, ..BatchNormConfig::default() };
+        let config = BatchNormConfig {
+            ws_init: Init::Const(1.0),
+            cudnn_enabled: false,
+            ..BatchNormConfig::default()
+        };
         let layer = |(number, io): (usize, &[i64])| {
             let path = path / number;
-            Self { dense: Dense::new(&path, io[0], io[1], 1.0), norm: nn::batch_norm1d(&path / "norm", io[1], config) }
+            Self {
+                dense: Dense::new(&path, io[0], io[1], 1.0),
+                norm: nn::batch_norm1d(&path / "norm", io[1], config),
+            }
         };
         channels.windows(2).enumerate().map(layer).collect()
     }
@@ -40,7 +47,11 @@ pub(super) struct TokenNorm(nn::LayerNorm);
 impl TokenNorm {
     /// The identity, before it is trained, of normalised tokens.
     pub(super) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        Self(nn::layer_norm(path, vec![channels], LayerNormConfig::default()))
+        Self(nn::layer_norm(
+            path,
+            vec![channels],
+            LayerNormConfig::default(),
+        ))
     }
 
     /// `[.., C]` in single precision.
@@ -59,7 +70,10 @@ pub(super) struct LayerNormed {
 impl LayerNormed {
     /// Builds a layer that keeps the number of channels.
     pub(super) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        Self { dense: Dense::new(path, channels, channels, 1.0), norm: TokenNorm::new(&(path / "norm"), channels) }
+        Self {
+            dense: Dense::new(path, channels, channels, 1.0),
+            norm: TokenNorm::new(&(path / "norm"), channels),
+        }
     }
 
     /// `[S, T, C]` in single precision.
@@ -77,5 +91,7 @@ impl LayerNormed {
 /// Those of the tensor library.
 pub(super) fn of_tokens(dense: &Dense, tokens: &Tensor) -> Result<Tensor, TchError> {
     let (sweeps, count, channels) = tokens.size3()?;
-    dense.forward(&tokens.f_reshape([-1, channels])?)?.f_view([sweeps, count, -1])
+    dense
+        .forward(&tokens.f_reshape([-1, channels])?)?
+        .f_view([sweeps, count, -1])
 }

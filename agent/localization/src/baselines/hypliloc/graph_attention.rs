@@ -43,8 +43,16 @@ impl GraphAttention {
     }
 
     fn new(path: &nn::Path<'_>, channels: i64, metric: Option<Tensor>, space: Space) -> Self {
-        let (dense, norm) = (Dense::new(path, channels, channels, 1.0), TokenNorm::new(&(path / "norm"), channels));
-        Self { dense, metric, norm, space }
+        let (dense, norm) = (
+            Dense::new(path, channels, channels, 1.0),
+            TokenNorm::new(&(path / "norm"), channels),
+        );
+        Self {
+            dense,
+            metric,
+            norm,
+            space,
+        }
     }
 
     /// `[S, T, C]` in single precision.
@@ -55,8 +63,9 @@ impl GraphAttention {
     /// Those of the tensor library.
     pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
         let (sweeps, count, channels) = tokens.size3()?;
-        let values =
-            of_tokens(&self.dense, tokens)?.f_view([sweeps, count, HEADS, channels / HEADS])?.f_transpose(1, 2)?;
+        let values = of_tokens(&self.dense, tokens)?
+            .f_view([sweeps, count, HEADS, channels / HEADS])?
+            .f_transpose(1, 2)?;
         let values = match self.space {
             Space::Euclidean => values,
             Space::Poincare => expmap0(&values)?,
@@ -66,11 +75,17 @@ impl GraphAttention {
             None => values.shallow_clone(),
         };
         let mask = None::<Tensor>;
-        let mean = Tensor::f_scaled_dot_product_attention(&query, &values, &values, mask, 0.0, false, 1.0, false)?;
+        let mean = Tensor::f_scaled_dot_product_attention(
+            &query, &values, &values, mask, 0.0, false, 1.0, false,
+        )?;
         let mean = match self.space {
             Space::Euclidean => mean,
             Space::Poincare => logmap0(&mean)?,
         };
-        self.norm.forward(&mean.f_transpose(1, 2)?.f_reshape([sweeps, count, channels])?)
+        self.norm.forward(
+            &mean
+                .f_transpose(1, 2)?
+                .f_reshape([sweeps, count, channels])?,
+        )
     }
 }

@@ -28,11 +28,22 @@ impl ImageBranch {
         let mut inputs = STAGES[0];
         for (stage, filters) in STAGES.into_iter().enumerate() {
             let stride = if stage == 0 { 1 } else { 2 };
-            blocks.extend(ResidualBlock::chain(&(path / "stages" / stage), [inputs, filters], BLOCKS, stride));
+            blocks.extend(ResidualBlock::chain(
+                &(path / "stages" / stage),
+                [inputs, filters],
+                BLOCKS,
+                stride,
+            ));
             inputs = filters;
         }
         let layer = |name: &str, io, kernel, stride| {
-            ConvLayer::normed(&(path / name / "conv"), &(path / name / "norm"), io, kernel, stride)
+            ConvLayer::normed(
+                &(path / name / "conv"),
+                &(path / name / "norm"),
+                io,
+                kernel,
+                stride,
+            )
         };
         Self {
             stem: layer("stem", [CHANNELS, STAGES[0]], 7, 2),
@@ -45,9 +56,19 @@ impl ImageBranch {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(super) fn forward(&self, ranges_m: &Tensor, kind: Kind, train: bool) -> Result<Tensor, TchError> {
-        let x = self.stem.forward(&channels(ranges_m)?.f_to_kind(kind)?, train);
-        let x = self.blocks.iter().fold(x, |x, block| block.forward(&x, train));
+    pub(super) fn forward(
+        &self,
+        ranges_m: &Tensor,
+        kind: Kind,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        let x = self
+            .stem
+            .forward(&channels(ranges_m)?.f_to_kind(kind)?, train);
+        let x = self
+            .blocks
+            .iter()
+            .fold(x, |x, block| block.forward(&x, train));
         self.outward.forward(&x, train).f_to_kind(Kind::Float)
     }
 }

@@ -43,7 +43,11 @@ impl HypLiLocLocalizer {
         let network = HypLiLoc::new(&variables.root());
         weights.copy_into(&variables)?;
         variables.freeze();
-        Ok(Self { network, config, device })
+        Ok(Self {
+            network,
+            config,
+            device,
+        })
     }
 
     /// Configuration: scene, origin and scale of its positions.
@@ -62,28 +66,46 @@ impl HypLiLocLocalizer {
 }
 
 impl Localize for HypLiLocLocalizer {
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(
+        &mut self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let start = Instant::now();
         let points_m: Vec<[f32; 3]> = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]).collect();
         let input = SweepInput::new(&points_m);
         times.voxelise = start.elapsed();
-        let Some(input) = input else { return Ok(no_pose(NoPoseReason::TooFewPoints, times)) };
+        let Some(input) = input else {
+            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+        };
         let start = Instant::now();
         let mut answer = no_grad(|| self.regress(input))?;
         times.regress = start.elapsed();
-        answer.iter_mut().zip(self.config.scale_m).for_each(|(axis, scale)| *axis *= scale as f32);
-        Ok(match of_length_one(&mut answer).then(|| upright(&answer, self.config.origin_m)).flatten() {
-            Some(pose) => Localization::from_estimate(PoseEstimate::new(pose.into(), FULL_CONFIDENCE), times),
-            None => no_pose(NoPoseReason::Failed, times),
-        })
+        answer
+            .iter_mut()
+            .zip(self.config.scale_m)
+            .for_each(|(axis, scale)| *axis *= scale as f32);
+        Ok(
+            match of_length_one(&mut answer)
+                .then(|| upright(&answer, self.config.origin_m))
+                .flatten()
+            {
+                Some(pose) => Localization::from_estimate(
+                    PoseEstimate::new(pose.into(), FULL_CONFIDENCE),
+                    times,
+                ),
+                None => no_pose(NoPoseReason::Failed, times),
+            },
+        )
     }
 }
 
 /// Scales the heading after the position to length 1; false if it has no direction.
 fn of_length_one(answer: &mut [f32]) -> bool {
-    let [.., cosine, sine] = answer else { return false };
+    let [.., cosine, sine] = answer else {
+        return false;
+    };
     let length = cosine.hypot(*sine);
     (*cosine, *sine) = (*cosine / length, *sine / length);
     length >= LEAST_HEADING
@@ -103,11 +125,20 @@ mod tests {
     use protocol::PointCloud;
 
     fn config() -> HypLiLocConfig {
-        HypLiLocConfig { scene_name: "test".into(), origin_m: [1000.0, -2000.0, 30.0], scale_m: [100.0, 200.0, 1.0] }
+        HypLiLocConfig {
+            scene_name: "test".into(),
+            origin_m: [1000.0, -2000.0, 30.0],
+            scale_m: [100.0, 200.0, 1.0],
+        }
     }
 
     /// Writes a network whose last layers answer with `position` and `heading` for any sweep.
-    fn write(folder: &Path, config: &HypLiLocConfig, position: [f32; 3], heading: [f32; 2]) -> PathBuf {
+    fn write(
+        folder: &Path,
+        config: &HypLiLocConfig,
+        position: [f32; 3],
+        heading: [f32; 2],
+    ) -> PathBuf {
         tch::set_num_threads(1);
         let variables = VarStore::new(Device::Cpu);
         let _ = HypLiLoc::new(&variables.root());
@@ -116,11 +147,16 @@ mod tests {
             let last = format!("heads.fusion.{name}.2");
             no_grad(|| {
                 let _ = named[&format!("{last}.weight")].shallow_clone().zero_();
-                named[&format!("{last}.bias")].shallow_clone().copy_(&Tensor::from_slice(bias));
+                named[&format!("{last}.bias")]
+                    .shallow_clone()
+                    .copy_(&Tensor::from_slice(bias));
             });
         }
         let about = BTreeMap::from([
-            (CONFIG_KEY.to_owned(), serde_json::to_string(config).unwrap()),
+            (
+                CONFIG_KEY.to_owned(),
+                serde_json::to_string(config).unwrap(),
+            ),
             (KIND_KEY.to_owned(), HypLiLocLocalizer::KIND.to_owned()),
         ]);
         let path = folder.join("weights.safetensors");
@@ -130,19 +166,31 @@ mod tests {
 
     fn sweep() -> PointCloud {
         let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
-        PointCloud { xyzi: wall.collect() }
+        PointCloud {
+            xyzi: wall.collect(),
+        }
     }
 
     #[test]
     fn weights_are_read_back_and_answer_in_the_world_frame() {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &config(), [0.5, -0.25, 2.0], [0.0, 0.3]);
-        assert_eq!(HypLiLocLocalizer::load(&path, Device::Cpu).unwrap().config(), &config());
+        assert_eq!(
+            HypLiLocLocalizer::load(&path, Device::Cpu)
+                .unwrap()
+                .config(),
+            &config()
+        );
         let mut localizer = load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap();
         let answer = localizer.localize(&sweep()).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let expected = [1050.0, -2050.0, 32.0];
-        assert!(pose.translation_m.iter().zip(expected).all(|(found, wanted)| (found - wanted).abs() < 1e-3));
+        assert!(
+            pose.translation_m
+                .iter()
+                .zip(expected)
+                .all(|(found, wanted)| (found - wanted).abs() < 1e-3)
+        );
         assert!((pose.yaw_rad() - std::f64::consts::FRAC_PI_2).abs() < 1e-6);
     }
 
@@ -151,28 +199,62 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &config(), [0.0; 3], [0.0; 2]);
         let mut localizer = HypLiLocLocalizer::load(&path, Device::Cpu).unwrap();
-        let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
-        let few = PointCloud { xyzi: (0..10).map(|k| [3.0 * k as f32, 3.0, 0.5, 0.1]).collect() };
-        let none = |reason| PoseEstimate::NoPose { reason, inlier_count: 0 };
+        let nan = PointCloud {
+            xyzi: vec![[f32::NAN; 4]; 5000],
+        };
+        let few = PointCloud {
+            xyzi: (0..10).map(|k| [3.0 * k as f32, 3.0, 0.5, 0.1]).collect(),
+        };
+        let none = |reason| PoseEstimate::NoPose {
+            reason,
+            inlier_count: 0,
+        };
         for cloud in [PointCloud::default(), nan, few] {
-            assert_eq!(localizer.localize(&cloud).unwrap().estimate, none(NoPoseReason::TooFewPoints));
+            assert_eq!(
+                localizer.localize(&cloud).unwrap().estimate,
+                none(NoPoseReason::TooFewPoints)
+            );
         }
-        assert_eq!(localizer.localize(&sweep()).unwrap().estimate, none(NoPoseReason::Failed));
+        assert_eq!(
+            localizer.localize(&sweep()).unwrap().estimate,
+            none(NoPoseReason::Failed)
+        );
     }
 
     #[test]
     fn files_of_something_else_are_named() {
         let folder = tempfile::tempdir().unwrap();
-        let flat = HypLiLocConfig { scale_m: [0.0; 3], ..config() };
+        let flat = HypLiLocConfig {
+            scale_m: [0.0; 3],
+            ..config()
+        };
         let path = write(folder.path(), &flat, [0.0; 3], [0.0; 2]);
-        let message = HypLiLocLocalizer::load(&path, Device::Cpu).unwrap_err().to_string();
+        let message = HypLiLocLocalizer::load(&path, Device::Cpu)
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("scale_m is [0.0, 0.0, 0.0]"), "{message}");
-        let message = SgLocLocalizer::load(&path, Device::Cpu, PoseSolver::default()).unwrap_err().to_string();
-        assert!(message.contains("\"HypLiLoc\"") && message.contains("\"SGLoc\""), "{message}");
+        let message = SgLocLocalizer::load(&path, Device::Cpu, PoseSolver::default())
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("\"HypLiLoc\"") && message.contains("\"SGLoc\""),
+            "{message}"
+        );
         let other = folder.path().join("other.safetensors");
         let about = BTreeMap::from([(KIND_KEY.to_owned(), "scene encoder".to_owned())]);
-        save(&other, &VarStore::new(Device::Cpu), &about, Precision::Single).unwrap();
-        let message = HypLiLocLocalizer::load(&other, Device::Cpu).unwrap_err().to_string();
-        assert!(message.contains("\"scene encoder\"") && message.contains("\"HypLiLoc\""), "{message}");
+        save(
+            &other,
+            &VarStore::new(Device::Cpu),
+            &about,
+            Precision::Single,
+        )
+        .unwrap();
+        let message = HypLiLocLocalizer::load(&other, Device::Cpu)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("\"scene encoder\"") && message.contains("\"HypLiLoc\""),
+            "{message}"
+        );
     }
 }

@@ -58,7 +58,8 @@ impl HypLiLoc {
             ),
             image_block: ResidualBlock::chain(&(path / "image_block"), [WIDTH, WIDTH], 1, 1),
             second: Fusion::new(&(path / "second_fusion")),
-            heads: ["points", "image", "fusion"].map(|name| PoseHead::new(&(path / "heads" / name))),
+            heads: ["points", "image", "fusion"]
+                .map(|name| PoseHead::new(&(path / "heads" / name))),
         }
     }
 
@@ -66,21 +67,36 @@ impl HypLiLoc {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn forward(&self, batch: &InputBatch, kind: Kind, train: bool) -> Result<BranchPoses, TchError> {
-        let points = self.points.forward(&batch.points_m, &batch.groups, kind, train)?;
+    pub fn forward(
+        &self,
+        batch: &InputBatch,
+        kind: Kind,
+        train: bool,
+    ) -> Result<BranchPoses, TchError> {
+        let points = self
+            .points
+            .forward(&batch.points_m, &batch.groups, kind, train)?;
         let map = self.image.forward(&batch.ranges_m, kind, train)?;
         let (sweeps, channels, rows, columns) = map.size4()?;
         let tokens_of = |map: &Tensor| map.f_flatten(2, 3)?.f_transpose(1, 2);
         let image = tokens_of(&map)?;
 
-        let fused = self.first.forward(&normalise(&points)?, &normalise(&image)?)?;
+        let fused = self
+            .first
+            .forward(&normalise(&points)?, &normalise(&image)?)?;
         let (count, cells) = (points.size()[1], rows * columns);
         let (inward, attention, outward) = &self.point_block;
-        let fused_points = outward.forward(&attention.forward(&inward.forward(&fused.f_narrow(1, 0, count)?)?)?)?;
+        let fused_points = outward
+            .forward(&attention.forward(&inward.forward(&fused.f_narrow(1, 0, count)?)?)?)?;
         let fused_map = fused.f_narrow(1, count, cells)?.f_transpose(1, 2)?;
         let fused_map = fused_map.f_reshape([sweeps, channels, rows, columns])?;
-        let fused_map = self.image_block.iter().fold(fused_map, |map, block| block.forward(&map, train));
-        let fused = self.second.forward(&fused_points, &tokens_of(&fused_map)?)?;
+        let fused_map = self
+            .image_block
+            .iter()
+            .fold(fused_map, |map, block| block.forward(&map, train));
+        let fused = self
+            .second
+            .forward(&fused_points, &tokens_of(&fused_map)?)?;
 
         let [point_head, image_head, fusion_head] = &self.heads;
         let features = [

@@ -31,7 +31,9 @@ pub(super) fn logmap0(point: &Tensor) -> Result<Tensor, TchError> {
 
 /// Norms along the last dimension, in units of the radius.
 fn scaled_norm(x: &Tensor) -> Result<Tensor, TchError> {
-    (x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)? * CURVATURE).f_add_scalar(TINY)?.f_sqrt()
+    (x.f_square()?.f_sum_dim_intlist(-1_i64, true, Kind::Float)? * CURVATURE)
+        .f_add_scalar(TINY)?
+        .f_sqrt()
 }
 
 #[cfg(test)]
@@ -56,7 +58,10 @@ mod tests {
         assert!((far.double_value(&[0]) - MAX_SHARE / CURVATURE.sqrt()).abs() < 1e-4);
         assert!(logmap0(&far).unwrap().isfinite().all().int64_value(&[]) == 1);
         let origin = Tensor::from_slice(&[0f32, 0.0]).set_requires_grad(true);
-        logmap0(&expmap0(&origin).unwrap()).unwrap().sum(Kind::Float).backward();
+        logmap0(&expmap0(&origin).unwrap())
+            .unwrap()
+            .sum(Kind::Float)
+            .backward();
         assert!(origin.grad().isfinite().all().int64_value(&[]) == 1);
     }
 }

@@ -25,7 +25,10 @@ impl PointBranch {
         Self {
             fine: SetAbstraction::new(&(path / "fine"), FINE, 0, [32, 32, 64]),
             coarse: SetAbstraction::new(&(path / "coarse"), COARSE, 64, [64, 64, 128]),
-            layers: BatchNormed::chain(&(path / "tokens"), &[3 + 128, 128, 256, 512, 256, 128, WIDTH]),
+            layers: BatchNormed::chain(
+                &(path / "tokens"),
+                &[3 + 128, 128, 256, 512, 256, 128, WIDTH],
+            ),
         }
     }
 
@@ -41,9 +44,13 @@ impl PointBranch {
         kind: Kind,
         train: bool,
     ) -> Result<Tensor, TchError> {
-        let features = self.fine.forward(points_m, None, &groups.fine, kind, train)?;
+        let features = self
+            .fine
+            .forward(points_m, None, &groups.fine, kind, train)?;
         let centres_m = points_m.f_narrow(1, 0, FINE.centres)?;
-        let features = self.coarse.forward(&centres_m, Some(&features), &groups.coarse, kind, train)?;
+        let features =
+            self.coarse
+                .forward(&centres_m, Some(&features), &groups.coarse, kind, train)?;
         let centres = points_m.f_narrow(1, 0, COARSE.centres)? / SCALE_M;
         let mut x = Tensor::f_cat(&[centres, features], 2)?.f_view([-1, 3 + 128])?;
         for layer in &self.layers {

@@ -28,11 +28,20 @@ impl PoseHead {
     /// Builds the layers below `path`.
     pub(super) fn new(path: &nn::Path<'_>) -> Self {
         let chain = |name: &str, outputs| {
-            let layer = |number: usize, from, to, gain| Dense::new(&(path / name / number), from, to, gain);
-            [layer(0, WIDTH, 128, 1.0), layer(1, 128, 64, 1.0), layer(2, 64, outputs, 0.1)]
+            let layer =
+                |number: usize, from, to, gain| Dense::new(&(path / name / number), from, to, gain);
+            [
+                layer(0, WIDTH, 128, 1.0),
+                layer(1, 128, 64, 1.0),
+                layer(2, 64, outputs, 0.1),
+            ]
         };
         let norm = Norm::with_defaults(&(path / "norm"), WIDTH);
-        Self { norm, position: chain("position", 3), heading: chain("heading", 2) }
+        Self {
+            norm,
+            position: chain("position", 3),
+            heading: chain("heading", 2),
+        }
     }
 
     /// `[S, WIDTH]`: batch norm of the mean of tokens `[S, T, WIDTH]`, which is nearly the same for all sweeps.
@@ -40,7 +49,9 @@ impl PoseHead {
     /// # Errors
     /// Those of the tensor library.
     pub(super) fn features(&self, tokens: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        Ok(self.norm.forward(&tokens.f_mean_dim(1_i64, false, Kind::Float)?, train))
+        Ok(self
+            .norm
+            .forward(&tokens.f_mean_dim(1_i64, false, Kind::Float)?, train))
     }
 
     /// Poses from features `[S, WIDTH]`.
@@ -49,8 +60,15 @@ impl PoseHead {
     /// Those of the tensor library.
     pub(super) fn forward(&self, features: &Tensor) -> Result<NormalisedPoses, TchError> {
         let through = |[first, second, third]: &[Dense; 3]| {
-            third.forward(&second.forward(&first.forward(features)?.f_relu()?)?.f_relu()?)
+            third.forward(
+                &second
+                    .forward(&first.forward(features)?.f_relu()?)?
+                    .f_relu()?,
+            )
         };
-        Ok(NormalisedPoses { position: through(&self.position)?, heading: through(&self.heading)? })
+        Ok(NormalisedPoses {
+            position: through(&self.position)?,
+            heading: through(&self.heading)?,
+        })
     }
 }

@@ -25,7 +25,8 @@ pub(super) fn range_image(points_m: &[[f32; 3]], range_m: f32) -> Vec<f32> {
     for &[x, y, z] in points_m {
         let in_plane = x.hypot(y);
         let range = in_plane.hypot(z);
-        let row = (HIGHEST_DEG - z.atan2(in_plane).to_degrees()) / (HIGHEST_DEG - LOWEST_DEG) * rows as f32;
+        let row = (HIGHEST_DEG - z.atan2(in_plane).to_degrees()) / (HIGHEST_DEG - LOWEST_DEG)
+            * rows as f32;
         // False for NaN too.
         let is_inside = range > 0.0 && range <= range_m && row >= 0.0 && row < rows as f32;
         if is_inside {
@@ -34,7 +35,10 @@ pub(super) fn range_image(points_m: &[[f32; 3]], range_m: f32) -> Vec<f32> {
             *cell = cell.min(range);
         }
     }
-    image.into_iter().map(|range| if range.is_finite() { range } else { 0.0 }).collect()
+    image
+        .into_iter()
+        .map(|range| if range.is_finite() { range } else { 0.0 })
+        .collect()
 }
 
 /// `[S, 4, ROWS, COLUMNS]` x, y, z and range in units of 20 m, from ranges `[S, ROWS, COLUMNS]`, metres.
@@ -48,8 +52,11 @@ pub(super) fn channels(ranges_m: &Tensor) -> Result<Tensor, TchError> {
 
 /// `[1, 4, ROWS, COLUMNS]`: direction of each cell, and 1.
 fn directions(device: Device) -> Result<Tensor, TchError> {
-    let middle = |count: i64| Tensor::f_arange(count, (Kind::Float, device)).map(|index| (index + 0.5) / count as f64);
-    let elevation = (middle(ROWS)? * f64::from(LOWEST_DEG - HIGHEST_DEG) + f64::from(HIGHEST_DEG)).f_deg2rad()?;
+    let middle = |count: i64| {
+        Tensor::f_arange(count, (Kind::Float, device)).map(|index| (index + 0.5) / count as f64)
+    };
+    let elevation = (middle(ROWS)? * f64::from(LOWEST_DEG - HIGHEST_DEG) + f64::from(HIGHEST_DEG))
+        .f_deg2rad()?;
     let azimuth = middle(COLUMNS)? * TAU - TAU / 2.0;
     let (elevation, azimuth) = (elevation.f_unsqueeze(1)?, azimuth.f_unsqueeze(0)?);
     let in_plane = elevation.f_cos()?;
@@ -94,12 +101,26 @@ mod tests {
     #[test]
     fn the_nearest_point_of_a_direction_is_seen() {
         let ahead = [[30.0, 0.01, 0.0], [10.0, 0.01, 0.0], [20.0, 0.01, 0.0]];
-        let unseen = [[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [1.0, 0.0, 5.0], [1.0, 0.0, -5.0], [f32::NAN, 0.0, 0.0]];
+        let unseen = [
+            [0.0, 0.0, 0.0],
+            [200.0, 0.0, 0.0],
+            [1.0, 0.0, 5.0],
+            [1.0, 0.0, -5.0],
+            [f32::NAN, 0.0, 0.0],
+        ];
         let image = range_image(&[&ahead[..], &unseen].concat(), 100.0);
-        let seen: Vec<(usize, f32)> = image.iter().copied().enumerate().filter(|&(_, range)| range > 0.0).collect();
+        let seen: Vec<(usize, f32)> = image
+            .iter()
+            .copied()
+            .enumerate()
+            .filter(|&(_, range)| range > 0.0)
+            .collect();
         let (row, column) = (2, COLUMNS as usize / 2);
         assert_eq!(seen.len(), 1, "{seen:?}");
-        assert!(seen[0].0 == row * COLUMNS as usize + column && (seen[0].1 - 10.0).abs() < 1e-4, "{seen:?}");
+        assert!(
+            seen[0].0 == row * COLUMNS as usize + column && (seen[0].1 - 10.0).abs() < 1e-4,
+            "{seen:?}"
+        );
     }
 
     #[test]
@@ -110,7 +131,9 @@ mod tests {
         assert_eq!(seen.size()[0], points.len() as i64);
         for [x, y, z] in points {
             let wanted = Tensor::from_slice(&[x, y, z]).view([1, 3, 1, 1]) / SCALE_M;
-            let off = (channels.narrow(1, 0, 3) - wanted).square().sum_dim_intlist(1, false, Kind::Float);
+            let off = (channels.narrow(1, 0, 3) - wanted)
+                .square()
+                .sum_dim_intlist(1, false, Kind::Float);
             // Half a cell of 1 by 0.9 degrees at 44 m.
             assert!(off.min().double_value(&[]).sqrt() * SCALE_M < 0.6);
         }
@@ -122,7 +145,9 @@ mod tests {
         let image = tensor(&range_image(&points, 100.0));
         for columns in [0, 1, 90, 123, 359] {
             let (sine, cosine) = (columns as f32).to_radians().sin_cos();
-            let turned = points.iter().map(|[x, y, z]| [cosine * x - sine * y, sine * x + cosine * y, *z]);
+            let turned = points
+                .iter()
+                .map(|[x, y, z]| [cosine * x - sine * y, sine * x + cosine * y, *z]);
             let turned: Vec<[f32; 3]> = turned.collect();
             let wanted = tensor(&range_image(&turned, 100.0));
             let rolled = roll_columns(&image, &Tensor::from_slice(&[columns])).unwrap();

@@ -11,7 +11,9 @@ const LAYERS: usize = 32;
 pub(super) fn thin(points_m: &[[f32; 3]], range_m: f32) -> Vec<[f32; 3]> {
     let side = (2.0 * range_m / VOXEL_M).ceil() as usize + 1;
     let mut is_taken = vec![false; side * side * LAYERS];
-    let index = |value: f32, lowest: f32, count: usize| (((value - lowest) / VOXEL_M) as usize).min(count - 1);
+    let index = |value: f32, lowest: f32, count: usize| {
+        (((value - lowest) / VOXEL_M) as usize).min(count - 1)
+    };
     let mut thinned = Vec::with_capacity(4096);
     for &point in points_m {
         let [x, y, z] = point;
@@ -31,11 +33,19 @@ pub(super) fn thin(points_m: &[[f32; 3]], range_m: f32) -> Vec<[f32; 3]> {
 /// `count` points, each the farthest from all before it; the first is the farthest from the sensor. The first k of them
 /// are the k that a sampling of k points would choose. Starts over when there are fewer; empty if there are none.
 pub(super) fn farthest_points(points_m: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
-    let [x, y, z] = [0, 1, 2].map(|axis| points_m.iter().map(|point| point[axis]).collect::<Vec<f32>>());
+    let [x, y, z] = [0, 1, 2].map(|axis| {
+        points_m
+            .iter()
+            .map(|point| point[axis])
+            .collect::<Vec<f32>>()
+    });
     let mut nearest = vec![f32::INFINITY; points_m.len()];
     let range = |[x, y, z]: [f32; 3]| x * x + y * y + z * z;
-    let first = (0..points_m.len()).max_by(|&a, &b| range(points_m[a]).total_cmp(&range(points_m[b])));
-    let Some(mut latest) = first else { return Vec::new() };
+    let first =
+        (0..points_m.len()).max_by(|&a, &b| range(points_m[a]).total_cmp(&range(points_m[b])));
+    let Some(mut latest) = first else {
+        return Vec::new();
+    };
     let mut chosen = Vec::with_capacity(count);
     while chosen.len() < count.min(points_m.len()) {
         chosen.push(points_m[latest]);
@@ -54,10 +64,19 @@ fn index_of_largest(values: &[f32]) -> usize {
     let mut lanes = [f32::NEG_INFINITY; 16];
     let (chunks, rest) = values.as_chunks::<16>();
     for chunk in chunks {
-        lanes.iter_mut().zip(chunk).for_each(|(lane, value)| *lane = if value > lane { *value } else { *lane });
+        lanes
+            .iter_mut()
+            .zip(chunk)
+            .for_each(|(lane, value)| *lane = if value > lane { *value } else { *lane });
     }
-    let largest = lanes.iter().chain(rest).fold(f32::NEG_INFINITY, |a, b| a.max(*b));
-    values.iter().position(|&value| value == largest).unwrap_or(0)
+    let largest = lanes
+        .iter()
+        .chain(rest)
+        .fold(f32::NEG_INFINITY, |a, b| a.max(*b));
+    values
+        .iter()
+        .position(|&value| value == largest)
+        .unwrap_or(0)
 }
 
 #[cfg(test)]
@@ -66,8 +85,19 @@ mod tests {
 
     #[test]
     fn a_voxel_keeps_its_first_point_and_points_out_of_range_are_left_out() {
-        let points = [[0.1, 0.1, 0.1], [0.9, 0.9, 0.9], [1.1, 0.1, 0.1], [30.0, 0.0, 0.0], [f32::NAN, 0.0, 0.0]];
-        let heights = [[5.0, 5.0, -100.0], [5.0, 5.0, 1e9], [5.0, 5.0, f32::INFINITY], [5.0, 5.0, 2e9]];
+        let points = [
+            [0.1, 0.1, 0.1],
+            [0.9, 0.9, 0.9],
+            [1.1, 0.1, 0.1],
+            [30.0, 0.0, 0.0],
+            [f32::NAN, 0.0, 0.0],
+        ];
+        let heights = [
+            [5.0, 5.0, -100.0],
+            [5.0, 5.0, 1e9],
+            [5.0, 5.0, f32::INFINITY],
+            [5.0, 5.0, 2e9],
+        ];
         let thinned = thin(&[&points[..], &heights].concat(), 20.0);
         assert_eq!(thinned, [points[0], points[2], heights[0], heights[1]]);
     }
@@ -76,14 +106,20 @@ mod tests {
     fn every_point_is_the_farthest_from_those_before() {
         let line: Vec<[f32; 3]> = (0..=40).map(|k| [k as f32, 0.0, 0.0]).collect();
         let chosen = farthest_points(&line, 5);
-        assert_eq!(chosen.iter().map(|point| point[0]).collect::<Vec<f32>>(), [40.0, 0.0, 20.0, 10.0, 30.0]);
+        assert_eq!(
+            chosen.iter().map(|point| point[0]).collect::<Vec<f32>>(),
+            [40.0, 0.0, 20.0, 10.0, 30.0]
+        );
         assert_eq!(farthest_points(&line, 3), chosen[..3]);
     }
 
     #[test]
     fn few_points_are_repeated_in_their_order() {
         let two = [[3.0, 0.0, 0.0], [1.0, 0.0, 0.0]];
-        assert_eq!(farthest_points(&two, 5), [two[0], two[1], two[0], two[1], two[0]]);
+        assert_eq!(
+            farthest_points(&two, 5),
+            [two[0], two[1], two[0], two[1], two[0]]
+        );
         assert!(farthest_points(&[], 5).is_empty());
     }
 }

@@ -17,7 +17,12 @@ pub(super) struct SetAbstraction {
 
 impl SetAbstraction {
     /// Builds the layers of these `channels` below `path`, for neighbours with `inputs` features.
-    pub(super) fn new(path: &nn::Path<'_>, neighbourhood: Neighbourhood, inputs: i64, channels: [i64; 3]) -> Self {
+    pub(super) fn new(
+        path: &nn::Path<'_>,
+        neighbourhood: Neighbourhood,
+        inputs: i64,
+        channels: [i64; 3],
+    ) -> Self {
         let [first, second, third] = channels;
         Self {
             layers: BatchNormed::chain(&(path / "layers"), &[3 + inputs, first, second, third]),
@@ -43,17 +48,26 @@ impl SetAbstraction {
         let count = points_m.size()[1];
         let first = Tensor::f_arange(sweeps, (Kind::Int64, groups.device()))? * count;
         let rows = (groups.f_to_kind(Kind::Int64)? + first.f_view([-1, 1, 1])?).f_view([-1])?;
-        let near = points_m.f_reshape([-1, 3])?.f_index_select(0, &rows)?.f_view([sweeps, centres, neighbours, 3])?;
-        let offsets = (near - points_m.f_narrow(1, 0, centres)?.f_unsqueeze(2)?) / self.neighbourhood.radius_m;
+        let near = points_m
+            .f_reshape([-1, 3])?
+            .f_index_select(0, &rows)?
+            .f_view([sweeps, centres, neighbours, 3])?;
+        let offsets = (near - points_m.f_narrow(1, 0, centres)?.f_unsqueeze(2)?)
+            / self.neighbourhood.radius_m;
         let mut x = offsets.f_view([-1, 3])?.f_to_kind(kind)?;
         if let Some(features) = features {
-            let features = features.f_to_kind(kind)?.f_reshape([sweeps * count, -1])?.f_index_select(0, &rows)?;
+            let features = features
+                .f_to_kind(kind)?
+                .f_reshape([sweeps * count, -1])?
+                .f_index_select(0, &rows)?;
             x = Tensor::f_cat(&[x, features], 1)?;
         }
         for layer in &self.layers {
             x = layer.forward(&x, train)?;
         }
-        let (x, _) = x.f_view([sweeps, centres, neighbours, -1])?.f_max_dim(2, false)?;
+        let (x, _) = x
+            .f_view([sweeps, centres, neighbours, -1])?
+            .f_max_dim(2, false)?;
         self.attention.forward(&x.f_to_kind(Kind::Float)?)
     }
 }

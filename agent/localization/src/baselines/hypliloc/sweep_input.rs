@@ -52,12 +52,28 @@ impl InputBatch {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(sweeps: &[SweepInput], device: Device) -> Result<Self, TchError> {
-        let points: Vec<f32> = sweeps.iter().flat_map(|sweep| sweep.points_m.as_flattened()).copied().collect();
-        let ranges: Vec<f32> = sweeps.iter().flat_map(|sweep| &sweep.ranges_m).copied().collect();
-        let points_m = Tensor::f_from_slice(&points)?.f_view([-1, POINTS, 3])?.f_to_device(device)?;
-        let ranges_m = Tensor::f_from_slice(&ranges)?.f_view([-1, ROWS, COLUMNS])?.f_to_kind(Kind::Half)?;
+        let points: Vec<f32> = sweeps
+            .iter()
+            .flat_map(|sweep| sweep.points_m.as_flattened())
+            .copied()
+            .collect();
+        let ranges: Vec<f32> = sweeps
+            .iter()
+            .flat_map(|sweep| &sweep.ranges_m)
+            .copied()
+            .collect();
+        let points_m = Tensor::f_from_slice(&points)?
+            .f_view([-1, POINTS, 3])?
+            .f_to_device(device)?;
+        let ranges_m = Tensor::f_from_slice(&ranges)?
+            .f_view([-1, ROWS, COLUMNS])?
+            .f_to_kind(Kind::Half)?;
         let groups = Groups::find(&points_m)?;
-        Ok(Self { points_m, ranges_m: ranges_m.f_to_device(device)?, groups })
+        Ok(Self {
+            points_m,
+            ranges_m: ranges_m.f_to_device(device)?,
+            groups,
+        })
     }
 
     /// Several batches as one.
@@ -72,7 +88,11 @@ impl InputBatch {
             groups.push(batch.groups);
         }
         let (points_m, ranges_m) = (Tensor::f_cat(&points, 0)?, Tensor::f_cat(&ranges, 0)?);
-        Ok(Self { points_m, ranges_m, groups: Groups::concatenate(&groups)? })
+        Ok(Self {
+            points_m,
+            ranges_m,
+            groups: Groups::concatenate(&groups)?,
+        })
     }
 
     /// The sweeps `rows` `[B]`.

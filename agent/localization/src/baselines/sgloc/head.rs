@@ -53,10 +53,17 @@ impl SgLocHead {
         let coarse = encoder.coarse_channels();
         let fine = encoder.local_channels() - coarse;
         let surroundings = encoder.context_m.iter().map(|_| coarse);
-        let scales: Vec<i64> =
-            [fine, coarse].into_iter().chain(surroundings).filter(|&channels| channels > 0).collect();
-        let squeeze = |(number, &channels): (usize, &i64)| Dense::new(&(path / "squeeze" / number), channels, 1, 0.1);
-        let block = |number: usize| [0, 1].map(|layer| Layer::new(&(path / "blocks" / number / layer), WIDTH));
+        let scales: Vec<i64> = [fine, coarse]
+            .into_iter()
+            .chain(surroundings)
+            .filter(|&channels| channels > 0)
+            .collect();
+        let squeeze = |(number, &channels): (usize, &i64)| {
+            Dense::new(&(path / "squeeze" / number), channels, 1, 0.1)
+        };
+        let block = |number: usize| {
+            [0, 1].map(|layer| Layer::new(&(path / "blocks" / number / layer), WIDTH))
+        };
         Self {
             squeeze: scales.iter().enumerate().map(squeeze).collect(),
             inward: Layer::new(&(path / "inward"), encoder.cell_channels() + 3),
@@ -72,10 +79,18 @@ impl SgLocHead {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub(super) fn forward(&self, cells: &Tensor, sensor_m: &Tensor, train: bool) -> Result<Tensor, TchError> {
+    pub(super) fn forward(
+        &self,
+        cells: &Tensor,
+        sensor_m: &Tensor,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let mut parts = self.weigh(cells)?;
         parts.push((sensor_m / POSITION_SCALE_M).f_to_kind(cells.kind())?);
-        let mut x = self.inward.forward(&Tensor::f_cat(&parts, 1)?, train)?.f_relu()?;
+        let mut x = self
+            .inward
+            .forward(&Tensor::f_cat(&parts, 1)?, train)?
+            .f_relu()?;
         for [first, second] in &self.blocks {
             let inner = first.forward(&x, train)?.f_relu()?;
             x = (x + second.forward(&inner, train)?).f_relu()?;

@@ -48,19 +48,34 @@ impl SgLocLocalizer {
         let network = SgLoc::new(&variables.root(), &config)?;
         weights.copy_into(&variables)?;
         variables.freeze();
-        Ok(Self { network, solver, device })
+        Ok(Self {
+            network,
+            solver,
+            device,
+        })
     }
 
     /// Scene coordinates of up to [`CELLS`] cells of a sweep.
-    fn regress(&self, sweep: &SweepVoxels, features: &SceneFeatures) -> Result<SceneCoordinates, LocalizerError> {
+    fn regress(
+        &self,
+        sweep: &SweepVoxels,
+        features: &SceneFeatures,
+    ) -> Result<SceneCoordinates, LocalizerError> {
         let chosen = choose_evenly(sweep.cells(), CELLS);
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
-        let sensor_m: Vec<[f32; 3]> = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect();
-        let places = Tensor::f_from_slice(sensor_m.as_flattened())?.f_view([-1, 3])?.f_to_device(self.device)?;
+        let sensor_m: Vec<[f32; 3]> = chosen
+            .iter()
+            .map(|&cell| sweep.cells()[cell].centroid_m)
+            .collect();
+        let places = Tensor::f_from_slice(sensor_m.as_flattened())?
+            .f_view([-1, 3])?
+            .f_to_device(self.device)?;
         let world: Vec<f32> = no_grad(|| {
             let cells = features.cells.f_index_select(0, &rows)?;
-            let coordinates = self.network.coordinates(&cells, &places, Kind::Float, false)?;
+            let coordinates = self
+                .network
+                .coordinates(&cells, &places, Kind::Float, false)?;
             Vec::try_from(&coordinates.f_reshape([-1])?.f_to_device(Device::Cpu)?)
         })?;
         Ok(SceneCoordinates {
@@ -73,7 +88,10 @@ impl SgLocLocalizer {
 }
 
 impl Localize for SgLocLocalizer {
-    fn localize_sweep(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize_sweep(
+        &mut self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
         let mut times = LocalizerTimes::default();
         let start = Instant::now();
@@ -119,7 +137,11 @@ mod tests {
             residual_widths: vec![8],
             ..SceneEncoderConfig::lean()
         };
-        SgLocConfig { scene_name: "test".into(), origin_m: [1000.0, -2000.0, 30.0], encoder }
+        SgLocConfig {
+            scene_name: "test".into(),
+            origin_m: [1000.0, -2000.0, 30.0],
+            encoder,
+        }
     }
 
     /// Writes a network whose last layer outputs `bias` for any sweep.
@@ -130,10 +152,15 @@ mod tests {
         let named = variables.variables();
         no_grad(|| {
             let _ = named["regressor.outward.weight"].shallow_clone().zero_();
-            named["regressor.outward.bias"].shallow_clone().copy_(&Tensor::from_slice(&bias));
+            named["regressor.outward.bias"]
+                .shallow_clone()
+                .copy_(&Tensor::from_slice(&bias));
         });
         let about = BTreeMap::from([
-            (CONFIG_KEY.to_owned(), serde_json::to_string(stated).unwrap()),
+            (
+                CONFIG_KEY.to_owned(),
+                serde_json::to_string(stated).unwrap(),
+            ),
             (KIND_KEY.to_owned(), SgLocLocalizer::KIND.to_owned()),
         ]);
         let path = folder.join("weights.safetensors");
@@ -149,10 +176,15 @@ mod tests {
 
     fn sweep() -> PointCloud {
         let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
-        PointCloud { xyzi: wall.collect() }
+        PointCloud {
+            xyzi: wall.collect(),
+        }
     }
 
-    const TOO_FEW_POINTS: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 };
+    const TOO_FEW_POINTS: PoseEstimate = PoseEstimate::NoPose {
+        reason: NoPoseReason::TooFewPoints,
+        inlier_count: 0,
+    };
 
     #[test]
     fn cells_that_are_all_shifted_alike_give_the_pose_of_the_shift() {
@@ -164,33 +196,76 @@ mod tests {
 
     #[test]
     fn sweeps_that_show_too_little_have_no_pose() {
-        let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
-        let few = PointCloud { xyzi: (0..10).map(|k| [3.0 * k as f32, 3.0, 0.5, 0.1]).collect() };
+        let nan = PointCloud {
+            xyzi: vec![[f32::NAN; 4]; 5000],
+        };
+        let few = PointCloud {
+            xyzi: (0..10).map(|k| [3.0 * k as f32, 3.0, 0.5, 0.1]).collect(),
+        };
         let mut localizer = shifting([0.0; 3]);
         for cloud in [&PointCloud::default(), &nan, &few] {
             assert_eq!(localizer.localize(cloud).unwrap().estimate, TOO_FEW_POINTS);
         }
         // Coordinates that overflow are those of no cell.
-        assert_eq!(shifting([3e38, 0.0, 0.0]).localize(&sweep()).unwrap().estimate, TOO_FEW_POINTS);
+        assert_eq!(
+            shifting([3e38, 0.0, 0.0])
+                .localize(&sweep())
+                .unwrap()
+                .estimate,
+            TOO_FEW_POINTS
+        );
     }
 
     #[test]
     fn files_of_something_else_are_named() {
         let folder = tempfile::tempdir().unwrap();
-        let error_text =
-            |path: &Path| SgLocLocalizer::load(path, Device::Cpu, PoseSolver::default()).unwrap_err().to_string();
-        let with = |encoder| SgLocConfig { encoder, ..config() };
-        let wider = with(SceneEncoderConfig { residual_widths: vec![16], ..config().encoder });
+        let error_text = |path: &Path| {
+            SgLocLocalizer::load(path, Device::Cpu, PoseSolver::default())
+                .unwrap_err()
+                .to_string()
+        };
+        let with = |encoder| SgLocConfig {
+            encoder,
+            ..config()
+        };
+        let wider = with(SceneEncoderConfig {
+            residual_widths: vec![16],
+            ..config().encoder
+        });
         let path = write(folder.path(), &wider, [0.0; 3]);
-        assert!(error_text(&path).contains("weights.safetensors: tensor \""), "{}", error_text(&path));
-        let path = write(folder.path(), &with(SceneEncoderConfig { voxel_m: -1.0, ..config().encoder }), [0.0; 3]);
-        assert!(error_text(&path).contains("voxel_m is -1"), "{}", error_text(&path));
+        assert!(
+            error_text(&path).contains("weights.safetensors: tensor \""),
+            "{}",
+            error_text(&path)
+        );
+        let path = write(
+            folder.path(),
+            &with(SceneEncoderConfig {
+                voxel_m: -1.0,
+                ..config().encoder
+            }),
+            [0.0; 3],
+        );
+        assert!(
+            error_text(&path).contains("voxel_m is -1"),
+            "{}",
+            error_text(&path)
+        );
         let path = write(folder.path(), &config(), [0.0; 3]);
-        let message = Localizer::load(&path, &path, Inference::default()).unwrap_err().to_string();
-        assert!(message.contains("\"SGLoc\"") && message.contains("\"scene encoder\""), "{message}");
+        let message = Localizer::load(&path, &path, Inference::default())
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("\"SGLoc\"") && message.contains("\"scene encoder\""),
+            "{message}"
+        );
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        assert!(error_text(&path).contains("not a complete safetensors file"), "{}", error_text(&path));
+        assert!(
+            error_text(&path).contains("not a complete safetensors file"),
+            "{}",
+            error_text(&path)
+        );
         assert!(error_text(&folder.path().join("missing")).contains("missing"));
     }
 }

@@ -28,7 +28,12 @@ impl SgLoc {
         let below = path / "regressor";
         let head = SgLocHead::new(&below, &config.encoder);
         let norm = FeatureNorm::new(&(&below / "norm"), config.encoder.cell_channels());
-        Ok(Self { config: config.clone(), encoder, norm, head })
+        Ok(Self {
+            config: config.clone(),
+            encoder,
+            norm,
+            head,
+        })
     }
 
     /// Configuration that it was built from.
@@ -48,8 +53,15 @@ impl SgLoc {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn coordinates(&self, cells: &Tensor, sensor_m: &Tensor, kind: Kind, train: bool) -> Result<Tensor, TchError> {
-        self.head.forward(&self.norm.forward(cells)?.f_to_kind(kind)?, sensor_m, train)
+    pub fn coordinates(
+        &self,
+        cells: &Tensor,
+        sensor_m: &Tensor,
+        kind: Kind,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        self.head
+            .forward(&self.norm.forward(cells)?.f_to_kind(kind)?, sensor_m, train)
     }
 
     /// Sets the normalisation from features `[N, cell_channels]`; without it they enter unchanged.

@@ -25,7 +25,9 @@ pub(super) struct BackboneEncoder {
 impl BackboneEncoder {
     /// True for the weights of a detector; their files need not name a kind.
     pub(super) fn is_in(weights: &Weights) -> bool {
-        weights.metadata(KIND_KEY).is_none_or(|kind| kind == "detector")
+        weights
+            .metadata(KIND_KEY)
+            .is_none_or(|kind| kind == "detector")
     }
 
     /// The encoder of a detector's weights.
@@ -33,7 +35,12 @@ impl BackboneEncoder {
         let config = weights.detector_config()?;
         let detector = Detector::from_weights(weights, &config, Device::Cpu)?;
         let (format, is_quantised) = (BevFormat::of_detector(&config), detector.is_quantised());
-        Ok(Self { detector: Mutex::new(detector), is_quantised, format, device })
+        Ok(Self {
+            detector: Mutex::new(detector),
+            is_quantised,
+            format,
+            device,
+        })
     }
 
     /// Grids of its levels.
@@ -43,15 +50,24 @@ impl BackboneEncoder {
 
     /// True for levels in the number format of its own and on the same grids: the same weights may have another area.
     pub(super) fn takes(&self, levels: &[BackboneLevel]) -> bool {
-        levels.iter().all(|level| level.is_quantised() == self.is_quantised)
-            && levels.iter().map(BackboneLevel::shape).eq(self.format.shapes())
+        levels
+            .iter()
+            .all(|level| level.is_quantised() == self.is_quantised)
+            && levels
+                .iter()
+                .map(BackboneLevel::shape)
+                .eq(self.format.shapes())
     }
 
     /// Features of some sweeps, one after another.
     pub(super) fn encode(&self, sweeps: &[&BevCells]) -> Result<EncodedCells, LocalizerError> {
         let (mut cells, mut of_sweeps, mut rows, mut end) = (Vec::new(), Vec::new(), Vec::new(), 0);
         for sweep in sweeps {
-            let encoded = self.detector.lock().unwrap_or_else(PoisonError::into_inner).encode(&sweep.cloud)?;
+            let encoded = self
+                .detector
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .encode(&sweep.cloud)?;
             let features = self.features(sweep, &encoded.levels)?;
             let start = end;
             end += sweep.cells().len() as i64;
@@ -59,30 +75,45 @@ impl BackboneEncoder {
             cells.push(features.cells);
             of_sweeps.push(features.sweeps);
         }
-        let features = SceneFeatures { cells: Tensor::f_cat(&cells, 0)?, sweeps: Tensor::f_cat(&of_sweeps, 0)? };
+        let features = SceneFeatures {
+            cells: Tensor::f_cat(&cells, 0)?,
+            sweeps: Tensor::f_cat(&of_sweeps, 0)?,
+        };
         Ok(EncodedCells { features, rows })
     }
 
     /// Features of one sweep from levels that the detector computed from it.
-    pub(super) fn features(&self, sweep: &BevCells, levels: &[BackboneLevel]) -> Result<SceneFeatures, LocalizerError> {
+    pub(super) fn features(
+        &self,
+        sweep: &BevCells,
+        levels: &[BackboneLevel],
+    ) -> Result<SceneFeatures, LocalizerError> {
         let Some((coarsest, places)) = levels.last().zip(sweep.places.last()) else {
             return Err(LocalizerError::Config("a backbone without levels".into()));
         };
         Ok(no_grad(|| {
             let map = coarsest.map()?;
             let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(map.device());
-            let own = levels.iter().zip(&sweep.places).map(|(level, places)| level.of_cells(&index(places)?));
+            let own = levels
+                .iter()
+                .zip(&sweep.places)
+                .map(|(level, places)| level.of_cells(&index(places)?));
             let mut parts: Vec<Tensor> = own.collect::<Result<_, _>>()?;
             let places = index(places)?;
             let channels = map.size()[1];
             for window in self.format.windows() {
-                let means = mean_over(&map, window)?.f_permute([0, 2, 3, 1])?.f_reshape([-1, channels])?;
+                let means = mean_over(&map, window)?
+                    .f_permute([0, 2, 3, 1])?
+                    .f_reshape([-1, channels])?;
                 parts.push(means.f_index_select(0, &places)?);
             }
             let mean = map.f_mean_dim([2_i64, 3].as_slice(), false, Kind::Float)?;
             let sweeps = Tensor::f_cat(&[mean, map.f_amax([2_i64, 3].as_slice(), false)?], 1)?;
             let cells = Tensor::f_cat(&parts, 1)?.f_to_device(self.device)?;
-            Ok::<_, TchError>(SceneFeatures { cells, sweeps: sweeps.f_to_device(self.device)? })
+            Ok::<_, TchError>(SceneFeatures {
+                cells,
+                sweeps: sweeps.f_to_device(self.device)?,
+            })
         })?)
     }
 }
@@ -91,7 +122,14 @@ impl BackboneEncoder {
 fn mean_over(map: &Tensor, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
     // One row after one column of the window: a fraction of the additions.
     let along = |map: &Tensor, size: [i64; 2]| {
-        map.f_avg_pool2d(size, [1; 2], size.map(|edge| edge / 2), false, false, None::<i64>)
+        map.f_avg_pool2d(
+            size,
+            [1; 2],
+            size.map(|edge| edge / 2),
+            false,
+            false,
+            None::<i64>,
+        )
     };
     along(&along(map, [height, 1])?, [1, width])
 }
@@ -121,12 +159,23 @@ mod tests {
     fn detectors(folder: &Path) -> [PathBuf; 2] {
         tch::set_num_threads(1);
         tch::manual_seed(3);
-        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let config = DetectorConfig {
+            lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
+            ..DetectorConfig::lean()
+        };
         let network = VarStore::new(Device::Cpu);
         PointPillars::new(&network.root(), &config).unwrap();
-        let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config).unwrap())].into();
+        let metadata: BTreeMap<_, _> = [(
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(&config).unwrap(),
+        )]
+        .into();
         [0.0, 1.0].map(|bias| {
-            let _ = no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(bias));
+            let _ = no_grad(|| {
+                network.variables()["cls_head.bias"]
+                    .shallow_clone()
+                    .fill_(bias)
+            });
             let path = folder.join(format!("detector-{bias}.safetensors"));
             save(&path, &network, &metadata, Precision::Single).unwrap();
             path
@@ -134,8 +183,17 @@ mod tests {
     }
 
     fn cloud(shift: f32) -> PointCloud {
-        let wall = (0..2000).map(|k| [(k % 50) as f32 * 0.4 - 10.0, 4.0 + shift, (k / 50) as f32 * 0.08 - 2.5, 0.3]);
-        PointCloud { xyzi: wall.collect() }
+        let wall = (0..2000).map(|k| {
+            [
+                (k % 50) as f32 * 0.4 - 10.0,
+                4.0 + shift,
+                (k / 50) as f32 * 0.08 - 2.5,
+                0.3,
+            ]
+        });
+        PointCloud {
+            xyzi: wall.collect(),
+        }
     }
 
     #[test]
@@ -146,17 +204,35 @@ mod tests {
         let mut of_vehicle = Detector::load(&path, Device::Cpu).unwrap();
         assert_eq!(sha256, of_vehicle.encoder_sha256());
         let clouds = [cloud(0.0), cloud(1.3)];
-        let sweeps = clouds.each_ref().map(|cloud| encoder.format().prepare(&cloud.xyzi));
+        let sweeps = clouds
+            .each_ref()
+            .map(|cloud| encoder.format().prepare(&cloud.xyzi));
         let both = encoder.encode(&sweeps.each_ref(), Kind::Float).unwrap();
         let count: usize = sweeps.iter().map(|sweep| sweep.cells().len()).sum();
-        assert_eq!(both.features.cells.size(), [count as i64, encoder.format().cell_channels()]);
-        assert_eq!(both.features.sweeps.size(), [2, encoder.format().sweep_channels()]);
+        assert_eq!(
+            both.features.cells.size(),
+            [count as i64, encoder.format().cell_channels()]
+        );
+        assert_eq!(
+            both.features.sweeps.size(),
+            [2, encoder.format().sweep_channels()]
+        );
         for (number, (sweep, cloud)) in sweeps.iter().zip(&clouds).enumerate() {
             let levels = of_vehicle.encode(cloud).unwrap().levels;
             let given = encoder.encode_one(sweep, Some(&levels)).unwrap();
             let rows = &both.rows[number];
-            assert!(given.cells.equal(&both.features.cells.narrow(0, rows.start, rows.end - rows.start)));
-            assert!(given.sweeps.equal(&both.features.sweeps.narrow(0, number as i64, 1)));
+            assert!(
+                given.cells.equal(&both.features.cells.narrow(
+                    0,
+                    rows.start,
+                    rows.end - rows.start
+                ))
+            );
+            assert!(
+                given
+                    .sweeps
+                    .equal(&both.features.sweeps.narrow(0, number as i64, 1))
+            );
         }
     }
 
@@ -166,21 +242,34 @@ mod tests {
         let path = detector(folder.path());
         let (encoder, _) = CellEncoder::load(&path, Device::Cpu).unwrap();
         let weights = Weights::load(&path).unwrap();
-        let larger =
-            DetectorConfig { lidar_range_m: [-25.6, -6.4, -3.0, 25.6, 6.4, 1.0], ..weights.detector_config().unwrap() };
+        let larger = DetectorConfig {
+            lidar_range_m: [-25.6, -6.4, -3.0, 25.6, 6.4, 1.0],
+            ..weights.detector_config().unwrap()
+        };
         let mut of_vehicle = Detector::from_weights(&weights, &larger, Device::Cpu).unwrap();
         let levels = of_vehicle.encode(&cloud(0.0)).unwrap().levels;
         let sweep = encoder.format().prepare(&cloud(0.0).xyzi);
         let own = encoder.encode_one(&sweep, None).unwrap();
-        assert!(encoder.encode_one(&sweep, Some(&levels)).unwrap().cells.equal(&own.cells));
+        assert!(
+            encoder
+                .encode_one(&sweep, Some(&levels))
+                .unwrap()
+                .cells
+                .equal(&own.cells)
+        );
     }
 
     #[test]
     fn an_empty_sweep_has_no_cells_but_features() {
         let folder = tempfile::tempdir().unwrap();
         let (encoder, _) = CellEncoder::load(&detector(folder.path()), Device::Cpu).unwrap();
-        let encoded = encoder.encode(&[&encoder.format().prepare(&[])], Kind::Float).unwrap();
-        assert_eq!(encoded.features.cells.size(), [0, encoder.format().cell_channels()]);
+        let encoded = encoder
+            .encode(&[&encoder.format().prepare(&[])], Kind::Float)
+            .unwrap();
+        assert_eq!(
+            encoded.features.cells.size(),
+            [0, encoder.format().cell_channels()]
+        );
         assert_eq!((encoded.rows.len(), encoded.rows[0].clone()), (1, 0..0));
     }
 
@@ -198,8 +287,19 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("head.safetensors");
         let metadata: BTreeMap<_, _> = [(KIND_KEY.to_owned(), "scene head".to_owned())].into();
-        save(&path, &VarStore::new(Device::Cpu), &metadata, Precision::Single).unwrap();
-        let message = CellEncoder::load(&path, Device::Cpu).unwrap_err().to_string();
-        assert!(message.contains("scene head") && message.contains(SceneEncoder::KIND), "{message}");
+        save(
+            &path,
+            &VarStore::new(Device::Cpu),
+            &metadata,
+            Precision::Single,
+        )
+        .unwrap();
+        let message = CellEncoder::load(&path, Device::Cpu)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            message.contains("scene head") && message.contains(SceneEncoder::KIND),
+            "{message}"
+        );
     }
 }

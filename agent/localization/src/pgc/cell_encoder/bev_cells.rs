@@ -57,13 +57,26 @@ impl BevFormat {
                 height: pillars[1].div_ceil(stride as usize),
             }
         };
-        let levels = config.num_filters.iter().zip(&config.layer_strides).map(level).collect();
-        let reach_m = |axis: usize| config.lidar_range_m[axis].abs().max(config.lidar_range_m[axis + 3].abs());
+        let levels = config
+            .num_filters
+            .iter()
+            .zip(&config.layer_strides)
+            .map(level)
+            .collect();
+        let reach_m = |axis: usize| {
+            config.lidar_range_m[axis]
+                .abs()
+                .max(config.lidar_range_m[axis + 3].abs())
+        };
         Self {
             crop: Crop::for_detector(config),
             low_m: [0, 1].map(|axis| config.lidar_range_m[axis] as f32),
             range_m: reach_m(0).hypot(reach_m(1)),
-            y_sign: if config.y_axis == YAxis::Right { -1.0 } else { 1.0 },
+            y_sign: if config.y_axis == YAxis::Right {
+                -1.0
+            } else {
+                1.0
+            },
             levels,
         }
     }
@@ -86,15 +99,18 @@ impl BevFormat {
 
     /// Channels, height and width of each level.
     pub(super) fn shapes(&self) -> impl Iterator<Item = [i64; 3]> + '_ {
-        self.levels.iter().map(|level| [level.channels, level.height as i64, level.width as i64])
+        self.levels
+            .iter()
+            .map(|level| [level.channels, level.height as i64, level.width as i64])
     }
 
     /// Height and width of the surroundings of a cell, cells of the coarsest level; odd, so that the cell is in the
     /// centre.
     pub(super) fn windows(&self) -> impl Iterator<Item = [i64; 2]> + '_ {
         let cell_m = self.levels.last().map_or([1.0; 2], |level| level.cell_m);
-        let window =
-            move |edge_m: f64| [1, 0].map(|axis| 2 * (edge_m / f64::from(cell_m[axis]) / 2.0).round() as i64 + 1);
+        let window = move |edge_m: f64| {
+            [1, 0].map(|axis| 2 * (edge_m / f64::from(cell_m[axis]) / 2.0).round() as i64 + 1)
+        };
         CONTEXT_M.into_iter().map(window)
     }
 
@@ -106,8 +122,12 @@ impl BevFormat {
 impl LevelGrid {
     /// Column and row of the cell under a place (metres from the grid's corner); the last where rounding leads beyond.
     fn cell(&self, [x_m, y_m]: [f32; 2]) -> [usize; 2] {
-        let index = |place_m: f32, edge_m: f32, count: usize| ((place_m / edge_m) as usize).min(count - 1);
-        [index(x_m, self.cell_m[0], self.width), index(y_m, self.cell_m[1], self.height)]
+        let index =
+            |place_m: f32, edge_m: f32, count: usize| ((place_m / edge_m) as usize).min(count - 1);
+        [
+            index(x_m, self.cell_m[0], self.width),
+            index(y_m, self.cell_m[1], self.height),
+        ]
     }
 }
 
@@ -119,26 +139,43 @@ impl BevCells {
         let mut cloud = PointCloud::default();
         format.crop.keep(points, &mut cloud.xyzi);
         let Some(finest) = format.levels.first() else {
-            return Self { cells: Vec::new(), places: Vec::new(), cloud };
+            return Self {
+                cells: Vec::new(),
+                places: Vec::new(),
+                cloud,
+            };
         };
         let mut columns = vec![Column::default(); finest.width * finest.height];
         for &[x, y, z, _] in &cloud.xyzi {
-            let [column, row] = finest.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
+            let [column, row] =
+                finest.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
             columns[row * finest.width + column].add([x, y, z]);
         }
-        let occupied = columns.iter().enumerate().filter(|(_, column)| column.points > 0);
-        let (numbers, cells): (Vec<usize>, Vec<Cell>) =
-            occupied.map(|(number, column)| (number, column.cell())).unzip();
+        let occupied = columns
+            .iter()
+            .enumerate()
+            .filter(|(_, column)| column.points > 0);
+        let (numbers, cells): (Vec<usize>, Vec<Cell>) = occupied
+            .map(|(number, column)| (number, column.cell()))
+            .unzip();
         let place = |grid: &LevelGrid| {
             // Strides are whole numbers: the cells of a level are whole blocks of those of the finest.
-            let steps = [0, 1].map(|axis| (grid.cell_m[axis] / finest.cell_m[axis]).round() as usize);
+            let steps =
+                [0, 1].map(|axis| (grid.cell_m[axis] / finest.cell_m[axis]).round() as usize);
             let number = |&number: &usize| {
-                let (column, row) = (number % finest.width / steps[0], number / finest.width / steps[1]);
+                let (column, row) = (
+                    number % finest.width / steps[0],
+                    number / finest.width / steps[1],
+                );
                 (row * grid.width + column) as i64
             };
             numbers.iter().map(number).collect()
         };
-        Self { cells, places: format.levels.iter().map(place).collect(), cloud }
+        Self {
+            cells,
+            places: format.levels.iter().map(place).collect(),
+            cloud,
+        }
     }
 
     /// The cells, row after row.
@@ -159,7 +196,12 @@ struct Column {
 
 impl Default for Column {
     fn default() -> Self {
-        Self { sum_m: [0.0; 3], low_m: f32::MAX, high_m: f32::MIN, points: 0 }
+        Self {
+            sum_m: [0.0; 3],
+            low_m: f32::MAX,
+            high_m: f32::MIN,
+            points: 0,
+        }
     }
 }
 
@@ -173,7 +215,11 @@ impl Column {
 
     fn cell(&self) -> Cell {
         let centroid_m = self.sum_m.map(|sum| sum / self.points as f32);
-        Cell { centroid_m, extent_m: self.high_m - self.low_m, points: self.points }
+        Cell {
+            centroid_m,
+            extent_m: self.high_m - self.low_m,
+            points: self.points,
+        }
     }
 }
 
@@ -184,9 +230,17 @@ mod tests {
     #[test]
     fn every_kept_point_is_in_the_cell_of_its_place_on_every_level() {
         for y_axis in [YAxis::Left, YAxis::Right] {
-            let config = DetectorConfig { y_axis, ..DetectorConfig::lean() };
+            let config = DetectorConfig {
+                y_axis,
+                ..DetectorConfig::lean()
+            };
             let format = BevFormat::of_detector(&config);
-            let points = [[5.0, 3.0, -1.0, 0.5], [5.1, 3.1, 0.5, 0.5], [-20.0, -30.0, 0.0, 0.1], [99.0, 0.0, 0.0, 0.0]];
+            let points = [
+                [5.0, 3.0, -1.0, 0.5],
+                [5.1, 3.1, 0.5, 0.5],
+                [-20.0, -30.0, 0.0, 0.1],
+                [99.0, 0.0, 0.0, 0.0],
+            ];
             let sweep = BevCells::new(&points, &format);
             let both = sweep.cells().iter().find(|cell| cell.points == 2).unwrap();
             assert!((both.centroid_m[1] - 3.05).abs() < 1e-5 && (both.extent_m - 1.5).abs() < 1e-6);
@@ -194,7 +248,8 @@ mod tests {
             for (grid, places) in format.levels.iter().zip(&sweep.places) {
                 for (cell, &place) in sweep.cells().iter().zip(places) {
                     let [x, y, _] = cell.centroid_m;
-                    let [column, row] = grid.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
+                    let [column, row] =
+                        grid.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
                     assert_eq!(place, (row * grid.width + column) as i64);
                 }
             }
@@ -204,14 +259,24 @@ mod tests {
     #[test]
     fn sizes_are_those_of_the_detector() {
         let format = BevFormat::of_detector(&DetectorConfig::lean());
-        assert_eq!((format.local_channels(), format.cell_channels(), format.sweep_channels()), (224, 480, 256));
+        assert_eq!(
+            (
+                format.local_channels(),
+                format.cell_channels(),
+                format.sweep_channels()
+            ),
+            (224, 480, 256)
+        );
         assert_eq!(format.windows().collect::<Vec<_>>(), [[7, 7], [19, 19]]);
         assert!((format.range_m() - 64.0).abs() < 0.1);
     }
 
     #[test]
     fn an_empty_sweep_has_no_cells() {
-        let sweep = BevCells::new(&[[f32::NAN; 4]], &BevFormat::of_detector(&DetectorConfig::lean()));
+        let sweep = BevCells::new(
+            &[[f32::NAN; 4]],
+            &BevFormat::of_detector(&DetectorConfig::lean()),
+        );
         assert!(sweep.cells().is_empty() && sweep.places.iter().all(Vec::is_empty));
     }
 }

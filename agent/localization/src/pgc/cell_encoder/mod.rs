@@ -79,22 +79,40 @@ impl CellEncoder {
         if BackboneEncoder::is_in(&weights) {
             let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
             let format = SweepFormat::Bev(encoder.format().clone());
-            return Ok((Self { network: Network::Backbone(encoder), format, device }, sha256));
+            return Ok((
+                Self {
+                    network: Network::Backbone(encoder),
+                    format,
+                    device,
+                },
+                sha256,
+            ));
         }
-        Ok((Self::sparse(SceneEncoder::from_weights(&weights, device)?, device), sha256))
+        Ok((
+            Self::sparse(SceneEncoder::from_weights(&weights, device)?, device),
+            sha256,
+        ))
     }
 
     /// SHA-256 that a head names the encoder of a file by, see [`Self::load`].
     #[must_use]
     pub fn sha256_of(weights: &Weights) -> String {
-        if BackboneEncoder::is_in(weights) { encoder_sha256(weights) } else { weights.sha256().to_owned() }
+        if BackboneEncoder::is_in(weights) {
+            encoder_sha256(weights)
+        } else {
+            weights.sha256().to_owned()
+        }
     }
 
     /// A scene encoder on its device.
     #[must_use]
     pub fn sparse(encoder: SceneEncoder, device: Device) -> Self {
         let format = SweepFormat::Voxels(encoder.config().clone());
-        Self { network: Network::Sparse(Box::new(encoder)), format, device }
+        Self {
+            network: Network::Sparse(Box::new(encoder)),
+            format,
+            device,
+        }
     }
 
     /// Format of its sweeps.
@@ -108,15 +126,27 @@ impl CellEncoder {
     ///
     /// # Errors
     /// [`LocalizerError`] when a sweep has another format, or the tensor library fails.
-    pub fn encode(&self, sweeps: &[&PreparedSweep], kind: Kind) -> Result<EncodedCells, LocalizerError> {
+    pub fn encode(
+        &self,
+        sweeps: &[&PreparedSweep],
+        kind: Kind,
+    ) -> Result<EncodedCells, LocalizerError> {
         match &self.network {
             Network::Sparse(encoder) => {
                 let batch = self.batch(encoder, sweeps)?;
-                let rows = (0..sweeps.len()).map(|sweep| batch.cell_rows(sweep)).collect();
-                Ok(EncodedCells { features: encoder.encode(&batch, kind)?, rows })
+                let rows = (0..sweeps.len())
+                    .map(|sweep| batch.cell_rows(sweep))
+                    .collect();
+                Ok(EncodedCells {
+                    features: encoder.encode(&batch, kind)?,
+                    rows,
+                })
             }
             Network::Backbone(encoder) => {
-                let cells: Vec<&BevCells> = sweeps.iter().map(|sweep| sweep.bev()).collect::<Result<_, _>>()?;
+                let cells: Vec<&BevCells> = sweeps
+                    .iter()
+                    .map(|sweep| sweep.bev())
+                    .collect::<Result<_, _>>()?;
                 encoder.encode(&cells)
             }
         }
@@ -161,15 +191,28 @@ impl CellEncoder {
     ///
     /// # Errors
     /// As [`Self::encode`].
-    pub fn observe(&self, sweep: &PreparedSweep, search: &mut ScaleSearch) -> Result<(), LocalizerError> {
+    pub fn observe(
+        &self,
+        sweep: &PreparedSweep,
+        search: &mut ScaleSearch,
+    ) -> Result<(), LocalizerError> {
         match &self.network {
-            Network::Sparse(encoder) => Ok(encoder.observe(&self.batch(encoder, &[sweep])?, search)?),
+            Network::Sparse(encoder) => {
+                Ok(encoder.observe(&self.batch(encoder, &[sweep])?, search)?)
+            }
             Network::Backbone(_) => Ok(()),
         }
     }
 
-    fn batch(&self, encoder: &SceneEncoder, sweeps: &[&PreparedSweep]) -> Result<VoxelBatch, LocalizerError> {
-        let voxels: Vec<&SweepVoxels> = sweeps.iter().map(|sweep| sweep.voxels()).collect::<Result<_, _>>()?;
+    fn batch(
+        &self,
+        encoder: &SceneEncoder,
+        sweeps: &[&PreparedSweep],
+    ) -> Result<VoxelBatch, LocalizerError> {
+        let voxels: Vec<&SweepVoxels> = sweeps
+            .iter()
+            .map(|sweep| sweep.voxels())
+            .collect::<Result<_, _>>()?;
         Ok(VoxelBatch::new(&voxels, encoder.config(), self.device)?)
     }
 }
@@ -180,9 +223,10 @@ impl SweepFormat {
     #[must_use]
     pub fn prepare(&self, points: &[[f32; 4]]) -> PreparedSweep {
         match self {
-            Self::Voxels(config) => {
-                PreparedSweep::Voxels(SweepVoxels::new(points.iter().map(|&[x, y, z, _]| [x, y, z]), config))
-            }
+            Self::Voxels(config) => PreparedSweep::Voxels(SweepVoxels::new(
+                points.iter().map(|&[x, y, z, _]| [x, y, z]),
+                config,
+            )),
             Self::Bev(format) => PreparedSweep::Bev(BevCells::new(points, format)),
         }
     }
@@ -237,14 +281,18 @@ impl PreparedSweep {
     fn voxels(&self) -> Result<&SweepVoxels, LocalizerError> {
         match self {
             Self::Voxels(voxels) => Ok(voxels),
-            Self::Bev(_) => Err(LocalizerError::Config("BEV cells of a detector, must be voxels".into())),
+            Self::Bev(_) => Err(LocalizerError::Config(
+                "BEV cells of a detector, must be voxels".into(),
+            )),
         }
     }
 
     fn bev(&self) -> Result<&BevCells, LocalizerError> {
         match self {
             Self::Bev(cells) => Ok(cells),
-            Self::Voxels(_) => Err(LocalizerError::Config("voxels, must be BEV cells of a detector".into())),
+            Self::Voxels(_) => Err(LocalizerError::Config(
+                "voxels, must be BEV cells of a detector".into(),
+            )),
         }
     }
 }

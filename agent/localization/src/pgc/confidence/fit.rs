@@ -59,7 +59,11 @@ pub enum FitError {
 /// # Errors
 /// [`FitError::GoodLoss`] unless it is at least 0 and below 1.
 pub fn check_good_loss(good_loss: f64) -> Result<(), FitError> {
-    if (0.0..1.0).contains(&good_loss) { Ok(()) } else { Err(FitError::GoodLoss(good_loss)) }
+    if (0.0..1.0).contains(&good_loss) {
+        Ok(())
+    } else {
+        Err(FitError::GoodLoss(good_loss))
+    }
 }
 
 impl ConfidenceModel {
@@ -69,21 +73,41 @@ impl ConfidenceModel {
     /// [`FitError`] when there are too few sweeps, or `good_loss` is not at least 0 and below 1.
     pub fn fit(sweeps: &[Labelled], good_loss: f64) -> Result<(Self, FitReport), FitError> {
         check_good_loss(good_loss)?;
-        let sweeps: Vec<_> = sweeps.iter().filter(|sweep| sweep.error_m.is_finite()).collect();
+        let sweeps: Vec<_> = sweeps
+            .iter()
+            .filter(|sweep| sweep.error_m.is_finite())
+            .collect();
         if sweeps.len() < MIN_SWEEPS {
             return Err(FitError::TooFew(sweeps.len()));
         }
-        let rows: Vec<[f64; FEATURES]> = sweeps.iter().map(|sweep| features(&sweep.evidence)).collect();
-        let targets: Vec<f64> = sweeps.iter().map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln()).collect();
+        let rows: Vec<[f64; FEATURES]> = sweeps
+            .iter()
+            .map(|sweep| features(&sweep.evidence))
+            .collect();
+        let targets: Vec<f64> = sweeps
+            .iter()
+            .map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln())
+            .collect();
         let (bias, weights) = non_negative_regression(&rows, &targets);
-        let mut model = Self { bias, weights, sigma: MonotoneMap::falling(Vec::new()), reject_below: 0.0 };
-        let samples = sweeps.iter().map(|sweep| (model.log_error(&sweep.evidence), observed(sweep.error_m)));
+        let mut model = Self {
+            bias,
+            weights,
+            sigma: MonotoneMap::falling(Vec::new()),
+            reject_below: 0.0,
+        };
+        let samples = sweeps
+            .iter()
+            .map(|sweep| (model.log_error(&sweep.evidence), observed(sweep.error_m)));
         model.sigma = MonotoneMap::fit(samples.collect(), GROUPS.0, GROUPS.1);
 
-        let sigmas: Vec<(f64, bool)> =
-            sweeps.iter().map(|sweep| (model.sigma(&sweep.evidence), sweep.error_m <= BAD_M)).collect();
+        let sigmas: Vec<(f64, bool)> = sweeps
+            .iter()
+            .map(|sweep| (model.sigma(&sweep.evidence), sweep.error_m <= BAD_M))
+            .collect();
         model.reject_below = threshold(&sigmas, good_loss);
-        let count = |is_counted: &dyn Fn(&(f64, bool)) -> bool| sigmas.iter().filter(|sigma| is_counted(sigma)).count();
+        let count = |is_counted: &dyn Fn(&(f64, bool)) -> bool| {
+            sigmas.iter().filter(|sigma| is_counted(sigma)).count()
+        };
         let report = FitReport {
             sweeps: sweeps.len(),
             bad: count(&|(_, is_good)| !is_good),
@@ -103,7 +127,11 @@ pub fn observed(error_m: f64) -> f64 {
 /// The highest threshold below which at most a share `good_loss` of the good poses lies; 1, which rejects every pose,
 /// without good ones.
 fn threshold(sigmas: &[(f64, bool)], good_loss: f64) -> f64 {
-    let mut good: Vec<f64> = sigmas.iter().filter(|(_, is_good)| *is_good).map(|(sigma, _)| *sigma).collect();
+    let mut good: Vec<f64> = sigmas
+        .iter()
+        .filter(|(_, is_good)| *is_good)
+        .map(|(sigma, _)| *sigma)
+        .collect();
     good.sort_by(f64::total_cmp);
     let lost = (good_loss * good.len() as f64).floor() as usize;
     good.get(lost).copied().unwrap_or(1.0)
@@ -154,10 +182,23 @@ mod tests {
                 ..SyntheticScene::default()
             };
             let is_hopeless = seed.is_multiple_of(10);
-            let scene = if is_hopeless { SyntheticScene { outliers: 0.85, twins: 1.0, ..scene } } else { scene };
+            let scene = if is_hopeless {
+                SyntheticScene {
+                    outliers: 0.85,
+                    twins: 1.0,
+                    ..scene
+                }
+            } else {
+                scene
+            };
             let found = PoseSolver::default().solve(&scene.coordinates(seed)).ok()?;
-            let off = scene.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
-            Some(Labelled { evidence: found.evidence, error_m: off.translation.vector.norm() })
+            let off = scene
+                .world_from_sensor(seed)
+                .inv_mul(&found.world_from_sensor);
+            Some(Labelled {
+                evidence: found.evidence,
+                error_m: off.translation.vector.norm(),
+            })
         };
         seeds.filter_map(sweep).collect()
     }
@@ -165,40 +206,67 @@ mod tests {
     #[test]
     fn a_fitted_confidence_ranks_and_is_calibrated_on_other_sweeps() {
         let (model, report) = ConfidenceModel::fit(&sweeps(0..600), 0.01).unwrap();
-        assert!(report.bad > 5 && report.bad_rejected * 2 >= report.bad, "{report:?}");
+        assert!(
+            report.bad > 5 && report.bad_rejected * 2 >= report.bad,
+            "{report:?}"
+        );
         assert!(model.weights.iter().all(|&weight| weight >= 0.0));
         let others = sweeps(5000..5600);
-        let sigmas: Vec<f64> = others.iter().map(|sweep| model.sigma(&sweep.evidence)).collect();
+        let sigmas: Vec<f64> = others
+            .iter()
+            .map(|sweep| model.sigma(&sweep.evidence))
+            .collect();
         let errors: Vec<f64> = others.iter().map(|sweep| sweep.error_m).collect();
         let correlation = spearman(&sigmas, &errors).unwrap();
         assert!(correlation < -0.6, "{correlation}");
-        let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / others.len() as f64;
-        let gap = mean(&mut sigmas.iter().copied()) - mean(&mut errors.iter().map(|&error| observed(error)));
+        let mean =
+            |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / others.len() as f64;
+        let gap = mean(&mut sigmas.iter().copied())
+            - mean(&mut errors.iter().map(|&error| observed(error)));
         assert!(gap.abs() < 0.05, "{gap}");
         let good = others.iter().filter(|sweep| sweep.error_m <= BAD_M);
-        let lost = good.clone().filter(|sweep| model.sigma(&sweep.evidence) < model.reject_below).count();
+        let lost = good
+            .clone()
+            .filter(|sweep| model.sigma(&sweep.evidence) < model.reject_below)
+            .count();
         assert!((lost as f64) < 0.02 * good.count() as f64, "{lost}");
     }
 
     #[test]
     fn a_few_sweeps_are_too_few() {
         let few = sweeps(0..20);
-        assert_eq!(ConfidenceModel::fit(&few, 0.01), Err(FitError::TooFew(few.len())));
+        assert_eq!(
+            ConfidenceModel::fit(&few, 0.01),
+            Err(FitError::TooFew(few.len()))
+        );
     }
 
     #[test]
     fn a_share_that_leaves_no_pose_is_rejected() {
         for good_loss in [1.0, -0.1, 1.5] {
-            assert_eq!(ConfidenceModel::fit(&[], good_loss), Err(FitError::GoodLoss(good_loss)));
+            assert_eq!(
+                ConfidenceModel::fit(&[], good_loss),
+                Err(FitError::GoodLoss(good_loss))
+            );
         }
-        assert!(check_good_loss(f64::NAN).is_err() && check_good_loss(0.0).is_ok() && check_good_loss(0.99).is_ok());
+        assert!(
+            check_good_loss(f64::NAN).is_err()
+                && check_good_loss(0.0).is_ok()
+                && check_good_loss(0.99).is_ok()
+        );
     }
 
     #[test]
     fn the_threshold_costs_no_more_than_allowed() {
         let sigmas: Vec<(f64, bool)> = (0..100).map(|k| (f64::from(k) / 100.0, k > 4)).collect();
         let below = threshold(&sigmas, 0.02);
-        assert_eq!(sigmas.iter().filter(|(sigma, is_good)| *is_good && *sigma < below).count(), 1);
+        assert_eq!(
+            sigmas
+                .iter()
+                .filter(|(sigma, is_good)| *is_good && *sigma < below)
+                .count(),
+            1
+        );
         assert_eq!(threshold(&[(0.9, false)], 0.02), 1.0);
     }
 }

@@ -46,7 +46,12 @@ impl MonotoneMap {
         if pools.is_empty() && !rest.is_empty() {
             pools.push(Pool::of(rest));
         }
-        Self { knots: pools.iter().map(|pool| (pool.x / pool.count, pool.mean())).collect() }
+        Self {
+            knots: pools
+                .iter()
+                .map(|pool| (pool.x / pool.count, pool.mean()))
+                .collect(),
+        }
     }
 
     /// Checks that x increases and values decrease from knot to knot, as in a fit up to rounding.
@@ -54,15 +59,23 @@ impl MonotoneMap {
     /// # Errors
     /// The knots that are wrong.
     pub(super) fn check(&self) -> Result<(), String> {
-        if let Some((x, y)) = self.knots.iter().find(|(x, y)| !x.is_finite() || !(0.0..=1.0).contains(y)) {
-            return Err(format!("sigma has a knot [{x}, {y}], its value must be 0 to 1"));
+        if let Some((x, y)) = self
+            .knots
+            .iter()
+            .find(|(x, y)| !x.is_finite() || !(0.0..=1.0).contains(y))
+        {
+            return Err(format!(
+                "sigma has a knot [{x}, {y}], its value must be 0 to 1"
+            ));
         }
         let is_in_order = |pair: &&[(f64, f64)]| {
             let ((x0, y0), (x1, y1)) = (pair[0], pair[1]);
             x1 >= x0 - ROUNDING * (1.0 + x0.abs()) && y1 <= y0 + ROUNDING
         };
         match self.knots.windows(2).find(|pair| !is_in_order(pair)) {
-            Some(pair) => Err(format!("sigma has the knots {pair:?} one after the other, x must rise and values fall")),
+            Some(pair) => Err(format!(
+                "sigma has the knots {pair:?} one after the other, x must rise and values fall"
+            )),
             None => Ok(()),
         }
     }
@@ -73,7 +86,9 @@ impl MonotoneMap {
         if x.is_nan() {
             return 0.0;
         }
-        let (Some(&first), Some(&last)) = (self.knots.first(), self.knots.last()) else { return 0.5 };
+        let (Some(&first), Some(&last)) = (self.knots.first(), self.knots.last()) else {
+            return 0.5;
+        };
         if x <= first.0 {
             return 1.0 - (1.0 - first.1) * (x - first.0).exp();
         }
@@ -97,11 +112,19 @@ struct Pool {
 impl Pool {
     fn of(samples: &[(f64, f64)]) -> Self {
         let sum = |part: fn(&(f64, f64)) -> f64| samples.iter().map(part).sum();
-        Self { x: sum(|sample| sample.0), value: sum(|sample| sample.1), count: samples.len() as f64 }
+        Self {
+            x: sum(|sample| sample.0),
+            value: sum(|sample| sample.1),
+            count: samples.len() as f64,
+        }
     }
 
     fn with(&self, other: &Self) -> Self {
-        Self { x: self.x + other.x, value: self.value + other.value, count: self.count + other.count }
+        Self {
+            x: self.x + other.x,
+            value: self.value + other.value,
+            count: self.count + other.count,
+        }
     }
 
     fn mean(&self) -> f64 {
@@ -146,6 +169,13 @@ mod tests {
     #[test]
     fn nan_has_no_confidence() {
         let map = MonotoneMap::falling(vec![(0.0, 0.8), (1.0, 0.1)]);
-        assert_eq!((map.at(f64::NAN), map.at(f64::INFINITY), map.at(f64::NEG_INFINITY)), (0.0, 0.0, 1.0));
+        assert_eq!(
+            (
+                map.at(f64::NAN),
+                map.at(f64::INFINITY),
+                map.at(f64::NEG_INFINITY)
+            ),
+            (0.0, 0.0, 1.0)
+        );
     }
 }

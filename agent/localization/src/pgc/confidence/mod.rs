@@ -78,11 +78,18 @@ impl ConfidenceModel {
         if self.bias.is_nan() || self.bias.abs() > MAX_WEIGHT {
             return Err(format!("bias is {:?}, must be -1e9 to 1e9", self.bias));
         }
-        if let Some(weight) = self.weights.iter().find(|weight| !(0.0..=MAX_WEIGHT).contains(*weight)) {
+        if let Some(weight) = self
+            .weights
+            .iter()
+            .find(|weight| !(0.0..=MAX_WEIGHT).contains(*weight))
+        {
             return Err(format!("a weight is {weight:?}, must be 0 to 1e9"));
         }
         if !(0.0..=1.0).contains(&self.reject_below) {
-            return Err(format!("reject_below is {}, must be 0 to 1", self.reject_below));
+            return Err(format!(
+                "reject_below is {}, must be 0 to 1",
+                self.reject_below
+            ));
         }
         self.sigma.check()
     }
@@ -95,14 +102,24 @@ impl ConfidenceModel {
 
     /// Expected natural logarithm of the error in metres.
     fn log_error(&self, evidence: &PoseEvidence) -> f64 {
-        self.bias + features(evidence).iter().zip(&self.weights).map(|(feature, weight)| feature * weight).sum::<f64>()
+        self.bias
+            + features(evidence)
+                .iter()
+                .zip(&self.weights)
+                .map(|(feature, weight)| feature * weight)
+                .sum::<f64>()
     }
 
     /// Model with round numbers, for tests.
     #[must_use]
     pub fn example() -> Self {
         let sigma = MonotoneMap::falling(vec![(-3.0, 0.95), (0.0, 0.5), (2.0, 0.05)]);
-        Self { bias: -1.0, weights: [0.3; FEATURES], sigma, reject_below: 0.1 }
+        Self {
+            bias: -1.0,
+            weights: [0.3; FEATURES],
+            sigma,
+            reject_below: 0.1,
+        }
     }
 }
 
@@ -110,8 +127,12 @@ impl ConfidenceModel {
 fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
     let log = |value: f64| value.clamp(1e-3, 1e6).ln();
     // A head has a refiner or has none: features that are always 0 get no weight.
-    let refinement =
-        |value: fn(&RefinementEvidence) -> f64| evidence.second.as_ref().map_or(0.0, |second| log(value(second)));
+    let refinement = |value: fn(&RefinementEvidence) -> f64| {
+        evidence
+            .second
+            .as_ref()
+            .map_or(0.0, |second| log(value(second)))
+    };
     [
         -log(evidence.inlier_ratio),
         -log(evidence.inliers as f64 / 100.0),
@@ -139,19 +160,34 @@ mod tests {
     #[test]
     fn sigma_decreases_with_evidence_against_a_pose() {
         let sigma = |outliers, noise_m| {
-            let scene = SyntheticScene { outliers, noise_m, ..SyntheticScene::default() };
+            let scene = SyntheticScene {
+                outliers,
+                noise_m,
+                ..SyntheticScene::default()
+            };
             let found = PoseSolver::default().solve(&scene.coordinates(1)).unwrap();
             ConfidenceModel::example().sigma(&found.evidence)
         };
-        let falling = [sigma(0.1, 0.1), sigma(0.3, 0.2), sigma(0.6, 0.4), sigma(0.8, 0.6)];
-        assert!(falling.windows(2).all(|pair| pair[0] > pair[1]), "{falling:?}");
+        let falling = [
+            sigma(0.1, 0.1),
+            sigma(0.3, 0.2),
+            sigma(0.6, 0.4),
+            sigma(0.8, 0.6),
+        ];
+        assert!(
+            falling.windows(2).all(|pair| pair[0] > pair[1]),
+            "{falling:?}"
+        );
     }
 
     #[test]
     fn a_model_survives_its_file() {
         let model = ConfidenceModel::example();
         let text = serde_json::to_string(&model).unwrap();
-        assert_eq!(serde_json::from_str::<ConfidenceModel>(&text).unwrap(), model);
+        assert_eq!(
+            serde_json::from_str::<ConfidenceModel>(&text).unwrap(),
+            model
+        );
         assert!(serde_json::from_str::<ConfidenceModel>(&text.replace("bias", "bais")).is_err());
     }
 
@@ -159,16 +195,51 @@ mod tests {
     fn values_that_no_fit_has_are_rejected_by_name() {
         let example = ConfidenceModel::example;
         assert_eq!(example().check(), Ok(()));
-        let refused = |model: ConfidenceModel, field: &str| model.check().unwrap_err().contains(field);
+        let refused =
+            |model: ConfidenceModel, field: &str| model.check().unwrap_err().contains(field);
         let mut weights = [0.3; FEATURES];
         weights[3] = 1e308;
-        assert!(refused(ConfidenceModel { weights, ..example() }, "a weight is 1e308"));
+        assert!(refused(
+            ConfidenceModel {
+                weights,
+                ..example()
+            },
+            "a weight is 1e308"
+        ));
         weights[3] = -0.1;
-        assert!(refused(ConfidenceModel { weights, ..example() }, "-0.1"));
-        assert!(refused(ConfidenceModel { bias: f64::NAN, ..example() }, "bias is NaN"));
-        assert!(refused(ConfidenceModel { reject_below: 1.5, ..example() }, "reject_below is 1.5"));
-        for knots in [vec![(1.0, 0.5), (0.0, 0.4)], vec![(0.0, 0.4), (1.0, 0.5)], vec![(0.0, 2.0)]] {
-            assert!(refused(ConfidenceModel { sigma: MonotoneMap::falling(knots), ..example() }, "sigma has"));
+        assert!(refused(
+            ConfidenceModel {
+                weights,
+                ..example()
+            },
+            "-0.1"
+        ));
+        assert!(refused(
+            ConfidenceModel {
+                bias: f64::NAN,
+                ..example()
+            },
+            "bias is NaN"
+        ));
+        assert!(refused(
+            ConfidenceModel {
+                reject_below: 1.5,
+                ..example()
+            },
+            "reject_below is 1.5"
+        ));
+        for knots in [
+            vec![(1.0, 0.5), (0.0, 0.4)],
+            vec![(0.0, 0.4), (1.0, 0.5)],
+            vec![(0.0, 2.0)],
+        ] {
+            assert!(refused(
+                ConfidenceModel {
+                    sigma: MonotoneMap::falling(knots),
+                    ..example()
+                },
+                "sigma has"
+            ));
         }
     }
 

@@ -8,7 +8,9 @@
 
 mod surfels;
 
-use nalgebra::{Isometry3, Matrix6, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{
+    Isometry3, Matrix6, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6,
+};
 use serde::{Deserialize, Serialize};
 
 use surfels::{Surfels, decimate};
@@ -52,9 +54,17 @@ pub struct IcpConfig {
 impl Default for IcpConfig {
     /// For 64-channel sweeps of streets.
     fn default() -> Self {
-        let level = |voxel_m, scale_m, max_steps| IcpLevel { voxel_m, scale_m, max_steps };
+        let level = |voxel_m, scale_m, max_steps| IcpLevel {
+            voxel_m,
+            scale_m,
+            max_steps,
+        };
         Self {
-            levels: vec![level(2.0, 1.0, 40), level(1.0, 0.4, 20), level(0.5, 0.15, 20)],
+            levels: vec![
+                level(2.0, 1.0, 40),
+                level(1.0, 0.4, 20),
+                level(0.5, 0.15, 20),
+            ],
             range_m: [2.5, 80.0],
             source_voxel_m: 0.5,
             max_points: 5000,
@@ -78,8 +88,16 @@ impl IcpTarget {
     /// Target without a point.
     #[must_use]
     pub fn new(config: &IcpConfig) -> Self {
-        let levels = config.levels.iter().map(|level| Surfels::new(level.voxel_m)).collect();
-        Self { levels, origin_m: None, range_m: config.range_m }
+        let levels = config
+            .levels
+            .iter()
+            .map(|level| Surfels::new(level.voxel_m))
+            .collect();
+        Self {
+            levels,
+            origin_m: None,
+            range_m: config.range_m,
+        }
     }
 
     /// Target of one sweep, in the frame of its sensor.
@@ -124,7 +142,9 @@ impl IcpSource {
     /// Decimates a sweep.
     #[must_use]
     pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
-        Self { points_m: decimate(within(xyzi, config.range_m), config.source_voxel_m) }
+        Self {
+            points_m: decimate(within(xyzi, config.range_m), config.source_voxel_m),
+        }
     }
 
     /// The points that are left `[N]`, in the frame of the sensor, metres.
@@ -135,8 +155,13 @@ impl IcpSource {
 }
 
 /// Points in range.
-fn within(xyzi: &[[f32; 4]], [nearest_m, farthest_m]: [f64; 2]) -> impl Iterator<Item = Vector3<f64>> {
-    let points = xyzi.iter().map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
+fn within(
+    xyzi: &[[f32; 4]],
+    [nearest_m, farthest_m]: [f64; 2],
+) -> impl Iterator<Item = Vector3<f64>> {
+    let points = xyzi
+        .iter()
+        .map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
     points.filter(move |point: &Vector3<f64>| (nearest_m..=farthest_m).contains(&point.norm()))
 }
 
@@ -175,7 +200,9 @@ pub enum NoIcpFit {
         required: f64,
     },
     /// Some direction is unconstrained: nothing but ground, or a street between two walls.
-    #[error("the planes constrain the worst direction to {constraint:.1e} only, at least {required:.1e} is needed")]
+    #[error(
+        "the planes constrain the worst direction to {constraint:.1e} only, at least {required:.1e} is needed"
+    )]
     Unconstrained {
         /// Constraint of the worst direction, 0..1.
         constraint: f64,
@@ -198,9 +225,16 @@ pub fn register(
     start: &Isometry3<f64>,
     config: &IcpConfig,
 ) -> Result<IcpFit, NoIcpFit> {
-    for (what, found) in [("source points", source.points_m.len()), ("target planes", target.planes())] {
+    for (what, found) in [
+        ("source points", source.points_m.len()),
+        ("target planes", target.planes()),
+    ] {
         if found < MIN_POINTS {
-            return Err(NoIcpFit::TooFew { what, found, required: MIN_POINTS });
+            return Err(NoIcpFit::TooFew {
+                what,
+                found,
+                required: MIN_POINTS,
+            });
         }
     }
     let stride = source.points_m.len().div_ceil(config.max_points.max(1));
@@ -221,7 +255,12 @@ pub fn register(
     }
     last.judge(points.len(), config)?;
     let overlap = last.pairs / points.len() as f64;
-    Ok(IcpFit { target_from_source: origin * motion, overlap, rms_m: (last.squares / last.pairs).sqrt(), steps })
+    Ok(IcpFit {
+        target_from_source: origin * motion,
+        overlap,
+        rms_m: (last.squares / last.pairs).sqrt(),
+        steps,
+    })
 }
 
 /// `motion`, rotated about the sensor and translated: the step's rotation is in units of 1 / [`LEVER_M`] radians.
@@ -248,14 +287,21 @@ struct NormalEquations {
 }
 
 impl NormalEquations {
-    fn gather(points: &[&Vector3<f64>], planes: &Surfels, motion: &Isometry3<f64>, level: &IcpLevel) -> Self {
+    fn gather(
+        points: &[&Vector3<f64>],
+        planes: &Surfels,
+        motion: &Isometry3<f64>,
+        level: &IcpLevel,
+    ) -> Self {
         let rotation = motion.rotation.to_rotation_matrix();
         let sensor = motion.translation.vector;
         let mut sums = Self::default();
         for point in points {
             let arm = rotation * *point;
             let moved = arm + sensor;
-            let Some(plane) = planes.near(&moved) else { continue };
+            let Some(plane) = planes.near(&moved) else {
+                continue;
+            };
             let distance = plane.normal.dot(&(moved - plane.centre_m));
             let scaled = (distance / level.scale_m).powi(2);
             if scaled < 9.0 {
@@ -264,7 +310,14 @@ impl NormalEquations {
             }
             let weight = 1.0 / ((1.0 + scaled) * (1.0 + scaled));
             let turn = arm.cross(&plane.normal) / LEVER_M;
-            let row = Vector6::new(turn.x, turn.y, turn.z, plane.normal.x, plane.normal.y, plane.normal.z);
+            let row = Vector6::new(
+                turn.x,
+                turn.y,
+                turn.z,
+                plane.normal.x,
+                plane.normal.y,
+                plane.normal.z,
+            );
             sums.weight += weight;
             sums.hessian += row * row.transpose() * weight;
             sums.gradient += row * (distance * weight);
@@ -282,11 +335,19 @@ impl NormalEquations {
     fn judge(&self, points: usize, config: &IcpConfig) -> Result<(), NoIcpFit> {
         let overlap = self.pairs / points as f64;
         if overlap < config.min_overlap.max(f64::EPSILON) {
-            return Err(NoIcpFit::TooLittleOverlap { overlap, required: config.min_overlap });
+            return Err(NoIcpFit::TooLittleOverlap {
+                overlap,
+                required: config.min_overlap,
+            });
         }
-        let constraint = SymmetricEigen::new(self.hessian / self.weight).eigenvalues.min();
+        let constraint = SymmetricEigen::new(self.hessian / self.weight)
+            .eigenvalues
+            .min();
         if constraint < config.min_constraint {
-            return Err(NoIcpFit::Unconstrained { constraint, required: config.min_constraint });
+            return Err(NoIcpFit::Unconstrained {
+                constraint,
+                required: config.min_constraint,
+            });
         }
         Ok(())
     }
@@ -333,7 +394,10 @@ mod tests {
 
     fn error(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> (f64, f64) {
         let off = truth.inv_mul(found);
-        (off.translation.vector.norm(), off.rotation.angle().to_degrees())
+        (
+            off.translation.vector.norm(),
+            off.rotation.angle().to_degrees(),
+        )
     }
 
     #[test]
@@ -343,11 +407,21 @@ mod tests {
         let target = IcpTarget::of_sweep(&crossing(&here, 0.0), &config);
         let source = IcpSource::of_sweep(&crossing(&there, 0.11), &config);
         let truth = here.inv_mul(&there);
-        let start = truth * Isometry3::new(Vector3::new(0.8, -0.6, 0.2), Vector3::new(0.01, -0.02, 0.05));
+        let start = truth
+            * Isometry3::new(
+                Vector3::new(0.8, -0.6, 0.2),
+                Vector3::new(0.01, -0.02, 0.05),
+            );
         let fit = register(&source, &target, &start, &config).unwrap();
         let (metres, degrees) = error(&truth, &fit.target_from_source);
-        assert!(metres < 0.03 && degrees < 0.05, "{metres} m, {degrees} degrees");
-        assert!(fit.overlap > 0.6 && fit.rms_m < 0.05 && fit.steps > 2, "{fit:?}");
+        assert!(
+            metres < 0.03 && degrees < 0.05,
+            "{metres} m, {degrees} degrees"
+        );
+        assert!(
+            fit.overlap > 0.6 && fit.rms_m < 0.05 && fit.steps > 2,
+            "{fit:?}"
+        );
     }
 
     #[test]
@@ -362,10 +436,14 @@ mod tests {
         map.fit();
         let there = pose(1.0, 1.0, 0.3);
         let source = IcpSource::of_sweep(&crossing(&there, 0.15), &config);
-        let start = far * there * Isometry3::new(Vector3::new(-0.7, 0.7, 0.0), Vector3::z() * -0.04);
+        let start =
+            far * there * Isometry3::new(Vector3::new(-0.7, 0.7, 0.0), Vector3::z() * -0.04);
         let fit = register(&source, &map, &start, &config).unwrap();
         let (metres, degrees) = error(&(far * there), &fit.target_from_source);
-        assert!(metres < 0.05 && degrees < 0.1, "{metres} m, {degrees} degrees");
+        assert!(
+            metres < 0.05 && degrees < 0.1,
+            "{metres} m, {degrees} degrees"
+        );
     }
 
     #[test]
@@ -375,15 +453,28 @@ mod tests {
         let mut moved = crossing(&there, 0.1);
         let static_points = moved.len();
         // A side of a lorry, two metres farther than in the target.
-        let lorry = |x: f64| (0..800).map(move |k| [x + f64::from(k % 40) * 0.2, 4.0, f64::from(k / 40) * 0.15]);
+        let lorry = |x: f64| {
+            (0..800).map(move |k| [x + f64::from(k % 40) * 0.2, 4.0, f64::from(k / 40) * 0.15])
+        };
         let mut target = crossing(&here, 0.0);
         target.extend(lorry(3.0).map(|p| [p[0] as f32, p[1] as f32, p[2] as f32 - 2.0, 0.1]));
-        moved.extend(lorry(5.0).map(|p| [p[0] as f32 - 1.0, p[1] as f32 - 0.3, p[2] as f32 - 2.0, 0.1]));
+        moved.extend(
+            lorry(5.0).map(|p| [p[0] as f32 - 1.0, p[1] as f32 - 0.3, p[2] as f32 - 2.0, 0.1]),
+        );
         assert!(moved.len() > static_points);
         let source = IcpSource::of_sweep(&moved, &config);
-        let fit = register(&source, &IcpTarget::of_sweep(&target, &config), &Isometry3::identity(), &config).unwrap();
+        let fit = register(
+            &source,
+            &IcpTarget::of_sweep(&target, &config),
+            &Isometry3::identity(),
+            &config,
+        )
+        .unwrap();
         let (metres, degrees) = error(&here.inv_mul(&there), &fit.target_from_source);
-        assert!(metres < 0.04 && degrees < 0.1, "{metres} m, {degrees} degrees");
+        assert!(
+            metres < 0.04 && degrees < 0.1,
+            "{metres} m, {degrees} degrees"
+        );
     }
 
     #[test]
@@ -391,22 +482,47 @@ mod tests {
         let config = IcpConfig::default();
         let ground = |shift: f32| -> Vec<[f32; 4]> {
             (0..10_000)
-                .map(|k| [(k % 100) as f32 * 0.5 - 25.0 + shift, (k / 100) as f32 * 0.5 - 25.0, -2.0, 0.1])
+                .map(|k| {
+                    [
+                        (k % 100) as f32 * 0.5 - 25.0 + shift,
+                        (k / 100) as f32 * 0.5 - 25.0,
+                        -2.0,
+                        0.1,
+                    ]
+                })
                 .collect()
         };
         let walls = |shift: f32| {
             let wall = move |y: f32| {
-                (0..2_000).map(move |k| [(k % 200) as f32 * 0.25 - 25.0 + shift, y, (k / 200) as f32 * 0.4 - 2.0, 0.1])
+                (0..2_000).map(move |k| {
+                    [
+                        (k % 200) as f32 * 0.25 - 25.0 + shift,
+                        y,
+                        (k / 200) as f32 * 0.4 - 2.0,
+                        0.1,
+                    ]
+                })
             };
             wall(6.0).chain(wall(-6.0))
         };
         for (source, target) in [
             (ground(0.1), ground(0.0)),
-            (ground(0.1).into_iter().chain(walls(0.2)).collect(), ground(0.0).into_iter().chain(walls(0.0)).collect()),
+            (
+                ground(0.1).into_iter().chain(walls(0.2)).collect(),
+                ground(0.0).into_iter().chain(walls(0.0)).collect(),
+            ),
         ] {
             let target = IcpTarget::of_sweep(&target, &config);
-            let found = register(&IcpSource::of_sweep(&source, &config), &target, &Isometry3::identity(), &config);
-            assert!(matches!(found, Err(NoIcpFit::Unconstrained { .. })), "{found:?}");
+            let found = register(
+                &IcpSource::of_sweep(&source, &config),
+                &target,
+                &Isometry3::identity(),
+                &config,
+            );
+            assert!(
+                matches!(found, Err(NoIcpFit::Unconstrained { .. })),
+                "{found:?}"
+            );
         }
     }
 
@@ -414,19 +530,32 @@ mod tests {
     fn too_little_evidence_is_an_error() {
         let config = IcpConfig::default();
         let sweep = crossing(&pose(0.0, 0.0, 0.0), 0.0);
-        let (source, target) = (IcpSource::of_sweep(&sweep, &config), IcpTarget::of_sweep(&sweep, &config));
+        let (source, target) = (
+            IcpSource::of_sweep(&sweep, &config),
+            IcpTarget::of_sweep(&sweep, &config),
+        );
         let none = IcpSource::of_sweep(&[[f32::NAN; 4]; 1000], &config);
         let start = Isometry3::identity();
         assert!(matches!(
             register(&none, &target, &start, &config),
-            Err(NoIcpFit::TooFew { what: "source points", found: 0, .. })
+            Err(NoIcpFit::TooFew {
+                what: "source points",
+                found: 0,
+                ..
+            })
         ));
         let empty = IcpTarget::of_sweep(&[], &config);
         assert!(matches!(
             register(&source, &empty, &start, &config),
-            Err(NoIcpFit::TooFew { what: "target planes", .. })
+            Err(NoIcpFit::TooFew {
+                what: "target planes",
+                ..
+            })
         ));
         let elsewhere = Isometry3::translation(500.0, 0.0, 0.0);
-        assert!(matches!(register(&source, &target, &elsewhere, &config), Err(NoIcpFit::TooLittleOverlap { .. })));
+        assert!(matches!(
+            register(&source, &target, &elsewhere, &config),
+            Err(NoIcpFit::TooLittleOverlap { .. })
+        ));
     }
 }

@@ -76,12 +76,19 @@ pub(super) struct Surfels {
 
 impl Surfels {
     pub(super) fn new(voxel_m: f64) -> Self {
-        Self { voxel_m, sites: Sites::default(), moments: Vec::new(), planes: Vec::new() }
+        Self {
+            voxel_m,
+            sites: Sites::default(),
+            moments: Vec::new(),
+            planes: Vec::new(),
+        }
     }
 
     /// Adds a point; those that no voxel can hold (not finite, hundreds of kilometres out) are left out.
     pub(super) fn add(&mut self, point_m: &Vector3<f64>) {
-        let Some(voxel) = voxel_of(point_m, self.voxel_m) else { return };
+        let Some(voxel) = voxel_of(point_m, self.voxel_m) else {
+            return;
+        };
         let row = self.sites.add(voxel) as usize;
         if row == self.moments.len() {
             self.moments.push(Moments::default());
@@ -95,7 +102,11 @@ impl Surfels {
         let around = |coord: &[i32; 3]| {
             let mut moments = Moments::default();
             for offset in 0..27 {
-                let shifted = [coord[0] + offset % 3 - 1, coord[1] + offset / 3 % 3 - 1, coord[2] + offset / 9 - 1];
+                let shifted = [
+                    coord[0] + offset % 3 - 1,
+                    coord[1] + offset / 3 % 3 - 1,
+                    coord[2] + offset / 9 - 1,
+                ];
                 if let Some(row) = self.sites.row(shifted) {
                     moments.merge(&self.moments[row as usize]);
                 }
@@ -103,9 +114,18 @@ impl Surfels {
             moments
         };
         let plane = |(coord, own): (&[i32; 3], &Moments)| {
-            Some(Surfel { centre_m: own.mean(), normal: around(coord).normal()? })
+            Some(Surfel {
+                centre_m: own.mean(),
+                normal: around(coord).normal()?,
+            })
         };
-        self.planes = self.sites.coords().iter().zip(&self.moments).map(plane).collect();
+        self.planes = self
+            .sites
+            .coords()
+            .iter()
+            .zip(&self.moments)
+            .map(plane)
+            .collect();
     }
 
     /// Number of voxels with a plane.
@@ -120,8 +140,16 @@ impl Surfels {
         let mut nearest = None;
         let mut least = f64::INFINITY;
         for offset in 0..8 {
-            let voxel = [first[0] + (offset & 1), first[1] + (offset >> 1 & 1), first[2] + (offset >> 2)];
-            let Some(plane) = self.sites.row(voxel).and_then(|row| self.planes.get(row as usize)?.as_ref()) else {
+            let voxel = [
+                first[0] + (offset & 1),
+                first[1] + (offset >> 1 & 1),
+                first[2] + (offset >> 2),
+            ];
+            let Some(plane) = self
+                .sites
+                .row(voxel)
+                .and_then(|row| self.planes.get(row as usize)?.as_ref())
+            else {
                 continue;
             };
             let distance = (plane.centre_m - point_m).norm_squared();
@@ -134,11 +162,16 @@ impl Surfels {
 }
 
 /// One point for every occupied voxel: the mean of the points in it, in order of first appearance.
-pub(super) fn decimate(points_m: impl IntoIterator<Item = Vector3<f64>>, voxel_m: f64) -> Vec<Vector3<f64>> {
+pub(super) fn decimate(
+    points_m: impl IntoIterator<Item = Vector3<f64>>,
+    voxel_m: f64,
+) -> Vec<Vector3<f64>> {
     let mut sites = Sites::default();
     let mut sums: Vec<(Vector3<f64>, f64)> = Vec::new();
     for point in points_m {
-        let Some(voxel) = voxel_of(&point, voxel_m) else { continue };
+        let Some(voxel) = voxel_of(&point, voxel_m) else {
+            continue;
+        };
         let row = sites.add(voxel) as usize;
         if row == sums.len() {
             sums.push(Default::default());
@@ -153,7 +186,9 @@ pub(super) fn decimate(points_m: impl IntoIterator<Item = Vector3<f64>>, voxel_m
 fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
     let voxel = (point_m / voxel_m).map(f64::floor);
     // One voxel of margin for the neighbours that are looked up. Also rejects values that are not finite.
-    let held = voxel.iter().all(|axis| axis.abs() < f64::from((1 << 20) - 2));
+    let held = voxel
+        .iter()
+        .all(|axis| axis.abs() < f64::from((1 << 20) - 2));
     held.then(|| [voxel.x as i32, voxel.y as i32, voxel.z as i32])
 }
 
@@ -210,10 +245,20 @@ mod tests {
 
     #[test]
     fn thinning_leaves_one_mean_a_voxel() {
-        let points = [[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 0.1, 0.1]].map(Vector3::from);
+        let points = [
+            [0.1, 0.1, 0.1],
+            [0.3, 0.1, 0.1],
+            [0.6, 0.1, 0.1],
+            [-0.1, 0.1, 0.1],
+        ]
+        .map(Vector3::from);
         let thin = decimate(points, 0.5);
         let expected = [[0.2, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 0.1, 0.1]].map(Vector3::from);
         assert_eq!(thin.len(), 3);
-        assert!(thin.iter().zip(&expected).all(|(a, b)| (a - b).norm() < 1e-12));
+        assert!(
+            thin.iter()
+                .zip(&expected)
+                .all(|(a, b)| (a - b).norm() < 1e-12)
+        );
     }
 }

@@ -48,9 +48,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         &title,
         "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.",
     );
-    card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "sweeps");
-    card.row("augmentation", format_args!("turns up to {} degrees, shifts up to {} m", args.turns.turn, args.shift));
-    card.row("mask of static objects", "supervised: pixels in annotated boxes are not static");
+    card.trained(
+        &config.run,
+        &summary.trained,
+        &format!("{} sweeps", summary.sweeps),
+        "sweeps",
+    );
+    card.row(
+        "augmentation",
+        format_args!(
+            "turns up to {} degrees, shifts up to {} m",
+            args.turns.turn, args.shift
+        ),
+    );
+    card.row(
+        "mask of static objects",
+        "supervised: pixels in annotated boxes are not static",
+    );
     if let Some(accuracy) = summary.validation {
         card.row("validation", text(&accuracy));
     }
@@ -66,16 +80,25 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 impl Args {
     fn config(&self) -> anyhow::Result<DiffLocTrainConfig> {
         if !(0.0..=10.0).contains(&self.shift) {
-            return Err(bad(&format!("--shift is {}, must be 0 to 10 metres", self.shift)));
+            return Err(bad(&format!(
+                "--shift is {}, must be 0 to 10 metres",
+                self.shift
+            )));
         }
         check_folders(self.sweeps.scenes.iter().chain(&self.validation))?;
         let run = run_config(&self.options, self.batch, self.lr)?;
-        let optimizer =
-            AdamWConfig { weight_decay: WEIGHT_DECAY, max_gradient_norm: MAX_GRADIENT_NORM, ..run.optimizer };
+        let optimizer = AdamWConfig {
+            weight_decay: WEIGHT_DECAY,
+            max_gradient_norm: MAX_GRADIENT_NORM,
+            ..run.optimizer
+        };
         Ok(DiffLocTrainConfig {
             scenes: self.sweeps.scenes.clone(),
             validation: self.validation.clone(),
-            network: DiffLocConfig { scene_name: self.sweeps.scene_name.clone(), ..DiffLocConfig::small() },
+            network: DiffLocConfig {
+                scene_name: self.sweeps.scene_name.clone(),
+                ..DiffLocConfig::small()
+            },
             turn_rad: self.turns.largest_rad()?,
             shift_m: self.shift,
             run: RunConfig { optimizer, ..run },
@@ -86,11 +109,21 @@ impl Args {
 fn show(bar: &TrainingBar, report: &DiffLocReport) {
     match report {
         DiffLocReport::Imaging(done, total) => bar.encoded(*done, *total),
-        DiffLocReport::Stepped { step, share_done, seconds, pose_l1, place_loss, accuracy } => {
+        DiffLocReport::Stepped {
+            step,
+            share_done,
+            seconds,
+            pose_l1,
+            place_loss,
+            accuracy,
+        } => {
             bar.report(
                 *share_done,
                 *seconds,
-                &format!("step {step} poses {pose_l1:.3} places {place_loss:.2}, batch {}", text(accuracy)),
+                &format!(
+                    "step {step} poses {pose_l1:.3} places {place_loss:.2}, batch {}",
+                    text(accuracy)
+                ),
             );
         }
         DiffLocReport::Validated(seconds, accuracy) => {
@@ -100,5 +133,9 @@ fn show(bar: &TrainingBar, report: &DiffLocReport) {
 }
 
 fn text(accuracy: &DiffLocAccuracy) -> String {
-    format!("median {:.2} m, {:.1} % under 3 m", accuracy.p50_m, 100.0 * accuracy.success_3m)
+    format!(
+        "median {:.2} m, {:.1} % under 3 m",
+        accuracy.p50_m,
+        100.0 * accuracy.success_3m
+    )
 }

@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
-use agent_offline::training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
+use agent_offline::training::{
+    EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder,
+};
 use localization::pgc::SceneEncoderConfig;
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
@@ -45,20 +47,35 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;
-    args.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
+    args.options.print(
+        &summary.trained,
+        &serde_json::json!({"accuracy": summary.accuracy}),
+    )?;
     Ok(())
 }
 
 fn tell(bar: &TrainingBar, report: &EncoderReport) {
     match report {
         EncoderReport::Read(data) => print_left_out(bar, data),
-        EncoderReport::Stepped { step, share_done, seconds, loss, accuracy } => {
+        EncoderReport::Stepped {
+            step,
+            share_done,
+            seconds,
+            loss,
+            accuracy,
+        } => {
             let EncoderAccuracy { top1, offset_m } = accuracy;
-            let text = format!("step {step} loss {loss:.3} top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1);
+            let text = format!(
+                "step {step} loss {loss:.3} top-1 {:.1} % offset {offset_m:.2} m",
+                100.0 * top1
+            );
             bar.report(*share_done, *seconds, &text);
         }
         EncoderReport::Validated(step, EncoderAccuracy { top1, offset_m }) => {
-            bar.print_line(&format!("step {step}: validation top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1));
+            bar.print_line(&format!(
+                "step {step}: validation top-1 {:.1} % offset {offset_m:.2} m",
+                100.0 * top1
+            ));
         }
     }
 }
@@ -87,7 +104,11 @@ fn card(config: &EncoderTrainConfig, summary: &EncoderSummary) -> ModelCard {
             config.encoder.voxel_m
         ),
     );
-    let data = format!("{} sweeps of {} scenes", summary.sweeps, config.scenes.len());
+    let data = format!(
+        "{} sweeps of {} scenes",
+        summary.sweeps,
+        config.scenes.len()
+    );
     card.trained(&config.run, &summary.trained, &data, "pairs");
     if let Some(accuracy) = summary.accuracy {
         card.row(

@@ -46,17 +46,30 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         } => {
             latest = Some((error_m, error_deg));
             let places = format!("places {points:.2} {image:.2} {fusion:.2}");
-            bar.report(share_done, seconds, &format!("step {step} error {error_m:.2} m {error_deg:.1} deg, {places}"));
+            bar.report(
+                share_done,
+                seconds,
+                &format!("step {step} error {error_m:.2} m {error_deg:.1} deg, {places}"),
+            );
         }
     })?;
     bar.finish();
     print_left_out(&bar, &trained.data);
     let title = format!("HypLiLoc, small, of {}", config.scene_name);
-    let mut card = ModelCard::new(&title, "Trained from random weights on the sweeps of one scene.");
+    let mut card = ModelCard::new(
+        &title,
+        "Trained from random weights on the sweeps of one scene.",
+    );
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
-    card.row("augmentation", format_args!("turns up to {} degrees", args.turns.turn));
+    card.row(
+        "augmentation",
+        format_args!("turns up to {} degrees", args.turns.turn),
+    );
     if let Some((error_m, error_deg)) = latest {
-        card.row("mean error of the last steps, training sweeps", format!("{error_m:.2} m, {error_deg:.1} deg"));
+        card.row(
+            "mean error of the last steps, training sweeps",
+            format!("{error_m:.2} m, {error_deg:.1} deg"),
+        );
     }
     card.write(&config.run.out)?;
     args.options.print(&trained, &serde_json::json!({}))?;

@@ -32,7 +32,8 @@ enum Stage {
 
 /// Runs the chosen stage.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS).context("cannot execute this program again")?;
+    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS)
+        .context("cannot execute this program again")?;
     match &args.stage {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),

@@ -30,7 +30,10 @@ impl SensorTurns {
     /// The largest turn, radians; an impossible one is a usage error.
     pub(crate) fn largest_rad(&self) -> anyhow::Result<f64> {
         if !(0.0..=180.0).contains(&self.turn) {
-            return Err(bad(&format!("--turn is {}, must be 0 to 180 degrees", self.turn)));
+            return Err(bad(&format!(
+                "--turn is {}, must be 0 to 180 degrees",
+                self.turn
+            )));
         }
         Ok(self.turn.to_radians())
     }
@@ -42,14 +45,24 @@ pub(crate) fn bad(reason: &str) -> anyhow::Error {
 }
 
 /// Configuration of a training; an invalid option is a usage error.
-pub(crate) fn run_config(options: &TrainingOptions, batch: usize, learning_rate: f64) -> anyhow::Result<RunConfig> {
-    Ok(options.run_config(batch, learning_rate).map_err(BadInput::of)?)
+pub(crate) fn run_config(
+    options: &TrainingOptions,
+    batch: usize,
+    learning_rate: f64,
+) -> anyhow::Result<RunConfig> {
+    Ok(options
+        .run_config(batch, learning_rate)
+        .map_err(BadInput::of)?)
 }
 
 /// Rejects missing folders before anything is computed.
-pub(crate) fn check_folders<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) -> anyhow::Result<()> {
+pub(crate) fn check_folders<'a>(
+    folders: impl IntoIterator<Item = &'a PathBuf>,
+) -> anyhow::Result<()> {
     for folder in folders {
-        std::fs::read_dir(folder).with_context(|| folder.display().to_string()).map_err(BadInput::of)?;
+        std::fs::read_dir(folder)
+            .with_context(|| folder.display().to_string())
+            .map_err(BadInput::of)?;
     }
     Ok(())
 }

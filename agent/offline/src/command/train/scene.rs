@@ -4,7 +4,8 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use agent_offline::training::{
-    LeaveOut, RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
+    LeaveOut, RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation,
+    train_scene,
 };
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
@@ -73,9 +74,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;
-    let SceneSummary { preparing_seconds, accuracy, cells_shown, .. } = summary;
-    let more =
-        serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
+    let SceneSummary {
+        preparing_seconds,
+        accuracy,
+        cells_shown,
+        ..
+    } = summary;
+    let more = serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
     args.options.print(&summary.trained, &more)?;
     Ok(())
 }
@@ -123,7 +128,11 @@ impl Args {
             width: self.width,
             blocks: self.blocks,
             refiner: !self.no_refiner,
-            augmentation: SweepAugmentation { copies: self.copies, turn_rad: self.turn.to_radians(), keep: 0.7 },
+            augmentation: SweepAugmentation {
+                copies: self.copies,
+                turn_rad: self.turn.to_radians(),
+                keep: 0.7,
+            },
             redundancy: self.leave_out.map(|leave_out| RedundancyConfig {
                 leave_out,
                 seed: run.seed,
@@ -137,9 +146,20 @@ impl Args {
 
 fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> ModelCard {
     let title = format!("Scene head of {}", summary.scene_name);
-    let mut card = ModelCard::new(&title, "World coordinates of cells on the features of a frozen encoder.");
-    card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "cells");
-    card.row("of which reading and encoding", format_args!("{:.0} s", summary.preparing_seconds));
+    let mut card = ModelCard::new(
+        &title,
+        "World coordinates of cells on the features of a frozen encoder.",
+    );
+    card.trained(
+        &config.run,
+        &summary.trained,
+        &format!("{} sweeps", summary.sweeps),
+        "cells",
+    );
+    card.row(
+        "of which reading and encoding",
+        format_args!("{:.0} s", summary.preparing_seconds),
+    );
     if let Some(accuracy) = summary.accuracy {
         card.row(
             "validation",

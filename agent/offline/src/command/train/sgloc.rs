@@ -37,19 +37,33 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut latest_m = None;
     let trained = train_sgloc(&config, &mut |report| match *report {
         SgLocReport::Encoding(done, total) => bar.encoded(done, total),
-        SgLocReport::Stepped { step, share_done, seconds, error_m } => {
+        SgLocReport::Stepped {
+            step,
+            share_done,
+            seconds,
+            error_m,
+        } => {
             latest_m = Some(error_m);
-            bar.report(share_done, seconds, &format!("step {step} error {error_m:.2} m"));
+            bar.report(
+                share_done,
+                seconds,
+                &format!("step {step} error {error_m:.2} m"),
+            );
         }
     })?;
     bar.finish();
     print_left_out(&bar, &trained.data);
     let title = format!("SGLoc, small, of {}", config.scene_name);
-    let mut card =
-        ModelCard::new(&title, "Head on the features of a frozen encoder, trained on the sweeps of one scene.");
+    let mut card = ModelCard::new(
+        &title,
+        "Head on the features of a frozen encoder, trained on the sweeps of one scene.",
+    );
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
     if let Some(error_m) = latest_m {
-        card.row("mean L1 error of the last steps, training cells", format!("{error_m:.2} m"));
+        card.row(
+            "mean L1 error of the last steps, training cells",
+            format!("{error_m:.2} m"),
+        );
     }
     card.write(&config.run.out)?;
     args.options.print(&trained, &serde_json::json!({}))?;

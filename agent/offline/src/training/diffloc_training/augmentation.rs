@@ -49,7 +49,10 @@ impl Augmentation {
         let images = windows.images.f_to_kind(Kind::Float)?;
         let count = images.size()[0] / frames;
         let on = (Kind::Float, images.device());
-        let mut changed = Augmented { images, poses: windows.poses.shallow_clone() };
+        let mut changed = Augmented {
+            images,
+            poses: windows.poses.shallow_clone(),
+        };
         if self.shift_m > 0.0 {
             let shift_m = (Tensor::f_rand([count, 2], on)? * 2.0 - 1.0) * self.shift_m;
             changed = self.shifted(
@@ -61,9 +64,15 @@ impl Augmentation {
         if self.turn_columns > 0 {
             let most = self.turn_columns;
             let turn = Tensor::f_randint_low(-most, most + 1, [count], (Kind::Int64, on.1))?;
-            changed = self.turned(&changed, &turn.f_repeat_interleave_self_int(frames, 0, count * frames)?)?;
+            changed = self.turned(
+                &changed,
+                &turn.f_repeat_interleave_self_int(frames, 0, count * frames)?,
+            )?;
         }
-        Ok(Augmented { images: spoilt(&changed.images)?, poses: changed.poses })
+        Ok(Augmented {
+            images: spoilt(&changed.images)?,
+            poses: changed.poses,
+        })
     }
 
     /// The sweeps of sensors that are moved by `shift_m` `[N, 2]` in their own frames: each pixel moves to where the
@@ -74,26 +83,39 @@ impl Augmentation {
         shift_m: &Tensor,
         normalisation: &Normalisation,
     ) -> Result<Augmented, TchError> {
-        let RangeImageConfig { rows, columns, elevations_deg } = self.image;
+        let RangeImageConfig {
+            rows,
+            columns,
+            elevations_deg,
+        } = self.image;
         let [low, high] = elevations_deg.map(|degrees| f64::from(degrees).to_radians());
         let [rows, columns] = [rows, columns].map(|size| size as i64);
         let pixels = rows * columns;
         let flat = sweeps.images.f_flatten(2, 3)?;
         let count = flat.size()[0];
-        let axis = |channel: usize| Ok::<_, TchError>(flat.f_select(1, channel as i64)? * f64::from(UNITS[channel]));
-        let moved = |channel: usize, number: i64| axis(channel)?.f_sub(&shift_m.f_narrow(1, number, 1)?);
+        let axis = |channel: usize| {
+            Ok::<_, TchError>(flat.f_select(1, channel as i64)? * f64::from(UNITS[channel]))
+        };
+        let moved =
+            |channel: usize, number: i64| axis(channel)?.f_sub(&shift_m.f_narrow(1, number, 1)?);
         let (x, y, z) = (moved(1, 0)?, moved(2, 1)?, axis(3)?);
         let level = (x.f_square()? + y.f_square()?).f_sqrt()?;
         let range = (level.f_square()? + z.f_square()?).f_sqrt()?;
-        let row = ((z.f_atan2(&level)?.f_neg()? + high) * (rows as f64 / (high - low))).f_floor()?;
-        let column = ((y.f_atan2(&x)? / TAU + 0.5) * columns as f64).f_floor()?.f_remainder(columns as f64)?;
+        let row =
+            ((z.f_atan2(&level)?.f_neg()? + high) * (rows as f64 / (high - low))).f_floor()?;
+        let column = ((y.f_atan2(&x)? / TAU + 0.5) * columns as f64)
+            .f_floor()?
+            .f_remainder(columns as f64)?;
         let is_seen = (flat.f_select(1, 0)?.f_gt(0.0)?)
             .f_logical_and(&row.f_ge(0.0)?)?
             .f_logical_and(&row.f_lt(rows as f64)?)?
             .f_logical_and(&range.f_gt(LEAST_RANGE_M)?)?;
         // Points that are not seen go to a pixel behind the last.
         let target = (row * columns as f64 + column).f_to_kind(Kind::Int64)?;
-        let target = target.f_where_self(&is_seen, &Tensor::f_full([1], pixels, (Kind::Int64, flat.device()))?)?;
+        let target = target.f_where_self(
+            &is_seen,
+            &Tensor::f_full([1], pixels, (Kind::Int64, flat.device()))?,
+        )?;
         // The pixel that a point comes from, below its range: the least is the closest.
         let source = Tensor::f_arange(pixels, (Kind::Int64, flat.device()))?;
         let depth = (&range / DEPTH_UNIT_M).f_to_kind(Kind::Int64)?;
@@ -108,15 +130,25 @@ impl Augmentation {
         let places = [unit(&range, 0)?, unit(&x, 1)?, unit(&y, 2)?];
         let places = Tensor::f_stack(&places, 1)?;
         let all = Tensor::f_cat(&[places, flat.f_narrow(1, 3, flat.size()[1] - 3)?], 1)?;
-        let images = all.f_gather(2, &origin.f_expand(all.size(), false)?, false)?.f_mul(&is_filled)?;
+        let images = all
+            .f_gather(2, &origin.f_expand(all.size(), false)?, false)?
+            .f_mul(&is_filled)?;
         // Along the heading, in the world.
-        let (cos, sin) = (sweeps.poses.f_narrow(1, 3, 1)?, sweeps.poses.f_narrow(1, 4, 1)?);
+        let (cos, sin) = (
+            sweeps.poses.f_narrow(1, 3, 1)?,
+            sweeps.poses.f_narrow(1, 4, 1)?,
+        );
         let (ahead, left) = (shift_m.f_narrow(1, 0, 1)?, shift_m.f_narrow(1, 1, 1)?);
         let east = (&ahead * &cos - &left * &sin) / normalisation.scale_m[0];
         let north = (&ahead * &sin + &left * &cos) / normalisation.scale_m[1];
         let rest = east.f_zeros_like()?.f_expand([count, 3], false)?;
-        let poses = sweeps.poses.f_add(&Tensor::f_cat(&[east, north, rest], 1)?)?;
-        Ok(Augmented { images: images.f_view(sweeps.images.size().as_slice())?, poses })
+        let poses = sweeps
+            .poses
+            .f_add(&Tensor::f_cat(&[east, north, rest], 1)?)?;
+        Ok(Augmented {
+            images: images.f_view(sweeps.images.size().as_slice())?,
+            poses,
+        })
     }
 
     /// The sweeps of sensors whose points lie `columns` `[N]` further counter-clockwise.
@@ -125,23 +157,40 @@ impl Augmentation {
         let width = images.size()[3];
         let source = Tensor::f_arange(width, (Kind::Int64, images.device()))?;
         let source = source.f_sub(&columns.f_unsqueeze(1)?)?.f_remainder(width)?;
-        let source = source.f_view([-1, 1, 1, width])?.f_expand(images.size(), false)?;
+        let source = source
+            .f_view([-1, 1, 1, width])?
+            .f_expand(images.size(), false)?;
         let images = images.f_gather(3, &source, false)?;
         let angle = columns.f_to_kind(Kind::Float)? * (TAU / width as f64);
         let (cos, sin) = (angle.f_cos()?, angle.f_sin()?);
         let turn = |x: &Tensor, y: &Tensor, cos: &Tensor, sin: &Tensor| {
-            Ok::<_, TchError>([x.f_mul(cos)?.f_sub(&y.f_mul(sin)?)?, x.f_mul(sin)?.f_add(&y.f_mul(cos)?)?])
+            Ok::<_, TchError>([
+                x.f_mul(cos)?.f_sub(&y.f_mul(sin)?)?,
+                x.f_mul(sin)?.f_add(&y.f_mul(cos)?)?,
+            ])
         };
         let of_image = |values: &Tensor| values.f_view([-1, 1, 1, 1]);
-        let [x, y] = turn(&images.f_narrow(1, 1, 1)?, &images.f_narrow(1, 2, 1)?, &of_image(&cos)?, &of_image(&sin)?)?;
+        let [x, y] = turn(
+            &images.f_narrow(1, 1, 1)?,
+            &images.f_narrow(1, 2, 1)?,
+            &of_image(&cos)?,
+            &of_image(&sin)?,
+        )?;
         let rest = images.f_narrow(1, 3, images.size()[1] - 3)?;
         let images = Tensor::f_cat(&[images.f_narrow(1, 0, 1)?, x, y, rest], 1)?;
         // The sensor itself has turned the other way.
         let poses = &sweeps.poses;
         let of_pose = |values: &Tensor| values.f_view([-1, 1]);
-        let [cosine, sine] =
-            turn(&poses.f_narrow(1, 3, 1)?, &poses.f_narrow(1, 4, 1)?, &of_pose(&cos)?, &of_pose(&sin)?.f_neg()?)?;
-        Ok(Augmented { images, poses: Tensor::f_cat(&[poses.f_narrow(1, 0, 3)?, cosine, sine], 1)? })
+        let [cosine, sine] = turn(
+            &poses.f_narrow(1, 3, 1)?,
+            &poses.f_narrow(1, 4, 1)?,
+            &of_pose(&cos)?,
+            &of_pose(&sin)?.f_neg()?,
+        )?;
+        Ok(Augmented {
+            images,
+            poses: Tensor::f_cat(&[poses.f_narrow(1, 0, 3)?, cosine, sine], 1)?,
+        })
     }
 }
 
@@ -149,13 +198,18 @@ impl Augmentation {
 fn spoilt(images: &Tensor) -> Result<Tensor, TchError> {
     let (count, channels, rows, columns) = images.size4()?;
     let on = (Kind::Float, images.device());
-    let kept =
-        Tensor::f_rand([count, 1, rows, columns], on)?.f_ge_tensor(&(Tensor::f_rand([count, 1, 1, 1], on)? * LOST))?;
+    let kept = Tensor::f_rand([count, 1, rows, columns], on)?
+        .f_ge_tensor(&(Tensor::f_rand([count, 1, 1, 1], on)? * LOST))?;
     let place = Tensor::f_arange(columns, on)?.f_view([1, 1, 1, -1])?;
     let first = Tensor::f_rand([count, 1, 1, 1], on)? * columns as f64;
     let width = Tensor::f_rand([count, 1, 1, 1], on)? * (SECTOR * columns as f64);
-    let is_hidden = Tensor::f_rand([count, 1, 1, 1], on)?.f_lt(HIDDEN)?.f_to_kind(Kind::Float)?;
-    let visible = place.f_sub(&first)?.f_remainder(columns as f64)?.f_ge_tensor(&(width * is_hidden))?;
+    let is_hidden = Tensor::f_rand([count, 1, 1, 1], on)?
+        .f_lt(HIDDEN)?
+        .f_to_kind(Kind::Float)?;
+    let visible = place
+        .f_sub(&first)?
+        .f_remainder(columns as f64)?
+        .f_ge_tensor(&(width * is_hidden))?;
     let kept = kept.f_logical_and(&visible)?.f_to_kind(Kind::Float)?;
     let factor = (Tensor::f_randn([count, 1, rows, columns], on)? * RANGE_NOISE + 1.0) * &kept;
     let places = images.f_narrow(1, 0, 4)?.f_mul(&factor)?;
@@ -166,11 +220,21 @@ fn spoilt(images: &Tensor) -> Result<Tensor, TchError> {
 /// Share of the seen pixels of each token that show static objects is a half or more: `[N, T]` of 0 or 1.
 pub(super) fn static_tokens(images: &Tensor, patch: [i64; 2]) -> Result<Tensor, TchError> {
     let pooled = |channel: i64| {
-        images.f_narrow(1, channel, 1)?.f_avg_pool2d(patch, patch, [0, 0], false, true, None)?.f_flatten(1, 3)
+        images
+            .f_narrow(1, channel, 1)?
+            .f_avg_pool2d(patch, patch, [0, 0], false, true, None)?
+            .f_flatten(1, 3)
     };
-    let seen = images.f_narrow(1, 0, 1)?.f_gt(0.0)?.f_to_kind(Kind::Float)?;
-    let seen = seen.f_avg_pool2d(patch, patch, [0, 0], false, true, None)?.f_flatten(1, 3)?;
-    pooled(CHANNELS as i64)?.f_le_tensor(&(seen * 0.5))?.f_to_kind(Kind::Float)
+    let seen = images
+        .f_narrow(1, 0, 1)?
+        .f_gt(0.0)?
+        .f_to_kind(Kind::Float)?;
+    let seen = seen
+        .f_avg_pool2d(patch, patch, [0, 0], false, true, None)?
+        .f_flatten(1, 3)?;
+    pooled(CHANNELS as i64)?
+        .f_le_tensor(&(seen * 0.5))?
+        .f_to_kind(Kind::Float)
 }
 
 #[cfg(test)]
@@ -179,15 +243,31 @@ mod tests {
 
     use super::*;
 
-    const IMAGE: RangeImageConfig = RangeImageConfig { rows: 8, columns: 64, elevations_deg: [-20.0, 20.0] };
-    const PLAIN: Augmentation = Augmentation { image: IMAGE, turn_columns: 0, shift_m: 0.0 };
-    const METRES: Normalisation = Normalisation { origin_m: [0.0; 3], scale_m: [2.0, 4.0, 1.0] };
+    const IMAGE: RangeImageConfig = RangeImageConfig {
+        rows: 8,
+        columns: 64,
+        elevations_deg: [-20.0, 20.0],
+    };
+    const PLAIN: Augmentation = Augmentation {
+        image: IMAGE,
+        turn_columns: 0,
+        shift_m: 0.0,
+    };
+    const METRES: Normalisation = Normalisation {
+        origin_m: [0.0; 3],
+        scale_m: [2.0, 4.0, 1.0],
+    };
 
     /// Points far enough apart that none hides another.
     fn cloud() -> Vec<[f32; 4]> {
         let point = |number: usize| {
             let (azimuth, range) = (number as f32 * 0.41 + 0.03, 12.0 + number as f32);
-            [range * azimuth.cos(), range * azimuth.sin(), number as f32 % 5.0 - 2.3, 0.5 + number as f32 * 0.01]
+            [
+                range * azimuth.cos(),
+                range * azimuth.sin(),
+                number as f32 % 5.0 - 2.3,
+                0.5 + number as f32 * 0.01,
+            ]
         };
         (0..15).map(point).collect()
     }
@@ -197,14 +277,31 @@ mod tests {
         tch::set_num_threads(1);
         let mut values = IMAGE.image(cloud);
         values.extend(vec![0.0; IMAGE.pixels()]);
-        let images = Tensor::from_slice(&values).view([1, -1, IMAGE.rows as i64, IMAGE.columns as i64]);
-        Augmented { images, poses: Tensor::from_slice(&pose).view([1, 5]) }
+        let images =
+            Tensor::from_slice(&values).view([1, -1, IMAGE.rows as i64, IMAGE.columns as i64]);
+        Augmented {
+            images,
+            poses: Tensor::from_slice(&pose).view([1, 5]),
+        }
     }
 
     fn assert_equal(found: &Augmented, expected: &Augmented) {
         assert!(found.images.allclose(&expected.images, 1e-4, 1e-4, false));
-        assert!(found.poses.allclose(&expected.poses, 1e-5, 1e-5, false), "{} {}", found.poses, expected.poses);
-        assert!(found.images.select(1, 0).gt(0.0).sum(Kind::Int64).int64_value(&[]) >= 15);
+        assert!(
+            found.poses.allclose(&expected.poses, 1e-5, 1e-5, false),
+            "{} {}",
+            found.poses,
+            expected.poses
+        );
+        assert!(
+            found
+                .images
+                .select(1, 0)
+                .gt(0.0)
+                .sum(Kind::Int64)
+                .int64_value(&[])
+                >= 15
+        );
     }
 
     #[test]
@@ -212,8 +309,16 @@ mod tests {
         let columns = 11;
         let angle = columns as f32 * std::f32::consts::TAU / IMAGE.columns as f32;
         let (sin, cos) = angle.sin_cos();
-        let turned: Vec<_> = cloud().iter().map(|&[x, y, z, i]| [x * cos - y * sin, x * sin + y * cos, z, i]).collect();
-        let found = PLAIN.turned(&sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]), &Tensor::from_slice(&[columns])).unwrap();
+        let turned: Vec<_> = cloud()
+            .iter()
+            .map(|&[x, y, z, i]| [x * cos - y * sin, x * sin + y * cos, z, i])
+            .collect();
+        let found = PLAIN
+            .turned(
+                &sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]),
+                &Tensor::from_slice(&[columns]),
+            )
+            .unwrap();
         // Its points have moved counter-clockwise, so the sensor has turned clockwise: heading 90 degrees less.
         assert_equal(&found, &sweep(&turned, [3.0, 4.0, 5.0, sin, cos]));
     }
@@ -221,11 +326,19 @@ mod tests {
     #[test]
     fn moved_pixels_are_the_sweep_of_a_moved_sensor() {
         let (ahead, left) = (1.5, -0.5);
-        let moved: Vec<_> = cloud().iter().map(|&[x, y, z, i]| [x - ahead, y - left, z, i]).collect();
+        let moved: Vec<_> = cloud()
+            .iter()
+            .map(|&[x, y, z, i]| [x - ahead, y - left, z, i])
+            .collect();
         let shift = Tensor::from_slice(&[ahead, left]).view([1, 2]);
-        let found = PLAIN.shifted(&sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]), &shift, &METRES).unwrap();
+        let found = PLAIN
+            .shifted(&sweep(&cloud(), [3.0, 4.0, 5.0, 0.0, 1.0]), &shift, &METRES)
+            .unwrap();
         // Ahead is north, left is west.
-        assert_equal(&found, &sweep(&moved, [3.0 + 0.5 / 2.0, 4.0 + 1.5 / 4.0, 5.0, 0.0, 1.0]));
+        assert_equal(
+            &found,
+            &sweep(&moved, [3.0 + 0.5 / 2.0, 4.0 + 1.5 / 4.0, 5.0, 0.0, 1.0]),
+        );
     }
 
     #[test]
@@ -233,7 +346,9 @@ mod tests {
         // On one line of sight only from the new place.
         let (near, far) = ([6.0, 1.0, 0.1, 0.5], [11.0, 1.0, 0.1, 0.9]);
         let shift = Tensor::from_slice(&[0.0f32, 0.97]).view([1, 2]);
-        let found = PLAIN.shifted(&sweep(&[near, far], [0.0; 5]), &shift, &METRES).unwrap();
+        let found = PLAIN
+            .shifted(&sweep(&[near, far], [0.0; 5]), &shift, &METRES)
+            .unwrap();
         let range = found.images.select(1, 0);
         assert_eq!(range.gt(0.0).sum(Kind::Int64).int64_value(&[]), 1);
         assert!((range.max().double_value(&[]) * 20.0 - 6.0).abs() < 0.01);
@@ -244,7 +359,8 @@ mod tests {
         let images = Tensor::zeros([1, 6, 2, 8], (Kind::Float, Device::Cpu));
         let _ = images.narrow(1, 0, 1).narrow(3, 0, 6).fill_(1.0);
         let _ = images.narrow(1, 5, 1).narrow(3, 3, 3).fill_(1.0);
-        let statics: Vec<f32> = Vec::try_from(static_tokens(&images, [2, 2]).unwrap().view([-1])).unwrap();
+        let statics: Vec<f32> =
+            Vec::try_from(static_tokens(&images, [2, 2]).unwrap().view([-1])).unwrap();
         assert_eq!(statics, [1.0, 1.0, 0.0, 1.0]);
     }
 }

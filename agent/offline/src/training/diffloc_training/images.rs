@@ -70,14 +70,28 @@ impl SweepImages {
         let source = Arc::clone(list);
         let mut loader = Prefetch::start(run.loader_threads, 0, move |number| {
             let number = number as usize;
-            (number < source.len()).then(|| prepare(&source, number, config)).flatten()
+            (number < source.len())
+                .then(|| prepare(&source, number, config))
+                .flatten()
         });
-        let size = [total as i64, STORED_CHANNELS, config.rows as i64, config.columns as i64];
+        let size = [
+            total as i64,
+            STORED_CHANNELS,
+            config.rows as i64,
+            config.columns as i64,
+        ];
         let images = Tensor::f_empty(size, (Kind::Half, run.device))?;
         let (mut poses, mut drives) = (Vec::new(), Vec::new());
         for done in 1..=total {
-            if let Some(Prepared { values, world_from_sensor, drive }) = loader.next_batch()? {
-                let image = Tensor::f_from_slice(&values)?.f_to_kind(Kind::Half)?.f_view(&size[1..])?;
+            if let Some(Prepared {
+                values,
+                world_from_sensor,
+                drive,
+            }) = loader.next_batch()?
+            {
+                let image = Tensor::f_from_slice(&values)?
+                    .f_to_kind(Kind::Half)?
+                    .f_view(&size[1..])?;
                 no_grad(|| images.f_get(poses.len() as i64)?.f_copy_(&image))?;
                 poses.push(world_from_sensor);
                 drives.push(drive);
@@ -103,7 +117,10 @@ impl SweepImages {
 
     /// Some images `[N, STORED_CHANNELS, rows, columns]` and poses `[N, 5]`, one after another.
     pub(super) fn narrow(&self, first: i64, count: i64) -> Result<SweepBatch, TchError> {
-        Ok(SweepBatch { images: self.images.f_narrow(0, first, count)?, poses: self.poses.f_narrow(0, first, count)? })
+        Ok(SweepBatch {
+            images: self.images.f_narrow(0, first, count)?,
+            poses: self.poses.f_narrow(0, first, count)?,
+        })
     }
 
     /// `count` random windows of `frames` sweeps of a drive, oldest first, equally far apart; where a drive has just
@@ -113,31 +130,47 @@ impl SweepImages {
         let last = Tensor::f_randint(self.len(), [count, 1], on)?;
         let skip = Tensor::f_randint_low(1, LONGEST_SKIP + 1, [count, 1], on)?;
         let back = Tensor::f_arange_start_step(frames - 1, -1, -1, on)?;
-        let first = self.first_of_drive.f_index_select(0, &last.f_view([-1])?)?.f_view([-1, 1])?;
-        let rows = last.f_sub(&skip.f_mul(&back)?)?.f_maximum(&first)?.f_view([-1])?;
-        Ok(SweepBatch { images: self.images.f_index_select(0, &rows)?, poses: self.poses.f_index_select(0, &rows)? })
+        let first = self
+            .first_of_drive
+            .f_index_select(0, &last.f_view([-1])?)?
+            .f_view([-1, 1])?;
+        let rows = last
+            .f_sub(&skip.f_mul(&back)?)?
+            .f_maximum(&first)?
+            .f_view([-1])?;
+        Ok(SweepBatch {
+            images: self.images.f_index_select(0, &rows)?,
+            poses: self.poses.f_index_select(0, &rows)?,
+        })
     }
 }
 
 impl Normalisation {
     fn of(poses: &[Isometry3<f64>]) -> Self {
         let count = poses.len() as f64;
-        let mean = |value: &dyn Fn(&Isometry3<f64>) -> f64| poses.iter().map(value).sum::<f64>() / count;
-        let origin_m: [f64; 3] = std::array::from_fn(|axis| mean(&|pose| pose.translation.vector[axis]));
+        let mean =
+            |value: &dyn Fn(&Isometry3<f64>) -> f64| poses.iter().map(value).sum::<f64>() / count;
+        let origin_m: [f64; 3] =
+            std::array::from_fn(|axis| mean(&|pose| pose.translation.vector[axis]));
         let scale_m = std::array::from_fn(|axis| {
-            mean(&|pose| (pose.translation.vector[axis] - origin_m[axis]).powi(2)).sqrt().max(LEAST_SCALE_M)
+            mean(&|pose| (pose.translation.vector[axis] - origin_m[axis]).powi(2))
+                .sqrt()
+                .max(LEAST_SCALE_M)
         });
         Self { origin_m, scale_m }
     }
 
     fn normalise(&self, poses: &[Isometry3<f64>], device: Device) -> Result<Tensor, TchError> {
         let rows: Vec<f32> = poses.iter().flat_map(|pose| self.row(pose)).collect();
-        Tensor::f_from_slice(&rows)?.f_view([-1, 5])?.f_to_device(device)
+        Tensor::f_from_slice(&rows)?
+            .f_view([-1, 5])?
+            .f_to_device(device)
     }
 
     fn row(&self, pose: &Isometry3<f64>) -> [f32; 5] {
         let position = pose.translation.vector - Vector3::from(self.origin_m);
-        let [x, y, z]: [f32; 3] = std::array::from_fn(|axis| (position[axis] / self.scale_m[axis]) as f32);
+        let [x, y, z]: [f32; 3] =
+            std::array::from_fn(|axis| (position[axis] / self.scale_m[axis]) as f32);
         let (sin, cos) = heading_rad(pose).sin_cos();
         [x, y, z, cos as f32, sin as f32]
     }
@@ -148,18 +181,33 @@ fn prepare(list: &SweepList, index: usize, config: RangeImageConfig) -> Option<P
     let mut values = config.image(&frame.points.xyzi);
     let movable = movable_pixels(&frame, &world_from_sensor, &values, config.pixels());
     values.extend(movable);
-    Some(Prepared { values, world_from_sensor, drive: list.drive(index)? })
+    Some(Prepared {
+        values,
+        world_from_sensor,
+        drive: list.drive(index)?,
+    })
 }
 
 /// `[pixels]`: 1 for each pixel of an image that shows a point in an annotated box, else 0.
-fn movable_pixels(frame: &Frame, world_from_sensor: &Isometry3<f64>, image: &[f32], pixels: usize) -> Vec<f32> {
-    let boxes: Vec<SensorBox> = frame.objects.iter().map(|object| SensorBox::new(object, world_from_sensor)).collect();
+fn movable_pixels(
+    frame: &Frame,
+    world_from_sensor: &Isometry3<f64>,
+    image: &[f32],
+    pixels: usize,
+) -> Vec<f32> {
+    let boxes: Vec<SensorBox> = frame
+        .objects
+        .iter()
+        .map(|object| SensorBox::new(object, world_from_sensor))
+        .collect();
     let axis = |channel: usize, pixel: usize| image[channel * pixels + pixel] * UNITS[channel];
     let is_movable = |pixel: usize| {
         let point = Point3::new(axis(1, pixel), axis(2, pixel), axis(3, pixel));
         image[pixel] > 0.0 && boxes.iter().any(|of| of.contains(&point))
     };
-    (0..pixels).map(|pixel| f32::from(u8::from(is_movable(pixel)))).collect()
+    (0..pixels)
+        .map(|pixel| f32::from(u8::from(is_movable(pixel))))
+        .collect()
 }
 
 /// An annotated box as seen from the sensor.
@@ -172,11 +220,19 @@ struct SensorBox {
 
 impl SensorBox {
     fn new(object: &Object, world_from_sensor: &Isometry3<f64>) -> Self {
-        let object_from_sensor = object.world_from_object.isometry().inv_mul(world_from_sensor);
+        let object_from_sensor = object
+            .world_from_object
+            .isometry()
+            .inv_mul(world_from_sensor);
         let [length, width, height] = object.size_m.map(|size| size as f32 / 2.0);
         let half_m = [length + BOX_MARGIN_M, width + BOX_MARGIN_M, height];
         Self {
-            center: object_from_sensor.inverse().translation.vector.cast().into(),
+            center: object_from_sensor
+                .inverse()
+                .translation
+                .vector
+                .cast()
+                .into(),
             object_from_sensor: object_from_sensor.cast(),
             half_m,
             radius_m: Vector3::from(half_m).norm(),
@@ -229,7 +285,12 @@ mod tests {
         };
         let mut frame = Frame::empty(CavId::new("7").unwrap(), 0, Handedness::Right);
         frame.objects = vec![car];
-        let points = [[9.0, 1.5, -1.2, 0.5], [9.0, -1.5, -1.2, 0.5], [13.0, 4.0, -1.0, 0.5], [9.0, 2.6, -1.2, 0.5]];
+        let points = [
+            [9.0, 1.5, -1.2, 0.5],
+            [9.0, -1.5, -1.2, 0.5],
+            [13.0, 4.0, -1.0, 0.5],
+            [9.0, 2.6, -1.2, 0.5],
+        ];
         let config = RangeImageConfig::default();
         let image = config.image(&points);
         let movable = movable_pixels(&frame, &sensor.isometry(), &image, config.pixels());
@@ -246,7 +307,13 @@ mod tests {
         let place = |number: usize| Isometry3::translation(number as f64, 0.0, 0.0);
         let poses: Vec<_> = (0..5).map(place).collect();
         let normalisation = Normalisation::of(&poses);
-        assert_eq!(normalisation, Normalisation { origin_m: [2.0, 0.0, 0.0], scale_m: [2.0_f64.sqrt(), 1.0, 1.0] });
+        assert_eq!(
+            normalisation,
+            Normalisation {
+                origin_m: [2.0, 0.0, 0.0],
+                scale_m: [2.0_f64.sqrt(), 1.0, 1.0]
+            }
+        );
         let images = SweepImages {
             images: Tensor::zeros([5, 1, 1, 1], (Kind::Half, Device::Cpu)),
             poses: normalisation.normalise(&poses, Device::Cpu).unwrap(),
@@ -256,7 +323,10 @@ mod tests {
         let windows = images.draw(200, 3).unwrap().poses.narrow(1, 0, 1) * 2.0_f64.sqrt() + 2.0;
         let rows: Vec<f32> = Vec::try_from(windows.round().view([-1])).unwrap();
         for window in rows.chunks_exact(3) {
-            assert!(window.is_sorted() && drives[window[0] as usize] == drives[window[2] as usize], "{window:?}");
+            assert!(
+                window.is_sorted() && drives[window[0] as usize] == drives[window[2] as usize],
+                "{window:?}"
+            );
         }
         assert!(rows.chunks_exact(3).any(|window| window == [0.0, 1.0, 2.0]));
     }

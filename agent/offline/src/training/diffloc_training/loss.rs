@@ -35,38 +35,63 @@ pub(super) fn losses(
     frames: i64,
     kind: Kind,
 ) -> Result<Losses, TchError> {
-    let images = batch.images.f_narrow(1, 0, CHANNELS as i64)?.f_to_kind(kind)?;
+    let images = batch
+        .images
+        .f_narrow(1, 0, CHANNELS as i64)?
+        .f_to_kind(kind)?;
     let encoded = network.encoder().forward(&images, true)?;
     let statics = static_tokens(&batch.images, network.config().patch)?;
-    let mask =
-        encoded.static_logits.f_binary_cross_entropy_with_logits::<Tensor>(&statics, None, None, Reduction::Mean)?;
-    let place = places.losses([&encoded.features], &batch.poses)?.f_select(0, 0)?;
-    let features = encoded.features.f_view([-1, frames, network.config().width])?;
-    let [pose, differences] = pose_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
+    let mask = encoded
+        .static_logits
+        .f_binary_cross_entropy_with_logits::<Tensor>(&statics, None, None, Reduction::Mean)?;
+    let place = places
+        .losses([&encoded.features], &batch.poses)?
+        .f_select(0, 0)?;
+    let features = encoded
+        .features
+        .f_view([-1, frames, network.config().width])?;
+    let [pose, differences] =
+        pose_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
     let total = &pose + differences + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;
-    Ok(Losses { total, pose: pose.f_detach()?, place: place.f_detach()?, features: features.f_detach()? })
+    Ok(Losses {
+        total,
+        pose: pose.f_detach()?,
+        place: place.f_detach()?,
+        features: features.f_detach()?,
+    })
 }
 
 /// L1 of the poses, and of their differences between sweeps that see each other.
-fn pose_losses(network: &DiffLoc, features: &Tensor, poses: &Tensor) -> Result<[Tensor; 2], TchError> {
+fn pose_losses(
+    network: &DiffLoc,
+    features: &Tensor,
+    poses: &Tensor,
+) -> Result<[Tensor; 2], TchError> {
     let drawn = |of: &Tensor| of.f_repeat([DRAWS, 1, 1]);
     let (features, poses) = (drawn(features)?, drawn(poses)?);
     let (count, frames, _) = poses.size3()?;
     let on = (Kind::Float, poses.device());
     let schedule = network.schedule();
     // The larger of two: where noise hides the pose, it has to come from the features.
-    let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?.f_amax(0_i64, false)?;
+    let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?
+        .f_amax(0_i64, false)?;
     let noise = Tensor::f_randn(poses.size(), on)?;
-    let joint = Tensor::f_rand([count], on)?.f_ge(SINGLE)?.f_to_kind(Kind::Float)?;
+    let joint = Tensor::f_rand([count], on)?
+        .f_ge(SINGLE)?
+        .f_to_kind(Kind::Float)?;
     let noisy = schedule.add_noise(&poses, &noise, &steps)?;
-    let velocity = network.denoiser().forward(&noisy, &steps, &features, Windows::Joint(&joint))?;
+    let velocity = network
+        .denoiser()
+        .forward(&noisy, &steps, &features, Windows::Joint(&joint))?;
     let error = schedule.poses(&noisy, &velocity, &steps)?.f_sub(&poses)?;
     let mean = error.f_abs()?.f_mean(Kind::Float)?;
     if frames < 2 {
         let none = mean.f_zeros_like()?;
         return Ok([mean, none]);
     }
-    let differences =
-        error.f_diff::<Tensor>(1, 1, None, None)?.f_abs()?.f_mean_dim([1_i64, 2].as_slice(), false, Kind::Float)?;
+    let differences = error
+        .f_diff::<Tensor>(1, 1, None, None)?
+        .f_abs()?
+        .f_mean_dim([1_i64, 2].as_slice(), false, Kind::Float)?;
     Ok([mean, differences.f_mul(&joint)?.f_mean(Kind::Float)?])
 }

@@ -31,7 +31,8 @@ const REPORT_EVERY: u64 = 50;
 /// Steps between two checkpoints and validations.
 const CHECKPOINT_EVERY: u64 = 1000;
 /// Columns of the training curve.
-const CURVE: &str = "step,seconds,pose_l1,place_loss,p50_m,success_3m,validation_p50_m,validation_success_3m";
+const CURVE: &str =
+    "step,seconds,pose_l1,place_loss,p50_m,success_3m,validation_p50_m,validation_success_3m";
 
 /// Configuration of a training of DiffLoc.
 #[derive(Debug, Clone)]
@@ -110,23 +111,53 @@ pub fn train_diffloc(
         folders => {
             let list = Arc::new(SweepList::open(folders)?);
             let normalisation = Some(images.normalisation);
-            Some(SweepImages::read(&list, config.network.image, normalisation, run, &mut imaging)?)
+            Some(SweepImages::read(
+                &list,
+                config.network.image,
+                normalisation,
+                run,
+                &mut imaging,
+            )?)
         }
     };
-    let network_config = DiffLocConfig { origin_m, scale_m, ..config.network.clone() };
+    let network_config = DiffLocConfig {
+        origin_m,
+        scale_m,
+        ..config.network.clone()
+    };
     let variables = VarStore::new(run.device);
     let network = DiffLoc::new(&variables.root(), &network_config)?;
     let places = [variables.root() / "places"];
-    let places = PlaceClasses::new(places, network_config.width, &images.poses, scale_m, run.seed)?;
+    let places = PlaceClasses::new(
+        places,
+        network_config.width,
+        &images.poses,
+        scale_m,
+        run.seed,
+    )?;
     let trainer = Trainer::begin(run, &variables, None, started)?;
-    let mut training = Training { config, network, places, variables, images, validation, trainer, last: None };
+    let mut training = Training {
+        config,
+        network,
+        places,
+        variables,
+        images,
+        validation,
+        trainer,
+        last: None,
+    };
     training.run(observe)?;
     let about = BTreeMap::from([
-        (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
+        (
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(&network_config).expect("a configuration is JSON"),
+        ),
         (KIND_KEY.to_owned(), DiffLocLocalizer::KIND.to_owned()),
     ]);
     Ok(DiffLocSummary {
-        trained: training.trainer.save_weights(&training.variables, about, list.data())?,
+        trained: training
+            .trainer
+            .save_weights(&training.variables, about, list.data())?,
         sweeps: training.images.len() as usize,
         network: network_config,
         validation: training.last,
@@ -157,20 +188,39 @@ impl Training<'_> {
             let step = self.trainer.steps();
             if self.trainer.is_report_due(REPORT_EVERY) || self.share_done() >= 1.0 {
                 let mean = Tensor::f_stack(&means, 0)?.f_mean_dim(0_i64, false, Kind::Double)?;
-                let (pose_l1, place_loss) = (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
+                let (pose_l1, place_loss) =
+                    (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
                 means.clear();
                 let seconds = self.trainer.seconds();
-                let accuracy = accuracy(&self.network, &losses.features, &losses.poses, &self.images.normalisation)?;
+                let accuracy = accuracy(
+                    &self.network,
+                    &losses.features,
+                    &losses.poses,
+                    &self.images.normalisation,
+                )?;
                 let share_done = self.share_done().min(1.0);
-                observe(&DiffLocReport::Stepped { step, share_done, seconds, pose_l1, place_loss, accuracy });
+                observe(&DiffLocReport::Stepped {
+                    step,
+                    share_done,
+                    seconds,
+                    pose_l1,
+                    place_loss,
+                    accuracy,
+                });
                 if step.is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0 {
                     self.trainer.checkpoint(&self.variables)?;
                     self.validate(observe)?;
                 }
                 let of = |accuracy: DiffLocAccuracy| [accuracy.p50_m, accuracy.success_3m];
                 let validated = self.last.map_or([f64::NAN; 2], of);
-                curve
-                    .numbers(&[&[step as f64, seconds, pose_l1, place_loss], &of(accuracy)[..], &validated].concat())?;
+                curve.numbers(
+                    &[
+                        &[step as f64, seconds, pose_l1, place_loss],
+                        &of(accuracy)[..],
+                        &validated,
+                    ]
+                    .concat(),
+                )?;
             }
         }
         Ok(())
@@ -178,12 +228,19 @@ impl Training<'_> {
 
     fn share_done(&self) -> f64 {
         let sweeps = self.trainer.steps() * self.config.run.batch as u64;
-        self.trainer.share_done(sweeps as f64 / self.images.len() as f64)
+        self.trainer
+            .share_done(sweeps as f64 / self.images.len() as f64)
     }
 
     /// Order, augmentation and noise follow from seed and step, so a resumed training is the uninterrupted one.
     fn step(&mut self) -> Result<StepLosses, LocalizerTrainError> {
-        let Self { config, network, places, images, .. } = self;
+        let Self {
+            config,
+            network,
+            places,
+            images,
+            ..
+        } = self;
         let run = &config.run;
         tch::manual_seed(run.seed.wrapping_shl(32).wrapping_add(self.trainer.steps()) as i64);
         let frames = config.network.frames;
@@ -198,10 +255,17 @@ impl Training<'_> {
         let share_done = self.share_done();
         self.trainer.step(&losses.total, share_done)?;
         let means = Tensor::f_stack(&[losses.pose, losses.place], 0)?;
-        Ok(StepLosses { means, features: losses.features.f_flatten(0, 1)?, poses: batch.poses })
+        Ok(StepLosses {
+            means,
+            features: losses.features.f_flatten(0, 1)?,
+            poses: batch.poses,
+        })
     }
 
-    fn validate(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), LocalizerTrainError> {
+    fn validate(
+        &mut self,
+        observe: &mut dyn FnMut(&DiffLocReport),
+    ) -> Result<(), LocalizerTrainError> {
         if let Some(images) = &self.validation {
             let accuracy = validate(&self.network, images, self.config.run.precision.kind())?;
             observe(&DiffLocReport::Validated(self.trainer.seconds(), accuracy));

@@ -14,7 +14,10 @@ const MAX_DROPPED: f64 = 0.3;
 
 /// Turns each sweep about the vertical by a random whole number of columns of the image, at most `turn_rad` to either
 /// side, which its heading follows; moves points and ranges a little, and leaves some out.
-pub(super) fn augment((batch, truth): (InputBatch, Truth), turn_rad: f64) -> Result<(InputBatch, Truth), TchError> {
+pub(super) fn augment(
+    (batch, truth): (InputBatch, Truth),
+    turn_rad: f64,
+) -> Result<(InputBatch, Truth), TchError> {
     let (sweeps, device) = (batch.len(), batch.points_m.device());
     let most = (turn_rad / TAU * COLUMNS as f64).round() as i64;
     let columns = Tensor::f_randint_low(-most, most + 1, [sweeps], (Kind::Int64, device))?;
@@ -29,11 +32,23 @@ pub(super) fn augment((batch, truth): (InputBatch, Truth), turn_rad: f64) -> Res
         like.f_rand_like()?.f_lt_tensor(&share)
     };
     let groups = batch.groups.without(&dropped(&points_m.f_select(2, 0)?)?)?;
-    let is_seen = ranges_m.f_gt(0.0)?.f_logical_and(&dropped(&ranges_m)?.f_logical_not()?)?;
+    let is_seen = ranges_m
+        .f_gt(0.0)?
+        .f_logical_and(&dropped(&ranges_m)?.f_logical_not()?)?;
     let ranges_m = (&ranges_m + ranges_m.f_randn_like()? * JITTER_M) * is_seen;
     // A sensor that is turned to the right sees all points turned to the left.
     let heading = turned(&truth.heading, &-turn)?;
-    Ok((InputBatch { points_m, ranges_m, groups }, Truth { position: truth.position, heading }))
+    Ok((
+        InputBatch {
+            points_m,
+            ranges_m,
+            groups,
+        },
+        Truth {
+            position: truth.position,
+            heading,
+        },
+    ))
 }
 
 /// Rotates vectors `[.., 2 or 3]` about the vertical by angles `[..]`, radians.
@@ -59,7 +74,11 @@ mod tests {
     fn wall() -> Vec<[f32; 3]> {
         let point = |k: i32| {
             let azimuth = (30.0 + 0.02 * (k % 1000) as f32).to_radians();
-            [40.0 * azimuth.cos(), 40.0 * azimuth.sin(), -1.0 - (k / 1000) as f32]
+            [
+                40.0 * azimuth.cos(),
+                40.0 * azimuth.sin(),
+                -1.0 - (k / 1000) as f32,
+            ]
         };
         (0..8000).map(point).collect()
     }
@@ -76,15 +95,29 @@ mod tests {
         let heading = Tensor::from_slice(&[0.0f32, 1.0]).view([1, 2]);
         for _ in 0..8 {
             let batch = InputBatch::new(std::slice::from_ref(&input), Device::Cpu).unwrap();
-            let truth = Truth { position: Tensor::from_slice(&[1f32, 2.0, 3.0]).view([1, 3]), heading: heading.copy() };
+            let truth = Truth {
+                position: Tensor::from_slice(&[1f32, 2.0, 3.0]).view([1, 3]),
+                heading: heading.copy(),
+            };
             let (batch, truth) = augment((batch, truth), TAU / 2.0).unwrap();
             let pair = |of: &Tensor| azimuth_deg(of.double_value(&[0]), of.double_value(&[1]));
             let heading_deg = pair(&truth.heading.view([2]));
             // The wall's middle: 40 degrees to the left of a vehicle that heads north.
-            let off = |azimuth_deg: f64| (azimuth_deg + heading_deg - 130.0 + 540.0).rem_euclid(360.0) - 180.0;
+            let off = |azimuth_deg: f64| {
+                (azimuth_deg + heading_deg - 130.0 + 540.0).rem_euclid(360.0) - 180.0
+            };
             let middle = batch.points_m.mean_dim(1_i64, false, Kind::Float).view([3]);
-            assert!(off(pair(&middle)).abs() < 1.5, "{} {heading_deg}", pair(&middle));
-            let seen = batch.ranges_m.gt(0.0).nonzero().narrow(1, 2, 1).to_kind(Kind::Float);
+            assert!(
+                off(pair(&middle)).abs() < 1.5,
+                "{} {heading_deg}",
+                pair(&middle)
+            );
+            let seen = batch
+                .ranges_m
+                .gt(0.0)
+                .nonzero()
+                .narrow(1, 2, 1)
+                .to_kind(Kind::Float);
             let turn = (seen + 0.5) * (TAU / COLUMNS as f64) - TAU / 2.0;
             let sum = |of: Tensor| of.sum(Kind::Float).double_value(&[]);
             let image_deg = azimuth_deg(sum(turn.cos()), sum(turn.sin()));

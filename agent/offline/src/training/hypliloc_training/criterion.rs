@@ -21,7 +21,9 @@ pub(super) struct Criteria {
 impl Criteria {
     pub(super) fn new(path: &nn::Path<'_>) -> Self {
         let mut log_variances = path.var("log_variances", &[3, 2], Init::Const(0.0));
-        tch::no_grad(|| log_variances.copy_(&(Tensor::from_slice(&START) / RATE).expand([3, 2], false)));
+        tch::no_grad(|| {
+            log_variances.copy_(&(Tensor::from_slice(&START) / RATE).expand([3, 2], false))
+        });
         Self { log_variances }
     }
 
@@ -39,15 +41,27 @@ impl Criteria {
 }
 
 /// `[2]` mean distance, metres, and mean heading error, radians; no gradient.
-pub(super) fn mean_errors(found: &NormalisedPoses, truth: &Truth, scale_m: &Tensor) -> Result<Tensor, TchError> {
+pub(super) fn mean_errors(
+    found: &NormalisedPoses,
+    truth: &Truth,
+    scale_m: &Tensor,
+) -> Result<Tensor, TchError> {
     let off = (found.position.detach() - &truth.position) * scale_m;
-    let distance = off.f_square()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_sqrt()?;
-    let parts = |heading: &Tensor| Ok::<_, TchError>((heading.f_select(1, 0)?, heading.f_select(1, 1)?));
-    let ((cosine, sine), (true_cosine, true_sine)) = (parts(&found.heading.detach())?, parts(&truth.heading)?);
+    let distance = off
+        .f_square()?
+        .f_sum_dim_intlist(1_i64, false, Kind::Float)?
+        .f_sqrt()?;
+    let parts =
+        |heading: &Tensor| Ok::<_, TchError>((heading.f_select(1, 0)?, heading.f_select(1, 1)?));
+    let ((cosine, sine), (true_cosine, true_sine)) =
+        (parts(&found.heading.detach())?, parts(&truth.heading)?);
     let across = &sine * &true_cosine - &cosine * &true_sine;
     let along = cosine * true_cosine + sine * true_sine;
     let angle = across.f_atan2(&along)?.f_abs()?;
-    Tensor::f_stack(&[distance.f_mean(Kind::Float)?, angle.f_mean(Kind::Float)?], 0)
+    Tensor::f_stack(
+        &[distance.f_mean(Kind::Float)?, angle.f_mean(Kind::Float)?],
+        0,
+    )
 }
 
 #[cfg(test)]
@@ -63,8 +77,14 @@ mod tests {
 
     #[test]
     fn errors_are_in_metres_and_radians() {
-        let found = NormalisedPoses { position: rows([0.3, 0.0, 0.0]), heading: rows([0.0, 0.2]) };
-        let truth = Truth { position: rows([0.0, 0.2, 0.0]), heading: rows([1.0, 0.0]) };
+        let found = NormalisedPoses {
+            position: rows([0.3, 0.0, 0.0]),
+            heading: rows([0.0, 0.2]),
+        };
+        let truth = Truth {
+            position: rows([0.0, 0.2, 0.0]),
+            heading: rows([1.0, 0.0]),
+        };
         let errors = mean_errors(&found, &truth, &Tensor::from_slice(&[10f32, 20.0, 1.0])).unwrap();
         let wanted = Tensor::from_slice(&[5.0, std::f32::consts::FRAC_PI_2]);
         assert!(errors.allclose(&wanted, 1e-5, 1e-5, false), "{errors:?}");
@@ -74,17 +94,38 @@ mod tests {
     fn every_branch_counts_and_weights_begin_as_those_of_atloc() {
         let variables = VarStore::new(Device::Cpu);
         let criteria = Criteria::new(&variables.root());
-        let pose = |off: f32| NormalisedPoses { position: rows([off; 3]), heading: rows([1.0 - off, 0.0]) };
-        let truth = Truth { position: rows([0.0; 3]), heading: rows([1.0, 0.0]) };
+        let pose = |off: f32| NormalisedPoses {
+            position: rows([off; 3]),
+            heading: rows([1.0 - off, 0.0]),
+        };
+        let truth = Truth {
+            position: rows([0.0; 3]),
+            heading: rows([1.0, 0.0]),
+        };
         let loss = |offs: [f32; 3]| {
             let [points, image, fusion] = offs.map(pose);
-            let poses = BranchPoses { points, image, fusion, features: [0.0; 3].map(|of| rows([of])) };
-            no_grad(|| criteria.loss(&poses, &truth)).unwrap().double_value(&[])
+            let poses = BranchPoses {
+                points,
+                image,
+                fusion,
+                features: [0.0; 3].map(|of| rows([of])),
+            };
+            no_grad(|| criteria.loss(&poses, &truth))
+                .unwrap()
+                .double_value(&[])
         };
         // Three times -3, and for an error of 0.1 in one branch 0.1 of the position and 0.05 e^3 of the heading.
         let more = 0.1 + 0.05 * 3f64.exp();
-        for (offs, wanted) in [([0.0; 3], -9.0), ([0.1, 0.0, 0.0], more - 9.0), ([0.0, 0.1, 0.1], 2.0 * more - 9.0)] {
-            assert!((loss(offs) - wanted).abs() < 1e-4, "{offs:?}: {}", loss(offs));
+        for (offs, wanted) in [
+            ([0.0; 3], -9.0),
+            ([0.1, 0.0, 0.0], more - 9.0),
+            ([0.0, 0.1, 0.1], 2.0 * more - 9.0),
+        ] {
+            assert!(
+                (loss(offs) - wanted).abs() < 1e-4,
+                "{offs:?}: {}",
+                loss(offs)
+            );
         }
     }
 }

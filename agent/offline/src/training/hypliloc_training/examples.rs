@@ -50,7 +50,8 @@ impl Examples {
         let source = Arc::clone(&list);
         let mut loader = Prefetch::start(run.loader_threads, 0, move |chunk| {
             let first = chunk as usize * CHUNK;
-            let read = (first..(first + CHUNK).min(total)).filter_map(|index| source.read(index, RANGE_M));
+            let read =
+                (first..(first + CHUNK).min(total)).filter_map(|index| source.read(index, RANGE_M));
             let sampled = read.map(|sweep| {
                 let points_m: Vec<[f32; 3]> = sweep.points().collect();
                 (SweepInput::new(&points_m), sweep.world_from_sensor)
@@ -78,12 +79,23 @@ impl Examples {
         }
         let mut data = list.data();
         if too_empty > 0 {
-            data.problems.push(format!("{too_empty} sweeps show too little to be localized"));
+            data.problems.push(format!(
+                "{too_empty} sweeps show too little to be localized"
+            ));
         }
         let (origin_m, deviation_m) = statistics(&poses);
-        let scale_m = Tensor::f_from_slice(&deviation_m)?.f_to_kind(Kind::Float)?.f_to_device(run.device)?;
+        let scale_m = Tensor::f_from_slice(&deviation_m)?
+            .f_to_kind(Kind::Float)?
+            .f_to_device(run.device)?;
         let truth = Truth::new(&poses, origin_m, deviation_m)?.to_device(run.device)?;
-        Ok(Self { inputs: InputBatch::concatenate(chunks)?, truth, origin_m, deviation_m, scale_m, data })
+        Ok(Self {
+            inputs: InputBatch::concatenate(chunks)?,
+            truth,
+            origin_m,
+            deviation_m,
+            scale_m,
+            data,
+        })
     }
 
     /// Number of sweeps.
@@ -100,23 +112,34 @@ impl Examples {
     pub(super) fn draw(&self, count: i64) -> Result<(InputBatch, Truth), TchError> {
         let rows = Tensor::f_randint(self.len(), [count], (Kind::Int64, self.scale_m.device()))?;
         let of = |all: &Tensor| all.f_index_select(0, &rows);
-        let truth = Truth { position: of(&self.truth.position)?, heading: of(&self.truth.heading)? };
+        let truth = Truth {
+            position: of(&self.truth.position)?,
+            heading: of(&self.truth.heading)?,
+        };
         Ok((self.inputs.select(&rows)?, truth))
     }
 }
 
 impl Truth {
-    fn new(world_from_sensor: &[Isometry3<f64>], origin_m: [f64; 3], deviation_m: [f64; 3]) -> Result<Self, TchError> {
+    fn new(
+        world_from_sensor: &[Isometry3<f64>],
+        origin_m: [f64; 3],
+        deviation_m: [f64; 3],
+    ) -> Result<Self, TchError> {
         let (mut positions, mut headings) = (Vec::new(), Vec::new());
         for pose in world_from_sensor {
-            let position =
-                (pose.translation.vector - Vector3::from(origin_m)).component_div(&Vector3::from(deviation_m));
+            let position = (pose.translation.vector - Vector3::from(origin_m))
+                .component_div(&Vector3::from(deviation_m));
             let heading = heading_rad(pose);
             positions.extend(position.iter().map(|&axis| axis as f32));
             headings.extend([heading.cos() as f32, heading.sin() as f32]);
         }
-        let tensor = |values: &[f32], columns: i64| Tensor::f_from_slice(values)?.f_view([-1, columns]);
-        Ok(Self { position: tensor(&positions, 3)?, heading: tensor(&headings, 2)? })
+        let tensor =
+            |values: &[f32], columns: i64| Tensor::f_from_slice(values)?.f_view([-1, columns]);
+        Ok(Self {
+            position: tensor(&positions, 3)?,
+            heading: tensor(&headings, 2)?,
+        })
     }
 
     /// `[S, 5]`: position and heading.
@@ -125,14 +148,24 @@ impl Truth {
     }
 
     fn to_device(&self, device: tch::Device) -> Result<Self, TchError> {
-        Ok(Self { position: self.position.f_to_device(device)?, heading: self.heading.f_to_device(device)? })
+        Ok(Self {
+            position: self.position.f_to_device(device)?,
+            heading: self.heading.f_to_device(device)?,
+        })
     }
 }
 
 /// Mean and standard deviation of the positions, metres.
 fn statistics(poses: &[Isometry3<f64>]) -> ([f64; 3], [f64; 3]) {
-    let mean = |value: &dyn Fn(&Isometry3<f64>) -> f64| poses.iter().map(value).sum::<f64>() / poses.len() as f64;
-    let origin_m: [f64; 3] = std::array::from_fn(|axis| mean(&|pose| pose.translation.vector[axis]));
-    let variance = |axis: usize| mean(&|pose| (pose.translation.vector[axis] - origin_m[axis]).powi(2));
-    (origin_m, std::array::from_fn(|axis| variance(axis).sqrt().max(LEAST_DEVIATION_M)))
+    let mean = |value: &dyn Fn(&Isometry3<f64>) -> f64| {
+        poses.iter().map(value).sum::<f64>() / poses.len() as f64
+    };
+    let origin_m: [f64; 3] =
+        std::array::from_fn(|axis| mean(&|pose| pose.translation.vector[axis]));
+    let variance =
+        |axis: usize| mean(&|pose| (pose.translation.vector[axis] - origin_m[axis]).powi(2));
+    (
+        origin_m,
+        std::array::from_fn(|axis| variance(axis).sqrt().max(LEAST_DEVIATION_M)),
+    )
 }

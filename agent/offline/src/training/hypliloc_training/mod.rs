@@ -74,18 +74,27 @@ pub fn train_hypliloc(
 ) -> Result<Trained, LocalizerTrainError> {
     let run = &config.run;
     run.start()?;
-    let examples = Examples::read(&config.scenes, run, &mut |done, all| observe(&HypLiLocReport::Sampling(done, all)))?;
+    let examples = Examples::read(&config.scenes, run, &mut |done, all| {
+        observe(&HypLiLocReport::Sampling(done, all))
+    })?;
     let variables = VarStore::new(run.device);
     let network = HypLiLoc::new(&variables.root());
     let criteria = Criteria::new(&(variables.root() / "criteria"));
     let places = ["points", "image", "fusion"].map(|branch| variables.root() / "places" / branch);
-    let places = PlaceClasses::new(places, WIDTH, &examples.poses()?, examples.deviation_m, run.seed)?;
+    let places = PlaceClasses::new(
+        places,
+        WIDTH,
+        &examples.poses()?,
+        examples.deviation_m,
+        run.seed,
+    )?;
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     // The tensor library draws all random numbers of a step, on the device.
     tch::manual_seed(run.seed.wrapping_add(trainer.steps()) as i64);
     Cuda::cudnn_set_benchmark(run.device.is_cuda());
-    let share_done =
-        |trainer: &Trainer| trainer.share_done((trainer.steps() * run.batch as u64) as f64 / examples.len() as f64);
+    let share_done = |trainer: &Trainer| {
+        trainer.share_done((trainer.steps() * run.batch as u64) as f64 / examples.len() as f64)
+    };
     let mut reported = trainer.steps();
     let mut sums = Tensor::f_zeros([5], (Kind::Float, run.device))?;
     while share_done(&trainer) < 1.0 {
@@ -123,7 +132,10 @@ pub fn train_hypliloc(
         scale_m: examples.deviation_m,
     };
     let about = BTreeMap::from([
-        (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
+        (
+            CONFIG_KEY.to_owned(),
+            serde_json::to_string(&network_config).expect("a configuration is JSON"),
+        ),
         (KIND_KEY.to_owned(), HypLiLocLocalizer::KIND.to_owned()),
     ]);
     Ok(trainer.save_weights(&variables, about, examples.data)?)
@@ -144,8 +156,16 @@ mod tests {
     use super::*;
 
     fn config(scene: &Path, out: &Path, steps: u64) -> HypLiLocTrainConfig {
-        let run = RunConfig { batch: 2, ..RunConfig::new(Length::Steps(steps), out) };
-        HypLiLocTrainConfig { scenes: vec![scene.to_owned()], scene_name: "small".into(), turn_rad: PI, run }
+        let run = RunConfig {
+            batch: 2,
+            ..RunConfig::new(Length::Steps(steps), out)
+        };
+        HypLiLocTrainConfig {
+            scenes: vec![scene.to_owned()],
+            scene_name: "small".into(),
+            turn_rad: PI,
+            run,
+        }
     }
 
     #[test]
@@ -153,7 +173,10 @@ mod tests {
         tch::set_num_threads(1);
         let folder = tempfile::tempdir().unwrap();
         let (scene, out) = (folder.path().join("scene"), folder.path().join("out"));
-        let drive = SynthOptions { frames: 2, ..SynthOptions::new(Subset::Town1loc, 400, scene.clone()) };
+        let drive = SynthOptions {
+            frames: 2,
+            ..SynthOptions::new(Subset::Town1loc, 400, scene.clone())
+        };
         generate(&drive, &|_| ()).unwrap();
         let mut sampled = 0;
         let mut observe = |report: &HypLiLocReport| {
@@ -161,16 +184,26 @@ mod tests {
                 sampled = *done;
             }
         };
-        assert_eq!(train_hypliloc(&config(&scene, &out, 2), &mut observe).unwrap().steps, 2);
+        assert_eq!(
+            train_hypliloc(&config(&scene, &out, 2), &mut observe)
+                .unwrap()
+                .steps,
+            2
+        );
         assert!(sampled >= 2, "{sampled}");
         let mut resumed = config(&scene, &out, 3);
         resumed.run.resume = true;
         let trained = train_hypliloc(&resumed, &mut |_| ()).unwrap();
         assert_eq!(trained.steps, 3);
         assert!(trained.weights.metadata().unwrap().len() < 10_000_000);
-        let mut localizer = load_baseline(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
+        let mut localizer =
+            load_baseline(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
         let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
-        let answer = localizer.localize(&PointCloud { xyzi: wall.collect() }).unwrap();
+        let answer = localizer
+            .localize(&PointCloud {
+                xyzi: wall.collect(),
+            })
+            .unwrap();
         assert!(answer.estimate.world_from_cav().is_some(), "{answer:?}");
     }
 }

@@ -61,12 +61,16 @@ impl CellOrder {
 
     /// Rows `[batch]` of the next step.
     pub(super) fn next_batch(&mut self, share_done: f64) -> Result<Tensor, TchError> {
-        let wants_all = self.redundancy.as_ref().is_some_and(|redundancy| redundancy.is_time_for_all(share_done));
+        let wants_all = self
+            .redundancy
+            .as_ref()
+            .is_some_and(|redundancy| redundancy.is_time_for_all(share_done));
         if wants_all || self.place + self.batch > self.order.len() {
             self.next_pass(share_done)?;
         }
         let end = self.place + self.batch;
-        let rows = Tensor::f_from_slice(&self.order[self.place..end])?.f_to_device(self.sweep_of_cell.device())?;
+        let rows = Tensor::f_from_slice(&self.order[self.place..end])?
+            .f_to_device(self.sweep_of_cell.device())?;
         self.place = end;
         // One more at the end of a pass, whatever part of a batch is left over then.
         let (shown, batches) = (end / self.batch, self.order.len() / self.batch);
@@ -75,11 +79,25 @@ impl CellOrder {
     }
 
     /// Records the errors `[N]` of the cells of a step, each of a sweep of `sweeps` `[N]`.
-    pub(super) fn watch(&mut self, share_done: f64, sweeps: &Tensor, errors: &Tensor) -> Result<(), TchError> {
-        if self.redundancy.as_ref().is_some_and(|redundancy| redundancy.watches(share_done)) {
+    pub(super) fn watch(
+        &mut self,
+        share_done: f64,
+        sweeps: &Tensor,
+        errors: &Tensor,
+    ) -> Result<(), TchError> {
+        if self
+            .redundancy
+            .as_ref()
+            .is_some_and(|redundancy| redundancy.watches(share_done))
+        {
             let errors: Vec<f32> = Vec::try_from(&errors.f_detach()?)?;
             let sweeps: Vec<i64> = Vec::try_from(sweeps)?;
-            self.watched.extend(sweeps.iter().zip(errors).map(|(&sweep, error)| (sweep as usize, error)));
+            self.watched.extend(
+                sweeps
+                    .iter()
+                    .zip(errors)
+                    .map(|(&sweep, error)| (sweep as usize, error)),
+            );
         }
         Ok(())
     }
@@ -94,11 +112,15 @@ impl CellOrder {
             }
             changed |= redundancy.advance(share_done);
             if changed {
-                self.sweep_weights = Tensor::f_from_slice(redundancy.weights())?.f_to_device(device)?;
+                self.sweep_weights =
+                    Tensor::f_from_slice(redundancy.weights())?.f_to_device(device)?;
             }
         }
         if changed {
-            let used = self.sweep_weights.f_index_select(0, &self.sweep_of_cell)?.f_gt(0.0)?;
+            let used = self
+                .sweep_weights
+                .f_index_select(0, &self.sweep_of_cell)?
+                .f_gt(0.0)?;
             self.order = Vec::try_from(&used.f_nonzero()?.f_squeeze_dim(1)?)?;
         }
         if self.order.len() < self.batch {
@@ -143,28 +165,52 @@ mod tests {
             let share_done = order.passes() / 20.0;
             let rows = order.next_batch(share_done).unwrap();
             let sweeps = order.sweep_of_cell.index_select(0, &rows);
-            let errors: Vec<f32> =
-                Vec::<i64>::try_from(&sweeps).unwrap().iter().map(|&sweep| (sweep * steps) as f32).collect();
-            order.watch(share_done, &sweeps, &Tensor::from_slice(&errors)).unwrap();
+            let errors: Vec<f32> = Vec::<i64>::try_from(&sweeps)
+                .unwrap()
+                .iter()
+                .map(|&sweep| (sweep * steps) as f32)
+                .collect();
+            order
+                .watch(share_done, &sweeps, &Tensor::from_slice(&errors))
+                .unwrap();
             steps += 1;
             cells_of_pass[order.passes().ceil() as usize] = order.order.len();
         }
         // Windows end after passes 5 and 10; from 84 % on, after pass 17, all are used again.
-        assert_eq!([5, 6, 10, 11, 17, 18].map(|pass| cells_of_pass[pass]), [100, 80, 80, 60, 60, 100]);
-        assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a reduced one");
+        assert_eq!(
+            [5, 6, 10, 11, 17, 18].map(|pass| cells_of_pass[pass]),
+            [100, 80, 80, 60, 60, 100]
+        );
+        assert_eq!(
+            steps,
+            8 * 3 + 12 * 2,
+            "three batches of a full pass, two of a reduced one"
+        );
     }
 
     #[test]
     fn all_are_used_again_in_the_middle_of_a_long_pass() {
         // The first two of four passes are recorded; the last is three eighths over when all are used again.
-        let config = RedundancyConfig { windows: [[0.0, 0.5], [0.9, 0.95]], ..RedundancyConfig::default() };
-        let mut order = CellOrder::new(&cache(), Some(Redundancy::new(config, vec![0; 10])), 10, 1, 0).unwrap();
+        let config = RedundancyConfig {
+            windows: [[0.0, 0.5], [0.9, 0.95]],
+            ..RedundancyConfig::default()
+        };
+        let mut order = CellOrder::new(
+            &cache(),
+            Some(Redundancy::new(config, vec![0; 10])),
+            10,
+            1,
+            0,
+        )
+        .unwrap();
         let mut cells = Vec::new();
         while order.passes() < 4.0 {
             let share_done = order.passes() / 4.0;
             let rows = order.next_batch(share_done).unwrap();
             let sweeps = order.sweep_of_cell.index_select(0, &rows);
-            order.watch(share_done, &sweeps, &sweeps.to_kind(Kind::Float)).unwrap();
+            order
+                .watch(share_done, &sweeps, &sweeps.to_kind(Kind::Float))
+                .unwrap();
             cells.push(order.order.len());
         }
         assert_eq!((cells[19], cells[20], cells[30]), (100, 80, 80));

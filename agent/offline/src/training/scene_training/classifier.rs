@@ -34,23 +34,41 @@ pub(super) fn train_classifier(
     let mut optimizer = AdamW::new(variables, AdamWConfig::default());
     let started = Instant::now();
     for step in 0..STEPS {
-        let of_time = limit.map_or(0.0, |limit| started.elapsed().as_secs_f64() / limit.as_secs_f64().max(1e-3));
+        let of_time = limit.map_or(0.0, |limit| {
+            started.elapsed().as_secs_f64() / limit.as_secs_f64().max(1e-3)
+        });
         let share_done = of_time.max(step as f64 / STEPS as f64);
         if share_done >= 1.0 {
             break;
         }
-        let rows: Vec<i64> = (0..BATCH).map(|_| rng.random_range(0..cache.sweep_count()) as i64).collect();
+        let rows: Vec<i64> = (0..BATCH)
+            .map(|_| rng.random_range(0..cache.sweep_count()) as i64)
+            .collect();
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(variables.device())?;
         let logits = head.classify(&cache.sweeps.f_index_select(0, &rows)?, true)?;
         let log_shares = logits.f_log_softmax(1, Kind::Float)?;
         let wanted = classes.f_index_select(0, &rows)?;
-        let hit = log_shares.f_gather(1, &wanted.f_unsqueeze(1)?, false)?.f_mean(Kind::Float)?;
+        let hit = log_shares
+            .f_gather(1, &wanted.f_unsqueeze(1)?, false)?
+            .f_mean(Kind::Float)?;
         let even = log_shares.f_mean(Kind::Float)?;
         let loss = -(hit * (1.0 - LABEL_SMOOTHING) + even * LABEL_SMOOTHING);
         optimizer.zero_grad();
         loss.f_backward()?;
-        optimizer.step(OneCycle { peak: LEARNING_RATE }.at(share_done))?;
+        optimizer.step(
+            OneCycle {
+                peak: LEARNING_RATE,
+            }
+            .at(share_done),
+        )?;
     }
-    let found = no_grad(|| head.classify(&cache.sweeps, false)?.f_argmax(1, false)?.f_eq_tensor(&classes))?;
-    found.f_to_kind(Kind::Float)?.f_mean(Kind::Float)?.f_double_value(&[])
+    let found = no_grad(|| {
+        head.classify(&cache.sweeps, false)?
+            .f_argmax(1, false)?
+            .f_eq_tensor(&classes)
+    })?;
+    found
+        .f_to_kind(Kind::Float)?
+        .f_mean(Kind::Float)?
+        .f_double_value(&[])
 }

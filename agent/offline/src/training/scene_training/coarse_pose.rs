@@ -18,14 +18,26 @@ pub(super) struct CoarsePoses {
 }
 
 impl CoarsePoses {
-    pub(super) fn new(world_from_sensor: &[Isometry3<f64>], device: Device) -> Result<Self, TchError> {
-        let headings: Vec<f32> = world_from_sensor.iter().map(|pose| heading_rad(pose) as f32).collect();
-        Ok(Self { headings: Tensor::f_from_slice(&headings)?.f_to_device(device)? })
+    pub(super) fn new(
+        world_from_sensor: &[Isometry3<f64>],
+        device: Device,
+    ) -> Result<Self, TchError> {
+        let headings: Vec<f32> = world_from_sensor
+            .iter()
+            .map(|pose| heading_rad(pose) as f32)
+            .collect();
+        Ok(Self {
+            headings: Tensor::f_from_slice(&headings)?.f_to_device(device)?,
+        })
     }
 
     /// Positions of cells `[N, 3]` with random errors, and cosine and sine of the heading `[N, 2]` with random errors;
     /// `sweeps` `[N]` is the sweep of each cell.
-    pub(super) fn draw(&self, targets_m: &Tensor, sweeps: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    pub(super) fn draw(
+        &self,
+        targets_m: &Tensor,
+        sweeps: &Tensor,
+    ) -> Result<(Tensor, Tensor), TchError> {
         let like = (Kind::Float, targets_m.device());
         let count = targets_m.size()[0];
         // Small and large errors both occur: the second round starts from a better pose than the first.
@@ -35,6 +47,9 @@ impl CoarsePoses {
             * Tensor::f_from_slice(&[1.0f32, 1.0, 0.3])?.f_to_device(like.1)?;
         let turn = Tensor::f_randn([count], like)? * TURN_RAD;
         let yaw = self.headings.f_index_select(0, sweeps)? + turn;
-        Ok((targets_m + shift, Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?))
+        Ok((
+            targets_m + shift,
+            Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?,
+        ))
     }
 }

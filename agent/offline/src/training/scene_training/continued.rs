@@ -22,7 +22,11 @@ pub(super) struct StoredHead {
 
 impl StoredHead {
     /// Reads a head that was trained on the features of the encoder with this SHA-256.
-    pub(super) fn load(path: &Path, encoder: &Path, encoder_sha256: &str) -> Result<Self, LocalizerError> {
+    pub(super) fn load(
+        path: &Path,
+        encoder: &Path,
+        encoder_sha256: &str,
+    ) -> Result<Self, LocalizerError> {
         let weights = Weights::load(path)?;
         weights.check_kind(SceneHead::KIND)?;
         let config: SceneHeadConfig = weights.config()?;
@@ -45,12 +49,22 @@ impl StoredHead {
 
 /// Class of each sweep of `cache`, which a trained head does not store: the one whose trusted sweeps lie nearest. A
 /// sweep is trusted if the head finds its cells with the class that it gives it.
-pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Result<Vec<usize>, LocalizerTrainError> {
+pub(super) fn classes_of_sweeps(
+    head: &SceneHead,
+    cache: &FeatureCache,
+) -> Result<Vec<usize>, LocalizerTrainError> {
     let (classes, errors_m) = no_grad(|| classify(head, cache))?;
-    let positions: Vec<[f64; 3]> = cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
+    let positions: Vec<[f64; 3]> = cache
+        .world_from_sensor
+        .iter()
+        .map(|pose| pose.translation.vector.into())
+        .collect();
     let mut sums = vec![[0.0; 4]; head.config().classes as usize];
-    for ((&class, _), position) in
-        classes.iter().zip(&errors_m).zip(&positions).filter(|((_, error_m), _)| **error_m < TRUSTED_M)
+    for ((&class, _), position) in classes
+        .iter()
+        .zip(&errors_m)
+        .zip(&positions)
+        .filter(|((_, error_m), _)| **error_m < TRUSTED_M)
     {
         (0..3).for_each(|axis| sums[class as usize][axis] += position[axis]);
         sums[class as usize][3] += 1.0;
@@ -62,9 +76,14 @@ pub(super) fn classes_of_sweeps(head: &SceneHead, cache: &FeatureCache) -> Resul
         .map(|(class, sum)| (class, std::array::from_fn(|axis| sum[axis] / sum[3])))
         .collect();
     if middles.is_empty() {
-        return Err(LocalizerTrainError::OtherScene(head.config().scene_name.clone()));
+        return Err(LocalizerTrainError::OtherScene(
+            head.config().scene_name.clone(),
+        ));
     }
-    Ok(positions.iter().map(|position| nearest(&middles, position)).collect())
+    Ok(positions
+        .iter()
+        .map(|position| nearest(&middles, position))
+        .collect())
 }
 
 /// Class of each sweep as the head sees it, and the median L1 error of some of its cells under it, metres.
@@ -79,20 +98,35 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
         if count == 0 {
             return Ok(f64::INFINITY);
         }
-        let rows =
-            Tensor::f_linspace(rows.start as f64, (rows.end - 1) as f64, count, (Kind::Double, cache.cells.device()))?
-                .f_to_kind(Kind::Int64)?;
+        let rows = Tensor::f_linspace(
+            rows.start as f64,
+            (rows.end - 1) as f64,
+            count,
+            (Kind::Double, cache.cells.device()),
+        )?
+        .f_to_kind(Kind::Int64)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
-        let of_cells = logits.f_narrow(0, sweep as i64, 1)?.f_expand([count, -1], false)?;
+        let of_cells = logits
+            .f_narrow(0, sweep as i64, 1)?
+            .f_expand([count, -1], false)?;
         let found = head.regress(&cells, &of_cells, Kind::Float)?.coordinates_m;
         let error = (found - cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
-        error.f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_median()?.f_double_value(&[])
+        error
+            .f_sum_dim_intlist(1_i64, false, Kind::Float)?
+            .f_median()?
+            .f_double_value(&[])
     });
     Ok((classes, errors.collect::<Result<_, TchError>>()?))
 }
 
 fn nearest(middles: &[(usize, [f64; 3])], position: &[f64; 3]) -> usize {
-    let square_m2 = |middle: &[f64; 3]| (0..3).map(|axis| (middle[axis] - position[axis]).powi(2)).sum::<f64>();
-    let nearest = middles.iter().min_by(|(_, one), (_, other)| square_m2(one).total_cmp(&square_m2(other)));
+    let square_m2 = |middle: &[f64; 3]| {
+        (0..3)
+            .map(|axis| (middle[axis] - position[axis]).powi(2))
+            .sum::<f64>()
+    };
+    let nearest = middles
+        .iter()
+        .min_by(|(_, one), (_, other)| square_m2(one).total_cmp(&square_m2(other)));
     nearest.map_or(0, |(class, _)| *class)
 }

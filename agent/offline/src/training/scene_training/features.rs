@@ -35,15 +35,29 @@ impl Features {
         let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
-            let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
+            let cache =
+                FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
             observe(&SceneReport::Encoded(list.data()));
             Ok::<_, LocalizerTrainError>(cache)
         };
         let training = encode(&sweeps.training, config.augmentation)?;
-        let unchanged = SweepAugmentation { copies: 1, ..config.augmentation };
-        let validation = sweeps.validation.as_ref().map(|list| encode(list, unchanged)).transpose()?;
+        let unchanged = SweepAugmentation {
+            copies: 1,
+            ..config.augmentation
+        };
+        let validation = sweeps
+            .validation
+            .as_ref()
+            .map(|list| encode(list, unchanged))
+            .transpose()?;
         let data = sweeps.training.data();
         let format = encoder.format().clone();
-        Ok(Self { training, validation, format, encoder_sha256, data })
+        Ok(Self {
+            training,
+            validation,
+            format,
+            encoder_sha256,
+            data,
+        })
     }
 }

@@ -23,14 +23,25 @@ const MARGIN_M: f64 = 8.0;
 pub(super) fn covering(targets_m: &Tensor, local_channels: i64) -> Result<RefinerConfig, TchError> {
     let bound = |extreme: Tensor, margin_m: f64| -> Result<[f64; 2], TchError> {
         let values: Vec<f32> = Vec::try_from(&extreme)?;
-        Ok([f64::from(values[0]) + margin_m, f64::from(values[1]) + margin_m])
+        Ok([
+            f64::from(values[0]) + margin_m,
+            f64::from(values[1]) + margin_m,
+        ])
     };
     let low_m = bound(targets_m.f_amin([0_i64], false)?, -MARGIN_M)?;
     let high_m = bound(targets_m.f_amax([0_i64], false)?, MARGIN_M)?;
     let area_m2 = (high_m[0] - low_m[0]) * (high_m[1] - low_m[1]);
     let spacing_m = (area_m2 / CORNERS).sqrt().max(SPACING_M);
     let reach = (REACH_M / spacing_m).ceil() as i64;
-    Ok(RefinerConfig { local_channels, low_m, high_m, spacing_m, reach, keys: KEYS, width: 256 })
+    Ok(RefinerConfig {
+        local_channels,
+        low_m,
+        high_m,
+        spacing_m,
+        reach,
+        keys: KEYS,
+        width: 256,
+    })
 }
 
 /// Crops the edges of the key grid that hardly any cell is near, so that they need not be stored; the remaining trained
@@ -40,7 +51,9 @@ pub(super) fn crop(
     variables: VarStore,
     targets_m: &Tensor,
 ) -> Result<VarStore, LocalizerError> {
-    let Some(full) = &head.refiner else { return Ok(variables) };
+    let Some(full) = &head.refiner else {
+        return Ok(variables);
+    };
     let bound = |share: f64, axis: i64| -> Result<f64, TchError> {
         let values = targets_m.f_select(1, axis)?;
         let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
@@ -57,7 +70,11 @@ pub(super) fn crop(
     for (name, mut variable) in kept.variables() {
         let source = &trained[&name];
         let is_key_grid = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
-        let source = if is_key_grid { source.f_index_select(0, &rows)? } else { source.shallow_clone() };
+        let source = if is_key_grid {
+            source.f_index_select(0, &rows)?
+        } else {
+            source.shallow_clone()
+        };
         no_grad(|| variable.f_copy_(&source))?;
     }
     Ok(kept)

@@ -13,7 +13,9 @@ pub(super) fn weighted_loss(
     targets_m: &Tensor,
     weights: &Tensor,
 ) -> Result<(Tensor, Tensor), TchError> {
-    let error = (&answer.coordinates_m - targets_m).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let error = (&answer.coordinates_m - targets_m)
+        .f_abs()?
+        .f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     // The error is the target of its prediction: the second term has a gradient for epsilon alone.
     let surprise = (error.f_detach()? - &answer.epsilon_m).f_abs()?;
     Ok((((&error + surprise) * weights).f_mean(Kind::Float)?, error))
@@ -30,6 +32,8 @@ pub(super) fn centre_loss(
 ) -> Result<Tensor, TchError> {
     let distance = Tensor::f_cdist(targets_m, centres_m, 2.0, 1_i64)? / CENTRE_BLUR_M;
     let wanted = (distance.f_square()? * -0.5).f_softmax(1, Kind::Float)?;
-    let each = (wanted * log_shares).f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_neg()?;
+    let each = (wanted * log_shares)
+        .f_sum_dim_intlist(1_i64, false, Kind::Float)?
+        .f_neg()?;
     (each * weights).f_mean(Kind::Float)
 }

@@ -64,7 +64,14 @@ pub fn train_scene(
             Some(Arc::new(list))
         }
     };
-    train_scene_on(config, &SceneSweeps { training, validation }, observe)
+    train_scene_on(
+        config,
+        &SceneSweeps {
+            training,
+            validation,
+        },
+        observe,
+    )
 }
 
 /// The same on lists of sweeps in place of the folders of `config`.
@@ -125,16 +132,30 @@ impl<'a> Training<'a> {
         let run = &config.run;
         run.start()?;
         let features = Features::compute(config, sweeps, observe)?;
-        let stored = config.init.as_ref().map(|init| StoredHead::load(init, &config.encoder, &features.encoder_sha256));
+        let stored = config
+            .init
+            .as_ref()
+            .map(|init| StoredHead::load(init, &config.encoder, &features.encoder_sha256));
         let stored = stored.transpose()?;
         let head_config = match &stored {
             Some(stored) => {
-                let counted = stored.config.sweep_points.or_else(|| median_points(&features.training.points));
-                SceneHeadConfig { sweep_points: counted, ..stored.config.clone() }
+                let counted = stored
+                    .config
+                    .sweep_points
+                    .or_else(|| median_points(&features.training.points));
+                SceneHeadConfig {
+                    sweep_points: counted,
+                    ..stored.config.clone()
+                }
             }
             None => head_config(config, &features)?,
         };
-        let Features { training: mut cache, validation, data, .. } = features;
+        let Features {
+            training: mut cache,
+            validation,
+            data,
+            ..
+        } = features;
         cache.move_origin(head_config.origin_m)?;
         let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
@@ -145,8 +166,11 @@ impl<'a> Training<'a> {
             }
             None => {
                 statistics::set_statistics(&mut head, &cache, run.seed)?;
-                let positions: Vec<[f64; 3]> =
-                    cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
+                let positions: Vec<[f64; 3]> = cache
+                    .world_from_sensor
+                    .iter()
+                    .map(|pose| pose.translation.vector.into())
+                    .collect();
                 kmeans(&positions, config.classes as usize, run.seed).1
             }
         };
@@ -162,7 +186,9 @@ impl<'a> Training<'a> {
             observe(&SceneReport::Classified(share));
         }
         let trainer = Trainer::begin(run, &variables, None, started)?;
-        let redundancy = config.redundancy.map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
+        let redundancy = config
+            .redundancy
+            .map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
         let header = "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
         Ok(Self {
             config,
@@ -201,7 +227,9 @@ impl<'a> Training<'a> {
         let share_done = self.share_done();
         let rows = self.order.next_batch(share_done)?;
         let sweeps = self.cache.sweep_of_cell.f_index_select(0, &rows)?;
-        let cells = self.head.normalise(&self.cache.cells.f_index_select(0, &rows)?)?;
+        let cells = self
+            .head
+            .normalise(&self.cache.cells.f_index_select(0, &rows)?)?;
         let logits = match self.logits.take() {
             Some(logits) if !self.trainer.steps().is_multiple_of(LOGITS_EVERY) => logits,
             // Dropout here too: in places without training data the classifier is less certain than on its training
@@ -210,12 +238,14 @@ impl<'a> Training<'a> {
         };
         let kind = self.config.run.precision.kind();
         let (regression, log_shares) =
-            self.head.regress_among_centres(&cells, &logits.f_index_select(0, &sweeps)?, kind)?;
+            self.head
+                .regress_among_centres(&cells, &logits.f_index_select(0, &sweeps)?, kind)?;
         self.logits = Some(logits);
         let targets = self.cache.targets_m.f_index_select(0, &rows)?;
         let weights = self.order.weights(&sweeps)?;
         let (mut loss, error) = weighted_loss(&regression, &targets, &weights)?;
-        loss += centre_loss(&log_shares, &targets, self.head.centres_m(), &weights)? * CENTRE_WEIGHT_M;
+        loss +=
+            centre_loss(&log_shares, &targets, self.head.centres_m(), &weights)? * CENTRE_WEIGHT_M;
         if let Some(refiner) = self.head.refiner() {
             let (assumed, heading) = self.coarse_poses.draw(&targets, &sweeps)?;
             let answer = refiner.look(&cells, &assumed, &heading, kind)?;
@@ -250,9 +280,17 @@ impl<'a> Training<'a> {
     }
 
     /// Validates and writes a checkpoint.
-    fn validate_and_save(&mut self, observe: &mut dyn FnMut(&SceneReport)) -> Result<(), LocalizerTrainError> {
+    fn validate_and_save(
+        &mut self,
+        observe: &mut dyn FnMut(&SceneReport),
+    ) -> Result<(), LocalizerTrainError> {
         let report = self.report();
-        let SceneReport::Stepped { error_m, epsilon_m, .. } = report else { unreachable!("a report of steps") };
+        let SceneReport::Stepped {
+            error_m, epsilon_m, ..
+        } = report
+        else {
+            unreachable!("a report of steps")
+        };
         let seconds = self.trainer.seconds();
         let mut row = vec![self.trainer.steps() as f64, seconds, error_m, epsilon_m];
         if let Some(validation) = &self.validation {
@@ -278,7 +316,10 @@ impl<'a> Training<'a> {
             None => key_grid::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?,
         };
         let about = BTreeMap::from([
-            (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
+            (
+                CONFIG_KEY.to_owned(),
+                serde_json::to_string(&self.head_config).expect("a configuration is JSON"),
+            ),
             (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
         ]);
         Ok(SceneSummary {
@@ -287,7 +328,8 @@ impl<'a> Training<'a> {
             scene_name: self.head_config.scene_name,
             sweeps: self.cache.sweep_count(),
             cells_shown: self.cells_shown,
-            error_m: (self.reported.steps > 0).then(|| self.reported.error_m / f64::from(self.reported.steps)),
+            error_m: (self.reported.steps > 0)
+                .then(|| self.reported.error_m / f64::from(self.reported.steps)),
             accuracy: self.accuracy,
         })
     }
@@ -302,8 +344,16 @@ fn classifier_time(run: &RunConfig) -> Option<Duration> {
 }
 
 /// The configuration of the head for these features.
-fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig, LocalizerTrainError> {
-    let Features { training, format, encoder_sha256, .. } = features;
+fn head_config(
+    config: &SceneTrainConfig,
+    features: &Features,
+) -> Result<SceneHeadConfig, LocalizerTrainError> {
+    let Features {
+        training,
+        format,
+        encoder_sha256,
+        ..
+    } = features;
     let refiner = || key_grid::covering(&training.targets_m, format.local_channels());
     Ok(SceneHeadConfig {
         scene_name: config.scene_name.clone(),

@@ -92,8 +92,19 @@ pub struct MessageCounts {
 
 impl From<Counts> for MessageCounts {
     fn from(counts: Counts) -> Self {
-        let Counts { sent, received, in_flight, dropped, adapted: _ } = counts;
-        Self { sent, received, in_flight, dropped }
+        let Counts {
+            sent,
+            received,
+            in_flight,
+            dropped,
+            adapted: _,
+        } = counts;
+        Self {
+            sent,
+            received,
+            in_flight,
+            dropped,
+        }
     }
 }
 
@@ -115,9 +126,13 @@ impl Cell {
     /// [`SweepError::Spec`] when the file is no cached run.
     pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>, SweepError> {
         let path = key.file(folder);
-        let Ok(text) = fs::read_to_string(&path) else { return Ok(None) };
-        let cell: Self = serde_json::from_str(&text)
-            .map_err(|error| SweepError::Spec { path: path.clone(), problem: error.to_string() })?;
+        let Ok(text) = fs::read_to_string(&path) else {
+            return Ok(None);
+        };
+        let cell: Self = serde_json::from_str(&text).map_err(|error| SweepError::Spec {
+            path: path.clone(),
+            problem: error.to_string(),
+        })?;
         Ok((cell.key == *key).then_some(cell))
     }
 
@@ -141,26 +156,46 @@ pub(super) struct Hashes {
 
 impl Hashes {
     pub(super) fn new(data_sha256: String) -> Self {
-        Self { data_sha256, files: BTreeMap::new() }
+        Self {
+            data_sha256,
+            files: BTreeMap::new(),
+        }
     }
 
     fn of(&mut self, path: &Path) -> Result<String, SweepError> {
         if let Some(known) = self.files.get(path) {
             return Ok(known.clone());
         }
-        let (_, hash) = hash_file(path).map_err(|source| SweepError::Io { path: path.to_owned(), source })?;
+        let (_, hash) = hash_file(path).map_err(|source| SweepError::Io {
+            path: path.to_owned(),
+            source,
+        })?;
         self.files.insert(path.to_owned(), hash.clone());
         Ok(hash)
     }
 
     /// All inputs of the run of a point.
-    pub(super) fn key(&mut self, experiment: &Experiment, point: &Point) -> Result<CellKey, SweepError> {
+    pub(super) fn key(
+        &mut self,
+        experiment: &Experiment,
+        point: &Point,
+    ) -> Result<CellKey, SweepError> {
         let (link, folder) = point.link(experiment)?;
         let poses = point.poses(experiment);
-        let poses_sha256 = poses.files().into_iter().map(|file| self.of(file)).collect::<Result<_, _>>()?;
-        let trace_sha256 = link.trace_file().map(|file| self.of(&folder.join(file))).transpose()?;
+        let poses_sha256 = poses
+            .files()
+            .into_iter()
+            .map(|file| self.of(file))
+            .collect::<Result<_, _>>()?;
+        let trace_sha256 = link
+            .trace_file()
+            .map(|file| self.of(&folder.join(file)))
+            .transpose()?;
         let weights_sha256 = self.of(&weights_of(&experiment.weights, point.method)?)?;
-        let program = env::current_exe().map_err(|source| SweepError::Io { path: "this program".into(), source })?;
+        let program = env::current_exe().map_err(|source| SweepError::Io {
+            path: "this program".into(),
+            source,
+        })?;
         Ok(CellKey {
             point: point.clone(),
             link,
@@ -179,9 +214,15 @@ impl Hashes {
 }
 
 /// Settings of the evaluation of a point.
-pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Result<EvaluationOptions, SweepError> {
+pub(super) fn options(
+    experiment: &Experiment,
+    point: &Point,
+    maps: &Path,
+) -> Result<EvaluationOptions, SweepError> {
     let weights = weights_of(&experiment.weights, point.method)?;
-    let read = Weights::load(&weights).map_err(EvaluateError::from).map_err(boxed)?;
+    let read = Weights::load(&weights)
+        .map_err(EvaluateError::from)
+        .map_err(boxed)?;
     let config: DetectorConfig = read.config().map_err(EvaluateError::from).map_err(boxed)?;
     let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
     Ok(EvaluationOptions {
@@ -193,7 +234,12 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
         rate: point.rate(),
         trust: experiment.ego.trust(),
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
-        stepped: Some(grid::stepped(point.link(experiment)?, point, &experiment.ego, experiment.compute)),
+        stepped: Some(grid::stepped(
+            point.link(experiment)?,
+            point,
+            &experiment.ego,
+            experiment.compute,
+        )),
         part: experiment.part(),
         protocol: experiment.protocol.clone(),
         ..EvaluationOptions::default()
@@ -203,7 +249,12 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
 /// Feature maps are cached losslessly, so that the cache changes no result.
 pub(super) fn kept_maps(experiment: &Experiment, folder: &Path) -> KeptMaps {
     let limit_bytes = (experiment.maps_limit_gb * 1e9) as u64;
-    KeptMaps { folder: folder.to_owned(), dtype: Dtype::F32, limit_bytes, intensity_scale: IntensityScale::AUTO }
+    KeptMaps {
+        folder: folder.to_owned(),
+        dtype: Dtype::F32,
+        limit_bytes,
+        intensity_scale: IntensityScale::AUTO,
+    }
 }
 
 /// Computes the run of a point; `on_frame` is called after every frame.
@@ -218,14 +269,30 @@ pub(super) fn compute(
     let options = options(experiment, point, maps)?;
     let (board, evaluator, _) = judged(&options, point.method, on_frame).map_err(Box::new)?;
     let metrics = metrics(&board, &evaluator, &options, began);
-    let used = board.records().iter().map(|record| record.fused as u64).sum();
+    let used = board
+        .records()
+        .iter()
+        .map(|record| record.fused as u64)
+        .sum();
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
-        if !matches!(account.topic, Topic::Stream { stream: Stream::Pose, .. }) {
+        if !matches!(
+            account.topic,
+            Topic::Stream {
+                stream: Stream::Pose,
+                ..
+            }
+        ) {
             messages.add(counts);
         }
     }
-    Ok(Cell { key, metrics, used, messages: messages.into(), wall_seconds: began.elapsed().as_secs_f64() })
+    Ok(Cell {
+        key,
+        metrics,
+        used,
+        messages: messages.into(),
+        wall_seconds: began.elapsed().as_secs_f64(),
+    })
 }
 
 fn boxed(error: EvaluateError) -> SweepError {

@@ -48,7 +48,13 @@ const DIMENSIONS: [Dimension; 7] = [
         label: "rate of a link, Mbit/s",
         is_logarithmic: true,
         value: |cell| cell.key.point.bandwidth_mbps,
-        text: |point| Some(point.bandwidth_mbps.map_or("unlimited".into(), |mbps| format!("{mbps} Mbit/s"))),
+        text: |point| {
+            Some(
+                point
+                    .bandwidth_mbps
+                    .map_or("unlimited".into(), |mbps| format!("{mbps} Mbit/s")),
+            )
+        },
     },
     Dimension {
         name: "loss",
@@ -62,7 +68,11 @@ const DIMENSIONS: [Dimension; 7] = [
         label: "pose noise, m (degrees alike)",
         is_logarithmic: false,
         value: |cell| cell.key.point.pose_noise.map(|noise| noise.position_std_m),
-        text: |point| point.pose_noise.map(|noise| format!("{} m {} deg", noise.position_std_m, noise.heading_std_deg)),
+        text: |point| {
+            point
+                .pose_noise
+                .map(|noise| format!("{} m {} deg", noise.position_std_m, noise.heading_std_deg))
+        },
     },
     Dimension {
         name: "agents",
@@ -85,32 +95,55 @@ fn codec(point: &Point) -> Option<String> {
         return None;
     }
     let name = point.codec.name();
-    Some(point.codec.keep.map_or(name.clone(), |keep| format!("{name} {} %", 100.0 * keep)))
+    Some(
+        point
+            .codec
+            .keep
+            .map_or(name.clone(), |keep| format!("{name} {} %", 100.0 * keep)),
+    )
 }
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.
 pub(super) fn figures(experiment: &Experiment, cells: &[Cell]) -> Vec<Figure> {
     let varies = |dimension: &Dimension| {
-        let mut texts: Vec<_> = cells.iter().filter_map(|cell| (dimension.text)(&cell.key.point)).collect();
+        let mut texts: Vec<_> = cells
+            .iter()
+            .filter_map(|cell| (dimension.text)(&cell.key.point))
+            .collect();
         texts.sort();
         texts.dedup();
         texts.len() > 1
     };
-    let varying: Vec<usize> = (0..DIMENSIONS.len()).filter(|&place| varies(&DIMENSIONS[place])).collect();
+    let varying: Vec<usize> = (0..DIMENSIONS.len())
+        .filter(|&place| varies(&DIMENSIONS[place]))
+        .collect();
     let figure = |&place: &usize| {
         let chart = |title: &str, precision: fn(&Metrics) -> Option<f64>| {
             chart(experiment, cells, place, &varying, title, precision)
         };
-        let charts =
-            [chart("AP@0.5", |metrics| metrics.ap_global.at_50), chart("AP@0.7", |metrics| metrics.ap_global.at_70)];
+        let charts = [
+            chart("AP@0.5", |metrics| metrics.ap_global.at_50),
+            chart("AP@0.7", |metrics| metrics.ap_global.at_70),
+        ];
         let charts: Vec<Chart> = charts.into_iter().flatten().collect();
-        (!charts.is_empty()).then(|| Figure { name: file_name(place), charts })
+        (!charts.is_empty()).then(|| Figure {
+            name: file_name(place),
+            charts,
+        })
     };
     varying.iter().filter_map(figure).collect()
 }
 
 fn file_name(place: usize) -> &'static str {
-    ["ap_latency", "ap_jitter", "ap_bandwidth", "ap_loss", "ap_pose_noise", "ap_agents", "ap_bytes"][place]
+    [
+        "ap_latency",
+        "ap_jitter",
+        "ap_bandwidth",
+        "ap_loss",
+        "ap_pose_noise",
+        "ap_agents",
+        "ap_bytes",
+    ][place]
 }
 
 fn chart(
@@ -125,32 +158,58 @@ fn chart(
     // Along bytes, the cells of all values of a codec form one line.
     let mut series: Vec<(String, Points)> = Vec::new();
     for cell in cells {
-        let (Some(x), Some(y)) = ((dimension.value)(cell), precision(&cell.metrics)) else { continue };
+        let (Some(x), Some(y)) = ((dimension.value)(cell), precision(&cell.metrics)) else {
+            continue;
+        };
         let point = &cell.key.point;
         let others = varying.iter().filter(|other| **other != place);
         let texts = others.filter_map(|&other| (DIMENSIONS[other].text)(point));
-        let name = std::iter::once(point.method.name().to_owned()).chain(texts).collect::<Vec<_>>().join(", ");
-        let known = series.iter().position(|(known, _)| *known == name).unwrap_or_else(|| {
-            series.push((name.clone(), BTreeMap::new()));
-            series.len() - 1
-        });
+        let name = std::iter::once(point.method.name().to_owned())
+            .chain(texts)
+            .collect::<Vec<_>>()
+            .join(", ");
+        let known = series
+            .iter()
+            .position(|(known, _)| *known == name)
+            .unwrap_or_else(|| {
+                series.push((name.clone(), BTreeMap::new()));
+                series.len() - 1
+            });
         let key = (dimension.text)(point).map_or(Key::Value(x.to_bits()), Key::Text);
         series[known].1.entry(key).or_default().push((x, y));
     }
-    let series: Vec<Series> = series.into_iter().map(|(name, points)| line(name, points)).collect();
-    let xs = || series.iter().flat_map(|series| series.points.iter().map(|(x, _)| *x));
-    let (low, high) = (xs().fold(f64::INFINITY, f64::min), xs().fold(f64::NEG_INFINITY, f64::max));
+    let series: Vec<Series> = series
+        .into_iter()
+        .map(|(name, points)| line(name, points))
+        .collect();
+    let xs = || {
+        series
+            .iter()
+            .flat_map(|series| series.points.iter().map(|(x, _)| *x))
+    };
+    let (low, high) = (
+        xs().fold(f64::INFINITY, f64::min),
+        xs().fold(f64::NEG_INFINITY, f64::max),
+    );
     if low > high {
         return None;
     }
     let x = if dimension.is_logarithmic {
-        let decades = [low.log10().floor(), high.log10().ceil().max(low.log10().floor() + 1.0)];
+        let decades = [
+            low.log10().floor(),
+            high.log10().ceil().max(low.log10().floor() + 1.0),
+        ];
         Axis::logarithmic(dimension.label, decades.map(|decade| 10f64.powf(decade)))
     } else {
         Axis::linear(dimension.label, span(low, high, dimension.name == "bytes"))
     };
     let title = format!("{}: {title}", experiment.name);
-    Some(Chart { title, x, y: Axis::linear("AP, ordered by score", [0.0, 1.0]), series })
+    Some(Chart {
+        title,
+        x,
+        y: Axis::linear("AP, ordered by score", [0.0, 1.0]),
+        series,
+    })
 }
 
 /// Points of a line, grouped for the mean over seeds.
@@ -164,12 +223,19 @@ enum Key {
 }
 
 fn line(name: String, points: Points) -> Series {
-    let mean =
-        |values: &[(f64, f64)], of: fn(&(f64, f64)) -> f64| values.iter().map(of).sum::<f64>() / values.len() as f64;
-    let mut points: Vec<(f64, f64)> =
-        points.values().map(|values| (mean(values, |value| value.0), mean(values, |value| value.1))).collect();
+    let mean = |values: &[(f64, f64)], of: fn(&(f64, f64)) -> f64| {
+        values.iter().map(of).sum::<f64>() / values.len() as f64
+    };
+    let mut points: Vec<(f64, f64)> = points
+        .values()
+        .map(|values| (mean(values, |value| value.0), mean(values, |value| value.1)))
+        .collect();
     points.sort_by(|a, b| a.0.total_cmp(&b.0));
-    Series { name, points, mark: Mark::LineAndDots }
+    Series {
+        name,
+        points,
+        mark: Mark::LineAndDots,
+    }
 }
 
 /// Ends of an axis: from 0 unless all values are far from it, and of a width above 0.
@@ -184,7 +250,10 @@ mod tests {
 
     #[test]
     fn axes_begin_at_zero_unless_all_values_are_far_from_it() {
-        assert_eq!([span(100.0, 500.0, false), span(0.0, 0.0, false)], [[0.0, 500.0], [0.0, 1.0]]);
+        assert_eq!(
+            [span(100.0, 500.0, false), span(0.0, 0.0, false)],
+            [[0.0, 500.0], [0.0, 1.0]]
+        );
         assert_eq!(span(14.3, 20.9, true), [14.0, 20.9]);
     }
 
@@ -193,7 +262,10 @@ mod tests {
         let points = [(100.0, 0.6), (0.0, 0.9), (100.0, 0.8)];
         let mut by_key: BTreeMap<Key, Vec<(f64, f64)>> = BTreeMap::new();
         for (x, y) in points {
-            by_key.entry(Key::Text(format!("{x}"))).or_default().push((x, y));
+            by_key
+                .entry(Key::Text(format!("{x}")))
+                .or_default()
+                .push((x, y));
         }
         let line = line("max".into(), by_key);
         assert_eq!(line.points[0], (0.0, 0.9));

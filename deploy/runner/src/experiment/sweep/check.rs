@@ -15,10 +15,22 @@ pub(super) const MOST_RUNS: usize = 10_000;
 
 /// Checks everything that does not depend on the data.
 pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
-    let Experiment { name, grid, ego, poses, compute, maps_limit_gb, scenarios, ticks, .. } = experiment;
+    let Experiment {
+        name,
+        grid,
+        ego,
+        poses,
+        compute,
+        maps_limit_gb,
+        scenarios,
+        ticks,
+        ..
+    } = experiment;
     let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     if name.is_empty() || !name.chars().all(is_name) {
-        return Err(format!("name {name:?} is to name files: letters, digits, - and _"));
+        return Err(format!(
+            "name {name:?} is to name files: letters, digits, - and _"
+        ));
     }
     for (field, value) in [("scenarios", scenarios), ("ticks", ticks)] {
         if *value == Some(0) {
@@ -26,7 +38,9 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
         }
     }
     ego.validate().map_err(|error| error.to_string())?;
-    poses.validate().map_err(|error| format!("poses: {error}"))?;
+    poses
+        .validate()
+        .map_err(|error| format!("poses: {error}"))?;
     number("compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
     number("compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
     number("compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)?;
@@ -49,9 +63,17 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
 pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> Result<(), String> {
     for scenario in scenarios {
         let found = scenario.agents.len();
-        let asked = experiment.grid.agents.iter().flatten().find(|asked| **asked > found);
+        let asked = experiment
+            .grid
+            .agents
+            .iter()
+            .flatten()
+            .find(|asked| **asked > found);
         if let Some(asked) = asked {
-            return Err(format!("grid.agents is {asked}, but scenario {} has {found} vehicles", scenario.name));
+            return Err(format!(
+                "grid.agents is {asked}, but scenario {} has {found} vehicles",
+                scenario.name
+            ));
         }
     }
     Ok(())
@@ -59,42 +81,108 @@ pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> R
 
 /// Checks every axis on its own.
 fn axes(grid: &Grid) -> Result<(), String> {
-    let Grid { method, codec, latency_ms, jitter_ms, bandwidth_mbps, loss, pose_noise, agents, seed } = grid;
+    let Grid {
+        method,
+        codec,
+        latency_ms,
+        jitter_ms,
+        bandwidth_mbps,
+        loss,
+        pose_noise,
+        agents,
+        seed,
+    } = grid;
     values("grid.method", Some(method), |_| Ok(()))?;
-    values("grid.codec", codec.as_ref(), |CodecSpec { keep, zstd_level, fit, .. }| {
-        if let Some(keep) = keep
-            && !(*keep > 0.0 && *keep <= 1.0)
-        {
-            return Err(format!("grid.codec: keep is {keep}, must be above 0 and at most 1"));
-        }
-        number("grid.codec: fit", fit.unwrap_or(1.0), 0.01, 1.0)?;
-        number("grid.codec: zstd_level", f64::from(zstd_level.unwrap_or(1)), 1.0, 22.0)
+    values(
+        "grid.codec",
+        codec.as_ref(),
+        |CodecSpec {
+             keep,
+             zstd_level,
+             fit,
+             ..
+         }| {
+            if let Some(keep) = keep
+                && !(*keep > 0.0 && *keep <= 1.0)
+            {
+                return Err(format!(
+                    "grid.codec: keep is {keep}, must be above 0 and at most 1"
+                ));
+            }
+            number("grid.codec: fit", fit.unwrap_or(1.0), 0.01, 1.0)?;
+            number(
+                "grid.codec: zstd_level",
+                f64::from(zstd_level.unwrap_or(1)),
+                1.0,
+                22.0,
+            )
+        },
+    )?;
+    values("grid.latency_ms", latency_ms.as_ref(), |ms| {
+        number("grid.latency_ms", *ms, 0.0, 600_000.0)
     })?;
-    values("grid.latency_ms", latency_ms.as_ref(), |ms| number("grid.latency_ms", *ms, 0.0, 600_000.0))?;
-    values("grid.jitter_ms", jitter_ms.as_ref(), |ms| number("grid.jitter_ms", *ms, 0.0, 600_000.0))?;
-    values("grid.bandwidth_mbps", bandwidth_mbps.as_ref(), |mbps| match *mbps {
-        f64::INFINITY => Ok(()),
-        mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
+    values("grid.jitter_ms", jitter_ms.as_ref(), |ms| {
+        number("grid.jitter_ms", *ms, 0.0, 600_000.0)
     })?;
-    values("grid.loss", loss.as_ref(), |share| number("grid.loss", *share, 0.0, 1.0))?;
-    values("grid.pose_noise", pose_noise.as_ref(), |NoiseSpec { position_std_m, heading_std_deg }| {
-        number("grid.pose_noise: position_std_m", *position_std_m, 0.0, 1000.0)?;
-        number("grid.pose_noise: heading_std_deg", *heading_std_deg, 0.0, 360.0)
+    values(
+        "grid.bandwidth_mbps",
+        bandwidth_mbps.as_ref(),
+        |mbps| match *mbps {
+            f64::INFINITY => Ok(()),
+            mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
+        },
+    )?;
+    values("grid.loss", loss.as_ref(), |share| {
+        number("grid.loss", *share, 0.0, 1.0)
     })?;
-    values("grid.agents", agents.as_ref(), |count| number("grid.agents", *count as f64, 1.0, 64.0))?;
+    values(
+        "grid.pose_noise",
+        pose_noise.as_ref(),
+        |NoiseSpec {
+             position_std_m,
+             heading_std_deg,
+         }| {
+            number(
+                "grid.pose_noise: position_std_m",
+                *position_std_m,
+                0.0,
+                1000.0,
+            )?;
+            number(
+                "grid.pose_noise: heading_std_deg",
+                *heading_std_deg,
+                0.0,
+                360.0,
+            )
+        },
+    )?;
+    values("grid.agents", agents.as_ref(), |count| {
+        number("grid.agents", *count as f64, 1.0, 64.0)
+    })?;
     values("grid.seed", seed.as_ref(), |_| Ok(()))
 }
 
 /// Contradictory or impossible combinations of fields.
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
-    let Experiment { grid, ego, poses, link: name, .. } = experiment;
-    let contradiction =
-        |axis: &str, field: &str| Err(format!("{axis} and the {field} of link {name} contradict each other"));
+    let Experiment {
+        grid,
+        ego,
+        poses,
+        link: name,
+        ..
+    } = experiment;
+    let contradiction = |axis: &str, field: &str| {
+        Err(format!(
+            "{axis} and the {field} of link {name} contradict each other"
+        ))
+    };
     if let Some(ego) = &ego.id {
         return Err(format!("ego.id is {ego}: choose by protocol.ego instead"));
     }
     if ego.inbox != InboxConfig::default() {
-        return Err("ego.inbox is given, but receive limits do not apply in simulation time".into());
+        return Err(
+            "ego.inbox is given, but receive limits do not apply in simulation time".into(),
+        );
     }
     if experiment.noise_mode == NoiseMode::Replayed {
         return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
@@ -111,10 +199,15 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
         return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());
     }
-    if grid.bandwidth_mbps.is_none() && grid.codec.iter().flatten().any(|codec| codec.fit.is_some()) {
+    if grid.bandwidth_mbps.is_none() && grid.codec.iter().flatten().any(|codec| codec.fit.is_some())
+    {
         return Err("grid.codec.fit is a share of grid.bandwidth_mbps, which is left out".into());
     }
-    if let Some(ms) = grid.latency_ms.iter().flatten().find(|ms| **ms > ego.max_age_ms as f64 + ego.deadline_ms as f64)
+    if let Some(ms) = grid
+        .latency_ms
+        .iter()
+        .flatten()
+        .find(|ms| **ms > ego.max_age_ms as f64 + ego.deadline_ms as f64)
     {
         return Err(format!(
             "grid.latency_ms is {ms}, but ego.max_age_ms is {}: every message would be too old to be fused",
@@ -122,21 +215,45 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
         ));
     }
     if grid.pose_noise.is_some() && *poses != PoseSourceConfig::Recorded {
-        return Err(format!("grid.pose_noise is added to recorded poses, but poses is {}", poses.name()));
+        return Err(format!(
+            "grid.pose_noise is added to recorded poses, but poses is {}",
+            poses.name()
+        ));
     }
-    if grid.codec.is_some() && grid.method.iter().all(|method| method.exchange() != Exchange::Features) {
+    if grid.codec.is_some()
+        && grid
+            .method
+            .iter()
+            .all(|method| method.exchange() != Exchange::Features)
+    {
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
         return Err(format!(
             "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
             names.join(", ")
         ));
     }
-    if grid.method.iter().all(|method| method.exchange() == Exchange::Nothing) && grid.agents.is_some() {
-        return Err("grid.agents varies the transmitting vehicles, but grid.method is none: there are none".into());
+    if grid
+        .method
+        .iter()
+        .all(|method| method.exchange() == Exchange::Nothing)
+        && grid.agents.is_some()
+    {
+        return Err(
+            "grid.agents varies the transmitting vehicles, but grid.method is none: there are none"
+                .into(),
+        );
     }
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
-    let loses = grid.loss.iter().flatten().any(|share| *share > 0.0 && *share < 1.0);
-    let errs = grid.pose_noise.iter().flatten().any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
+    let loses = grid
+        .loss
+        .iter()
+        .flatten()
+        .any(|share| *share > 0.0 && *share < 1.0);
+    let errs = grid
+        .pose_noise
+        .iter()
+        .flatten()
+        .any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
     let is_random = jitters || loses || errs || is_random(link);
     if !is_random && grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1) {
         return Err("grid.seed has several values, but nothing in the experiment is random".into());
@@ -145,7 +262,10 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
 }
 
 fn is_random(link: &LinkConfig) -> bool {
-    let delay = !matches!(link.delay, DelayModel::None | DelayModel::ConstantMs(_) | DelayModel::Trace);
+    let delay = !matches!(
+        link.delay,
+        DelayModel::None | DelayModel::ConstantMs(_) | DelayModel::Trace
+    );
     delay || link.loss != LossModel::None || link.reorder.is_some() || link.duplicate > 0.0
 }
 
@@ -170,14 +290,24 @@ fn values<T: PartialEq + Debug>(
 
 fn number(field: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
     let fits = (low..=high).contains(&value);
-    if fits { Ok(()) } else { Err(format!("{field} is {value}, must be {low} to {high}")) }
+    if fits {
+        Ok(())
+    } else {
+        Err(format!("{field} is {value}, must be {low} to {high}"))
+    }
 }
 
 /// The axes with more than one value, multiplied: `3 method x 6 latency_ms`.
 pub(super) fn product(grid: &Grid) -> String {
-    let sizes = super::grid::sizes(grid).into_iter().filter(|(_, size)| *size > 1);
+    let sizes = super::grid::sizes(grid)
+        .into_iter()
+        .filter(|(_, size)| *size > 1);
     let factors: Vec<String> = sizes.map(|(axis, size)| format!("{size} {axis}")).collect();
-    if factors.is_empty() { "1".into() } else { factors.join(" x ") }
+    if factors.is_empty() {
+        "1".into()
+    } else {
+        factors.join(" x ")
+    }
 }
 
 #[cfg(test)]
@@ -196,24 +326,60 @@ mod tests {
         for (text, message) in [
             ("grid: {method: []}", "grid.method is empty"),
             ("grid: {method: [max], loss: [0, 1.5]}", "grid.loss is 1.5"),
-            ("grid: {method: [max], loss: [0.1, 0.1]}", "grid.loss names 0.1 twice"),
-            ("grid: {method: [max], bandwidth_mbps: [0]}", "grid.bandwidth_mbps is 0"),
-            ("grid: {method: [max], codec: [{dtype: f16, keep: 0}]}", "keep is 0"),
-            ("grid: {method: [max], codec: [{dtype: f32, fit: 2}]}", "grid.codec: fit is 2"),
-            ("grid: {method: [max], jitter_ms: [5]}", "grid.latency_ms, which is left out"),
-            ("grid: {method: [max], codec: [{dtype: f32, fit: 0.2}]}", "grid.bandwidth_mbps, which is left out"),
-            ("link: dsrc\ngrid: {method: [max], bandwidth_mbps: [6]}", "capacity of link dsrc"),
+            (
+                "grid: {method: [max], loss: [0.1, 0.1]}",
+                "grid.loss names 0.1 twice",
+            ),
+            (
+                "grid: {method: [max], bandwidth_mbps: [0]}",
+                "grid.bandwidth_mbps is 0",
+            ),
+            (
+                "grid: {method: [max], codec: [{dtype: f16, keep: 0}]}",
+                "keep is 0",
+            ),
+            (
+                "grid: {method: [max], codec: [{dtype: f32, fit: 2}]}",
+                "grid.codec: fit is 2",
+            ),
+            (
+                "grid: {method: [max], jitter_ms: [5]}",
+                "grid.latency_ms, which is left out",
+            ),
+            (
+                "grid: {method: [max], codec: [{dtype: f32, fit: 0.2}]}",
+                "grid.bandwidth_mbps, which is left out",
+            ),
+            (
+                "link: dsrc\ngrid: {method: [max], bandwidth_mbps: [6]}",
+                "capacity of link dsrc",
+            ),
             ("link: nowhere\ngrid: {method: [max]}", "nowhere"),
-            ("ego: {max_age_ms: 300}\ngrid: {method: [max], latency_ms: [500]}", "ego.max_age_ms is 300"),
-            ("grid: {method: [late], codec: [{dtype: i8}]}", "grid.method (late) sends none"),
-            ("grid: {method: [max], seed: [1, 2]}", "nothing in the experiment is random"),
+            (
+                "ego: {max_age_ms: 300}\ngrid: {method: [max], latency_ms: [500]}",
+                "ego.max_age_ms is 300",
+            ),
+            (
+                "grid: {method: [late], codec: [{dtype: i8}]}",
+                "grid.method (late) sends none",
+            ),
+            (
+                "grid: {method: [max], seed: [1, 2]}",
+                "nothing in the experiment is random",
+            ),
             (
                 "poses: {cached: {file: p.csv}}\ngrid: {method: [max], pose_noise: [{position_std_m: 1, heading_std_deg: 1}]}",
                 "poses is cached",
             ),
             ("ego: {id: '7'}\ngrid: {method: [max]}", "protocol.ego"),
-            ("noise_mode: replayed\ngrid: {method: [max]}", "noise_mode is replayed"),
-            ("poses: {noisy: {step_s: 0}}\ngrid: {method: [max]}", "poses: noisy.step_s is 0"),
+            (
+                "noise_mode: replayed\ngrid: {method: [max]}",
+                "noise_mode is replayed",
+            ),
+            (
+                "poses: {noisy: {step_s: 0}}\ngrid: {method: [max]}",
+                "poses: noisy.step_s is 0",
+            ),
             ("ticks: 0\ngrid: {method: [max]}", "ticks is 0"),
         ] {
             let problem = problem(text);
@@ -223,11 +389,18 @@ mod tests {
 
     #[test]
     fn a_grid_that_takes_too_long_is_refused_with_its_size() {
-        let many = (0..101).map(|k| k.to_string()).collect::<Vec<_>>().join(", ");
-        let text = format!("grid: {{method: [max], latency_ms: [{many}], seed: [{many}], jitter_ms: [1]}}");
+        let many = (0..101)
+            .map(|k| k.to_string())
+            .collect::<Vec<_>>()
+            .join(", ");
+        let text = format!(
+            "grid: {{method: [max], latency_ms: [{many}], seed: [{many}], jitter_ms: [1]}}"
+        );
         let problem = problem(&text);
         assert!(
-            problem.contains("101 latency_ms x 101 seed = 10201 runs, 2.8 hours even at a second each"),
+            problem.contains(
+                "101 latency_ms x 101 seed = 10201 runs, 2.8 hours even at a second each"
+            ),
             "{problem}"
         );
     }

@@ -45,7 +45,10 @@ pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
         ("codec", size(grid.codec.as_ref().map(Vec::len))),
         ("latency_ms", size(grid.latency_ms.as_ref().map(Vec::len))),
         ("jitter_ms", size(grid.jitter_ms.as_ref().map(Vec::len))),
-        ("bandwidth_mbps", size(grid.bandwidth_mbps.as_ref().map(Vec::len))),
+        (
+            "bandwidth_mbps",
+            size(grid.bandwidth_mbps.as_ref().map(Vec::len)),
+        ),
         ("loss", size(grid.loss.as_ref().map(Vec::len))),
         ("pose_noise", size(grid.pose_noise.as_ref().map(Vec::len))),
         ("agents", size(grid.agents.as_ref().map(Vec::len))),
@@ -55,14 +58,19 @@ pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
 
 /// Number of points of the grid.
 pub(super) fn count(grid: &Grid) -> usize {
-    sizes(grid).into_iter().fold(1, |product, (_, size)| product.saturating_mul(size))
+    sizes(grid)
+        .into_iter()
+        .fold(1, |product, (_, size)| product.saturating_mul(size))
 }
 
 /// Every point; the last field varies fastest.
 #[must_use]
 pub fn points(grid: &Grid) -> Vec<Point> {
     let mut points: Vec<Point> = Vec::new();
-    let codecs = grid.codec.clone().unwrap_or_else(|| vec![CodecSpec::default()]);
+    let codecs = grid
+        .codec
+        .clone()
+        .unwrap_or_else(|| vec![CodecSpec::default()]);
     for &method in &grid.method {
         for &codec in &codecs {
             points.push(Point {
@@ -78,18 +86,34 @@ pub fn points(grid: &Grid) -> Vec<Point> {
             });
         }
     }
-    points = spread(points, grid.latency_ms.as_deref(), |point, value| point.latency_ms = Some(value));
-    points = spread(points, grid.jitter_ms.as_deref(), |point, value| point.jitter_ms = Some(value));
+    points = spread(points, grid.latency_ms.as_deref(), |point, value| {
+        point.latency_ms = Some(value)
+    });
+    points = spread(points, grid.jitter_ms.as_deref(), |point, value| {
+        point.jitter_ms = Some(value)
+    });
     points = spread(points, grid.bandwidth_mbps.as_deref(), |point, value| {
         point.bandwidth_mbps = Some(value).filter(|mbps| mbps.is_finite());
     });
-    points = spread(points, grid.loss.as_deref(), |point, value| point.loss = Some(value));
-    points = spread(points, grid.pose_noise.as_deref(), |point, value| point.pose_noise = Some(value));
-    points = spread(points, grid.agents.as_deref(), |point, value| point.agents = Some(value));
-    spread(points, grid.seed.as_deref(), |point, value| point.seed = value)
+    points = spread(points, grid.loss.as_deref(), |point, value| {
+        point.loss = Some(value)
+    });
+    points = spread(points, grid.pose_noise.as_deref(), |point, value| {
+        point.pose_noise = Some(value)
+    });
+    points = spread(points, grid.agents.as_deref(), |point, value| {
+        point.agents = Some(value)
+    });
+    spread(points, grid.seed.as_deref(), |point, value| {
+        point.seed = value
+    })
 }
 
-fn spread<T: Copy>(points: Vec<Point>, values: Option<&[T]>, set: impl Fn(&mut Point, T)) -> Vec<Point> {
+fn spread<T: Copy>(
+    points: Vec<Point>,
+    values: Option<&[T]>,
+    set: impl Fn(&mut Point, T),
+) -> Vec<Point> {
     let Some(values) = values else { return points };
     let with = |point: Point| {
         let set = &set;
@@ -116,7 +140,10 @@ impl Point {
             };
         }
         if let Some(rate_mbps) = self.bandwidth_mbps {
-            link.capacity = CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 };
+            link.capacity = CapacityConfig::TokenBucket {
+                rate_mbps,
+                burst_bytes: 0,
+            };
         }
         if let Some(share) = self.loss {
             link.loss = LossModel::Bernoulli(share);
@@ -128,7 +155,11 @@ impl Point {
     /// Pose source of this point.
     #[must_use]
     pub fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
-        let Some(NoiseSpec { position_std_m, heading_std_deg }) = self.pose_noise else {
+        let Some(NoiseSpec {
+            position_std_m,
+            heading_std_deg,
+        }) = self.pose_noise
+        else {
             return experiment.poses.clone();
         };
         let (mode, seed) = (experiment.noise_mode, self.seed);
@@ -144,7 +175,12 @@ impl Point {
     /// Encoding of feature maps of `channels` on `grid`.
     #[must_use]
     pub fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
-        let CodecSpec { dtype, keep, zstd_level, fit: _ } = self.codec;
+        let CodecSpec {
+            dtype,
+            keep,
+            zstd_level,
+            fit: _,
+        } = self.codec;
         let cells = grid.cells() as u64;
         let budget = |keep: f64| {
             let kept = (keep * cells as f64).ceil() as u64;
@@ -153,7 +189,12 @@ impl Point {
         };
         // All cells need no budget, and a mask would only cost bytes.
         let budget_bytes = keep.filter(|keep| *keep < 1.0).map(budget);
-        CodecConfig { dtype, gate: None, budget_bytes, zstd_level }
+        CodecConfig {
+            dtype,
+            gate: None,
+            budget_bytes,
+            zstd_level,
+        }
     }
 
     /// Rate that feature maps are adapted to; empty without adaptation, or if the link is unlimited.
@@ -205,9 +246,15 @@ mod tests {
         let grid = experiment("{method: [max, late], latency_ms: [0, 100], seed: [1, 2, 3]}").grid;
         let points = points(&grid);
         assert_eq!((points.len(), count(&grid)), (12, 12));
-        assert_eq!((points[0].method, points[0].latency_ms, points[0].seed), (Method::MAX, Some(0.0), 1));
+        assert_eq!(
+            (points[0].method, points[0].latency_ms, points[0].seed),
+            (Method::MAX, Some(0.0), 1)
+        );
         assert_eq!((points[1].latency_ms, points[1].seed), (Some(0.0), 2));
-        assert_eq!((points[11].method, points[11].latency_ms, points[11].seed), (Method::LATE, Some(100.0), 3));
+        assert_eq!(
+            (points[11].method, points[11].latency_ms, points[11].seed),
+            (Method::LATE, Some(100.0), 3)
+        );
     }
 
     #[test]
@@ -216,10 +263,25 @@ mod tests {
         let experiment = experiment(text);
         let points = points(&experiment.grid);
         let (first, _) = points[0].link(&experiment).unwrap();
-        assert_eq!((first.delay, first.capacity), (DelayModel::ConstantMs(50.0), CapacityConfig::Unlimited));
+        assert_eq!(
+            (first.delay, first.capacity),
+            (DelayModel::ConstantMs(50.0), CapacityConfig::Unlimited)
+        );
         let (last, _) = points[3].link(&experiment).unwrap();
-        assert_eq!(last.delay, DelayModel::Normal { mean_ms: 50.0, std_ms: 10.0 });
-        assert_eq!(last.capacity, CapacityConfig::TokenBucket { rate_mbps: 6.0, burst_bytes: 0 });
+        assert_eq!(
+            last.delay,
+            DelayModel::Normal {
+                mean_ms: 50.0,
+                std_ms: 10.0
+            }
+        );
+        assert_eq!(
+            last.capacity,
+            CapacityConfig::TokenBucket {
+                rate_mbps: 6.0,
+                burst_bytes: 0
+            }
+        );
         assert_eq!(last.loss, LossModel::Bernoulli(0.1));
     }
 
@@ -227,17 +289,32 @@ mod tests {
     fn a_share_of_the_link_is_a_rate_of_bytes() {
         let text = "{method: [max], codec: [{dtype: f32}, {dtype: f32, fit: 0.5}], bandwidth_mbps: [6, .inf]}";
         let points = points(&experiment(text).grid);
-        let rates: Vec<_> = points.iter().map(|point| (point.codec.name(), point.rate().bytes_per_second)).collect();
+        let rates: Vec<_> = points
+            .iter()
+            .map(|point| (point.codec.name(), point.rate().bytes_per_second))
+            .collect();
         let name = |text: &str| text.to_owned();
         let fitted = name("f32 fitted to 0.5");
-        let expected = [(name("f32"), None), (name("f32"), None), (fitted.clone(), Some(375_000)), (fitted, None)];
+        let expected = [
+            (name("f32"), None),
+            (name("f32"), None),
+            (fitted.clone(), Some(375_000)),
+            (fitted, None),
+        ];
         assert_eq!(rates, expected);
     }
 
     #[test]
     fn a_share_of_cells_is_a_budget_of_bytes() {
-        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 10, height: 8 };
-        let experiment = experiment("{method: [max], codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]}");
+        let grid = BevGrid {
+            x_min_m: 0.0,
+            y_min_m: 0.0,
+            cell_m: 1.0,
+            width: 10,
+            height: 8,
+        };
+        let experiment =
+            experiment("{method: [max], codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]}");
         let points = points(&experiment.grid);
         assert_eq!(points[0].codec(grid, 4).budget_bytes, None);
         // Four scales, ten bytes of mask, twenty cells of four bytes.

@@ -15,8 +15,17 @@ const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;ma
 
 /// Page of an experiment with the file content `spec` and the SVG of the charts of each figure.
 // Writing to a string cannot fail.
-pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[Vec<String>]) -> String {
-    let title = if experiment.title.is_empty() { &experiment.name } else { &experiment.title };
+pub(super) fn page(
+    experiment: &Experiment,
+    spec: &str,
+    cells: &[Cell],
+    figures: &[Vec<String>],
+) -> String {
+    let title = if experiment.title.is_empty() {
+        &experiment.name
+    } else {
+        &experiment.title
+    };
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\n\
@@ -49,35 +58,56 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     for line in provenance(cells) {
         let _ = writeln!(page, "<li>{}</li>", escaped(&line));
     }
-    let _ = writeln!(page, "</ul>\n<h2>Experiment</h2>\n<pre>{}</pre>\n</body></html>", escaped(spec));
+    let _ = writeln!(
+        page,
+        "</ul>\n<h2>Experiment</h2>\n<pre>{}</pre>\n</body></html>",
+        escaped(spec)
+    );
     page
 }
 
 /// The runs: what varies in a table, the best precisions in bold, and the rest in a line.
 fn runs_table(table: &VaryingTable) -> String {
     let mut text = "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>".to_owned();
-    table.columns.iter().for_each(|column| text += &format!("<th>{}</th>", escaped(column)));
+    table
+        .columns
+        .iter()
+        .for_each(|column| text += &format!("<th>{}</th>", escaped(column)));
     text += "</tr></thead><tbody>\n";
     for (line, fields) in table.lines.iter().enumerate() {
         text += "<tr>";
         for (column, field) in fields.iter().enumerate() {
             let field = escaped(field);
-            let field = if table.is_best(line, column) { format!("<b>{field}</b>") } else { field };
+            let field = if table.is_best(line, column) {
+                format!("<b>{field}</b>")
+            } else {
+                field
+            };
             text += &format!("<td>{field}</td>");
         }
         text += "</tr>\n";
     }
     text += "</tbody></table></div>\n";
-    let constants: Vec<String> = table.constants.iter().map(|(name, value)| format!("{name} {value}")).collect();
+    let constants: Vec<String> = table
+        .constants
+        .iter()
+        .map(|(name, value)| format!("{name} {value}"))
+        .collect();
     if !constants.is_empty() {
-        text += &format!("<p>The same in all runs: {}.</p>\n", escaped(&constants.join(", ")));
+        text += &format!(
+            "<p>The same in all runs: {}.</p>\n",
+            escaped(&constants.join(", "))
+        );
     }
     text
 }
 
 /// Text with the special characters of markup escaped.
 fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }
 
 /// Program, data and weights, each once.
@@ -89,7 +119,10 @@ fn provenance(cells: &[Cell]) -> Vec<String> {
             [
                 format!("program SHA-256 {}", key.program_sha256),
                 format!("data SHA-256 {}", key.data_sha256),
-                format!("weights of {} SHA-256 {}", key.point.method, key.weights_sha256),
+                format!(
+                    "weights of {} SHA-256 {}",
+                    key.point.method, key.weights_sha256
+                ),
             ]
         })
         .collect();

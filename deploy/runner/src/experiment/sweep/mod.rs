@@ -141,23 +141,46 @@ impl Sweep {
         let experiment = Experiment::read(file)?;
         generate(&experiment)?;
         let part = experiment.part();
-        let all = part.open(&experiment.dataset, &experiment.protocol).map_err(Box::new)?.scenarios;
+        let all = part
+            .open(&experiment.dataset, &experiment.protocol)
+            .map_err(Box::new)?
+            .scenarios;
         let scenarios: Vec<Scenario> = part.chosen(&all).cloned().collect();
-        let spec = |problem| SweepError::Spec { path: file.to_owned(), problem };
+        let spec = |problem| SweepError::Spec {
+            path: file.to_owned(),
+            problem,
+        };
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {
-            return Err(spec(format!("dataset {}: there is no frame in it", experiment.dataset.display())));
+            return Err(spec(format!(
+                "dataset {}: there is no frame in it",
+                experiment.dataset.display()
+            )));
         }
         check::check_scenes(&experiment, &scenarios).map_err(spec)?;
         let points = points(&experiment.grid);
         let mut hashes = cell::Hashes::new(dataset::content_sha256(&scenarios));
-        let keys = points.iter().map(|point| hashes.key(&experiment, point)).collect::<Result<_, _>>()?;
+        let keys = points
+            .iter()
+            .map(|point| hashes.key(&experiment, point))
+            .collect::<Result<_, _>>()?;
         let (file, out) = (file.to_owned(), out.to_owned());
-        Ok(Self { file, experiment, points, all, scenarios, keys, out })
+        Ok(Self {
+            file,
+            experiment,
+            points,
+            all,
+            scenarios,
+            keys,
+            out,
+        })
     }
 
     /// Cached runs, by place in the grid.
     fn known(&self) -> Result<Vec<Option<Cell>>, SweepError> {
-        self.keys.iter().map(|key| Cell::read(key, &self.cells())).collect()
+        self.keys
+            .iter()
+            .map(|key| Cell::read(key, &self.cells()))
+            .collect()
     }
 
     fn cells(&self) -> PathBuf {
@@ -169,7 +192,10 @@ impl Sweep {
     }
 
     fn frames(&self) -> usize {
-        self.scenarios.iter().map(|scenario| scenario.ticks.len()).sum()
+        self.scenarios
+            .iter()
+            .map(|scenario| scenario.ticks.len())
+            .sum()
     }
 
     /// Computes the missing runs and writes table, charts and report.
@@ -177,9 +203,14 @@ impl Sweep {
     /// # Errors
     /// [`SweepError`] at the first run that cannot be computed; earlier runs are cached.
     pub fn run(&self, options: &SweepOptions) -> Result<Swept, SweepError> {
-        fs::create_dir_all(self.cells()).map_err(|source| SweepError::Io { path: self.cells(), source })?;
+        fs::create_dir_all(self.cells()).map_err(|source| SweepError::Io {
+            path: self.cells(),
+            source,
+        })?;
         let known = self.known()?;
-        let missing: Vec<usize> = (0..known.len()).filter(|&index| known[index].is_none()).collect();
+        let missing: Vec<usize> = (0..known.len())
+            .filter(|&index| known[index].is_none())
+            .collect();
         self.announce(&known, &missing, options)?;
         if options.dry_run {
             return Ok(Swept::default());
@@ -187,16 +218,28 @@ impl Sweep {
         let maps = self.encode(&missing, options.jobs)?;
         self.compute(&missing, options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
-        let cells = cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
+        let cells =
+            cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
         let table = self.write(&cells)?;
         if !options.keep_maps {
             remove_maps(&maps)?;
         }
-        Ok(Swept { table, left_out: cells.into_iter().map(|cell| cell.metrics.left_out).collect() })
+        Ok(Swept {
+            table,
+            left_out: cells
+                .into_iter()
+                .map(|cell| cell.metrics.left_out)
+                .collect(),
+        })
     }
 
     /// Prints the number of runs and the estimated time.
-    fn announce(&self, known: &[Option<Cell>], missing: &[usize], options: &SweepOptions) -> Result<(), SweepError> {
+    fn announce(
+        &self,
+        known: &[Option<Cell>],
+        missing: &[usize],
+        options: &SweepOptions,
+    ) -> Result<(), SweepError> {
         let (runs, frames) = (known.len(), self.frames());
         output::note(format_args!(
             "{}: {} = {runs} runs of {frames} frames, {} done before",
@@ -204,14 +247,23 @@ impl Sweep {
             check::product(&self.experiment.grid),
             runs - missing.len()
         ));
-        let Some(&first) = missing.first() else { return Ok(()) };
+        let Some(&first) = missing.first() else {
+            return Ok(());
+        };
         let done: Vec<&Cell> = known.iter().flatten().collect();
         let seconds: f64 = done.iter().map(|cell| cell.wall_seconds).sum();
         let judged: f64 = done.iter().map(|cell| cell.metrics.frames as f64).sum();
-        let per_frame = if judged > 0.0 { seconds / judged } else { self.probe(&self.points[first])? };
+        let per_frame = if judged > 0.0 {
+            seconds / judged
+        } else {
+            self.probe(&self.points[first])?
+        };
         let jobs = options.jobs.clamp(1, missing.len());
         let minutes = per_frame * (missing.len() * frames) as f64 / jobs as f64 / 60.0;
-        output::note(format_args!("about {minutes:.1} minutes for {} runs with {jobs} jobs", missing.len()));
+        output::note(format_args!(
+            "about {minutes:.1} minutes for {} runs with {jobs} jobs",
+            missing.len()
+        ));
         Ok(())
     }
 
@@ -220,7 +272,12 @@ impl Sweep {
         let mut options = cell::options(&self.experiment, point, &self.maps())?;
         options.maps = None;
         options.part.scenarios = Some(1);
-        options.part.ticks = Some(self.experiment.ticks.unwrap_or(PROBED_TICKS).min(PROBED_TICKS));
+        options.part.ticks = Some(
+            self.experiment
+                .ticks
+                .unwrap_or(PROBED_TICKS)
+                .min(PROBED_TICKS),
+        );
         let began = Instant::now();
         let metrics = evaluate(&options, point.method, &mut || {}).map_err(Box::new)?;
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
@@ -239,7 +296,8 @@ impl Sweep {
         let mut stored = Vec::new();
         for file in files {
             let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
-            let weights = perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
+            let weights =
+                perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
             let weights = Arc::new(weights.with_precision(self.experiment.precision));
             let bar = progress::bar(0, "sweeps encoded");
             let kept = cell::kept_maps(&self.experiment, &self.maps());
@@ -265,7 +323,14 @@ impl Sweep {
             }
         };
         let computed = if jobs > 1 && missing.len() > 1 {
-            workers::run(&self.file, &self.out, missing, jobs, &|| bar.inc(1), &on_done)
+            workers::run(
+                &self.file,
+                &self.out,
+                missing,
+                jobs,
+                &|| bar.inc(1),
+                &on_done,
+            )
         } else {
             missing.iter().try_for_each(|&index| {
                 self.compute_one(index, &mut || bar.inc(1))?;
@@ -287,7 +352,10 @@ impl Sweep {
     /// # Errors
     /// [`SweepError::Io`] when the parent process has ended.
     pub fn work(&self) -> Result<(), SweepError> {
-        let gone = |source| SweepError::Io { path: "the parent sweep".into(), source };
+        let gone = |source| SweepError::Io {
+            path: "the parent sweep".into(),
+            source,
+        };
         let reply = |line: &str| {
             let mut output = io::stdout().lock();
             writeln!(output, "{line}").and_then(|()| output.flush())
@@ -295,11 +363,13 @@ impl Sweep {
         for line in io::stdin().lock().lines() {
             let index: Option<usize> = line.map_err(gone)?.trim().parse().ok();
             let Some(index) = index.filter(|index| *index < self.points.len()) else {
-                reply(&format!("{} that is no point of the grid", workers::FAILED)).map_err(gone)?;
+                reply(&format!("{} that is no point of the grid", workers::FAILED))
+                    .map_err(gone)?;
                 continue;
             };
             // The parent may have ended; then the answer to the run fails too.
-            let computed = self.compute_one(index, &mut || reply(workers::FRAME).unwrap_or_default());
+            let computed =
+                self.compute_one(index, &mut || reply(workers::FRAME).unwrap_or_default());
             let answer = match computed {
                 Ok(()) => workers::DONE.to_owned(),
                 Err(error) => format!("{} {error}", workers::FAILED),
@@ -322,13 +392,25 @@ impl Sweep {
             let svg = figures::svg(&figure.charts)?;
             write(&format!("{}.svg", figure.name), &svg)?;
             // Charts of their own: side by side where there is room, and else below each other.
-            let each = figure.charts.chunks(1).map(figures::svg).collect::<Result<Vec<_>, _>>()?;
+            let each = figure
+                .charts
+                .chunks(1)
+                .map(figures::svg)
+                .collect::<Result<Vec<_>, _>>()?;
             drawings.push(each);
-            figures::save_png(&figure.charts, &self.out.join(format!("{}.png", figure.name)))?;
+            figures::save_png(
+                &figure.charts,
+                &self.out.join(format!("{}.png", figure.name)),
+            )?;
         }
-        let spec =
-            fs::read_to_string(&self.file).map_err(|source| SweepError::Io { path: self.file.clone(), source })?;
-        write("report.html", &html::page(&self.experiment, &spec, cells, &drawings))?;
+        let spec = fs::read_to_string(&self.file).map_err(|source| SweepError::Io {
+            path: self.file.clone(),
+            source,
+        })?;
+        write(
+            "report.html",
+            &html::page(&self.experiment, &spec, cells, &drawings),
+        )?;
         let (columns, lines) = table::rows(&self.experiment, cells);
         Ok(VaryingTable::new(&columns, &lines).text())
     }
@@ -338,7 +420,10 @@ impl Sweep {
 /// files of their folder stay.
 fn remove_maps(files: &[PathBuf]) -> Result<(), SweepError> {
     for path in files {
-        fs::remove_file(path).map_err(|source| SweepError::Io { path: path.clone(), source })?;
+        fs::remove_file(path).map_err(|source| SweepError::Io {
+            path: path.clone(),
+            source,
+        })?;
     }
     if let Some(folder) = files.first().and_then(|file| file.parent()) {
         // It stays where it holds anything else.
@@ -349,7 +434,9 @@ fn remove_maps(files: &[PathBuf]) -> Result<(), SweepError> {
 
 /// Generates the data set if it is requested and does not exist.
 fn generate(experiment: &Experiment) -> Result<(), SweepError> {
-    let Some(generate) = &experiment.generate else { return Ok(()) };
+    let Some(generate) = &experiment.generate else {
+        return Ok(());
+    };
     let options = SynthOptions {
         frames: generate.frames,
         scenes: generate.scenarios,
@@ -360,9 +447,14 @@ fn generate(experiment: &Experiment) -> Result<(), SweepError> {
     if generate::are_kept(&options)? {
         return Ok(());
     }
-    output::note(format_args!("generating {} scenarios into {}", generate.scenarios, experiment.dataset.display()));
+    output::note(format_args!(
+        "generating {} scenarios into {}",
+        generate.scenarios,
+        experiment.dataset.display()
+    ));
     let bar = progress::percent_bar(options.scenarios());
-    let generated = generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
+    let generated =
+        generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     generated?;
     Ok(())

@@ -142,7 +142,12 @@ pub struct CodecSpec {
 
 impl Default for CodecSpec {
     fn default() -> Self {
-        Self { dtype: Dtype::F16, keep: None, zstd_level: None, fit: None }
+        Self {
+            dtype: Dtype::F16,
+            keep: None,
+            zstd_level: None,
+            fit: None,
+        }
     }
 }
 
@@ -150,7 +155,9 @@ impl CodecSpec {
     /// Label in tables and charts: the number format, and the fraction of the link's rate.
     #[must_use]
     pub fn name(&self) -> String {
-        let fitted = self.fit.map_or(String::new(), |share| format!(" fitted to {share}"));
+        let fitted = self
+            .fit
+            .map_or(String::new(), |share| format!(" fitted to {share}"));
         format!("{:?}{fitted}", self.dtype).to_lowercase()
     }
 }
@@ -184,7 +191,10 @@ impl Experiment {
     /// # Errors
     /// [`SweepError`] names the file and the field.
     pub fn read(path: &Path) -> Result<Self, SweepError> {
-        let spec = |problem: String| SweepError::Spec { path: path.into(), problem };
+        let spec = |problem: String| SweepError::Spec {
+            path: path.into(),
+            problem,
+        };
         let mut experiment: Self = config_file::read(path)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         experiment.dataset = folder.join(&experiment.dataset);
@@ -200,6 +210,10 @@ impl Experiment {
     /// The part of the data set that is evaluated.
     #[must_use]
     pub fn part(&self) -> crate::experiment::evaluation::Part {
-        crate::experiment::evaluation::Part { scenarios: self.scenarios, ticks: self.ticks, ..Default::default() }
+        crate::experiment::evaluation::Part {
+            scenarios: self.scenarios,
+            ticks: self.ticks,
+            ..Default::default()
+        }
     }
 }

@@ -28,15 +28,27 @@ const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbp
 
 /// Definitions of columns whose names are not enough.
 pub(super) const NOTES: &[(&str, &str)] = &[
-    ("latency_ms, bandwidth_mbps, loss", "empty: as in the experiment's link; inf: unlimited"),
-    ("noise_t, noise_r", "standard deviation of the poses' errors, metres and degrees"),
-    ("ap_global, ap_frame", "average precision ordered by score over all frames, and ordered by frame as in OpenCOOD"),
+    (
+        "latency_ms, bandwidth_mbps, loss",
+        "empty: as in the experiment's link; inf: unlimited",
+    ),
+    (
+        "noise_t, noise_r",
+        "standard deviation of the poses' errors, metres and degrees",
+    ),
+    (
+        "ap_global, ap_frame",
+        "average precision ordered by score over all frames, and ordered by frame as in OpenCOOD",
+    ),
     (
         "payload_bytes, wire_bytes",
         "mean per neighbour and frame that was fused; wire: with headers and the pose's message",
     ),
     ("log2_payload, log2_wire", "binary logarithm of these"),
-    ("log2_frame", "binary logarithm of the wire bytes that an ego used per frame, of all neighbours together"),
+    (
+        "log2_frame",
+        "binary logarithm of the wire bytes that an ego used per frame, of all neighbours together",
+    ),
     (
         "log2_fp32",
         "binary logarithm of the sent values at 4 bytes each, as Where2comm counts; empty where their number does \
@@ -46,27 +58,53 @@ pub(super) const NOTES: &[(&str, &str)] = &[
         "nominal_fp32_log2",
         "binary logarithm of a complete feature map at 4 bytes a value, independent of what was sent",
     ),
-    ("e2e_ms", "from the capture of the ego's sweep to the publication of its detections, simulation time"),
-    ("age_ms", "capture time of the ego's sweep less that of the fused neighbour's"),
-    ("frames_used", "neighbours' messages fused, over all frames; one may serve several frames"),
-    ("sent, received, in_flight, dropped", "feature maps, boxes or points of neighbours, each counted once"),
+    (
+        "e2e_ms",
+        "from the capture of the ego's sweep to the publication of its detections, simulation time",
+    ),
+    (
+        "age_ms",
+        "capture time of the ego's sweep less that of the fused neighbour's",
+    ),
+    (
+        "frames_used",
+        "neighbours' messages fused, over all frames; one may serve several frames",
+    ),
+    (
+        "sent, received, in_flight, dropped",
+        "feature maps, boxes or points of neighbours, each counted once",
+    ),
 ];
 
 /// The whole table.
 #[must_use]
 pub fn csv(experiment: &Experiment, cells: &[Cell]) -> String {
     let mut text = CsvText::new(COLUMNS);
-    cells.iter().for_each(|cell| text.row(line(experiment, cell)));
+    cells
+        .iter()
+        .for_each(|cell| text.row(line(experiment, cell)));
     text.finish()
 }
 
 /// Names of the columns, and the fields of each line.
-pub(super) fn rows(experiment: &Experiment, cells: &[Cell]) -> (Vec<&'static str>, Vec<Vec<String>>) {
-    (COLUMNS.split(',').collect(), cells.iter().map(|cell| line(experiment, cell)).collect())
+pub(super) fn rows(
+    experiment: &Experiment,
+    cells: &[Cell],
+) -> (Vec<&'static str>, Vec<Vec<String>>) {
+    (
+        COLUMNS.split(',').collect(),
+        cells.iter().map(|cell| line(experiment, cell)).collect(),
+    )
 }
 
 fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
-    let Cell { key, metrics, used, messages, wall_seconds: _ } = cell;
+    let Cell {
+        key,
+        metrics,
+        used,
+        messages,
+        wall_seconds: _,
+    } = cell;
     let point = &key.point;
     let sends_maps = point.method.exchange() == Exchange::Features;
     let is_plain = sends_maps && point.codec.fit.is_none() && point.codec.zstd_level.is_none();
@@ -75,35 +113,92 @@ fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
         mbps => plain(mbps),
     };
     let mut fields = vec![point.method.name().to_owned()];
-    fields.push(if sends_maps { point.codec.name() } else { String::new() });
-    fields.push(if sends_maps { plain(point.codec.keep) } else { String::new() });
-    fields.push(point.codec.zstd_level.filter(|_| sends_maps).map_or(String::new(), |level| level.to_string()));
-    fields.extend([plain(point.latency_ms), plain(point.jitter_ms), bandwidth, plain(point.loss)]);
+    fields.push(if sends_maps {
+        point.codec.name()
+    } else {
+        String::new()
+    });
+    fields.push(if sends_maps {
+        plain(point.codec.keep)
+    } else {
+        String::new()
+    });
+    fields.push(
+        point
+            .codec
+            .zstd_level
+            .filter(|_| sends_maps)
+            .map_or(String::new(), |level| level.to_string()),
+    );
+    fields.extend([
+        plain(point.latency_ms),
+        plain(point.jitter_ms),
+        bandwidth,
+        plain(point.loss),
+    ]);
     fields.extend([
         plain(point.pose_noise.map(|noise| noise.position_std_m)),
         plain(point.pose_noise.map(|noise| noise.heading_std_deg)),
     ]);
-    fields.push(point.agents.map_or(String::new(), |agents| agents.to_string()));
+    fields.push(
+        point
+            .agents
+            .map_or(String::new(), |agents| agents.to_string()),
+    );
     fields.extend([point.seed.to_string(), metrics.frames.to_string()]);
-    for ByIou { at_30, at_50, at_70 } in [metrics.ap_global, metrics.ap_frame_order] {
+    for ByIou {
+        at_30,
+        at_50,
+        at_70,
+    } in [metrics.ap_global, metrics.ap_frame_order]
+    {
         fields.extend([at_30, at_50, at_70].map(|precision| fixed(precision, 4)));
     }
     let comm = &metrics.comm;
-    fields.extend([fixed(comm.payload_bytes_mean, 1), fixed(comm.wire_bytes_mean, 1), fixed(comm.log2_payload, 4)]);
+    fields.extend([
+        fixed(comm.payload_bytes_mean, 1),
+        fixed(comm.wire_bytes_mean, 1),
+        fixed(comm.log2_payload, 4),
+    ]);
     let log2 = |bytes: Option<f64>| fixed(bytes.filter(|bytes| *bytes > 0.0).map(f64::log2), 4);
     fields.push(log2(comm.wire_bytes_mean));
-    fields.push(log2(comm.wire_bytes_mean.map(|bytes| bytes * *used as f64 / metrics.frames.max(1) as f64)));
+    fields
+        .push(log2(comm.wire_bytes_mean.map(|bytes| {
+            bytes * *used as f64 / metrics.frames.max(1) as f64
+        })));
     fields.push(log2(
-        comm.payload_bytes_mean.filter(|_| is_plain).map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64),
+        comm.payload_bytes_mean
+            .filter(|_| is_plain)
+            .map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64),
     ));
     fields.push(fixed(Some(comm.nominal_fp32_log2), 4));
     let latency = &metrics.latency_ms.capture_to_detection;
-    fields
-        .extend([latency.p50, latency.p95, latency.p99, metrics.age_ms.p50, metrics.age_ms.p95].map(|ms| fixed(ms, 3)));
+    fields.extend(
+        [
+            latency.p50,
+            latency.p95,
+            latency.p99,
+            metrics.age_ms.p50,
+            metrics.age_ms.p95,
+        ]
+        .map(|ms| fixed(ms, 3)),
+    );
     let count = |reason: &DropReason| messages.dropped.get(reason).copied().unwrap_or(0);
-    fields.extend([*used, count(&DropReason::Stale), messages.sent, messages.received, messages.in_flight].map(text));
+    fields.extend(
+        [
+            *used,
+            count(&DropReason::Stale),
+            messages.sent,
+            messages.received,
+            messages.in_flight,
+        ]
+        .map(text),
+    );
     fields.extend(REASONS.iter().map(|reason| text(count(reason))));
-    let others = messages.dropped.iter().filter(|(reason, _)| !REASONS.contains(reason));
+    let others = messages
+        .dropped
+        .iter()
+        .filter(|(reason, _)| !REASONS.contains(reason));
     fields.push(text(others.map(|(_, count)| *count).sum()));
     fields
 }

@@ -27,22 +27,44 @@ pub(super) struct VaryingTable {
 impl VaryingTable {
     /// The varying settings, then precisions, then the other varying results.
     pub(super) fn new(columns: &[&str], lines: &[Vec<String>]) -> Self {
-        let values = |place: usize| lines.iter().map(move |line| line.get(place).map_or("", String::as_str));
+        let values = |place: usize| {
+            lines
+                .iter()
+                .map(move |line| line.get(place).map_or("", String::as_str))
+        };
         let varies = |place: usize| values(place).any(|value| Some(value) != values(place).next());
-        let settings = columns.iter().position(|column| *column == LAST_SETTING).map_or(0, |last| last + 1);
+        let settings = columns
+            .iter()
+            .position(|column| *column == LAST_SETTING)
+            .map_or(0, |last| last + 1);
         let is_shown = |place: &usize| varies(*place) || PRECISIONS.contains(&columns[*place]);
-        let (precisions, others): (Vec<usize>, Vec<usize>) =
-            (settings..columns.len()).filter(is_shown).partition(|&place| PRECISIONS.contains(&columns[place]));
+        let (precisions, others): (Vec<usize>, Vec<usize>) = (settings..columns.len())
+            .filter(is_shown)
+            .partition(|&place| PRECISIONS.contains(&columns[place]));
         let varied: Vec<usize> = (0..settings).filter(|&place| varies(place)).collect();
-        let kept: Vec<usize> = varied.iter().copied().chain(precisions).chain(others).collect();
+        let kept: Vec<usize> = varied
+            .iter()
+            .copied()
+            .chain(precisions)
+            .chain(others)
+            .collect();
         let constant = |place: usize| {
             let value = values(place).next().filter(|value| !value.is_empty())?;
             Some((columns[place].to_owned(), value.to_owned()))
         };
         Self {
-            columns: kept.iter().map(|&place| columns[place].to_owned()).collect(),
-            lines: lines.iter().map(|line| kept.iter().map(|&place| line[place].clone()).collect()).collect(),
-            constants: (0..columns.len()).filter(|place| !kept.contains(place)).filter_map(constant).collect(),
+            columns: kept
+                .iter()
+                .map(|&place| columns[place].to_owned())
+                .collect(),
+            lines: lines
+                .iter()
+                .map(|line| kept.iter().map(|&place| line[place].clone()).collect())
+                .collect(),
+            constants: (0..columns.len())
+                .filter(|place| !kept.contains(place))
+                .filter_map(constant)
+                .collect(),
             settings: varied.len(),
         }
     }
@@ -50,16 +72,25 @@ impl VaryingTable {
     /// True if a field is the highest of a column of precisions, where they differ.
     pub(super) fn is_best(&self, line: usize, column: usize) -> bool {
         PRECISIONS.contains(&self.columns[column].as_str())
-            && self.range(column).is_some_and(|(low, high)| low < high && self.number(line, column) == Some(high))
+            && self
+                .range(column)
+                .is_some_and(|(low, high)| low < high && self.number(line, column) == Some(high))
     }
 
     /// One sentence: the runs with the highest and the lowest AP@0.5.
     pub(super) fn sentence(&self) -> Option<String> {
         let column = self.columns.iter().position(|column| column == MAIN)?;
         let (low, high) = self.range(column).filter(|(low, high)| low < high)?;
-        let run_with = |value: f64| (0..self.lines.len()).find(|&line| self.number(line, column) == Some(value));
-        let (best, worst) = (self.settings_of(run_with(high)?), self.settings_of(run_with(low)?));
-        Some(format!("AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."))
+        let run_with = |value: f64| {
+            (0..self.lines.len()).find(|&line| self.number(line, column) == Some(value))
+        };
+        let (best, worst) = (
+            self.settings_of(run_with(high)?),
+            self.settings_of(run_with(low)?),
+        );
+        Some(format!(
+            "AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."
+        ))
     }
 
     /// The table for a terminal: settings, precisions, and of the other results those that fit; then the sentence.
@@ -73,30 +104,43 @@ impl VaryingTable {
             .filter(|&place| place < self.settings || PRECISIONS.contains(&name(place)))
             .collect();
         let mut used: usize = shown.iter().map(|&place| width(place)).sum();
-        for place in (self.settings..self.columns.len()).filter(|&place| KEY_RESULTS.contains(&name(place))) {
+        for place in
+            (self.settings..self.columns.len()).filter(|&place| KEY_RESULTS.contains(&name(place)))
+        {
             used += width(place);
             if used <= TERMINAL {
                 shown.push(place);
             }
         }
         let side = |place: usize| {
-            let is_number = (0..self.lines.len())
-                .all(|line| self.lines[line][place].is_empty() || self.number(line, place).is_some());
+            let is_number = (0..self.lines.len()).all(|line| {
+                self.lines[line][place].is_empty() || self.number(line, place).is_some()
+            });
             if is_number { Side::Right } else { Side::Left }
         };
-        let mut table = TextTable::new(shown.iter().map(|&place| (self.columns[place].as_str(), side(place))));
+        let mut table = TextTable::new(
+            shown
+                .iter()
+                .map(|&place| (self.columns[place].as_str(), side(place))),
+        );
         for line in &self.lines {
             table.row(shown.iter().map(|&place| match line[place].as_str() {
                 "" => "-".to_owned(),
                 value => value.to_owned(),
             }));
         }
-        let sentence = self.sentence().map_or(String::new(), |sentence| format!("{sentence}\n"));
+        let sentence = self
+            .sentence()
+            .map_or(String::new(), |sentence| format!("{sentence}\n"));
         format!("{table}{sentence}")
     }
 
     fn settings_of(&self, line: usize) -> String {
-        let pairs = self.columns.iter().zip(&self.lines[line]).take(self.settings);
+        let pairs = self
+            .columns
+            .iter()
+            .zip(&self.lines[line])
+            .take(self.settings);
         pairs
             .filter(|(_, value)| !value.is_empty())
             .map(|(name, value)| format!("{name} {value}"))
@@ -110,7 +154,9 @@ impl VaryingTable {
 
     fn range(&self, column: usize) -> Option<(f64, f64)> {
         let numbers = (0..self.lines.len()).filter_map(|line| self.number(line, column));
-        numbers.map(|number| (number, number)).reduce(|(low, high), (number, _)| (low.min(number), high.max(number)))
+        numbers
+            .map(|number| (number, number))
+            .reduce(|(low, high), (number, _)| (low.min(number), high.max(number)))
     }
 }
 
@@ -120,19 +166,41 @@ mod tests {
 
     #[test]
     fn what_is_the_same_in_all_runs_is_said_once_and_the_best_run_is_named() {
-        let columns = ["method", "zstd", "loss", "seed", "frames", "ap_global_50", "e2e_ms_p50"];
+        let columns = [
+            "method",
+            "zstd",
+            "loss",
+            "seed",
+            "frames",
+            "ap_global_50",
+            "e2e_ms_p50",
+        ];
         let line = |fields: [&str; 7]| fields.map(str::to_owned).to_vec();
-        let lines =
-            [line(["max", "", "0", "1", "10", "0.9000", "31"]), line(["max", "", "0.1", "1", "10", "0.8000", "30"])];
+        let lines = [
+            line(["max", "", "0", "1", "10", "0.9000", "31"]),
+            line(["max", "", "0.1", "1", "10", "0.8000", "30"]),
+        ];
         let table = VaryingTable::new(&columns, &lines);
         assert_eq!(table.columns, ["loss", "ap_global_50", "e2e_ms_p50"]);
         let constants = [("method", "max"), ("seed", "1"), ("frames", "10")];
-        assert_eq!(table.constants, constants.map(|(name, value)| (name.to_owned(), value.to_owned())));
+        assert_eq!(
+            table.constants,
+            constants.map(|(name, value)| (name.to_owned(), value.to_owned()))
+        );
         assert!(table.is_best(0, 1) && !table.is_best(1, 1) && !table.is_best(0, 2));
-        assert_eq!(table.sentence().unwrap(), "AP@0.5 is between 0.800 (loss 0.1) and 0.900 (loss 0).");
+        assert_eq!(
+            table.sentence().unwrap(),
+            "AP@0.5 is between 0.800 (loss 0.1) and 0.900 (loss 0)."
+        );
         let text = table.text();
-        assert_eq!(text.lines().next().unwrap(), "loss  ap_global_50  e2e_ms_p50");
-        assert!(text.ends_with("0.900 (loss 0).\n") && text.lines().count() == 4, "{text}");
+        assert_eq!(
+            text.lines().next().unwrap(),
+            "loss  ap_global_50  e2e_ms_p50"
+        );
+        assert!(
+            text.ends_with("0.900 (loss 0).\n") && text.lines().count() == 4,
+            "{text}"
+        );
         assert_eq!(VaryingTable::new(&columns, &lines[..1]).sentence(), None);
     }
 }

@@ -32,12 +32,18 @@ pub(super) fn run(
         for _ in 0..jobs.min(missing.len()) {
             scope.spawn(|| {
                 if let Err(error) = serve(file, out, &queue, &failure, on_frame, on_done) {
-                    failure.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
+                    failure
+                        .lock()
+                        .unwrap_or_else(std::sync::PoisonError::into_inner)
+                        .get_or_insert(error);
                 }
             });
         }
     });
-    failure.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).map_or(Ok(()), Err)
+    failure
+        .into_inner()
+        .unwrap_or_else(std::sync::PoisonError::into_inner)
+        .map_or(Ok(()), Err)
 }
 
 /// Feeds one worker until no run is left, or another worker has failed.
@@ -54,15 +60,26 @@ fn serve(
     let mut input = worker.0.stdin.take().ok_or_else(silent)?;
     let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
     loop {
-        if failure.lock().unwrap_or_else(std::sync::PoisonError::into_inner).is_some() {
+        if failure
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .is_some()
+        {
             return Ok(());
         }
-        let Some(index) = queue.lock().unwrap_or_else(std::sync::PoisonError::into_inner).next() else {
+        let Some(index) = queue
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .next()
+        else {
             return Ok(());
         };
         writeln!(input, "{index}").map_err(|error| SweepError::Worker(error.to_string()))?;
         loop {
-            let line = output.next().ok_or_else(silent)?.map_err(|error| SweepError::Worker(error.to_string()))?;
+            let line = output
+                .next()
+                .ok_or_else(silent)?
+                .map_err(|error| SweepError::Worker(error.to_string()))?;
             match line.split_once(' ').unwrap_or((line.as_str(), "")) {
                 (FRAME, _) => on_frame(),
                 (DONE, _) => break on_done(),
@@ -74,13 +91,25 @@ fn serve(
 }
 
 fn start(file: &Path, out: &Path) -> Result<Child, SweepError> {
-    let program = std::env::current_exe().map_err(|source| SweepError::Io { path: "this program".into(), source })?;
+    let program = std::env::current_exe().map_err(|source| SweepError::Io {
+        path: "this program".into(),
+        source,
+    })?;
     Command::new(&program)
-        .args(["sweep".as_ref(), file.as_os_str(), "--out".as_ref(), out.as_os_str(), "--worker".as_ref()])
+        .args([
+            "sweep".as_ref(),
+            file.as_os_str(),
+            "--out".as_ref(),
+            out.as_os_str(),
+            "--worker".as_ref(),
+        ])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()
-        .map_err(|source| SweepError::Io { path: program, source })
+        .map_err(|source| SweepError::Io {
+            path: program,
+            source,
+        })
 }
 
 /// A process that is killed when it is dropped.

@@ -92,9 +92,13 @@ impl Cell {
     /// [`TableError::Spec`] when the file belongs to other inputs.
     pub(super) fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>, TableError> {
         let path = key.file(folder);
-        let Ok(text) = fs::read_to_string(&path) else { return Ok(None) };
-        let cell: Self = serde_json::from_str(&text)
-            .map_err(|error| TableError::Spec { path: path.clone(), problem: error.to_string() })?;
+        let Ok(text) = fs::read_to_string(&path) else {
+            return Ok(None);
+        };
+        let cell: Self = serde_json::from_str(&text).map_err(|error| TableError::Spec {
+            path: path.clone(),
+            problem: error.to_string(),
+        })?;
         Ok((cell.key == *key).then_some(cell))
     }
 
@@ -122,6 +126,9 @@ pub(super) fn pose_files(poses: &PoseSourceConfig) -> Result<Vec<String>, TableE
 /// # Errors
 /// [`TableError::Io`] names it.
 pub(super) fn sha256(path: &Path) -> Result<String, TableError> {
-    let hashed = hash_file(path).map_err(|source| TableError::Io { path: path.to_owned(), source });
+    let hashed = hash_file(path).map_err(|source| TableError::Io {
+        path: path.to_owned(),
+        source,
+    });
     Ok(hashed?.1)
 }

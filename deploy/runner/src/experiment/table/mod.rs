@@ -94,11 +94,23 @@ pub trait TableObserver {
 ///
 /// # Errors
 /// [`TableError`] at the first cell that cannot be computed; earlier cells are cached.
-pub fn run(spec: &TableSpec, out: &Path, observer: &mut dyn TableObserver) -> Result<Vec<FilledTable>, TableError> {
+pub fn run(
+    spec: &TableSpec,
+    out: &Path,
+    observer: &mut dyn TableObserver,
+) -> Result<Vec<FilledTable>, TableError> {
     let cells = out.join("cells");
-    fs::create_dir_all(&cells).map_err(|source| TableError::Io { path: cells.clone(), source })?;
+    fs::create_dir_all(&cells).map_err(|source| TableError::Io {
+        path: cells.clone(),
+        source,
+    })?;
     let data_sha256 = dataset::content_sha256(&dataset::open(&spec.dataset)?.scenarios);
-    let run = Run { spec, cells, data_sha256, commit: commit() };
+    let run = Run {
+        spec,
+        cells,
+        data_sha256,
+        commit: commit(),
+    };
     let mut filled = Vec::with_capacity(spec.tables.len());
     for table in &spec.tables {
         let table = run.fill(table, observer)?;
@@ -121,19 +133,35 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    fn fill(&self, table: &Table, observer: &mut dyn TableObserver) -> Result<FilledTable, TableError> {
+    fn fill(
+        &self,
+        table: &Table,
+        observer: &mut dyn TableObserver,
+    ) -> Result<FilledTable, TableError> {
         let mut rows = Vec::with_capacity(table.rows.len());
         for row in &table.rows {
             let weights = self.spec.weights_of(row)?;
             let mut cells = Vec::with_capacity(table.columns.len());
             for column in &table.columns {
-                let of_training = |weights: &PathBuf| self.cell(table, row, column, weights, observer);
+                let of_training =
+                    |weights: &PathBuf| self.cell(table, row, column, weights, observer);
                 cells.push(weights.iter().map(of_training).collect::<Result<_, _>>()?);
             }
-            rows.push(FilledRow { label: row.label(), cells });
+            rows.push(FilledRow {
+                label: row.label(),
+                cells,
+            });
         }
-        let columns = table.columns.iter().map(|column| column.name.clone()).collect();
-        Ok(FilledTable { name: table.name.clone(), columns, rows })
+        let columns = table
+            .columns
+            .iter()
+            .map(|column| column.name.clone())
+            .collect();
+        Ok(FilledTable {
+            name: table.name.clone(),
+            columns,
+            rows,
+        })
     }
 
     fn cell(
@@ -184,12 +212,20 @@ impl Run<'_> {
                 intensity_scale: IntensityScale::AUTO,
             }),
             frames: self.spec.frames,
-            part: Part { scenarios: table.scenarios, ..Part::default() },
+            part: Part {
+                scenarios: table.scenarios,
+                ..Part::default()
+            },
             protocol: self.spec.protocol.clone(),
             ..EvaluationOptions::default()
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;
-        let cell = Cell { key, weights: weights.to_owned(), commit: self.commit.clone(), metrics };
+        let cell = Cell {
+            key,
+            weights: weights.to_owned(),
+            commit: self.commit.clone(),
+            metrics,
+        };
         cell.write(&self.cells)?;
         Ok(cell)
     }
@@ -197,7 +233,18 @@ impl Run<'_> {
 
 /// Commit of the checkout in the working directory, with `-dirty` if files differ from it.
 fn commit() -> String {
-    let output = Command::new("git").args(["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]).output();
+    let output = Command::new("git")
+        .args([
+            "describe",
+            "--always",
+            "--dirty",
+            "--abbrev=12",
+            "--exclude=*",
+        ])
+        .output();
     let description = output.ok().filter(|output| output.status.success());
-    description.map_or_else(|| "unknown".to_owned(), |output| String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    description.map_or_else(
+        || "unknown".to_owned(),
+        |output| String::from_utf8_lossy(&output.stdout).trim().to_owned(),
+    )
 }

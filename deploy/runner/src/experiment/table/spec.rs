@@ -113,7 +113,10 @@ impl TableSpec {
     /// [`TableError`] names the file and the error.
     pub fn read(path: &Path) -> Result<Self, TableError> {
         let spec: Self = config_file::read(path)?;
-        spec.check().map_err(|problem| TableError::Spec { path: path.to_owned(), problem })?;
+        spec.check().map_err(|problem| TableError::Spec {
+            path: path.to_owned(),
+            problem,
+        })?;
         Ok(spec)
     }
 
@@ -121,9 +124,15 @@ impl TableSpec {
         for (index, table) in self.tables.iter().enumerate() {
             let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
             if table.name.is_empty() || !table.name.chars().all(is_name) {
-                return Err(format!("table name {:?} is to name files: letters, digits, - and _", table.name));
+                return Err(format!(
+                    "table name {:?} is to name files: letters, digits, - and _",
+                    table.name
+                ));
             }
-            if self.tables[..index].iter().any(|other| other.name == table.name) {
+            if self.tables[..index]
+                .iter()
+                .any(|other| other.name == table.name)
+            {
                 return Err(format!("two tables are called {:?}", table.name));
             }
             if table.rows.is_empty() || table.columns.is_empty() {
@@ -148,7 +157,10 @@ impl TableSpec {
     /// Encoding of feature maps.
     #[must_use]
     pub fn codec(&self) -> CodecConfig {
-        CodecConfig { dtype: self.dtype, ..CodecConfig::default() }
+        CodecConfig {
+            dtype: self.dtype,
+            ..CodecConfig::default()
+        }
     }
 }
 
@@ -156,7 +168,9 @@ impl Row {
     /// First column of the row.
     #[must_use]
     pub fn label(&self) -> String {
-        self.name.clone().unwrap_or_else(|| self.method.name().to_owned())
+        self.name
+            .clone()
+            .unwrap_or_else(|| self.method.name().to_owned())
     }
 }
 
@@ -188,10 +202,23 @@ tables:
     fn rows_and_columns_are_read_with_their_defaults() {
         let spec = read(SPEC).unwrap();
         let table = &spec.tables[0];
-        assert_eq!((table.rows[0].label(), table.rows[1].label()), ("none".to_owned(), "PASTAT".to_owned()));
+        assert_eq!(
+            (table.rows[0].label(), table.rows[1].label()),
+            ("none".to_owned(), "PASTAT".to_owned())
+        );
         assert_eq!(table.rows[1].poses.as_ref().unwrap().name(), "cached");
-        assert_eq!((table.columns[0].poses.name(), table.columns[1].poses.name()), ("recorded", "noisy"));
-        assert_eq!((table.columns[0].delay_ms, table.columns[1].delay_ms, spec.dtype), (0, 100, Dtype::F16));
+        assert_eq!(
+            (table.columns[0].poses.name(), table.columns[1].poses.name()),
+            ("recorded", "noisy")
+        );
+        assert_eq!(
+            (
+                table.columns[0].delay_ms,
+                table.columns[1].delay_ms,
+                spec.dtype
+            ),
+            (0, 100, Dtype::F16)
+        );
         assert_eq!(spec.weights_of(&table.rows[1]).unwrap().len(), 2);
     }
 
@@ -201,13 +228,22 @@ tables:
             (SPEC.replace("method: none", "method: nine"), "tables.yaml"),
             (SPEC.replace("name: main", "name: ../main"), "../main"),
             (SPEC.replace("delay_ms", "delay_s"), "delay_s"),
-            (SPEC.replace("  columns:", "  columns: []\n  more:"), "tables.yaml"),
+            (
+                SPEC.replace("  columns:", "  columns: []\n  more:"),
+                "tables.yaml",
+            ),
         ] {
             let message = read(&text).unwrap_err().to_string();
-            assert!(message.contains("tables.yaml") && message.contains(part), "{message}");
+            assert!(
+                message.contains("tables.yaml") && message.contains(part),
+                "{message}"
+            );
         }
         let spec = read(&SPEC.replace("weights: deploy/weights\n", "")).unwrap();
-        let message = spec.weights_of(&spec.tables[0].rows[0]).unwrap_err().to_string();
+        let message = spec
+            .weights_of(&spec.tables[0].rows[0])
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("none"), "{message}");
     }
 }

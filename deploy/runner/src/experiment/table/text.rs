@@ -16,7 +16,12 @@ pub fn markdown(table: &FilledTable) -> String {
     let single = table.columns.len() == 1;
     let heads: Vec<String> = if single {
         let global = format!("{}: AP@0.3 / 0.5 / 0.7, global order", table.columns[0]);
-        vec![global, "frame order".into(), "bytes per message".into(), "log2".into()]
+        vec![
+            global,
+            "frame order".into(),
+            "bytes per message".into(),
+            "log2".into(),
+        ]
     } else {
         table.columns.clone()
     };
@@ -27,7 +32,8 @@ pub fn markdown(table: &FilledTable) -> String {
         let values: Vec<String> = if single {
             let cells = &cells[0];
             let frame_order = precision(cells, |cell| cell.metrics.ap_frame_order);
-            let bytes = |digits, value: &dyn Fn(&Cell) -> Option<f64>| number(&mean(cells, value), digits);
+            let bytes =
+                |digits, value: &dyn Fn(&Cell) -> Option<f64>| number(&mean(cells, value), digits);
             vec![
                 precision(cells, |cell| cell.metrics.ap_global),
                 frame_order,
@@ -35,7 +41,10 @@ pub fn markdown(table: &FilledTable) -> String {
                 bytes(2, &|cell| cell.metrics.comm.log2_payload),
             ]
         } else {
-            cells.iter().map(|cells| precision(cells, |cell| cell.metrics.ap_global)).collect()
+            cells
+                .iter()
+                .map(|cells| precision(cells, |cell| cell.metrics.ap_global))
+                .collect()
         };
         let _ = writeln!(text, "| {label} | {} |", values.join(" | "));
     }
@@ -60,10 +69,21 @@ fn provenance(table: &FilledTable) -> String {
         all(&|cell| cell.commit.clone()),
         all(&|cell| format!("`{}`", cell.key.data_sha256)),
     );
-    let weights: BTreeMap<String, &Cell> =
-        cells().map(|cell| (format!("{} {}", cell.weights.display(), cell.key.weights_sha256), cell)).collect();
+    let weights: BTreeMap<String, &Cell> = cells()
+        .map(|cell| {
+            (
+                format!("{} {}", cell.weights.display(), cell.key.weights_sha256),
+                cell,
+            )
+        })
+        .collect();
     for cell in weights.values() {
-        let _ = writeln!(text, "- `{}`, SHA-256 `{}`", cell.weights.display(), cell.key.weights_sha256);
+        let _ = writeln!(
+            text,
+            "- `{}`, SHA-256 `{}`",
+            cell.weights.display(),
+            cell.key.weights_sha256
+        );
     }
     text
 }
@@ -79,7 +99,12 @@ pub fn csv(table: &FilledTable) -> String {
     for FilledRow { label, cells } in &table.rows {
         for (column, trainings) in table.columns.iter().zip(cells) {
             for (training, cell) in trainings.iter().enumerate() {
-                let place = [table.name.clone(), label.clone(), column.clone(), training.to_string()];
+                let place = [
+                    table.name.clone(),
+                    label.clone(),
+                    column.clone(),
+                    training.to_string(),
+                ];
                 text.row(place.into_iter().chain(cell_fields(cell)));
             }
         }
@@ -88,15 +113,42 @@ pub fn csv(table: &FilledTable) -> String {
 }
 
 fn cell_fields(cell: &Cell) -> Vec<String> {
-    let Cell { key, metrics, commit, .. } = cell;
-    let mut fields = vec![key.method.to_string(), key.poses.name().to_owned(), key.delay_ms.to_string()];
+    let Cell {
+        key,
+        metrics,
+        commit,
+        ..
+    } = cell;
+    let mut fields = vec![
+        key.method.to_string(),
+        key.poses.name().to_owned(),
+        key.delay_ms.to_string(),
+    ];
     fields.push(metrics.frames.to_string());
-    for ByIou { at_30, at_50, at_70 } in [metrics.ap_global, metrics.ap_frame_order] {
+    for ByIou {
+        at_30,
+        at_50,
+        at_70,
+    } in [metrics.ap_global, metrics.ap_frame_order]
+    {
         fields.extend([at_30, at_50, at_70].map(plain));
     }
     let (comm, pose) = (&metrics.comm, &metrics.pose);
-    fields.extend([comm.payload_bytes_mean, comm.log2_payload, pose.mean_m, pose.p95_m].map(plain));
-    fields.extend([pose.no_pose.to_string(), commit.clone(), key.weights_sha256.clone(), key.data_sha256.clone()]);
+    fields.extend(
+        [
+            comm.payload_bytes_mean,
+            comm.log2_payload,
+            pose.mean_m,
+            pose.p95_m,
+        ]
+        .map(plain),
+    );
+    fields.extend([
+        pose.no_pose.to_string(),
+        commit.clone(),
+        key.weights_sha256.clone(),
+        key.data_sha256.clone(),
+    ]);
     fields
 }
 
@@ -107,7 +159,10 @@ fn mean(cells: &[Cell], value: &dyn Fn(&Cell) -> Option<f64>) -> Option<(f64, Op
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
     let square: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    Some((mean, (values.len() > 1).then(|| (square / (count - 1.0)).sqrt())))
+    Some((
+        mean,
+        (values.len() > 1).then(|| (square / (count - 1.0)).sqrt()),
+    ))
 }
 
 fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
@@ -120,8 +175,12 @@ fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
 
 /// Three precisions in per cent.
 fn precision(cells: &[Cell], of: impl Fn(&Cell) -> ByIou) -> String {
-    let at =
-        |pick: fn(ByIou) -> Option<f64>| number(&mean(cells, &|cell| pick(of(cell)).map(|value| 100.0 * value)), 2);
+    let at = |pick: fn(ByIou) -> Option<f64>| {
+        number(
+            &mean(cells, &|cell| pick(of(cell)).map(|value| 100.0 * value)),
+            2,
+        )
+    };
     [at(|ap| ap.at_30), at(|ap| ap.at_50), at(|ap| ap.at_70)].join(" / ")
 }
 
@@ -141,7 +200,11 @@ mod tests {
     use deploy::score::metrics::{Communication, Metrics};
 
     fn cell(method: Method, at_50: f64) -> Cell {
-        let ap = ByIou { at_30: Some(0.9), at_50: Some(at_50), at_70: None };
+        let ap = ByIou {
+            at_30: Some(0.9),
+            at_50: Some(at_50),
+            at_70: None,
+        };
         let metrics = Metrics {
             clock: "offline".into(),
             ap_global: ap,
@@ -172,13 +235,21 @@ mod tests {
             score_threshold: 0.1,
             version: "1".into(),
         };
-        Cell { key, weights: "w.safetensors".into(), commit: "abc".into(), metrics }
+        Cell {
+            key,
+            weights: "w.safetensors".into(),
+            commit: "abc".into(),
+            metrics,
+        }
     }
 
     fn table(columns: &[&str]) -> FilledTable {
         let row = |method: Method, trainings: &[f64]| FilledRow {
             label: format!("{method}, here"),
-            cells: columns.iter().map(|_| trainings.iter().map(|&at_50| cell(method, at_50)).collect()).collect(),
+            cells: columns
+                .iter()
+                .map(|_| trainings.iter().map(|&at_50| cell(method, at_50)).collect())
+                .collect(),
         };
         FilledTable {
             name: "main".into(),
@@ -190,9 +261,15 @@ mod tests {
     #[test]
     fn one_condition_shows_both_orderings_and_bytes() {
         let text = markdown(&table(&["true poses"]));
-        assert!(text.contains("| none, here | 90.00 / 50.00 / - | 90.00 / 50.00 / - | 1024 | 10.00 |"), "{text}");
+        assert!(
+            text.contains("| none, here | 90.00 / 50.00 / - | 90.00 / 50.00 / - | 1024 | 10.00 |"),
+            "{text}"
+        );
         assert!(text.contains("70.00 ± 14.14"), "{text}");
-        assert!(text.contains("Commit: abc.") && text.contains("SHA-256 `0.6`") && text.contains("`d`"), "{text}");
+        assert!(
+            text.contains("Commit: abc.") && text.contains("SHA-256 `0.6`") && text.contains("`d`"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -203,8 +280,17 @@ mod tests {
         let text = csv(&table);
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), 1 + 2 + 4);
-        assert!(lines[1].starts_with("main,\"none, here\",0 m,0,none,recorded,0,60,0.900000,0.500000,,"), "{text}");
+        assert!(
+            lines[1]
+                .starts_with("main,\"none, here\",0 m,0,none,recorded,0,60,0.900000,0.500000,,"),
+            "{text}"
+        );
         let columns = lines[0].split(',').count();
-        assert!(lines[1..].iter().all(|line| line.split(',').count() == columns + 1), "{text}");
+        assert!(
+            lines[1..]
+                .iter()
+                .all(|line| line.split(',').count() == columns + 1),
+            "{text}"
+        );
     }
 }

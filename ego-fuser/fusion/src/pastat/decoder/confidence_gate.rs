@@ -15,9 +15,18 @@ pub(super) struct ConfidenceGate {
 
 impl ConfidenceGate {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let neutral = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        let neutral = nn::LinearConfig {
+            ws_init: Init::Const(0.0),
+            bs_init: Some(Init::Const(0.0)),
+            bias: true,
+        };
         Self {
-            hidden: nn::linear(path / "hidden", 2 * config.dim, config.dim, nn::LinearConfig::default()),
+            hidden: nn::linear(
+                path / "hidden",
+                2 * config.dim,
+                config.dim,
+                nn::LinearConfig::default(),
+            ),
             out: nn::linear(path / "out", config.dim, 1, neutral),
             patch: config.patch,
         }
@@ -28,8 +37,8 @@ impl ConfidenceGate {
         // A layer of both, side by side; the ego's part is the same for all others.
         let dim = ego.size4()?.3;
         let part = |first: i64| self.hidden.ws.f_narrow(1, first, dim);
-        let hidden =
-            others.f_linear(&part(0)?, None::<&Tensor>)? + ego.f_linear(&part(dim)?, self.hidden.bs.as_ref())?;
+        let hidden = others.f_linear(&part(0)?, None::<&Tensor>)?
+            + ego.f_linear(&part(dim)?, self.hidden.bs.as_ref())?;
         let weight = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
         let (maps, rows, columns, _) = weight.size4()?;
         let weight = weight.f_view([maps, 1, rows, columns])?;

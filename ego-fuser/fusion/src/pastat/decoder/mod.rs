@@ -27,8 +27,17 @@ pub(super) struct Decoder {
 impl Decoder {
     /// Its variables are `gate.*` and `decoder.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let PastatConfig { channels, dim, patch, .. } = *config;
-        let neutral = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        let PastatConfig {
+            channels,
+            dim,
+            patch,
+            ..
+        } = *config;
+        let neutral = nn::LinearConfig {
+            ws_init: Init::Const(0.0),
+            bs_init: Some(Init::Const(0.0)),
+            bias: true,
+        };
         let gate = ConfidenceGate::new(&(path / "gate"), config);
         let path = path / "decoder";
         Self {
@@ -45,13 +54,23 @@ impl Decoder {
     /// # Shapes
     /// - `tokens`: of all entries, as input to the transformer
     /// - `context`: `[1, h, w, D]`, the ego's tokens after the transformer
-    pub(super) fn maximum(&self, maps: &FineMaps, tokens: &Tokens, context: &Tensor) -> Result<Tensor, TchError> {
-        let FineMaps { own, neighbours, .. } = maps;
+    pub(super) fn maximum(
+        &self,
+        maps: &FineMaps,
+        tokens: &Tokens,
+        context: &Tensor,
+    ) -> Result<Tensor, TchError> {
+        let FineMaps {
+            own, neighbours, ..
+        } = maps;
         let count = neighbours.count()?;
         if count == 0 {
             return f64_tensor::by_cell(own);
         }
-        let weight = self.gate.forward(&channels_last(&tokens.values.f_narrow(0, 1, count)?)?, context)?;
+        let weight = self.gate.forward(
+            &channels_last(&tokens.values.f_narrow(0, 1, count)?)?,
+            context,
+        )?;
         neighbours.maximum_with(own, &weight)
     }
 
@@ -59,17 +78,34 @@ impl Decoder {
     /// contiguous in memory.
     pub(super) fn changed(&self, fused: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
         let (_, rows, columns, dim) = ego.size4()?;
-        let Self { channels, patch, .. } = *self;
+        let Self {
+            channels, patch, ..
+        } = *self;
         // Weights are stored by channel and then by cell; transposing these few is cheaper than transposing the result.
         let by_cell = |weights: &Tensor, each: i64| {
-            weights.f_view([channels, patch * patch, each])?.f_transpose(0, 1)?.f_reshape([-1, each])
+            weights
+                .f_view([channels, patch * patch, each])?
+                .f_transpose(0, 1)?
+                .f_reshape([-1, each])
         };
-        let bias = self.cells.bs.as_ref().map(|bias| by_cell(bias, 1)?.f_squeeze_dim(1)).transpose()?;
-        let cells = self.norm.forward(ego).f_linear(&by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
-        let cells = cells.f_to_kind(Kind::Float)?.f_view([1, rows, columns, patch, patch, channels].as_slice())?;
+        let bias = self
+            .cells
+            .bs
+            .as_ref()
+            .map(|bias| by_cell(bias, 1)?.f_squeeze_dim(1))
+            .transpose()?;
+        let cells = self
+            .norm
+            .forward(ego)
+            .f_linear(&by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
+        let cells = cells
+            .f_to_kind(Kind::Float)?
+            .f_view([1, rows, columns, patch, patch, channels].as_slice())?;
         let fused = fused.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let by_patch = fused.f_view([1, rows, patch, columns, patch, channels].as_slice())?;
         let changed = by_patch.f_add(&cells.f_permute([0, 1, 3, 2, 4, 5])?)?;
-        changed.f_view([1, rows * patch, columns * patch, channels])?.f_permute([0, 3, 1, 2])
+        changed
+            .f_view([1, rows * patch, columns * patch, channels])?
+            .f_permute([0, 3, 1, 2])
     }
 }

@@ -52,9 +52,18 @@ impl AlignmentSearch {
         area: &Area,
         is_training: bool,
     ) -> Result<Displacements, TchError> {
-        let nowhere = Tensor::f_zeros([pairs.ego_from_cav.len() as i64, 3], (Kind::Float, pairs.shown.device()))?;
+        let nowhere = Tensor::f_zeros(
+            [pairs.ego_from_cav.len() as i64, 3],
+            (Kind::Float, pairs.shown.device()),
+        )?;
         let search = |pairs: &Pairs| match self.config {
-            Some(config) => offsets([&pairs.ego, &pairs.shown], &pairs.ego_from_cav, area, config, is_training),
+            Some(config) => offsets(
+                [&pairs.ego, &pairs.shown],
+                &pairs.ego_from_cav,
+                area,
+                config,
+                is_training,
+            ),
             None => nowhere.f_narrow(0, 0, pairs.ego_from_cav.len() as i64),
         };
         if is_training {
@@ -64,7 +73,13 @@ impl AlignmentSearch {
         let rows = rows_where(&near.similarity.f_lt(FITS)?)?;
         let found = match rows.is_empty() {
             true => near,
-            false => compare_there(network, pairs, near, (&rows, &search(&pairs.only(&rows)?)?), area)?,
+            false => compare_there(
+                network,
+                pairs,
+                near,
+                (&rows, &search(&pairs.only(&rows)?)?),
+                area,
+            )?,
         };
         compare_again(network, pairs, found, area)
     }
@@ -85,7 +100,11 @@ fn compare_there(
     }
     let rows: Vec<i64> = moved.iter().map(|&row| searched[row as usize]).collect();
     let there = network.displacements(&pairs.only(&rows)?, &picked(far, &moved)?, area)?;
-    let better = rows_where(&there.similarity.f_gt_tensor(&picked(&near.similarity, &rows)?.f_add_scalar(MARGIN)?)?)?;
+    let better = rows_where(
+        &there
+            .similarity
+            .f_gt_tensor(&picked(&near.similarity, &rows)?.f_add_scalar(MARGIN)?)?,
+    )?;
     let rows: Vec<i64> = better.iter().map(|&row| rows[row as usize]).collect();
     near.with(&rows, &there.only(&better)?)
 }
@@ -97,7 +116,11 @@ fn compare_again(
     found: Displacements,
     area: &Area,
 ) -> Result<Displacements, TchError> {
-    let square = found.deltas.f_narrow(1, 0, 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
+    let square = found
+        .deltas
+        .f_narrow(1, 0, 2)?
+        .f_square()?
+        .f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
     let rows = rows_where(&square.f_gt(AGAIN_M * AGAIN_M)?)?;
     if rows.is_empty() {
         return Ok(found);
@@ -120,13 +143,25 @@ fn offsets(
     [ego, others]: [&Tensor; 2],
     ego_from_cav: &[Pose],
     area: &Area,
-    SearchConfig { cells, radius, margin }: SearchConfig,
+    SearchConfig {
+        cells,
+        radius,
+        margin,
+    }: SearchConfig,
     train: bool,
 ) -> Result<Tensor, TchError> {
     let cells = cells / area.cells();
     let none: [i64; 2] = [0, 0];
-    let large =
-        |maps: &Tensor| maps.f_detach()?.f_avg_pool2d([cells, cells], [cells, cells], none, false, true, None::<i64>);
+    let large = |maps: &Tensor| {
+        maps.f_detach()?.f_avg_pool2d(
+            [cells, cells],
+            [cells, cells],
+            none,
+            false,
+            true,
+            None::<i64>,
+        )
+    };
     let maps = [&large(ego)?, &large(others)?];
     let cell_m = area.cell_m() * cells as f64;
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
@@ -135,11 +170,19 @@ fn offsets(
     }
     let mut tries = vec![(fit, (shifts(radius)? * cell_m).f_constant_pad_nd([0, 1])?)];
     if !train {
-        tries.extend(turned_tries(maps, ego_from_cav, area, cell_m, radius.min(TURNED_RADIUS))?);
+        tries.extend(turned_tries(
+            maps,
+            ego_from_cav,
+            area,
+            cell_m,
+            radius.min(TURNED_RADIUS),
+        )?);
     }
     let (fits, offsets): (Vec<_>, Vec<_>) = tries.into_iter().unzip();
     let best = Tensor::f_cat(&fits, 1)?.f_argmax(-1, false)?;
-    Tensor::f_cat(&offsets, 0)?.f_to_device(best.device())?.f_index_select(0, &best)
+    Tensor::f_cat(&offsets, 0)?
+        .f_to_device(best.device())?
+        .f_index_select(0, &best)
 }
 
 /// Correlations of each rotation, `[K, P]`, less the margin, and the offsets `[P, 3]` of the columns.
@@ -152,22 +195,46 @@ fn turned_tries(
 ) -> Result<Vec<(Tensor, Tensor)>, TchError> {
     let turned = turned(others, &TURNS_RAD, ego_from_cav, area)?;
     // All at once, as the ego's map at each shift is the same for all.
-    let fit = Shifted::new(ego, radius, 1)?.correlate(&turned)?.whole.f_sub_scalar(TURN_MARGIN)?;
+    let fit = Shifted::new(ego, radius, 1)?
+        .correlate(&turned)?
+        .whole
+        .f_sub_scalar(TURN_MARGIN)?;
     let shifts_m = shifts(radius)? * cell_m;
     let offsets = |turn_rad: f64| shifts_m.f_pad([0, 1], "constant", turn_rad);
     let of_turn = |(fit, turn_rad)| Ok((fit, offsets(turn_rad)?));
-    fit.f_split(others.size4()?.0, 0)?.into_iter().zip(TURNS_RAD).map(of_turn).collect()
+    fit.f_split(others.size4()?.0, 0)?
+        .into_iter()
+        .zip(TURNS_RAD)
+        .map(of_turn)
+        .collect()
 }
 
 /// All maps rotated about their senders by the first of some angles, then by the second, and so on.
-fn turned(maps: &Tensor, turns_rad: &[f64], ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
+fn turned(
+    maps: &Tensor,
+    turns_rad: &[f64],
+    ego_from_cav: &[Pose],
+    area: &Area,
+) -> Result<Tensor, TchError> {
     let (count, _, rows, columns) = maps.size4()?;
-    let deltas: Vec<f32> =
-        turns_rad.iter().flat_map(|&turn_rad| [0.0, 0.0, turn_rad as f32].repeat(count as usize)).collect();
+    let deltas: Vec<f32> = turns_rad
+        .iter()
+        .flat_map(|&turn_rad| [0.0, 0.0, turn_rad as f32].repeat(count as usize))
+        .collect();
     let deltas = Tensor::f_from_slice(&deltas)?.f_view([-1, 3])?;
-    let places = sampling_grid(&deltas, &ego_from_cav.repeat(turns_rad.len()), area, [rows, columns])?;
+    let places = sampling_grid(
+        &deltas,
+        &ego_from_cav.repeat(turns_rad.len()),
+        area,
+        [rows, columns],
+    )?;
     let maps = maps.f_repeat([turns_rad.len() as i64, 1, 1, 1])?;
-    maps.f_grid_sampler(&places.f_to_device(maps.device())?, BILINEAR, PADDING_ZEROS, false)
+    maps.f_grid_sampler(
+        &places.f_to_device(maps.device())?,
+        BILINEAR,
+        PADDING_ZEROS,
+        false,
+    )
 }
 
 #[cfg(test)]
@@ -184,8 +251,18 @@ mod tests {
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 
-    const CONFIG: SearchConfig = SearchConfig { cells: 4, radius: 5, margin: 0.3 };
-    const GRID: BevGrid = BevGrid { x_min_m: -24.0, y_min_m: -16.0, cell_m: 0.5, width: 96, height: 64 };
+    const CONFIG: SearchConfig = SearchConfig {
+        cells: 4,
+        radius: 5,
+        margin: 0.3,
+    };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -24.0,
+        y_min_m: -16.0,
+        cell_m: 0.5,
+        width: 96,
+        height: 64,
+    };
 
     fn area() -> Area {
         Area::new(&GRID, [64, 96], 4)
@@ -211,8 +288,12 @@ mod tests {
         let expected = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
         assert_eq!(found([&ego, &others], &area(), CONFIG, true), expected);
         // The same in cells of two by two, of which two by two are a pooled cell.
-        let [ego, others] = [&ego, &others].map(|maps| maps.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None));
-        assert_eq!(found([&ego, &others], &area().with_cells_of(2), CONFIG, true), expected);
+        let [ego, others] =
+            [&ego, &others].map(|maps| maps.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None));
+        assert_eq!(
+            found([&ego, &others], &area().with_cells_of(2), CONFIG, true),
+            expected
+        );
     }
 
     #[test]
@@ -236,7 +317,14 @@ mod tests {
     fn in_training_a_gain_below_the_margin_moves_nothing() {
         let ego = map(1);
         let other = ego.roll([12], [3]) * 0.6 + &ego * 0.5;
-        let with = |margin, train| found([&ego, &other], &area(), SearchConfig { margin, ..CONFIG }, train);
+        let with = |margin, train| {
+            found(
+                [&ego, &other],
+                &area(),
+                SearchConfig { margin, ..CONFIG },
+                train,
+            )
+        };
         assert_eq!(with(0.0, true), [-6.0, 0.0, 0.0]);
         assert_eq!(with(0.2, true), [0.0; 3]);
         assert_eq!(with(0.2, false), [-6.0, 0.0, 0.0]);
@@ -245,41 +333,86 @@ mod tests {
     /// Corrections of FSA with a search for three maps: the ego's; the same twelve cells too far along x and sixteen
     /// back along y; and a map of another scene.
     fn far_off(search: SearchConfig, train: bool) -> Vec<f32> {
-        let grid = BevGrid { x_min_m: -24.0, y_min_m: -16.0, cell_m: 0.5, width: 96, height: 64 };
-        let (area, confidences) = (Area::new(&grid, [64, 96], 4), Tensor::ones([3, CONFIDENCES], FLOAT));
+        let grid = BevGrid {
+            x_min_m: -24.0,
+            y_min_m: -16.0,
+            cell_m: 0.5,
+            width: 96,
+            height: 64,
+        };
+        let (area, confidences) = (
+            Area::new(&grid, [64, 96], 4),
+            Tensor::ones([3, CONFIDENCES], FLOAT),
+        );
         let variables = VarStore::new(Device::Cpu);
         let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &FsaConfig::default());
         redraw(&variables, &["matching"], 0.3);
         let map = |seed| uniform(seed, &[1, 4, 64, 96]).gt(0.99).to_kind(Kind::Float);
         let with_mask = |features: Tensor| {
             let (maps, _, height, width) = features.size4().unwrap();
-            WarpedMaps { features, mask: Tensor::ones([maps, 1, height, width], FLOAT) }
+            WarpedMaps {
+                features,
+                mask: Tensor::ones([maps, 1, height, width], FLOAT),
+            }
         };
-        let others = with_mask(Tensor::cat(&[&map(5), &map(5).roll([-16, 12], [2, 3]), &map(6)], 0));
-        let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
+        let others = with_mask(Tensor::cat(
+            &[&map(5), &map(5).roll([-16, 12], [2, 3]), &map(6)],
+            0,
+        ));
+        let poses = [
+            Pose::IDENTITY,
+            Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3),
+            Pose::IDENTITY,
+        ];
         let compared = || {
-            let [ego, others] = [&with_mask(map(5)), &others].map(|maps| fsa.reduced(maps).unwrap());
-            let pairs = fsa.pairs([&ego, &others], &confidences, &poses, &area).unwrap();
-            AlignmentSearch::new(Some(search)).displacements(&fsa, &pairs, &area, train).unwrap().deltas
+            let [ego, others] =
+                [&with_mask(map(5)), &others].map(|maps| fsa.reduced(maps).unwrap());
+            let pairs = fsa
+                .pairs([&ego, &others], &confidences, &poses, &area)
+                .unwrap();
+            AlignmentSearch::new(Some(search))
+                .displacements(&fsa, &pairs, &area, train)
+                .unwrap()
+                .deltas
         };
         Vec::try_from(no_grad(compared).view(-1)).unwrap()
     }
 
     #[test]
     fn a_map_that_is_far_off_comes_back_and_others_stay() {
-        let search = SearchConfig { cells: 4, radius: 9, margin: 0.3 };
+        let search = SearchConfig {
+            cells: 4,
+            radius: 9,
+            margin: 0.3,
+        };
         let back = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
         assert_eq!(far_off(search, true), back);
         assert_eq!(far_off(search, false), back);
         // Beyond the search range it is not found.
-        assert_eq!(far_off(SearchConfig { radius: 1, ..search }, false), [0.0; 9]);
+        assert_eq!(
+            far_off(
+                SearchConfig {
+                    radius: 1,
+                    ..search
+                },
+                false
+            ),
+            [0.0; 9]
+        );
     }
 
     #[test]
     fn after_training_offsets_below_the_margin_are_compared_closely() {
-        let search = SearchConfig { cells: 4, radius: 9, margin: 2.0 };
+        let search = SearchConfig {
+            cells: 4,
+            radius: 9,
+            margin: 2.0,
+        };
         assert_eq!(far_off(search, true), [0.0; 9]);
-        assert_eq!(far_off(search, false), [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0]);
+        assert_eq!(
+            far_off(search, false),
+            [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0]
+        );
     }
 
     #[test]
@@ -288,23 +421,52 @@ mod tests {
         let fsa = AlignmentNetwork::new(
             &variables.root(),
             [4, 6],
-            &FsaConfig { alignment_search: None, ..FsaConfig::default() },
+            &FsaConfig {
+                alignment_search: None,
+                ..FsaConfig::default()
+            },
         );
-        let area = Area::new(&BevGrid { width: 32, height: 16, x_min_m: -8.0, y_min_m: -4.0, ..GRID }, [16, 32], 4);
+        let area = Area::new(
+            &BevGrid {
+                width: 32,
+                height: 16,
+                x_min_m: -8.0,
+                y_min_m: -4.0,
+                ..GRID
+            },
+            [16, 32],
+            4,
+        );
         redraw(&variables, &["matching"], 0.3);
         // Only a share of the observed motion is applied.
-        let _ = no_grad(|| variables.variables()["delta.bias"].narrow(0, 3, 3).fill_(0.6));
+        let _ = no_grad(|| {
+            variables.variables()["delta.bias"]
+                .narrow(0, 3, 3)
+                .fill_(0.6)
+        });
         let map = uniform(5, &[1, 4, 16, 32]).gt(0.97).to_kind(Kind::Float);
-        let maps = [map.shallow_clone(), map.roll([3], [3])]
-            .map(|features| fsa.reduced(&WarpedMaps { mask: features.ones_like().narrow(1, 0, 1), features }).unwrap());
+        let maps = [map.shallow_clone(), map.roll([3], [3])].map(|features| {
+            fsa.reduced(&WarpedMaps {
+                mask: features.ones_like().narrow(1, 0, 1),
+                features,
+            })
+            .unwrap()
+        });
         let shift_x_m = |train| {
             let confidences = Tensor::ones([1, CONFIDENCES], FLOAT);
-            let pairs = fsa.pairs([&maps[0], &maps[1]], &confidences, &[Pose::IDENTITY], &area).unwrap();
-            let found = AlignmentSearch::new(None).displacements(&fsa, &pairs, &area, train).unwrap();
+            let pairs = fsa
+                .pairs([&maps[0], &maps[1]], &confidences, &[Pose::IDENTITY], &area)
+                .unwrap();
+            let found = AlignmentSearch::new(None)
+                .displacements(&fsa, &pairs, &area, train)
+                .unwrap();
             found.deltas.double_value(&[0, 0])
         };
         let (first, both) = (shift_x_m(true), shift_x_m(false));
         assert!(first < -AGAIN_M, "{first}");
-        assert!((both + 1.5).abs() < 0.7 * (first + 1.5).abs(), "{first} {both}");
+        assert!(
+            (both + 1.5).abs() < 0.7 * (first + 1.5).abs(),
+            "{first} {both}"
+        );
     }
 }

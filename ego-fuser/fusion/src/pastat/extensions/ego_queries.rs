@@ -29,7 +29,12 @@ impl Others {
         let (entries, dim, height, width) = tokens.size4()?;
         let others = tokens.f_narrow(0, 1, entries - 1)?;
         let [dim, cells] = [dim, height * width].map(|size| size as usize);
-        Ok(Self { tokens: numbers(&others)?, valid: numbers(valid)?, dim, cells })
+        Ok(Self {
+            tokens: numbers(&others)?,
+            valid: numbers(valid)?,
+            dim,
+            cells,
+        })
     }
 
     /// For each head and cell the mean of all entries' normalised tokens, weighted by the attention of the head's
@@ -40,14 +45,26 @@ impl Others {
     /// - `ego`: `[D, cells]`, the tokens of the ego's newest
     pub(crate) fn gather(&self, asked: &[f32], ego: &[f32]) -> Vec<f32> {
         let size = self.dim * self.cells;
-        let entries: Vec<&[f32]> = std::iter::once(ego).chain(self.tokens.chunks_exact(size)).collect();
+        let entries: Vec<&[f32]> = std::iter::once(ego)
+            .chain(self.tokens.chunks_exact(size))
+            .collect();
         let mut gathered = vec![0.0; asked.len()];
         for first in (0..self.cells).step_by(STRIP) {
-            let strip = Strip { first, count: STRIP.min(self.cells - first), of: self };
+            let strip = Strip {
+                first,
+                count: STRIP.min(self.cells - first),
+                of: self,
+            };
             let normal: Vec<Normal> = entries.iter().map(|entry| strip.normal(entry)).collect();
-            for (asked, gathered) in asked.chunks_exact(size).zip(gathered.chunks_exact_mut(size)) {
-                let mut weights: Vec<Row> =
-                    entries.iter().zip(&normal).map(|(entry, normal)| strip.score(asked, entry, normal)).collect();
+            for (asked, gathered) in asked
+                .chunks_exact(size)
+                .zip(gathered.chunks_exact_mut(size))
+            {
+                let mut weights: Vec<Row> = entries
+                    .iter()
+                    .zip(&normal)
+                    .map(|(entry, normal)| strip.score(asked, entry, normal))
+                    .collect();
                 strip.softmax(&mut weights);
                 strip.mean(&entries, &normal, &weights, gathered);
             }
@@ -76,20 +93,27 @@ impl Strip<'_> {
     /// The strip's cells of each channel.
     fn rows<'b>(&self, map: &'b [f32]) -> impl Iterator<Item = &'b [f32]> + use<'b> {
         let cells = self.first..self.first + self.count;
-        map.chunks_exact(self.of.cells).map(move |row| &row[cells.clone()])
+        map.chunks_exact(self.of.cells)
+            .map(move |row| &row[cells.clone()])
     }
 
     fn normal(&self, entry: &[f32]) -> Normal {
         let channels = self.of.dim as f32;
         let (mut mean, mut scale) = ([0.0; STRIP], [0.0; STRIP]);
-        self.rows(entry).for_each(|row| mean.iter_mut().zip(row).for_each(|(sum, value)| *sum += value));
+        self.rows(entry).for_each(|row| {
+            mean.iter_mut()
+                .zip(row)
+                .for_each(|(sum, value)| *sum += value)
+        });
         mean.iter_mut().for_each(|sum| *sum /= channels);
         self.rows(entry).for_each(|row| {
             for ((sum, value), mean) in scale.iter_mut().zip(row).zip(&mean) {
                 *sum += (value - mean) * (value - mean);
             }
         });
-        scale.iter_mut().for_each(|sum| *sum = (*sum / channels + EPSILON).sqrt().recip());
+        scale
+            .iter_mut()
+            .for_each(|sum| *sum = (*sum / channels + EPSILON).sqrt().recip());
         Normal { mean, scale }
     }
 
@@ -100,13 +124,18 @@ impl Strip<'_> {
                 *score += asked * (value - mean);
             }
         }
-        score.iter_mut().zip(scale).for_each(|(score, scale)| *score *= scale);
+        score
+            .iter_mut()
+            .zip(scale)
+            .for_each(|(score, scale)| *score *= scale);
         score
     }
 
     /// Scores of the entries to their weights.
     fn softmax(&self, scores: &mut [Row]) {
-        let valid = |entry: usize, cell: usize| self.of.valid[entry * self.of.cells + self.first + cell] != 0.0;
+        let valid = |entry: usize, cell: usize| {
+            self.of.valid[entry * self.of.cells + self.first + cell] != 0.0
+        };
         for cell in 0..self.count {
             let is_any = (0..scores.len()).any(|entry| valid(entry, cell));
             for (entry, scores) in scores.iter_mut().enumerate() {
@@ -118,7 +147,11 @@ impl Strip<'_> {
             }
         }
         let mut most = [f32::NEG_INFINITY; STRIP];
-        scores.iter().for_each(|scores| most.iter_mut().zip(scores).for_each(|(most, score)| *most = most.max(*score)));
+        scores.iter().for_each(|scores| {
+            most.iter_mut()
+                .zip(scores)
+                .for_each(|(most, score)| *most = most.max(*score))
+        });
         let mut total = [0.0; STRIP];
         for scores in scores.iter_mut() {
             for ((score, most), total) in scores.iter_mut().zip(&most).zip(&mut total) {
@@ -126,16 +159,32 @@ impl Strip<'_> {
                 *total += *score;
             }
         }
-        scores.iter_mut().for_each(|scores| scores.iter_mut().zip(&total).for_each(|(score, total)| *score /= total));
+        scores.iter_mut().for_each(|scores| {
+            scores
+                .iter_mut()
+                .zip(&total)
+                .for_each(|(score, total)| *score /= total)
+        });
     }
 
     fn mean(&self, entries: &[&[f32]], normal: &[Normal], weights: &[Row], gathered: &mut [f32]) {
         let cells = self.first..self.first + self.count;
         for ((entry, Normal { mean, scale }), weight) in entries.iter().zip(normal).zip(weights) {
             let mut share = *weight;
-            share.iter_mut().zip(scale).for_each(|(share, scale)| *share *= scale);
-            for (sums, row) in gathered.chunks_exact_mut(self.of.cells).zip(self.rows(entry)) {
-                for (((sum, value), mean), share) in sums[cells.clone()].iter_mut().zip(row).zip(mean).zip(&share) {
+            share
+                .iter_mut()
+                .zip(scale)
+                .for_each(|(share, scale)| *share *= scale);
+            for (sums, row) in gathered
+                .chunks_exact_mut(self.of.cells)
+                .zip(self.rows(entry))
+            {
+                for (((sum, value), mean), share) in sums[cells.clone()]
+                    .iter_mut()
+                    .zip(row)
+                    .zip(mean)
+                    .zip(&share)
+                {
                     *sum += share * (value - mean);
                 }
             }

@@ -24,7 +24,10 @@ impl Area {
     /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells
     /// away.
     pub(crate) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
-        let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
+        let half_m = [
+            width as f64 * grid.cell_m / 2.0,
+            height as f64 * grid.cell_m / 2.0,
+        ];
         Self {
             middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]],
             half_m,
@@ -37,9 +40,18 @@ impl Area {
 
     /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
     pub(crate) fn with_cells_of(self, cells: i64) -> Self {
-        let (cell_m, radius) = (self.cell_m * cells as f64, (self.radius + cells - 1) / cells);
+        let (cell_m, radius) = (
+            self.cell_m * cells as f64,
+            (self.radius + cells - 1) / cells,
+        );
         let size = self.size.map(|count| count / cells);
-        Self { size, cell_m, cells: self.cells * cells, radius, ..self }
+        Self {
+            size,
+            cell_m,
+            cells: self.cells * cells,
+            radius,
+            ..self
+        }
     }
 
     /// Edge of a cell, metres.
@@ -54,7 +66,9 @@ impl Area {
 
     /// Positions of vehicles, metres from the centre of the area, `[N, 2]`.
     pub(crate) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-        let place = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32);
+        let place = |pose: &Pose| {
+            [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32)
+        };
         let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
         Tensor::f_from_slice(&places)?.f_view([-1, 2])
     }
@@ -66,10 +80,13 @@ impl Area {
 
     /// `[PARTS^2, 2]`: centres of the compared parts, metres from the centre of the area.
     pub(crate) fn middles_of_parts(&self) -> Result<Tensor, TchError> {
-        let along = |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
+        let along =
+            |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
         let [half_x, half_y] = self.half_m;
         let middles: Vec<f32> = (0..PARTS)
-            .flat_map(|row| (0..PARTS).flat_map(move |column| [along(column, half_x), along(row, half_y)]))
+            .flat_map(|row| {
+                (0..PARTS).flat_map(move |column| [along(column, half_x), along(row, half_y)])
+            })
             .collect();
         Tensor::f_from_slice(&middles)?.f_view([-1, 2])
     }
@@ -85,7 +102,9 @@ pub(crate) fn sampling_grid(
     area: &Area,
     size: [i64; 2],
 ) -> Result<Tensor, TchError> {
-    let senders = planar_poses(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
+    let senders = planar_poses(ego_from_cav)?
+        .f_to_device(deltas.device())?
+        .f_narrow(1, 0, 2)?;
     // p_map = v + R^T (p_ego - v - d), with v the sender's position and d the shift.
     let moved = senders.f_constant_pad_nd([0, 1])? + deltas;
     places(&moved, &senders, [area, area], size)
@@ -100,22 +119,39 @@ pub(crate) fn own_sampling_grid(
 ) -> Result<Tensor, TchError> {
     let moved = planar_poses(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
     // p_cav = R^T (p_ego - v - d).
-    places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], area.size)
+    places(
+        &moved,
+        &moved.f_narrow(1, 0, 2)?.f_zeros_like()?,
+        [area, own],
+        area.size,
+    )
 }
 
 /// `[N, 3]`: x and y, metres, and yaw, radians.
 fn planar_poses(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-    let of_pose = |pose: &Pose| [pose.translation_m[0] as f32, pose.translation_m[1] as f32, pose.yaw_rad() as f32];
+    let of_pose = |pose: &Pose| {
+        [
+            pose.translation_m[0] as f32,
+            pose.translation_m[1] as f32,
+            pose.yaw_rad() as f32,
+        ]
+    };
     let values: Vec<f32> = ego_from_cav.iter().flat_map(of_pose).collect();
     Tensor::f_from_slice(&values)?.f_view([-1, 3])
 }
 
 /// Positions of the cells of a grid over `area` on grids over `on`, given the position and rotation on `area`,
 /// `[N, 3]`, of the point that is at `origin` `[N, 2]` on those: `[N, H, W, 2]`.
-fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]) -> Result<Tensor, TchError> {
+fn places(
+    pose: &Tensor,
+    origin: &Tensor,
+    [area, on]: [&Area; 2],
+    size: [i64; 2],
+) -> Result<Tensor, TchError> {
     let yaw = pose.f_select(1, 2)?;
     let (cos, sin) = (yaw.f_cos()?, yaw.f_sin()?);
-    let from = |axis: usize| Ok::<_, TchError>(area.middle_m[axis] - pose.f_select(1, axis as i64)?);
+    let from =
+        |axis: usize| Ok::<_, TchError>(area.middle_m[axis] - pose.f_select(1, axis as i64)?);
     let at = |axis: usize| Ok::<_, TchError>(origin.f_select(1, axis as i64)? - on.middle_m[axis]);
     let ([half_x, half_y], [on_x, on_y]) = (area.half_m, on.half_m);
     let (from_x, from_y) = (from(0)?, from(1)?);
@@ -130,15 +166,26 @@ fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]
 /// A sender's pose corrected by a `delta`, see [`sampling_grid`].
 pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
     let [x, y, z] = ego_from_cav.translation_m;
-    Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
+    Pose::from_xyz_yaw(
+        [x + delta[0], y + delta[1], z],
+        ego_from_cav.yaw_rad() + delta[2],
+    )
 }
 
 /// Maps `[N, C, H, W]` and their validity `[N, 1, H, W]`, sampled at `sampling_grid`. Cells beyond their edges are
 /// invalid; the values of invalid cells are not zero.
-pub(crate) fn resample(maps: &Tensor, valid: &Tensor, sampling_grid: &Tensor) -> Result<(Tensor, Tensor), TchError> {
-    let valid =
-        valid.f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
-    Ok((maps.f_grid_sampler(sampling_grid, BILINEAR, PADDING_ZEROS, false)?, valid))
+pub(crate) fn resample(
+    maps: &Tensor,
+    valid: &Tensor,
+    sampling_grid: &Tensor,
+) -> Result<(Tensor, Tensor), TchError> {
+    let valid = valid
+        .f_grid_sampler(&sampling_grid.f_detach()?, NEAREST, PADDING_ZEROS, false)?
+        .f_to_kind(Kind::Float)?;
+    Ok((
+        maps.f_grid_sampler(sampling_grid, BILINEAR, PADDING_ZEROS, false)?,
+        valid,
+    ))
 }
 
 #[cfg(test)]
@@ -150,7 +197,13 @@ mod tests {
     use crate::warp::warp_to_ego;
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
-    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -8.0,
+        y_min_m: -4.0,
+        cell_m: 0.5,
+        width: 32,
+        height: 16,
+    };
 
     fn area() -> Area {
         Area::new(&GRID, [16, 32], 4)
@@ -159,14 +212,22 @@ mod tests {
     fn map_moved(maps: &Tensor, delta: [f32; 3], ego_from_cav: Pose) -> Tensor {
         let deltas = Tensor::from_slice(&delta).view([1, 3]);
         let sampling_grid = sampling_grid(&deltas, &[ego_from_cav], &area(), [16, 32]).unwrap();
-        resample(maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &sampling_grid).unwrap().0
+        resample(maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &sampling_grid)
+            .unwrap()
+            .0
     }
 
     #[test]
     fn a_delta_moves_a_map_as_a_pose_would() {
         let maps = Tensor::randn([1, 2, 16, 32], FLOAT);
         // A vehicle at the ego's own position: rotation about it and then a shift is a pose.
-        let by_pose = warp_to_ego(&maps, None, &[Pose::from_xyz_yaw([1.0, -0.5, 0.0], 0.1)], &GRID).unwrap();
+        let by_pose = warp_to_ego(
+            &maps,
+            None,
+            &[Pose::from_xyz_yaw([1.0, -0.5, 0.0], 0.1)],
+            &GRID,
+        )
+        .unwrap();
         let by_delta = map_moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
         let inside = |map: &Tensor| map.narrow(2, 4, 8).narrow(3, 8, 16);
         assert!(inside(&by_delta).allclose(&inside(&by_pose.features), 1e-3, 1e-3, false));
@@ -183,9 +244,18 @@ mod tests {
         let places = own_sampling_grid(&deltas, &[pose], [&padded, &area()]).unwrap();
         let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();
         let inside = |map: &Tensor| map.narrow(2, 0, 16).narrow(3, 0, 32);
-        assert!((inside(&(read * &valid)) - by_pose.features).abs().mean(Kind::Float).double_value(&[]) < 1e-3);
+        assert!(
+            (inside(&(read * &valid)) - by_pose.features)
+                .abs()
+                .mean(Kind::Float)
+                .double_value(&[])
+                < 1e-3
+        );
         assert_eq!(inside(&valid), by_pose.mask);
-        assert!(valid.sum(Kind::Float).double_value(&[]) > by_pose.mask.sum(Kind::Float).double_value(&[]));
+        assert!(
+            valid.sum(Kind::Float).double_value(&[])
+                > by_pose.mask.sum(Kind::Float).double_value(&[])
+        );
     }
 
     #[test]
@@ -194,7 +264,10 @@ mod tests {
         // The cell of the vehicle itself, at (3.25, 1.25), stays where it is; one beside it does not.
         let _ = map.get(0).get(0).get(10).get(22).fill_(1.0);
         let vehicle = Pose::from_xyz_yaw([3.25, 1.25, 0.0], 0.7);
-        assert!((map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 22]) - 1.0).abs() < 1e-3);
+        assert!(
+            (map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 22]) - 1.0).abs()
+                < 1e-3
+        );
         let _ = map.get(0).get(0).get(10).get(28).fill_(1.0);
         assert!(map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 28]) < 0.1);
     }

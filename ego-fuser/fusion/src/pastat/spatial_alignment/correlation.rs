@@ -30,7 +30,9 @@ pub(crate) struct Correlation {
 /// cell of the ego's that it is compared with.
 pub(crate) fn shifts(radius: i64) -> Result<Tensor, TchError> {
     let steps = || -radius..=radius;
-    let all: Vec<f32> = steps().flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32])).collect();
+    let all: Vec<f32> = steps()
+        .flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32]))
+        .collect();
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
 }
 
@@ -55,19 +57,33 @@ impl Shifted {
     pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
         let ego = ego.f_detach()?;
         let around = ego.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
-        let numbers = if are_numbers(&around) { Some(numbers(&around)?) } else { None };
+        let numbers = if are_numbers(&around) {
+            Some(numbers(&around)?)
+        } else {
+            None
+        };
         let squares = sum_by_part(&ego.f_square()?, parts)?.f_squeeze_dim(1)?;
-        Ok(Self { around, numbers, maps: OnceCell::new(), squares, radius, parts })
+        Ok(Self {
+            around,
+            numbers,
+            maps: OnceCell::new(),
+            squares,
+            radius,
+            parts,
+        })
     }
 
     /// Compares it with the maps of `others`, `[N, M, H, W]`.
     pub(crate) fn correlate(&self, others: &Tensor) -> Result<Correlation, TchError> {
         let products = match &self.numbers {
-            Some(own) if are_numbers(others) && others.size4()?.0 <= FEW_MAPS => self.sums(own, others)?,
+            Some(own) if are_numbers(others) && others.size4()?.0 <= FEW_MAPS => {
+                self.sums(own, others)?
+            }
             _ => by_part(others, self.parts)?.f_matmul(&self.maps()?.f_transpose(1, 2)?)?,
         };
         let theirs = sum_by_part(&others.f_square()?, self.parts)?;
-        let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
+        let over_parts =
+            |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
         let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
         let energy = length(self.squares.f_unsqueeze(1)? * &theirs)?;
         let whole_energy = length(self.squares.f_sum(None::<Kind>)? * over_parts(&theirs)?)?;
@@ -88,7 +104,11 @@ impl Shifted {
         let (parts, edge) = (self.parts, 2 * self.radius + 1);
         let (rows, columns) = (height / parts, width / parts);
         // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
-        let maps = self.around.f_contiguous()?.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
+        let maps = self
+            .around
+            .f_contiguous()?
+            .f_unfold(1, height, 1)?
+            .f_unfold(2, width, 1)?;
         let maps = maps
             .f_view([channels, edge, edge, parts, rows, parts, columns].as_slice())?
             .f_permute([3, 5, 1, 2, 0, 4, 6])?
@@ -110,7 +130,8 @@ impl Shifted {
             let (top, left) = (part / parts * rows, part % parts * columns);
             for map in values.chunks_exact(channels * height * width) {
                 sums.fill([0.0; LANES]);
-                for (channel, row) in (0..channels).flat_map(|channel| (top..top + rows).map(move |row| (channel, row)))
+                for (channel, row) in (0..channels)
+                    .flat_map(|channel| (top..top + rows).map(move |row| (channel, row)))
                 {
                     let shown = &map[(channel * height + row) * width + left..][..columns];
                     // Nothing is there, as beyond the edges of a map.
@@ -118,9 +139,12 @@ impl Shifted {
                         continue;
                     }
                     for (down, sums) in sums.chunks_exact_mut(edge).enumerate() {
-                        let row = (channel * (height + 2 * radius) + row + down) * (width + 2 * radius);
+                        let row =
+                            (channel * (height + 2 * radius) + row + down) * (width + 2 * radius);
                         let own = &own[row + left..][..columns + 2 * radius];
-                        sums.iter_mut().zip(own.windows(columns)).for_each(|(sum, own)| add_products(sum, shown, own));
+                        sums.iter_mut()
+                            .zip(own.windows(columns))
+                            .for_each(|(sum, own)| add_products(sum, shown, own));
                     }
                 }
                 all.extend(sums.iter().map(|lanes| lanes.iter().sum::<f32>()));
@@ -134,10 +158,17 @@ impl Shifted {
 #[inline]
 fn add_products(sums: &mut [f32; LANES], a: &[f32], b: &[f32]) {
     let (a_chunks, b_chunks) = (a.chunks_exact(LANES), b.chunks_exact(LANES));
-    let rest = a_chunks.remainder().iter().zip(b_chunks.remainder()).zip(sums.iter_mut());
+    let rest = a_chunks
+        .remainder()
+        .iter()
+        .zip(b_chunks.remainder())
+        .zip(sums.iter_mut());
     rest.for_each(|((a, b), sum)| *sum += a * b);
     for (a, b) in a_chunks.zip(b_chunks) {
-        sums.iter_mut().zip(a).zip(b).for_each(|((sum, a), b)| *sum += a * b);
+        sums.iter_mut()
+            .zip(a)
+            .zip(b)
+            .for_each(|((sum, a), b)| *sum += a * b);
     }
 }
 
@@ -156,8 +187,14 @@ fn sum_by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
 
 /// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by
 /// `exp(sharpness * correlation)`.
-pub(crate) fn peaks(correlation: &Tensor, sharpness: &Tensor, shifts: &Tensor) -> Result<Tensor, TchError> {
-    (correlation * sharpness).f_softmax(-1, None)?.f_matmul(shifts)
+pub(crate) fn peaks(
+    correlation: &Tensor,
+    sharpness: &Tensor,
+    shifts: &Tensor,
+) -> Result<Tensor, TchError> {
+    (correlation * sharpness)
+        .f_softmax(-1, None)?
+        .f_matmul(shifts)
 }
 
 #[cfg(test)]
@@ -173,7 +210,10 @@ mod tests {
         let ego = Tensor::randn([1, 3, 16, 24], (Kind::Float, Device::Cpu));
         // Two cells further along x, one back along y.
         let other = ego.roll([-1, 2], [2, 3]);
-        let found = Shifted::new(&ego, 3, PARTS).unwrap().correlate(&other).unwrap();
+        let found = Shifted::new(&ego, 3, PARTS)
+            .unwrap()
+            .correlate(&other)
+            .unwrap();
         let shifts = shifts(3).unwrap();
         let whole = peaks(&found.whole, &Tensor::from(60f32), &shifts).unwrap();
         let parts = peaks(&found.parts, &Tensor::from(60f32), &shifts).unwrap();
@@ -189,11 +229,16 @@ mod tests {
 
     #[test]
     fn numbers_and_tensors_find_the_same() {
-        let (ego, others) = (uniform(1, &[1, 3, 16, 24]), uniform(2, &[2, 3, 16, 24]) - 0.4);
+        let (ego, others) = (
+            uniform(1, &[1, 3, 16, 24]),
+            uniform(2, &[2, 3, 16, 24]) - 0.4,
+        );
         for parts in [1, PARTS] {
             let shifted = Shifted::new(&ego, 2, parts).unwrap();
             let numbers = shifted.correlate(&others).unwrap();
-            let tensors = shifted.correlate(&others.copy().set_requires_grad(true)).unwrap();
+            let tensors = shifted
+                .correlate(&others.copy().set_requires_grad(true))
+                .unwrap();
             assert_eq!(numbers.parts.size(), [parts * parts, 2, 25]);
             assert!(numbers.parts.allclose(&tensors.parts, 1e-5, 1e-6, false));
             assert!(numbers.whole.allclose(&tensors.whole, 1e-5, 1e-6, false));
@@ -204,7 +249,10 @@ mod tests {
     fn where_nothing_is_to_be_seen_nothing_fits() {
         let options = (Kind::Float, Device::Cpu);
         let [ego, others] = [1, 2].map(|maps| Tensor::zeros([maps, 2, 8, 8], options));
-        let found = Shifted::new(&ego, 2, PARTS).unwrap().correlate(&others).unwrap();
+        let found = Shifted::new(&ego, 2, PARTS)
+            .unwrap()
+            .correlate(&others)
+            .unwrap();
         assert_eq!(found.parts.abs().max().double_value(&[]), 0.0);
         assert_eq!(found.whole.size(), [2, 25]);
     }

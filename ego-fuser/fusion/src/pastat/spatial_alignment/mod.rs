@@ -58,7 +58,8 @@ pub(super) struct AlignedTokens {
 impl SpatialAlignment {
     /// Its variables are `fsa.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let network = |fsa| AlignmentNetwork::new(&(path / "fsa"), [config.channels, config.dim], fsa);
+        let network =
+            |fsa| AlignmentNetwork::new(&(path / "fsa"), [config.channels, config.dim], fsa);
         Self {
             network: config.fsa.as_ref().map(network),
             search: AlignmentSearch::new(config.fsa.as_ref().and_then(|fsa| fsa.alignment_search)),
@@ -79,7 +80,18 @@ impl SpatialAlignment {
         let PatchTokens { values, valid } = tokens;
         let Some(network) = self.network.as_ref().filter(|_| coarse.origins.count() > 1) else {
             let neighbours = NeighbourMaps::still(coarse.newest.only(1, count)?);
-            return Ok((FineMaps { own, neighbours, corrections: None }, AlignedTokens { values, valid, fit: None }));
+            return Ok((
+                FineMaps {
+                    own,
+                    neighbours,
+                    corrections: None,
+                },
+                AlignedTokens {
+                    values,
+                    valid,
+                    fit: None,
+                },
+            ));
         };
         let (_, height, width) = own.size3()?;
         let area = Area::new(grid, [height, width], network.radius());
@@ -89,25 +101,49 @@ impl SpatialAlignment {
         let neighbours = moved_maps(coarse, &deltas, &area, grid)?;
         // The ego's newest, which matches itself, gets nothing.
         let fit = Some(fit.f_constant_pad_nd([0, 0, 1, 0])?);
-        Ok((FineMaps { own, neighbours, corrections: Some(deltas) }, AlignedTokens { values, valid, fit }))
+        Ok((
+            FineMaps {
+                own,
+                neighbours,
+                corrections: Some(deltas),
+            },
+            AlignedTokens { values, valid, fit },
+        ))
     }
 
     /// Displacements of all entries from the ego's newest.
     fn compare(
         &self,
         network: &AlignmentNetwork,
-        CoarseMaps { newest, earlier, origins, .. }: &CoarseMaps,
+        CoarseMaps {
+            newest,
+            earlier,
+            origins,
+            ..
+        }: &CoarseMaps,
         confidences: &Tensor,
         area: &Area,
         is_training: bool,
     ) -> Result<Displacements, TchError> {
-        let (newest, agents, poses) = (network.reduced(newest)?, newest.count()?, &origins.ego_from_cav);
+        let (newest, agents, poses) = (
+            network.reduced(newest)?,
+            newest.count()?,
+            &origins.ego_from_cav,
+        );
         let ego = newest.only(0, 1)?;
         let mut found = Vec::with_capacity(2);
         let mut add = |maps: [&WarpedMaps; 2], first: i64, end: i64, area: &Area| {
             let confidences = confidences.f_narrow(0, first, end - first)?;
-            let pairs = network.pairs(maps, &confidences, &poses[first as usize..end as usize], area)?;
-            found.push(self.search.displacements(network, &pairs, area, is_training)?);
+            let pairs = network.pairs(
+                maps,
+                &confidences,
+                &poses[first as usize..end as usize],
+                area,
+            )?;
+            found.push(
+                self.search
+                    .displacements(network, &pairs, area, is_training)?,
+            );
             Ok::<_, TchError>(())
         };
         if agents > 1 {
@@ -115,8 +151,16 @@ impl SpatialAlignment {
         }
         if let Some(earlier) = earlier {
             // Means of reduced maps are reduced means of maps.
-            let (ego, area) = (pooled(&ego, self.earlier_cells)?, area.with_cells_of(self.earlier_cells));
-            add([&ego, &network.reduced(earlier)?], agents, poses.len() as i64, &area)?;
+            let (ego, area) = (
+                pooled(&ego, self.earlier_cells)?,
+                area.with_cells_of(self.earlier_cells),
+            );
+            add(
+                [&ego, &network.reduced(earlier)?],
+                agents,
+                poses.len() as i64,
+                &area,
+            )?;
         }
         Displacements::all(&found)
     }
@@ -132,21 +176,46 @@ fn moved_tokens(
 ) -> Result<(Tensor, Tensor), TchError> {
     let (entries, _, rows, columns) = values.size4()?;
     let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
-    let with_first = |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
+    let with_first =
+        |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
     let places = sampling_grid(deltas, &origins.ego_from_cav[1..], area, [rows, columns])?;
-    let (after, after_valid) = resample(&after_first(values)?, &after_first(valid)?.f_unsqueeze(1)?, &places)?;
-    Ok((with_first(values, after)?, with_first(valid, after_valid.f_squeeze_dim(1)?)?))
+    let (after, after_valid) = resample(
+        &after_first(values)?,
+        &after_first(valid)?.f_unsqueeze(1)?,
+        &places,
+    )?;
+    Ok((
+        with_first(values, after)?,
+        with_first(valid, after_valid.f_squeeze_dim(1)?)?,
+    ))
 }
 
 /// The newest maps of neighbours, resampled from the maps as received by the poses that `deltas` correct.
-fn moved_maps(coarse: &CoarseMaps, deltas: &Tensor, area: &Area, grid: &BevGrid) -> Result<NeighbourMaps, TchError> {
+fn moved_maps(
+    coarse: &CoarseMaps,
+    deltas: &Tensor,
+    area: &Area,
+    grid: &BevGrid,
+) -> Result<NeighbourMaps, TchError> {
     let count = coarse.newest.count()? - 1;
     if count == 0 {
         return Ok(NeighbourMaps::still(coarse.newest.only(1, 1)?));
     }
-    let own = Area::new(grid, [i64::from(grid.height), i64::from(grid.width)], area.radius());
-    let (deltas, poses) = (deltas.f_narrow(0, 0, count)?, &coarse.origins.ego_from_cav[1..=count as usize]);
+    let own = Area::new(
+        grid,
+        [i64::from(grid.height), i64::from(grid.width)],
+        area.radius(),
+    );
+    let (deltas, poses) = (
+        deltas.f_narrow(0, 0, count)?,
+        &coarse.origins.ego_from_cav[1..=count as usize],
+    );
     let places = own_sampling_grid(&deltas, poses, [area, &own])?;
-    let cells = coarse.received_cells.iter().skip(1).map(FullResolutionMap::shallow_clone).collect();
+    let cells = coarse
+        .received_cells
+        .iter()
+        .skip(1)
+        .map(FullResolutionMap::shallow_clone)
+        .collect();
     NeighbourMaps::at(coarse.received.only(1, count + 1)?, cells, places)
 }

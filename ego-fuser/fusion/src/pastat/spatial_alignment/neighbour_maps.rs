@@ -21,7 +21,11 @@ pub(crate) struct NeighbourMaps {
 impl NeighbourMaps {
     /// Of maps that are aligned already.
     pub(crate) fn still(maps: WarpedMaps) -> Self {
-        Self { maps, cells: Vec::new(), places: None }
+        Self {
+            maps,
+            cells: Vec::new(),
+            places: None,
+        }
     }
 
     /// Number of maps.
@@ -37,9 +41,17 @@ impl NeighbourMaps {
     }
 
     /// Of maps as received, to be sampled at `places`; `cells` are the same in plain floats, where there are such.
-    pub(crate) fn at(maps: WarpedMaps, cells: Vec<FullResolutionMap>, places: Tensor) -> Result<Self, TchError> {
+    pub(crate) fn at(
+        maps: WarpedMaps,
+        cells: Vec<FullResolutionMap>,
+        places: Tensor,
+    ) -> Result<Self, TchError> {
         if cells.len() as i64 == maps.count()? && are_numbers(&places) {
-            return Ok(Self { maps, cells, places: Some(places) });
+            return Ok(Self {
+                maps,
+                cells,
+                places: Some(places),
+            });
         }
         let (features, mask) = resample(&maps.features, &maps.mask, &places)?;
         Ok(Self::still(WarpedMaps { features, mask }))
@@ -57,11 +69,15 @@ impl NeighbourMaps {
                 }
             }
             let (channels, height, width) = own.size3()?;
-            return Tensor::f_from_slice(&maximum)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2]);
+            return Tensor::f_from_slice(&maximum)?
+                .f_view([1, height, width, channels])?
+                .f_permute([0, 3, 1, 2]);
         }
         let WarpedMaps { features, mask } = &self.maps;
         // A map contributes nothing out of its reach.
-        let reach = mask.f_zeros_like()?.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
+        let reach = mask
+            .f_zeros_like()?
+            .f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
         let mut maximum = own.shallow_clone();
         for index in 0..self.count()? {
             let [map, weight, reach] = [features, weight, &reach].map(|tensor| tensor.f_get(index));
@@ -82,27 +98,47 @@ mod tests {
 
     #[test]
     fn numbers_and_tensors_find_the_same_maximum() {
-        let grid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+        let grid = BevGrid {
+            x_min_m: -8.0,
+            y_min_m: -4.0,
+            cell_m: 0.5,
+            width: 32,
+            height: 16,
+        };
         let area = Area::new(&grid, [16, 32], 4);
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let deltas = Tensor::from_slice(&[0.7f32, -0.4, 0.05, -1.3, 0.2, 0.0]).view([2, 3]);
         let places = own_sampling_grid(&deltas, &poses, [&area, &area]).unwrap();
         let mask = uniform(4, &[2, 1, 16, 32]).gt(0.2).to_kind(Kind::Float);
         let features = (uniform(5, &[2, 3, 16, 32]) - 0.3) * &mask;
-        let (own, weight) = (uniform(6, &[3, 16, 32]) - 0.5, uniform(7, &[2, 1, 16, 32]) * 2.0);
+        let (own, weight) = (
+            uniform(6, &[3, 16, 32]) - 0.5,
+            uniform(7, &[2, 1, 16, 32]) * 2.0,
+        );
         let found = |with_gradient| {
-            let maps = WarpedMaps { features: features.shallow_clone(), mask: mask.shallow_clone() };
-            let cells =
-                |map| FullResolutionMap::of(&features.narrow(0, map, 1), Some(&mask.narrow(0, map, 1))).unwrap();
+            let maps = WarpedMaps {
+                features: features.shallow_clone(),
+                mask: mask.shallow_clone(),
+            };
+            let cells = |map| {
+                FullResolutionMap::of(&features.narrow(0, map, 1), Some(&mask.narrow(0, map, 1)))
+                    .unwrap()
+            };
             let cells = (0..2).map(cells).collect();
-            let moved = NeighbourMaps::at(maps, cells, places.copy().set_requires_grad(with_gradient)).unwrap();
+            let moved =
+                NeighbourMaps::at(maps, cells, places.copy().set_requires_grad(with_gradient))
+                    .unwrap();
             assert_eq!(moved.places.is_none(), with_gradient);
             moved.maximum_with(&own, &weight).unwrap()
         };
         let (numbers, tensors) = (found(false), found(true));
         assert_ne!(numbers, own.unsqueeze(0));
         // At a position between two cells either may be the nearest.
-        let apart = (numbers - tensors).abs().gt(1e-4).sum(Kind::Int64).int64_value(&[]);
+        let apart = (numbers - tensors)
+            .abs()
+            .gt(1e-4)
+            .sum(Kind::Int64)
+            .int64_value(&[]);
         assert!(apart <= 3, "{apart}");
     }
 }

@@ -40,14 +40,29 @@ pub(crate) struct AlignmentNetwork {
 impl AlignmentNetwork {
     /// Before training it moves nothing and adds nothing to tokens of `dim` channels.
     pub(crate) fn new(path: &nn::Path<'_>, [channels, dim]: [i64; 2], config: &FsaConfig) -> Self {
-        let FsaConfig { matching, hidden, .. } = *config;
-        let still = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
-        let around = nn::ConvConfig { padding: 1, ..Default::default() };
+        let FsaConfig {
+            matching, hidden, ..
+        } = *config;
+        let still = nn::LinearConfig {
+            ws_init: Init::Const(0.0),
+            bs_init: Some(Init::Const(0.0)),
+            bias: true,
+        };
+        let around = nn::ConvConfig {
+            padding: 1,
+            ..Default::default()
+        };
         // For each part the shift along x and y and its quality; the same for the whole; the motion; the confidences.
         let inputs = 3 * (PARTS * PARTS + 1) + 3 + CONFIDENCES;
         Self {
             matching: [
-                nn::conv2d(path / "matching0", channels, matching, 1, nn::ConvConfig::default()),
+                nn::conv2d(
+                    path / "matching0",
+                    channels,
+                    matching,
+                    1,
+                    nn::ConvConfig::default(),
+                ),
                 nn::conv2d(path / "matching1", matching, matching, 3, around),
             ],
             sharpness: path.var("sharpness", &[], Init::Const(SHARPNESS.ln())),
@@ -64,8 +79,14 @@ impl AlignmentNetwork {
     }
 
     /// The reduced channels in which maps are compared.
-    pub(crate) fn reduced(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<WarpedMaps, TchError> {
-        Ok(WarpedMaps { features: pointwise(&self.matching[0], features)?, mask: mask.shallow_clone() })
+    pub(crate) fn reduced(
+        &self,
+        WarpedMaps { features, mask }: &WarpedMaps,
+    ) -> Result<WarpedMaps, TchError> {
+        Ok(WarpedMaps {
+            features: pointwise(&self.matching[0], features)?,
+            mask: mask.shallow_clone(),
+        })
     }
 
     /// `K` maps and the ego's, all [reduced](Self::reduced), prepared for comparison.
@@ -93,20 +114,36 @@ impl AlignmentNetwork {
     }
 
     /// Compares maps at `deltas` `[K, 3]`, metres and radians in the ego's frame; the displacements include those.
-    pub(crate) fn displacements(&self, pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Displacements, TchError> {
-        let Pairs { own, confidences, ego_from_cav, .. } = pairs;
+    pub(crate) fn displacements(
+        &self,
+        pairs: &Pairs,
+        deltas: &Tensor,
+        area: &Area,
+    ) -> Result<Displacements, TchError> {
+        let Pairs {
+            own,
+            confidences,
+            ego_from_cav,
+            ..
+        } = pairs;
         let device = deltas.device();
         let found = own.correlate(&moved(pairs, deltas, area)?)?;
         let shifts = (shifts(area.radius())? * area.cell_m()).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
         let parts = peaks(&found.parts, &sharpness, &shifts)?;
         let whole = peaks(&found.whole, &sharpness, &shifts)?;
-        let [fit, similarity] = [&found.parts, &found.whole].map(|found| found.f_amax([-1_i64].as_slice(), false));
+        let [fit, similarity] =
+            [&found.parts, &found.whole].map(|found| found.f_amax([-1_i64].as_slice(), false));
         let (fit, similarity) = (fit?, similarity?);
         let weight = fit.f_relu()?.f_square()? * &found.energy;
-        let senders = area.places_of(ego_from_cav)?.f_to_device(device)? + deltas.f_narrow(1, 0, 2)?;
+        let senders =
+            area.places_of(ego_from_cav)?.f_to_device(device)? + deltas.f_narrow(1, 0, 2)?;
         let motion = rigid_motion(&parts, &weight, &senders, area)?;
-        let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([ego_from_cav.len() as i64, -1]);
+        let by_entry = |parts: Tensor| {
+            parts
+                .f_transpose(0, 1)?
+                .f_reshape([ego_from_cav.len() as i64, -1])
+        };
         let inputs = [
             by_entry(parts)?,
             by_entry(fit)?,
@@ -117,14 +154,23 @@ impl AlignmentNetwork {
         ];
         let hidden = self.hidden.forward(&Tensor::f_cat(&inputs, 1)?).f_relu()?;
         let near = self.bounded(&self.delta.forward(&hidden), motion)?;
-        Ok(Displacements { deltas: near + deltas, fit: self.fit.forward(&hidden), similarity })
+        Ok(Displacements {
+            deltas: near + deltas,
+            fit: self.fit.forward(&hidden),
+            similarity,
+        })
     }
 
     /// `[K, 3]` from the network's output `learnt` `[K, 6]`, an addition and the share of the `motion` `[K, 3]`, within
     /// bounds.
     fn bounded(&self, learnt: &Tensor, motion: Tensor) -> Result<Tensor, TchError> {
-        let FsaConfig { max_shift_m, max_turn_rad, .. } = self.config;
-        let bounds = Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
+        let FsaConfig {
+            max_shift_m,
+            max_turn_rad,
+            ..
+        } = self.config;
+        let bounds =
+            Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
         let bounds = bounds.f_to_device(motion.device())?;
         let raw = learnt.f_narrow(1, 0, 3)? + motion / &bounds * learnt.f_narrow(1, 3, 3)?;
         Ok(raw.f_tanh()? * bounds)
@@ -133,14 +179,24 @@ impl AlignmentNetwork {
     /// Compared form of maps, `[N, M, H, W]`: zero mean over the valid cells, so that empty road matches nothing.
     fn shown(&self, WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor, TchError> {
         let shown = self.matching[1].forward(&features.f_relu()?);
-        let over_map = |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
+        let over_map =
+            |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
         let mean = over_map(&(&shown * mask))? / over_map(mask)?.f_clamp_min(1.0)?;
         Ok((shown - mean) * mask)
     }
 }
 
 /// Compared form of others, moved by `deltas` `[K, 3]`.
-fn moved(Pairs { shown, mask, ego_from_cav, .. }: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor, TchError> {
+fn moved(
+    Pairs {
+        shown,
+        mask,
+        ego_from_cav,
+        ..
+    }: &Pairs,
+    deltas: &Tensor,
+    area: &Area,
+) -> Result<Tensor, TchError> {
     if deltas.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
     }
@@ -157,22 +213,47 @@ fn moved(Pairs { shown, mask, ego_from_cav, .. }: &Pairs, deltas: &Tensor, area:
 /// - `parts`: `[PARTS^2, N, 2]` shifts, metres
 /// - `weight`: `[PARTS^2, N]`, confidence of each of them
 /// - `senders`: `[N, 2]`, positions of the maps' senders, metres from the centre of `area`
-fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) -> Result<Tensor, TchError> {
+fn rigid_motion(
+    parts: &Tensor,
+    weight: &Tensor,
+    senders: &Tensor,
+    area: &Area,
+) -> Result<Tensor, TchError> {
     let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
     let share = weight / over_parts(weight)?.f_add_scalar(EPSILON)?;
     let share = share.f_unsqueeze(2)?;
     // Centres of the parts, from the centre of the grid.
-    let middles = area.middles_of_parts()?.f_to_device(parts.device())?.f_unsqueeze(1)?;
-    let (mean, middle) = (over_parts(&(parts * &share))?, over_parts(&(&middles * &share))?);
-    let (shift, arm) = (parts - mean.f_unsqueeze(0)?, &middles - middle.f_unsqueeze(0)?);
+    let middles = area
+        .middles_of_parts()?
+        .f_to_device(parts.device())?
+        .f_unsqueeze(1)?;
+    let (mean, middle) = (
+        over_parts(&(parts * &share))?,
+        over_parts(&(&middles * &share))?,
+    );
+    let (shift, arm) = (
+        parts - mean.f_unsqueeze(0)?,
+        &middles - middle.f_unsqueeze(0)?,
+    );
     let column = |tensor: &Tensor, axis: i64| tensor.f_narrow(2, axis, 1);
     let turning = column(&arm, 0)? * column(&shift, 1)? - column(&arm, 1)? * column(&shift, 0)?;
-    let inertia = over_parts(&(arm.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), true, None)? * &share))?;
+    let inertia = over_parts(
+        &(arm
+            .f_square()?
+            .f_sum_dim_intlist([2_i64].as_slice(), true, None)?
+            * &share),
+    )?;
     // A single part does not determine a rotation: a few metres of lever arm prevent division by zero.
     let turn = over_parts(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
     let to_sender = senders - middle;
     // The weighted centre of the observed parts moves by `mean`; a rotation moves the sender relative to it.
-    let across = Tensor::f_cat(&[-(to_sender.f_narrow(1, 1, 1)?), to_sender.f_narrow(1, 0, 1)?], 1)?;
+    let across = Tensor::f_cat(
+        &[
+            -(to_sender.f_narrow(1, 1, 1)?),
+            to_sender.f_narrow(1, 0, 1)?,
+        ],
+        1,
+    )?;
     Tensor::f_cat(&[mean + across * &turn, turn], 1)
 }
 
@@ -185,7 +266,13 @@ mod tests {
     use super::*;
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
-    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+    const GRID: BevGrid = BevGrid {
+        x_min_m: -8.0,
+        y_min_m: -4.0,
+        cell_m: 0.5,
+        width: 32,
+        height: 16,
+    };
 
     fn area() -> Area {
         Area::new(&GRID, [16, 32], 4)
@@ -193,17 +280,31 @@ mod tests {
 
     /// Without the search, in which random maps match anywhere.
     fn near() -> FsaConfig {
-        FsaConfig { alignment_search: None, ..FsaConfig::default() }
+        FsaConfig {
+            alignment_search: None,
+            ..FsaConfig::default()
+        }
     }
 
     fn random(maps: i64) -> WarpedMaps {
-        WarpedMaps { features: Tensor::randn([maps, 4, 16, 32], FLOAT), mask: Tensor::ones([maps, 1, 16, 32], FLOAT) }
+        WarpedMaps {
+            features: Tensor::randn([maps, 4, 16, 32], FLOAT),
+            mask: Tensor::ones([maps, 1, 16, 32], FLOAT),
+        }
     }
 
     fn compared(fsa: &AlignmentNetwork, maps: [&WarpedMaps; 2], poses: &[Pose]) -> Displacements {
         let maps_count = poses.len() as i64;
-        let pairs = fsa.pairs(maps, &Tensor::ones([maps_count, CONFIDENCES], FLOAT), poses, &area()).unwrap();
-        fsa.displacements(&pairs, &Tensor::zeros([maps_count, 3], FLOAT), &area()).unwrap()
+        let pairs = fsa
+            .pairs(
+                maps,
+                &Tensor::ones([maps_count, CONFIDENCES], FLOAT),
+                poses,
+                &area(),
+            )
+            .unwrap();
+        fsa.displacements(&pairs, &Tensor::zeros([maps_count, 3], FLOAT), &area())
+            .unwrap()
     }
 
     #[test]
@@ -219,10 +320,13 @@ mod tests {
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
         let maps = Tensor::randn([2, 4, 16, 32], FLOAT);
         let sampling_grid = sampling_grid(&deltas, &poses, &area(), [16, 32]).unwrap();
-        let (same, valid) = resample(&maps, &Tensor::ones([2, 1, 16, 32], FLOAT), &sampling_grid).unwrap();
+        let (same, valid) =
+            resample(&maps, &Tensor::ones([2, 1, 16, 32], FLOAT), &sampling_grid).unwrap();
         assert!(same.allclose(&maps, 1e-4, 1e-4, false));
         assert_eq!(valid.min().double_value(&[]), 1.0);
-        (same * Tensor::randn([2, 4, 16, 32], FLOAT)).sum(Kind::Float).backward();
+        (same * Tensor::randn([2, 4, 16, 32], FLOAT))
+            .sum(Kind::Float)
+            .backward();
         let gradient = variables.variables()["delta.weight"].grad();
         assert!(gradient.abs().max().double_value(&[]) > 0.0);
     }
@@ -232,30 +336,56 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let config = near();
         let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &config);
-        let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
+        let _ = tch::no_grad(|| {
+            variables.variables()["delta.bias"]
+                .shallow_clone()
+                .fill_(1e6)
+        });
         let reduce = |maps: &WarpedMaps| fsa.reduced(maps).unwrap();
-        let deltas = compared(&fsa, [&reduce(&random(1)), &reduce(&random(1))], &[Pose::IDENTITY]).deltas;
+        let deltas = compared(
+            &fsa,
+            [&reduce(&random(1)), &reduce(&random(1))],
+            &[Pose::IDENTITY],
+        )
+        .deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
-        assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
+        assert!(
+            (found[0] - 3.0).abs() < 1e-6
+                && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6
+        );
     }
 
     #[test]
     fn shifts_of_parts_make_the_motion_that_a_wrong_pose_needs() {
         let sender = Pose::from_xyz_yaw([3.0, -1.0, 0.0], 0.4);
         let (turn, shift) = (0.02_f64, [0.7, -0.3]);
-        let (middles, senders) = (area().middles_of_parts().unwrap(), area().places_of(&[sender]).unwrap());
+        let (middles, senders) = (
+            area().middles_of_parts().unwrap(),
+            area().places_of(&[sender]).unwrap(),
+        );
         // Each part moves by the shift, and by the rotation about the sender.
         let parts: Vec<f32> = (0..PARTS * PARTS)
             .flat_map(|part| {
-                let [x, y] = [0, 1].map(|axis| middles.double_value(&[part, axis]) - senders.double_value(&[0, axis]));
+                let [x, y] = [0, 1].map(|axis| {
+                    middles.double_value(&[part, axis]) - senders.double_value(&[0, axis])
+                });
                 [(shift[0] - turn * y) as f32, (shift[1] + turn * x) as f32]
             })
             .collect();
         let parts = Tensor::from_slice(&parts).view([-1, 1, 2]);
-        let motion = rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &senders, &area()).unwrap();
+        let motion = rigid_motion(
+            &parts,
+            &Tensor::ones([PARTS * PARTS, 1], FLOAT),
+            &senders,
+            &area(),
+        )
+        .unwrap();
         let [dx, dy, theta] = [0, 1, 2].map(|index| motion.double_value(&[0, index]));
         // The rotation is underestimated by the added arm, and the shift by the corresponding move of the sender.
         assert!(theta > 0.4 * turn && theta <= turn, "{theta}");
-        assert!((dx - shift[0]).abs() < 0.05 && (dy - shift[1]).abs() < 0.05, "{dx} {dy}");
+        assert!(
+            (dx - shift[0]).abs() < 0.05 && (dy - shift[1]).abs() < 0.05,
+            "{dx} {dy}"
+        );
     }
 }

@@ -33,7 +33,10 @@ impl Pairs {
             shown: picked(&self.shown, rows)?,
             mask: picked(&self.mask, rows)?,
             confidences: picked(&self.confidences, rows)?,
-            ego_from_cav: rows.iter().map(|&row| self.ego_from_cav[row as usize]).collect(),
+            ego_from_cav: rows
+                .iter()
+                .map(|&row| self.ego_from_cav[row as usize])
+                .collect(),
         })
     }
 }
@@ -52,7 +55,9 @@ pub(crate) struct Displacements {
 impl Displacements {
     /// Concatenation of several comparisons.
     pub(crate) fn all(several: &[Self]) -> Result<Self, TchError> {
-        let cat = |of: fn(&Self) -> &Tensor| Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0);
+        let cat = |of: fn(&Self) -> &Tensor| {
+            Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0)
+        };
         Ok(Self {
             deltas: cat(|each| &each.deltas)?,
             fit: cat(|each| &each.fit)?,
@@ -83,7 +88,10 @@ impl Displacements {
 
 /// Some rows of a tensor.
 pub(crate) fn picked(tensor: &Tensor, rows: &[i64]) -> Result<Tensor, TchError> {
-    tensor.f_index_select(0, &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?)
+    tensor.f_index_select(
+        0,
+        &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?,
+    )
 }
 
 /// The rows of `[K]` that are true.

@@ -24,13 +24,20 @@ pub(super) struct AgentAttention {
 
 impl AgentAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64) -> Self {
-        let bare = nn::LinearConfig { bias: false, ..Default::default() };
+        let bare = nn::LinearConfig {
+            bias: false,
+            ..Default::default()
+        };
         Self {
             query: nn::linear(path / "query", dim, dim, bare),
             key: nn::linear(path / "key", dim, dim, bare),
             value: nn::linear(path / "value", dim, dim, bare),
             out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
-            members: Tensor::eye(heads, (Kind::Float, path.device())).repeat_interleave_self_int(dim / heads, 0, None),
+            members: Tensor::eye(heads, (Kind::Float, path.device())).repeat_interleave_self_int(
+                dim / heads,
+                0,
+                None,
+            ),
             heads,
         }
     }
@@ -41,7 +48,12 @@ impl AgentAttention {
     /// - `tokens`: `[N, h, w, D]`
     /// - `valid`: `[N, h, w]`, 1 for valid tokens
     /// - returns: `[rows, h, w, D]`
-    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
+    pub(super) fn forward(
+        &self,
+        tokens: &Tensor,
+        valid: &Tensor,
+        rows: i64,
+    ) -> Result<Tensor, TchError> {
         let (entries, height, width, dim) = tokens.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
         let query = self.query.forward(&tokens.f_narrow(0, 0, rows)?) / (each as f64).sqrt();
@@ -49,12 +61,24 @@ impl AgentAttention {
         let hidden = valid.f_eq(0.0)?.f_view([entries, cells, 1])?;
         let mixed = if rows == 1 {
             let by_cell = |tensor: &Tensor| tensor.f_view([-1, cells, dim]);
-            self.one_row(&by_cell(&query)?, &by_cell(&key)?, &by_cell(&value)?, &hidden)?
+            self.one_row(
+                &by_cell(&query)?,
+                &by_cell(&key)?,
+                &by_cell(&value)?,
+                &hidden,
+            )?
         } else {
             let by_head = |tensor: &Tensor| tensor.f_view([-1, cells, self.heads, each]);
-            all_rows(&by_head(&query)?, &by_head(&key)?, &by_head(&value)?, &hidden)?
+            all_rows(
+                &by_head(&query)?,
+                &by_head(&key)?,
+                &by_head(&value)?,
+                &hidden,
+            )?
         };
-        Ok(self.out.forward(&mixed.f_reshape([rows, height, width, dim])?))
+        Ok(self
+            .out
+            .forward(&mixed.f_reshape([rows, height, width, dim])?))
     }
 
     /// Attention of the ego to all, from tokens that are not normalised yet: the same as `forward` of one row.
@@ -64,7 +88,12 @@ impl AgentAttention {
     ///
     /// # Shapes
     /// - `ego`, returns: `[1, h, w, D]`
-    pub(super) fn gather(&self, norm: &nn::LayerNorm, ego: &Tensor, others: &Others) -> Result<Tensor, TchError> {
+    pub(super) fn gather(
+        &self,
+        norm: &nn::LayerNorm,
+        ego: &Tensor,
+        others: &Others,
+    ) -> Result<Tensor, TchError> {
         let (_, height, width, dim) = ego.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
         let by_channel = |tokens: &Tensor| tokens.f_view([cells, dim])?.f_transpose(0, 1);
@@ -72,25 +101,50 @@ impl AgentAttention {
         let query = self.query.forward(&norm.forward(ego)) / (each as f64).sqrt();
         let query = by_channel(&query)?.f_reshape([self.heads, each, cells])?;
         let (one, none) = (Tensor::from(1f32), Tensor::from(0f32));
-        let (gain, shift) = (norm.ws.as_ref().unwrap_or(&one), norm.bs.as_ref().unwrap_or(&none));
-        let asked = (by_head(&self.key)? * gain).f_transpose(1, 2)?.f_matmul(&query)?;
+        let (gain, shift) = (
+            norm.ws.as_ref().unwrap_or(&one),
+            norm.bs.as_ref().unwrap_or(&none),
+        );
+        let asked = (by_head(&self.key)? * gain)
+            .f_transpose(1, 2)?
+            .f_matmul(&query)?;
         let gathered = others.gather(&numbers(&asked)?, &numbers(&by_channel(ego)?)?);
         let gathered = Tensor::f_from_slice(&gathered)?.f_view([self.heads, dim, cells])?;
         let values = by_head(&self.value)?;
-        let mixed =
-            (&values * gain).f_matmul(&gathered)? + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
-        Ok(self.out.forward(&mixed.f_view([dim, cells])?.f_transpose(0, 1)?.f_reshape([1, height, width, dim])?))
+        let mixed = (&values * gain).f_matmul(&gathered)?
+            + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
+        Ok(self.out.forward(
+            &mixed
+                .f_view([dim, cells])?
+                .f_transpose(0, 1)?
+                .f_reshape([1, height, width, dim])?,
+        ))
     }
 
     /// One query row, the ego's: sums over few entries are cheaper than products of small matrices.
-    fn one_row(&self, query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+    fn one_row(
+        &self,
+        query: &Tensor,
+        key: &Tensor,
+        value: &Tensor,
+        hidden: &Tensor,
+    ) -> Result<Tensor, TchError> {
         let scores = (query * key).f_matmul(&self.members)?;
         let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
-        (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value).f_sum_dim_intlist([0_i64].as_slice(), true, None)
+        (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value).f_sum_dim_intlist(
+            [0_i64].as_slice(),
+            true,
+            None,
+        )
     }
 }
 
-fn all_rows(query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+fn all_rows(
+    query: &Tensor,
+    key: &Tensor,
+    value: &Tensor,
+    hidden: &Tensor,
+) -> Result<Tensor, TchError> {
     // [N, cells, heads, d] to [cells, heads, N, d]
     let by_cell = |tensor: &Tensor| tensor.f_permute([1, 2, 0, 3])?.f_contiguous();
     let scores = by_cell(query)?.f_matmul(&by_cell(key)?.f_transpose(2, 3)?)?;
@@ -120,11 +174,18 @@ struct WindowSize {
 
 impl WindowAttention {
     pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64, edges: &[i64]) -> Self {
-        let bare = nn::LinearConfig { bias: false, ..Default::default() };
+        let bare = nn::LinearConfig {
+            bias: false,
+            ..Default::default()
+        };
         let heads = heads / edges.len() as i64;
         let size = |(index, &edge): (usize, &i64)| WindowSize {
             edge,
-            bias: path.var(&format!("bias{index}"), &[(2 * edge - 1).pow(2), heads], Init::Const(0.0)),
+            bias: path.var(
+                &format!("bias{index}"),
+                &[(2 * edge - 1).pow(2), heads],
+                Init::Const(0.0),
+            ),
             places: relative_places(edge),
         };
         Self {
@@ -147,13 +208,19 @@ impl WindowAttention {
         let projected = self.query_key_value.forward(tokens);
         let mut parts = Vec::with_capacity(self.sizes.len());
         for (index, size) in self.sizes.iter().enumerate() {
-            let of_size = |which: i64| projected.f_narrow(3, which * dim + index as i64 * share, share);
+            let of_size =
+                |which: i64| projected.f_narrow(3, which * dim + index as i64 * share, share);
             parts.push(self.within(size, [of_size(0)?, of_size(1)?, of_size(2)?], valid)?);
         }
         Ok(self.out.forward(&Tensor::f_cat(&parts, 3)?))
     }
 
-    fn within(&self, size: &WindowSize, parts: [Tensor; 3], valid: &Tensor) -> Result<Tensor, TchError> {
+    fn within(
+        &self,
+        size: &WindowSize,
+        parts: [Tensor; 3],
+        valid: &Tensor,
+    ) -> Result<Tensor, TchError> {
         let (entries, height, width, share) = parts[0].size4()?;
         let (edge, each) = (size.edge, share / self.heads);
         let (down, across) = (height / edge, width / edge);
@@ -163,12 +230,18 @@ impl WindowAttention {
                 .f_permute([0, 1, 3, 5, 2, 4, 6])?
                 .f_reshape([entries * down * across, self.heads, edge * edge, each])
         };
-        let [query, key, value] = [windows(&parts[0])?, windows(&parts[1])?, windows(&parts[2])?];
+        let [query, key, value] = [
+            windows(&parts[0])?,
+            windows(&parts[1])?,
+            windows(&parts[2])?,
+        ];
         let mut scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)?;
         scores = scores.f_add_(&self.preference(size)?)?;
         let hidden = valid.f_eq(0.0)?;
         if hidden.f_any()?.f_int64_value(&[])? != 0 {
-            let hidden = hidden.f_view([entries, down, edge, across, edge])?.f_permute([0, 1, 3, 2, 4])?;
+            let hidden = hidden
+                .f_view([entries, down, edge, across, edge])?
+                .f_permute([0, 1, 3, 2, 4])?;
             let hidden = hidden.f_reshape([entries * down * across, 1, 1, edge * edge])?;
             scores = scores.f_masked_fill(&hidden, MASKED)?;
         }
@@ -184,7 +257,11 @@ impl WindowAttention {
     fn preference(&self, size: &WindowSize) -> Result<Tensor, TchError> {
         let tokens = size.edge * size.edge;
         let places = Tensor::f_from_slice(&size.places)?.f_to_device(size.bias.device())?;
-        size.bias.f_index_select(0, &places)?.f_view([tokens, tokens, self.heads])?.f_permute([2, 0, 1])?.f_contiguous()
+        size.bias
+            .f_index_select(0, &places)?
+            .f_view([tokens, tokens, self.heads])?
+            .f_permute([2, 0, 1])?
+            .f_contiguous()
     }
 }
 
@@ -194,7 +271,9 @@ fn relative_places(edge: i64) -> Vec<i64> {
     let place = |(a_row, a_column): (i64, i64), (b_row, b_column): (i64, i64)| {
         (a_row - b_row + edge - 1) * (2 * edge - 1) + a_column - b_column + edge - 1
     };
-    tokens().flat_map(|a| tokens().map(move |b| place(a, b))).collect()
+    tokens()
+        .flat_map(|a| tokens().map(move |b| place(a, b)))
+        .collect()
 }
 
 #[cfg(test)]
@@ -223,17 +302,29 @@ mod tests {
     fn what_the_ego_gathers_is_what_one_row_learns() {
         let variables = VarStore::new(Device::Cpu);
         let attention = AgentAttention::new(&variables.root(), 12, 2);
-        let norm = nn::layer_norm(variables.root() / "norm", vec![12], nn::LayerNormConfig::default());
+        let norm = nn::layer_norm(
+            variables.root() / "norm",
+            vec![12],
+            nn::LayerNormConfig::default(),
+        );
         redraw(&variables, &["weight", "bias"], 0.8);
         // More cells than a strip, and a rest.
         let tokens = uniform(1, &[4, 9, 10, 12]) * 3.0;
         let valid = uniform(2, &[4, 9, 10]).gt(0.4).to_kind(Kind::Float);
         // No valid tokens here.
         let _ = valid.select(1, 0).select(1, 0).fill_(0.0);
-        let forward = attention.forward(&norm.forward(&tokens), &valid, 1).unwrap();
+        let forward = attention
+            .forward(&norm.forward(&tokens), &valid, 1)
+            .unwrap();
         let others = Others::of(&tokens.permute([0, 3, 1, 2]), &valid).unwrap();
-        let gathered = attention.gather(&norm, &tokens.narrow(0, 0, 1), &others).unwrap();
-        assert!(gathered.allclose(&forward, 1e-4, 1e-5, false), "{}", (gathered - forward).abs().max());
+        let gathered = attention
+            .gather(&norm, &tokens.narrow(0, 0, 1), &others)
+            .unwrap();
+        assert!(
+            gathered.allclose(&forward, 1e-4, 1e-5, false),
+            "{}",
+            (gathered - forward).abs().max()
+        );
     }
 
     #[test]
@@ -247,14 +338,27 @@ mod tests {
         let changed = tokens.copy();
         let _ = changed.get(1).fill_(7.0);
         let same = |found: Tensor, again: Tensor| found.allclose(&again, 1e-5, 1e-6, false);
-        assert!(same(agents.forward(&tokens, &valid, 1).unwrap(), agents.forward(&changed, &valid, 1).unwrap()));
+        assert!(same(
+            agents.forward(&tokens, &valid, 1).unwrap(),
+            agents.forward(&changed, &valid, 1).unwrap()
+        ));
         let _ = valid.get(0).get(1).get(3).fill_(0.0);
         let _ = changed.get(0).get(1).get(3).fill_(9.0);
-        let [first, second] = [&tokens, &changed].map(|tokens| windows.forward(tokens, &valid).unwrap());
-        let difference = (first - second).abs().sum_dim_intlist([3_i64].as_slice(), false, Kind::Float);
+        let [first, second] =
+            [&tokens, &changed].map(|tokens| windows.forward(tokens, &valid).unwrap());
+        let difference =
+            (first - second)
+                .abs()
+                .sum_dim_intlist([3_i64].as_slice(), false, Kind::Float);
         let _ = difference.get(0).get(1).get(3).fill_(0.0);
-        assert!(difference.get(0).max().double_value(&[]) < 1e-5, "only the hidden token itself may change");
-        assert!(difference.isfinite().all().int64_value(&[]) == 1, "a window with nothing valid is a number too");
+        assert!(
+            difference.get(0).max().double_value(&[]) < 1e-5,
+            "only the hidden token itself may change"
+        );
+        assert!(
+            difference.isfinite().all().int64_value(&[]) == 1,
+            "a window with nothing valid is a number too"
+        );
     }
 
     #[test]

@@ -18,14 +18,24 @@ pub(super) struct Block {
 
 impl Block {
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
-        let PastatConfig { dim, heads, mlp_ratio, .. } = *config;
-        let norm = |name: &str| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default());
-        let linear = |name: &str, from, to| nn::linear(path / name, from, to, nn::LinearConfig::default());
+        let PastatConfig {
+            dim,
+            heads,
+            mlp_ratio,
+            ..
+        } = *config;
+        let norm =
+            |name: &str| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default());
+        let linear =
+            |name: &str, from, to| nn::linear(path / name, from, to, nn::LinearConfig::default());
         Self {
             norms: [norm("norm_agents"), norm("norm_windows"), norm("norm_mlp")],
             agents: AgentAttention::new(&(path / "agents"), dim, heads),
             windows: WindowAttention::new(&(path / "windows"), dim, heads, &config.windows),
-            mlp: [linear("mlp0", dim, mlp_ratio * dim), linear("mlp1", mlp_ratio * dim, dim)],
+            mlp: [
+                linear("mlp0", dim, mlp_ratio * dim),
+                linear("mlp1", mlp_ratio * dim, dim),
+            ],
         }
     }
 
@@ -35,15 +45,28 @@ impl Block {
     /// - `tokens`: `[N, h, w, D]`
     /// - `valid`: `[N, h, w]`
     /// - returns: `[rows, h, w, D]`
-    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
+    pub(super) fn forward(
+        &self,
+        tokens: &Tensor,
+        valid: &Tensor,
+        rows: i64,
+    ) -> Result<Tensor, TchError> {
         let kept = tokens.f_narrow(0, 0, rows)?;
-        let kept = self.agents.forward(&self.norms[0].forward(tokens), valid, rows)? + kept;
+        let kept = self
+            .agents
+            .forward(&self.norms[0].forward(tokens), valid, rows)?
+            + kept;
         self.across(&kept, &valid.f_narrow(0, 0, rows)?)
     }
 
     /// The ego's newest `[1, h, w, D]` after this block, in plain floats: the same as the first row of
     /// [`forward`](Self::forward).
-    pub(super) fn gather(&self, ego: &Tensor, others: &Others, valid: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn gather(
+        &self,
+        ego: &Tensor,
+        others: &Others,
+        valid: &Tensor,
+    ) -> Result<Tensor, TchError> {
         let kept = self.agents.gather(&self.norms[0], ego, others)? + ego;
         self.across(&kept, valid)
     }
@@ -52,7 +75,9 @@ impl Block {
     fn across(&self, kept: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
         let [_, norm_windows, norm_mlp] = &self.norms;
         let kept = self.windows.forward(&norm_windows.forward(kept), valid)? + kept;
-        let inner = self.mlp[0].forward(&norm_mlp.forward(&kept)).f_gelu("none")?;
+        let inner = self.mlp[0]
+            .forward(&norm_mlp.forward(&kept))
+            .f_gelu("none")?;
         Ok(self.mlp[1].forward(&inner) + kept)
     }
 }

@@ -26,7 +26,10 @@ impl Transformer {
     /// Its variables are `blocks.*` below `path`.
     pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
         let block = |index: usize| Block::new(&(path / "blocks" / index), config);
-        Self { blocks: (0..config.depth).map(block).collect(), rows: config.rows }
+        Self {
+            blocks: (0..config.depth).map(block).collect(),
+            rows: config.rows,
+        }
     }
 
     /// Context of the ego: its tokens `[1, h, w, D]` after all blocks.
@@ -34,13 +37,20 @@ impl Transformer {
         if self.rows == Rows::Ego && values.device() == Device::Cpu && !values.requires_grad() {
             let (others, valid) = (Others::of(values, valid)?, valid.f_narrow(0, 0, 1)?);
             let ego = channels_last(&values.f_narrow(0, 0, 1)?)?;
-            return self.blocks.iter().try_fold(ego, |ego, block| block.gather(&ego, &others, &valid));
+            return self
+                .blocks
+                .iter()
+                .try_fold(ego, |ego, block| block.gather(&ego, &others, &valid));
         }
         let count = values.size()[0];
         let mut tokens = channels_last(values)?;
         for (index, block) in self.blocks.iter().enumerate() {
             let is_last = index + 1 == self.blocks.len();
-            let rows = if is_last || self.rows == Rows::Ego { 1 } else { count };
+            let rows = if is_last || self.rows == Rows::Ego {
+                1
+            } else {
+                count
+            };
             let kept = block.forward(&tokens, valid, rows)?;
             tokens = if is_last || rows == count {
                 kept

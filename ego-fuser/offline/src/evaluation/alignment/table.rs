@@ -65,7 +65,14 @@ impl Tally {
         let failed: usize = self.reasons.values().sum();
         let pairs = failed + self.errors.len();
         let share = |count: usize| count as f64 / pairs.max(1) as f64;
-        let within = |metres: f64| share(self.errors.iter().filter(|error| error.metres < metres).count());
+        let within = |metres: f64| {
+            share(
+                self.errors
+                    .iter()
+                    .filter(|error| error.metres < metres)
+                    .count(),
+            )
+        };
         let bytes_mean = self.bytes / pairs.max(1) as f64;
         let of = |value: fn(&AlignmentError) -> f64| {
             let values: Vec<f64> = self.errors.iter().map(value).collect();
@@ -129,23 +136,47 @@ mod tests {
 
     fn outcome(result: Result<(f64, f64), NotAligned>) -> PairOutcome {
         let result = result.map(|(metres, degrees)| AlignmentError { metres, degrees });
-        PairOutcome { method: 0, bytes: 64, time: Duration::from_millis(20), result }
+        PairOutcome {
+            method: 0,
+            bytes: 64,
+            time: Duration::from_millis(20),
+            result,
+        }
     }
 
     #[test]
     fn a_pair_without_alignment_is_no_success() {
         let mut tally = Tally::default();
-        for result in [Ok((0.5, 1.0)), Ok((2.0, 0.2)), Ok((30.0, 90.0)), Err(NotAligned::NoPose)] {
+        for result in [
+            Ok((0.5, 1.0)),
+            Ok((2.0, 0.2)),
+            Ok((30.0, 90.0)),
+            Err(NotAligned::NoPose),
+        ] {
             tally.add(&outcome(result));
         }
         let row = tally.row("poses");
-        assert_eq!((row.pairs, row.success_3m, row.success_1m, row.not_aligned), (4, 0.5, 0.25, 0.25));
-        assert_eq!((row.p50_m, row.p50_deg, row.log2_bytes), (Some(2.0), Some(1.0), 6.0));
-        assert!((row.mean_m.unwrap() - 32.5 / 3.0).abs() < 1e-12 && (row.time_s - 0.02).abs() < 1e-12);
+        assert_eq!(
+            (row.pairs, row.success_3m, row.success_1m, row.not_aligned),
+            (4, 0.5, 0.25, 0.25)
+        );
+        assert_eq!(
+            (row.p50_m, row.p50_deg, row.log2_bytes),
+            (Some(2.0), Some(1.0), 6.0)
+        );
+        assert!(
+            (row.mean_m.unwrap() - 32.5 / 3.0).abs() < 1e-12 && (row.time_s - 0.02).abs() < 1e-12
+        );
         assert_eq!(row.reasons, BTreeMap::from([("no_pose", 1)]));
         let text = markdown(&[row, Tally::default().row("nothing")]);
         assert_eq!(text.lines().count(), 4);
-        assert!(text.contains("| poses | 0.0200 | 6.00 | 50.00 | 25.00 | 10.83 / 2.00 |"), "{text}");
-        assert!(text.contains("| nothing | 0.0000 | 0.00 | 0.00 | 0.00 | - | - |"), "{text}");
+        assert!(
+            text.contains("| poses | 0.0200 | 6.00 | 50.00 | 25.00 | 10.83 / 2.00 |"),
+            "{text}"
+        );
+        assert!(
+            text.contains("| nothing | 0.0000 | 0.00 | 0.00 | 0.00 | - | - |"),
+            "{text}"
+        );
     }
 }

@@ -33,7 +33,11 @@ pub struct ComputeTimes {
 
 impl ComputeTimes {
     /// Computers that take no time at all.
-    pub const NONE: Self = Self { pose_ms: 0.0, map_ms: 0.0, fuse_ms: 0.0 };
+    pub const NONE: Self = Self {
+        pose_ms: 0.0,
+        map_ms: 0.0,
+        fuse_ms: 0.0,
+    };
 
     pub(super) fn pose_nanos(&self) -> u64 {
         nanos::of_ms(self.pose_ms)
@@ -54,13 +58,26 @@ impl ComputeTimes {
 
     /// In simulation time every sweep is processed: a process that is slower than the scene is rejected.
     pub(super) fn check(&self, scenario: &Scenario) -> Result<(), EvaluateError> {
-        let steps = scenario.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-        let Some(period_nanos) = steps.min() else { return Ok(()) };
-        let steps = [("an agent (pose_ms + map_ms)", self.agent_nanos()), ("the ego (fuse_ms)", self.fuse_nanos())];
+        let steps = scenario
+            .ticks
+            .windows(2)
+            .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let Some(period_nanos) = steps.min() else {
+            return Ok(());
+        };
+        let steps = [
+            ("an agent (pose_ms + map_ms)", self.agent_nanos()),
+            ("the ego (fuse_ms)", self.fuse_nanos()),
+        ];
         for (what, takes_nanos) in steps {
             if takes_nanos > period_nanos {
-                let [takes_ms, period_ms] = [takes_nanos, period_nanos].map(|nanos| nanos as f64 * 1e-6);
-                return Err(EvaluateError::TooSlow { what, takes_ms, period_ms });
+                let [takes_ms, period_ms] =
+                    [takes_nanos, period_nanos].map(|nanos| nanos as f64 * 1e-6);
+                return Err(EvaluateError::TooSlow {
+                    what,
+                    takes_ms,
+                    period_ms,
+                });
             }
         }
         Ok(())
@@ -87,9 +104,15 @@ impl Evaluator {
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
         let samples = self.samples(scenario, MEASURED_VEHICLES, &|ticks| ticks < MEASURED_TICKS)?;
         let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
-        let Samples { pose, map, fuse, .. } = &samples;
+        let Samples {
+            pose, map, fuse, ..
+        } = &samples;
         let [pose_ms, map_ms, fuse_ms] = [pose, map, fuse].map(|sample| median(sample));
-        Ok(ComputeTimes { pose_ms, map_ms, fuse_ms })
+        Ok(ComputeTimes {
+            pose_ms,
+            map_ms,
+            fuse_ms,
+        })
     }
 
     /// Estimates the compute times of a fleet of `vehicles` on this machine from as many ticks as `budget` allows:
@@ -105,21 +128,35 @@ impl Evaluator {
         budget: Duration,
     ) -> Result<ComputeTimes, EvaluateError> {
         let began = Instant::now();
-        let goes_on = |ticks| ticks < ESTIMATED_TICKS || (ticks < MEASURED_TICKS && began.elapsed() < budget);
+        let goes_on =
+            |ticks| ticks < ESTIMATED_TICKS || (ticks < MEASURED_TICKS && began.elapsed() < budget);
         // Few sweeps are timed, so each of them is measured.
         let source = self.config.pose_source.clone();
         self.config.pose_source = source.clone().measuring_every_sweep();
         let samples = self.samples(scenario, vehicles, &goes_on);
         self.config.pose_source = source;
-        let Samples { pose, observe, map, fuse, motion } = &samples?;
+        let Samples {
+            pose,
+            observe,
+            map,
+            fuse,
+            motion,
+        } = &samples?;
         let warm = |per_tick: usize, sample: &[f64]| {
-            let warm = sample.get(per_tick..).filter(|warm| !warm.is_empty()).unwrap_or(sample);
+            let warm = sample
+                .get(per_tick..)
+                .filter(|warm| !warm.is_empty())
+                .unwrap_or(sample);
             median(warm).unwrap_or(0.0)
         };
         let agents = vehicles.min(MEASURED_VEHICLES);
         let interval = f64::from(self.config.pose_source.measuring_interval(motion));
         let pose_ms = warm(agents, pose) + warm(agents, observe) / interval;
-        Ok(ComputeTimes { pose_ms, map_ms: warm(agents, map), fuse_ms: warm(1, fuse) })
+        Ok(ComputeTimes {
+            pose_ms,
+            map_ms: warm(agents, map),
+            fuse_ms: warm(1, fuse),
+        })
     }
 
     /// Durations while `goes_on` with the number of ticks so far.
@@ -136,7 +173,13 @@ impl Evaluator {
             .take(MEASURED_VEHICLES)
             .map(|cav| self.participant(scenario, cav, true, None))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
-        let Samples { mut pose, mut observe, mut map, mut fuse, mut motion } = Samples::default();
+        let Samples {
+            mut pose,
+            mut observe,
+            mut map,
+            mut fuse,
+            mut motion,
+        } = Samples::default();
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| goes_on(*tick)) {
             let mut sent = Vec::with_capacity(participants.len());
@@ -147,7 +190,16 @@ impl Evaluator {
                 let frame = scenario.load(place, tick, &LoadOptions::default())?;
                 motion = frame.motion();
                 let began = Instant::now();
-                sent.extend(view(participant, &frame, None, Some(exchange), &self.config.codec)?.into_view());
+                sent.extend(
+                    view(
+                        participant,
+                        &frame,
+                        None,
+                        Some(exchange),
+                        &self.config.codec,
+                    )?
+                    .into_view(),
+                );
                 let all = began.elapsed();
                 let times = participant.pose_times();
                 pose.push(ms(times.estimate));
@@ -155,8 +207,12 @@ impl Evaluator {
                 map.push(ms(all.saturating_sub(times.estimate + times.observe)));
             }
             let others = scenario.agents.iter().take(vehicles).skip(sent.len());
-            let copies =
-                sent.get(1).map(|neighbour: &View| others.map(|cav| View { cav: cav.clone(), ..neighbour.clone() }));
+            let copies = sent.get(1).map(|neighbour: &View| {
+                others.map(|cav| View {
+                    cav: cav.clone(),
+                    ..neighbour.clone()
+                })
+            });
             let copies: Vec<View> = copies.into_iter().flatten().collect();
             sent.extend(copies);
             let began = Instant::now();
@@ -166,7 +222,13 @@ impl Evaluator {
             fuse.push(ms(began.elapsed()));
         }
         self.ego.forget();
-        Ok(Samples { pose, observe, map, fuse, motion })
+        Ok(Samples {
+            pose,
+            observe,
+            map,
+            fuse,
+            motion,
+        })
     }
 }
 

@@ -66,7 +66,14 @@ impl DelayedDelivery {
     }
 
     /// Hands over a pose that will be sent at `nanos`.
-    pub(super) fn enqueue_pose(&mut self, from: &CavId, sequence: u64, bytes: u64, nanos: u64, distance_m: f64) {
+    pub(super) fn enqueue_pose(
+        &mut self,
+        from: &CavId,
+        sequence: u64,
+        bytes: u64,
+        nanos: u64,
+        distance_m: f64,
+    ) {
         self.hand_over(from, Stream::Pose, sequence, bytes, nanos, distance_m, None);
     }
 
@@ -82,14 +89,24 @@ impl DelayedDelivery {
     ) {
         self.stream = stream;
         let clock = self.link.clock();
-        envelope.view.capture_nanos = clock.shown_since(self.began_nanos, envelope.view.capture_nanos);
+        envelope.view.capture_nanos =
+            clock.shown_since(self.began_nanos, envelope.view.capture_nanos);
         let from = envelope.view.cav.clone();
-        self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, Some(envelope));
+        self.hand_over(
+            &from,
+            stream,
+            sequence,
+            bytes,
+            nanos,
+            distance_m,
+            Some(envelope),
+        );
     }
 
     /// Counts a map that the rate control has adapted.
     pub(super) fn adapted(&mut self, from: &CavId, stream: Stream, reason: RateReason) {
-        self.ledger.adapted(&Account::published(topic(from, stream)), reason);
+        self.ledger
+            .adapted(&Account::published(topic(from, stream)), reason);
     }
 
     #[expect(clippy::too_many_arguments, reason = "the fields of a packet")]
@@ -105,27 +122,55 @@ impl DelayedDelivery {
     ) {
         let id = self.next_id;
         self.next_id += 1;
-        self.kept.insert(id, Kept { topic: topic(from, stream), envelope });
+        self.kept.insert(
+            id,
+            Kept {
+                topic: topic(from, stream),
+                envelope,
+            },
+        );
         let submitted_nanos = nanos.saturating_sub(self.began_nanos);
         let (from, to) = (from.clone(), self.ego.clone());
-        let packet = Packet { id, from, to, stream, sequence, bytes, submitted_nanos, distance_m };
+        let packet = Packet {
+            id,
+            from,
+            to,
+            stream,
+            sequence,
+            bytes,
+            submitted_nanos,
+            distance_m,
+        };
         self.pending.insert((submitted_nanos, id), packet);
     }
 
     /// Arrivals by `nanos`, in order of time. All messages that are sent until then have been handed over.
     pub(super) fn until(&mut self, nanos: u64) -> Vec<Arrived> {
         let nanos = nanos.saturating_sub(self.began_nanos);
-        while let Some(entry) = self.pending.first_entry().filter(|entry| entry.key().0 <= nanos) {
+        while let Some(entry) = self
+            .pending
+            .first_entry()
+            .filter(|entry| entry.key().0 <= nanos)
+        {
             let packet = entry.remove();
-            self.ledger.sent(&Account::published(topic(&packet.from, packet.stream)));
+            self.ledger
+                .sent(&Account::published(topic(&packet.from, packet.stream)));
             self.sent_bytes += packet.bytes;
             self.link.submit(packet);
         }
-        self.link.advance(nanos).into_iter().filter_map(|outcome| self.settle(outcome)).collect()
+        self.link
+            .advance(nanos)
+            .into_iter()
+            .filter_map(|outcome| self.settle(outcome))
+            .collect()
     }
 
     fn settle(&mut self, outcome: Outcome) -> Option<Arrived> {
-        let Outcome { nanos, packet, delivery } = outcome;
+        let Outcome {
+            nanos,
+            packet,
+            delivery,
+        } = outcome;
         let account = Account::towards(topic(&packet.from, packet.stream), &self.receiver);
         let envelope = match delivery {
             Delivery::Dropped(reason) => {
@@ -133,15 +178,22 @@ impl DelayedDelivery {
                 self.ledger.dropped(&account, reason);
                 return None;
             }
-            Delivery::Arrived { is_repeated: true, .. } => {
+            Delivery::Arrived {
+                is_repeated: true, ..
+            } => {
                 // The copy counts as one more message.
                 self.ledger.sent(&account);
-                self.kept.get(&packet.id).and_then(|kept| kept.envelope.clone())
+                self.kept
+                    .get(&packet.id)
+                    .and_then(|kept| kept.envelope.clone())
             }
             Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.envelope),
         };
         match envelope {
-            Some(envelope) => Some(Arrived { nanos: nanos.saturating_add(self.began_nanos), envelope }),
+            Some(envelope) => Some(Arrived {
+                nanos: nanos.saturating_add(self.began_nanos),
+                envelope,
+            }),
             None => {
                 self.ledger.received(&account);
                 None
@@ -151,12 +203,16 @@ impl DelayedDelivery {
 
     /// The ego has used a message.
     pub(super) fn received(&mut self, cav: &CavId) {
-        self.ledger.received(&Account::towards(topic(cav, self.stream), &self.receiver));
+        self.ledger
+            .received(&Account::towards(topic(cav, self.stream), &self.receiver));
     }
 
     /// The ego has not used a message.
     pub(super) fn dropped(&mut self, cav: &CavId, reason: DropReason) {
-        self.ledger.dropped(&Account::towards(topic(cav, self.stream), &self.receiver), reason);
+        self.ledger.dropped(
+            &Account::towards(topic(cav, self.stream), &self.receiver),
+            reason,
+        );
     }
 
     /// Counts a vehicle's messages that neither arrived nor were lost; `waiting` messages of it have arrived and were
@@ -165,8 +221,15 @@ impl DelayedDelivery {
         let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
         for (stream, waiting) in [(Stream::Pose, 0), (self.stream, waiting)] {
             let topic = topic(cav, stream);
-            let under_way = self.kept.iter().filter(|(id, kept)| kept.topic == topic && !not_sent.contains(id)).count();
-            self.ledger.set_in_flight(&Account::towards(topic, &self.receiver), under_way as u64 + waiting);
+            let under_way = self
+                .kept
+                .iter()
+                .filter(|(id, kept)| kept.topic == topic && !not_sent.contains(id))
+                .count();
+            self.ledger.set_in_flight(
+                &Account::towards(topic, &self.receiver),
+                under_way as u64 + waiting,
+            );
         }
     }
 
@@ -182,5 +245,8 @@ impl DelayedDelivery {
 }
 
 fn topic(cav: &CavId, stream: Stream) -> Topic {
-    Topic::Stream { cav: cav.clone(), stream }
+    Topic::Stream {
+        cav: cav.clone(),
+        stream,
+    }
 }

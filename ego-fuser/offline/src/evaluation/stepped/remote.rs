@@ -12,13 +12,14 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
-    Arrival, Barrier, Bus, BusError, Event, Inbox, NotReady, Publisher, PublisherOptions, Route, Subscription,
-    process_id,
+    Arrival, Barrier, Bus, BusError, Event, Inbox, NotReady, Publisher, PublisherOptions, Route,
+    Subscription, process_id,
 };
 use dataset::frame::Frame;
 use protocol::message::{Bev, Boxes, GnssSource, Points};
 use protocol::{
-    CavId, Gnss, HEADER_LEN, Lidar, Limits, PoseEstimate, ProcessId, RateChoice, Role, Stream, Topic, WireError,
+    CavId, Gnss, HEADER_LEN, Lidar, Limits, PoseEstimate, ProcessId, RateChoice, Role, Stream,
+    Topic, WireError,
 };
 
 use super::super::Sent;
@@ -70,7 +71,9 @@ pub struct RemotePool {
 
 impl fmt::Debug for RemotePool {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("RemoteCrew").field("vehicles", &self.sensors.keys()).finish_non_exhaustive()
+        f.debug_struct("RemoteCrew")
+            .field("vehicles", &self.sensors.keys())
+            .finish_non_exhaustive()
     }
 }
 
@@ -98,11 +101,16 @@ impl RemotePool {
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let (mut sensors, mut subscriptions, mut routes) = (BTreeMap::new(), Vec::new(), Vec::new());
+        let (mut sensors, mut subscriptions, mut routes) =
+            (BTreeMap::new(), Vec::new(), Vec::new());
         let here = bus.identity().process.clone();
         for (cav, stream) in vehicles {
-            let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
-            let publisher = |stream| bus.publisher(topic(stream), PublisherOptions::SENSOR.lossless(1));
+            let topic = |stream| Topic::Stream {
+                cav: cav.clone(),
+                stream,
+            };
+            let publisher =
+                |stream| bus.publisher(topic(stream), PublisherOptions::SENSOR.lossless(1));
             sensors.insert(
                 cav.clone(),
                 Sensors {
@@ -112,15 +120,24 @@ impl RemotePool {
                 },
             );
             let there = process_id(Role::Agent, cav);
-            let route = |stream, receiver: &ProcessId| Route { topic: topic(stream), receiver: receiver.clone() };
-            routes.extend([Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| route(stream, &there)));
+            let route = |stream, receiver: &ProcessId| Route {
+                topic: topic(stream),
+                receiver: receiver.clone(),
+            };
+            routes.extend(
+                [Stream::Gnss, Stream::Imu, Stream::Lidar].map(|stream| route(stream, &there)),
+            );
             for stream in [Stream::Pose, *stream] {
                 subscriptions.push(bus.subscribe(topic(stream), &inbox)?);
                 routes.push(route(stream, &here));
             }
         }
         Barrier::new(routes).await_routes(bus)?.wait(timeout)?;
-        Ok(Self { inbox, sensors, _subscriptions: subscriptions })
+        Ok(Self {
+            inbox,
+            sensors,
+            _subscriptions: subscriptions,
+        })
     }
 
     /// Ends the streams of sweeps.
@@ -134,35 +151,59 @@ impl RemotePool {
     /// Sends the sweeps of a tick and waits for all answers, in the same order.
     pub(super) fn request(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
-            let Some(Sensors { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else { continue };
+            let Some(Sensors { gnss, imu, lidar }) = self.sensors.get(&frame.cav) else {
+                continue;
+            };
             if let Some(world_from_lidar) = frame.world_from_lidar {
                 let source = GnssSource::Recorded;
-                let measured = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
+                let measured = Gnss {
+                    world_from_lidar,
+                    position_std_m: 0.0,
+                    heading_std_rad: 0.0,
+                    source,
+                };
                 gnss.submit(frame.capture_nanos, measured);
             }
             imu.submit(frame.capture_nanos, frame.motion());
-            lidar.submit(frame.capture_nanos, Lidar { points: frame.points.clone() });
+            lidar.submit(
+                frame.capture_nanos,
+                Lidar {
+                    points: frame.points.clone(),
+                },
+            );
         }
         let deadline = Instant::now() + TIMEOUT;
-        let mut answers: BTreeMap<&CavId, Answer> =
-            frames.iter().map(|frame| (&frame.cav, Answer::default())).collect();
-        let is_open = |(_, answer): &(&&CavId, &Answer)| answer.pose.is_none() || answer.content.is_none();
+        let mut answers: BTreeMap<&CavId, Answer> = frames
+            .iter()
+            .map(|frame| (&frame.cav, Answer::default()))
+            .collect();
+        let is_open =
+            |(_, answer): &(&&CavId, &Answer)| answer.pose.is_none() || answer.content.is_none();
         while answers.iter().any(|entry| is_open(&entry)) {
             match self.inbox.take(Some(deadline)) {
                 Pop::Item(topic, Event::Message(arrival)) => {
-                    let Topic::Stream { cav, stream } = &topic else { continue };
-                    let asked = frames
-                        .iter()
-                        .any(|frame| frame.cav == *cav && frame.capture_nanos == arrival.header.stamp.capture_nanos);
+                    let Topic::Stream { cav, stream } = &topic else {
+                        continue;
+                    };
+                    let asked = frames.iter().any(|frame| {
+                        frame.cav == *cav
+                            && frame.capture_nanos == arrival.header.stamp.capture_nanos
+                    });
                     if let Some(answer) = answers.get_mut(cav).filter(|_| asked) {
                         answer
                             .note(*stream, &arrival)
-                            .map_err(|source| RemoteError::Unsound { topic: topic.clone(), source })?;
+                            .map_err(|source| RemoteError::Unsound {
+                                topic: topic.clone(),
+                                source,
+                            })?;
                     }
                 }
                 Pop::Item(..) => {}
                 Pop::TimedOut | Pop::Closed => {
-                    let silent = answers.iter().filter(is_open).map(|(cav, _)| cav.to_string());
+                    let silent = answers
+                        .iter()
+                        .filter(is_open)
+                        .map(|(cav, _)| cav.to_string());
                     let cavs = silent.collect::<Vec<_>>().join(", ");
                     return Err(RemoteError::Silent {
                         cavs,
@@ -171,7 +212,10 @@ impl RemotePool {
                 }
             }
         }
-        Ok(frames.iter().filter_map(|frame| answers.remove(&frame.cav)?.into_sent(frame)).collect())
+        Ok(frames
+            .iter()
+            .filter_map(|frame| answers.remove(&frame.cav)?.into_sent(frame))
+            .collect())
     }
 }
 
@@ -183,7 +227,11 @@ impl Answer {
             Stream::Bev => {
                 let message: Bev = arrival.decode(&limits)?;
                 let rate = message.features.rate;
-                self.content = Some((Content::Features(message.features.decode(&limits)?), bytes, rate));
+                self.content = Some((
+                    Content::Features(message.features.decode(&limits)?),
+                    bytes,
+                    rate,
+                ));
             }
             Stream::Boxes => {
                 let message: Boxes = arrival.decode(&limits)?;

@@ -10,22 +10,38 @@ impl Entries<'_> {
     /// `POINTS`, or `WIDTH` times `HEIGHT`: the values present must be consistent, and one of `POINTS` and `WIDTH` is
     /// required.
     pub(super) fn points(&self) -> Result<usize, PcdError> {
-        let (width, height, points) = (self.count("WIDTH")?, self.count("HEIGHT")?, self.count("POINTS")?);
+        let (width, height, points) = (
+            self.count("WIDTH")?,
+            self.count("HEIGHT")?,
+            self.count("POINTS")?,
+        );
         let (key, line, count) = match (width, points) {
             (Some((_, width)), Some((line, points))) => {
                 check_product(width, height.map(|(_, height)| height), line, points)?;
                 ("POINTS", line, points)
             }
             (None, Some((line, points))) => ("POINTS", line, points),
-            (Some((line, width)), None) => {
-                ("WIDTH", line, width.saturating_mul(height.map_or(1, |(_, height)| height)))
+            (Some((line, width)), None) => (
+                "WIDTH",
+                line,
+                width.saturating_mul(height.map_or(1, |(_, height)| height)),
+            ),
+            (None, None) => {
+                return Err(PcdError::of(
+                    "POINTS",
+                    "missing in the header, and WIDTH too",
+                ));
             }
-            (None, None) => return Err(PcdError::of("POINTS", "missing in the header, and WIDTH too")),
         };
         if count > MAX_POINTS {
-            return Err(PcdError::at(line, key, format!("{count} points, at most {MAX_POINTS} are read")));
+            return Err(PcdError::at(
+                line,
+                key,
+                format!("{count} points, at most {MAX_POINTS} are read"),
+            ));
         }
-        usize::try_from(count).map_err(|_| PcdError::at(line, key, format!("{count} do not fit this machine")))
+        usize::try_from(count)
+            .map_err(|_| PcdError::at(line, key, format!("{count} do not fit this machine")))
     }
 
     fn count(&self, key: &str) -> Result<Option<(u64, u64)>, PcdError> {
@@ -33,7 +49,9 @@ impl Entries<'_> {
             return Ok(None);
         }
         let (line, value) = self.single(key)?;
-        let number = value.parse().map_err(|_| PcdError::at(line, key, format!("{value:?} is no count")))?;
+        let number = value
+            .parse()
+            .map_err(|_| PcdError::at(line, key, format!("{value:?} is no count")))?;
         Ok(Some((line, number)))
     }
 }
@@ -47,6 +65,13 @@ fn check_product(width: u64, height: Option<u64>, line: u64, points: u64) -> Res
     if fits {
         return Ok(());
     }
-    let height = height.map_or_else(|| "of no HEIGHT".into(), |height| format!("x HEIGHT {height}"));
-    Err(PcdError::at(line, "POINTS", format!("{points}, which does not match WIDTH {width} {height}")))
+    let height = height.map_or_else(
+        || "of no HEIGHT".into(),
+        |height| format!("x HEIGHT {height}"),
+    );
+    Err(PcdError::at(
+        line,
+        "POINTS",
+        format!("{points}, which does not match WIDTH {width} {height}"),
+    ))
 }

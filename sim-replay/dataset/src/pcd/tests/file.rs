@@ -75,7 +75,12 @@ fn ten_digits(value: f64) -> String {
         let text = format!("{value:.decimals$}");
         return if decimals > 0 { trimmed(&text) } else { text };
     }
-    format!("{}e{}{:02}", trimmed(mantissa), if exponent < 0 { '-' } else { '+' }, exponent.abs())
+    format!(
+        "{}e{}{:02}",
+        trimmed(mantissa),
+        if exponent < 0 { '-' } else { '+' },
+        exponent.abs()
+    )
 }
 
 /// A file before it is written.
@@ -90,12 +95,20 @@ impl File {
     /// This number of copies of one point.
     pub(super) fn new(fields: &[(&'static str, Number)], points: usize) -> Self {
         let (names, row): (Vec<_>, Vec<_>) = fields.iter().copied().unzip();
-        Self { names, rows: vec![row; points], height: 1 }
+        Self {
+            names,
+            rows: vec![row; points],
+            height: 1,
+        }
     }
 
     /// Points of these fields; every row has the same types.
     pub(super) fn of_rows(names: &[&'static str], rows: Vec<Vec<Number>>) -> Self {
-        Self { names: names.to_vec(), rows, height: 1 }
+        Self {
+            names: names.to_vec(),
+            rows,
+            height: 1,
+        }
     }
 
     /// The same points as an organised cloud with this number of rows.
@@ -105,8 +118,12 @@ impl File {
 
     pub(super) fn header(&self, data: &str) -> String {
         let row = self.rows.first().expect("a point");
-        let of_each =
-            |text: &dyn Fn(Number) -> String| row.iter().map(|&number| text(number)).collect::<Vec<_>>().join(" ");
+        let of_each = |text: &dyn Fn(Number) -> String| {
+            row.iter()
+                .map(|&number| text(number))
+                .collect::<Vec<_>>()
+                .join(" ")
+        };
         format!(
             "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {}\nSIZE {}\nTYPE {}\nCOUNT {}\nWIDTH {}\n\
              HEIGHT {}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {}\nDATA {data}\n",
@@ -122,7 +139,11 @@ impl File {
 
     pub(super) fn ascii(&self, end_of_line: &str) -> Vec<u8> {
         let line = |row: &Vec<Number>| {
-            let words: Vec<String> = row.iter().map(|number| number.text()).filter(|text| !text.is_empty()).collect();
+            let words: Vec<String> = row
+                .iter()
+                .map(|number| number.text())
+                .filter(|text| !text.is_empty())
+                .collect();
             words.join(" ") + end_of_line
         };
         (self.header("ascii") + &self.rows.iter().map(line).collect::<String>()).into_bytes()
@@ -136,8 +157,9 @@ impl File {
 
     pub(super) fn compressed(&self) -> Vec<u8> {
         let columns = 0..self.names.len();
-        let unpacked: Vec<u8> =
-            columns.flat_map(|column| self.rows.iter().flat_map(move |row| row[column].bytes())).collect();
+        let unpacked: Vec<u8> = columns
+            .flat_map(|column| self.rows.iter().flat_map(move |row| row[column].bytes()))
+            .collect();
         let packed = lzf::tests::compress(&unpacked);
         let mut file = self.header("binary_compressed").into_bytes();
         file.extend((packed.len() as u32).to_le_bytes());

@@ -12,10 +12,16 @@ use file::{File, Number};
 
 /// A file of each kind to damage: our own, and those of PCL and Open3D with their trailing bytes.
 static SAMPLES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
-    let cloud = PointCloud { xyzi: (0..20).map(|i| [i as f32, -1.5, 0.25, 1.0 - i as f32 / 64.0]).collect() };
+    let cloud = PointCloud {
+        xyzi: (0..20)
+            .map(|i| [i as f32, -1.5, 0.25, 1.0 - i as f32 / 64.0])
+            .collect(),
+    };
     let ours = [Encoding::Ascii, Encoding::Binary]
         .into_iter()
-        .flat_map(|encoding| [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field)))
+        .flat_map(|encoding| {
+            [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field))
+        })
         .map(|(encoding, field)| encode(&cloud, encoding, field));
     ours.chain([binary::tests::compressed(&cloud)])
         .chain(writers::all().into_iter().map(|variant| variant.bytes))
@@ -28,13 +34,29 @@ fn every_truncation_is_an_error_or_cuts_unneeded_bytes() {
         let whole = decode(file).unwrap();
         let is_text = file.windows(10).any(|window| window == b"DATA ascii");
         for length in 0..file.len() {
-            let Ok(cloud) = decode(&file[..length]) else { continue };
+            let Ok(cloud) = decode(&file[..length]) else {
+                continue;
+            };
             // Digits of the last number may be cut; bytes after the points are not needed.
-            let (all, kept) = (whole.points.len() + whole.dropped, cloud.points.len() + cloud.dropped);
+            let (all, kept) = (
+                whole.points.len() + whole.dropped,
+                cloud.points.len() + cloud.dropped,
+            );
             assert_eq!(kept, all, "{length} of {}", file.len());
-            let last_token = file.len() - file.iter().rev().skip(2).position(|&byte| byte == b' ').unwrap_or(0) - 2;
+            let last_token = file.len()
+                - file
+                    .iter()
+                    .rev()
+                    .skip(2)
+                    .position(|&byte| byte == b' ')
+                    .unwrap_or(0)
+                - 2;
             assert!(
-                if is_text { length >= last_token - 1 } else { same_bits(&cloud, &whole) },
+                if is_text {
+                    length >= last_token - 1
+                } else {
+                    same_bits(&cloud, &whole)
+                },
                 "{length} of {}",
                 file.len()
             );
@@ -43,7 +65,14 @@ fn every_truncation_is_an_error_or_cuts_unneeded_bytes() {
 }
 
 fn same_bits(a: &PcdCloud, b: &PcdCloud) -> bool {
-    let bits = |cloud: &PcdCloud| cloud.points.xyzi.iter().map(|point| point.map(f32::to_bits)).collect::<Vec<_>>();
+    let bits = |cloud: &PcdCloud| {
+        cloud
+            .points
+            .xyzi
+            .iter()
+            .map(|point| point.map(f32::to_bits))
+            .collect::<Vec<_>>()
+    };
     bits(a) == bits(b)
 }
 
@@ -95,7 +124,10 @@ proptest! {
 #[test]
 fn the_message_names_line_and_field() {
     let error = PcdError::at(9, "POINTS", "3, but WIDTH x HEIGHT is 4");
-    assert_eq!(error.to_string(), "line 9: POINTS: 3, but WIDTH x HEIGHT is 4");
+    assert_eq!(
+        error.to_string(),
+        "line 9: POINTS: 3, but WIDTH x HEIGHT is 4"
+    );
 }
 
 #[test]
@@ -110,10 +142,20 @@ fn numbers_of_all_types_are_read_from_all_encodings() {
         Number::I2(-300),
         Number::I4(-70_000),
     ];
-    let expected = [-1.25, 7.5, 200.0, 40_000.0, 70_000.0, -3.0, -300.0, -70_000.0];
+    let expected = [
+        -1.25, 7.5, 200.0, 40_000.0, 70_000.0, -3.0, -300.0, -70_000.0,
+    ];
     for (number, expected) in numbers.into_iter().zip(expected) {
         let one = Number::F4(1.0);
-        let file = File::new(&[("x", number), ("y", one), ("z", number), ("Intensity", number)], 3);
+        let file = File::new(
+            &[
+                ("x", number),
+                ("y", one),
+                ("z", number),
+                ("Intensity", number),
+            ],
+            3,
+        );
         for bytes in file.in_all_encodings() {
             let cloud = decode(&bytes).unwrap();
             assert_eq!(cloud.points.xyzi, [[expected, 1.0, expected, expected]; 3]);

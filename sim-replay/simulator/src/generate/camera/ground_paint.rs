@@ -26,7 +26,10 @@ pub(crate) struct GroundPaint<'w> {
 
 impl<'w> GroundPaint<'w> {
     pub(crate) fn new(world: &'w World<'w>) -> Self {
-        Self { world, is_road: HashMap::new() }
+        Self {
+            world,
+            is_road: HashMap::new(),
+        }
     }
 
     pub(super) fn colour(&mut self, place_m: &Vector3<f64>, weather: Weather) -> Colour {
@@ -35,8 +38,12 @@ impl<'w> GroundPaint<'w> {
         let is_road = *self.is_road.entry(cell).or_insert_with(|| {
             let middle = cell.map(|axis| (f64::from(axis) + 0.5) * CELL_M);
             let lanes = &world.map_model.lanes;
-            let nearest = world.lane_index.nearest(lanes, middle, WIDEST_LANE_M, None, None);
-            nearest.is_some_and(|at| at.offset_m.abs() < lanes.lane(at.lane).width_m / 2.0 + SHOULDER_M)
+            let nearest = world
+                .lane_index
+                .nearest(lanes, middle, WIDEST_LANE_M, None, None);
+            nearest.is_some_and(|at| {
+                at.offset_m.abs() < lanes.lane(at.lane).width_m / 2.0 + SHOULDER_M
+            })
         });
         // A little of each cell's own, so that flat ground shows its distance.
         let seed = (u64::from(cell[0].cast_unsigned()) << 32) | u64::from(cell[1].cast_unsigned());

@@ -55,10 +55,15 @@ impl FromStr for ImageSize {
 
     /// Reads `WIDTHxHEIGHT`.
     fn from_str(text: &str) -> Result<Self, String> {
-        let edges = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
+        let edges = text
+            .split_once('x')
+            .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
         let (width_px, height_px) =
             edges.ok_or_else(|| format!("{text:?} is not WIDTHxHEIGHT, for example 480x300"))?;
-        Ok(Self { width_px, height_px })
+        Ok(Self {
+            width_px,
+            height_px,
+        })
     }
 }
 
@@ -70,10 +75,22 @@ struct Mount {
 
 /// The mounts of OPV2V and V2VLoc, by number.
 const MOUNTS: [Mount; 4] = [
-    Mount { position_m: [2.5, 0.0, 1.0], yaw_deg: 0.0 },
-    Mount { position_m: [0.0, -0.3, 1.8], yaw_deg: -100.0 },
-    Mount { position_m: [0.0, 0.3, 1.8], yaw_deg: 100.0 },
-    Mount { position_m: [-2.0, 0.0, 1.5], yaw_deg: 180.0 },
+    Mount {
+        position_m: [2.5, 0.0, 1.0],
+        yaw_deg: 0.0,
+    },
+    Mount {
+        position_m: [0.0, -0.3, 1.8],
+        yaw_deg: -100.0,
+    },
+    Mount {
+        position_m: [0.0, 0.3, 1.8],
+        yaw_deg: 100.0,
+    },
+    Mount {
+        position_m: [-2.0, 0.0, 1.5],
+        yaw_deg: 180.0,
+    },
 ];
 
 /// A camera that keeps its buffers from one image to the next.
@@ -104,7 +121,13 @@ pub(super) struct Surroundings<'a> {
 
 impl CameraRig {
     pub(super) fn new(size: ImageSize) -> Self {
-        Self { cameras: MOUNTS.iter().map(|mount| MountedCamera::new(mount, size)).collect(), size }
+        Self {
+            cameras: MOUNTS
+                .iter()
+                .map(|mount| MountedCamera::new(mount, size))
+                .collect(),
+            size,
+        }
     }
 
     /// The images of all cameras on a vehicle at `vehicle`, by number. The same arguments give the same bytes.
@@ -117,8 +140,19 @@ impl CameraRig {
     ) -> Vec<(u8, Camera)> {
         let size = self.size;
         let images = self.cameras.iter_mut().zip(0u8..).map(|(camera, number)| {
-            let rendered = camera.render(vehicle, surroundings, ground_paint, seed.wrapping_add(number.into()));
-            (number, Camera { metadata: camera.metadata, image: png_image::encode(&rendered.rgb, size) })
+            let rendered = camera.render(
+                vehicle,
+                surroundings,
+                ground_paint,
+                seed.wrapping_add(number.into()),
+            );
+            (
+                number,
+                Camera {
+                    metadata: camera.metadata,
+                    image: png_image::encode(&rendered.rgb, size),
+                },
+            )
         });
         images.collect()
     }
@@ -128,7 +162,12 @@ impl MountedCamera {
     fn new(mount: &Mount, size: ImageSize) -> Self {
         let (width, height) = (f64::from(size.width_px), f64::from(size.height_px));
         let focal_px = width / 2.0 / (FIELD_OF_VIEW_DEG.to_radians() / 2.0).tan();
-        let pinhole = Pinhole { fx_px: focal_px, fy_px: focal_px, cx_px: width / 2.0, cy_px: height / 2.0 };
+        let pinhole = Pinhole {
+            fx_px: focal_px,
+            fy_px: focal_px,
+            cx_px: width / 2.0,
+            cy_px: height / 2.0,
+        };
         let yaw_rad = mount.yaw_deg.to_radians();
         let step_rad = 1.0 / (RAYS_PER_PIXEL * focal_px);
         let half_rad = [width, height].map(|edge| (edge / 2.0 / focal_px).atan() + 2.0 * step_rad);
@@ -143,14 +182,20 @@ impl MountedCamera {
             range_m: RANGE_M,
             rolling: false,
         };
-        let nearest = |angle_rad: f64, first_rad: f64| ((angle_rad - first_rad) / step_rad).round().max(0.0) as u32;
-        let pixels = (0..size.height_px).flat_map(|row| (0..size.width_px).map(move |column| (row, column)));
+        let nearest = |angle_rad: f64, first_rad: f64| {
+            ((angle_rad - first_rad) / step_rad).round().max(0.0) as u32
+        };
+        let pixels =
+            (0..size.height_px).flat_map(|row| (0..size.width_px).map(move |column| (row, column)));
         let rays = pixels.map(|(row, column)| {
             // Through the middle of the pixel: to the left and up, for one unit ahead.
             let left = -(f64::from(column) + 0.5 - pinhole.cx_px) / focal_px;
             let up = -(f64::from(row) + 0.5 - pinhole.cy_px) / focal_px;
             let (azimuth, elevation) = (left.atan(), (up / left.hypot(1.0)).atan());
-            (nearest(-azimuth, -half_rad[0]), nearest(elevation, -half_rad[1]))
+            (
+                nearest(-azimuth, -half_rad[0]),
+                nearest(elevation, -half_rad[1]),
+            )
         });
         let position_m = Vector3::from(mount.position_m);
         Self {
@@ -176,10 +221,21 @@ impl MountedCamera {
     ) -> Rendered {
         let sensor = Sweep::still(vehicle.mounted(self.position_m.into()));
         // At the end of the sweep, the capture time, everything stands where it is then.
-        let bodies: Vec<Body<'_>> =
-            surroundings.bodies.iter().map(|body| Body { motion: Sweep::still(body.motion.end), ..*body }).collect();
+        let bodies: Vec<Body<'_>> = surroundings
+            .bodies
+            .iter()
+            .map(|body| Body {
+                motion: Sweep::still(body.motion.end),
+                ..*body
+            })
+            .collect();
         self.caster.cast(&sensor, surroundings.ground, &bodies);
-        let shader = Shader::new(&self.caster, &sensor, surroundings.paints, surroundings.weather);
+        let shader = Shader::new(
+            &self.caster,
+            &sensor,
+            surroundings.paints,
+            surroundings.weather,
+        );
         shader.render(&self.rays, ground_paint, seed)
     }
 }

@@ -31,8 +31,13 @@ const VEHICLES: [Colour; 8] = [
     [0.12, 0.36, 0.24],
 ];
 /// Colours of walls.
-const WALLS: [Colour; 5] =
-    [[0.70, 0.62, 0.52], [0.58, 0.36, 0.30], [0.74, 0.73, 0.70], [0.52, 0.54, 0.57], [0.80, 0.74, 0.60]];
+const WALLS: [Colour; 5] = [
+    [0.70, 0.62, 0.52],
+    [0.58, 0.36, 0.30],
+    [0.74, 0.73, 0.70],
+    [0.52, 0.54, 0.57],
+    [0.80, 0.74, 0.60],
+];
 const LEAVES: Colour = [0.20, 0.36, 0.12];
 const TRUNK: Colour = [0.34, 0.30, 0.27];
 /// Least height of a box that is a building, metres.
@@ -52,7 +57,11 @@ pub(crate) fn of_shape(shape: &BodyShape, place: u64) -> Paint {
         _ => {
             let colour = WALLS[SplitMix64::new(place).below(WALLS.len())];
             let height_m = shape.bounds.max_m[2] - shape.bounds.min_m[2];
-            if height_m > BUILDING_M { Paint::Wall(colour) } else { Paint::Plain(colour.map(|part| 0.8 * part)) }
+            if height_m > BUILDING_M {
+                Paint::Wall(colour)
+            } else {
+                Paint::Plain(colour.map(|part| 0.8 * part))
+            }
         }
     }
 }

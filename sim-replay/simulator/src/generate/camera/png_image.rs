@@ -13,7 +13,9 @@ pub(super) fn encode(rgb: &[u8], size: ImageSize) -> Vec<u8> {
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_compression(png::Compression::Fast);
     let mut writer = encoder.write_header().expect("memory takes a header");
-    writer.write_image_data(rgb).expect("memory takes an image of its size");
+    writer
+        .write_image_data(rgb)
+        .expect("memory takes an image of its size");
     writer.finish().expect("memory takes an end");
     bytes
 }

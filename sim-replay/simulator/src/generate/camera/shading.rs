@@ -44,7 +44,12 @@ pub(super) struct Shader<'a> {
 }
 
 impl<'a> Shader<'a> {
-    pub(super) fn new(caster: &'a Caster, sensor: &Sweep, paints: &'a [Paint], weather: Weather) -> Self {
+    pub(super) fn new(
+        caster: &'a Caster,
+        sensor: &Sweep,
+        paints: &'a [Paint],
+        weather: Weather,
+    ) -> Self {
         Self {
             image: caster.image(),
             channels: caster.pattern().channels,
@@ -58,7 +63,12 @@ impl<'a> Shader<'a> {
     }
 
     /// The image whose pixels have these rays.
-    pub(super) fn render(&self, rays: &[(u32, u32)], ground: &mut GroundPaint<'_>, seed: u64) -> Rendered {
+    pub(super) fn render(
+        &self,
+        rays: &[(u32, u32)],
+        ground: &mut GroundPaint<'_>,
+        seed: u64,
+    ) -> Rendered {
         let mut random = SplitMix64::new(seed);
         let mut rgb = Vec::with_capacity(3 * rays.len());
         for &(column, channel) in rays {
@@ -66,14 +76,18 @@ impl<'a> Shader<'a> {
             if self.weather == Weather::Snow && random.chance(FLAKES) {
                 colour = mix(colour, SNOW, 0.7);
             }
-            rgb.extend(colour.map(|part| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8));
+            rgb.extend(
+                colour.map(|part| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8),
+            );
         }
         Rendered {
             rgb,
             #[cfg(test)]
             depths_m: rays
                 .iter()
-                .map(|&(column, channel)| self.image.depths_m[self.ray(column as usize, channel as usize)])
+                .map(|&(column, channel)| {
+                    self.image.depths_m[self.ray(column as usize, channel as usize)]
+                })
                 .collect(),
         }
     }
@@ -89,14 +103,23 @@ impl<'a> Shader<'a> {
         if hit == MISS {
             return sky;
         }
-        let place = self.origin_m + (self.world_from_sensor * self.point(column, channel, depth_m)).cast::<f64>();
+        let place = self.origin_m
+            + (self.world_from_sensor * self.point(column, channel, depth_m)).cast::<f64>();
         let material = match hit {
             GROUND => ground.colour(&place, self.weather),
             body => self.paint(body as usize, place.z as f32),
         };
-        let facing = self.normal(column, channel).dot(&Vector3::from(SUN).normalize()).max(0.0);
-        let sun = if self.weather == Weather::Sunny { 1.0 - AMBIENT } else { 0.3 };
-        let lit = material.map(|part| part * (AMBIENT + (1.0 - AMBIENT - sun) * 0.5 + sun * facing * 1.3));
+        let facing = self
+            .normal(column, channel)
+            .dot(&Vector3::from(SUN).normalize())
+            .max(0.0);
+        let sun = if self.weather == Weather::Sunny {
+            1.0 - AMBIENT
+        } else {
+            0.3
+        };
+        let lit = material
+            .map(|part| part * (AMBIENT + (1.0 - AMBIENT - sun) * 0.5 + sun * facing * 1.3));
         mix(lit, sky, 1.0 - (-depth_m / self.haze_m()).exp())
     }
 
@@ -105,7 +128,11 @@ impl<'a> Shader<'a> {
             Some(Paint::Vehicle(colour) | Paint::Plain(colour)) => *colour,
             Some(Paint::Wall(colour)) => {
                 let share = (height_m / STOREY_M).rem_euclid(1.0);
-                if (WINDOW_ROWS[0]..WINDOW_ROWS[1]).contains(&share) { mix(*colour, WINDOW, 0.6) } else { *colour }
+                if (WINDOW_ROWS[0]..WINDOW_ROWS[1]).contains(&share) {
+                    mix(*colour, WINDOW, 0.6)
+                } else {
+                    *colour
+                }
             }
             None => [0.5; 3],
         }
@@ -148,10 +175,20 @@ impl<'a> Shader<'a> {
         };
         let across = along((column + 1, channel), (column.saturating_sub(1), channel));
         let up = along((column, channel + 1), (column, channel.saturating_sub(1)));
-        let (Some(across), Some(up)) = (across, up) else { return Vector3::z() };
+        let (Some(across), Some(up)) = (across, up) else {
+            return Vector3::z();
+        };
         let normal = across.cross(&up);
-        let towards_sensor = if normal.dot(&here) > 0.0 { -normal } else { normal };
+        let towards_sensor = if normal.dot(&here) > 0.0 {
+            -normal
+        } else {
+            normal
+        };
         let length = towards_sensor.norm();
-        if length > 0.0 { self.world_from_sensor * towards_sensor / length } else { Vector3::z() }
+        if length > 0.0 {
+            self.world_from_sensor * towards_sensor / length
+        } else {
+            Vector3::z()
+        }
     }
 }

@@ -5,10 +5,19 @@ use crate::generate::raycast::{BodyShape, Bounds, Part, Plane};
 use crate::generate::world::World;
 use crate::map::{RoadMapSource, build};
 
-const SIZE: ImageSize = ImageSize { width_px: 120, height_px: 80 };
+const SIZE: ImageSize = ImageSize {
+    width_px: 120,
+    height_px: 80,
+};
 
 fn block() -> BodyShape {
-    BodyShape::new(vec![Part::Box(Bounds::centered([0.0, 0.0, 0.75], [2.0, 0.9, 0.75]))], 0.5)
+    BodyShape::new(
+        vec![Part::Box(Bounds::centered(
+            [0.0, 0.0, 0.75],
+            [2.0, 0.9, 0.75],
+        ))],
+        0.5,
+    )
 }
 
 #[test]
@@ -21,22 +30,41 @@ fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
     for (number, yaw_deg) in [0.0f64, -100.0, 100.0, 180.0].into_iter().enumerate() {
         let ahead = vehicle.isometry() * Isometry3::rotation(Vector3::z() * yaw_deg.to_radians());
         let place = ahead * Point3::new(14.0, 1.0, 0.0);
-        let bodies = [Body { shape: &shape, motion: Sweep::still(Placement::level(place.coords.into(), 0.4)) }];
-        let surroundings =
-            Surroundings { ground: &Plane(0.0), bodies: &bodies, paints: &[of_vehicle(1)], weather: Weather::Sunny };
+        let bodies = [Body {
+            shape: &shape,
+            motion: Sweep::still(Placement::level(place.coords.into(), 0.4)),
+        }];
+        let surroundings = Surroundings {
+            ground: &Plane(0.0),
+            bodies: &bodies,
+            paints: &[of_vehicle(1)],
+            weather: Weather::Sunny,
+        };
         let camera = &mut rig.cameras[number];
         let rendered = camera.render(&vehicle, &surroundings, &mut GroundPaint::new(&world), 1);
         let metadata = camera.metadata;
         let world_from_lidar = vehicle.mounted(LIDAR_MOUNT_M).isometry();
-        let camera_from_world = (world_from_lidar * metadata.lidar_from_camera.unwrap().isometry()).inverse();
+        let camera_from_world =
+            (world_from_lidar * metadata.lidar_from_camera.unwrap().isometry()).inverse();
         let middle = camera_from_world * (place + Vector3::z() * 0.75);
-        let [column, row] = metadata.pinhole.unwrap().project(middle.coords.into()).unwrap();
-        let depth_m =
-            |column: f64, row: f64| rendered.depths_m[row as usize * SIZE.width_px as usize + column as usize];
+        let [column, row] = metadata
+            .pinhole
+            .unwrap()
+            .project(middle.coords.into())
+            .unwrap();
+        let depth_m = |column: f64, row: f64| {
+            rendered.depths_m[row as usize * SIZE.width_px as usize + column as usize]
+        };
         let distance_m = middle.coords.norm() as f32;
-        assert!((depth_m(column, row) - distance_m).abs() < 2.1, "{number}: {} {distance_m}", depth_m(column, row));
+        assert!(
+            (depth_m(column, row) - distance_m).abs() < 2.1,
+            "{number}: {} {distance_m}",
+            depth_m(column, row)
+        );
         // Well above the box there is sky, well below ground that is nearer.
-        assert!(depth_m(column, row - 20.0) > 149.0 && depth_m(column, row + 12.0) < distance_m - 2.1);
+        assert!(
+            depth_m(column, row - 20.0) > 149.0 && depth_m(column, row + 12.0) < distance_m - 2.1
+        );
     }
 }
 
@@ -46,19 +74,34 @@ fn images_are_the_same_for_the_same_arguments_and_differ_by_weather() {
     let world = World::new(&map);
     let vehicle = Placement::level([0.0, 0.0, 0.0], 0.0);
     let images = |weather| {
-        let surroundings = Surroundings { ground: &Plane(0.0), bodies: &[], paints: &[], weather };
+        let surroundings = Surroundings {
+            ground: &Plane(0.0),
+            bodies: &[],
+            paints: &[],
+            weather,
+        };
         CameraRig::new(SIZE).images(&vehicle, &surroundings, &mut GroundPaint::new(&world), 5)
     };
     let sunny = images(Weather::Sunny);
-    assert_eq!(sunny.iter().map(|(number, _)| *number).collect::<Vec<_>>(), [0, 1, 2, 3]);
+    assert_eq!(
+        sunny.iter().map(|(number, _)| *number).collect::<Vec<_>>(),
+        [0, 1, 2, 3]
+    );
     assert_eq!(sunny, images(Weather::Sunny));
     assert_ne!(sunny, images(Weather::Snow));
-    assert!(sunny.iter().all(|(_, camera)| ImageFormat::of_bytes(&camera.image) == Some(ImageFormat::Png)));
+    assert!(
+        sunny
+            .iter()
+            .all(|(_, camera)| ImageFormat::of_bytes(&camera.image) == Some(ImageFormat::Png))
+    );
 }
 
 #[test]
 fn sizes_are_read_as_they_are_written() {
-    assert_eq!("480x300".parse::<ImageSize>().unwrap().to_string(), "480x300");
+    assert_eq!(
+        "480x300".parse::<ImageSize>().unwrap().to_string(),
+        "480x300"
+    );
     for text in ["480", "480x", "x300", "480×300", "-1x3"] {
         assert!(text.parse::<ImageSize>().is_err(), "{text}");
     }

@@ -25,11 +25,23 @@ impl AgentFolders {
         make_fresh_folder(&folder)?;
         let mark = Unfinished::mark(&folder)?;
         write_file(&folder.join(FILE_NAME), &scene.origin)?;
-        let agents: Vec<PathBuf> = agent_folders(scene).iter().map(|name| folder.join(name)).collect();
+        let agents: Vec<PathBuf> = agent_folders(scene)
+            .iter()
+            .map(|name| folder.join(name))
+            .collect();
         agents.iter().try_for_each(|folder| make_folder(folder))?;
-        let ticks = scene.capture_nanos.iter().map(|nanos| nanos / scene.tick_nanos).collect();
+        let ticks = scene
+            .capture_nanos
+            .iter()
+            .map(|nanos| nanos / scene.tick_nanos)
+            .collect();
         let is_roadside = scene.agents.iter().map(|agent| agent.is_roadside).collect();
-        Ok(Self { agents, is_roadside, ticks, mark })
+        Ok(Self {
+            agents,
+            is_roadside,
+            ticks,
+            mark,
+        })
     }
 
     /// True if an agent is a roadside unit.
@@ -61,7 +73,11 @@ pub(super) struct AgentFolderWriter {
 
 impl AgentFolderWriter {
     pub(super) fn new(root: &Path, write_frame: WriteFrame) -> Self {
-        Self { root: root.to_owned(), folders: None, write_frame }
+        Self {
+            root: root.to_owned(),
+            folders: None,
+            write_frame,
+        }
     }
 }
 
@@ -72,8 +88,13 @@ impl SceneWriter for AgentFolderWriter {
     }
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(folders) = &self.folders else { return Ok(()) };
-        moment.frames.iter().try_for_each(|frame| (self.write_frame)(folders, moment, frame))
+        let Some(folders) = &self.folders else {
+            return Ok(());
+        };
+        moment
+            .frames
+            .iter()
+            .try_for_each(|frame| (self.write_frame)(folders, moment, frame))
     }
 
     fn end(&mut self) -> Result<(), SynthError> {

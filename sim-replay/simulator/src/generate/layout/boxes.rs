@@ -18,7 +18,10 @@ const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
 pub(super) fn of_255(intensity: f32) -> f32 {
     let nearest = intensity * FULL_BYTE;
     let candidates = [nearest, nearest.next_down(), nearest.next_up()];
-    candidates.into_iter().find(|candidate| candidate / FULL_BYTE == intensity).unwrap_or(nearest)
+    candidates
+        .into_iter()
+        .find(|candidate| candidate / FULL_BYTE == intensity)
+        .unwrap_or(nearest)
 }
 
 /// An intensity of 0 to 1 as a sensor's byte.
@@ -36,7 +39,9 @@ pub(super) fn ring([x, y, z, _]: [f32; 4]) -> u8 {
 }
 
 /// Little-endian numbers, one after another.
-pub(super) fn float_bytes<const N: usize>(rows: impl ExactSizeIterator<Item = [f32; N]>) -> Vec<u8> {
+pub(super) fn float_bytes<const N: usize>(
+    rows: impl ExactSizeIterator<Item = [f32; N]>,
+) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(rows.len() * N * size_of::<f32>());
     bytes.extend(rows.flatten().flat_map(f32::to_le_bytes));
     bytes
@@ -44,8 +49,13 @@ pub(super) fn float_bytes<const N: usize>(rows: impl ExactSizeIterator<Item = [f
 
 /// The cloud with intensities of 0 to 255.
 pub(super) fn with_byte_intensities(points: &PointCloud) -> PointCloud {
-    let scaled = points.xyzi.iter().map(|&[x, y, z, intensity]| [x, y, z, of_255(intensity)]);
-    PointCloud { xyzi: scaled.collect() }
+    let scaled = points
+        .xyzi
+        .iter()
+        .map(|&[x, y, z, intensity]| [x, y, z, of_255(intensity)]);
+    PointCloud {
+        xyzi: scaled.collect(),
+    }
 }
 
 /// The object as an upright box in the frame of a LiDAR.
@@ -74,12 +84,20 @@ pub(super) fn points_in(frame: &AgentFrame, object: &Object) -> usize {
     let center = object_from_lidar.inverse().translation.vector;
     let reach = half.iter().map(|half| half * half).sum::<f32>().sqrt();
     // Most points are far away in x or y; this test needs no transform.
-    let near = |&&[x, y, ..]: &&[f32; 4]| (x - center.x).abs() <= reach && (y - center.y).abs() <= reach;
+    let near =
+        |&&[x, y, ..]: &&[f32; 4]| (x - center.x).abs() <= reach && (y - center.y).abs() <= reach;
     let inside = |&&[x, y, z, _]: &&[f32; 4]| {
         let local = object_from_lidar * Point3::new(x, y, z);
         (0..3).all(|axis| local[axis].abs() <= half[axis])
     };
-    frame.frame.points.xyzi.iter().filter(near).filter(inside).count()
+    frame
+        .frame
+        .points
+        .xyzi
+        .iter()
+        .filter(near)
+        .filter(inside)
+        .count()
 }
 
 /// The name of a class in the types of V2V4Real and V2X-Real.
@@ -113,8 +131,18 @@ mod tests {
 
     #[test]
     fn the_channel_of_a_direction() {
-        let point = |deg: f32| [10.0 * deg.to_radians().cos(), 0.0, 10.0 * deg.to_radians().sin(), 0.5];
-        assert_eq!([-25.0, 2.0, -40.0, 80.0].map(|deg| ring(point(deg))), [0, 63, 0, 63]);
+        let point = |deg: f32| {
+            [
+                10.0 * deg.to_radians().cos(),
+                0.0,
+                10.0 * deg.to_radians().sin(),
+                0.5,
+            ]
+        };
+        assert_eq!(
+            [-25.0, 2.0, -40.0, 80.0].map(|deg| ring(point(deg))),
+            [0, 63, 0, 63]
+        );
         assert_eq!(ring(point(-25.0 + 27.0 * 10.0 / 63.0)), 10);
     }
 

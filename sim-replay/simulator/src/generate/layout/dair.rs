@@ -43,8 +43,14 @@ struct Side {
     labels: &'static str,
 }
 
-const VEHICLE: Side = Side { folder: "vehicle-side", labels: "lidar" };
-const UNIT: Side = Side { folder: "infrastructure-side", labels: "virtuallidar" };
+const VEHICLE: Side = Side {
+    folder: "vehicle-side",
+    labels: "lidar",
+};
+const UNIT: Side = Side {
+    folder: "infrastructure-side",
+    labels: "virtuallidar",
+};
 
 /// The writer.
 #[derive(Debug)]
@@ -81,7 +87,14 @@ struct Rows {
 impl Dair {
     pub(super) fn new(root: &Path, edition: Edition) -> Self {
         let rows = Mutex::new(Vec::new());
-        Self { root: root.to_owned(), edition, scenes: 0, next_frame: 0, scene: None, rows }
+        Self {
+            root: root.to_owned(),
+            edition,
+            scenes: 0,
+            next_frame: 0,
+            scene: None,
+            rows,
+        }
     }
 
     fn make_folders(&self) -> Result<(), SynthError> {
@@ -99,7 +112,9 @@ impl Dair {
             "infrastructure-side/label/virtuallidar",
             &cooperative,
         ];
-        folders.iter().try_for_each(|folder| make_folder(&self.root.join(folder)))
+        folders
+            .iter()
+            .try_for_each(|folder| make_folder(&self.root.join(folder)))
     }
 
     fn cooperative_labels(&self) -> &'static str {
@@ -121,35 +136,61 @@ impl Dair {
     }
 
     /// The sweep and the labels of one side.
-    fn write_side(&self, side: &Side, id: &str, frame: &AgentFrame, omitted: &Omissions) -> Result<(), SynthError> {
+    fn write_side(
+        &self,
+        side: &Side,
+        id: &str,
+        frame: &AgentFrame,
+        omitted: &Omissions,
+    ) -> Result<(), SynthError> {
         let points = with_byte_intensities(&frame.frame.points);
         let cloud = pcd::encode(&points, Encoding::Binary, IntensityField::Intensity);
-        write_file(&self.root.join(format!("{}/velodyne/{id}.pcd", side.folder)), cloud)?;
+        write_file(
+            &self.root.join(format!("{}/velodyne/{id}.pcd", side.folder)),
+            cloud,
+        )?;
         let mut labels = Vec::new();
         for object in &frame.frame.objects {
             match side_type(object.class) {
-                Some(kind) => labels.push(upright_label(kind, object.id, &upright_in(frame, object))),
+                Some(kind) => {
+                    labels.push(upright_label(kind, object.id, &upright_in(frame, object)))
+                }
                 None => omitted.add("objects of a class without a name in the labels", 1),
             }
         }
-        self.write_json(&format!("{}/label/{}/{id}.json", side.folder, side.labels), &Value::Array(labels))
+        self.write_json(
+            &format!("{}/label/{}/{id}.json", side.folder, side.labels),
+            &Value::Array(labels),
+        )
     }
 
     /// Writes the pose of the vehicle's LiDAR, in the two steps of the data set.
     fn write_vehicle_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
         let world_from_lidar = frame.world_from_lidar();
-        let world_from_novatel = frame.frame.world_from_vehicle.map_or(world_from_lidar, |vehicle| vehicle.isometry());
+        let world_from_novatel = frame
+            .frame
+            .world_from_vehicle
+            .map_or(world_from_lidar, |vehicle| vehicle.isometry());
         let novatel_from_lidar: Pose = world_from_novatel.inv_mul(&world_from_lidar).into();
         let mount = json!({ "transform": transform(&novatel_from_lidar) });
-        self.write_json(&format!("vehicle-side/calib/lidar_to_novatel/{id}.json"), &mount)?;
+        self.write_json(
+            &format!("vehicle-side/calib/lidar_to_novatel/{id}.json"),
+            &mount,
+        )?;
         let pose = transform(&world_from_novatel.into());
-        self.write_json(&format!("vehicle-side/calib/novatel_to_world/{id}.json"), &pose)
+        self.write_json(
+            &format!("vehicle-side/calib/novatel_to_world/{id}.json"),
+            &pose,
+        )
     }
 
     fn write_unit_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
         let mut pose = transform(&frame.world_from_lidar().into());
         pose["relative_error"] = json!({ "delta_x": 0.0, "delta_y": 0.0 });
-        self.write_json(&format!("infrastructure-side/calib/virtuallidar_to_world/{id}.json"), &pose)
+        self.write_json(
+            &format!("infrastructure-side/calib/virtuallidar_to_world/{id}.json"),
+            &pose,
+        )
     }
 
     /// The label of an object that either side lists.
@@ -166,36 +207,62 @@ impl Dair {
 
 impl SceneWriter for Dair {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        let refused = |reason: String| Err(SynthError::Layout { layout: self.layout(), reason });
+        let refused = |reason: String| {
+            Err(SynthError::Layout {
+                layout: self.layout(),
+                reason,
+            })
+        };
         if scene.agents.len() < 2 {
-            return refused(format!("scene {} has one agent; a vehicle and a roadside unit are needed", scene.name));
+            return refused(format!(
+                "scene {} has one agent; a vehicle and a roadside unit are needed",
+                scene.name
+            ));
         }
         let frames = scene.capture_nanos.len();
         if self.next_frame + frames > FIRST_UNIT_FRAME {
-            return refused(format!("more than {FIRST_UNIT_FRAME} frames have no numbers of six digits"));
+            return refused(format!(
+                "more than {FIRST_UNIT_FRAME} frames have no numbers of six digits"
+            ));
         }
         if self.scenes == 0 {
             self.make_folders()?;
         }
         write_origin(&self.root, scene)?;
         // A roadside unit if there is one, else the second agent.
-        let unit = (1..scene.agents.len()).find(|&agent| scene.agents[agent].is_roadside).unwrap_or(1);
+        let unit = (1..scene.agents.len())
+            .find(|&agent| scene.agents[agent].is_roadside)
+            .unwrap_or(1);
         let (number, first_frame) = (self.scenes, self.next_frame);
-        self.scene = Some(Batch { number, first_frame, unit, capture_nanos: scene.capture_nanos.clone() });
+        self.scene = Some(Batch {
+            number,
+            first_frame,
+            unit,
+            capture_nanos: scene.capture_nanos.clone(),
+        });
         self.scenes += 1;
         self.next_frame += frames;
         Ok(())
     }
 
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
-        let Some(batch) = &self.scene else { return Ok(()) };
-        let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
-            omitted.add("frames of moments without vehicle or roadside unit", moment.frames.len());
+        let Some(batch) = &self.scene else {
             return Ok(());
         };
-        omitted.add("frames of agents beyond one vehicle and one roadside unit", moment.frames.len() - 2);
+        let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
+            omitted.add(
+                "frames of moments without vehicle or roadside unit",
+                moment.frames.len(),
+            );
+            return Ok(());
+        };
+        omitted.add(
+            "frames of agents beyond one vehicle and one roadside unit",
+            moment.frames.len() - 2,
+        );
         let number = batch.first_frame + moment.index;
-        let [id, unit_id] = [number, FIRST_UNIT_FRAME + number].map(|number| format!("{number:06}"));
+        let [id, unit_id] =
+            [number, FIRST_UNIT_FRAME + number].map(|number| format!("{number:06}"));
         self.write_side(&VEHICLE, &id, vehicle, omitted)?;
         self.write_side(&UNIT, &unit_id, unit, omitted)?;
         self.write_vehicle_pose(&id, vehicle)?;
@@ -204,7 +271,10 @@ impl SceneWriter for Dair {
         for object in Moment::union([vehicle, unit]) {
             match cooperative_type(object.class) {
                 Some(kind) => labels.push(self.cooperative_label(kind, object, vehicle)),
-                None => omitted.add("objects that are no vehicles, in the labels of both sides", 1),
+                None => omitted.add(
+                    "objects that are no vehicles, in the labels of both sides",
+                    1,
+                ),
             }
         }
         let path = format!("cooperative/{}/{id}.json", self.cooperative_labels());
@@ -221,9 +291,14 @@ impl SceneWriter for Dair {
     fn finish(&mut self) -> Result<(), SynthError> {
         let mut rows = std::mem::take(&mut *locked(&self.rows));
         rows.sort_by_key(|(number, _)| *number);
-        let list = |of: fn(&Rows) -> &Value| Value::Array(rows.iter().map(|(_, rows)| of(rows).clone()).collect());
+        let list = |of: fn(&Rows) -> &Value| {
+            Value::Array(rows.iter().map(|(_, rows)| of(rows).clone()).collect())
+        };
         self.write_json("vehicle-side/data_info.json", &list(|rows| &rows.vehicle))?;
-        self.write_json("infrastructure-side/data_info.json", &list(|rows| &rows.unit))?;
+        self.write_json(
+            "infrastructure-side/data_info.json",
+            &list(|rows| &rows.unit),
+        )?;
         self.write_json("cooperative/data_info.json", &list(|rows| &rows.pair))
     }
 }
@@ -231,7 +306,9 @@ impl SceneWriter for Dair {
 impl Dair {
     /// The rows of a capture time in the lists.
     fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> Rows {
-        let micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS + batch.capture_nanos[moment.index] / 1000;
+        let micros = EPOCH_MICROS
+            + batch.number as u64 * DAY_MICROS
+            + batch.capture_nanos[moment.index] / 1000;
         let last_frame = batch.first_frame + batch.capture_nanos.len() - 1;
         let [first, last] = [batch.first_frame, last_frame];
         let span = |offset: usize| [first, last].map(|number| format!("{:06}", offset + number));
@@ -255,10 +332,21 @@ impl Dair {
                 "system_error_offset": offset,
             }),
         };
-        Rows { vehicle, unit, pair }
+        Rows {
+            vehicle,
+            unit,
+            pair,
+        }
     }
 
-    fn side_row(&self, side: &Side, id: &str, micros: u64, batch: &Batch, [first, last]: [String; 2]) -> Value {
+    fn side_row(
+        &self,
+        side: &Side,
+        id: &str,
+        micros: u64,
+        batch: &Batch,
+        [first, last]: [String; 2],
+    ) -> Value {
         let mut row = json!({
             "image_path": format!("image/{id}.jpg"),
             "image_timestamp": micros.to_string(),

@@ -11,7 +11,9 @@ pub(super) fn side_type(class: ObjectClass) -> Option<&'static str> {
     match class {
         ObjectClass::TwoWheeler => Some("Cyclist"),
         ObjectClass::Pedestrian => Some("Pedestrian"),
-        ObjectClass::Car | ObjectClass::Van | ObjectClass::Truck | ObjectClass::Bus => cooperative_type(class),
+        ObjectClass::Car | ObjectClass::Van | ObjectClass::Truck | ObjectClass::Bus => {
+            cooperative_type(class)
+        }
         ObjectClass::Other => None,
     }
 }
@@ -30,7 +32,8 @@ pub(super) fn cooperative_type(class: ObjectClass) -> Option<&'static str> {
 /// Rotation as 3 rows and translation as 3 rows of one number.
 pub(super) fn transform(pose: &Pose) -> Value {
     let rotation = pose.isometry().rotation.to_rotation_matrix();
-    let rows: [[f64; 3]; 3] = std::array::from_fn(|row| std::array::from_fn(|column| rotation[(row, column)]));
+    let rows: [[f64; 3]; 3] =
+        std::array::from_fn(|row| std::array::from_fn(|column| rotation[(row, column)]));
     json!({ "rotation": rows, "translation": pose.translation_m.map(|metres| [metres]) })
 }
 
@@ -81,14 +84,36 @@ mod tests {
             size_m: [4.0, 2.0, 1.0],
             speed_mps: None,
         };
-        let upright = Box3d { center_m: [10.0, 20.0, 1.0], size_m: [4.0, 2.0, 1.0], heading_rad: 1.5 };
+        let upright = Box3d {
+            center_m: [10.0, 20.0, 1.0],
+            size_m: [4.0, 2.0, 1.0],
+            heading_rad: 1.5,
+        };
         let label = world_label("Bus", &object, &upright);
-        let corner =
-            |index: usize| -> Vec<f64> { serde_json::from_value(label["world_8_points"][index].clone()).unwrap() };
+        let corner = |index: usize| -> Vec<f64> {
+            serde_json::from_value(label["world_8_points"][index].clone()).unwrap()
+        };
         // Front left of the bottom: the front is towards y, left towards -x.
-        for (index, expected) in [(0, [9.0, 22.0, 0.5]), (1, [11.0, 22.0, 0.5]), (6, [11.0, 18.0, 1.5])] {
-            assert!(corner(index).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-12), "{:?}", corner(index));
+        for (index, expected) in [
+            (0, [9.0, 22.0, 0.5]),
+            (1, [11.0, 22.0, 0.5]),
+            (6, [11.0, 18.0, 1.5]),
+        ] {
+            assert!(
+                corner(index)
+                    .iter()
+                    .zip(expected)
+                    .all(|(a, b)| (a - b).abs() < 1e-12),
+                "{:?}",
+                corner(index)
+            );
         }
-        assert_eq!((label["3d_dimensions"]["l"].as_f64(), label["track_id"].as_str()), (Some(4.0), Some("7")));
+        assert_eq!(
+            (
+                label["3d_dimensions"]["l"].as_f64(),
+                label["track_id"].as_str()
+            ),
+            (Some(4.0), Some("7"))
+        );
     }
 }

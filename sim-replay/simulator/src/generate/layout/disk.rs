@@ -8,7 +8,10 @@ use crate::generate::error::SynthError;
 use dataset::UNFINISHED;
 
 fn failed(path: &Path, source: io::Error) -> SynthError {
-    SynthError::Write { path: path.to_owned(), source }
+    SynthError::Write {
+        path: path.to_owned(),
+        source,
+    }
 }
 
 /// Writes text or bytes.
@@ -32,19 +35,27 @@ pub(super) fn make_fresh_folder(path: &Path) -> Result<(), SynthError> {
 
 /// The folder of a scene below `root`; no name leads outside `root`.
 pub(crate) fn scene_path(root: &Path, name: &str) -> PathBuf {
-    let parts = Path::new(name).components().filter(|part| matches!(part, Component::Normal(_)));
+    let parts = Path::new(name)
+        .components()
+        .filter(|part| matches!(part, Component::Normal(_)));
     root.join(parts.collect::<PathBuf>())
 }
 
 /// Writes the origin of a scene, in a file that no reader takes for a frame.
 pub(super) fn write_origin(folder: &Path, scene: &SceneHeader) -> Result<(), SynthError> {
-    write_file(&folder.join(format!("{}.origin.txt", flat_name(&scene.name))), &scene.origin)
+    write_file(
+        &folder.join(format!("{}.origin.txt", flat_name(&scene.name))),
+        &scene.origin,
+    )
 }
 
 /// The name of a scene as one part of a path.
 fn flat_name(name: &str) -> String {
     let allowed = |letter: char| letter.is_alphanumeric() || matches!(letter, '.' | '-' | '_');
-    let text: String = name.chars().map(|letter| if allowed(letter) { letter } else { '_' }).collect();
+    let text: String = name
+        .chars()
+        .map(|letter| if allowed(letter) { letter } else { '_' })
+        .collect();
     text.trim_start_matches('.').to_owned()
 }
 
@@ -56,7 +67,10 @@ impl Unfinished {
     /// Marks a folder, which exists.
     pub(crate) fn mark(folder: &Path) -> Result<Self, SynthError> {
         let mark = folder.join(UNFINISHED);
-        write_file(&mark, "This folder is being written, or the run that wrote it was interrupted.\n")?;
+        write_file(
+            &mark,
+            "This folder is being written, or the run that wrote it was interrupted.\n",
+        )?;
         Ok(Self(mark))
     }
 
@@ -72,8 +86,14 @@ mod tests {
 
     #[test]
     fn a_scene_stays_below_the_root() {
-        assert_eq!(scene_path(Path::new("out"), "test/a"), Path::new("out/test/a"));
-        assert_eq!(scene_path(Path::new("out"), "/../x/./y"), Path::new("out/x/y"));
+        assert_eq!(
+            scene_path(Path::new("out"), "test/a"),
+            Path::new("out/test/a")
+        );
+        assert_eq!(
+            scene_path(Path::new("out"), "/../x/./y"),
+            Path::new("out/x/y")
+        );
         assert_eq!(flat_name("../test/a b"), "_test_a_b");
     }
 
@@ -93,6 +113,9 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("missing/file");
         let message = write_file(&path, "x").unwrap_err().to_string();
-        assert!(message.starts_with(&*path.to_string_lossy()) && message.contains("No such file"), "{message}");
+        assert!(
+            message.starts_with(&*path.to_string_lossy()) && message.contains("No such file"),
+            "{message}"
+        );
     }
 }

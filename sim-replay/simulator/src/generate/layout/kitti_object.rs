@@ -40,11 +40,19 @@ pub(super) struct KittiObject {
 
 impl KittiObject {
     pub(super) fn new(root: &Path) -> Self {
-        Self { root: root.to_owned(), next_frame: None, first_frame: 0, moments: 0 }
+        Self {
+            root: root.to_owned(),
+            next_frame: None,
+            first_frame: 0,
+            moments: 0,
+        }
     }
 
     fn file(&self, folder: &str, number: usize, suffix: &str) -> PathBuf {
-        self.root.join(SPLIT).join(folder).join(format!("{number:06}{suffix}"))
+        self.root
+            .join(SPLIT)
+            .join(folder)
+            .join(format!("{number:06}{suffix}"))
     }
 }
 
@@ -53,7 +61,9 @@ impl SceneWriter for KittiObject {
         let split = self.root.join(SPLIT);
         if self.next_frame.is_none() {
             make_fresh_folder(&split)?;
-            ["velodyne", "calib", "label_2"].iter().try_for_each(|name| make_folder(&split.join(name)))?;
+            ["velodyne", "calib", "label_2"]
+                .iter()
+                .try_for_each(|name| make_folder(&split.join(name)))?;
         }
         write_origin(&self.root, scene)?;
         self.first_frame = self.next_frame.unwrap_or(0);
@@ -111,7 +121,12 @@ impl Label {
         // The camera's x points to the right of the LiDAR's x.
         let rotation_y_rad = -upright.heading_rad - std::f64::consts::FRAC_PI_2;
         let alpha_rad = rotation_y_rad - bottom.x.atan2(bottom.z);
-        Self { size_m: [height, width, length], bottom_m: bottom.into(), rotation_y_rad, alpha_rad }
+        Self {
+            size_m: [height, width, length],
+            bottom_m: bottom.into(),
+            rotation_y_rad,
+            alpha_rad,
+        }
     }
 }
 

@@ -61,7 +61,10 @@ impl Style for KittiOdometry {
         write_file(&folder.join("times.txt"), times(sequence.capture_nanos))?;
         let poses = root.join("poses");
         make_folder(&poses)?;
-        write_file(&poses.join(format!("{:02}.txt", sequence.number)), pose_lines(sequence))
+        write_file(
+            &poses.join(format!("{:02}.txt", sequence.number)),
+            pose_lines(sequence),
+        )
     }
 }
 
@@ -80,15 +83,23 @@ fn times(capture_nanos: &[u64]) -> String {
 /// repeated.
 fn pose_lines(sequence: &Sequence<'_>) -> String {
     let camera_from_lidar = camera_from_lidar();
-    let Some(first) = sequence.sweeps.first() else { return String::new() };
+    let Some(first) = sequence.sweeps.first() else {
+        return String::new();
+    };
     let first_from_world = first.world_from_lidar.isometry().inverse();
     let mut text = String::with_capacity(280 * sequence.capture_nanos.len());
     for moment in 0..sequence.capture_nanos.len() {
-        let next = sequence.sweeps.partition_point(|sweep| sweep.moment <= moment);
+        let next = sequence
+            .sweeps
+            .partition_point(|sweep| sweep.moment <= moment);
         let sweep = &sequence.sweeps[next.saturating_sub(1)];
         let first_from_lidar = first_from_world * sweep.world_from_lidar.isometry();
-        let pose = (camera_from_lidar * first_from_lidar * camera_from_lidar.inverse()).to_homogeneous();
-        let row = (0..12).map(|place| format!("{:e}", pose[(place / 4, place % 4)])).collect::<Vec<_>>().join(" ");
+        let pose =
+            (camera_from_lidar * first_from_lidar * camera_from_lidar.inverse()).to_homogeneous();
+        let row = (0..12)
+            .map(|place| format!("{:e}", pose[(place / 4, place % 4)]))
+            .collect::<Vec<_>>()
+            .join(" ");
         text.push_str(&row);
         text.push('\n');
     }

@@ -16,7 +16,11 @@ impl Style for Mars {
     }
 
     fn channels(&self, scene: &SceneHeader) -> Vec<String> {
-        scene.agents.iter().map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id)).collect()
+        scene
+            .agents
+            .iter()
+            .map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id))
+            .collect()
     }
 
     fn file_name(&self, _: usize, _: usize, micros: u64) -> String {

@@ -110,7 +110,10 @@ impl SceneLayout {
             Self::Mars => Box::new(nuscenes::NuScenes::new(root, &mars::Mars)),
             Self::Nclt => Box::new(sequences::Sequences::new(root, &nclt::Nclt)),
             Self::Oxford => Box::new(sequences::Sequences::new(root, &oxford::Oxford)),
-            Self::KittiOdometry => Box::new(sequences::Sequences::new(root, &kitti_odometry::KittiOdometry)),
+            Self::KittiOdometry => Box::new(sequences::Sequences::new(
+                root,
+                &kitti_odometry::KittiOdometry,
+            )),
             Self::KittiObject => Box::new(kitti_object::KittiObject::new(root)),
         }
     }
@@ -211,7 +214,10 @@ pub(crate) struct BoxAnchor {
 impl AgentFrame {
     /// The pose of the LiDAR in the world. Writers get no frames without a pose.
     pub(crate) fn world_from_lidar(&self) -> nalgebra::Isometry3<f64> {
-        self.frame.world_from_lidar.unwrap_or(protocol::Pose::IDENTITY).isometry()
+        self.frame
+            .world_from_lidar
+            .unwrap_or(protocol::Pose::IDENTITY)
+            .isometry()
     }
 }
 
@@ -243,11 +249,15 @@ impl Omissions {
 
     /// All counts.
     pub(crate) fn into_counts(self) -> BTreeMap<&'static str, u64> {
-        self.0.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.0
+            .into_inner()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 }
 
 /// The content of a lock, also after a panic of a thread that held it, since such a panic ends the program.
 pub(crate) fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    mutex
+        .lock()
+        .unwrap_or_else(std::sync::PoisonError::into_inner)
 }

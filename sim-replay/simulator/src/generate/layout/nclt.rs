@@ -55,7 +55,10 @@ impl Style for Nclt {
             bytes.extend([x, y, z].into_iter().flat_map(u16::to_le_bytes));
             bytes.extend([byte(intensity), ring(point)]);
         }
-        omitted.add("points beyond the coordinates that can be written (-100 m to 227 m)", outside);
+        omitted.add(
+            "points beyond the coordinates that can be written (-100 m to 227 m)",
+            outside,
+        );
         bytes
     }
 
@@ -68,16 +71,25 @@ impl Style for Nclt {
             let [x, y, z] = pose.translation_m;
             let (roll, pitch, heading) = pose.isometry().rotation.euler_angles();
             // Writing to a String does not fail.
-            let _ = writeln!(rows, "{},{x},{y},{z},{roll},{pitch},{heading}", sweep.micros);
+            let _ = writeln!(
+                rows,
+                "{},{x},{y},{z},{roll},{pitch},{heading}",
+                sweep.micros
+            );
         }
-        write_file(&folder.join(format!("groundtruth_{}.csv", Self::day(sequence.number))), rows)
+        write_file(
+            &folder.join(format!("groundtruth_{}.csv", Self::day(sequence.number))),
+            rows,
+        )
     }
 }
 
 /// A coordinate as a number of steps, if it is in range.
 fn steps(metres: f32) -> Option<u16> {
     let steps = ((f64::from(metres) - LEAST_M) / STEP_M).round();
-    (0.0..=f64::from(u16::MAX)).contains(&steps).then_some(steps as u16)
+    (0.0..=f64::from(u16::MAX))
+        .contains(&steps)
+        .then_some(steps as u16)
 }
 
 #[cfg(test)]
@@ -87,9 +99,20 @@ mod tests {
     #[test]
     fn points_are_rounded_and_those_outside_are_counted() {
         let omitted = Omissions::default();
-        let bytes = Nclt.points(&[[1.0024, -2.0026, 0.5, 0.2], [-100.5, 0.0, 0.0, 0.5]], &omitted);
-        let numbers: Vec<u16> = bytes[..6].as_chunks::<2>().0.iter().map(|pair| u16::from_le_bytes(*pair)).collect();
-        assert_eq!((numbers, bytes[6], bytes.len()), (vec![20_200, 20_401, 19_900], 51, 8));
+        let bytes = Nclt.points(
+            &[[1.0024, -2.0026, 0.5, 0.2], [-100.5, 0.0, 0.0, 0.5]],
+            &omitted,
+        );
+        let numbers: Vec<u16> = bytes[..6]
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .map(|pair| u16::from_le_bytes(*pair))
+            .collect();
+        assert_eq!(
+            (numbers, bytes[6], bytes.len()),
+            (vec![20_200, 20_401, 19_900], 51, 8)
+        );
         assert_eq!(omitted.into_counts().into_values().collect::<Vec<_>>(), [1]);
     }
 }

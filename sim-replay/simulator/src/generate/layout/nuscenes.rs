@@ -60,13 +60,26 @@ struct Current {
 impl NuScenes {
     pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
         let (samples, tables) = (Mutex::new(Vec::new()), Tables::default());
-        Self { root: root.to_owned(), style, scenes: 0, scene: None, samples, tables }
+        Self {
+            root: root.to_owned(),
+            style,
+            scenes: 0,
+            scene: None,
+            samples,
+            tables,
+        }
     }
 
     fn sweep_bytes(&self, frame: &AgentFrame) -> Vec<u8> {
         let row = |&point: &[f32; 4]| {
             let [x, y, z, intensity] = point;
-            [x, y, z, self.style.intensity(intensity), f32::from(ring(point))]
+            [
+                x,
+                y,
+                z,
+                self.style.intensity(intensity),
+                f32::from(ring(point)),
+            ]
         };
         float_bytes(frame.frame.points.xyzi.iter().map(row))
     }
@@ -80,14 +93,22 @@ impl SceneWriter for NuScenes {
         }
         write_origin(&self.root, scene)?;
         let channels = self.style.channels(scene);
-        channels.iter().try_for_each(|channel| make_folder(&self.root.join(SWEEPS).join(channel)))?;
-        self.scene = Some(Current { number: self.scenes, header: scene.clone(), channels });
+        channels
+            .iter()
+            .try_for_each(|channel| make_folder(&self.root.join(SWEEPS).join(channel)))?;
+        self.scene = Some(Current {
+            number: self.scenes,
+            header: scene.clone(),
+            channels,
+        });
         self.scenes += 1;
         Ok(())
     }
 
     fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(scene) = &self.scene else { return Ok(()) };
+        let Some(scene) = &self.scene else {
+            return Ok(());
+        };
         let offset = EPOCH_MICROS + scene.number as u64 * DAY_MICROS;
         let micros = offset + scene.header.capture_nanos[moment.index] / 1000;
         let name = self.style.file_name(scene.number, moment.index, micros);
@@ -95,15 +116,33 @@ impl SceneWriter for NuScenes {
         for frame in &moment.frames {
             let file = format!("{SWEEPS}/{}/{name}", scene.channels[frame.agent]);
             write_file(&self.root.join(&file), self.sweep_bytes(frame))?;
-            let (world_from_lidar, vehicle) = (frame.world_from_lidar(), frame.frame.world_from_vehicle);
-            sweeps.push(SweepRecord { agent: frame.agent, file, world_from_lidar, world_from_vehicle: vehicle });
+            let (world_from_lidar, vehicle) =
+                (frame.world_from_lidar(), frame.frame.world_from_vehicle);
+            sweeps.push(SweepRecord {
+                agent: frame.agent,
+                file,
+                world_from_lidar,
+                world_from_vehicle: vehicle,
+            });
         }
         let annotations = Moment::union(&moment.frames).into_iter().map(|object| {
-            let lidar_points = moment.frames.iter().map(|frame| points_in(frame, object)).sum();
-            AnnotationRecord { object: object.clone(), lidar_points }
+            let lidar_points = moment
+                .frames
+                .iter()
+                .map(|frame| points_in(frame, object))
+                .sum();
+            AnnotationRecord {
+                object: object.clone(),
+                lidar_points,
+            }
         });
         let annotations = annotations.collect();
-        locked(&self.samples).push(Sample { moment: moment.index, micros, sweeps, annotations });
+        locked(&self.samples).push(Sample {
+            moment: moment.index,
+            micros,
+            sweeps,
+            annotations,
+        });
         Ok(())
     }
 
@@ -111,9 +150,19 @@ impl SceneWriter for NuScenes {
         let mut samples = std::mem::take(&mut *locked(&self.samples));
         samples.sort_by_key(|sample| sample.moment);
         if let Some(scene) = self.scene.take() {
-            let Current { number, header, channels } = &scene;
+            let Current {
+                number,
+                header,
+                channels,
+            } = &scene;
             let fields = self.style.scene_fields(header);
-            self.tables.add(SceneTables { number: *number, name: &header.name, channels, fields, samples: &samples });
+            self.tables.add(SceneTables {
+                number: *number,
+                name: &header.name,
+                channels,
+                fields,
+                samples: &samples,
+            });
         }
         Ok(())
     }
@@ -122,7 +171,10 @@ impl SceneWriter for NuScenes {
         let folder = self.root.join(self.style.version());
         let tables = std::mem::take(&mut self.tables).into_tables();
         tables.into_iter().try_for_each(|(name, rows)| {
-            write_file(&folder.join(format!("{name}.json")), Value::Array(rows).to_string())
+            write_file(
+                &folder.join(format!("{name}.json")),
+                Value::Array(rows).to_string(),
+            )
         })
     }
 }

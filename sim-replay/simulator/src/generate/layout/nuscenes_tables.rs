@@ -74,7 +74,11 @@ impl Tables {
 
     /// All tables, empty ones included.
     pub(super) fn into_tables(mut self) -> BTreeMap<&'static str, Vec<Value>> {
-        for name in EMPTY_TABLES.into_iter().chain(["instance", "sample_annotation", "category", "map"]) {
+        for name in
+            EMPTY_TABLES
+                .into_iter()
+                .chain(["instance", "sample_annotation", "category", "map"])
+        {
             self.0.entry(name).or_default();
         }
         self.0
@@ -83,11 +87,14 @@ impl Tables {
     /// Adds the rows of a scene.
     pub(super) fn add(&mut self, scene: SceneTables<'_>) {
         let samples = scene.samples.iter();
-        let tokens: Vec<String> =
-            samples.map(|sample| scene_token(&scene, "sample", &[&sample.moment.to_string()])).collect();
+        let tokens: Vec<String> = samples
+            .map(|sample| scene_token(&scene, "sample", &[&sample.moment.to_string()]))
+            .collect();
         self.add_scene(&scene, &tokens);
         let scene_token = scene_token(&scene, "scene", &[]);
-        for ((sample, token), (prev, next)) in scene.samples.iter().zip(&tokens).zip(neighbours(&tokens)) {
+        for ((sample, token), (prev, next)) in
+            scene.samples.iter().zip(&tokens).zip(neighbours(&tokens))
+        {
             self.push(
                 "sample",
                 json!({
@@ -132,20 +139,29 @@ impl Tables {
                 .iter()
                 .zip(sample_tokens)
                 .filter_map(|(sample, token)| {
-                    Some((sample, sample.sweeps.iter().find(|sweep| sweep.agent == agent)?, token))
+                    Some((
+                        sample,
+                        sample.sweeps.iter().find(|sweep| sweep.agent == agent)?,
+                        token,
+                    ))
                 })
                 .collect();
-            let Some((_, first, _)) = chain.first() else { continue };
+            let Some((_, first, _)) = chain.first() else {
+                continue;
+            };
             let mount = self.add_mount(scene, channel, first);
             let tokens: Vec<String> = chain
                 .iter()
-                .map(|(sample, ..)| scene_token(scene, "sample_data", &[channel, &sample.moment.to_string()]))
+                .map(|(sample, ..)| {
+                    scene_token(scene, "sample_data", &[channel, &sample.moment.to_string()])
+                })
                 .collect();
             for (((sample, sweep, sample_token), token), (prev, next)) in
                 chain.iter().zip(&tokens).zip(neighbours(&tokens))
             {
                 // The mount is that of the first sweep, so that one row serves the whole scene.
-                let world_from_vehicle: Pose = (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
+                let world_from_vehicle: Pose =
+                    (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
                 self.push(
                     "ego_pose",
                     json!({
@@ -168,11 +184,19 @@ impl Tables {
     fn add_mount(&mut self, scene: &SceneTables<'_>, channel: &str, first: &SweepRecord) -> Mount {
         // A sensor is one row, also if several scenes use it.
         let sensor = token(&["sensor", channel]);
-        let known = self.0.get("sensor").is_some_and(|rows| rows.iter().any(|row| row["token"] == sensor.as_str()));
+        let known = self
+            .0
+            .get("sensor")
+            .is_some_and(|rows| rows.iter().any(|row| row["token"] == sensor.as_str()));
         if !known {
-            self.push("sensor", json!({ "token": sensor, "channel": channel, "modality": "lidar" }));
+            self.push(
+                "sensor",
+                json!({ "token": sensor, "channel": channel, "modality": "lidar" }),
+            );
         }
-        let world_from_vehicle = first.world_from_vehicle.map_or(first.world_from_lidar, |pose| pose.isometry());
+        let world_from_vehicle = first
+            .world_from_vehicle
+            .map_or(first.world_from_lidar, |pose| pose.isometry());
         let vehicle_from_lidar = world_from_vehicle.inv_mul(&first.world_from_lidar);
         let pose: Pose = vehicle_from_lidar.into();
         let token = scene_token(scene, "calibrated_sensor", &[channel]);
@@ -183,15 +207,22 @@ impl Tables {
                 "rotation": pose.rotation_wxyz, "camera_intrinsic": [],
             }),
         );
-        Mount { token, vehicle_from_lidar }
+        Mount {
+            token,
+            vehicle_from_lidar,
+        }
     }
 
     /// Objects by id, and their boxes at each sample: a chain of boxes per object.
     fn add_annotations(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
-        let mut by_object: BTreeMap<i64, Vec<(&Sample, &String, &AnnotationRecord)>> = BTreeMap::new();
+        let mut by_object: BTreeMap<i64, Vec<(&Sample, &String, &AnnotationRecord)>> =
+            BTreeMap::new();
         for (sample, token) in scene.samples.iter().zip(sample_tokens) {
             for annotation in &sample.annotations {
-                by_object.entry(annotation.object.id).or_default().push((sample, token, annotation));
+                by_object
+                    .entry(annotation.object.id)
+                    .or_default()
+                    .push((sample, token, annotation));
             }
         }
         for (id, chain) in &by_object {
@@ -199,7 +230,9 @@ impl Tables {
             let instance = scene_token(scene, "instance", &[&id]);
             let tokens: Vec<String> = chain
                 .iter()
-                .map(|(sample, ..)| scene_token(scene, "annotation", &[&id, &sample.moment.to_string()]))
+                .map(|(sample, ..)| {
+                    scene_token(scene, "annotation", &[&id, &sample.moment.to_string()])
+                })
                 .collect();
             let category = self.category(chain[0].2.object.class);
             self.push(
@@ -212,7 +245,11 @@ impl Tables {
             for (((_, sample_token, annotation), token), (prev, next)) in
                 chain.iter().zip(&tokens).zip(neighbours(&tokens))
             {
-                let Object { world_from_object, size_m: [length, width, height], .. } = &annotation.object;
+                let Object {
+                    world_from_object,
+                    size_m: [length, width, height],
+                    ..
+                } = &annotation.object;
                 self.push(
                     "sample_annotation",
                     json!({
@@ -241,7 +278,11 @@ impl Tables {
 
 /// The tokens before and after each, empty at the ends.
 fn neighbours(tokens: &[String]) -> impl Iterator<Item = (&str, &str)> {
-    let at = |place: Option<usize>| place.and_then(|place| tokens.get(place)).map_or("", String::as_str);
+    let at = |place: Option<usize>| {
+        place
+            .and_then(|place| tokens.get(place))
+            .map_or("", String::as_str)
+    };
     (0..tokens.len()).map(move |place| (at(place.checked_sub(1)), at(place.checked_add(1))))
 }
 
@@ -288,39 +329,106 @@ mod tests {
             world_from_lidar: Pose::from_xyz_yaw([moment as f64, 0.0, 2.0], 0.0).isometry(),
             world_from_vehicle: Some(Pose::from_xyz_yaw([moment as f64 + 0.5, 0.0, 0.0], 0.0)),
         };
-        let annotations = objects.into_iter().map(|object| AnnotationRecord { object, lidar_points: 3 }).collect();
-        Sample { moment, micros: 100_000 * moment as u64, sweeps: vec![sweep], annotations }
+        let annotations = objects
+            .into_iter()
+            .map(|object| AnnotationRecord {
+                object,
+                lidar_points: 3,
+            })
+            .collect();
+        Sample {
+            moment,
+            micros: 100_000 * moment as u64,
+            sweeps: vec![sweep],
+            annotations,
+        }
     }
 
     #[test]
     fn rows_refer_to_each_other() {
-        let samples =
-            [sample(0, vec![object(7, 10.0)]), sample(1, vec![object(7, 11.0), object(8, 20.0)]), sample(2, vec![])];
+        let samples = [
+            sample(0, vec![object(7, 10.0)]),
+            sample(1, vec![object(7, 11.0), object(8, 20.0)]),
+            sample(2, vec![]),
+        ];
         let channels = ["TOP".to_owned(), "absent".to_owned()];
         let mut tables = Tables::default();
-        tables.add(SceneTables { number: 0, name: "a", channels: &channels, fields: Map::new(), samples: &samples });
-        tables.add(SceneTables { number: 1, name: "b", channels: &channels, fields: Map::new(), samples: &samples });
+        tables.add(SceneTables {
+            number: 0,
+            name: "a",
+            channels: &channels,
+            fields: Map::new(),
+            samples: &samples,
+        });
+        tables.add(SceneTables {
+            number: 1,
+            name: "b",
+            channels: &channels,
+            fields: Map::new(),
+            samples: &samples,
+        });
         let tables = tables.into_tables();
         let count = |name: &str| tables[name].len();
-        assert_eq!((count("scene"), count("sample"), count("sample_data"), count("ego_pose")), (2, 6, 6, 6));
-        assert_eq!((count("sensor"), count("calibrated_sensor"), count("category")), (1, 2, 1));
-        assert_eq!((count("instance"), count("sample_annotation"), count("visibility")), (4, 6, 0));
+        assert_eq!(
+            (
+                count("scene"),
+                count("sample"),
+                count("sample_data"),
+                count("ego_pose")
+            ),
+            (2, 6, 6, 6)
+        );
+        assert_eq!(
+            (
+                count("sensor"),
+                count("calibrated_sensor"),
+                count("category")
+            ),
+            (1, 2, 1)
+        );
+        assert_eq!(
+            (
+                count("instance"),
+                count("sample_annotation"),
+                count("visibility")
+            ),
+            (4, 6, 0)
+        );
         let row = |name: &str, token: &Value| {
-            tables[name].iter().find(|row| row["token"] == *token).unwrap_or_else(|| panic!("{name} {token}")).clone()
+            tables[name]
+                .iter()
+                .find(|row| row["token"] == *token)
+                .unwrap_or_else(|| panic!("{name} {token}"))
+                .clone()
         };
         // From the scene along its samples to the second box of the first object.
         let first = row("sample", &tables["scene"][0]["first_sample_token"]);
         assert_eq!(first["prev"], "");
         let second = row("sample", &first["next"]);
-        assert_eq!((second["timestamp"].as_u64(), &second["prev"]), (Some(100_000), &first["token"]));
-        let instance = row("instance", &tables["sample_annotation"][0]["instance_token"]);
+        assert_eq!(
+            (second["timestamp"].as_u64(), &second["prev"]),
+            (Some(100_000), &first["token"])
+        );
+        let instance = row(
+            "instance",
+            &tables["sample_annotation"][0]["instance_token"],
+        );
         assert_eq!(instance["nbr_annotations"], 2);
         let last = row("sample_annotation", &instance["last_annotation_token"]);
-        assert_eq!((&last["sample_token"], &last["size"]), (&second["token"], &json!([2.0, 4.0, 1.5])));
-        assert_eq!(row("category", &instance["category_token"])["name"], "vehicle.car");
+        assert_eq!(
+            (&last["sample_token"], &last["size"]),
+            (&second["token"], &json!([2.0, 4.0, 1.5]))
+        );
+        assert_eq!(
+            row("category", &instance["category_token"])["name"],
+            "vehicle.car"
+        );
         // The LiDAR 0.5 m behind the vehicle's origin and 2 m above.
         let sweep = &tables["sample_data"][1];
-        assert_eq!(row("ego_pose", &sweep["ego_pose_token"])["translation"], json!([1.5, 0.0, 0.0]));
+        assert_eq!(
+            row("ego_pose", &sweep["ego_pose_token"])["translation"],
+            json!([1.5, 0.0, 0.0])
+        );
         let mount = row("calibrated_sensor", &sweep["calibrated_sensor_token"]);
         assert_eq!(mount["translation"], json!([-0.5, 0.0, 2.0]));
     }

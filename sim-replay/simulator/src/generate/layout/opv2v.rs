@@ -23,25 +23,46 @@ pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }
 
-fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> Result<(), SynthError> {
+fn write_files(
+    folders: &AgentFolders,
+    moment: &Moment,
+    frame: &AgentFrame,
+) -> Result<(), SynthError> {
     let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
     write_file(&folders.file(moment, frame, ".pcd"), points)?;
-    for SweepVariant { name, points, labels } in &frame.variants {
+    for SweepVariant {
+        name,
+        points,
+        labels,
+    } in &frame.variants
+    {
         let bytes = pcd_of(points, IntensityField::RedAndLabel(labels));
         write_file(&folders.file(moment, frame, &format!("_{name}.pcd")), bytes)?;
     }
     if let Some(radar) = &frame.frame.radar {
-        write_file(&folders.file(moment, frame, "_radar.pcd"), pcd_of(&radar.xyzi, IntensityField::Red))?;
+        write_file(
+            &folders.file(moment, frame, "_radar.pcd"),
+            pcd_of(&radar.xyzi, IntensityField::Red),
+        )?;
     }
     for (number, Camera { metadata, image }) in &frame.frame.cameras {
         let ending = metadata.format.name();
-        write_file(&folders.file(moment, frame, &format!("_camera{number}.{ending}")), image)?;
+        write_file(
+            &folders.file(moment, frame, &format!("_camera{number}.{ending}")),
+            image,
+        )?;
     }
-    write_file(&folders.file(moment, frame, ".yaml"), frame_yaml(frame, folders.is_roadside(frame)))
+    write_file(
+        &folders.file(moment, frame, ".yaml"),
+        frame_yaml(frame, folders.is_roadside(frame)),
+    )
 }
 
 fn pcd_of(points: &[[f32; 4]], intensity: IntensityField<'_>) -> Vec<u8> {
-    let xyzi = points.iter().map(|&[x, y, z, fourth]| [x, -y, z, fourth]).collect();
+    let xyzi = points
+        .iter()
+        .map(|&[x, y, z, fourth]| [x, -y, z, fourth])
+        .collect();
     pcd::encode(&PointCloud { xyzi }, Encoding::Binary, intensity)
 }
 
@@ -73,7 +94,10 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
         ("predicted_ego_pos", frame.gnss_world_from_vehicle),
         ("true_ego_pos", frame.world_from_vehicle),
     ];
-    for (key, pose) in poses.iter().filter_map(|(key, pose)| Some((key, pose.as_ref()?))) {
+    for (key, pose) in poses
+        .iter()
+        .filter_map(|(key, pose)| Some((key, pose.as_ref()?)))
+    {
         write_list(yaml, "", key, &six(pose))?;
         if *key == "lidar_pose" {
             writeln!(yaml, "plan_trajectory: []")?;
@@ -84,43 +108,94 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
 
 /// Calibration of a camera: its pose in the world, `extrinsic` from the LiDAR to the camera, both left-handed with x
 /// ahead, and `intrinsic`.
-fn write_camera(yaml: &mut String, number: u8, camera: &Camera, world_from_lidar: Option<&Pose>) -> std::fmt::Result {
-    let CameraMetadata { pinhole, lidar_from_camera, .. } = camera.metadata;
+fn write_camera(
+    yaml: &mut String,
+    number: u8,
+    camera: &Camera,
+    world_from_lidar: Option<&Pose>,
+) -> std::fmt::Result {
+    let CameraMetadata {
+        pinhole,
+        lidar_from_camera,
+        ..
+    } = camera.metadata;
     let (Some(pinhole), Some(lidar_from_camera), Some(world_from_lidar)) =
         (pinhole, lidar_from_camera, world_from_lidar)
     else {
         return Ok(());
     };
     let lidar_from_body = lidar_from_camera.isometry() * body_from_optical().inverse();
-    let world_from_body = CarlaPose::from_pose(&(world_from_lidar.isometry() * lidar_from_body).into());
+    let world_from_body =
+        CarlaPose::from_pose(&(world_from_lidar.isometry() * lidar_from_body).into());
     let [world_from_body_left, world_from_lidar_left] =
-        [&world_from_body, &CarlaPose::from_pose(world_from_lidar)].map(CarlaPose::left_handed_matrix);
+        [&world_from_body, &CarlaPose::from_pose(world_from_lidar)]
+            .map(CarlaPose::left_handed_matrix);
     let extrinsic = world_from_body_left.try_inverse().unwrap_or_default() * world_from_lidar_left;
     writeln!(yaml, "camera{number}:")?;
     let cords: [f64; 6] = world_from_body.into();
     write_list(yaml, "  ", "cords", &cords)?;
-    write_rows(yaml, "extrinsic", extrinsic.row_iter().map(|row| row.iter().copied().collect()))?;
-    let Pinhole { fx_px, fy_px, cx_px, cy_px } = pinhole;
-    write_rows(yaml, "intrinsic", [vec![fx_px, 0.0, cx_px], vec![0.0, fy_px, cy_px], vec![0.0, 0.0, 1.0]].into_iter())
+    write_rows(
+        yaml,
+        "extrinsic",
+        extrinsic
+            .row_iter()
+            .map(|row| row.iter().copied().collect()),
+    )?;
+    let Pinhole {
+        fx_px,
+        fy_px,
+        cx_px,
+        cy_px,
+    } = pinhole;
+    write_rows(
+        yaml,
+        "intrinsic",
+        [
+            vec![fx_px, 0.0, cx_px],
+            vec![0.0, fy_px, cy_px],
+            vec![0.0, 0.0, 1.0],
+        ]
+        .into_iter(),
+    )
 }
 
-fn write_rows(yaml: &mut String, key: &str, mut rows: impl Iterator<Item = Vec<f64>>) -> std::fmt::Result {
+fn write_rows(
+    yaml: &mut String,
+    key: &str,
+    mut rows: impl Iterator<Item = Vec<f64>>,
+) -> std::fmt::Result {
     writeln!(yaml, "  {key}:")?;
     rows.try_for_each(|row| writeln!(yaml, "  - {row:?}"))
 }
 
 fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
     let [latitude, longitude, altitude] = fix.geodetic();
-    writeln!(yaml, "gnss:\n  altitude: {altitude}\n  latitude: {latitude}\n  longitude: {longitude}")?;
+    writeln!(
+        yaml,
+        "gnss:\n  altitude: {altitude}\n  latitude: {latitude}\n  longitude: {longitude}"
+    )?;
     // Left-handed like everything in these files.
-    let (heading, rate) = (-fix.heading_rad.to_degrees(), -fix.yaw_rate_radps.to_degrees());
-    writeln!(yaml, "imu:\n  heading_deg: {heading}\n  speed_mps: {}\n  yaw_rate_degps: {rate}", fix.speed_mps)
+    let (heading, rate) = (
+        -fix.heading_rad.to_degrees(),
+        -fix.yaw_rate_radps.to_degrees(),
+    );
+    writeln!(
+        yaml,
+        "imu:\n  heading_deg: {heading}\n  speed_mps: {}\n  yaw_rate_degps: {rate}",
+        fix.speed_mps
+    )
 }
 
 /// The motion of a recorded frame, if its yaw rate is recorded: `ego_speed` alone holds the speed.
 fn write_motion(yaml: &mut String, motion: &EgoMotion) -> std::fmt::Result {
-    let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s else { return Ok(()) };
-    writeln!(yaml, "imu:\n  yaw_rate_degps: {}", -yaw_rate_rad_s.to_degrees())
+    let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s else {
+        return Ok(());
+    };
+    writeln!(
+        yaml,
+        "imu:\n  yaw_rate_degps: {}",
+        -yaw_rate_rad_s.to_degrees()
+    )
 }
 
 fn write_vehicles(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
@@ -131,7 +206,8 @@ fn write_vehicles(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     for (object, anchor) in agent.frame.objects.iter().zip(anchors(agent)) {
         let mut more = vec![("class", class(object.class).to_owned())];
         // Objects that are not vehicles must not count as vehicles.
-        if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class {
+        if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class
+        {
             more.push(("obj_type", super::boxes::real_type(object.class).to_owned()));
         }
         let entry = ObjectEntry {

@@ -42,11 +42,16 @@ impl Style for Oxford {
                 [x, y, z, of_255(intensity)][index]
             })
         };
-        (0..4).flat_map(component).flat_map(f32::to_le_bytes).collect()
+        (0..4)
+            .flat_map(component)
+            .flat_map(f32::to_le_bytes)
+            .collect()
     }
 
     fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
-        let (Some(first), Some(last)) = (sequence.sweeps.first(), sequence.sweeps.last()) else { return Ok(()) };
+        let (Some(first), Some(last)) = (sequence.sweeps.first(), sequence.sweeps.last()) else {
+            return Ok(());
+        };
         let (stamps, rows) = padded(first, sequence.sweeps, last);
         let file = root.join(&sequence.folder).join("velodyne_left_False.h5");
         write_file(&file, poses_file(&stamps, &rows))
@@ -55,12 +60,24 @@ impl Style for Oxford {
 
 /// Time stamps and rows of 3x4 matrices. The entries that readers drop are copies of the first and of the last pose.
 fn padded(first: &SweepPose, sweeps: &[SweepPose], last: &SweepPose) -> (Vec<i64>, Vec<[f64; 12]>) {
-    let before = (1..=TRIMMED as u64).rev().map(|step| SweepPose { micros: first.micros - step, ..*first });
-    let after = (1..=TRIMMED as u64).map(|step| SweepPose { micros: last.micros + step, ..*last });
-    before.chain(sweeps.iter().copied()).chain(after).map(|sweep| (sweep.micros as i64, row(&sweep))).unzip()
+    let before = (1..=TRIMMED as u64).rev().map(|step| SweepPose {
+        micros: first.micros - step,
+        ..*first
+    });
+    let after = (1..=TRIMMED as u64).map(|step| SweepPose {
+        micros: last.micros + step,
+        ..*last
+    });
+    before
+        .chain(sweeps.iter().copied())
+        .chain(after)
+        .map(|sweep| (sweep.micros as i64, row(&sweep)))
+        .unzip()
 }
 
 fn row(sweep: &SweepPose) -> [f64; 12] {
-    let matrix = pose_z_down(&sweep.world_from_lidar).isometry().to_homogeneous();
+    let matrix = pose_z_down(&sweep.world_from_lidar)
+        .isometry()
+        .to_homogeneous();
     std::array::from_fn(|place| matrix[(place / 4, place % 4)])
 }

@@ -79,7 +79,14 @@ struct Current {
 impl Sequences {
     pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
         let sweeps = Mutex::new(Vec::new());
-        Self { root: root.to_owned(), style, scenes: 0, next_sequence: 0, scene: None, sweeps }
+        Self {
+            root: root.to_owned(),
+            style,
+            scenes: 0,
+            next_sequence: 0,
+            scene: None,
+            sweeps,
+        }
     }
 }
 
@@ -87,7 +94,9 @@ impl SceneWriter for Sequences {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
         let mut marks = Vec::with_capacity(scene.agents.len());
         for agent in 0..scene.agents.len() {
-            let folder = self.root.join(self.style.folder(self.next_sequence + agent));
+            let folder = self
+                .root
+                .join(self.style.folder(self.next_sequence + agent));
             make_fresh_folder(&folder)?;
             marks.push(Unfinished::mark(&folder)?);
             write_origin(&folder, scene)?;
@@ -95,22 +104,40 @@ impl SceneWriter for Sequences {
         }
         let offset_micros = self.style.epoch_micros() + self.scenes as u64 * DAY_MICROS;
         let (first_sequence, capture_nanos) = (self.next_sequence, scene.capture_nanos.clone());
-        self.scene = Some(Current { first_sequence, offset_micros, capture_nanos, marks });
+        self.scene = Some(Current {
+            first_sequence,
+            offset_micros,
+            capture_nanos,
+            marks,
+        });
         self.scenes += 1;
         self.next_sequence += scene.agents.len();
         Ok(())
     }
 
     fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
-        let Some(scene) = &self.scene else { return Ok(()) };
+        let Some(scene) = &self.scene else {
+            return Ok(());
+        };
         let micros = scene.offset_micros + scene.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
-            let folder = self.root.join(self.style.folder(scene.first_sequence + frame.agent));
-            let file = folder.join(self.style.sweeps_folder()).join(self.style.file_name(moment.index, micros));
+            let folder = self
+                .root
+                .join(self.style.folder(scene.first_sequence + frame.agent));
+            let file = folder
+                .join(self.style.sweeps_folder())
+                .join(self.style.file_name(moment.index, micros));
             write_file(&file, self.style.points(&frame.frame.points.xyzi, omitted))?;
-            omitted.add("boxes, which the layout does not have", frame.frame.objects.len());
+            omitted.add(
+                "boxes, which the layout does not have",
+                frame.frame.objects.len(),
+            );
             let world_from_lidar = frame.world_from_lidar().into();
-            let sweep = SweepPose { moment: moment.index, micros, world_from_lidar };
+            let sweep = SweepPose {
+                moment: moment.index,
+                micros,
+                world_from_lidar,
+            };
             locked(&self.sweeps).push((frame.agent, sweep));
         }
         Ok(())
@@ -119,12 +146,23 @@ impl SceneWriter for Sequences {
     fn end(&mut self) -> Result<(), SynthError> {
         let mut sweeps = std::mem::take(&mut *locked(&self.sweeps));
         sweeps.sort_by_key(|(agent, sweep)| (*agent, sweep.moment));
-        let Some(scene) = self.scene.take() else { return Ok(()) };
+        let Some(scene) = self.scene.take() else {
+            return Ok(());
+        };
         for (agent, mark) in scene.marks.into_iter().enumerate() {
             let number = scene.first_sequence + agent;
-            let own: Vec<SweepPose> = sweeps.iter().filter(|(of, _)| *of == agent).map(|(_, sweep)| *sweep).collect();
+            let own: Vec<SweepPose> = sweeps
+                .iter()
+                .filter(|(of, _)| *of == agent)
+                .map(|(_, sweep)| *sweep)
+                .collect();
             let folder = self.style.folder(number);
-            let sequence = Sequence { folder, number, capture_nanos: &scene.capture_nanos, sweeps: &own };
+            let sequence = Sequence {
+                folder,
+                number,
+                capture_nanos: &scene.capture_nanos,
+                sweeps: &own,
+            };
             self.style.write_poses(&self.root, &sequence)?;
             mark.clear()?;
         }
@@ -134,7 +172,11 @@ impl SceneWriter for Sequences {
 
 /// A date by number, of months of 28 days each: year, month, day.
 pub(super) fn date(first_year: usize, number: usize) -> [usize; 3] {
-    [first_year + number / (12 * 28), 1 + number / 28 % 12, 1 + number % 28]
+    [
+        first_year + number / (12 * 28),
+        1 + number / 28 % 12,
+        1 + number % 28,
+    ]
 }
 
 /// Points in axes with y to the right and z down, as in NCLT and Oxford.
@@ -146,7 +188,10 @@ pub(super) fn z_down([x, y, z, intensity]: [f32; 4]) -> [f32; 4] {
 pub(super) fn pose_z_down(pose: &Pose) -> Pose {
     let ([x, y, z], [qw, qx, qy, qz]) = (pose.translation_m, pose.rotation_wxyz);
     // Half a turn about x on either side.
-    Pose { translation_m: [x, -y, -z], rotation_wxyz: [qw, qx, -qy, -qz] }
+    Pose {
+        translation_m: [x, -y, -z],
+        rotation_wxyz: [qw, qx, -qy, -qz],
+    }
 }
 
 #[cfg(test)]
@@ -161,16 +206,25 @@ mod tests {
     fn dates_are_dates() {
         assert_eq!(
             [0, 27, 28, 335, 336].map(|number| date(2012, number)),
-            [[2012, 1, 1], [2012, 1, 28], [2012, 2, 1], [2012, 12, 28], [2013, 1, 1]]
+            [
+                [2012, 1, 1],
+                [2012, 1, 28],
+                [2012, 2, 1],
+                [2012, 12, 28],
+                [2013, 1, 1]
+            ]
         );
     }
 
     #[test]
     fn poses_turn_as_points_do() {
-        let pose: Pose = Isometry3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, -0.2, 0.7)).into();
+        let pose: Pose =
+            Isometry3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, -0.2, 0.7)).into();
         let half_turn = Isometry3::rotation(Vector3::x() * PI);
         let expected = half_turn * pose.isometry() * half_turn.inverse();
         let difference = pose_z_down(&pose).isometry().inv_mul(&expected);
-        assert!(difference.translation.vector.norm() < 1e-12 && difference.rotation.angle() < 1e-12);
+        assert!(
+            difference.translation.vector.norm() < 1e-12 && difference.rotation.angle() < 1e-12
+        );
     }
 }

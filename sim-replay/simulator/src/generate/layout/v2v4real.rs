@@ -56,8 +56,16 @@ pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }
 
-fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> Result<(), SynthError> {
-    let points = pcd::encode(&frame.frame.points, Encoding::Binary, IntensityField::Intensity);
+fn write_files(
+    folders: &AgentFolders,
+    moment: &Moment,
+    frame: &AgentFrame,
+) -> Result<(), SynthError> {
+    let points = pcd::encode(
+        &frame.frame.points,
+        Encoding::Binary,
+        IntensityField::Intensity,
+    );
     write_file(&folders.file(moment, frame, ".pcd"), points)?;
     let mut yaml = String::with_capacity(2048 + 400 * frame.frame.objects.len());
     write_frame(&mut yaml, frame).expect("writing to a String cannot fail");
@@ -69,7 +77,10 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     if let Some(speed_mps) = frame.speed_mps {
         writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
     }
-    for (key, pose) in [("lidar_pose", frame.world_from_lidar), ("true_ego_pos", frame.world_from_vehicle)] {
+    for (key, pose) in [
+        ("lidar_pose", frame.world_from_lidar),
+        ("true_ego_pos", frame.world_from_vehicle),
+    ] {
         if let Some(pose) = pose {
             writeln!(yaml, "{key}: {}", pickled_matrix(&pose))?;
         }
@@ -86,7 +97,10 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
 }
 
 fn write_object(yaml: &mut String, object: &Object, lidar_from_object: &Pose) -> std::fmt::Result {
-    let more = [("ass_id", object.id.to_string()), ("obj_type", real_type(object.class).to_owned())];
+    let more = [
+        ("ass_id", object.id.to_string()),
+        ("obj_type", real_type(object.class).to_owned()),
+    ];
     let entry = ObjectEntry {
         id: object.id,
         angle_deg: CarlaPose::from_right_handed(lidar_from_object).roll_yaw_pitch_deg,
@@ -103,7 +117,11 @@ fn write_object(yaml: &mut String, object: &Object, lidar_from_object: &Pose) ->
 fn pickled_matrix(pose: &Pose) -> String {
     let matrix = pose.isometry().to_homogeneous();
     // nalgebra keeps columns together, NumPy rows.
-    let bytes: Vec<u8> = matrix.transpose().iter().flat_map(|value| value.to_le_bytes()).collect();
+    let bytes: Vec<u8> = matrix
+        .transpose()
+        .iter()
+        .flat_map(|value| value.to_le_bytes())
+        .collect();
     let mut text = MATRIX_HEAD.to_owned();
     let digits = STANDARD.encode(bytes);
     let mut rest = digits.as_str();

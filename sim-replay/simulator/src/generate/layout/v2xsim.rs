@@ -17,8 +17,16 @@ impl Style for V2xSim {
     fn channels(&self, scene: &SceneHeader) -> Vec<String> {
         let unit = scene.agents.iter().position(|agent| agent.is_roadside);
         let mut numbers = 1..;
-        let mut number = |agent: usize| if Some(agent) == unit { 0 } else { numbers.next().unwrap_or_default() };
-        (0..scene.agents.len()).map(|agent| format!("LIDAR_TOP_id_{}", number(agent))).collect()
+        let mut number = |agent: usize| {
+            if Some(agent) == unit {
+                0
+            } else {
+                numbers.next().unwrap_or_default()
+            }
+        };
+        (0..scene.agents.len())
+            .map(|agent| format!("LIDAR_TOP_id_{}", number(agent)))
+            .collect()
     }
 
     fn file_name(&self, scene: usize, moment: usize, _: u64) -> String {

@@ -14,10 +14,17 @@ pub(super) const KMH_PER_MPS: f64 = 3.6;
 const FIRST_VEHICLE: usize = 1001;
 
 /// A list of numbers below a key.
-pub(super) fn write_list(yaml: &mut String, indent: &str, key: &str, values: &[f64]) -> fmt::Result {
+pub(super) fn write_list(
+    yaml: &mut String,
+    indent: &str,
+    key: &str,
+    values: &[f64],
+) -> fmt::Result {
     writeln!(yaml, "{indent}{key}:")?;
     // Minus zero would be another text for the same number; `{:?}` keeps a point in whole numbers.
-    values.iter().try_for_each(|value| writeln!(yaml, "{indent}- {:?}", value + 0.0))
+    values
+        .iter()
+        .try_for_each(|value| writeln!(yaml, "{indent}- {:?}", value + 0.0))
 }
 
 /// An object of the map of vehicles, in the numbers of the file.
@@ -38,7 +45,10 @@ impl ObjectEntry<'_> {
     /// Writes the entry, with keys in alphabetical order.
     pub(super) fn write(&self, yaml: &mut String) -> fmt::Result {
         let more = |yaml: &mut String, after: &str, until: &str| {
-            let mut between = self.more.iter().filter(|(key, _)| after < *key && *key < until);
+            let mut between = self
+                .more
+                .iter()
+                .filter(|(key, _)| after < *key && *key < until);
             between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
         };
         writeln!(yaml, "  {}:", self.id)?;
@@ -67,17 +77,30 @@ pub(super) fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
 
 fn bottom_anchor(object: &Object) -> BoxAnchor {
     let Pose { translation_m, .. } = object.world_from_object;
-    let up = object.world_from_object.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
+    let up = object.world_from_object.isometry().rotation
+        * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
     let center_offset_m: [f64; 3] = up.into();
-    BoxAnchor { location_m: std::array::from_fn(|axis| translation_m[axis] - center_offset_m[axis]), center_offset_m }
+    BoxAnchor {
+        location_m: std::array::from_fn(|axis| translation_m[axis] - center_offset_m[axis]),
+        center_offset_m,
+    }
 }
 
 /// The folders of a scene's agents. Readers sort them as text, roadside units (negative numbers) last: where the
 /// agents' own names are not such numbers, they are numbered.
 pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
-    let own: Vec<String> = scene.agents.iter().map(|agent| agent.id.as_str().to_owned()).collect();
-    let is_number =
-        |agent: &SceneAgent| agent.id.as_str().parse::<i64>().is_ok_and(|number| (number < 0) == agent.is_roadside);
+    let own: Vec<String> = scene
+        .agents
+        .iter()
+        .map(|agent| agent.id.as_str().to_owned())
+        .collect();
+    let is_number = |agent: &SceneAgent| {
+        agent
+            .id
+            .as_str()
+            .parse::<i64>()
+            .is_ok_and(|number| (number < 0) == agent.is_roadside)
+    };
     let key = |name: &String| (name.starts_with('-'), name.clone());
     if scene.agents.iter().all(is_number) && own.is_sorted_by_key(key) {
         return own;
@@ -97,8 +120,13 @@ mod tests {
     use super::*;
 
     fn folders(agents: &[(&str, bool)]) -> Vec<String> {
-        let agents =
-            agents.iter().map(|&(id, is_roadside)| SceneAgent { id: CavId::new(id).unwrap(), is_roadside }).collect();
+        let agents = agents
+            .iter()
+            .map(|&(id, is_roadside)| SceneAgent {
+                id: CavId::new(id).unwrap(),
+                is_roadside,
+            })
+            .collect();
         agent_folders(&SceneHeader {
             name: "a".into(),
             agents,
@@ -110,10 +138,24 @@ mod tests {
 
     #[test]
     fn agents_keep_names_that_readers_take_in_the_same_order() {
-        assert_eq!(folders(&[("1045", false), ("650", false), ("-1", true)]), ["1045", "650", "-1"]);
-        assert_eq!(folders(&[("650", false), ("1045", false)]), ["1001", "1002"], "the ego would be another one");
-        assert_eq!(folders(&[("vehicle", false), ("unit", true)]), ["1001", "-1"]);
-        assert_eq!(folders(&[("2", false), ("3", true)]), ["1001", "-1"], "a unit has a negative number");
+        assert_eq!(
+            folders(&[("1045", false), ("650", false), ("-1", true)]),
+            ["1045", "650", "-1"]
+        );
+        assert_eq!(
+            folders(&[("650", false), ("1045", false)]),
+            ["1001", "1002"],
+            "the ego would be another one"
+        );
+        assert_eq!(
+            folders(&[("vehicle", false), ("unit", true)]),
+            ["1001", "-1"]
+        );
+        assert_eq!(
+            folders(&[("2", false), ("3", true)]),
+            ["1001", "-1"],
+            "a unit has a negative number"
+        );
     }
 
     #[test]
@@ -130,8 +172,20 @@ mod tests {
         };
         let mut yaml = String::new();
         entry.write(&mut yaml).unwrap();
-        let keys: Vec<&str> = yaml.lines().filter_map(|line| line.trim().split_once(':')).map(|(key, _)| key).collect();
-        assert_eq!(keys, ["7", "angle", "ass_id", "center", "extent", "location", "obj_type", "speed"]);
-        assert!(yaml.contains("    - 0.0\n    - 90.0\n    - 0.0\n") && yaml.ends_with("speed: 36\n"), "{yaml}");
+        let keys: Vec<&str> = yaml
+            .lines()
+            .filter_map(|line| line.trim().split_once(':'))
+            .map(|(key, _)| key)
+            .collect();
+        assert_eq!(
+            keys,
+            [
+                "7", "angle", "ass_id", "center", "extent", "location", "obj_type", "speed"
+            ]
+        );
+        assert!(
+            yaml.contains("    - 0.0\n    - 90.0\n    - 0.0\n") && yaml.ends_with("speed: 36\n"),
+            "{yaml}"
+        );
     }
 }

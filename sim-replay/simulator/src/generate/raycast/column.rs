@@ -51,7 +51,11 @@ impl RayPattern {
     /// Time at which a column is measured: 0 at the start of the sweep, 1 at its end.
     #[must_use]
     pub(crate) fn time(&self, column: usize) -> f64 {
-        if self.rolling { (column + 1) as f64 / self.columns as f64 } else { 1.0 }
+        if self.rolling {
+            (column + 1) as f64 / self.columns as f64
+        } else {
+            1.0
+        }
     }
 }
 
@@ -69,14 +73,22 @@ impl ColumnRays<'_> {
     /// The first `count` rays; lets the compiler assume that all slices of a kernel have this length.
     #[inline]
     pub(super) fn cut(&self, count: usize) -> Self {
-        Self { cos: &self.cos[..count], sin: &self.sin[..count], ..*self }
+        Self {
+            cos: &self.cos[..count],
+            sin: &self.sin[..count],
+            ..*self
+        }
     }
 
     /// Unit normal of the plane in which the rays lie.
     #[inline]
     pub(super) fn normal(&self) -> [f32; 3] {
         let (h, u) = (self.forward, self.up);
-        [u[1] * h[2] - u[2] * h[1], u[2] * h[0] - u[0] * h[2], u[0] * h[1] - u[1] * h[0]]
+        [
+            u[1] * h[2] - u[2] * h[1],
+            u[2] * h[0] - u[0] * h[2],
+            u[0] * h[1] - u[1] * h[0],
+        ]
     }
 }
 
@@ -92,7 +104,12 @@ pub(super) struct ColumnPose {
 
 impl ColumnPose {
     /// The column of `sensor` at `column` of `pattern`, relative to `anchor`.
-    pub(super) fn new(pattern: &RayPattern, column: usize, sensor: &Sweep, anchor: &Vector3<f64>) -> Self {
+    pub(super) fn new(
+        pattern: &RayPattern,
+        column: usize,
+        sensor: &Sweep,
+        anchor: &Vector3<f64>,
+    ) -> Self {
         let time = pattern.time(column);
         let Placement { position_m, .. } = sensor.at(time);
         let rotation = sensor.at(time).rotation();

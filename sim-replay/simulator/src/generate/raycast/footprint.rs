@@ -32,8 +32,11 @@ pub(super) struct SensorFrames {
 
 impl SensorFrames {
     pub(super) fn new(sensor: &Sweep) -> Self {
-        let frame = |placement: &Placement| (placement.rotation().transpose(), placement.position_m);
-        Self { ends: [frame(&sensor.start), frame(&sensor.end)] }
+        let frame =
+            |placement: &Placement| (placement.rotation().transpose(), placement.position_m);
+        Self {
+            ends: [frame(&sensor.start), frame(&sensor.end)],
+        }
     }
 
     /// The footprint of `body`, or nothing if it is out of range or outside the field of view.
@@ -53,17 +56,30 @@ impl SensorFrames {
         }
         if nearest_m < TOUCHING_M {
             let channels = 0..pattern.channels;
-            return Some(Footprint { first_column: 0, columns: pattern.columns, channels, nearest_m: 0.0 });
+            return Some(Footprint {
+                first_column: 0,
+                columns: pattern.columns,
+                channels,
+                nearest_m: 0.0,
+            });
         }
         let channels = channels(pattern, &corners, nearest_m)?;
         let (first_column, columns) = columns(pattern, &flat, &center, nearest_m)?;
-        Some(Footprint { first_column, columns, channels, nearest_m })
+        Some(Footprint {
+            first_column,
+            columns,
+            channels,
+            nearest_m,
+        })
     }
 
     /// Cheap early test: most bodies of a scene are too far away.
     fn is_surely_out_of_range(&self, range_m: f32, body: &Body<'_>) -> bool {
-        let [near_x, near_y] =
-            [0, 1].map(|axis: usize| body.shape.bounds.min_m[axis].abs().max(body.shape.bounds.max_m[axis].abs()));
+        let [near_x, near_y] = [0, 1].map(|axis: usize| {
+            body.shape.bounds.min_m[axis]
+                .abs()
+                .max(body.shape.bounds.max_m[axis].abs())
+        });
         // Both ends may be a sweep's motion apart; the margin is conservative.
         let reach_m = f64::from(range_m + near_x + near_y) + 10.0;
         let offset = body.motion.end.position_m - self.ends[1].1;
@@ -75,7 +91,8 @@ impl SensorFrames {
         let poses = [0, 1].map(|end| {
             let (sensor_from_world, sensor_position) = &self.ends[end];
             let rotation: Matrix3<f32> = (sensor_from_world * ends[end].rotation()).cast();
-            let position: Vector3<f32> = (sensor_from_world * (ends[end].position_m - sensor_position)).cast();
+            let position: Vector3<f32> =
+                (sensor_from_world * (ends[end].position_m - sensor_position)).cast();
             (rotation, position)
         });
         let corners = bounds.corners();
@@ -88,27 +105,61 @@ impl SensorFrames {
     /// A lower bound of the horizontal distance: the best of a few lines that separate the sensor from the corners.
     fn nearest(&self, motion: &Sweep, flat: &[Vector2<f32>; 16], center: &Vector2<f32>) -> f32 {
         let axes: Matrix3<f32> = (self.ends[1].0 * motion.end.rotation()).cast();
-        let closest = flat.iter().min_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared())).unwrap_or(center);
+        let closest = flat
+            .iter()
+            .min_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))
+            .unwrap_or(center);
         let (x, y) = (axes.column(0).xy(), axes.column(1).xy());
         let directions = [x, -x, y, -y, *center, *closest];
         let parting = |direction: &Vector2<f32>| {
             let direction = direction.try_normalize(1e-6)?;
-            flat.iter().map(|corner| corner.dot(&direction)).min_by(f32::total_cmp)
+            flat.iter()
+                .map(|corner| corner.dot(&direction))
+                .min_by(f32::total_cmp)
         };
-        directions.iter().filter_map(parting).fold(f32::MIN, f32::max)
+        directions
+            .iter()
+            .filter_map(parting)
+            .fold(f32::MIN, f32::max)
     }
 }
 
 /// The channels between the lowest and the highest elevation at which a corner's height can be seen.
-fn channels(pattern: &RayPattern, corners: &[Vector3<f32>; 16], nearest_m: f32) -> Option<Range<usize>> {
-    let farthest_m = corners.iter().map(|corner| corner.xy().norm()).fold(0.0, f32::max) + BEND_M;
-    let low = corners.iter().map(|corner| corner.z).fold(f32::MAX, f32::min) - BEND_M;
-    let high = corners.iter().map(|corner| corner.z).fold(f32::MIN, f32::max) + BEND_M;
-    let steepest =
-        |height: f32, falling: bool| (height / if (height < 0.0) == falling { nearest_m } else { farthest_m }).atan();
-    let channel = |elevation: f32| (elevation - pattern.first_elevation_rad) / pattern.elevation_step_rad;
+fn channels(
+    pattern: &RayPattern,
+    corners: &[Vector3<f32>; 16],
+    nearest_m: f32,
+) -> Option<Range<usize>> {
+    let farthest_m = corners
+        .iter()
+        .map(|corner| corner.xy().norm())
+        .fold(0.0, f32::max)
+        + BEND_M;
+    let low = corners
+        .iter()
+        .map(|corner| corner.z)
+        .fold(f32::MAX, f32::min)
+        - BEND_M;
+    let high = corners
+        .iter()
+        .map(|corner| corner.z)
+        .fold(f32::MIN, f32::max)
+        + BEND_M;
+    let steepest = |height: f32, falling: bool| {
+        (height
+            / if (height < 0.0) == falling {
+                nearest_m
+            } else {
+                farthest_m
+            })
+        .atan()
+    };
+    let channel =
+        |elevation: f32| (elevation - pattern.first_elevation_rad) / pattern.elevation_step_rad;
     let first = channel(steepest(low, true)).floor().max(0.0);
-    let last = channel(steepest(high, false)).ceil().min((pattern.channels - 1) as f32);
+    let last = channel(steepest(high, false))
+        .ceil()
+        .min((pattern.channels - 1) as f32);
     (first <= last).then(|| first as usize..last as usize + 1)
 }
 
@@ -130,7 +181,10 @@ fn columns(
     let margin = BEND_M / nearest_m;
     let index = |azimuth: f32| (azimuth - pattern.first_azimuth_rad) / pattern.azimuth_step_rad;
     let interval = |turn: f32| {
-        let (a, b) = (index(middle + low - margin + turn), index(middle + high + margin + turn));
+        let (a, b) = (
+            index(middle + low - margin + turn),
+            index(middle + high + margin + turn),
+        );
         (a.min(b).floor() as i64 - 1, a.max(b).ceil() as i64 + 1)
     };
     let count = pattern.columns as i64;
@@ -139,7 +193,10 @@ fn columns(
         return Some((first, (last - first + 1).min(count) as usize));
     }
     debug_assert!(middle.abs() <= PI + 1e-3);
-    let clipped = [-TAU, 0.0, TAU].map(interval).into_iter().filter(|(first, last)| *last >= 0 && *first < count);
+    let clipped = [-TAU, 0.0, TAU]
+        .map(interval)
+        .into_iter()
+        .filter(|(first, last)| *last >= 0 && *first < count);
     let (first, last) = clipped.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
     let (first, last) = (first.max(0), last.min(count - 1));
     Some((first, (last - first + 1) as usize))

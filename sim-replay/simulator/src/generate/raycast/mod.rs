@@ -45,8 +45,16 @@ impl BodyShape {
     /// If `parts` is empty: a body without extent is an error of the caller.
     #[must_use]
     pub fn new(parts: Vec<Part>, reflectivity: f32) -> Self {
-        let bounds = parts.iter().map(Part::bounds).reduce(|a, b| a.union(&b)).expect("a body has parts");
-        Self { parts, bounds, reflectivity }
+        let bounds = parts
+            .iter()
+            .map(Part::bounds)
+            .reduce(|a, b| a.union(&b))
+            .expect("a body has parts");
+        Self {
+            parts,
+            bounds,
+            reflectivity,
+        }
     }
 }
 
@@ -142,7 +150,9 @@ impl Caster {
     /// A caster for sweeps of `pattern`.
     #[must_use]
     pub(crate) fn new(pattern: RayPattern) -> Self {
-        let elevations: Vec<f32> = (0..pattern.channels).map(|channel| pattern.elevation_rad(channel)).collect();
+        let elevations: Vec<f32> = (0..pattern.channels)
+            .map(|channel| pattern.elevation_rad(channel))
+            .collect();
         Self {
             cos: elevations.iter().map(|elevation| elevation.cos()).collect(),
             sin: elevations.iter().map(|elevation| elevation.sin()).collect(),
@@ -160,30 +170,53 @@ impl Caster {
     }
 
     /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are transparent.
-    pub(crate) fn cast(&mut self, sensor: &Sweep, ground: &dyn Surface, bodies: &[Body<'_>]) -> &RangeImage {
+    pub(crate) fn cast(
+        &mut self,
+        sensor: &Sweep,
+        ground: &dyn Surface,
+        bodies: &[Body<'_>],
+    ) -> &RangeImage {
         let anchor = sensor.end.position_m;
         let (pattern, channels) = (&self.pattern, self.pattern.channels);
         self.columns.clear();
-        self.columns.extend((0..pattern.columns).map(|column| ColumnPose::new(pattern, column, sensor, &anchor)));
+        self.columns.extend(
+            (0..pattern.columns).map(|column| ColumnPose::new(pattern, column, sensor, &anchor)),
+        );
         self.image.depths_m.clear();
-        self.image.depths_m.resize(pattern.columns * channels, pattern.range_m);
+        self.image
+            .depths_m
+            .resize(pattern.columns * channels, pattern.range_m);
         self.image.hits.clear();
         self.image.hits.resize(pattern.columns * channels, MISS);
 
-        let image = self.image.depths_m.chunks_exact_mut(channels).zip(self.image.hits.chunks_exact_mut(channels));
+        let image = self
+            .image
+            .depths_m
+            .chunks_exact_mut(channels)
+            .zip(self.image.hits.chunks_exact_mut(channels));
         for (pose, (depths, hits)) in self.columns.iter().zip(image) {
             let origin = anchor + pose.origin.cast::<f64>();
-            let rays = SurfaceRays { origin, forward: pose.forward, up: pose.up, cos: &self.cos, sin: &self.sin };
+            let rays = SurfaceRays {
+                origin,
+                forward: pose.forward,
+                up: pose.up,
+                cos: &self.cos,
+                sin: &self.sin,
+            };
             ground.cast(&rays, depths, hits);
         }
 
         let frames = SensorFrames::new(sensor);
         self.order.clear();
         let visible = bodies.iter().enumerate();
-        self.order.extend(visible.filter_map(|(index, body)| Some((frames.footprint(&self.pattern, body)?, index))));
+        self.order.extend(
+            visible
+                .filter_map(|(index, body)| Some((frames.footprint(&self.pattern, body)?, index))),
+        );
         // Near bodies first: bodies behind them need not be intersected. The index makes the order of ties
         // deterministic.
-        self.order.sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
+        self.order
+            .sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
         for index in 0..self.order.len() {
             let (footprint, body) = self.order[index].clone();
             self.cast_body(&bodies[body], &footprint, body as u32, &anchor);
@@ -198,7 +231,10 @@ impl Caster {
     }
 
     /// The columns of the last sweep in the frame of the sensor at the sweep's end, where de-skewed points lie.
-    pub(crate) fn columns_at_end<'a>(&'a self, sensor: &Sweep) -> impl Iterator<Item = SkewedColumn> + 'a {
+    pub(crate) fn columns_at_end<'a>(
+        &'a self,
+        sensor: &Sweep,
+    ) -> impl Iterator<Item = SkewedColumn> + 'a {
         let end_from_world: Matrix3<f32> = sensor.end.rotation().transpose().cast();
         self.columns.iter().map(move |pose| SkewedColumn {
             origin_m: end_from_world * pose.origin,
@@ -212,12 +248,24 @@ impl Caster {
         self.cos.iter().copied().zip(self.sin.iter().copied())
     }
 
-    fn cast_body(&mut self, body: &Body<'_>, footprint: &Footprint, id: u32, anchor: &Vector3<f64>) {
+    fn cast_body(
+        &mut self,
+        body: &Body<'_>,
+        footprint: &Footprint,
+        id: u32,
+        anchor: &Vector3<f64>,
+    ) {
         let count = self.pattern.columns as i64;
-        let (cos, sin) = (&self.cos[footprint.channels.clone()], &self.sin[footprint.channels.clone()]);
+        let (cos, sin) = (
+            &self.cos[footprint.channels.clone()],
+            &self.sin[footprint.channels.clone()],
+        );
         let frame = |time: f32| -> (Matrix3<f32>, Vector3<f32>) {
             let placement = body.motion.at(f64::from(time));
-            (placement.rotation().transpose().cast(), (placement.position_m - anchor).cast())
+            (
+                placement.rotation().transpose().cast(),
+                (placement.position_m - anchor).cast(),
+            )
         };
         let still = body.motion.is_still().then(|| frame(1.0));
         for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
@@ -225,7 +273,11 @@ impl Caster {
             let offset = column * self.pattern.channels;
             let range = offset + footprint.channels.start..offset + footprint.channels.end;
             let depths = &mut self.image.depths_m[range.clone()];
-            if depths.iter().fold(0.0f32, |far, &depth| if depth > far { depth } else { far }) < footprint.nearest_m {
+            if depths
+                .iter()
+                .fold(0.0f32, |far, &depth| if depth > far { depth } else { far })
+                < footprint.nearest_m
+            {
                 continue;
             }
             let hits = &mut self.image.hits[range];

@@ -74,7 +74,13 @@ impl Bounds {
     #[must_use]
     pub fn corners(&self) -> [[f32; 3]; 8] {
         std::array::from_fn(|corner| {
-            std::array::from_fn(|axis| if corner >> axis & 1 == 0 { self.min_m[axis] } else { self.max_m[axis] })
+            std::array::from_fn(|axis| {
+                if corner >> axis & 1 == 0 {
+                    self.min_m[axis]
+                } else {
+                    self.max_m[axis]
+                }
+            })
         })
     }
 
@@ -95,9 +101,11 @@ impl Part {
     pub fn bounds(&self) -> Bounds {
         match self {
             Self::Hull { bounds, .. } | Self::Box(bounds) => *bounds,
-            Self::Cylinder { center_m, radius_m, half_height_m } => {
-                Bounds::centered(*center_m, [*radius_m, *radius_m, *half_height_m])
-            }
+            Self::Cylinder {
+                center_m,
+                radius_m,
+                half_height_m,
+            } => Bounds::centered(*center_m, [*radius_m, *radius_m, *half_height_m]),
             Self::Ellipsoid { center_m, radii_m } => Bounds::centered(*center_m, *radii_m),
         }
     }
@@ -116,7 +124,11 @@ impl Part {
                     cast_box(bounds, rays, depth, hit, id);
                 }
             }
-            Self::Cylinder { center_m, radius_m, half_height_m } => {
+            Self::Cylinder {
+                center_m,
+                radius_m,
+                half_height_m,
+            } => {
                 if self.bounds().meets_plane(&rays.origin, &rays.normal()) {
                     cast_cylinder(*center_m, *radius_m, *half_height_m, rays, depth, hit, id);
                 }
@@ -152,7 +164,11 @@ fn greater(a: f32, b: f32) -> f32 {
 
 #[inline(always)]
 fn off_zero(value: f32) -> f32 {
-    if value.abs() < PARALLEL { -PARALLEL } else { value }
+    if value.abs() < PARALLEL {
+        -PARALLEL
+    } else {
+        value
+    }
 }
 
 fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
@@ -172,7 +188,13 @@ fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut
     }
 }
 
-fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
+fn cast_hull(
+    planes: &[[f32; 4]],
+    rays: &ColumnRays<'_>,
+    depth: &mut [f32],
+    hit: &mut [u32],
+    id: u32,
+) {
     const LANES: usize = 64;
     for start in (0..depth.len()).step_by(LANES) {
         let count = LANES.min(depth.len() - start);
@@ -181,17 +203,33 @@ fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, depth: &mut [f32], hit:
         for plane in planes {
             let dot = |v: &[f32; 3]| plane[0] * v[0] + plane[1] * v[1] + plane[2] * v[2];
             // Distance to the plane from inside, and its decrease along the two directions that span the column.
-            let (inside, along, rise) = (plane[3] - dot(&rays.origin), dot(&rays.forward), dot(&rays.up));
+            let (inside, along, rise) = (
+                plane[3] - dot(&rays.origin),
+                dot(&rays.forward),
+                dot(&rays.up),
+            );
             let lanes = enter[..count].iter_mut().zip(&mut exit[..count]);
-            for ((enter, exit), (cos, sin)) in lanes.zip(rays.cos[range.clone()].iter().zip(&rays.sin[range.clone()])) {
+            for ((enter, exit), (cos, sin)) in
+                lanes.zip(rays.cos[range.clone()].iter().zip(&rays.sin[range.clone()]))
+            {
                 let slope = off_zero(along * cos + rise * sin);
                 let at = inside / slope;
-                *enter = if slope < 0.0 { greater(*enter, at) } else { *enter };
-                *exit = if slope < 0.0 { *exit } else { lesser(*exit, at) };
+                *enter = if slope < 0.0 {
+                    greater(*enter, at)
+                } else {
+                    *enter
+                };
+                *exit = if slope < 0.0 {
+                    *exit
+                } else {
+                    lesser(*exit, at)
+                };
             }
         }
         let lanes = enter[..count].iter().zip(&exit[..count]);
-        for ((enter, exit), (depth, hit)) in lanes.zip(depth[range.clone()].iter_mut().zip(&mut hit[range])) {
+        for ((enter, exit), (depth, hit)) in
+            lanes.zip(depth[range.clone()].iter_mut().zip(&mut hit[range]))
+        {
             shorten(*enter, enter <= exit, depth, hit, id);
         }
     }
@@ -209,7 +247,11 @@ fn cast_cylinder(
     let o: [f32; 3] = std::array::from_fn(|axis| rays.origin[axis] - center[axis]);
     let (h, u) = (rays.forward, rays.up);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
-        let (dx, dy, dz) = (h[0] * cos + u[0] * sin, h[1] * cos + u[1] * sin, off_zero(h[2] * cos + u[2] * sin));
+        let (dx, dy, dz) = (
+            h[0] * cos + u[0] * sin,
+            h[1] * cos + u[1] * sin,
+            off_zero(h[2] * cos + u[2] * sin),
+        );
         let flat = greater(dx * dx + dy * dy, PARALLEL);
         // From the ray's distance to the axis rather than from b^2 - ac, which cancels for a thin pole far away.
         let aside = o[0] * dy - o[1] * dx;
@@ -217,7 +259,10 @@ fn cast_cylinder(
         let half_chord = greater(room, 0.0).sqrt();
         let middle = -(o[0] * dx + o[1] * dy);
         let inverse = 1.0 / dz;
-        let (a, b) = ((-half_height - o[2]) * inverse, (half_height - o[2]) * inverse);
+        let (a, b) = (
+            (-half_height - o[2]) * inverse,
+            (half_height - o[2]) * inverse,
+        );
         let enter = greater((middle - half_chord) / flat, lesser(a, b));
         let exit = lesser((middle + half_chord) / flat, greater(a, b));
         shorten(enter, (room >= 0.0) & (enter <= exit), depth, hit, id);
@@ -237,11 +282,20 @@ fn cast_ellipsoid(
     let h: [f32; 3] = std::array::from_fn(|axis| rays.forward[axis] / radii[axis]);
     let u: [f32; 3] = std::array::from_fn(|axis| rays.up[axis] / radii[axis]);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
-        let d = [h[0] * cos + u[0] * sin, h[1] * cos + u[1] * sin, h[2] * cos + u[2] * sin];
+        let d = [
+            h[0] * cos + u[0] * sin,
+            h[1] * cos + u[1] * sin,
+            h[2] * cos + u[2] * sin,
+        ];
         let square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
         let middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / square;
-        let closest = [o[0] + middle * d[0], o[1] + middle * d[1], o[2] + middle * d[2]];
-        let room = 1.0 - (closest[0] * closest[0] + closest[1] * closest[1] + closest[2] * closest[2]);
+        let closest = [
+            o[0] + middle * d[0],
+            o[1] + middle * d[1],
+            o[2] + middle * d[2],
+        ];
+        let room =
+            1.0 - (closest[0] * closest[0] + closest[1] * closest[1] + closest[2] * closest[2]);
         let enter = middle - (greater(room, 0.0) / square).sqrt();
         shorten(enter, room >= 0.0, depth, hit, id);
     }

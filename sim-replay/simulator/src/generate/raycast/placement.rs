@@ -21,7 +21,12 @@ impl Placement {
     /// A level placement.
     #[must_use]
     pub fn level(position_m: [f64; 3], yaw_rad: f64) -> Self {
-        Self { position_m: position_m.into(), yaw_rad, pitch_rad: 0.0, roll_rad: 0.0 }
+        Self {
+            position_m: position_m.into(),
+            yaw_rad,
+            pitch_rad: 0.0,
+            roll_rad: 0.0,
+        }
     }
 
     /// `world_from_self`, the turning part.
@@ -40,14 +45,19 @@ impl Placement {
     /// `world_from_self`.
     #[must_use]
     pub fn isometry(&self) -> Isometry3<f64> {
-        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(self.rotation()));
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(
+            self.rotation(),
+        ));
         Isometry3::from_parts(Translation3::from(self.position_m), rotation)
     }
 
     /// The placement of something mounted at `offset_m` in this frame, with the same axes.
     #[must_use]
     pub fn mounted(&self, offset_m: [f64; 3]) -> Self {
-        Self { position_m: self.position_m + self.rotation() * Vector3::from(offset_m), ..*self }
+        Self {
+            position_m: self.position_m + self.rotation() * Vector3::from(offset_m),
+            ..*self
+        }
     }
 }
 
@@ -64,7 +74,10 @@ impl Sweep {
     /// No motion.
     #[must_use]
     pub fn still(placement: Placement) -> Self {
-        Self { start: placement, end: placement }
+        Self {
+            start: placement,
+            end: placement,
+        }
     }
 
     /// True if start and end are the same.
@@ -79,7 +92,8 @@ impl Sweep {
         let mix = |a: f64, b: f64| a + (b - a) * time;
         let turn = wrapped(self.end.yaw_rad - self.start.yaw_rad);
         Placement {
-            position_m: self.start.position_m + (self.end.position_m - self.start.position_m) * time,
+            position_m: self.start.position_m
+                + (self.end.position_m - self.start.position_m) * time,
             // Backwards from the end, so that the pose at time 1 is the end to the last bit.
             yaw_rad: self.end.yaw_rad - turn * (1.0 - time),
             pitch_rad: mix(self.start.pitch_rad, self.end.pitch_rad),
@@ -90,7 +104,10 @@ impl Sweep {
     /// The motion of something mounted on this.
     #[must_use]
     pub fn mounted(&self, offset_m: [f64; 3]) -> Self {
-        Self { start: self.start.mounted(offset_m), end: self.end.mounted(offset_m) }
+        Self {
+            start: self.start.mounted(offset_m),
+            end: self.end.mounted(offset_m),
+        }
     }
 }
 
@@ -107,19 +124,30 @@ mod tests {
 
     #[test]
     fn pitch_lifts_the_nose_and_yaw_turns_left() {
-        let turned = Placement { pitch_rad: 0.1, ..Placement::level([0.0; 3], PI / 2.0) };
+        let turned = Placement {
+            pitch_rad: 0.1,
+            ..Placement::level([0.0; 3], PI / 2.0)
+        };
         let nose = turned.rotation() * Vector3::x();
         assert!((nose - Vector3::new(0.0, 0.1f64.cos(), 0.1f64.sin())).norm() < 1e-12);
     }
 
     #[test]
     fn roll_lifts_the_left_side_and_leaves_the_nose() {
-        let level = Placement { pitch_rad: 0.1, ..Placement::level([0.0; 3], PI / 2.0) };
-        let rotation = Placement { roll_rad: 0.2, ..level }.rotation();
+        let level = Placement {
+            pitch_rad: 0.1,
+            ..Placement::level([0.0; 3], PI / 2.0)
+        };
+        let rotation = Placement {
+            roll_rad: 0.2,
+            ..level
+        }
+        .rotation();
         assert!((rotation * Vector3::x() - level.rotation() * Vector3::x()).norm() < 1e-12);
         let left = rotation * Vector3::y();
         assert!(
-            (left.z - 0.2f64.sin() * 0.1f64.cos()).abs() < 1e-12 && (left.x + 0.2f64.cos()).abs() < 1e-12,
+            (left.z - 0.2f64.sin() * 0.1f64.cos()).abs() < 1e-12
+                && (left.x + 0.2f64.cos()).abs() < 1e-12,
             "{left}"
         );
     }
@@ -129,15 +157,27 @@ mod tests {
         let start = Placement::level([0.0; 3], 3.1);
         let end = Placement::level([1.0, 0.0, 0.0], -3.1);
         let middle = Sweep { start, end }.at(0.5);
-        assert!((wrapped(middle.yaw_rad - PI)).abs() < 1e-9 && (middle.position_m.x - 0.5).abs() < 1e-12);
+        assert!(
+            (wrapped(middle.yaw_rad - PI)).abs() < 1e-9
+                && (middle.position_m.x - 0.5).abs() < 1e-12
+        );
         assert_eq!(Sweep { start, end }.at(1.0).yaw_rad, -3.1);
     }
 
     #[test]
     fn the_rotation_is_that_of_the_isometry() {
-        let placement =
-            Placement { position_m: Vector3::new(1.0, 2.0, 3.0), yaw_rad: 0.7, pitch_rad: -0.2, roll_rad: 0.3 };
-        let difference = placement.isometry().rotation.to_rotation_matrix().into_inner() - placement.rotation();
+        let placement = Placement {
+            position_m: Vector3::new(1.0, 2.0, 3.0),
+            yaw_rad: 0.7,
+            pitch_rad: -0.2,
+            roll_rad: 0.3,
+        };
+        let difference = placement
+            .isometry()
+            .rotation
+            .to_rotation_matrix()
+            .into_inner()
+            - placement.rotation();
         assert!(difference.amax() < 1e-12);
     }
 }

@@ -39,8 +39,15 @@ fn random_part(random: &mut SplitMix64) -> Part {
     let half = [size(0.1, 6.0), size(0.1, 3.0), size(0.1, 4.0)];
     match random.below(4) {
         0 => Part::Box(Bounds::centered(center, half)),
-        1 => Part::Cylinder { center_m: center, radius_m: half[0] * 0.2, half_height_m: half[2] },
-        2 => Part::Ellipsoid { center_m: center, radii_m: half },
+        1 => Part::Cylinder {
+            center_m: center,
+            radius_m: half[0] * 0.2,
+            half_height_m: half[2],
+        },
+        2 => Part::Ellipsoid {
+            center_m: center,
+            radii_m: half,
+        },
         _ => {
             // A box with its upper edges cut off obliquely.
             let bounds = Bounds::centered(center, half);
@@ -60,9 +67,15 @@ fn random_part(random: &mut SplitMix64) -> Part {
 }
 
 fn random_motion(random: &mut SplitMix64, reach_m: f64) -> Sweep {
-    let position = [random.between(-reach_m, reach_m), random.between(-reach_m, reach_m), random.between(-1.0, 3.0)];
-    let start =
-        Placement { pitch_rad: random.between(-0.1, 0.1), ..Placement::level(position, random.between(-PI, PI)) };
+    let position = [
+        random.between(-reach_m, reach_m),
+        random.between(-reach_m, reach_m),
+        random.between(-1.0, 3.0),
+    ];
+    let start = Placement {
+        pitch_rad: random.between(-0.1, 0.1),
+        ..Placement::level(position, random.between(-PI, PI))
+    };
     if random.chance(0.4) {
         return Sweep::still(start);
     }
@@ -112,11 +125,17 @@ fn enter(part: &Part, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
             let planes: Vec<[f64; 4]> = planes.iter().map(|p| p.map(f64::from)).collect();
             clip(&planes).map(|(near, _)| near)
         }
-        Part::Cylinder { center_m, radius_m, .. } => {
+        Part::Cylinder {
+            center_m, radius_m, ..
+        } => {
             let c = center_m.map(f64::from);
             let (x, y) = (o.x - c[0], o.y - c[1]);
             let r = f64::from(*radius_m);
-            let (near, far) = roots(d.x * d.x + d.y * d.y, x * d.x + y * d.y, x * x + y * y - r * r)?;
+            let (near, far) = roots(
+                d.x * d.x + d.y * d.y,
+                x * d.x + y * d.y,
+                x * x + y * y - r * r,
+            )?;
             let (bottom, top) = clip(&slabs(&part.bounds(), &[2]))?;
             (near.max(bottom) <= far.min(top)).then(|| near.max(bottom))
         }
@@ -129,7 +148,12 @@ fn enter(part: &Part, o: &Point3<f64>, d: &Vector3<f64>) -> Option<f64> {
     }
 }
 
-fn brute_force(pattern: &RayPattern, sensor: &Sweep, ground: f64, bodies: &[Body<'_>]) -> RangeImage {
+fn brute_force(
+    pattern: &RayPattern,
+    sensor: &Sweep,
+    ground: f64,
+    bodies: &[Body<'_>],
+) -> RangeImage {
     let mut image = RangeImage::default();
     for column in 0..pattern.columns {
         let time = pattern.time(column);
@@ -138,7 +162,11 @@ fn brute_force(pattern: &RayPattern, sensor: &Sweep, ground: f64, bodies: &[Body
         for channel in 0..pattern.channels {
             let elevation = f64::from(pattern.elevation_rad(channel));
             let direction = world_from_sensor
-                * Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
+                * Vector3::new(
+                    elevation.cos() * azimuth.cos(),
+                    elevation.cos() * azimuth.sin(),
+                    elevation.sin(),
+                );
             let origin = world_from_sensor * Point3::origin();
             let (mut best, mut hit) = (f64::from(pattern.range_m), MISS);
             let at = (ground - origin.z) / direction.z;
@@ -161,16 +189,33 @@ fn brute_force(pattern: &RayPattern, sensor: &Sweep, ground: f64, bodies: &[Body
     image
 }
 
-fn check_against_brute_force(pattern: RayPattern, seeds: std::ops::Range<u64>, reach_m: f64, sensor_z: f64) {
+fn check_against_brute_force(
+    pattern: RayPattern,
+    seeds: std::ops::Range<u64>,
+    reach_m: f64,
+    sensor_z: f64,
+) {
     let mut caster = Caster::new(pattern.clone());
     let (mut rays, mut on_bodies, mut silhouettes) = (0, 0, 0);
     for seed in seeds {
         let mut random = SplitMix64::new(seed);
         let shapes: Vec<BodyShape> = (0..60)
-            .map(|_| BodyShape::new((0..=random.below(3)).map(|_| random_part(&mut random)).collect(), 1.0))
+            .map(|_| {
+                BodyShape::new(
+                    (0..=random.below(3))
+                        .map(|_| random_part(&mut random))
+                        .collect(),
+                    1.0,
+                )
+            })
             .collect();
-        let bodies: Vec<Body<'_>> =
-            shapes.iter().map(|shape| Body { shape, motion: random_motion(&mut random, reach_m) }).collect();
+        let bodies: Vec<Body<'_>> = shapes
+            .iter()
+            .map(|shape| Body {
+                shape,
+                motion: random_motion(&mut random, reach_m),
+            })
+            .collect();
         let mut sensor = random_motion(&mut random, 1.0);
         // Far from the origin of the world, where `f32` alone would be too coarse.
         let offset = Vector3::new(4_000.0, -7_000.0, sensor_z);
@@ -196,8 +241,14 @@ fn check_against_brute_force(pattern: RayPattern, seeds: std::ops::Range<u64>, r
             silhouettes += usize::from(error > 2e-3 || image.hits[ray] != expected.hits[ray]);
         }
     }
-    assert!(on_bodies * 5 > rays, "too few rays meet a body to prove anything: {on_bodies} of {rays}");
-    assert!(silhouettes * 2_000 < rays, "{silhouettes} of {rays} rays differ");
+    assert!(
+        on_bodies * 5 > rays,
+        "too few rays meet a body to prove anything: {on_bodies} of {rays}"
+    );
+    assert!(
+        silhouettes * 2_000 < rays,
+        "{silhouettes} of {rays} rays differ"
+    );
 }
 
 #[test]
@@ -212,16 +263,36 @@ fn a_fan_equals_brute_force() {
 
 #[test]
 fn bodies_around_the_sensor_do_not_hide_the_rest() {
-    let shell = BodyShape::new(vec![Part::Box(Bounds::centered([0.0; 3], [3.0, 1.0, 2.0]))], 1.0);
-    let wall = BodyShape::new(vec![Part::Box(Bounds::centered([0.0; 3], [0.5, 40.0, 8.0]))], 1.0);
+    let shell = BodyShape::new(
+        vec![Part::Box(Bounds::centered([0.0; 3], [3.0, 1.0, 2.0]))],
+        1.0,
+    );
+    let wall = BodyShape::new(
+        vec![Part::Box(Bounds::centered([0.0; 3], [0.5, 40.0, 8.0]))],
+        1.0,
+    );
     let bodies = [
-        Body { shape: &shell, motion: Sweep::still(Placement::level([0.0; 3], 0.0)) },
-        Body { shape: &wall, motion: Sweep::still(Placement::level([20.5, 0.0, 0.0], 0.0)) },
+        Body {
+            shape: &shell,
+            motion: Sweep::still(Placement::level([0.0; 3], 0.0)),
+        },
+        Body {
+            shape: &wall,
+            motion: Sweep::still(Placement::level([20.5, 0.0, 0.0], 0.0)),
+        },
     ];
     let mut caster = Caster::new(spinning());
-    let image = caster.cast(&Sweep::still(Placement::level([0.0, 0.0, 1.9], 0.0)), &Plane(0.0), &bodies);
+    let image = caster.cast(
+        &Sweep::still(Placement::level([0.0, 0.0, 1.9], 0.0)),
+        &Plane(0.0),
+        &bodies,
+    );
     assert!(image.hits.iter().all(|&hit| hit != 0) && image.hits.contains(&1));
     // Column 180 looks straight ahead: the wall's face is 20 m away in the channel nearest to level.
     let level = 180 * 64 + 58;
-    assert!((image.depths_m[level] - 20.0).abs() < 0.01, "{}", image.depths_m[level]);
+    assert!(
+        (image.depths_m[level] - 20.0).abs() < 0.01,
+        "{}",
+        image.depths_m[level]
+    );
 }

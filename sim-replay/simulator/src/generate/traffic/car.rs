@@ -45,7 +45,8 @@ impl Car {
 
     /// Placement after `drive_m` more metres of its path.
     pub(crate) fn placement_after(&self, roads: &Roads<'_>, drive_m: f64) -> Placement {
-        self.path.placement(roads.graph, drive_m, self.wheelbase_m(), self.aside_m)
+        self.path
+            .placement(roads.graph, drive_m, self.wheelbase_m(), self.aside_m)
     }
 
     /// Its footprint now.

@@ -47,7 +47,12 @@ impl Driver {
     }
 
     /// Acceleration at `speed_mps` for a desired speed of `wanted_mps`, metres per second squared.
-    pub(crate) fn acceleration_mps2(&self, speed_mps: f64, wanted_mps: f64, obstacles: &[Obstacle]) -> f64 {
+    pub(crate) fn acceleration_mps2(
+        &self,
+        speed_mps: f64,
+        wanted_mps: f64,
+        obstacles: &[Obstacle],
+    ) -> f64 {
         let wanted = wanted_mps.max(0.1);
         let free = if speed_mps <= wanted {
             self.acceleration_mps2 * (1.0 - (speed_mps / wanted).powi(4))
@@ -55,14 +60,18 @@ impl Driver {
             // The model's own term brakes far too hard before a mere bend.
             -self.comfort_mps2 * (1.0 - wanted / speed_mps).max(0.0).sqrt() * 1.5
         };
-        let most = obstacles.iter().map(|obstacle| self.interaction(speed_mps, obstacle)).fold(0.0, f64::max);
+        let most = obstacles
+            .iter()
+            .map(|obstacle| self.interaction(speed_mps, obstacle))
+            .fold(0.0, f64::max);
         (free - self.acceleration_mps2 * most).max(-EMERGENCY_MPS2)
     }
 
     fn interaction(&self, speed_mps: f64, obstacle: &Obstacle) -> f64 {
         let closing = speed_mps - obstacle.speed_mps;
         let braking = 2.0 * (self.acceleration_mps2 * self.comfort_mps2).sqrt();
-        let wanted_gap = self.jam_gap_m + (speed_mps * self.headway_s + speed_mps * closing / braking).max(0.0);
+        let wanted_gap =
+            self.jam_gap_m + (speed_mps * self.headway_s + speed_mps * closing / braking).max(0.0);
         (wanted_gap / obstacle.gap_m.max(0.1)).powi(2)
     }
 }
@@ -75,12 +84,21 @@ pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
     (0..points.len())
         .map(|index| {
             let at = |index: usize| [points[index][0], points[index][1]];
-            let (a, b, c) = (at(index.saturating_sub(REACH)), at(index), at((index + REACH).min(points.len() - 1)));
+            let (a, b, c) = (
+                at(index.saturating_sub(REACH)),
+                at(index),
+                at((index + REACH).min(points.len() - 1)),
+            );
             let side = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
-            let doubled_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
+            let doubled_area =
+                ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
             let product = side(a, b) * side(b, c) * side(a, c);
             // Curvature of the circle through the three points.
-            let curvature = if product > 1e-6 { 2.0 * doubled_area / product } else { 0.0 };
+            let curvature = if product > 1e-6 {
+                2.0 * doubled_area / product
+            } else {
+                0.0
+            };
             let bend = (SIDEWAYS_MPS2 / curvature.max(1e-6)).sqrt().max(CRAWL_MPS);
             lane.speed_limit_mps.min(bend) as f32
         })
@@ -101,21 +119,50 @@ mod tests {
         }
         assert!((speed - 12.0).abs() < 0.3, "{speed}");
         for _ in 0..4000 {
-            let obstacle = Obstacle { gap_m: 400.0 - position, speed_mps: 0.0 };
-            speed = f64::max(0.0, speed + 0.05 * driver.acceleration_mps2(speed, 12.0, &[obstacle]));
+            let obstacle = Obstacle {
+                gap_m: 400.0 - position,
+                speed_mps: 0.0,
+            };
+            speed = f64::max(
+                0.0,
+                speed + 0.05 * driver.acceleration_mps2(speed, 12.0, &[obstacle]),
+            );
             position += 0.05 * speed;
         }
-        assert!(speed < 0.05 && position < 399.0 && position > 395.0, "{speed} {position}");
+        assert!(
+            speed < 0.05 && position < 399.0 && position > 395.0,
+            "{speed} {position}"
+        );
     }
 
     #[test]
     fn bends_are_slow_and_straights_are_not() {
-        let circle = (0..60).map(|i| [20.0 * (f64::from(i) / 20.0).cos(), 20.0 * (f64::from(i) / 20.0).sin(), 0.0]);
+        let circle = (0..60).map(|i| {
+            [
+                20.0 * (f64::from(i) / 20.0).cos(),
+                20.0 * (f64::from(i) / 20.0).sin(),
+                0.0,
+            ]
+        });
         let bend = Lane::new(LaneId(0), circle.collect(), 3.5, 20.0);
         let speeds = bend_speeds_mps(&bend);
         let expected = (SIDEWAYS_MPS2 * 20.0).sqrt() as f32;
-        assert!(speeds[5..55].iter().all(|speed| (speed - expected).abs() < 0.1), "{speeds:?}");
-        let straight = Lane::new(LaneId(0), (0..60).map(|i| [f64::from(i), 0.0, 0.0]).collect(), 3.5, 20.0);
-        assert!(bend_speeds_mps(&straight).iter().all(|&speed| speed == 20.0));
+        assert!(
+            speeds[5..55]
+                .iter()
+                .all(|speed| (speed - expected).abs() < 0.1),
+            "{speeds:?}"
+        );
+        let straight = Lane::new(
+            LaneId(0),
+            (0..60).map(|i| [f64::from(i), 0.0, 0.0]).collect(),
+            3.5,
+            20.0,
+        );
+        assert!(
+            bend_speeds_mps(&straight)
+                .iter()
+                .all(|&speed| speed == 20.0)
+        );
     }
 }

@@ -35,14 +35,22 @@ impl Explorer {
             for next in roads.onward(lane.id) {
                 onto[next.0 as usize].push((lane.id, length_m));
             }
-            for beside in [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(lane)) {
+            for beside in [Side::Left, Side::Right]
+                .into_iter()
+                .filter_map(|side| side.of(lane))
+            {
                 onto[beside.0 as usize].push((lane.id, CHANGE_M));
             }
         }
-        let is_road =
-            lanes.iter().map(|lane| !lane.in_junction && lane.length_m >= SHORTEST_M && roads.is_endless(lane.id));
-        let mut explorer =
-            Self { onto, is_road: is_road.collect(), visits: vec![0; lanes.len()], unknown_m: Vec::new() };
+        let is_road = lanes.iter().map(|lane| {
+            !lane.in_junction && lane.length_m >= SHORTEST_M && roads.is_endless(lane.id)
+        });
+        let mut explorer = Self {
+            onto,
+            is_road: is_road.collect(),
+            visits: vec![0; lanes.len()],
+            unknown_m: Vec::new(),
+        };
         explorer.choose(start);
         explorer
     }
@@ -63,9 +71,15 @@ impl Explorer {
     /// Keeps the lanes with the shortest distance to a least visited one.
     pub(super) fn keep_best(&mut self, lanes: &mut Vec<LaneId>) {
         let distances: Vec<Option<u64>> = lanes.iter().map(|&lane| self.unknown_m(lane)).collect();
-        let Some(least) = distances.iter().flatten().min() else { return };
+        let Some(least) = distances.iter().flatten().min() else {
+            return;
+        };
         let mut distances = distances.iter();
-        lanes.retain(|_| distances.next().is_some_and(|distance| distance.as_ref() == Some(least)));
+        lanes.retain(|_| {
+            distances
+                .next()
+                .is_some_and(|distance| distance.as_ref() == Some(least))
+        });
     }
 
     /// True if the lane `beside` justifies the change from `own`.
@@ -88,14 +102,20 @@ impl Explorer {
         let roads = || (0..self.visits.len()).filter(|&lane| self.is_road[lane]);
         let fewest = roads().map(|lane| self.visits[lane]).min();
         let mut unknown_m = vec![None; self.visits.len()];
-        let mut open: BinaryHeap<_> =
-            roads().filter(|&lane| Some(self.visits[lane]) == fewest).map(|lane| Reverse((0, lane))).collect();
+        let mut open: BinaryHeap<_> = roads()
+            .filter(|&lane| Some(self.visits[lane]) == fewest)
+            .map(|lane| Reverse((0, lane)))
+            .collect();
         while let Some(Reverse((distance_m, lane))) = open.pop() {
             if unknown_m[lane].is_some() {
                 continue;
             }
             unknown_m[lane] = Some(distance_m);
-            open.extend(self.onto[lane].iter().map(|&(from, cost_m)| Reverse((distance_m + cost_m, from.0 as usize))));
+            open.extend(
+                self.onto[lane]
+                    .iter()
+                    .map(|&(from, cost_m)| Reverse((distance_m + cost_m, from.0 as usize))),
+            );
         }
         unknown_m
     }
@@ -117,11 +137,17 @@ mod tests {
             let mut onward = roads.onward(lane);
             explorer.keep_best(&mut onward);
             // Lane changes are part of the route where they shorten it.
-            let beside = [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(map_model.lanes.lane(lane)));
-            lane = beside.into_iter().find(|&beside| explorer.prefers(beside, lane)).unwrap_or(onward[0]);
+            let beside = [Side::Left, Side::Right]
+                .into_iter()
+                .filter_map(|side| side.of(map_model.lanes.lane(lane)));
+            lane = beside
+                .into_iter()
+                .find(|&beside| explorer.prefers(beside, lane))
+                .unwrap_or(onward[0]);
             explorer.choose(lane);
         }
-        let known = (0..explorer.visits.len()).filter(|&lane| explorer.is_road[lane] && explorer.visits[lane] > 0);
+        let known = (0..explorer.visits.len())
+            .filter(|&lane| explorer.is_road[lane] && explorer.visits[lane] > 0);
         assert!(known.count() * 100 >= count * 98, "{count} roads");
     }
 }

@@ -12,15 +12,27 @@ pub(crate) struct RightOfWay {
 
 impl RightOfWay {
     pub(crate) fn new(lanes: usize) -> Self {
-        Self { holders: vec![Vec::new(); lanes] }
+        Self {
+            holders: vec![Vec::new(); lanes],
+        }
     }
 
     /// Reserves a lane for a vehicle, unless another one holds a conflicting lane.
-    pub(crate) fn take(&mut self, index: u32, car: &mut Car, lane: LaneId, roads: &Roads<'_>) -> bool {
+    pub(crate) fn take(
+        &mut self,
+        index: u32,
+        car: &mut Car,
+        lane: LaneId,
+        roads: &Roads<'_>,
+    ) -> bool {
         if car.held.contains(&lane) {
             return true;
         }
-        let taken = |other: &LaneId| self.holders[other.0 as usize].iter().any(|&holder| holder != index);
+        let taken = |other: &LaneId| {
+            self.holders[other.0 as usize]
+                .iter()
+                .any(|&holder| holder != index)
+        };
         if roads.graph.lane(lane).conflicts.iter().any(taken) {
             return false;
         }
@@ -36,7 +48,9 @@ impl RightOfWay {
         }
         let needed: Vec<LaneId> = if car.is_present {
             let under = car.path.lanes_under(roads.graph, car.half_length_m() + 0.5);
-            under.chain(car.path.ahead(roads.graph).map(|(lane, _)| lane)).collect()
+            under
+                .chain(car.path.ahead(roads.graph).map(|(lane, _)| lane))
+                .collect()
         } else {
             Vec::new()
         };

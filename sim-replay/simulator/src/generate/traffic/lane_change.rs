@@ -74,7 +74,11 @@ pub(crate) struct LaneChangeState {
 
 impl LaneChangeState {
     pub(crate) fn random(random: &mut SplitMix64) -> Self {
-        Self { held_up_s: 0.0, random_change: None, random_change_timer_s: random.between(0.0, 50.0) }
+        Self {
+            held_up_s: 0.0,
+            random_change: None,
+            random_change_timer_s: random.between(0.0, 50.0),
+        }
     }
 }
 
@@ -109,20 +113,36 @@ impl Traffic<'_> {
         let state = &mut car.lane_change;
         // The waiting time after a change elapses in any case.
         let is_rising = is_held_up || state.held_up_s < 0.0;
-        state.held_up_s = if is_rising { state.held_up_s + STEP_S } else { (state.held_up_s - STEP_S).max(0.0) };
+        state.held_up_s = if is_rising {
+            state.held_up_s + STEP_S
+        } else {
+            (state.held_up_s - STEP_S).max(0.0)
+        };
         state.random_change_timer_s -= STEP_S;
         if state.random_change_timer_s > 0.0 {
             return;
         }
         // A random change expires; after the pause there may be another one.
-        let random_change = if state.random_change.is_some() { None } else { self.random_change(index) };
-        let turns_in_s = if random_change.is_some() { RANDOM_CHANGE_S } else { self.time_to_random_change_s(index) };
+        let random_change = if state.random_change.is_some() {
+            None
+        } else {
+            self.random_change(index)
+        };
+        let turns_in_s = if random_change.is_some() {
+            RANDOM_CHANGE_S
+        } else {
+            self.time_to_random_change_s(index)
+        };
         let state = &mut self.cars[index].lane_change;
         (state.random_change, state.random_change_timer_s) = (random_change, turns_in_s);
     }
 
     fn time_to_random_change_s(&mut self, index: usize) -> f64 {
-        let [low, high] = if self.explores(index) { [4.0, 16.0] } else { [20.0, 80.0] };
+        let [low, high] = if self.explores(index) {
+            [4.0, 16.0]
+        } else {
+            [20.0, 80.0]
+        };
         self.random.between(low, high)
     }
 
@@ -135,7 +155,9 @@ impl Traffic<'_> {
         let own = self.cars[index].path.lane();
         let sides = [Side::Left, Side::Right];
         let lane = self.roads.graph.lane(own);
-        let sides = sides.into_iter().filter_map(|side| Some((side, side.of(lane)?)));
+        let sides = sides
+            .into_iter()
+            .filter_map(|side| Some((side, side.of(lane)?)));
         let mut sides: Vec<(Side, LaneId)> = sides.collect();
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             let wanted = |&(_, lane): &(Side, LaneId)| explorer.prefers(lane, own);
@@ -180,8 +202,10 @@ impl Traffic<'_> {
     fn gain_mps2(&self, index: usize, path: &Path) -> f64 {
         let car = &self.cars[index];
         let wanted_mps = free_speed_mps(car, self.roads);
-        let with =
-            |leader: Option<Obstacle>| car.driver.acceleration_mps2(car.speed_mps, wanted_mps, leader.as_slice());
+        let with = |leader: Option<Obstacle>| {
+            car.driver
+                .acceleration_mps2(car.speed_mps, wanted_mps, leader.as_slice())
+        };
         with(self.leader_on(index, path)) - with(car.leader)
     }
 
@@ -197,24 +221,39 @@ impl Traffic<'_> {
             return false;
         }
         let brakes_softly = |car: &Car, ahead: Obstacle| {
-            let braking = -car.driver.acceleration_mps2(car.speed_mps, car.speed_mps, &[ahead]);
+            let braking = -car
+                .driver
+                .acceleration_mps2(car.speed_mps, car.speed_mps, &[ahead]);
             ahead.gap_m > SAFE_GAP_M && braking < SAFE_MPS2
         };
-        if !self.leader_on(index, path).is_none_or(|leader| brakes_softly(car, leader)) {
+        if !self
+            .leader_on(index, path)
+            .is_none_or(|leader| brakes_softly(car, leader))
+        {
             return false;
         }
         let follower = self.follower_on(index, path.lane(), path.s_m());
         let is_let_in = |(follower, apart_m): (usize, f64)| {
             let follower = &self.cars[follower];
             let gap_m = apart_m - car.half_length_m() - follower.half_length_m();
-            brakes_softly(follower, Obstacle { gap_m, speed_mps: car.speed_mps })
+            brakes_softly(
+                follower,
+                Obstacle {
+                    gap_m,
+                    speed_mps: car.speed_mps,
+                },
+            )
         };
         if !follower.is_none_or(is_let_in) {
             return false;
         }
         // Vehicles that are not in the list of the lane: those that cross it, or have nearly left it.
-        let beside =
-            Path::new(path.lane(), path.s_m()).placement(self.roads.graph, 0.0, car.wheelbase_m(), car.aside_m);
+        let beside = Path::new(path.lane(), path.s_m()).placement(
+            self.roads.graph,
+            0.0,
+            car.wheelbase_m(),
+            car.aside_m,
+        );
         let mut room = Rectangle::new(&beside, &car.vehicle.size_m).grown(0.3);
         room.half_m[0] += SAFE_GAP_M;
         self.is_free(index, &room, near)
@@ -233,10 +272,19 @@ impl Traffic<'_> {
                 .filter(|&(other, apart_m)| other != index && apart_m >= 0.0)
                 .min_by(|a, b| a.1.total_cmp(&b.1));
             match behind {
-                Some(found) if nearest.is_none_or(|(_, least_m)| found.1 < least_m) => nearest = Some(found),
+                Some(found) if nearest.is_none_or(|(_, least_m)| found.1 < least_m) => {
+                    nearest = Some(found)
+                }
                 Some(_) => {}
                 None if start_m < BEHIND_M => {
-                    open.extend(self.roads.graph.lane(lane).predecessors.iter().map(|&before| (before, start_m)));
+                    open.extend(
+                        self.roads
+                            .graph
+                            .lane(lane)
+                            .predecessors
+                            .iter()
+                            .map(|&before| (before, start_m)),
+                    );
                 }
                 None => {}
             }
@@ -247,11 +295,19 @@ impl Traffic<'_> {
     fn begin_change(&mut self, index: usize, path: Path) {
         let pause_s = self.time_to_random_change_s(index);
         let car = &mut self.cars[index];
-        car.lane_change = LaneChangeState { held_up_s: -REST_S, random_change: None, random_change_timer_s: pause_s };
+        car.lane_change = LaneChangeState {
+            held_up_s: -REST_S,
+            random_change: None,
+            random_change_timer_s: pause_s,
+        };
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             // Lanes that were decided but will not be driven do not count.
-            car.path.ahead(self.roads.graph).skip(1).for_each(|(lane, _)| explorer.give_up(lane));
-            path.ahead(self.roads.graph).for_each(|(lane, _)| explorer.choose(lane));
+            car.path
+                .ahead(self.roads.graph)
+                .skip(1)
+                .for_each(|(lane, _)| explorer.give_up(lane));
+            path.ahead(self.roads.graph)
+                .for_each(|(lane, _)| explorer.choose(lane));
         }
         let entry = (path.s_m(), index as u32);
         let occupants = &mut self.occupants[path.lane().0 as usize];
@@ -268,7 +324,8 @@ fn free_speed_mps(car: &Car, roads: &Roads<'_>) -> f64 {
 
 fn is_held_up(car: &Car, roads: &Roads<'_>) -> bool {
     let slow_mps = SLOW_SHARE * free_speed_mps(car, roads);
-    let is_slow = |leader: &Obstacle| leader.speed_mps < slow_mps && leader.gap_m < 8.0 + 2.5 * car.speed_mps;
+    let is_slow =
+        |leader: &Obstacle| leader.speed_mps < slow_mps && leader.gap_m < 8.0 + 2.5 * car.speed_mps;
     car.leader.as_ref().is_some_and(is_slow) && car.speed_mps < slow_mps
 }
 
@@ -281,7 +338,11 @@ fn change_m(car: &Car) -> f64 {
 fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     let graph = roads.graph;
     let is_in_junction = |lane: LaneId| graph.lane(lane).in_junction;
-    if car.path.lanes_under(graph, car.half_length_m()).any(is_in_junction) {
+    if car
+        .path
+        .lanes_under(graph, car.half_length_m())
+        .any(is_in_junction)
+    {
         return None;
     }
     let mut left = car.path.lane();
@@ -302,7 +363,11 @@ fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
         }
         (lane, left) = roads.onward(lane).into_iter().find_map(|next| {
             let next_left = side.opposite().of(graph.lane(next))?;
-            graph.lane(left).successors.contains(&next_left).then_some((next, next_left))
+            graph
+                .lane(left)
+                .successors
+                .contains(&next_left)
+                .then_some((next, next_left))
         })?;
     }
 }

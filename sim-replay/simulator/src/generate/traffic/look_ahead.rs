@@ -31,7 +31,8 @@ impl Traffic<'_> {
         obstacles.extend(self.end_of_the_way(index));
         let wanted = self.wanted_speed_mps(index);
         let car = &self.cars[index];
-        car.driver.acceleration_mps2(car.speed_mps, wanted, &obstacles)
+        car.driver
+            .acceleration_mps2(car.speed_mps, wanted, &obstacles)
     }
 
     /// The speed permitted by limits and bends ahead, metres per second.
@@ -70,7 +71,10 @@ impl Traffic<'_> {
             if let Some(&(s_m, other)) = self.occupants[lane.0 as usize].iter().find(is_ahead) {
                 let leader = &self.cars[other as usize];
                 let gap_m = start_m + s_m - car.half_length_m() - leader.half_length_m();
-                return Some(Obstacle { gap_m, speed_mps: leader.speed_mps });
+                return Some(Obstacle {
+                    gap_m,
+                    speed_mps: leader.speed_mps,
+                });
             }
         }
         None
@@ -100,21 +104,29 @@ impl Traffic<'_> {
                 // Already across the line: wait in the lane for the others by the swept way alone.
                 continue;
             }
-            return Some(Obstacle { gap_m: start_m - car.half_length_m() - STOP_LINE_M, speed_mps: 0.0 });
+            return Some(Obstacle {
+                gap_m: start_m - car.half_length_m() - STOP_LINE_M,
+                speed_mps: 0.0,
+            });
         }
         None
     }
 
     /// True if the lane behind a junction has space for one more vehicle.
     fn has_exit_room(&self, index: usize, exit: Option<LaneId>) -> bool {
-        let Some(exit) = exit.filter(|exit| !self.roads.graph.lane(*exit).in_junction) else { return true };
-        let Some(&(s_m, last)) = self.occupants[exit.0 as usize].iter().find(|(_, other)| *other as usize != index)
+        let Some(exit) = exit.filter(|exit| !self.roads.graph.lane(*exit).in_junction) else {
+            return true;
+        };
+        let Some(&(s_m, last)) = self.occupants[exit.0 as usize]
+            .iter()
+            .find(|(_, other)| *other as usize != index)
         else {
             return true;
         };
         let last = &self.cars[last as usize];
         let room_m = s_m - last.half_length_m();
-        last.speed_mps > MOVING_ON_MPS || room_m > 2.0 * self.cars[index].half_length_m() + EXIT_ROOM_M
+        last.speed_mps > MOVING_ON_MPS
+            || room_m > 2.0 * self.cars[index].half_length_m() + EXIT_ROOM_M
     }
 
     /// The nearest vehicle that stands or drives the same way in the strip that the vehicle will sweep: merging lanes,
@@ -127,7 +139,8 @@ impl Traffic<'_> {
         let reach_m = (6.0 + 2.5 * car.speed_mps).min(30.0);
         let here = car.motion.end;
         let (sin, cos) = here.yaw_rad.sin_cos();
-        self.index.near(car.point_m(), reach_m + car.half_length_m() + 6.0, near);
+        self.index
+            .near(car.point_m(), reach_m + car.half_length_m() + 6.0, near);
         near.retain(|&other| {
             let other_car = &self.cars[other as usize];
             let offset = other_car.motion.end.position_m - here.position_m;
@@ -146,13 +159,17 @@ impl Traffic<'_> {
         let mut ahead_m = car.half_length_m();
         while ahead_m < car.half_length_m() + reach_m {
             let [x, y, _] = car.path.point_m(self.roads.graph, ahead_m);
-            let hit =
-                near.iter().find(|&&other| self.cars[other as usize].rectangle().distance_m([x, y]) < half_width_m);
+            let hit = near.iter().find(|&&other| {
+                self.cars[other as usize].rectangle().distance_m([x, y]) < half_width_m
+            });
             if let Some(&other) = hit {
                 let other = &self.cars[other as usize];
                 let turned = wrapped(other.motion.end.yaw_rad - here.yaw_rad);
                 let speed_mps = (other.speed_mps * turned.cos()).max(0.0);
-                return Some(Obstacle { gap_m: ahead_m - car.half_length_m(), speed_mps });
+                return Some(Obstacle {
+                    gap_m: ahead_m - car.half_length_m(),
+                    speed_mps,
+                });
             }
             ahead_m += SWEEP_STEP_M;
         }
@@ -163,6 +180,9 @@ impl Traffic<'_> {
     fn end_of_the_way(&self, index: usize) -> Option<Obstacle> {
         let car = &self.cars[index];
         let left_m = car.path.remaining_m(self.roads.graph);
-        (left_m < super::DECIDED_M).then(|| Obstacle { gap_m: left_m - car.half_length_m(), speed_mps: 0.0 })
+        (left_m < super::DECIDED_M).then(|| Obstacle {
+            gap_m: left_m - car.half_length_m(),
+            speed_mps: 0.0,
+        })
     }
 }

@@ -83,7 +83,8 @@ impl<'t> Traffic<'t> {
             self.drive(index, speed, &mut near);
         }
         for index in 0..self.cars.len() {
-            self.right_of_way.release_behind(index as u32, &mut self.cars[index], self.roads);
+            self.right_of_way
+                .release_behind(index as u32, &mut self.cars[index], self.roads);
         }
         self.exchange_far_cars();
     }
@@ -98,14 +99,22 @@ impl<'t> Traffic<'t> {
         let is_free = speed_mps == 0.0 || self.is_free(index, &footprint, near);
         let car = &mut self.cars[index];
         if is_free {
-            car.path.advance(self.roads.graph, distance_m, car.vehicle.size_m[0]);
-            car.motion = Sweep { start, end: if speed_mps == 0.0 { start } else { end } };
+            car.path
+                .advance(self.roads.graph, distance_m, car.vehicle.size_m[0]);
+            car.motion = Sweep {
+                start,
+                end: if speed_mps == 0.0 { start } else { end },
+            };
             car.speed_mps = speed_mps;
         } else {
             car.motion = Sweep::still(start);
             car.speed_mps = 0.0;
         }
-        car.standing_s = if car.speed_mps < 0.1 { car.standing_s + STEP_S } else { 0.0 };
+        car.standing_s = if car.speed_mps < 0.1 {
+            car.standing_s + STEP_S
+        } else {
+            0.0
+        };
         let to = car.point_m();
         self.index.relocate(index as u32, from, to);
     }
@@ -114,17 +123,30 @@ impl<'t> Traffic<'t> {
     fn is_free(&self, index: usize, footprint: &Rectangle, near: &mut Vec<u32>) -> bool {
         let radius_m = footprint.radius_m() + 9.0;
         self.index.near(footprint.center_m, radius_m, near);
-        let cars = near.iter().map(|&other| other as usize).filter(|&other| other != index);
-        if cars.into_iter().any(|other| self.cars[other].rectangle().overlaps(footprint)) {
+        let cars = near
+            .iter()
+            .map(|&other| other as usize)
+            .filter(|&other| other != index);
+        if cars
+            .into_iter()
+            .any(|other| self.cars[other].rectangle().overlaps(footprint))
+        {
             return false;
         }
         self.parked_index.near(footprint.center_m, radius_m, near);
-        !near.iter().any(|&spot| self.parked[spot as usize].overlaps(footprint))
+        !near
+            .iter()
+            .any(|&spot| self.parked[spot as usize].overlaps(footprint))
     }
 
     fn list_occupants(&mut self) {
         self.occupants.iter_mut().for_each(Vec::clear);
-        for (index, car) in self.cars.iter().enumerate().filter(|(_, car)| car.is_present) {
+        for (index, car) in self
+            .cars
+            .iter()
+            .enumerate()
+            .filter(|(_, car)| car.is_present)
+        {
             self.occupants[car.path.lane().0 as usize].push((car.path.s_m(), index as u32));
             // Vehicles behind it on the lane that it leaves must not hit it.
             if let Some((lane, s_m)) = car.path.leaving(self.roads.graph) {
@@ -139,8 +161,12 @@ impl<'t> Traffic<'t> {
     /// Appends lanes to paths that are too short.
     fn decide_ways(&mut self) {
         for index in 0..self.cars.len() {
-            while self.cars[index].is_present && self.cars[index].path.remaining_m(self.roads.graph) < DECIDED_M {
-                let Some(next) = self.choose_next(index) else { break };
+            while self.cars[index].is_present
+                && self.cars[index].path.remaining_m(self.roads.graph) < DECIDED_M
+            {
+                let Some(next) = self.choose_next(index) else {
+                    break;
+                };
                 self.cars[index].path.push(next);
             }
         }

@@ -47,7 +47,10 @@ impl Change {
     }
 
     fn left_beside(&self, lane: LaneId) -> Option<LaneId> {
-        self.beside.iter().find(|pair| pair.lane == lane).map(|pair| pair.left)
+        self.beside
+            .iter()
+            .find(|pair| pair.lane == lane)
+            .map(|pair| pair.left)
     }
 }
 
@@ -57,7 +60,12 @@ const LEFT_SHARE: f64 = 0.7;
 impl Path {
     /// Starts on one lane.
     pub(crate) fn new(lane: LaneId, s_m: f64) -> Self {
-        Self { lanes: VecDeque::from([lane]), current: 0, s_m, change: None }
+        Self {
+            lanes: VecDeque::from([lane]),
+            current: 0,
+            s_m,
+            change: None,
+        }
     }
 
     /// The lane under the vehicle's centre.
@@ -82,11 +90,22 @@ impl Path {
 
     /// Leaves the present lane for its neighbour over `length_m` metres: `beside` are the lanes of the new path from
     /// there on, `s_m` is the vehicle's position on the first. The curve begins at the front axle.
-    pub(crate) fn change(&mut self, beside: Vec<Beside>, s_m: f64, length_m: f64, wheelbase_m: f64) {
+    pub(crate) fn change(
+        &mut self,
+        beside: Vec<Beside>,
+        s_m: f64,
+        length_m: f64,
+        wheelbase_m: f64,
+    ) {
         self.lanes.truncate(self.current);
         self.lanes.extend(beside.iter().map(|pair| pair.lane));
         self.s_m = s_m;
-        self.change = Some(Change { beside, done_m: -0.5 * wheelbase_m, length_m, wheelbase_m });
+        self.change = Some(Change {
+            beside,
+            done_m: -0.5 * wheelbase_m,
+            length_m,
+            wheelbase_m,
+        });
     }
 
     /// True if the vehicle is between two lanes.
@@ -96,19 +115,31 @@ impl Path {
 
     /// The lane that the vehicle is leaving and its position there, metres, while it occupies space there.
     pub(crate) fn leaving(&self, graph: &LaneGraph) -> Option<(LaneId, f64)> {
-        let change = self.change.as_ref().filter(|change| change.share(0.0) < LEFT_SHARE)?;
+        let change = self
+            .change
+            .as_ref()
+            .filter(|change| change.share(0.0) < LEFT_SHARE)?;
         let left = change.left_beside(self.lane())?;
-        Some((left, self.s_m / graph.lane(self.lane()).length_m * graph.lane(left).length_m))
+        Some((
+            left,
+            self.s_m / graph.lane(self.lane()).length_m * graph.lane(left).length_m,
+        ))
     }
 
     /// Length of the decided path ahead, metres.
     pub(crate) fn remaining_m(&self, graph: &LaneGraph) -> f64 {
-        self.ahead(graph).map(|(lane, start_m)| start_m + graph.lane(lane).length_m).last().unwrap_or(0.0)
+        self.ahead(graph)
+            .map(|(lane, start_m)| start_m + graph.lane(lane).length_m)
+            .last()
+            .unwrap_or(0.0)
     }
 
     /// The lane under the vehicle and those ahead, each with the distance to its start (negative for the first),
     /// metres.
-    pub(crate) fn ahead<'a>(&'a self, graph: &'a LaneGraph) -> impl Iterator<Item = (LaneId, f64)> + 'a {
+    pub(crate) fn ahead<'a>(
+        &'a self,
+        graph: &'a LaneGraph,
+    ) -> impl Iterator<Item = (LaneId, f64)> + 'a {
         let mut start_m = -self.s_m;
         self.lanes.iter().skip(self.current).map(move |&lane| {
             let entry = (lane, start_m);
@@ -123,13 +154,20 @@ impl Path {
         if let Some(change) = &mut self.change {
             change.done_m += distance_m;
         }
-        self.change.take_if(|change| change.done_m > change.length_m + 0.5 * change.wheelbase_m);
+        self.change
+            .take_if(|change| change.done_m > change.length_m + 0.5 * change.wheelbase_m);
         while self.s_m > graph.lane(self.lane()).length_m && self.current + 1 < self.lanes.len() {
             self.s_m -= graph.lane(self.lane()).length_m;
             self.current += 1;
         }
         let behind = |path: &Self| -> f64 {
-            path.lanes.iter().take(path.current).skip(1).map(|&lane| graph.lane(lane).length_m).sum::<f64>() + path.s_m
+            path.lanes
+                .iter()
+                .take(path.current)
+                .skip(1)
+                .map(|&lane| graph.lane(lane).length_m)
+                .sum::<f64>()
+                + path.s_m
         };
         while self.current > 0 && behind(self) > keep_behind_m {
             self.lanes.pop_front();
@@ -138,7 +176,11 @@ impl Path {
     }
 
     /// Lanes touched by the stretch from `behind_m` behind to the vehicle's centre, the current one first.
-    pub(crate) fn lanes_under(&self, graph: &LaneGraph, behind_m: f64) -> impl Iterator<Item = LaneId> + '_ {
+    pub(crate) fn lanes_under(
+        &self,
+        graph: &LaneGraph,
+        behind_m: f64,
+    ) -> impl Iterator<Item = LaneId> + '_ {
         let mut left_m = behind_m - self.s_m;
         let mut lanes = vec![self.lane()];
         for &lane in self.lanes.iter().take(self.current).rev() {
@@ -160,7 +202,9 @@ impl Path {
 
     /// Slope across the path there, radians; positive where the left side is higher.
     fn bank_rad(&self, graph: &LaneGraph, offset_m: f64) -> f64 {
-        self.mixed(graph, offset_m, Lane::bank_rad, |from, to, share| from + share * (to - from))
+        self.mixed(graph, offset_m, Lane::bank_rad, |from, to, share| {
+            from + share * (to - from)
+        })
     }
 
     /// Value of a lane property `offset_m` ahead of the vehicle's centre; during a change, mixed from both lanes.
@@ -182,7 +226,9 @@ impl Path {
         }
         let lane = graph.lane(self.lanes[index]);
         let own = on(lane, s_m);
-        let Some(change) = &self.change else { return own };
+        let Some(change) = &self.change else {
+            return own;
+        };
         let share = change.share(offset_m);
         match change.left_beside(lane.id) {
             Some(left) if share < 1.0 => {
@@ -196,7 +242,13 @@ impl Path {
 
     /// Placement of a vehicle of this wheelbase after `drive_m` more metres, both axles on the path, `aside_m` to the
     /// left of it.
-    pub(crate) fn placement(&self, graph: &LaneGraph, drive_m: f64, wheelbase_m: f64, aside_m: f64) -> Placement {
+    pub(crate) fn placement(
+        &self,
+        graph: &LaneGraph,
+        drive_m: f64,
+        wheelbase_m: f64,
+        aside_m: f64,
+    ) -> Placement {
         let front = self.point_m(graph, drive_m + 0.5 * wheelbase_m);
         let rear = self.point_m(graph, drive_m - 0.5 * wheelbase_m);
         let (dx, dy, dz) = (front[0] - rear[0], front[1] - rear[1], front[2] - rear[2]);
@@ -205,9 +257,16 @@ impl Path {
         let roll_rad = self.bank_rad(graph, drive_m);
         let (rise, flat) = roll_rad.sin_cos();
         let aside_flat_m = aside_m * flat;
-        let position =
-            [middle[0] - aside_flat_m * dy / base, middle[1] + aside_flat_m * dx / base, middle[2] + aside_m * rise];
-        Placement { pitch_rad: dz.atan2(base), roll_rad, ..Placement::level(position, dy.atan2(dx)) }
+        let position = [
+            middle[0] - aside_flat_m * dy / base,
+            middle[1] + aside_flat_m * dx / base,
+            middle[2] + aside_m * rise,
+        ];
+        Placement {
+            pitch_rad: dz.atan2(base),
+            roll_rad,
+            ..Placement::level(position, dy.atan2(dx))
+        }
     }
 }
 
@@ -216,7 +275,11 @@ fn point_on(lane: &Lane, s_m: f64) -> [f64; 3] {
     let (point, heading) = lane.at(s_m);
     let beyond_m = s_m - s_m.clamp(0.0, lane.length_m);
     let (sin, cos) = heading.sin_cos();
-    [point[0] + beyond_m * cos, point[1] + beyond_m * sin, point[2]]
+    [
+        point[0] + beyond_m * cos,
+        point[1] + beyond_m * sin,
+        point[2],
+    ]
 }
 
 #[cfg(test)]
@@ -224,7 +287,11 @@ mod tests {
     use super::*;
 
     fn two_lanes() -> LaneGraph {
-        let line = |from: i32, to: i32| (from..=to).map(|x| [f64::from(x), 0.0, 0.1 * f64::from(x)]).collect();
+        let line = |from: i32, to: i32| {
+            (from..=to)
+                .map(|x| [f64::from(x), 0.0, 0.1 * f64::from(x)])
+                .collect()
+        };
         let mut first = Lane::new(LaneId(0), line(0, 20), 3.5, 10.0);
         first.successors = vec![LaneId(1)];
         LaneGraph::new(vec![first, Lane::new(LaneId(1), line(20, 50), 3.5, 10.0)])
@@ -237,7 +304,10 @@ mod tests {
         path.push(LaneId(1));
         path.advance(&graph, 3.0, 6.0);
         assert_eq!((path.lane(), path.s_m()), (LaneId(1), 1.0));
-        assert_eq!(path.lanes_under(&graph, 3.0).collect::<Vec<_>>(), [LaneId(1), LaneId(0)]);
+        assert_eq!(
+            path.lanes_under(&graph, 3.0).collect::<Vec<_>>(),
+            [LaneId(1), LaneId(0)]
+        );
         let placement = path.placement(&graph, 0.0, 3.0, 0.5);
         assert!((placement.position_m - nalgebra::Vector3::new(21.0, 0.5, 2.1)).norm() < 1e-9);
         assert!((placement.pitch_rad - 0.1f64.atan()).abs() < 1e-9);
@@ -253,18 +323,38 @@ mod tests {
         ]);
         let mut path = Path::new(LaneId(0), 20.0);
         let before = path.placement(&graph, 0.0, 3.0, 0.0);
-        path.change(vec![Beside { lane: LaneId(1), left: LaneId(0) }], 20.0, 40.0, 3.0);
+        path.change(
+            vec![Beside {
+                lane: LaneId(1),
+                left: LaneId(0),
+            }],
+            20.0,
+            40.0,
+            3.0,
+        );
         assert_eq!(path.placement(&graph, 0.0, 3.0, 0.0), before);
-        assert_eq!((path.lane(), path.leaving(&graph)), (LaneId(1), Some((LaneId(0), 20.0))));
+        assert_eq!(
+            (path.lane(), path.leaving(&graph)),
+            (LaneId(1), Some((LaneId(0), 20.0)))
+        );
         let mut last = before;
         while path.is_changing() {
             let next = path.placement(&graph, 0.5, 3.0, 0.0);
             path.advance(&graph, 0.5, 5.0);
-            assert!((path.placement(&graph, 0.0, 3.0, 0.0).position_m - next.position_m).norm() < 1e-9);
+            assert!(
+                (path.placement(&graph, 0.0, 3.0, 0.0).position_m - next.position_m).norm() < 1e-9
+            );
             let moved = next.position_m - last.position_m;
-            assert!(moved.y >= 0.0 && (moved.norm() - 0.5).abs() < 0.01, "{moved}");
+            assert!(
+                moved.y >= 0.0 && (moved.norm() - 0.5).abs() < 0.01,
+                "{moved}"
+            );
             // The nose points where the vehicle goes.
-            assert!((moved.y.atan2(moved.x) - next.yaw_rad).abs() < 0.02, "{moved} {}", next.yaw_rad);
+            assert!(
+                (moved.y.atan2(moved.x) - next.yaw_rad).abs() < 0.02,
+                "{moved} {}",
+                next.yaw_rad
+            );
             last = next;
         }
         assert_eq!((last.position_m.y, last.yaw_rad), (3.5, 0.0));

@@ -23,12 +23,20 @@ impl Rectangle {
         let [x, y, z_m] = placement.position_m.into();
         // On a banked road vehicles side by side are closer to each other as seen from above.
         let half_width_m = 0.5 * size_m[1] * placement.roll_rad.cos();
-        Self { center_m: [x, y], axis: [cos, sin], half_m: [0.5 * size_m[0], half_width_m], z_m }
+        Self {
+            center_m: [x, y],
+            axis: [cos, sin],
+            half_m: [0.5 * size_m[0], half_width_m],
+            z_m,
+        }
     }
 
     /// Grown by `margin_m` on every side.
     pub(crate) fn grown(&self, margin_m: f64) -> Self {
-        Self { half_m: self.half_m.map(|half| half + margin_m), ..*self }
+        Self {
+            half_m: self.half_m.map(|half| half + margin_m),
+            ..*self
+        }
     }
 
     /// Radius of the circle around it.
@@ -38,20 +46,27 @@ impl Rectangle {
 
     /// True if both lie on one level and share a point (separating axes).
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
-        let offset = [other.center_m[0] - self.center_m[0], other.center_m[1] - self.center_m[1]];
-        if (self.z_m - other.z_m).abs() > LEVEL_M || offset[0].hypot(offset[1]) > self.radius_m() + other.radius_m() {
+        let offset = [
+            other.center_m[0] - self.center_m[0],
+            other.center_m[1] - self.center_m[1],
+        ];
+        if (self.z_m - other.z_m).abs() > LEVEL_M
+            || offset[0].hypot(offset[1]) > self.radius_m() + other.radius_m()
+        {
             return false;
         }
         let side = |axis: [f64; 2]| [-axis[1], axis[0]];
         let axes = [self.axis, side(self.axis), other.axis, side(other.axis)];
-        axes.iter().all(|axis| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis))
+        axes.iter()
+            .all(|axis| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis))
     }
 
     /// Distance of a point from the rectangle, 0 inside, metres.
     pub(crate) fn distance_m(&self, point: [f64; 2]) -> f64 {
         let offset = [point[0] - self.center_m[0], point[1] - self.center_m[1]];
         let along = (dot(self.axis, offset).abs() - self.half_m[0]).max(0.0);
-        let aside = ((self.axis[0] * offset[1] - self.axis[1] * offset[0]).abs() - self.half_m[1]).max(0.0);
+        let aside =
+            ((self.axis[0] * offset[1] - self.axis[1] * offset[0]).abs() - self.half_m[1]).max(0.0);
         along.hypot(aside)
     }
 
@@ -76,7 +91,10 @@ pub(crate) struct NeighbourIndex {
 
 impl NeighbourIndex {
     fn cell(point: [f64; 2]) -> (i32, i32) {
-        ((point[0] / CELL_M).floor() as i32, (point[1] / CELL_M).floor() as i32)
+        (
+            (point[0] / CELL_M).floor() as i32,
+            (point[1] / CELL_M).floor() as i32,
+        )
     }
 
     pub(crate) fn insert(&mut self, index: u32, point: [f64; 2]) {

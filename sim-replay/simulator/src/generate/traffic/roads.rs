@@ -32,9 +32,17 @@ impl<'t> Roads<'t> {
     pub(crate) fn new(graph: &'t LaneGraph) -> Self {
         let endless = endless_lanes(graph);
         let any_endless = endless.contains(&true);
-        let open = graph.lanes.iter().filter(|lane| !lane.in_junction && (!any_endless || endless[lane.id.0 as usize]));
+        let open = graph
+            .lanes
+            .iter()
+            .filter(|lane| !lane.in_junction && (!any_endless || endless[lane.id.0 as usize]));
         let spawns = open.flat_map(spawns_of).collect();
-        Self { graph, bend_speeds: graph.lanes.iter().map(bend_speeds_mps).collect(), endless, spawns }
+        Self {
+            graph,
+            bend_speeds: graph.lanes.iter().map(bend_speeds_mps).collect(),
+            endless,
+            spawns,
+        }
     }
 
     /// Highest speed at a position on a lane, metres per second.
@@ -52,8 +60,16 @@ impl<'t> Roads<'t> {
     /// The successors of a lane: those that never end, if there are any.
     pub(crate) fn onward(&self, lane: LaneId) -> Vec<LaneId> {
         let successors = &self.graph.lane(lane).successors;
-        let endless: Vec<LaneId> = successors.iter().copied().filter(|next| self.endless[next.0 as usize]).collect();
-        if endless.is_empty() { successors.clone() } else { endless }
+        let endless: Vec<LaneId> = successors
+            .iter()
+            .copied()
+            .filter(|next| self.endless[next.0 as usize])
+            .collect();
+        if endless.is_empty() {
+            successors.clone()
+        } else {
+            endless
+        }
     }
 }
 
@@ -62,20 +78,30 @@ fn spawns_of(lane: &Lane) -> impl Iterator<Item = Spawn> + '_ {
     (0..count).map(|index| {
         let s_m = SPAWN_EDGE_M + SPAWN_STEP_M * index as f64;
         let ([x, y, _], _) = lane.at(s_m);
-        Spawn { lane: lane.id, s_m, point_m: [x, y] }
+        Spawn {
+            lane: lane.id,
+            s_m,
+            point_m: [x, y],
+        }
     })
 }
 
 /// Removes lanes without successors until none is left.
 fn endless_lanes(graph: &LaneGraph) -> Vec<bool> {
-    let mut onward: Vec<usize> = graph.lanes.iter().map(|lane| lane.successors.len()).collect();
+    let mut onward: Vec<usize> = graph
+        .lanes
+        .iter()
+        .map(|lane| lane.successors.len())
+        .collect();
     let mut before: Vec<Vec<LaneId>> = vec![Vec::new(); graph.lanes.len()];
     for lane in &graph.lanes {
         for next in &lane.successors {
             before[next.0 as usize].push(lane.id);
         }
     }
-    let mut ends: Vec<usize> = (0..onward.len()).filter(|&lane| onward[lane] == 0).collect();
+    let mut ends: Vec<usize> = (0..onward.len())
+        .filter(|&lane| onward[lane] == 0)
+        .collect();
     while let Some(end) = ends.pop() {
         for previous in &before[end] {
             let left = &mut onward[previous.0 as usize];
@@ -94,7 +120,14 @@ mod tests {
 
     #[test]
     fn a_dead_end_is_avoided_where_a_ring_leads_on() {
-        let straight = |id| Lane::new(LaneId(id), (0..40).map(|x| [f64::from(x), 0.0, 0.0]).collect(), 3.5, 10.0);
+        let straight = |id| {
+            Lane::new(
+                LaneId(id),
+                (0..40).map(|x| [f64::from(x), 0.0, 0.0]).collect(),
+                3.5,
+                10.0,
+            )
+        };
         let mut lanes = vec![straight(0), straight(1), straight(2), straight(3)];
         lanes[0].successors = vec![LaneId(1), LaneId(2)];
         lanes[1].successors = vec![LaneId(0)];

@@ -53,7 +53,9 @@ impl<'t> Traffic<'t> {
             index: NeighbourIndex::default(),
             random: SplitMix64::new(seed),
             next_id: FOCUS_ID,
-            explorer: options.focus_explores.then(|| Explorer::new(roads, start.lane)),
+            explorer: options
+                .focus_explores
+                .then(|| Explorer::new(roads, start.lane)),
         };
         let focus = Vehicle::random_connected(&mut traffic.random);
         traffic.add(focus, start);
@@ -85,11 +87,21 @@ impl<'t> Traffic<'t> {
             let distance = (spawn.point_m[0] - center_m[0]).hypot(spawn.point_m[1] - center_m[1]);
             (low_m..high_m).contains(&distance)
         };
-        self.roads.spawns.iter().filter(is_inside).copied().collect()
+        self.roads
+            .spawns
+            .iter()
+            .filter(is_inside)
+            .copied()
+            .collect()
     }
 
     fn has_room(&self, vehicle: &Vehicle, spawn: Spawn, index: usize, near: &mut Vec<u32>) -> bool {
-        let placement = Path::new(spawn.lane, spawn.s_m).placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], 0.0);
+        let placement = Path::new(spawn.lane, spawn.s_m).placement(
+            self.roads.graph,
+            0.0,
+            0.6 * vehicle.size_m[0],
+            0.0,
+        );
         let mut footprint = Rectangle::new(&placement, &vehicle.size_m).grown(0.4);
         footprint.half_m[0] += SPAWN_ROOM_M;
         self.is_free(index, &footprint, near)
@@ -102,7 +114,8 @@ impl<'t> Traffic<'t> {
         let lane_change = LaneChangeState::random(&mut self.random);
         let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
         let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
-        self.index.insert(self.cars.len() as u32, placement.position_m.xy().into());
+        self.index
+            .insert(self.cars.len() as u32, placement.position_m.xy().into());
         self.cars.push(Car {
             id: self.next_id,
             vehicle,
@@ -135,17 +148,20 @@ impl<'t> Traffic<'t> {
             if car.is_present {
                 let point_m = car.point_m();
                 let distance_m = (point_m[0] - center_m[0]).hypot(point_m[1] - center_m[1]);
-                let is_at_an_end = car.path.remaining_m(self.roads.graph) < car.half_length_m() + 3.0;
+                let is_at_an_end =
+                    car.path.remaining_m(self.roads.graph) < car.half_length_m() + 3.0;
                 if distance_m > self.options.radius_m || is_at_an_end || Some(index) == stuck {
                     self.index.remove(index as u32, point_m);
                     let car = &mut self.cars[index];
                     car.is_present = false;
-                    self.right_of_way.release_behind(index as u32, car, self.roads);
+                    self.right_of_way
+                        .release_behind(index as u32, car, self.roads);
                 }
                 continue;
             }
             let low_m = self.options.radius_m - EDGE_M;
-            let edge = edge.get_or_insert_with(|| self.spawns_between(center_m, low_m, self.options.radius_m));
+            let edge = edge
+                .get_or_insert_with(|| self.spawns_between(center_m, low_m, self.options.radius_m));
             for _ in 0..TRIES.min(edge.len()) {
                 let spawn = edge[self.random.below(edge.len())];
                 if self.has_room(&self.cars[index].vehicle, spawn, index, &mut near) {
@@ -162,12 +178,14 @@ impl<'t> Traffic<'t> {
         let over_s = self.cars[0].standing_s - STUCK_S;
         if over_s > 0.0 && over_s % NEXT_LEAVES_S < STEP_S {
             let center_m = self.cars[0].point_m();
-            let distance_m = |car: &Car| (car.point_m()[0] - center_m[0]).hypot(car.point_m()[1] - center_m[1]);
+            let distance_m =
+                |car: &Car| (car.point_m()[0] - center_m[0]).hypot(car.point_m()[1] - center_m[1]);
             let standing = (1..self.cars.len()).filter(|&index| {
                 let car = &self.cars[index];
                 car.is_present && car.standing_s > NEXT_LEAVES_S
             });
-            return standing.min_by(|&a, &b| distance_m(&self.cars[a]).total_cmp(&distance_m(&self.cars[b])));
+            return standing
+                .min_by(|&a, &b| distance_m(&self.cars[a]).total_cmp(&distance_m(&self.cars[b])));
         }
         let is_first = |car: &Car| car.leader.is_none_or(|leader| leader.gap_m > QUEUE_GAP_M);
         let stuck = (1..self.cars.len()).filter(|&index| {

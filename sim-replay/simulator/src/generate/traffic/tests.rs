@@ -5,7 +5,11 @@ use crate::generate::vehicle::Vehicle;
 use crate::map::{Lane, LaneGraph, LaneId, RoadMapSource, build, lane_builder, opendrive};
 
 fn options(vehicles_per_km: f64) -> TrafficOptions {
-    TrafficOptions { vehicles_per_km, radius_m: 210.0, focus_explores: false }
+    TrafficOptions {
+        vehicles_per_km,
+        radius_m: 210.0,
+        focus_explores: false,
+    }
 }
 
 /// Overlapping pairs of footprints among those that are present.
@@ -14,7 +18,9 @@ fn overlaps(traffic: &Traffic<'_>) -> Vec<(i64, i64)> {
     let mut pairs = Vec::new();
     for (place, car) in present.iter().enumerate() {
         let rectangle = car.rectangle();
-        let others = present[place + 1..].iter().filter(|other| other.rectangle().overlaps(&rectangle));
+        let others = present[place + 1..]
+            .iter()
+            .filter(|other| other.rectangle().overlaps(&rectangle));
         pairs.extend(others.map(|other| (car.id, other.id)));
     }
     pairs
@@ -28,13 +34,27 @@ fn no_vehicles_overlap_and_most_move() {
         for seed in 0..3 {
             let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
             let mut traffic = Traffic::new(&roads, &[], options(35.0), start, seed);
-            assert!(traffic.cars.len() > 20, "{}: {} vehicles", map_model.name, traffic.cars.len());
+            assert!(
+                traffic.cars.len() > 20,
+                "{}: {} vehicles",
+                map_model.name,
+                traffic.cars.len()
+            );
             let (mut moving, mut all, mut changing) = (0, 0, 0);
             for step in 0..1200 {
                 traffic.step();
-                changing += traffic.cars.iter().filter(|car| car.path.is_changing()).count();
+                changing += traffic
+                    .cars
+                    .iter()
+                    .filter(|car| car.path.is_changing())
+                    .count();
                 if step % 5 == 0 {
-                    assert_eq!(overlaps(&traffic), [], "{} seed {seed} step {step}", map_model.name);
+                    assert_eq!(
+                        overlaps(&traffic),
+                        [],
+                        "{} seed {seed} step {step}",
+                        map_model.name
+                    );
                 }
                 if step > 600 {
                     let present = traffic.cars.iter().filter(|car| car.is_present);
@@ -42,9 +62,18 @@ fn no_vehicles_overlap_and_most_move() {
                     moving += present.filter(|car| car.speed_mps > 0.5).count();
                 }
             }
-            assert!(moving * 2 > all, "{} seed {seed}: {moving} of {all} vehicle steps are moving", map_model.name);
+            assert!(
+                moving * 2 > all,
+                "{} seed {seed}: {moving} of {all} vehicle steps are moving",
+                map_model.name
+            );
             // The first map has one lane each way.
-            assert_eq!(changing > 0, source == RoadMapSource::Town4, "{} seed {seed}: {changing}", map_model.name);
+            assert_eq!(
+                changing > 0,
+                source == RoadMapSource::Town4,
+                "{} seed {seed}: {changing}",
+                map_model.name
+            );
         }
     }
 }
@@ -55,7 +84,10 @@ fn vehicles_keep_a_gap_and_stop_behind_standing_ones() {
     let graph = LaneGraph::new(vec![Lane::new(LaneId(0), line, 3.5, 14.0)]);
     let roads = Roads::new(&graph);
     let blocked = Vehicle::random_parked(&mut SplitMix64::new(1));
-    let parked = [Rectangle::new(&super::super::raycast::Placement::level([300.0, 0.0, 0.0], 0.0), &blocked.size_m)];
+    let parked = [Rectangle::new(
+        &super::super::raycast::Placement::level([300.0, 0.0, 0.0], 0.0),
+        &blocked.size_m,
+    )];
     let mut traffic = Traffic::new(&roads, &parked, options(20.0), roads.spawns[2], 3);
     for _ in 0..2000 {
         traffic.step();
@@ -86,7 +118,12 @@ fn two_lanes(length_m: i32) -> LaneGraph {
 
 fn add_slow(traffic: &mut Traffic<'_>, lane: u32, s_m: f64, pace: f64) {
     let vehicle = Vehicle::random_driving(&mut SplitMix64::new(7));
-    let spawn = *traffic.roads.spawns.iter().find(|spawn| spawn.lane == LaneId(lane) && spawn.s_m >= s_m).unwrap();
+    let spawn = *traffic
+        .roads
+        .spawns
+        .iter()
+        .find(|spawn| spawn.lane == LaneId(lane) && spawn.s_m >= s_m)
+        .unwrap();
     traffic.add(vehicle, spawn);
     let car = traffic.cars.last_mut().unwrap();
     car.driver.pace = pace;
@@ -107,9 +144,21 @@ fn a_driver_changes_lanes_smoothly_to_get_past_somebody_slow() {
         let (now, speed_mps) = (focus.motion.end, focus.speed_mps);
         assert_eq!(focus.motion.start, last);
         let moved = now.position_m - last.position_m;
-        assert!(moved.y.abs() < 2.0 * STEP_S, "{} m/s sideways", moved.y / STEP_S);
-        assert!((moved.norm() - speed_mps * STEP_S).abs() < 0.02 * speed_mps * STEP_S + 1e-9, "{moved} {speed_mps}");
-        assert!((now.yaw_rad - last.yaw_rad).abs() < 0.03, "{} {}", now.yaw_rad, last.yaw_rad);
+        assert!(
+            moved.y.abs() < 2.0 * STEP_S,
+            "{} m/s sideways",
+            moved.y / STEP_S
+        );
+        assert!(
+            (moved.norm() - speed_mps * STEP_S).abs() < 0.02 * speed_mps * STEP_S + 1e-9,
+            "{moved} {speed_mps}"
+        );
+        assert!(
+            (now.yaw_rad - last.yaw_rad).abs() < 0.03,
+            "{} {}",
+            now.yaw_rad,
+            last.yaw_rad
+        );
         last = now;
     }
     let slow = traffic.cars[1].motion.end.position_m;
@@ -128,17 +177,31 @@ fn no_lane_change_causes_a_collision() {
     for _ in 0..1200 {
         traffic.step();
         assert_eq!(overlaps(&traffic), []);
-        assert!(traffic.cars.iter().all(|car| car.motion.end.position_m.y > -0.3));
+        assert!(
+            traffic
+                .cars
+                .iter()
+                .all(|car| car.motion.end.position_m.y > -0.3)
+        );
     }
     let ahead = |index: usize| traffic.cars[index].motion.end.position_m.x;
-    assert!(ahead(0) < ahead(1) && ahead(0) < ahead(2), "{} {} {}", ahead(0), ahead(1), ahead(2));
+    assert!(
+        ahead(0) < ahead(1) && ahead(0) < ahead(2),
+        "{} {} {}",
+        ahead(0),
+        ahead(1),
+        ahead(2)
+    );
 }
 
 #[test]
 fn an_exploring_focus_drives_several_lanes_of_a_road() {
     let map_model = build(&RoadMapSource::Town4, 0).unwrap();
     let roads = Roads::new(&map_model.lanes);
-    let options = TrafficOptions { focus_explores: true, ..options(12.0) };
+    let options = TrafficOptions {
+        focus_explores: true,
+        ..options(12.0)
+    };
     let mut both = 0;
     for seed in 0..4 {
         let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
@@ -149,7 +212,12 @@ fn an_exploring_focus_drives_several_lanes_of_a_road() {
             driven[traffic.cars[0].path.lane().0 as usize] = true;
         }
         let is_driven = |lane: &Option<LaneId>| lane.is_some_and(|lane| driven[lane.0 as usize]);
-        both += map_model.lanes.lanes.iter().filter(|lane| driven[lane.id.0 as usize] && is_driven(&lane.left)).count();
+        both += map_model
+            .lanes
+            .lanes
+            .iter()
+            .filter(|lane| driven[lane.id.0 as usize] && is_driven(&lane.left))
+            .count();
     }
     assert!(both >= 4, "{both} lanes were driven beside another one");
 }
@@ -161,7 +229,11 @@ fn the_same_seed_drives_the_same_way() {
     let end = |seed| {
         let mut traffic = Traffic::new(&roads, &[], options(30.0), roads.spawns[10], seed);
         (0..400).for_each(|_| traffic.step());
-        traffic.cars.iter().map(|car| (car.id, car.motion)).collect::<Vec<_>>()
+        traffic
+            .cars
+            .iter()
+            .map(|car| (car.id, car.motion))
+            .collect::<Vec<_>>()
     };
     assert_eq!(end(4), end(4));
     assert_ne!(end(4), end(5));
@@ -171,7 +243,10 @@ fn the_same_seed_drives_the_same_way() {
 fn knots_come_undone() {
     let map_model = build(&RoadMapSource::Town4, 0).unwrap();
     let roads = Roads::new(&map_model.lanes);
-    let options = TrafficOptions { focus_explores: true, ..options(14.0) };
+    let options = TrafficOptions {
+        focus_explores: true,
+        ..options(14.0)
+    };
     // Seeds whose roundabouts fill up within six minutes.
     for seed in [0, 6, 23] {
         let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
@@ -181,7 +256,10 @@ fn knots_come_undone() {
             traffic.step();
             longest_s = longest_s.max(traffic.cars[0].standing_s);
         }
-        assert!(longest_s < 90.0, "seed {seed}: the focus stands for {longest_s} s");
+        assert!(
+            longest_s < 90.0,
+            "seed {seed}: the focus stands for {longest_s} s"
+        );
     }
 }
 
@@ -198,8 +276,11 @@ fn one_road(attributes: &str, geometry: &str, lateral: &str, lanes: &str) -> Lan
 
 #[test]
 fn vehicles_drive_on_the_side_that_the_map_gives() {
-    let lane =
-        |id: i32| format!(r#"<lane id="{id}" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>"#);
+    let lane = |id: i32| {
+        format!(
+            r#"<lane id="{id}" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>"#
+        )
+    };
     let lanes = format!("<left>{}</left><right>{}</right>", lane(1), lane(-1));
     let line = r#"<geometry s="0" x="0" y="0" hdg="0" length="400"><line/></geometry>"#;
     for (rule, eastwards_y_m) in [("LHT", 1.75), ("RHT", -1.75)] {
@@ -213,9 +294,15 @@ fn vehicles_drive_on_the_side_that_the_map_gives() {
             for car in traffic.cars.iter().filter(|car| car.is_present) {
                 let (place, along) = (car.motion.end.position_m, car.motion.end.yaw_rad.cos());
                 // Half a metre of the own lane's middle, with the driver's habit.
-                assert!((place.y - along.signum() * eastwards_y_m).abs() < 0.5, "{rule}: {place} {along}");
+                assert!(
+                    (place.y - along.signum() * eastwards_y_m).abs() < 0.5,
+                    "{rule}: {place} {along}"
+                );
                 let moved = place.x - car.motion.start.position_m.x;
-                assert!(along.abs() > 0.99 && moved * along >= 0.0, "{rule}: {moved} {along}");
+                assert!(
+                    along.abs() > 0.99 && moved * along >= 0.0,
+                    "{rule}: {moved} {along}"
+                );
                 *(if along > 0.0 { &mut east } else { &mut west }) += 1;
             }
         }
@@ -245,7 +332,12 @@ fn vehicles_lean_with_a_banked_road_and_pass_side_by_side() {
         )
     };
     let lanes = format!("<right>{}{}</right>", lane(-1), lane(-2));
-    let graph = one_road(&format!(r#"length="{length_m}""#), &geometry, &lateral, &lanes);
+    let graph = one_road(
+        &format!(r#"length="{length_m}""#),
+        &geometry,
+        &lateral,
+        &lanes,
+    );
     assert!(graph.lanes.iter().all(|lane| lane.successors == [lane.id]));
     let roads = Roads::new(&graph);
     let mut traffic = Traffic::new(&roads, &[], options(20.0), roads.spawns[0], 9);
@@ -258,8 +350,15 @@ fn vehicles_lean_with_a_banked_road_and_pass_side_by_side() {
             let place = placement.position_m;
             let beside_m = (place.x.powi(2) + (place.y - radius_m).powi(2)).sqrt() - radius_m;
             // On the plane of the bank, and leaning as it does.
-            assert!((place.z - beside_m * bank_rad.tan()).abs() < 0.1, "{place} {beside_m}");
-            assert!((placement.roll_rad + bank_rad).abs() < 1e-6, "{}", placement.roll_rad);
+            assert!(
+                (place.z - beside_m * bank_rad.tan()).abs() < 0.1,
+                "{place} {beside_m}"
+            );
+            assert!(
+                (placement.roll_rad + bank_rad).abs() < 1e-6,
+                "{}",
+                placement.roll_rad
+            );
             if step > 400 {
                 all += 1;
                 moving += usize::from(car.speed_mps > 3.0);

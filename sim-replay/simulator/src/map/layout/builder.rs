@@ -4,7 +4,9 @@ use super::super::clothoid;
 use super::super::curve::{Curve, CurveShape, Pose2};
 use super::super::lateral::LateralProfile;
 use super::super::profile::Profile;
-use super::super::road::{Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork};
+use super::super::road::{
+    Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork,
+};
 
 /// Lanes across a road, each outwards from the reference line: kind and width in metres.
 #[derive(Debug, Clone, Default)]
@@ -44,7 +46,10 @@ struct LaneEdge {
 impl CrossProfile {
     /// The same lanes on both sides.
     pub(super) fn both(side: Vec<(LaneKind, f64)>) -> Self {
-        Self { left: side.clone(), right: side }
+        Self {
+            left: side.clone(),
+            right: side,
+        }
     }
 
     /// Width of the wider side, metres.
@@ -58,7 +63,9 @@ impl CrossProfile {
 pub(super) fn path(poses: &[Pose2]) -> Vec<Curve> {
     let mut curves: Vec<Curve> = Vec::new();
     for pair in poses.windows(2) {
-        let s_m = curves.last().map_or(0.0, |curve| curve.s_m + curve.length_m);
+        let s_m = curves
+            .last()
+            .map_or(0.0, |curve| curve.s_m + curve.length_m);
         curves.push(clothoid::between(pair[0], pair[1], s_m));
     }
     curves
@@ -66,7 +73,9 @@ pub(super) fn path(poses: &[Pose2]) -> Vec<Curve> {
 
 /// Length of a line of curves, metres.
 pub(super) fn path_length_m(curves: &[Curve]) -> f64 {
-    curves.last().map_or(0.0, |curve| curve.s_m + curve.length_m)
+    curves
+        .last()
+        .map_or(0.0, |curve| curve.s_m + curve.length_m)
 }
 
 impl Builder {
@@ -79,28 +88,43 @@ impl Builder {
         limit_mps: f64,
     ) -> usize {
         let lanes = |side: &[(LaneKind, f64)]| {
-            side.iter().map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width))).collect()
+            side.iter()
+                .map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width)))
+                .collect()
         };
-        let section = LaneSection { s_m: 0.0, left: lanes(&profile.left), right: lanes(&profile.right) };
+        let section = LaneSection {
+            s_m: 0.0,
+            left: lanes(&profile.left),
+            right: lanes(&profile.right),
+        };
         self.push(plan_view, elevation, section, limit_mps)
     }
 
     /// Adds a junction without connections.
     pub(super) fn junction(&mut self) -> usize {
         let id = self.network.junctions.len();
-        self.network.junctions.push(Junction { id: format!("j{id}"), ..Junction::default() });
+        self.network.junctions.push(Junction {
+            id: format!("j{id}"),
+            ..Junction::default()
+        });
         id
     }
 
     /// Lets one road follow another, lane by lane on the right.
     pub(super) fn follow(&mut self, before: usize, after: usize) {
         let road = &mut self.network.roads[before];
-        road.successor = Some(RoadLink::Road { road: after, contact: Contact::Start });
+        road.successor = Some(RoadLink::Road {
+            road: after,
+            contact: Contact::Start,
+        });
         for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
             lane.successor = Some(-(place as i32 + 1));
         }
         let road = &mut self.network.roads[after];
-        road.predecessor = Some(RoadLink::Road { road: before, contact: Contact::End });
+        road.predecessor = Some(RoadLink::Road {
+            road: before,
+            contact: Contact::End,
+        });
         for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
             lane.predecessor = Some(-(place as i32 + 1));
         }
@@ -111,22 +135,36 @@ impl Builder {
         let (exit, entry) = (self.lane_edge(from, true), self.lane_edge(to, false));
         let curve = clothoid::between(exit.pose, entry.pose, 0.0);
         let length_m = curve.length_m;
-        let cubic = |from, to| Profile { records: vec![Profile::hermite(0.0, length_m, from, to)] };
+        let cubic = |from, to| Profile {
+            records: vec![Profile::hermite(0.0, length_m, from, to)],
+        };
         let elevation = cubic([exit.height_m, exit.slope], [entry.height_m, entry.slope]);
         let width = cubic([exit.width_m, 0.0], [entry.width_m, 0.0]);
         let mut only = RoadLane::new(LaneKind::Driving, width);
         (only.predecessor, only.successor) = (Some(from.lane), Some(to.lane));
-        let section = LaneSection { s_m: 0.0, left: Vec::new(), right: vec![only] };
+        let section = LaneSection {
+            s_m: 0.0,
+            left: Vec::new(),
+            right: vec![only],
+        };
         let connecting = self.push(vec![curve], elevation, section, limit_mps);
-        let link = |end: RoadEnd| Some(RoadLink::Road { road: end.road, contact: end.contact });
+        let link = |end: RoadEnd| {
+            Some(RoadLink::Road {
+                road: end.road,
+                contact: end.contact,
+            })
+        };
         let road = &mut self.network.roads[connecting];
-        (road.junction, road.predecessor, road.successor) = (Some(junction), link(from.end), link(to.end));
-        self.network.junctions[junction].connections.push(Connection {
-            incoming: from.end.road,
-            connecting,
-            contact: Contact::Start,
-            lane_links: vec![(from.lane, -1)],
-        });
+        (road.junction, road.predecessor, road.successor) =
+            (Some(junction), link(from.end), link(to.end));
+        self.network.junctions[junction]
+            .connections
+            .push(Connection {
+                incoming: from.end.road,
+                connecting,
+                contact: Contact::Start,
+                lane_links: vec![(from.lane, -1)],
+            });
         for end in [from.end, to.end] {
             let road = &mut self.network.roads[end.road];
             let link = match end.contact {
@@ -158,24 +196,58 @@ impl Builder {
 
     fn driving_lanes(&self, end: RoadEnd, along: bool) -> Vec<LaneEnd> {
         let section = &self.network.roads[end.road].sections[0];
-        let (side, sign) = if along { (&section.right, -1) } else { (&section.left, 1) };
-        let driving = side.iter().enumerate().filter(|(_, lane)| lane.kind == LaneKind::Driving);
-        driving.map(|(place, _)| LaneEnd { end, lane: sign * (place as i32 + 1) }).collect()
+        let (side, sign) = if along {
+            (&section.right, -1)
+        } else {
+            (&section.left, 1)
+        };
+        let driving = side
+            .iter()
+            .enumerate()
+            .filter(|(_, lane)| lane.kind == LaneKind::Driving);
+        driving
+            .map(|(place, _)| LaneEnd {
+                end,
+                lane: sign * (place as i32 + 1),
+            })
+            .collect()
     }
 
     /// The left edge of a lane where it leaves its road (`exit`) or enters it.
     fn lane_edge(&self, LaneEnd { end, lane }: LaneEnd, exit: bool) -> LaneEdge {
         let road = &self.network.roads[end.road];
-        debug_assert_eq!(lane < 0, (end.contact == Contact::End) == exit, "lane {lane} does not lead this way");
-        let s = if end.contact == Contact::End { road.length_m } else { 0.0 };
+        debug_assert_eq!(
+            lane < 0,
+            (end.contact == Contact::End) == exit,
+            "lane {lane} does not lead this way"
+        );
+        let s = if end.contact == Contact::End {
+            road.length_m
+        } else {
+            0.0
+        };
         let [low, high] = road.lane_span_m(0, lane, s);
         let pose = road.pose_at(s);
-        let (pose, sign) =
-            if lane < 0 { (pose.moved(0.0, high, 0.0), 1.0) } else { (pose.moved(0.0, low, 0.0).reversed(), -1.0) };
-        LaneEdge { pose, height_m: road.elevation.at(s), slope: sign * road.elevation.slope_at(s), width_m: high - low }
+        let (pose, sign) = if lane < 0 {
+            (pose.moved(0.0, high, 0.0), 1.0)
+        } else {
+            (pose.moved(0.0, low, 0.0).reversed(), -1.0)
+        };
+        LaneEdge {
+            pose,
+            height_m: road.elevation.at(s),
+            slope: sign * road.elevation.slope_at(s),
+            width_m: high - low,
+        }
     }
 
-    fn push(&mut self, plan_view: Vec<Curve>, elevation: Profile, section: LaneSection, limit_mps: f64) -> usize {
+    fn push(
+        &mut self,
+        plan_view: Vec<Curve>,
+        elevation: Profile,
+        section: LaneSection,
+        limit_mps: f64,
+    ) -> usize {
         let place = self.network.roads.len();
         self.network.roads.push(Road {
             id: format!("r{place}"),
@@ -200,5 +272,10 @@ impl Builder {
 
 /// An arc of a circle as a road's whole reference line.
 pub(super) fn arc(start: Pose2, curvature: f64, length_m: f64) -> Vec<Curve> {
-    vec![Curve { s_m: 0.0, start, length_m, shape: CurveShape::Arc { curvature } }]
+    vec![Curve {
+        s_m: 0.0,
+        start,
+        length_m,
+        shape: CurveShape::Arc { curvature },
+    }]
 }

@@ -20,10 +20,20 @@ pub(super) struct GridPlan {
 }
 
 /// Spreads `count` values over `low..=high`, the inner ones shifted by up to `share` of their distance.
-pub(super) fn spread(low: f64, high: f64, count: usize, share: f64, rng: &mut ChaCha8Rng) -> Vec<f64> {
+pub(super) fn spread(
+    low: f64,
+    high: f64,
+    count: usize,
+    share: f64,
+    rng: &mut ChaCha8Rng,
+) -> Vec<f64> {
     let step = (high - low) / (count - 1) as f64;
     let value = |place: usize| {
-        let shift = if place == 0 || place + 1 == count { 0.0 } else { rng.random_range(-share..share) };
+        let shift = if place == 0 || place + 1 == count {
+            0.0
+        } else {
+            rng.random_range(-share..share)
+        };
         low + (place as f64 + shift) * step
     };
     (0..count).map(value).collect()
@@ -53,19 +63,31 @@ pub(super) fn grid(
 }
 
 /// All streets of a plan, with its irregularity times `calm`.
-fn full_grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], calm: f64, rng: &mut ChaCha8Rng) -> StreetGraph {
+fn full_grid(
+    plan: &GridPlan,
+    y_range: impl Fn(f64) -> [f64; 2],
+    calm: f64,
+    rng: &mut ChaCha8Rng,
+) -> StreetGraph {
     let rows = spread(0.0, 1.0, plan.rows, 0.2 * calm, rng);
     let jitter = (plan.jitter_m * calm).max(1e-3);
     let mut graph = StreetGraph::default();
     let ranges: Vec<[f64; 2]> = plan.columns_m.iter().map(|&x| y_range(x)).collect();
     // The smaller `calm`, the closer all columns are to their common shape: then the rows are at right angles to them.
-    let common =
-        ranges.iter().fold([f64::NEG_INFINITY, f64::INFINITY], |[a, b], [low, high]| [a.max(*low), b.min(*high)]);
+    let common = ranges
+        .iter()
+        .fold([f64::NEG_INFINITY, f64::INFINITY], |[a, b], [low, high]| {
+            [a.max(*low), b.min(*high)]
+        });
     for (&x, own) in plan.columns_m.iter().zip(&ranges) {
         let [low, high] = [0, 1].map(|end| common[end] + calm * (own[end] - common[end]));
         for &row in &rows {
             let [dx, dy] = [(); 2].map(|()| rng.random_range(-jitter..jitter));
-            graph.nodes.push(Node { x: x + dx, y: low + row * (high - low) + dy, port: None });
+            graph.nodes.push(Node {
+                x: x + dx,
+                y: low + row * (high - low) + dy,
+                port: None,
+            });
         }
     }
     let at = |column: usize, row: usize| column * plan.rows + row;
@@ -85,8 +107,14 @@ fn full_grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], calm: f64, rng:
 /// Ties the node nearest to `port` to it.
 fn attach(graph: &mut StreetGraph, port: Pose2) {
     let distance = |node: usize| (graph.nodes[node].x - port.x).hypot(graph.nodes[node].y - port.y);
-    let nearest = (0..graph.nodes.len()).min_by(|&a, &b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
-    graph.nodes.push(Node { x: port.x, y: port.y, port: Some(port) });
+    let nearest = (0..graph.nodes.len())
+        .min_by(|&a, &b| distance(a).total_cmp(&distance(b)))
+        .unwrap_or(0);
+    graph.nodes.push(Node {
+        x: port.x,
+        y: port.y,
+        port: Some(port),
+    });
     graph.edges.push([nearest, graph.nodes.len() - 1]);
 }
 

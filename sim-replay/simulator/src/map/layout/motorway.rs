@@ -36,10 +36,18 @@ pub(super) type Direction = f64;
 impl Motorway {
     /// A carriageway from one length of the ring to another, in driving direction (to rising lengths along the ring, to
     /// falling ones against it).
-    pub(super) fn carriageway(&self, builder: &mut Builder, from_m: f64, to_m: f64, direction: Direction) -> usize {
+    pub(super) fn carriageway(
+        &self,
+        builder: &mut Builder,
+        from_m: f64,
+        to_m: f64,
+        direction: Direction,
+    ) -> usize {
         let steps = ((to_m - from_m).abs() / KNOT_M).ceil().max(1.0) as usize;
         let at = |step: usize| from_m + (to_m - from_m) * step as f64 / steps as f64;
-        let poses: Vec<Pose2> = (0..=steps).map(|step| self.left_edge(at(step), direction)).collect();
+        let poses: Vec<Pose2> = (0..=steps)
+            .map(|step| self.left_edge(at(step), direction))
+            .collect();
         let curves = path(&poses);
         let records = (0..steps).map(|step| {
             let (a, b) = (at(step), at(step + 1));
@@ -49,17 +57,29 @@ impl Motorway {
             let ends = [a, b].map(|s| [self.ring.height_m(s), self.ring.slope(s) * scale]);
             Profile::hermite(curves[step].s_m, length, ends[0], ends[1])
         });
-        let elevation = Profile { records: records.collect() };
+        let elevation = Profile {
+            records: records.collect(),
+        };
         let mut right = vec![(LaneKind::Driving, LANE_M); self.lanes];
         right.push((LaneKind::Shoulder, 2.5));
-        let profile = CrossProfile { left: vec![(LaneKind::Shoulder, 0.75)], right };
+        let profile = CrossProfile {
+            left: vec![(LaneKind::Shoulder, 0.75)],
+            right,
+        };
         builder.road(curves, elevation, &profile, LIMIT_MPS)
     }
 
     /// Carriageways one after the other through `stops_m`, linked; returns the first and the last.
-    pub(super) fn carriageways(&self, builder: &mut Builder, stops_m: &[f64], direction: Direction) -> [usize; 2] {
-        let roads: Vec<usize> =
-            stops_m.windows(2).map(|pair| self.carriageway(builder, pair[0], pair[1], direction)).collect();
+    pub(super) fn carriageways(
+        &self,
+        builder: &mut Builder,
+        stops_m: &[f64],
+        direction: Direction,
+    ) -> [usize; 2] {
+        let roads: Vec<usize> = stops_m
+            .windows(2)
+            .map(|pair| self.carriageway(builder, pair[0], pair[1], direction))
+            .collect();
         for pair in roads.windows(2) {
             builder.follow(pair[0], pair[1]);
         }
@@ -70,8 +90,20 @@ impl Motorway {
     pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
         self.go_on(builder, junction, before, after);
-        let outer = LaneEnd { end: RoadEnd { road: before, contact: Contact::End }, lane: -(self.lanes as i32) };
-        let ramp = LaneEnd { end: RoadEnd { road: ramp, contact: Contact::Start }, lane: -1 };
+        let outer = LaneEnd {
+            end: RoadEnd {
+                road: before,
+                contact: Contact::End,
+            },
+            lane: -(self.lanes as i32),
+        };
+        let ramp = LaneEnd {
+            end: RoadEnd {
+                road: ramp,
+                contact: Contact::Start,
+            },
+            lane: -1,
+        };
         builder.connect(junction, outer, ramp, LIMIT_MPS);
     }
 
@@ -79,36 +111,81 @@ impl Motorway {
     pub(super) fn merge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
         self.go_on(builder, junction, before, after);
-        let ramp = LaneEnd { end: RoadEnd { road: ramp, contact: Contact::End }, lane: -1 };
-        let outer = LaneEnd { end: RoadEnd { road: after, contact: Contact::Start }, lane: -(self.lanes as i32) };
+        let ramp = LaneEnd {
+            end: RoadEnd {
+                road: ramp,
+                contact: Contact::End,
+            },
+            lane: -1,
+        };
+        let outer = LaneEnd {
+            end: RoadEnd {
+                road: after,
+                contact: Contact::Start,
+            },
+            lane: -(self.lanes as i32),
+        };
         builder.connect(junction, ramp, outer, LIMIT_MPS);
     }
 
     /// A ramp that left at `s_m` down to `port` (which looks away from its roundabout).
-    pub(super) fn off_ramp(&self, builder: &mut Builder, s_m: f64, direction: Direction, port: Pose2) -> usize {
+    pub(super) fn off_ramp(
+        &self,
+        builder: &mut Builder,
+        s_m: f64,
+        direction: Direction,
+        port: Pose2,
+    ) -> usize {
         let start = self.ramp_pose(s_m, direction, -RAMP_ANGLE_RAD);
         self.ramp(
             builder,
             [start, port.reversed()],
-            [[self.ring.height_m(s_m), direction * self.ring.slope(s_m)], [0.0; 2]],
+            [
+                [self.ring.height_m(s_m), direction * self.ring.slope(s_m)],
+                [0.0; 2],
+            ],
         )
     }
 
     /// A ramp from `port` up to `s_m`, where it joins.
-    pub(super) fn on_ramp(&self, builder: &mut Builder, s_m: f64, direction: Direction, port: Pose2) -> usize {
+    pub(super) fn on_ramp(
+        &self,
+        builder: &mut Builder,
+        s_m: f64,
+        direction: Direction,
+        port: Pose2,
+    ) -> usize {
         let end = self.ramp_pose(s_m, direction, RAMP_ANGLE_RAD);
-        self.ramp(builder, [port, end], [[0.0; 2], [self.ring.height_m(s_m), direction * self.ring.slope(s_m)]])
+        self.ramp(
+            builder,
+            [port, end],
+            [
+                [0.0; 2],
+                [self.ring.height_m(s_m), direction * self.ring.slope(s_m)],
+            ],
+        )
     }
 
     /// Puts a tunnel over a whole carriageway.
     pub(super) fn cover(builder: &mut Builder, road: usize) {
         let length_m = builder.network.roads[road].length_m;
-        builder.network.roads[road].structures.push(RoadStructure { tunnel: true, s_m: 0.0, length_m });
+        builder.network.roads[road].structures.push(RoadStructure {
+            tunnel: true,
+            s_m: 0.0,
+            length_m,
+        });
     }
 
     fn ramp(&self, builder: &mut Builder, poses: [Pose2; 2], heights: [[f64; 2]; 2]) -> usize {
         let curves = path(&poses);
-        let elevation = Profile { records: vec![Profile::hermite(0.0, curves[0].length_m, heights[0], heights[1])] };
+        let elevation = Profile {
+            records: vec![Profile::hermite(
+                0.0,
+                curves[0].length_m,
+                heights[0],
+                heights[1],
+            )],
+        };
         let profile = CrossProfile {
             left: vec![(LaneKind::Shoulder, 0.4)],
             right: vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)],
@@ -119,18 +196,35 @@ impl Motorway {
     /// Left edge of the first lane, in driving direction.
     fn left_edge(&self, s_m: f64, direction: Direction) -> Pose2 {
         let middle = self.ring.pose(s_m);
-        if direction > 0.0 { middle.moved(0.0, -self.median_m, 0.0) } else { middle.moved(0.0, self.median_m, PI) }
+        if direction > 0.0 {
+            middle.moved(0.0, -self.median_m, 0.0)
+        } else {
+            middle.moved(0.0, self.median_m, PI)
+        }
     }
 
     fn ramp_pose(&self, s_m: f64, direction: Direction, turn_rad: f64) -> Pose2 {
         let outer = (self.lanes as f64 - 1.0) * LANE_M;
-        self.left_edge(s_m, direction).moved(0.0, -outer - RAMP_OFFSET_M, turn_rad)
+        self.left_edge(s_m, direction)
+            .moved(0.0, -outer - RAMP_OFFSET_M, turn_rad)
     }
 
     fn go_on(&self, builder: &mut Builder, junction: usize, before: usize, after: usize) {
         for lane in 1..=self.lanes as i32 {
-            let from = LaneEnd { end: RoadEnd { road: before, contact: Contact::End }, lane: -lane };
-            let to = LaneEnd { end: RoadEnd { road: after, contact: Contact::Start }, lane: -lane };
+            let from = LaneEnd {
+                end: RoadEnd {
+                    road: before,
+                    contact: Contact::End,
+                },
+                lane: -lane,
+            };
+            let to = LaneEnd {
+                end: RoadEnd {
+                    road: after,
+                    contact: Contact::Start,
+                },
+                lane: -lane,
+            };
             builder.connect(junction, from, to, LIMIT_MPS);
         }
     }

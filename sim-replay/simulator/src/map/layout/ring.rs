@@ -35,10 +35,19 @@ struct Bump {
 impl Ring {
     /// A line of some 2.8 km: its right-hand lobe reaches to about x = 500 m.
     pub(super) fn random(rng: &mut ChaCha8Rng) -> Self {
-        let half_m = [rng.random_range(480.0..540.0), rng.random_range(235.0..270.0)];
+        let half_m = [
+            rng.random_range(480.0..540.0),
+            rng.random_range(235.0..270.0),
+        ];
         let lean = [rng.random_range(-0.07..0.07), rng.random_range(-0.09..0.09)];
         let waves = [(); 4].map(|()| [rng.random_range(0.0..9.0), rng.random_range(0.0..2.0 * PI)]);
-        let mut ring = Self { half_m, lean, waves, lengths_m: vec![0.0], bumps: Vec::new() };
+        let mut ring = Self {
+            half_m,
+            lean,
+            waves,
+            lengths_m: vec![0.0],
+            bumps: Vec::new(),
+        };
         let mut length = 0.0;
         for sample in 0..SAMPLES {
             let at = |sample: usize| ring.point(2.0 * PI * sample as f64 / SAMPLES as f64);
@@ -48,10 +57,20 @@ impl Ring {
         }
         let upper = ring.crossing()[usize::from(rng.random_bool(0.5))];
         let height_m = rng.random_range(RISE_M[0]..RISE_M[1]);
-        ring.bumps.push(Bump { middle_m: upper, height_m, plateau_m: 45.0, reach_m: rng.random_range(240.0..300.0) });
+        ring.bumps.push(Bump {
+            middle_m: upper,
+            height_m,
+            plateau_m: 45.0,
+            reach_m: rng.random_range(240.0..300.0),
+        });
         let height_m = rng.random_range(RISE_M[0]..RISE_M[1]);
         let middle_m = ring.apex_m();
-        ring.bumps.push(Bump { middle_m, height_m, plateau_m: 25.0, reach_m: rng.random_range(290.0..340.0) });
+        ring.bumps.push(Bump {
+            middle_m,
+            height_m,
+            plateau_m: 25.0,
+            reach_m: rng.random_range(290.0..340.0),
+        });
         ring
     }
 
@@ -72,7 +91,10 @@ impl Ring {
     /// Place and heading at a length, which may lie beyond one round.
     pub(super) fn pose(&self, s_m: f64) -> Pose2 {
         let s = s_m.rem_euclid(self.length_m());
-        let after = self.lengths_m.partition_point(|&length| length <= s).clamp(1, SAMPLES);
+        let after = self
+            .lengths_m
+            .partition_point(|&length| length <= s)
+            .clamp(1, SAMPLES);
         let (low, high) = (self.lengths_m[after - 1], self.lengths_m[after]);
         let t = 2.0 * PI * ((after - 1) as f64 + (s - low) / (high - low)) / SAMPLES as f64;
         let [x, y] = self.point(t);
@@ -85,7 +107,8 @@ impl Ring {
         let total = self.length_m();
         let height = |bump: &Bump| {
             let away = (s_m - bump.middle_m + total / 2.0).rem_euclid(total) - total / 2.0;
-            let share = ((bump.reach_m - away.abs()) / (bump.reach_m - bump.plateau_m)).clamp(0.0, 1.0);
+            let share =
+                ((bump.reach_m - away.abs()) / (bump.reach_m - bump.plateau_m)).clamp(0.0, 1.0);
             bump.height_m * share * share * (3.0 - 2.0 * share)
         };
         self.bumps.iter().map(height).fold(0.0, f64::max)
@@ -98,9 +121,12 @@ impl Ring {
 
     /// Lowest and highest y inside the right-hand lobe at `x`, on the line itself.
     pub(super) fn lobe_m(&self, x: f64) -> [f64; 2] {
-        let samples = (1..SAMPLES / 2).map(|sample| self.point(2.0 * PI * sample as f64 / SAMPLES as f64));
+        let samples =
+            (1..SAMPLES / 2).map(|sample| self.point(2.0 * PI * sample as f64 / SAMPLES as f64));
         let near = samples.filter(|point| (point[0] - x).abs() < 4.0);
-        near.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], p| [low.min(p[1]), high.max(p[1])])
+        near.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], p| {
+            [low.min(p[1]), high.max(p[1])]
+        })
     }
 
     /// The two lengths at which the line crosses itself.
@@ -122,10 +148,17 @@ impl Ring {
 
     /// A leaning figure of eight with some waves. At a quarter of the parameter it heads down the right-hand end.
     fn point(&self, t: f64) -> [f64; 2] {
-        let (a, b) = (self.half_m[0] * (1.0 + self.lean[0] * t.sin()), self.half_m[1] * (1.0 + self.lean[1] * t.sin()));
-        let wave = |[height, phase]: [f64; 2], frequency: f64| height * (frequency * t + phase).sin();
+        let (a, b) = (
+            self.half_m[0] * (1.0 + self.lean[0] * t.sin()),
+            self.half_m[1] * (1.0 + self.lean[1] * t.sin()),
+        );
+        let wave =
+            |[height, phase]: [f64; 2], frequency: f64| height * (frequency * t + phase).sin();
         let [x2, y2, x3, y3] = self.waves;
-        [a * t.sin() + wave(x2, 2.0) + wave(x3, 3.0), b * (2.0 * t).sin() + wave(y2, 2.0) + wave(y3, 3.0)]
+        [
+            a * t.sin() + wave(x2, 2.0) + wave(x3, 3.0),
+            b * (2.0 * t).sin() + wave(y2, 2.0) + wave(y3, 3.0),
+        ]
     }
 }
 
@@ -147,9 +180,16 @@ mod tests {
             let angle = wrap_angle(ring.pose(a).heading_rad - ring.pose(b).heading_rad).abs();
             assert!((angle - FRAC_PI_2).abs() < 0.6, "{seed}: {angle}");
             assert!((ring.height_m(a) - ring.height_m(b)).abs() > 6.0, "{seed}");
-            assert!((2300.0..3400.0).contains(&ring.length_m()), "{seed}: {}", ring.length_m());
+            assert!(
+                (2300.0..3400.0).contains(&ring.length_m()),
+                "{seed}: {}",
+                ring.length_m()
+            );
             // The right-hand end leads down, as the interchange expects.
-            assert!((ring.pose(ring.apex_m()).heading_rad + FRAC_PI_2).abs() < 0.3, "{seed}");
+            assert!(
+                (ring.pose(ring.apex_m()).heading_rad + FRAC_PI_2).abs() < 0.3,
+                "{seed}"
+            );
         }
     }
 

@@ -27,22 +27,44 @@ pub(super) struct Roundabout {
 impl Roundabout {
     /// End of the arm at an angle, facing away from the roundabout.
     pub(super) fn port(&self, angle_rad: f64) -> Pose2 {
-        Pose2::new(self.center_m[0], self.center_m[1], angle_rad).moved(self.radius_m + PORT_M, 0.0, 0.0)
+        Pose2::new(self.center_m[0], self.center_m[1], angle_rad).moved(
+            self.radius_m + PORT_M,
+            0.0,
+            0.0,
+        )
     }
 
     /// x, y and radius of the free middle, metres.
     pub(super) fn island(&self) -> [f64; 3] {
-        [self.center_m[0], self.center_m[1], self.radius_m - LANE_M / 2.0 - 2.5]
+        [
+            self.center_m[0],
+            self.center_m[1],
+            self.radius_m - LANE_M / 2.0 - 2.5,
+        ]
     }
 
     /// Builds the ring and joins the arms to it, by rising angle; the roads of the arms end at their ports.
     pub(super) fn join(&self, builder: &mut Builder, arms: &[(f64, RoadEnd)]) {
-        let ring: Vec<usize> = (0..arms.len()).map(|place| self.ring_road(builder, arms, place)).collect();
+        let ring: Vec<usize> = (0..arms.len())
+            .map(|place| self.ring_road(builder, arms, place))
+            .collect();
         for (place, &(_, arm)) in arms.iter().enumerate() {
             let junction = builder.junction();
             let before = ring[(place + ring.len() - 1) % ring.len()];
-            let end = LaneEnd { end: RoadEnd { road: before, contact: Contact::End }, lane: -1 };
-            let start = LaneEnd { end: RoadEnd { road: ring[place], contact: Contact::Start }, lane: -1 };
+            let end = LaneEnd {
+                end: RoadEnd {
+                    road: before,
+                    contact: Contact::End,
+                },
+                lane: -1,
+            };
+            let start = LaneEnd {
+                end: RoadEnd {
+                    road: ring[place],
+                    contact: Contact::Start,
+                },
+                lane: -1,
+            };
             builder.connect(junction, end, start, LIMIT_MPS);
             for incoming in builder.incoming(arm) {
                 builder.connect(junction, incoming, start, LIMIT_MPS);
@@ -67,6 +89,11 @@ impl Roundabout {
             left: vec![(LaneKind::Shoulder, 1.0)],
             right: vec![(LaneKind::Driving, LANE_M), (LaneKind::Shoulder, 0.6)],
         };
-        builder.road(arc(start, 1.0 / inner, inner * turn), Profile::default(), &profile, LIMIT_MPS)
+        builder.road(
+            arc(start, 1.0 / inner, inner * turn),
+            Profile::default(),
+            &profile,
+            LIMIT_MPS,
+        )
     }
 }

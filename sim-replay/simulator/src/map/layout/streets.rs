@@ -49,7 +49,11 @@ struct Chain {
 
 impl StreetGraph {
     pub(super) fn degree(&self, node: usize) -> usize {
-        self.edges.iter().flatten().filter(|&&end| end == node).count()
+        self.edges
+            .iter()
+            .flatten()
+            .filter(|&&end| end == node)
+            .count()
     }
 
     fn angle(&self, from: usize, to: usize) -> f64 {
@@ -68,10 +72,14 @@ impl StreetGraph {
             }
             let around = self.edges.iter().filter(|edge| edge.contains(&node));
             let others = around.map(|&[a, b]| if a == node { b } else { a });
-            let arms: Vec<(f64, f64)> = others.map(|other| (self.angle(node, other), BROAD_M)).collect();
+            let arms: Vec<(f64, f64)> = others
+                .map(|other| (self.angle(node, other), BROAD_M))
+                .collect();
             junction_radius_m(&arms)
         };
-        self.edges.iter().all(|&[a, b]| self.distance_m(a, b) > radius(a) + radius(b) + LEAST_STREET_M)
+        self.edges
+            .iter()
+            .all(|&[a, b]| self.distance_m(a, b) > radius(a) + radius(b) + LEAST_STREET_M)
     }
 
     /// A node at which streets end: three or more meet there, or it is a port.
@@ -92,9 +100,20 @@ pub(super) fn lay_out(
     // Road ends by node, in the order of the chains.
     let mut ends: Vec<Vec<RoadEnd>> = vec![Vec::new(); graph.nodes.len()];
     for chain in &chains {
-        let road = builder.road(path(&poses(graph, chain, &radii)), Profile::default(), &chain.profile, limit_mps);
-        ends[chain.nodes[0]].push(RoadEnd { road, contact: Contact::Start });
-        ends[chain.nodes[chain.nodes.len() - 1]].push(RoadEnd { road, contact: Contact::End });
+        let road = builder.road(
+            path(&poses(graph, chain, &radii)),
+            Profile::default(),
+            &chain.profile,
+            limit_mps,
+        );
+        ends[chain.nodes[0]].push(RoadEnd {
+            road,
+            contact: Contact::Start,
+        });
+        ends[chain.nodes[chain.nodes.len() - 1]].push(RoadEnd {
+            road,
+            contact: Contact::End,
+        });
     }
     let mut ports = Vec::new();
     for (node, ends) in ends.iter().enumerate() {
@@ -116,10 +135,15 @@ fn join(builder: &mut Builder, junction: usize, ends: &[RoadEnd], limit_mps: f64
                 continue;
             }
             let turn = wrap_angle(
-                builder.outward_pose(to).heading_rad + std::f64::consts::PI - builder.outward_pose(from).heading_rad,
+                builder.outward_pose(to).heading_rad + std::f64::consts::PI
+                    - builder.outward_pose(from).heading_rad,
             );
             // Turning traffic slows down.
-            let limit = if turn.abs() > 0.5 { limit_mps.min(7.0) } else { limit_mps };
+            let limit = if turn.abs() > 0.5 {
+                limit_mps.min(7.0)
+            } else {
+                limit_mps
+            };
             let (incoming, outgoing) = (builder.incoming(from), builder.outgoing(to));
             for (&lane_in, &lane_out) in incoming.iter().zip(&outgoing) {
                 builder.connect(junction, lane_in, lane_out, limit);
@@ -135,7 +159,9 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
         if !graph.is_end(start) {
             continue;
         }
-        while let Some(first) = (0..used.len()).find(|&edge| !used[edge] && graph.edges[edge].contains(&start)) {
+        while let Some(first) =
+            (0..used.len()).find(|&edge| !used[edge] && graph.edges[edge].contains(&start))
+        {
             let mut nodes = vec![start];
             let mut edge = Some(first);
             while let Some(current) = edge {
@@ -144,10 +170,15 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
                 let next = if a == nodes[nodes.len() - 1] { b } else { a };
                 nodes.push(next);
                 let ends_here = graph.is_end(next);
-                edge = (0..used.len()).find(|&edge| !ends_here && !used[edge] && graph.edges[edge].contains(&next));
+                edge = (0..used.len())
+                    .find(|&edge| !ends_here && !used[edge] && graph.edges[edge].contains(&next));
             }
             let wiggle_rad = [(); 2].map(|()| rng.random_range(-WIGGLE_RAD..WIGGLE_RAD));
-            chains.push(Chain { nodes, profile: street_profile(rng), wiggle_rad });
+            chains.push(Chain {
+                nodes,
+                profile: street_profile(rng),
+                wiggle_rad,
+            });
         }
     }
     chains
@@ -155,7 +186,11 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
 
 /// Lanes of one street: a lane each way, with or without parking, verge and broad pavements.
 fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
-    let verge_m = if rng.random_bool(0.3) { rng.random_range(1.2..2.4) } else { 0.0 };
+    let verge_m = if rng.random_bool(0.3) {
+        rng.random_range(1.2..2.4)
+    } else {
+        0.0
+    };
     let sidewalk_m = rng.random_range(1.6..3.4);
     let mut side = || {
         let mut lanes = vec![(LaneKind::Driving, 3.5)];
@@ -170,7 +205,10 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
         lanes.push((LaneKind::Sidewalk, sidewalk_m));
         lanes
     };
-    CrossProfile { left: side(), right: side() }
+    CrossProfile {
+        left: side(),
+        right: side(),
+    }
 }
 
 /// Distance from each junction's middle at which its roads begin, metres: far enough that their edges do not overlap.
@@ -205,8 +243,15 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
     let last = chain.nodes.len() - 1;
     let mut poses = vec![end_pose(graph, chain, radii, 0)];
     for place in 1..last {
-        let [before, corner, after] = [chain.nodes[place - 1], chain.nodes[place], chain.nodes[place + 1]];
-        let reach = 0.4 * graph.distance_m(before, corner).min(graph.distance_m(corner, after));
+        let [before, corner, after] = [
+            chain.nodes[place - 1],
+            chain.nodes[place],
+            chain.nodes[place + 1],
+        ];
+        let reach = 0.4
+            * graph
+                .distance_m(before, corner)
+                .min(graph.distance_m(corner, after));
         let reach = reach.min(22.0);
         let middle = |heading| Pose2::new(graph.nodes[corner].x, graph.nodes[corner].y, heading);
         poses.push(middle(graph.angle(before, corner)).moved(-reach, 0.0, 0.0));
@@ -219,12 +264,23 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
 /// Pose at which a street begins at its first (0) or last (1) node, facing into the street.
 fn end_pose(graph: &StreetGraph, chain: &Chain, radii: &[f64], which: usize) -> Pose2 {
     let last = chain.nodes.len() - 1;
-    let (node, next) =
-        if which == 0 { (chain.nodes[0], chain.nodes[1]) } else { (chain.nodes[last], chain.nodes[last - 1]) };
+    let (node, next) = if which == 0 {
+        (chain.nodes[0], chain.nodes[1])
+    } else {
+        (chain.nodes[last], chain.nodes[last - 1])
+    };
     if let Some(port) = graph.nodes[node].port {
         return port;
     }
-    let wiggle = if graph.distance_m(node, next) > WIGGLE_MIN_M { chain.wiggle_rad[which] } else { 0.0 };
-    let middle = Pose2::new(graph.nodes[node].x, graph.nodes[node].y, graph.angle(node, next) + wiggle);
+    let wiggle = if graph.distance_m(node, next) > WIGGLE_MIN_M {
+        chain.wiggle_rad[which]
+    } else {
+        0.0
+    };
+    let middle = Pose2::new(
+        graph.nodes[node].x,
+        graph.nodes[node].y,
+        graph.angle(node, next) + wiggle,
+    );
     middle.moved(radii[node], 0.0, 0.0)
 }

@@ -3,7 +3,11 @@ use super::super::lane_builder::lane_graph;
 use super::*;
 
 fn road_m(layout: &Layout, in_junctions: bool) -> f64 {
-    let roads = layout.network.roads.iter().filter(|road| in_junctions || road.junction.is_none());
+    let roads = layout
+        .network
+        .roads
+        .iter()
+        .filter(|road| in_junctions || road.junction.is_none());
     roads.map(|road| road.length_m).sum()
 }
 
@@ -11,9 +15,17 @@ fn road_m(layout: &Layout, in_junctions: bool) -> f64 {
 fn check(name: &str, layout: &Layout) -> LaneGraph {
     for road in &layout.network.roads {
         for pair in road.plan_view.windows(2) {
-            assert!(pair[0].end().distance_m(&pair[1].start) < 1e-3, "{name}: road {} breaks", road.id);
+            assert!(
+                pair[0].end().distance_m(&pair[1].start) < 1e-3,
+                "{name}: road {} breaks",
+                road.id
+            );
             let turn = wrap_angle(pair[0].end().heading_rad - pair[1].start.heading_rad);
-            assert!(turn.abs() < 1e-6, "{name}: road {} bends by {turn}", road.id);
+            assert!(
+                turn.abs() < 1e-6,
+                "{name}: road {} bends by {turn}",
+                road.id
+            );
         }
         let mut s = 0.0;
         while s < road.length_m {
@@ -29,12 +41,23 @@ fn check(name: &str, layout: &Layout) -> LaneGraph {
     let (graph, counts) = lane_graph(&layout.network);
     assert_eq!(counts.refused, 0, "{name}");
     for lane in &graph.lanes {
-        assert!(!lane.successors.is_empty() && !lane.predecessors.is_empty(), "{name}: {:?} ends", lane.id);
+        assert!(
+            !lane.successors.is_empty() && !lane.predecessors.is_empty(),
+            "{name}: {:?} ends",
+            lane.id
+        );
         let end = lane.centerline[lane.centerline.len() - 1];
         for &next in &lane.successors {
             let start = graph.lane(next).centerline[0];
-            let gap = (0..3).map(|axis| (end[axis] - start[axis]).powi(2)).sum::<f64>().sqrt();
-            assert!(gap < 0.05, "{name}: {gap} m between {:?} and {next:?}", lane.id);
+            let gap = (0..3)
+                .map(|axis| (end[axis] - start[axis]).powi(2))
+                .sum::<f64>()
+                .sqrt();
+            assert!(
+                gap < 0.05,
+                "{name}: {gap} m between {:?} and {next:?}",
+                lane.id
+            );
         }
     }
     graph
@@ -42,7 +65,11 @@ fn check(name: &str, layout: &Layout) -> LaneGraph {
 
 /// Lanes of different roads outside junctions keep apart.
 fn check_apart(name: &str, graph: &LaneGraph) {
-    let outside: Vec<_> = graph.lanes.iter().filter(|lane| !lane.in_junction).collect();
+    let outside: Vec<_> = graph
+        .lanes
+        .iter()
+        .filter(|lane| !lane.in_junction)
+        .collect();
     let mut cells = std::collections::BTreeMap::<[i64; 2], Vec<(usize, [f64; 3])>>::new();
     let cell = |p: &[f64; 3]| [(p[0] / 8.0).floor() as i64, (p[1] / 8.0).floor() as i64];
     for (index, lane) in outside.iter().enumerate() {
@@ -56,12 +83,16 @@ fn check_apart(name: &str, graph: &LaneGraph) {
             for near in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| [column + dx, row + dy])) {
                 for &(other, place) in cells.get(&near).into_iter().flatten() {
                     let other_lane = outside[other];
-                    let linked = lane.successors.contains(&other_lane.id) || other_lane.successors.contains(&lane.id);
+                    let linked = lane.successors.contains(&other_lane.id)
+                        || other_lane.successors.contains(&lane.id);
                     let apart = (point[0] - place[0]).hypot(point[1] - place[1]);
                     let level = (point[2] - place[2]).abs() < 5.0;
                     let least = (lane.width_m + other_lane.width_m) / 2.0 - 0.35;
                     if other != index && !linked && level && apart < least {
-                        panic!("{name}: {:?} and {:?} are {apart:.2} m apart at {point:?}", lane.id, other_lane.id);
+                        panic!(
+                            "{name}: {:?} and {:?} are {apart:.2} m apart at {point:?}",
+                            lane.id, other_lane.id
+                        );
                     }
                 }
             }
@@ -76,7 +107,13 @@ fn reached_share(graph: &LaneGraph, from: usize) -> f64 {
     seen[from] = true;
     while let Some(lane) = open.pop() {
         let lane = &graph.lanes[lane];
-        for next in lane.successors.iter().chain(&lane.left).chain(&lane.right).map(|id| id.0 as usize) {
+        for next in lane
+            .successors
+            .iter()
+            .chain(&lane.left)
+            .chain(&lane.right)
+            .map(|id| id.0 as usize)
+        {
             if !seen[next] {
                 seen[next] = true;
                 open.push(next);
@@ -93,11 +130,22 @@ fn town1_is_a_small_town_for_every_seed() {
         let graph = check(&name, &layout);
         check_apart(&name, &graph);
         let length = road_m(&layout, false);
-        assert!((2200.0..3800.0).contains(&length), "{name}: {length} m of streets");
+        assert!(
+            (2200.0..3800.0).contains(&length),
+            "{name}: {length} m of streets"
+        );
         assert!(road_m(&layout, true) > 2500.0, "{name}");
-        let arms: Vec<usize> = layout.network.junctions.iter().map(|junction| junction.connections.len()).collect();
+        let arms: Vec<usize> = layout
+            .network
+            .junctions
+            .iter()
+            .map(|junction| junction.connections.len())
+            .collect();
         assert!(arms.contains(&6), "{name}: no T-junction");
-        assert!(arms.iter().filter(|&&count| count >= 6).count() >= 6, "{name}: {arms:?}");
+        assert!(
+            arms.iter().filter(|&&count| count >= 6).count() >= 6,
+            "{name}: {arms:?}"
+        );
         assert_eq!(reached_share(&graph, 0), 1.0, "{name}");
     }
 }
@@ -109,18 +157,39 @@ fn town4_is_a_motorway_with_ramps_bridge_roundabouts_and_town_for_every_seed() {
         let graph = check(&name, &layout);
         check_apart(&name, &graph);
         let length = road_m(&layout, false);
-        assert!((8000.0..13000.0).contains(&length), "{name}: {length} m of road");
+        assert!(
+            (8000.0..13000.0).contains(&length),
+            "{name}: {length} m of road"
+        );
         assert_eq!(reached_share(&graph, 0), 1.0, "{name}");
-        let highest = graph.lanes.iter().flat_map(|lane| &lane.centerline).map(|point| point[2]).fold(0.0, f64::max);
+        let highest = graph
+            .lanes
+            .iter()
+            .flat_map(|lane| &lane.centerline)
+            .map(|point| point[2])
+            .fold(0.0, f64::max);
         assert!(highest > 6.4, "{name}: highest road at {highest} m");
-        assert!(layout.network.roads.iter().any(|road| road.structures.iter().any(|structure| structure.tunnel)));
+        assert!(
+            layout
+                .network
+                .roads
+                .iter()
+                .any(|road| road.structures.iter().any(|structure| structure.tunnel))
+        );
     }
 }
 
 #[test]
 fn seeds_change_the_layout() {
     for lay_out in [town1, town4] {
-        let roads = |seed| lay_out(seed).network.roads.iter().map(|road| road.length_m).collect::<Vec<_>>();
+        let roads = |seed| {
+            lay_out(seed)
+                .network
+                .roads
+                .iter()
+                .map(|road| road.length_m)
+                .collect::<Vec<_>>()
+        };
         assert_eq!(roads(5), roads(5));
         assert_ne!(roads(5), roads(6));
     }

@@ -14,20 +14,34 @@ const LIMIT_MPS: f64 = 11.176;
 /// Lays out the map of a seed.
 pub(crate) fn lay_out(seed: u64) -> Layout {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let (width, height) = (rng.random_range(385.0..415.0), rng.random_range(325.0..355.0));
+    let (width, height) = (
+        rng.random_range(385.0..415.0),
+        rng.random_range(325.0..355.0),
+    );
     let (columns, rows) = [(5, 4), (4, 5), (5, 5)][rng.random_range(0..3)];
     // Streets that are not at right angles: the rows' ends lie at different heights.
     let (shear, taper) = (rng.random_range(-0.1..0.1), rng.random_range(-0.08..0.08));
     let columns_m = spread(0.0, width, columns, 0.22, &mut rng);
     // A denser grid loses more streets, so that the total length is about the same for all grids.
     let left_out = if columns + rows == 9 { 0.04 } else { 0.14 };
-    let plan = GridPlan { columns_m, rows, left_out, jitter_m: 5.0 };
+    let plan = GridPlan {
+        columns_m,
+        rows,
+        left_out,
+        jitter_m: 5.0,
+    };
     let y_range = |x: f64| {
         let share = x / width - 0.5;
-        [shear * x + share * taper * height, height + shear * x - share * taper * height]
+        [
+            shear * x + share * taper * height,
+            height + shear * x - share * taper * height,
+        ]
     };
     let graph = grid(&plan, y_range, None, &mut rng);
     let mut builder = Builder::default();
     streets::lay_out(&mut builder, &graph, LIMIT_MPS, &mut rng);
-    Layout { network: builder.network, islands: Vec::new() }
+    Layout {
+        network: builder.network,
+        islands: Vec::new(),
+    }
 }

@@ -31,7 +31,11 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x7465_776e_3474_6f77);
     let mut builder = Builder::default();
     let ring = Ring::random(&mut rng);
-    let motorway = Motorway { ring, lanes: rng.random_range(3..=4), median_m: rng.random_range(1.6..3.2) };
+    let motorway = Motorway {
+        ring,
+        lanes: rng.random_range(3..=4),
+        median_m: rng.random_range(1.6..3.2),
+    };
     let [inside, outside] = roundabouts(&motorway, &mut rng);
     let link = link_road(&mut builder, &inside, &outside);
     // Arms by rising angle: 0 is away from the town inside, and away from the ring outside.
@@ -39,13 +43,32 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     let map_model = map_model(&mut builder, &motorway, &inside, &mut rng);
     let works = works(&mut builder, &outside, &mut rng);
     let [off_inside, on_inside, off_outside, on_outside] = ramps;
-    let start = |road| RoadEnd { road, contact: Contact::Start };
-    let end = |road| RoadEnd { road, contact: Contact::End };
-    let arms = [(0.0, start(link)), (FRAC_PI_2, end(off_inside)), (PI, map_model), (-FRAC_PI_2, start(on_inside))];
+    let start = |road| RoadEnd {
+        road,
+        contact: Contact::Start,
+    };
+    let end = |road| RoadEnd {
+        road,
+        contact: Contact::End,
+    };
+    let arms = [
+        (0.0, start(link)),
+        (FRAC_PI_2, end(off_inside)),
+        (PI, map_model),
+        (-FRAC_PI_2, start(on_inside)),
+    ];
     inside.join(&mut builder, &arms);
-    let arms = [(0.0, works), (FRAC_PI_2, start(on_outside)), (PI, end(link)), (-FRAC_PI_2, end(off_outside))];
+    let arms = [
+        (0.0, works),
+        (FRAC_PI_2, start(on_outside)),
+        (PI, end(link)),
+        (-FRAC_PI_2, end(off_outside)),
+    ];
     outside.join(&mut builder, &arms);
-    Layout { network: builder.network, islands: vec![inside.island(), outside.island()] }
+    Layout {
+        network: builder.network,
+        islands: vec![inside.island(), outside.island()],
+    }
 }
 
 /// One roundabout inside the ring's right-hand lobe and one outside, on a line across the motorway at its far end.
@@ -53,16 +76,28 @@ fn roundabouts(motorway: &Motorway, rng: &mut ChaCha8Rng) -> [Roundabout; 2] {
     let apex = motorway.ring.pose(motorway.ring.apex_m());
     let mut at = |side: f64| {
         let distance = rng.random_range(88.0..104.0);
-        Roundabout { center_m: [apex.x + side * distance, apex.y], radius_m: rng.random_range(20.0..25.0) }
+        Roundabout {
+            center_m: [apex.x + side * distance, apex.y],
+            radius_m: rng.random_range(20.0..25.0),
+        }
     };
     [at(-1.0), at(1.0)]
 }
 
 /// The road below the motorway.
 fn link_road(builder: &mut Builder, inside: &Roundabout, outside: &Roundabout) -> usize {
-    let lanes = vec![(LaneKind::Driving, 3.5), (LaneKind::Shoulder, 0.8), (LaneKind::Sidewalk, 2.2)];
+    let lanes = vec![
+        (LaneKind::Driving, 3.5),
+        (LaneKind::Shoulder, 0.8),
+        (LaneKind::Sidewalk, 2.2),
+    ];
     let poses = [inside.port(0.0), outside.port(PI).reversed()];
-    builder.road(path(&poses), Profile::default(), &CrossProfile::both(lanes), LINK_LIMIT_MPS)
+    builder.road(
+        path(&poses),
+        Profile::default(),
+        &CrossProfile::both(lanes),
+        LINK_LIMIT_MPS,
+    )
 }
 
 /// Carriageways and ramps. Returns the ramps: off and on at the inner roundabout, off and on at the outer one.
@@ -83,17 +118,24 @@ fn interchange(
         let after = apex + direction * RAMP_FROM_MIDDLE_M;
         let zone = direction * RAMP_ZONE_M;
         // Ring lengths of the tunnel as they follow on the way round.
-        let (first, second) =
-            if direction > 0.0 { (tunnel, tunnel_end) } else { (tunnel_end - around, tunnel - around) };
+        let (first, second) = if direction > 0.0 {
+            (tunnel, tunnel_end)
+        } else {
+            (tunnel_end - around, tunnel - around)
+        };
         let inner = motorway.carriageway(builder, before, after, direction);
         let stops = [after + zone, (after + zone + first) / 2.0, first, second];
         let [leaving, covered] = motorway.carriageways(builder, &stops, direction);
         Motorway::cover(builder, covered);
         let back = before - zone + direction * around;
-        let [rest, arriving] = motorway.carriageways(builder, &[second, (second + back) / 2.0, back], direction);
+        let [rest, arriving] =
+            motorway.carriageways(builder, &[second, (second + back) / 2.0, back], direction);
         builder.follow(covered, rest);
         // Inside, the ring leads down: traffic comes from above. Outside it comes from below.
-        let (from, to) = (roundabout.port(direction * FRAC_PI_2), roundabout.port(-direction * FRAC_PI_2));
+        let (from, to) = (
+            roundabout.port(direction * FRAC_PI_2),
+            roundabout.port(-direction * FRAC_PI_2),
+        );
         let off = motorway.off_ramp(builder, before, direction, from);
         let on = motorway.on_ramp(builder, after, direction, to);
         motorway.diverge(builder, arriving, inner, off);
@@ -104,19 +146,37 @@ fn interchange(
 }
 
 /// The small town inside the ring; returns the street's end at the roundabout.
-fn map_model(builder: &mut Builder, motorway: &Motorway, inside: &Roundabout, rng: &mut ChaCha8Rng) -> RoadEnd {
+fn map_model(
+    builder: &mut Builder,
+    motorway: &Motorway,
+    inside: &Roundabout,
+    rng: &mut ChaCha8Rng,
+) -> RoadEnd {
     let port = inside.port(PI);
-    let (east, west) =
-        (port.x - rng.random_range(30.0..45.0), motorway.ring.pose(0.0).x + rng.random_range(150.0..175.0));
+    let (east, west) = (
+        port.x - rng.random_range(30.0..45.0),
+        motorway.ring.pose(0.0).x + rng.random_range(150.0..175.0),
+    );
     let y_range = |x: f64| {
         let [low, high] = motorway.ring.lobe_m(x);
         [low + CLEARANCE_M, high - CLEARANCE_M]
     };
-    let columns_m = spread(west, east, (((east - west) / STREETS_M) as usize + 1).clamp(2, 4), 0.12, rng);
+    let columns_m = spread(
+        west,
+        east,
+        (((east - west) / STREETS_M) as usize + 1).clamp(2, 4),
+        0.12,
+        rng,
+    );
     // As many rows as the shortest column has room for.
     let heights = columns_m.iter().map(|&x| y_range(x)[1] - y_range(x)[0]);
     let rows = (heights.fold(f64::INFINITY, f64::min) / STREETS_M) as usize + 1;
-    let plan = GridPlan { columns_m, rows: rows.clamp(3, 5), left_out: 0.12, jitter_m: 4.0 };
+    let plan = GridPlan {
+        columns_m,
+        rows: rows.clamp(3, 5),
+        left_out: 0.12,
+        jitter_m: 4.0,
+    };
     let graph = grid(&plan, y_range, Some(port), rng);
     streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
 }
@@ -125,10 +185,23 @@ fn map_model(builder: &mut Builder, motorway: &Motorway, inside: &Roundabout, rn
 fn works(builder: &mut Builder, outside: &Roundabout, rng: &mut ChaCha8Rng) -> RoadEnd {
     let port = outside.port(0.0);
     let west = port.x + rng.random_range(35.0..50.0);
-    let (width, height) = (rng.random_range(120.0..180.0), rng.random_range(150.0..210.0));
-    let plan = GridPlan { columns_m: vec![west, west + width], rows: 3, left_out: 0.14, jitter_m: 5.0 };
+    let (width, height) = (
+        rng.random_range(120.0..180.0),
+        rng.random_range(150.0..210.0),
+    );
+    let plan = GridPlan {
+        columns_m: vec![west, west + width],
+        rows: 3,
+        left_out: 0.14,
+        jitter_m: 5.0,
+    };
     let (y, shear) = (port.y, rng.random_range(-0.15..0.15));
-    let y_range = |x: f64| [y - height / 2.0 + shear * (x - west), y + height / 2.0 + shear * (x - west)];
+    let y_range = |x: f64| {
+        [
+            y - height / 2.0 + shear * (x - west),
+            y + height / 2.0 + shear * (x - west),
+        ]
+    };
     let graph = grid(&plan, y_range, Some(port), rng);
     streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
 }

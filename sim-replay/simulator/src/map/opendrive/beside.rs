@@ -13,16 +13,22 @@ fn read_all<T>(
     read: impl Fn(Element) -> Result<T, OpenDriveError>,
     log: &mut FindingLog,
 ) -> Vec<T> {
-    let Some(list) = road.child(list) else { return Vec::new() };
-    let read =
-        children(list, name).filter_map(|element| read(element).map_err(|error| error.note(log, "left out")).ok());
+    let Some(list) = road.child(list) else {
+        return Vec::new();
+    };
+    let read = children(list, name).filter_map(|element| {
+        read(element)
+            .map_err(|error| error.note(log, "left out"))
+            .ok()
+    });
     read.collect()
 }
 
 pub(super) fn read_objects(road: Element, log: &mut FindingLog) -> Vec<RoadObject> {
     let read_object = |element: Element| {
-        let label =
-            [element.optional_text("type"), element.optional_text("name")].map(Option::unwrap_or_default).join(" ");
+        let label = [element.optional_text("type"), element.optional_text("name")]
+            .map(Option::unwrap_or_default)
+            .join(" ");
         let size = |name| element.number_or(name, 0.0, 0.0, 1e4);
         Ok(RoadObject {
             label,
@@ -39,7 +45,11 @@ pub(super) fn read_objects(road: Element, log: &mut FindingLog) -> Vec<RoadObjec
 pub(super) fn read_signals(road: Element, log: &mut FindingLog) -> Vec<RoadSignal> {
     let read_signal = |element: Element| {
         // The signal faces against the direction it is for; `+` is for traffic along the road.
-        let flip = if element.optional_text("orientation") == Some("-") { std::f64::consts::PI } else { 0.0 };
+        let flip = if element.optional_text("orientation") == Some("-") {
+            std::f64::consts::PI
+        } else {
+            0.0
+        };
         Ok(RoadSignal {
             name: element.optional_text("name").unwrap_or_default().to_owned(),
             dynamic: element.optional_text("dynamic") == Some("yes"),
@@ -53,12 +63,20 @@ pub(super) fn read_signals(road: Element, log: &mut FindingLog) -> Vec<RoadSigna
     read_all(road, "signals", "signal", read_signal, log)
 }
 
-pub(super) fn read_structures(road: Element, road_length_m: f64, log: &mut FindingLog) -> Vec<RoadStructure> {
+pub(super) fn read_structures(
+    road: Element,
+    road_length_m: f64,
+    log: &mut FindingLog,
+) -> Vec<RoadStructure> {
     let mut structures = Vec::new();
     for (name, tunnel) in [("bridge", false), ("tunnel", true)] {
         let read = |element: Element| {
             let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
-            Ok(RoadStructure { tunnel, s_m, length_m: element.number("length", 0.0, MAX_LENGTH_M)? })
+            Ok(RoadStructure {
+                tunnel,
+                s_m,
+                length_m: element.number("length", 0.0, MAX_LENGTH_M)?,
+            })
         };
         structures.extend(read_all(road, "objects", name, read, log));
     }

@@ -26,7 +26,10 @@ pub(super) fn widths_from_borders(
     stretch: &Stretch,
     log: &mut FindingLog,
 ) -> Result<(), OpenDriveError> {
-    if elements.iter().all(|element| element.child("border").is_none()) {
+    if elements
+        .iter()
+        .all(|element| element.child("border").is_none())
+    {
         return Ok(());
     }
     let side = f64::from(sign);
@@ -59,7 +62,8 @@ fn read_border(
     log: &mut FindingLog,
 ) -> Result<Profile, OpenDriveError> {
     let border = read_profile(element, "border", "sOffset", MAX_OFFSET_M)?;
-    let looks = (0..=LOOKS).map(|look| border.at(stretch.length_m * f64::from(look) / f64::from(LOOKS)));
+    let looks =
+        (0..=LOOKS).map(|look| border.at(stretch.length_m * f64::from(look) / f64::from(LOOKS)));
     let farthest = looks.fold(0.0, |far: f64, t| if t.abs() > far.abs() { t } else { far });
     if farthest * side < 0.0 {
         let found = format!("has <border> at t={farthest:.3} on its other side");
@@ -80,41 +84,75 @@ fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut Fin
 
 /// A profile over places counted from `start_m` on.
 fn shifted(profile: &Profile, start_m: f64) -> Profile {
-    let last_before = profile.records.partition_point(|&(start, _)| start <= start_m).saturating_sub(1);
-    let records = profile.records.get(last_before..).unwrap_or_default().iter();
+    let last_before = profile
+        .records
+        .partition_point(|&(start, _)| start <= start_m)
+        .saturating_sub(1);
+    let records = profile
+        .records
+        .get(last_before..)
+        .unwrap_or_default()
+        .iter();
     let records = records.map(|&(start, coefficients)| {
-        if start < start_m { (0.0, moved(coefficients, start_m - start)) } else { (start - start_m, coefficients) }
+        if start < start_m {
+            (0.0, moved(coefficients, start_m - start))
+        } else {
+            (start - start_m, coefficients)
+        }
     });
-    Profile { records: records.collect() }
+    Profile {
+        records: records.collect(),
+    }
 }
 
 fn times(profile: &Profile, factor: f64) -> Profile {
-    let records = profile.records.iter().map(|&(start, coefficients)| (start, coefficients.map(|c| factor * c)));
-    Profile { records: records.collect() }
+    let records = profile
+        .records
+        .iter()
+        .map(|&(start, coefficients)| (start, coefficients.map(|c| factor * c)));
+    Profile {
+        records: records.collect(),
+    }
 }
 
 /// Sum of two profiles: a record wherever either has one.
 fn sum(a: &Profile, b: &Profile) -> Profile {
-    let mut starts: Vec<f64> = a.records.iter().chain(&b.records).map(|&(start, _)| start).collect();
+    let mut starts: Vec<f64> = a
+        .records
+        .iter()
+        .chain(&b.records)
+        .map(|&(start, _)| start)
+        .collect();
     starts.sort_unstable_by(f64::total_cmp);
     starts.dedup();
     let at = |profile: &Profile, place: f64| {
-        let after = profile.records.partition_point(|&(start, _)| start <= place);
+        let after = profile
+            .records
+            .partition_point(|&(start, _)| start <= place);
         let record = profile.records.get(after.saturating_sub(1));
-        record.map_or([0.0; 4], |&(start, coefficients)| moved(coefficients, place - start))
+        record.map_or([0.0; 4], |&(start, coefficients)| {
+            moved(coefficients, place - start)
+        })
     };
     let records = starts.into_iter().map(|place| {
         let (a, b) = (at(a, place), at(b, place));
         let ([a0, a1, a2, a3], [b0, b1, b2, b3]) = (a, b);
         (place, [a0 + b0, a1 + b1, a2 + b2, a3 + b3])
     });
-    Profile { records: records.collect() }
+    Profile {
+        records: records.collect(),
+    }
 }
 
 /// The same cubic of a variable that begins `by` later.
 fn moved(coefficients: [f64; 4], by: f64) -> [f64; 4] {
     let [_, _, c, d] = coefficients;
-    [cubic(coefficients, by), cubic_slope(coefficients, by), c + 3.0 * d * by, d]
+    [
+        cubic(coefficients, by),
+        cubic_slope(coefficients, by),
+        c + 3.0 * d * by,
+        d,
+    ]
 }
 
 #[cfg(test)]
@@ -123,14 +161,34 @@ mod tests {
 
     #[test]
     fn sums_of_cubics_are_exact_wherever_either_changes() {
-        let a = Profile { records: vec![(0.0, [3.0, 0.1, -0.01, 0.001]), (12.0, [2.0, 0.0, 0.02, 0.0])] };
-        let b = Profile { records: vec![(0.0, [1.0, 0.0, 0.0, 0.0]), (7.5, [0.5, -0.2, 0.0, 0.003])] };
+        let a = Profile {
+            records: vec![
+                (0.0, [3.0, 0.1, -0.01, 0.001]),
+                (12.0, [2.0, 0.0, 0.02, 0.0]),
+            ],
+        };
+        let b = Profile {
+            records: vec![(0.0, [1.0, 0.0, 0.0, 0.0]), (7.5, [0.5, -0.2, 0.0, 0.003])],
+        };
         let found = sum(&a, &b);
-        assert_eq!(found.records.iter().map(|record| record.0).collect::<Vec<_>>(), [0.0, 7.5, 12.0]);
+        assert_eq!(
+            found
+                .records
+                .iter()
+                .map(|record| record.0)
+                .collect::<Vec<_>>(),
+            [0.0, 7.5, 12.0]
+        );
         for place in 0..200 {
             let place = f64::from(place) / 10.0;
-            assert!((found.at(place) - a.at(place) - b.at(place)).abs() < 1e-9, "{place}");
-            assert!((shifted(&a, 5.0).at(place) - a.at(place + 5.0)).abs() < 1e-9, "{place}");
+            assert!(
+                (found.at(place) - a.at(place) - b.at(place)).abs() < 1e-9,
+                "{place}"
+            );
+            assert!(
+                (shifted(&a, 5.0).at(place) - a.at(place + 5.0)).abs() < 1e-9,
+                "{place}"
+            );
         }
         assert_eq!(shifted(&Profile::default(), 5.0), Profile::default());
     }

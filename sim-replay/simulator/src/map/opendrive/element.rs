@@ -58,13 +58,39 @@ impl OpenDriveError {
     /// Records the error as a finding: the affected part was handled by `action`.
     pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
         match self {
-            Self::TooLarge { .. } | Self::Xml(_) => log.add(1, "OpenDRIVE", &self.to_string(), action),
-            Self::Element { line, element, problem } => log.add(*line, element, problem, action),
-            Self::Missing { line, element, attribute } => {
-                log.add(*line, element, &format!("has no attribute {attribute}"), action);
+            Self::TooLarge { .. } | Self::Xml(_) => {
+                log.add(1, "OpenDRIVE", &self.to_string(), action)
             }
-            Self::Value { line, element, attribute, value, expected } => {
-                log.add(*line, element, &format!("{attribute}=\"{value}\", expected {expected}"), action);
+            Self::Element {
+                line,
+                element,
+                problem,
+            } => log.add(*line, element, problem, action),
+            Self::Missing {
+                line,
+                element,
+                attribute,
+            } => {
+                log.add(
+                    *line,
+                    element,
+                    &format!("has no attribute {attribute}"),
+                    action,
+                );
+            }
+            Self::Value {
+                line,
+                element,
+                attribute,
+                value,
+                expected,
+            } => {
+                log.add(
+                    *line,
+                    element,
+                    &format!("{attribute}=\"{value}\", expected {expected}"),
+                    action,
+                );
             }
         }
     }
@@ -117,7 +143,9 @@ pub(super) fn children<'a, 'input>(
     parent: Element<'a, 'input>,
     name: &'static str,
 ) -> impl Iterator<Item = Element<'a, 'input>> {
-    parent.elements().filter(move |element| element.node.has_tag_name(name))
+    parent
+        .elements()
+        .filter(move |element| element.node.has_tag_name(name))
 }
 
 impl<'a, 'input> Element<'a, 'input> {
@@ -133,14 +161,23 @@ impl<'a, 'input> Element<'a, 'input> {
     /// All child elements.
     pub(super) fn elements(self) -> impl Iterator<Item = Self> {
         let lines = self.lines;
-        self.node.children().filter(Node::is_element).map(move |node| Self { node, lines })
+        self.node
+            .children()
+            .filter(Node::is_element)
+            .map(move |node| Self { node, lines })
     }
 
     /// The largest magnitude of a number among the descendants with a name; 0 where there is none.
     pub(super) fn largest(&self, name: &'static str, attribute: &'static str) -> f64 {
-        let nodes = self.node.descendants().filter(|node| node.has_tag_name(name));
+        let nodes = self
+            .node
+            .descendants()
+            .filter(|node| node.has_tag_name(name));
         let values = nodes.filter_map(|node| node.attribute(attribute)?.trim().parse::<f64>().ok());
-        values.map(f64::abs).filter(|value| value.is_finite()).fold(0.0, f64::max)
+        values
+            .map(f64::abs)
+            .filter(|value| value.is_finite())
+            .fold(0.0, f64::max)
     }
 
     /// The first child with a name.
@@ -150,7 +187,8 @@ impl<'a, 'input> Element<'a, 'input> {
 
     /// The first child with a name, which must be there.
     pub(super) fn required(&self, name: &'static str) -> Result<Self, OpenDriveError> {
-        self.child(name).ok_or_else(|| self.error_element(&format!("has no <{name}>")))
+        self.child(name)
+            .ok_or_else(|| self.error_element(&format!("has no <{name}>")))
     }
 
     pub(super) fn optional_text(&self, attribute: &'static str) -> Option<&'a str> {
@@ -158,18 +196,31 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     pub(super) fn text(&self, attribute: &'static str) -> Result<&'a str, OpenDriveError> {
-        self.optional_text(attribute).ok_or_else(|| OpenDriveError::Missing {
-            line: self.line(),
-            element: self.name().to_owned(),
-            attribute,
-        })
+        self.optional_text(attribute)
+            .ok_or_else(|| OpenDriveError::Missing {
+                line: self.line(),
+                element: self.name().to_owned(),
+                attribute,
+            })
     }
 
     /// A finite number within bounds.
-    pub(super) fn number(&self, attribute: &'static str, low: f64, high: f64) -> Result<f64, OpenDriveError> {
+    pub(super) fn number(
+        &self,
+        attribute: &'static str,
+        low: f64,
+        high: f64,
+    ) -> Result<f64, OpenDriveError> {
         let text = self.text(attribute)?;
-        let value: f64 = text.trim().parse().map_err(|_| self.error_value(attribute, text, "a number"))?;
-        if (low..=high).contains(&value) { Ok(value) } else { Err(self.error_range(attribute, text, low, high)) }
+        let value: f64 = text
+            .trim()
+            .parse()
+            .map_err(|_| self.error_value(attribute, text, "a number"))?;
+        if (low..=high).contains(&value) {
+            Ok(value)
+        } else {
+            Err(self.error_range(attribute, text, low, high))
+        }
     }
 
     /// A finite number within bounds, or the default where the attribute is missing.
@@ -180,13 +231,20 @@ impl<'a, 'input> Element<'a, 'input> {
         low: f64,
         high: f64,
     ) -> Result<f64, OpenDriveError> {
-        if self.node.has_attribute(attribute) { self.number(attribute, low, high) } else { Ok(default) }
+        if self.node.has_attribute(attribute) {
+            self.number(attribute, low, high)
+        } else {
+            Ok(default)
+        }
     }
 
     /// A lane id.
     pub(super) fn lane_id(&self, attribute: &'static str) -> Result<i32, OpenDriveError> {
         let text = self.text(attribute)?;
-        let value: i32 = text.trim().parse().map_err(|_| self.error_value(attribute, text, "a lane id"))?;
+        let value: i32 = text
+            .trim()
+            .parse()
+            .map_err(|_| self.error_value(attribute, text, "a lane id"))?;
         // The absolute value of the lowest `i32` does not fit into an `i32`.
         if value.unsigned_abs() <= MAX_LANES.unsigned_abs() {
             Ok(value)
@@ -220,10 +278,19 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     pub(super) fn error_element(&self, problem: &str) -> OpenDriveError {
-        OpenDriveError::Element { line: self.line(), element: self.name().to_owned(), problem: problem.to_owned() }
+        OpenDriveError::Element {
+            line: self.line(),
+            element: self.name().to_owned(),
+            problem: problem.to_owned(),
+        }
     }
 
-    pub(super) fn error_value(&self, attribute: &'static str, value: &str, expected: &str) -> OpenDriveError {
+    pub(super) fn error_value(
+        &self,
+        attribute: &'static str,
+        value: &str,
+        expected: &str,
+    ) -> OpenDriveError {
         OpenDriveError::Value {
             line: self.line(),
             element: self.name().to_owned(),
@@ -240,7 +307,11 @@ impl<'a, 'input> Element<'a, 'input> {
         low: impl std::fmt::Display,
         high: impl std::fmt::Display,
     ) -> OpenDriveError {
-        self.error_value(attribute, &value.to_string(), &format!("a value from {low} to {high}"))
+        self.error_value(
+            attribute,
+            &value.to_string(),
+            &format!("a value from {low} to {high}"),
+        )
     }
 }
 
@@ -260,8 +331,17 @@ mod tests {
         let text: String = (0..1500).map(|line| "x".repeat(line % 17) + "\n").collect();
         assert!(text.len() > 3 * BLOCK);
         let lines = LineIndex::new(&text);
-        for place in (0..=text.len()).step_by(7).chain([BLOCK, BLOCK - 1, text.len(), text.len() + 9]) {
-            let counted = text.bytes().take(place).filter(|&byte| byte == b'\n').count() as u32 + 1;
+        for place in
+            (0..=text.len())
+                .step_by(7)
+                .chain([BLOCK, BLOCK - 1, text.len(), text.len() + 9])
+        {
+            let counted = text
+                .bytes()
+                .take(place)
+                .filter(|&byte| byte == b'\n')
+                .count() as u32
+                + 1;
             assert_eq!(lines.line(place), counted, "{place}");
         }
     }

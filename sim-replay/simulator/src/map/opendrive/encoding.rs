@@ -36,13 +36,20 @@ fn unmarked(bytes: &[u8], log: &mut FindingLog) -> &'static Encoding {
         [0, b'<', ..] => return UTF_16BE,
         _ => {}
     }
-    let Some(label) = declared(bytes.get(..DECLARATION_BYTES).unwrap_or(bytes)) else { return UTF_8 };
+    let Some(label) = declared(bytes.get(..DECLARATION_BYTES).unwrap_or(bytes)) else {
+        return UTF_8;
+    };
     match Encoding::for_label(label.as_bytes()) {
         // A declaration that can be read byte by byte is no UTF-16, whatever it declares.
         Some(encoding) if encoding == UTF_16LE || encoding == UTF_16BE => UTF_8,
         Some(encoding) => encoding,
         None => {
-            log.add(1, "OpenDRIVE", &format!("encoding=\"{label}\""), "unknown; read as UTF-8");
+            log.add(
+                1,
+                "OpenDRIVE",
+                &format!("encoding=\"{label}\""),
+                "unknown; read as UTF-8",
+            );
             UTF_8
         }
     }
@@ -51,10 +58,24 @@ fn unmarked(bytes: &[u8], log: &mut FindingLog) -> &'static Encoding {
 /// The label in `<?xml ... encoding="label"?>`.
 fn declared(head: &[u8]) -> Option<String> {
     let head = String::from_utf8_lossy(head);
-    let declaration = head.trim_start().strip_prefix("<?xml")?.split("?>").next()?;
-    let value = declaration.split_once("encoding")?.1.trim_start().strip_prefix('=')?.trim_start();
-    let quote = value.chars().next().filter(|&quote| quote == '"' || quote == '\'')?;
-    value[1..].split_once(quote).map(|(label, _)| label.trim().to_owned())
+    let declaration = head
+        .trim_start()
+        .strip_prefix("<?xml")?
+        .split("?>")
+        .next()?;
+    let value = declaration
+        .split_once("encoding")?
+        .1
+        .trim_start()
+        .strip_prefix('=')?
+        .trim_start();
+    let quote = value
+        .chars()
+        .next()
+        .filter(|&quote| quote == '"' || quote == '\'')?;
+    value[1..]
+        .split_once(quote)
+        .map(|(label, _)| label.trim().to_owned())
 }
 
 #[cfg(test)]
@@ -64,32 +85,56 @@ mod tests {
     fn decoded(bytes: &[u8]) -> (String, Vec<String>) {
         let mut log = FindingLog::default();
         let text = decode(bytes, &mut log).into_owned();
-        (text, log.into_list().iter().map(ToString::to_string).collect())
+        (
+            text,
+            log.into_list().iter().map(ToString::to_string).collect(),
+        )
     }
 
     #[test]
     fn marks_and_declarations_give_the_encoding() {
         let latin = b"<?xml version=\"1.0\" encoding='ISO-8859-1'?><a b=\"Stra\xdfe\"/>";
-        assert_eq!(decoded(latin).0, "<?xml version=\"1.0\" encoding='ISO-8859-1'?><a b=\"Straße\"/>");
+        assert_eq!(
+            decoded(latin).0,
+            "<?xml version=\"1.0\" encoding='ISO-8859-1'?><a b=\"Straße\"/>"
+        );
         assert_eq!(decoded(b"\xef\xbb\xbf<a/>"), ("<a/>".into(), vec![]));
-        let wide = |text: &str, bytes: fn(u16) -> [u8; 2]| text.encode_utf16().flat_map(bytes).collect::<Vec<_>>();
+        let wide = |text: &str, bytes: fn(u16) -> [u8; 2]| {
+            text.encode_utf16().flat_map(bytes).collect::<Vec<_>>()
+        };
         for text in ["\u{feff}<a b=\"ß\"/>", "<a b=\"ß\"/>"] {
             let plain = text.trim_start_matches('\u{feff}');
-            assert_eq!(decoded(&wide(text, u16::to_le_bytes)), (plain.into(), vec![]));
-            assert_eq!(decoded(&wide(text, u16::to_be_bytes)), (plain.into(), vec![]));
+            assert_eq!(
+                decoded(&wide(text, u16::to_le_bytes)),
+                (plain.into(), vec![])
+            );
+            assert_eq!(
+                decoded(&wide(text, u16::to_be_bytes)),
+                (plain.into(), vec![])
+            );
         }
     }
 
     #[test]
     fn invalid_bytes_are_read_and_reported() {
-        let (text, found) = decoded(b"<?xml version=\"1.0\" encoding=\"UTF-8\"?><a b=\"Stra\xdfe\"/>");
+        let (text, found) =
+            decoded(b"<?xml version=\"1.0\" encoding=\"UTF-8\"?><a b=\"Stra\xdfe\"/>");
         assert!(text.contains("Straße"), "{text}");
-        assert_eq!(found, ["line 1: <OpenDRIVE> holds bytes that are not UTF-8; read as windows-1252"]);
+        assert_eq!(
+            found,
+            ["line 1: <OpenDRIVE> holds bytes that are not UTF-8; read as windows-1252"]
+        );
         let (_, found) = decoded(b"<?xml version=\"1.0\" encoding=\"klingon\"?><a/>");
-        assert_eq!(found, ["line 1: <OpenDRIVE> encoding=\"klingon\"; unknown; read as UTF-8"]);
+        assert_eq!(
+            found,
+            ["line 1: <OpenDRIVE> encoding=\"klingon\"; unknown; read as UTF-8"]
+        );
         let (_, found) = decoded(b"\xff\xfe<\0\0\xd8");
         assert_eq!(found.len(), 1);
-        assert_eq!(decoded(b"<?xml version=\"1.0\" encoding=\"UTF-16\"?><a/>").1, Vec::<String>::new());
+        assert_eq!(
+            decoded(b"<?xml version=\"1.0\" encoding=\"UTF-16\"?><a/>").1,
+            Vec::<String>::new()
+        );
         assert_eq!(decoded(b""), (String::new(), vec![]));
     }
 }

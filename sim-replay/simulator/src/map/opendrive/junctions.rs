@@ -12,19 +12,33 @@ pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junctio
     let direct = kind == "direct";
     match kind {
         "default" | "direct" | "" => {}
-        "virtual" => element.note_value(log, "type", "built only where its roads begin or end at other roads' ends"),
-        "crossing" => element.note_value(log, "type", "left out: pedestrian crossings are not simulated"),
+        "virtual" => element.note_value(
+            log,
+            "type",
+            "built only where its roads begin or end at other roads' ends",
+        ),
+        "crossing" => element.note_value(
+            log,
+            "type",
+            "left out: pedestrian crossings are not simulated",
+        ),
         _ => element.note_value(log, "type", "treated as a common junction"),
     }
     let mut connections = Vec::new();
     for connection in children(element, "connection") {
         match read_connection(connection, ids, direct, log) {
             Ok(Some(found)) => connections.push(found),
-            Ok(None) => connection.note(log, "names no road that it leads to", "connection left out"),
+            Ok(None) => {
+                connection.note(log, "names no road that it leads to", "connection left out")
+            }
             Err(error) => error.note(log, "connection left out"),
         }
     }
-    Junction { id: element.optional_text("id").unwrap_or_default().to_owned(), direct, connections }
+    Junction {
+        id: element.optional_text("id").unwrap_or_default().to_owned(),
+        direct,
+        connections,
+    }
 }
 
 fn read_connection(
@@ -38,7 +52,11 @@ fn read_connection(
         let found = ids.roads.get(id).copied();
         found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
     };
-    let onto = if direct { "linkedRoad" } else { "connectingRoad" };
+    let onto = if direct {
+        "linkedRoad"
+    } else {
+        "connectingRoad"
+    };
     if element.optional_text(onto).is_none() {
         return Ok(None);
     }
@@ -56,5 +74,10 @@ fn read_connection(
         return Err(element.error_element("has no lane link that can be read"));
     }
     let (incoming, connecting) = (road("incomingRoad")?, road(onto)?);
-    Ok(Some(Connection { incoming, connecting, contact: read_contact(element)?, lane_links }))
+    Ok(Some(Connection {
+        incoming,
+        connecting,
+        contact: read_contact(element)?,
+        lane_links,
+    }))
 }

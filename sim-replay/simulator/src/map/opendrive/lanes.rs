@@ -18,7 +18,9 @@ pub(super) fn read_sections(
     let mut starts: Vec<(f64, Element)> = Vec::new();
     for element in children(lanes, "laneSection") {
         // Writers round: a section may begin a little behind the road's end.
-        let s_m = element.number("s", 0.0, road_length_m + 1.0)?.min(road_length_m);
+        let s_m = element
+            .number("s", 0.0, road_length_m + 1.0)?
+            .min(road_length_m);
         if let Some((before, _)) = starts.last().filter(|(before, _)| s_m < *before) {
             let expected = format!("at least the section before, {before}");
             return Err(element.error_value("s", &s_m.to_string(), &expected));
@@ -30,15 +32,25 @@ pub(super) fn read_sections(
     }
     let mut sections = Vec::with_capacity(starts.len());
     for (place, &(s_m, element)) in starts.iter().enumerate() {
-        let end_m = starts.get(place + 1).map_or(road_length_m, |(next, _)| *next);
+        let end_m = starts
+            .get(place + 1)
+            .map_or(road_length_m, |(next, _)| *next);
         if matches!(element.optional_text("singleSide"), Some("true" | "1")) {
             element.note_value(log, "singleSide", "the other side has no lanes here");
         }
         let mut side = |name, sign| {
-            let stretch = Stretch { s_m, length_m: end_m - s_m, lane_offset };
+            let stretch = Stretch {
+                s_m,
+                length_m: end_m - s_m,
+                lane_offset,
+            };
             read_side(element, name, sign, &stretch, log)
         };
-        let section = LaneSection { s_m, left: side("left", 1)?, right: side("right", -1)? };
+        let section = LaneSection {
+            s_m,
+            left: side("left", 1)?,
+            right: side("right", -1)?,
+        };
         check_widths(element, &section, end_m - s_m)?;
         sections.push(section);
     }
@@ -54,11 +66,26 @@ pub(super) struct Stretch<'a> {
 }
 
 /// Refuses sections whose width polynomials exceed the limits of a road.
-fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<(), OpenDriveError> {
-    let widest = |width: &Profile| (0..=20).map(|i| width.at(length_m * f64::from(i) / 20.0)).fold(0.0, f64::max);
-    match section.left.iter().chain(&section.right).map(|lane| widest(&lane.width)).find(|&width| width > MAX_WIDTH_M) {
+fn check_widths(
+    element: Element,
+    section: &LaneSection,
+    length_m: f64,
+) -> Result<(), OpenDriveError> {
+    let widest = |width: &Profile| {
+        (0..=20)
+            .map(|i| width.at(length_m * f64::from(i) / 20.0))
+            .fold(0.0, f64::max)
+    };
+    match section
+        .left
+        .iter()
+        .chain(&section.right)
+        .map(|lane| widest(&lane.width))
+        .find(|&width| width > MAX_WIDTH_M)
+    {
         Some(width) => {
-            let problem = format!("holds a lane that is {width:.1} m wide; expected at most {MAX_WIDTH_M}");
+            let problem =
+                format!("holds a lane that is {width:.1} m wide; expected at most {MAX_WIDTH_M}");
             Err(element.error_element(&problem))
         }
         None => Ok(()),
@@ -74,22 +101,36 @@ fn read_side(
     stretch: &Stretch,
     log: &mut FindingLog,
 ) -> Result<Vec<RoadLane>, OpenDriveError> {
-    let Some(side) = section.child(name) else { return Ok(Vec::new()) };
+    let Some(side) = section.child(name) else {
+        return Ok(Vec::new());
+    };
     let mut elements: Vec<(i32, Element)> = Vec::new();
     for element in children(side, "lane") {
         match element.lane_id("id") {
             Ok(id) if id.signum() == sign => elements.push((id.abs(), element)),
-            Ok(id) => element.error_range("id", id, sign, sign * MAX_LANES).note(log, "lane left out"),
+            Ok(id) => element
+                .error_range("id", id, sign, sign * MAX_LANES)
+                .note(log, "lane left out"),
             Err(error) => error.note(log, "lane left out"),
         }
     }
     elements.sort_by_key(|&(id, _)| id);
-    let count = elements.iter().zip(1..).take_while(|((id, _), place)| id == place).count();
-    let next = elements.iter().zip(1..).find(|((id, _), place)| id != place).map_or(1, |(_, place)| place);
+    let count = elements
+        .iter()
+        .zip(1..)
+        .take_while(|((id, _), place)| id == place)
+        .count();
+    let next = elements
+        .iter()
+        .zip(1..)
+        .find(|((id, _), place)| id != place)
+        .map_or(1, |(_, place)| place);
     for &(_, element) in elements.iter().skip(count) {
         let expected = format!("{}, without gaps or doubles", sign * next);
         let id = element.optional_text("id").unwrap_or_default();
-        element.error_value("id", id, &expected).note(log, "lane left out");
+        element
+            .error_value("id", id, &expected)
+            .note(log, "lane left out");
     }
     elements.truncate(count);
     let mut lanes = Vec::with_capacity(count);
@@ -106,13 +147,19 @@ fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane, OpenDri
     let link = element.child("link");
     let mut linked = |name| {
         let end = link.and_then(|link| link.child(name))?;
-        end.lane_id("id").map_err(|error| error.note(log, "lane link treated as absent")).ok()
+        end.lane_id("id")
+            .map_err(|error| error.note(log, "lane link treated as absent"))
+            .ok()
     };
     let (predecessor, successor) = (linked("predecessor"), linked("successor"));
     let mut speeds = children(element, "speed");
     let speed_limit_mps = speeds.next().and_then(|speed| read_speed(speed, log));
     for further in speeds {
-        further.note_value(log, "sOffset", "left out: the first limit holds for the whole lane");
+        further.note_value(
+            log,
+            "sOffset",
+            "left out: the first limit holds for the whole lane",
+        );
     }
     let reversed = match element.optional_text("direction") {
         Some("reversed") => true,
@@ -139,8 +186,8 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
             element.note_value(log, "type", "driven in the direction of its side only");
             LaneKind::Driving
         }
-        "driving" | "entry" | "exit" | "onRamp" | "offRamp" | "connectingRamp" | "slipLane" | "mwyEntry"
-        | "mwyExit" => LaneKind::Driving,
+        "driving" | "entry" | "exit" | "onRamp" | "offRamp" | "connectingRamp" | "slipLane"
+        | "mwyEntry" | "mwyExit" => LaneKind::Driving,
         "parking" => LaneKind::Parking,
         "shoulder" | "stop" => LaneKind::Shoulder,
         "sidewalk" | "walking" => LaneKind::Sidewalk,
@@ -155,8 +202,10 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
 
 /// Reports the heights of lanes over the road (kerbs), which are not built.
 fn note_heights(element: Element, log: &mut FindingLog) {
-    let height = |element: &Element, name| element.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0).abs();
-    let heights = children(element, "height").map(|record| height(&record, "inner").max(height(&record, "outer")));
+    let height =
+        |element: &Element, name| element.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0).abs();
+    let heights = children(element, "height")
+        .map(|record| height(&record, "inner").max(height(&record, "outer")));
     let highest_m = heights.fold(0.0, f64::max);
     if highest_m > 0.0 {
         let kind = element.optional_text("type").unwrap_or_default();

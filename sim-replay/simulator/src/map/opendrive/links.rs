@@ -10,7 +10,9 @@ pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut Findi
     let link = element.child("link");
     let mut end = |name| {
         let end = link.and_then(|link| link.child(name))?;
-        read_link(end, ids).map_err(|error| error.note(log, "link treated as absent")).ok()
+        read_link(end, ids)
+            .map_err(|error| error.note(log, "link treated as absent"))
+            .ok()
     };
     (road.predecessor, road.successor) = (end("predecessor"), end("successor"));
     road.junction = match element.optional_text("junction").map(str::trim) {
@@ -18,7 +20,11 @@ pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut Findi
         Some(id) => {
             let junction = ids.junctions.get(id).copied();
             if junction.is_none() {
-                element.note_value(log, "junction", "no such junction in this map; treated as none");
+                element.note_value(
+                    log,
+                    "junction",
+                    "no such junction in this map; treated as none",
+                );
             }
             junction
         }
@@ -33,12 +39,14 @@ fn read_link(element: Element, ids: &Ids) -> Result<RoadLink, OpenDriveError> {
             None => Err(element.error_value("elementId", id, "the id of a junction of this map")),
         },
         "road" => match ids.roads.get(id) {
-            Some(&road) if element.optional_text("contactPoint").is_some() => {
-                Ok(RoadLink::Road { road, contact: read_contact(element)? })
-            }
+            Some(&road) if element.optional_text("contactPoint").is_some() => Ok(RoadLink::Road {
+                road,
+                contact: read_contact(element)?,
+            }),
             Some(_) if element.optional_text("elementS").is_some() => {
                 let at = element.optional_text("elementS").unwrap_or_default();
-                let problem = format!("meets road {id} at s={at}, between its ends (virtual junction)");
+                let problem =
+                    format!("meets road {id} at s={at}, between its ends (virtual junction)");
                 Err(element.error_element(&problem))
             }
             Some(_) => Err(element.error_element("has no attribute contactPoint")),

@@ -7,7 +7,14 @@
 //! before it is used, so that no file can cause a panic, a hang or unbounded memory.
 
 // Maps come from other programs: an index or a cast that does not fit is an error of the map, not a panic.
-#![cfg_attr(not(test), deny(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::indexing_slicing))]
+#![cfg_attr(
+    not(test),
+    deny(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        clippy::indexing_slicing
+    )
+)]
 
 mod beside;
 mod border;
@@ -70,13 +77,23 @@ pub fn read_bytes(bytes: &[u8]) -> Result<RoadNetwork, OpenDriveError> {
 }
 
 fn check_size(bytes: usize) -> Result<(), OpenDriveError> {
-    if bytes > MAX_BYTES { Err(OpenDriveError::TooLarge { bytes, limit: MAX_BYTES }) } else { Ok(()) }
+    if bytes > MAX_BYTES {
+        Err(OpenDriveError::TooLarge {
+            bytes,
+            limit: MAX_BYTES,
+        })
+    } else {
+        Ok(())
+    }
 }
 
 fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveError> {
-    let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
-    let document =
-        Document::parse_with_options(text, options).map_err(|error| OpenDriveError::Xml(error.to_string()))?;
+    let options = ParsingOptions {
+        nodes_limit: MAX_NODES,
+        ..ParsingOptions::default()
+    };
+    let document = Document::parse_with_options(text, options)
+        .map_err(|error| OpenDriveError::Xml(error.to_string()))?;
     let lines = LineIndex::new(text);
     let root = Element::root(document.root_element(), &lines);
     if root.name() != "OpenDRIVE" {
@@ -85,15 +102,29 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveEr
     children(root, "include").for_each(|element| element.note_value(&mut log, "file", "left out"));
     let (mut roads, elements) = read_roads(root, &mut log)?;
     let (junctions, junction_elements) = collect_ids(root, "junction", &mut log);
-    let places = roads.iter().enumerate().map(|(place, road)| (road.id.clone(), place));
-    let ids = Ids { roads: places.collect(), junctions };
+    let places = roads
+        .iter()
+        .enumerate()
+        .map(|(place, road)| (road.id.clone(), place));
+    let ids = Ids {
+        roads: places.collect(),
+        junctions,
+    };
     let mut junctions_m = vec![0.0; ids.junctions.len()];
     for (road, element) in roads.iter_mut().zip(elements) {
         log.enter("road", &road.id);
         links::read(element, road, &ids, &mut log);
-        if let Some(total_m) = road.junction.and_then(|junction| junctions_m.get_mut(junction)) {
+        if let Some(total_m) = road
+            .junction
+            .and_then(|junction| junctions_m.get_mut(junction))
+        {
             *total_m += lanes_length_m(road);
-            check_total(element, "the lanes of its junction", *total_m, MAX_JUNCTION_M)?;
+            check_total(
+                element,
+                "the lanes of its junction",
+                *total_m,
+                MAX_JUNCTION_M,
+            )?;
         }
     }
     let mut junctions = Vec::new();
@@ -101,7 +132,11 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveEr
         log.enter("junction", element.optional_text("id").unwrap_or_default());
         junctions.push(junctions::read(element, &ids, &mut log));
     }
-    Ok(RoadNetwork { roads, junctions, findings: log.into_list() })
+    Ok(RoadNetwork {
+        roads,
+        junctions,
+        findings: log.into_list(),
+    })
 }
 
 /// All roads that can be read, each with its element; the others are left out.
@@ -147,11 +182,18 @@ fn lanes_length_m(road: &Road) -> f64 {
     lengths.sum()
 }
 
-fn check_total(element: Element, what: &str, total_m: f64, limit_m: f64) -> Result<(), OpenDriveError> {
+fn check_total(
+    element: Element,
+    what: &str,
+    total_m: f64,
+    limit_m: f64,
+) -> Result<(), OpenDriveError> {
     if total_m <= limit_m {
         return Ok(());
     }
-    Err(element.error_element(&format!("brings {what} to {total_m:.0} m, more than the limit of {limit_m} m")))
+    Err(element.error_element(&format!(
+        "brings {what} to {total_m:.0} m, more than the limit of {limit_m} m"
+    )))
 }
 
 /// Elements with an id of their own, and their indices by id; others are left out.
@@ -164,7 +206,9 @@ fn collect_ids<'a, 'input>(
     for element in children(root, name) {
         match element.text("id") {
             Ok(id) if ids.contains_key(id) => {
-                element.error_value("id", id, "used by one element only").note(log, "left out");
+                element
+                    .error_value("id", id, "used by one element only")
+                    .note(log, "left out");
             }
             Ok(id) => {
                 ids.insert(id.to_owned(), elements.len());

@@ -20,17 +20,29 @@ const JOINT_TOLERANCE_M: f64 = 2.0;
 const SHORT_M: f64 = 1.0;
 
 /// Reads a reference line; also returns the length of its road: that of the elements where the road's own differs.
-pub(super) fn read(road: Element, log: &mut FindingLog) -> Result<(Vec<Curve>, f64), OpenDriveError> {
+pub(super) fn read(
+    road: Element,
+    log: &mut FindingLog,
+) -> Result<(Vec<Curve>, f64), OpenDriveError> {
     let plan_view = road.required("planView")?;
     let mut curves: Vec<Curve> = Vec::new();
     for element in children(plan_view, "geometry") {
         let curve = read_curve(element, log)?;
         if curves.last().is_some_and(|before| curve.s_m < before.s_m) {
-            return Err(element.error_value("s", &curve.s_m.to_string(), "the elements in rising order"));
+            return Err(element.error_value(
+                "s",
+                &curve.s_m.to_string(),
+                "the elements in rising order",
+            ));
         }
-        if let Some(gap_m) = curves.last().map(|before| before.end().distance_m(&curve.start)).filter(too_far) {
-            let problem =
-                format!("starts {gap_m:.2} m from the end of the one before; expected at most {JOINT_TOLERANCE_M}");
+        if let Some(gap_m) = curves
+            .last()
+            .map(|before| before.end().distance_m(&curve.start))
+            .filter(too_far)
+        {
+            let problem = format!(
+                "starts {gap_m:.2} m from the end of the one before; expected at most {JOINT_TOLERANCE_M}"
+            );
             return Err(element.error_element(&problem));
         }
         // An element of no length has no direction of its own and adds nothing.
@@ -48,7 +60,11 @@ pub(super) fn read(road: Element, log: &mut FindingLog) -> Result<(Vec<Curve>, f
 fn road_length_m(road: Element, total_m: f64, log: &mut FindingLog) -> f64 {
     let error = match road.number("length", 0.0, MAX_LENGTH_M) {
         Ok(length_m) if (total_m - length_m).abs() <= LENGTH_TOLERANCE_M => return length_m,
-        Ok(length_m) => road.error_value("length", &length_m.to_string(), &format!("{total_m}, as its <planView>")),
+        Ok(length_m) => road.error_value(
+            "length",
+            &length_m.to_string(),
+            &format!("{total_m}, as its <planView>"),
+        ),
         Err(error) => error,
     };
     error.note(log, "the length of its reference line is used");
@@ -61,30 +77,47 @@ fn too_far(gap_m: &f64) -> bool {
 
 fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve, OpenDriveError> {
     let coordinate = |name| element.number(name, -MAX_COORDINATE_M, MAX_COORDINATE_M);
-    let start = Pose2::new(coordinate("x")?, coordinate("y")?, element.number("hdg", -1e4, 1e4)?);
+    let start = Pose2::new(
+        coordinate("x")?,
+        coordinate("y")?,
+        element.number("hdg", -1e4, 1e4)?,
+    );
     let length_m = element.number("length", 0.0, MAX_LENGTH_M)?;
     let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
     let Some(kind) = element.elements().find(|child| child.name() != "userData") else {
         return Err(element.error_element("has no shape"));
     };
-    let curve = |shape| Curve { s_m, start, length_m, shape };
+    let curve = |shape| Curve {
+        s_m,
+        start,
+        length_m,
+        shape,
+    };
     let shape = match kind.name() {
         "line" => return Ok(curve(CurveShape::Line)),
         "arc" => {
             let [curvature] = curvatures(kind, ["curvature"], length_m, log)?;
-            if curvature.is_nan() { CurveShape::Line } else { CurveShape::Arc { curvature } }
+            if curvature.is_nan() {
+                CurveShape::Line
+            } else {
+                CurveShape::Arc { curvature }
+            }
         }
         "spiral" if length_m == 0.0 => CurveShape::Line,
         "spiral" => {
             let [start, end] = curvatures(kind, ["curvStart", "curvEnd"], length_m, log)?;
-            if start.is_nan() { CurveShape::Line } else { CurveShape::Spiral { start, end } }
+            if start.is_nan() {
+                CurveShape::Line
+            } else {
+                CurveShape::Spiral { start, end }
+            }
         }
         "poly3" => CurveShape::Poly3(kind.cubic(["a", "b", "c", "d"])?),
         "paramPoly3" => return read_param_poly3(element, kind, &curve, log),
         other => {
-            return Err(
-                element.error_element(&format!("holds <{other}>; expected line, arc, spiral, poly3 or paramPoly3"))
-            );
+            return Err(element.error_element(&format!(
+                "holds <{other}>; expected line, arc, spiral, poly3 or paramPoly3"
+            )));
         }
     };
     checked(element, curve(shape), log)
@@ -103,9 +136,16 @@ fn curvatures<const N: usize>(
     for (value, name) in values.iter_mut().zip(names) {
         *value = element.number(name, -ANY_CURVATURE, ANY_CURVATURE)?;
     }
-    let odd = values.iter().zip(names).find(|(value, _)| value.abs() > bound);
-    let Some((value, name)) = odd else { return Ok(values) };
-    element.error_range(name, value, -bound, bound).note(log, &format!("built as a straight line of {length_m} m"));
+    let odd = values
+        .iter()
+        .zip(names)
+        .find(|(value, _)| value.abs() > bound);
+    let Some((value, name)) = odd else {
+        return Ok(values);
+    };
+    element
+        .error_range(name, value, -bound, bound)
+        .note(log, &format!("built as a straight line of {length_m} m"));
     Ok([f64::NAN; N])
 }
 
@@ -116,7 +156,10 @@ fn read_param_poly3(
     curve: &dyn Fn(CurveShape) -> Curve,
     log: &mut FindingLog,
 ) -> Result<Curve, OpenDriveError> {
-    let (u, v) = (kind.cubic(["aU", "bU", "cU", "dU"])?, kind.cubic(["aV", "bV", "cV", "dV"])?);
+    let (u, v) = (
+        kind.cubic(["aU", "bU", "cU", "dU"])?,
+        kind.cubic(["aV", "bV", "cV", "dV"])?,
+    );
     let with = |normalized| curve(CurveShape::ParamPoly3 { u, v, normalized });
     let has_length = with(true).length_m > 0.0;
     match kind.optional_text("pRange").map(str::trim) {
@@ -126,7 +169,11 @@ fn read_param_poly3(
         None => {}
     }
     if has_length && !fits(&with(true)) && fits(&with(false)) {
-        kind.note(log, "has no pRange and fits its length only by arcLength", "arcLength is used");
+        kind.note(
+            log,
+            "has no pRange and fits its length only by arcLength",
+            "arcLength is used",
+        );
         return Ok(with(false));
     }
     checked(element, with(has_length), log)
@@ -137,18 +184,27 @@ fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve
     if keeps_its_length(&curve) {
         return Ok(curve);
     }
-    let error = element.error_value("length", &curve.length_m.to_string(), "about the length of its curve");
+    let error = element.error_value(
+        "length",
+        &curve.length_m.to_string(),
+        "about the length of its curve",
+    );
     if curve.length_m > SHORT_M {
         return Err(error);
     }
     error.note(log, "built as a straight line");
-    Ok(Curve { shape: CurveShape::Line, ..curve })
+    Ok(Curve {
+        shape: CurveShape::Line,
+        ..curve
+    })
 }
 
 /// True if a curve is as long as its element up to a factor of two.
 fn fits(curve: &Curve) -> bool {
     let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
-    let measured_m: f64 = (0..10).map(|tenth| at(tenth).distance_m(&at(tenth + 1))).sum();
+    let measured_m: f64 = (0..10)
+        .map(|tenth| at(tenth).distance_m(&at(tenth + 1)))
+        .sum();
     measured_m > 0.5 * curve.length_m && measured_m < 2.0 * curve.length_m
 }
 

@@ -32,21 +32,29 @@ pub(super) fn read_profile(
 /// Reads the cross-sections of a road. A part that cannot be read, or is steeper than the limit, is left out.
 pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -> LateralProfile {
     let mut lateral = LateralProfile::default();
-    let Some(element) = road.child("lateralProfile") else { return lateral };
+    let Some(element) = road.child("lateralProfile") else {
+        return lateral;
+    };
     lateral.superelevation_rad = slope(element, "superelevation", |_| true, length_m, log);
     lateral.crossfall_rad = ["left", "right"].map(|side| {
         let is_of_side = |record: &Element| {
-            matches!(record.optional_text("side"), None | Some("both")) || record.optional_text("side") == Some(side)
+            matches!(record.optional_text("side"), None | Some("both"))
+                || record.optional_text("side") == Some(side)
         };
         slope(element, "crossfall", is_of_side, length_m, log)
     });
     match read_shapes(element) {
-        Ok(shapes) if shapes.iter().any(|shape| !is_zero(&shape.height_m)) => lateral.shapes = shapes,
+        Ok(shapes) if shapes.iter().any(|shape| !is_zero(&shape.height_m)) => {
+            lateral.shapes = shapes
+        }
         Ok(_) => {}
         Err(error) => error.note(log, "shape of the road left out"),
     }
     for other in element.elements() {
-        if !matches!(other.name(), "superelevation" | "crossfall" | "shape" | "userData") {
+        if !matches!(
+            other.name(),
+            "superelevation" | "crossfall" | "shape" | "userData"
+        ) {
             let found = format!("up to {:.2} m high", highest_constant_m(other));
             other.note(log, &found, "left out: the road is built without it");
         }
@@ -69,10 +77,12 @@ fn slope(
             return Profile::default();
         }
     };
-    let steepest = (0..=LOOKS).map(|look| profile.at(length_m * f64::from(look) / f64::from(LOOKS)));
+    let steepest =
+        (0..=LOOKS).map(|look| profile.at(length_m * f64::from(look) / f64::from(LOOKS)));
     let steepest = steepest.map(f64::abs).fold(0.0, f64::max);
     if steepest > MAX_SLOPE_RAD {
-        let found = format!("holds <{name}> up to {steepest:.2} rad, expected at most {MAX_SLOPE_RAD}");
+        let found =
+            format!("holds <{name}> up to {steepest:.2} rad, expected at most {MAX_SLOPE_RAD}");
         parent.note(log, &found, "left out: the road is built without it");
         return Profile::default();
     }
@@ -100,22 +110,43 @@ fn read_shapes(parent: Element) -> Result<Vec<CrossShape>, OpenDriveError> {
         let record = (t_m, element.cubic(["a", "b", "c", "d"])?);
         match shapes.last_mut() {
             Some(last) if last.s_m == s_m => {
-                if last.height_m.records.last().is_some_and(|&(before, _)| t_m < before) {
-                    return Err(element.error_value("t", &t_m.to_string(), "the elements in rising order"));
+                if last
+                    .height_m
+                    .records
+                    .last()
+                    .is_some_and(|&(before, _)| t_m < before)
+                {
+                    return Err(element.error_value(
+                        "t",
+                        &t_m.to_string(),
+                        "the elements in rising order",
+                    ));
                 }
                 last.height_m.records.push(record);
             }
             Some(last) if last.s_m > s_m => {
-                return Err(element.error_value("s", &s_m.to_string(), "the elements in rising order"));
+                return Err(element.error_value(
+                    "s",
+                    &s_m.to_string(),
+                    "the elements in rising order",
+                ));
             }
-            _ => shapes.push(CrossShape { s_m, height_m: Profile { records: vec![record] } }),
+            _ => shapes.push(CrossShape {
+                s_m,
+                height_m: Profile {
+                    records: vec![record],
+                },
+            }),
         }
     }
     Ok(shapes)
 }
 
 fn is_zero(profile: &Profile) -> bool {
-    profile.records.iter().all(|(_, coefficients)| coefficients.iter().all(|&coefficient| coefficient == 0.0))
+    profile
+        .records
+        .iter()
+        .all(|(_, coefficients)| coefficients.iter().all(|&coefficient| coefficient == 0.0))
 }
 
 /// The largest constant of an element's descendants, metres: the height of a surface that is not built.

@@ -56,7 +56,12 @@ fn read_rule(element: Element, log: &mut FindingLog) -> bool {
 fn read_speed_limits(road: Element, log: &mut FindingLog) -> Vec<(f64, f64)> {
     let mut limits: Vec<(f64, f64)> = Vec::new();
     for element in children(road, "type") {
-        let Some(limit) = element.child("speed").and_then(|speed| read_speed(speed, log)) else { continue };
+        let Some(limit) = element
+            .child("speed")
+            .and_then(|speed| read_speed(speed, log))
+        else {
+            continue;
+        };
         match element.number("s", 0.0, MAX_LENGTH_M) {
             Ok(s_m) => limits.push((s_m, limit)),
             Err(error) => error.note(log, "speed limit treated as absent"),
@@ -70,10 +75,13 @@ fn read_speed_limits(road: Element, log: &mut FindingLog) -> Vec<(f64, f64)> {
 fn note_unread(road: Element, log: &mut FindingLog) {
     for element in road.elements() {
         match element.name() {
-            "link" | "type" | "planView" | "elevationProfile" | "lateralProfile" | "lanes" | "objects" | "signals"
-            | "railroad" | "userData" | "dataQuality" => {}
+            "link" | "type" | "planView" | "elevationProfile" | "lateralProfile" | "lanes"
+            | "objects" | "signals" | "railroad" | "userData" | "dataQuality" => {}
             "surface" => {
-                for surface in element.elements().filter(|surface| surface.name() != "userData") {
+                for surface in element
+                    .elements()
+                    .filter(|surface| surface.name() != "userData")
+                {
                     surface.note_value(log, "file", "left out: the road is built without it");
                 }
             }

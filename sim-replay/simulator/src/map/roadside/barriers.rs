@@ -31,9 +31,14 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
         let (share, barrier) = match side.zone {
             Zone::Street => continue,
-            Zone::Motorway if side.median => {
-                (1.0, if rng.random_bool(0.5) { Barrier::Concrete } else { Barrier::Steel })
-            }
+            Zone::Motorway if side.median => (
+                1.0,
+                if rng.random_bool(0.5) {
+                    Barrier::Concrete
+                } else {
+                    Barrier::Steel
+                },
+            ),
             Zone::Motorway => (0.9, Barrier::Steel),
             Zone::Rural => (0.55, Barrier::Steel),
         };
@@ -54,9 +59,13 @@ fn along_side(site: &mut Site, side: &Side, share: f64, barrier: Barrier, rng: &
                 let pose = side.beyond_kerb(site.surface, site.network, s, 0.45);
                 [pose.x, pose.y, side.road_m(site.surface, site.network, s)]
             };
-            let pieces = pieces(s, end, |s| site.network.roads[side.road].pose_at(s).heading_rad);
-            let parts: Vec<Vec<Solid>> =
-                pieces.iter().map(|&[from, to]| piece(line(from), line(to), barrier)).collect();
+            let pieces = pieces(s, end, |s| {
+                site.network.roads[side.road].pose_at(s).heading_rad
+            });
+            let parts: Vec<Vec<Solid>> = pieces
+                .iter()
+                .map(|&[from, to]| piece(line(from), line(to), barrier))
+                .collect();
             for parts in parts {
                 site.try_place(&parts, 0.0, false);
             }
@@ -71,12 +80,18 @@ fn between_directions(site: &mut Site, road: usize) {
     let middle = |cut: &CrossSection| {
         let section = &network.roads[road].sections[cut.section];
         let edge = |ids: Vec<i32>| {
-            ids.into_iter()
-                .find(|&id| section.lane(id).is_some_and(|lane| lane.kind == super::super::road::LaneKind::Driving))
+            ids.into_iter().find(|&id| {
+                section
+                    .lane(id)
+                    .is_some_and(|lane| lane.kind == super::super::road::LaneKind::Driving)
+            })
         };
         let left = edge((1..=section.left.len() as i32).collect())?;
         let right = edge((1..=section.right.len() as i32).map(|id| -id).collect())?;
-        let s = cut.s_m.min(network.roads[road].section_end_m(cut.section) - 1e-6).max(section.s_m);
+        let s = cut
+            .s_m
+            .min(network.roads[road].section_end_m(cut.section) - 1e-6)
+            .max(section.s_m);
         let low = network.roads[road].lane_span_m(cut.section, right, s)[1];
         let high = network.roads[road].lane_span_m(cut.section, left, s)[0];
         (high - low > 1.0).then(|| {
@@ -103,7 +118,10 @@ fn between_directions(site: &mut Site, road: usize) {
         let outline = super::site::outline(part);
         network.roads[road].junction.is_none()
             && !site.surface.any(&outline, |patch| {
-                patch.road as usize != road && patch.carriageway && a < patch.high_m() + 4.5 && b > patch.low_m() - 0.05
+                patch.road as usize != road
+                    && patch.carriageway
+                    && a < patch.high_m() + 4.5
+                    && b > patch.low_m() - 0.05
             })
     };
     let parts: Vec<Solid> = parts.into_iter().filter(clear).collect();
@@ -133,17 +151,37 @@ fn piece(from: [f64; 3], to: [f64; 3], barrier: Barrier) -> Vec<Solid> {
     let z = from[2].min(to[2]);
     let rise = (to[2] - from[2]).abs();
     match barrier {
-        Barrier::Concrete => vec![wall(SolidKind::Barrier, a, b, [z - 0.2, z + rise + 0.85], 0.4, 0.5)],
+        Barrier::Concrete => vec![wall(
+            SolidKind::Barrier,
+            a,
+            b,
+            [z - 0.2, z + rise + 0.85],
+            0.4,
+            0.5,
+        )],
         Barrier::Steel => {
-            let mut parts = vec![wall(SolidKind::Barrier, a, b, [z + 0.42, z + rise + 0.76], 0.1, 0.6)];
+            let mut parts = vec![wall(
+                SolidKind::Barrier,
+                a,
+                b,
+                [z + 0.42, z + rise + 0.76],
+                0.1,
+                0.6,
+            )];
             let length = (b[0] - a[0]).hypot(b[1] - a[1]);
             let posts = (length / POST_M).floor() as u32;
             for post in 0..=posts {
                 let share = f64::from(post) * POST_M / length.max(0.1);
                 let at = |i: usize| from[i] + share * (to[i] - from[i]);
-                let pose = super::super::curve::Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
+                let pose =
+                    super::super::curve::Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
                 let foot = PartFootprint::new(pose, at(2));
-                parts.push(foot.cuboid(SolidKind::Barrier, [0.0, 0.0, -0.3], [0.1, 0.14, 1.02], 0.5));
+                parts.push(foot.cuboid(
+                    SolidKind::Barrier,
+                    [0.0, 0.0, -0.3],
+                    [0.1, 0.14, 1.02],
+                    0.5,
+                ));
             }
             parts
         }

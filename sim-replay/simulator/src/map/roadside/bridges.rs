@@ -26,8 +26,17 @@ const TUNNEL_M: f64 = 5.2;
 pub(super) fn place(site: &mut Site) {
     let flat = site.ground.plane_z_m().is_some();
     for road in 0..site.surface.roads.len() {
-        for structure in site.network.roads[road].structures.iter().filter(|structure| structure.tunnel) {
-            tunnel(site, road, structure.s_m, structure.s_m + structure.length_m);
+        for structure in site.network.roads[road]
+            .structures
+            .iter()
+            .filter(|structure| structure.tunnel)
+        {
+            tunnel(
+                site,
+                road,
+                structure.s_m,
+                structure.s_m + structure.length_m,
+            );
         }
         if !flat {
             bridge(site, road);
@@ -39,8 +48,17 @@ pub(super) fn place(site: &mut Site) {
 /// Height of the road over the lowest terrain under a cut, metres.
 fn drop_m(site: &Site, cut: &CrossSection) -> f64 {
     let [low, high] = cut.paved_m;
-    let probes = [low, low + 0.25 * (high - low), (low + high) / 2.0, high - 0.25 * (high - low), high];
-    probes.iter().map(|&t| cut.height_m(t) - site.ground_m(cut.at(t))).fold(0.0, f64::max)
+    let probes = [
+        low,
+        low + 0.25 * (high - low),
+        (low + high) / 2.0,
+        high - 0.25 * (high - low),
+        high,
+    ];
+    probes
+        .iter()
+        .map(|&t| cut.height_m(t) - site.ground_m(cut.at(t)))
+        .fold(0.0, f64::max)
 }
 
 fn bridge(site: &mut Site, road: usize) {
@@ -55,7 +73,9 @@ fn bridge(site: &mut Site, road: usize) {
             continue;
         }
         let drop = drops[i - 1].min(drops[i]);
-        let thickness = (drop - HEADROOM_M - 0.05).clamp(SLAB_M[0], SLAB_M[1]).min(drop * 0.4);
+        let thickness = (drop - HEADROOM_M - 0.05)
+            .clamp(SLAB_M[0], SLAB_M[1])
+            .min(drop * 0.4);
         let slab = slab(from, to, thickness);
         site.place(&[slab]);
         parapet(site, road, from, to);
@@ -72,7 +92,14 @@ fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
     let (a, b) = (middle(from), middle(to));
     let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
     let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;
-    wall(SolidKind::BridgeDeck, a, b, [top - thickness_m, top], width + 0.3, 0.35)
+    wall(
+        SolidKind::BridgeDeck,
+        a,
+        b,
+        [top - thickness_m, top],
+        width + 0.3,
+        0.35,
+    )
 }
 
 /// Low walls at both edges, where no other lane of the same height joins.
@@ -106,10 +133,20 @@ fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
             continue;
         }
         let foot = PartFootprint::new(Pose2::new(at[0], at[1], cut.pose.heading_rad), ground);
-        let pillar = foot.cylinder(SolidKind::Pillar, [0.0, 0.0, -0.5], [0.55, height + 0.5], 0.4);
+        let pillar = foot.cylinder(
+            SolidKind::Pillar,
+            [0.0, 0.0, -0.5],
+            [0.55, height + 0.5],
+            0.4,
+        );
         let around = super::site::outline(&pillar).grown(0.5);
         // Clear of the lanes below; its own slab above does not count.
-        if site.surface.is_clear(&around, [pillar.bottom_m(), pillar.top_m() - 0.2], HEADROOM_M, true) {
+        if site.surface.is_clear(
+            &around,
+            [pillar.bottom_m(), pillar.top_m() - 0.2],
+            HEADROOM_M,
+            true,
+        ) {
             site.place(&[pillar]);
         }
     }
@@ -125,15 +162,22 @@ fn retaining_walls(site: &mut Site, road: usize) {
         }
         for side in [0, 1] {
             let sign = if side == 0 { -1.0 } else { 1.0 };
-            let beside = [from, to].map(|cut| site.ground_m(cut.at(cut.paved_m[side] + sign * BESIDE_M)));
+            let beside =
+                [from, to].map(|cut| site.ground_m(cut.at(cut.paved_m[side] + sign * BESIDE_M)));
             let high = beside[0].max(beside[1]);
-            let road_z = from.height_m(from.paved_m[side]).min(to.height_m(to.paved_m[side]));
+            let road_z = from
+                .height_m(from.paved_m[side])
+                .min(to.height_m(to.paved_m[side]));
             if beside[0].min(beside[1]) - road_z < RETAINED_M {
                 continue;
             }
             let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + sign * 0.5));
             let middle = [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
-            let around = Rectangle { center_m: middle, half_m: [1.0, 1.0], yaw_rad: from.pose.heading_rad };
+            let around = Rectangle {
+                center_m: middle,
+                half_m: [1.0, 1.0],
+                yaw_rad: from.pose.heading_rad,
+            };
             let mut above = f64::INFINITY;
             site.surface.any(&around, |patch| {
                 let z = patch.low_m();
@@ -144,8 +188,16 @@ fn retaining_walls(site: &mut Site, road: usize) {
             });
             let covered = above.is_finite();
             let top = (high + 0.4).min(above - 0.9);
-            let kind = if covered { SolidKind::TunnelWall } else { SolidKind::Wall };
-            site.try_place(&[wall(kind, a, b, [road_z - 0.4, top], 0.3, 0.4)], 0.0, false);
+            let kind = if covered {
+                SolidKind::TunnelWall
+            } else {
+                SolidKind::Wall
+            };
+            site.try_place(
+                &[wall(kind, a, b, [road_z - 0.4, top], 0.3, 0.4)],
+                0.0,
+                false,
+            );
         }
     }
 }
@@ -157,20 +209,50 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
     let mut s = from_m;
     while s + 1.0 < end {
         let next = (s + PIECE_M).min(end);
-        let (a, b) = (*cut_at(site.surface, road, s), *cut_at(site.surface, road, next));
-        let z = [a.range_m()[0].min(b.range_m()[0]), a.range_m()[1].max(b.range_m()[1])];
+        let (a, b) = (
+            *cut_at(site.surface, road, s),
+            *cut_at(site.surface, road, next),
+        );
+        let z = [
+            a.range_m()[0].min(b.range_m()[0]),
+            a.range_m()[1].max(b.range_m()[1]),
+        ];
         for side in [0, 1] {
             let out = if side == 0 { -0.45 } else { 0.45 };
             let [p, q] = [a, b].map(|cut| cut.at(cut.paved_m[side] + out));
-            let part = wall(SolidKind::TunnelWall, p, q, [z[0] - 0.3, z[1] + TUNNEL_M], 0.4, 0.4);
-            if site.surface.is_clear(&super::site::outline(&part), [z[0], z[1] + 1.0], HEADROOM_M, true) {
+            let part = wall(
+                SolidKind::TunnelWall,
+                p,
+                q,
+                [z[0] - 0.3, z[1] + TUNNEL_M],
+                0.4,
+                0.4,
+            );
+            if site.surface.is_clear(
+                &super::site::outline(&part),
+                [z[0], z[1] + 1.0],
+                HEADROOM_M,
+                true,
+            ) {
                 site.place(&[part]);
             }
         }
         let [p, q] = [a, b].map(|cut| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0));
         let width = (a.paved_m[1] - a.paved_m[0]).max(b.paved_m[1] - b.paved_m[0]) + 1.3;
-        let roof = wall(SolidKind::BridgeDeck, p, q, [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8], width, 0.35);
-        if site.surface.is_clear(&super::site::outline(&roof), [roof.bottom_m(), roof.top_m()], HEADROOM_M, true) {
+        let roof = wall(
+            SolidKind::BridgeDeck,
+            p,
+            q,
+            [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8],
+            width,
+            0.35,
+        );
+        if site.surface.is_clear(
+            &super::site::outline(&roof),
+            [roof.bottom_m(), roof.top_m()],
+            HEADROOM_M,
+            true,
+        ) {
             site.place(&[roof]);
         }
         s = next;

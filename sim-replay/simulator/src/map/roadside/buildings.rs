@@ -56,7 +56,11 @@ impl Style {
 
 /// The solids of a building.
 pub(super) fn build(style: Style, lot: &Lot, rng: &mut ChaCha8Rng) -> Vec<Solid> {
-    let mut draft = Draft { foot: lot.foot, reflectivity: rng.random_range(0.15..0.75), parts: Vec::new() };
+    let mut draft = Draft {
+        foot: lot.foot,
+        reflectivity: rng.random_range(0.15..0.75),
+        parts: Vec::new(),
+    };
     let size = [lot.width_m, lot.depth_m];
     match style {
         Style::House => house(&mut draft, size, rng),
@@ -87,27 +91,52 @@ impl Draft {
 
     /// A box whose lower side is at `at[2]`.
     fn block_at(&mut self, at: [f64; 3], size: [f64; 3]) {
-        self.parts.push(self.foot.cuboid(SolidKind::Building, at, size, self.reflectivity));
+        self.parts.push(
+            self.foot
+                .cuboid(SolidKind::Building, at, size, self.reflectivity),
+        );
     }
 
     fn cylinder(&mut self, at: [f64; 3], size: [f64; 2]) {
-        self.parts.push(self.foot.cylinder(SolidKind::Building, at, size, self.reflectivity));
+        self.parts.push(
+            self.foot
+                .cylinder(SolidKind::Building, at, size, self.reflectivity),
+        );
     }
 
     /// A gabled roof as steps, its ridge along `u` or along `v`.
-    fn gable(&mut self, u: f64, v: f64, z: f64, [width, depth]: [f64; 2], rise: f64, ridge_along_u: bool) {
+    fn gable(
+        &mut self,
+        u: f64,
+        v: f64,
+        z: f64,
+        [width, depth]: [f64; 2],
+        rise: f64,
+        ridge_along_u: bool,
+    ) {
         const STEPS: u32 = 4;
         for step in 0..STEPS {
             let share = 1.0 - f64::from(step) / f64::from(STEPS);
-            let size = if ridge_along_u { [width, depth * share] } else { [width * share, depth] };
+            let size = if ridge_along_u {
+                [width, depth * share]
+            } else {
+                [width * share, depth]
+            };
             let height = rise / f64::from(STEPS);
-            self.block_at([u, v, z + f64::from(step) * height], [size[0], size[1], height]);
+            self.block_at(
+                [u, v, z + f64::from(step) * height],
+                [size[0], size[1], height],
+            );
         }
     }
 }
 
 fn house(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
-    let height = if rng.random_bool(0.5) { rng.random_range(2.8..3.6) } else { rng.random_range(5.2..6.6) };
+    let height = if rng.random_bool(0.5) {
+        rng.random_range(2.8..3.6)
+    } else {
+        rng.random_range(5.2..6.6)
+    };
     // The porch takes the first metre and a half of the lot.
     let porch = 1.4;
     let (body_depth, v) = (depth - porch, porch / 2.0);
@@ -118,10 +147,28 @@ fn house(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     draft.body(u, v, [body_width, body_depth, height]);
     match rng.random_range(0..4) {
         0 => draft.block_at([u, v, height], [body_width, body_depth, 0.4]),
-        1 => draft.gable(u, v, height, [body_width, body_depth], rng.random_range(2.0..4.0), false),
-        _ => draft.gable(u, v, height, [body_width, body_depth], rng.random_range(2.0..4.0), true),
+        1 => draft.gable(
+            u,
+            v,
+            height,
+            [body_width, body_depth],
+            rng.random_range(2.0..4.0),
+            false,
+        ),
+        _ => draft.gable(
+            u,
+            v,
+            height,
+            [body_width, body_depth],
+            rng.random_range(2.0..4.0),
+            true,
+        ),
     }
-    let chimney = [u + rng.random_range(-0.3..0.3) * body_width, v + 0.2 * body_depth, height + 1.0];
+    let chimney = [
+        u + rng.random_range(-0.3..0.3) * body_width,
+        v + 0.2 * body_depth,
+        height + 1.0,
+    ];
     draft.block_at(chimney, [0.6, 0.6, rng.random_range(2.2..3.6)]);
     let door = u + rng.random_range(-0.3..0.3) * body_width;
     let front = -depth / 2.0 + porch / 2.0;
@@ -138,7 +185,11 @@ fn house(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     }
     if with_garage {
         let deep = (body_depth * 0.7).max(5.0).min(body_depth);
-        draft.body(side * (width - garage) / 2.0, v + (body_depth - deep) / 2.0, [garage - 0.1, deep, 2.6]);
+        draft.body(
+            side * (width - garage) / 2.0,
+            v + (body_depth - deep) / 2.0,
+            [garage - 0.1, deep, 2.6],
+        );
     }
 }
 
@@ -155,7 +206,14 @@ fn row(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         draft.reflectivity = rng.random_range(0.15..0.75);
         draft.body(u, back / 2.0, [size[0], size[1], own]);
         if gabled {
-            draft.gable(u, back / 2.0, own, size, rng.random_range(1.8..3.0), rng.random_bool(0.75));
+            draft.gable(
+                u,
+                back / 2.0,
+                own,
+                size,
+                rng.random_range(1.8..3.0),
+                rng.random_bool(0.75),
+            );
         } else {
             draft.block_at([u, back / 2.0, own], [1.2, 0.8, rng.random_range(0.8..1.8)]);
         }
@@ -172,7 +230,9 @@ fn row(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
 fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let floors = rng.random_range(3..=6);
     let height = f64::from(floors) * 3.0 + rng.random_range(0.5..1.5);
-    let bar = (depth * rng.random_range(0.45..0.6)).max(8.0).min(depth - 1.2);
+    let bar = (depth * rng.random_range(0.45..0.6))
+        .max(8.0)
+        .min(depth - 1.2);
     let front = -depth / 2.0 + 1.2;
     draft.body(0.0, front + bar / 2.0, [width, bar, height]);
     let wing = (width * 0.35).min(10.0);
@@ -186,11 +246,26 @@ fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     };
     for side in wings {
         let lower = height - 3.0 * f64::from(rng.random_range(0..=1));
-        draft.body(side * (width - wing) / 2.0, front + bar + rest / 2.0, [wing, rest, lower]);
+        draft.body(
+            side * (width - wing) / 2.0,
+            front + bar + rest / 2.0,
+            [wing, rest, lower],
+        );
     }
     for _ in 0..rng.random_range(1..=3) {
-        let at = [rng.random_range(-0.4..0.4) * width, front + bar * rng.random_range(0.3..0.7), height];
-        draft.block_at(at, [rng.random_range(1.5..4.0), rng.random_range(1.5..3.0), rng.random_range(1.0..2.8)]);
+        let at = [
+            rng.random_range(-0.4..0.4) * width,
+            front + bar * rng.random_range(0.3..0.7),
+            height,
+        ];
+        draft.block_at(
+            at,
+            [
+                rng.random_range(1.5..4.0),
+                rng.random_range(1.5..3.0),
+                rng.random_range(1.0..2.8),
+            ],
+        );
     }
     let columns = rng.random_range(2..=4);
     let balconies = rng.random_bool(0.7);
@@ -198,7 +273,11 @@ fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         let u = width * ((f64::from(column) + 0.5) / f64::from(columns) - 0.5);
         if !balconies {
             // Stair towers or pilasters instead.
-            draft.body(u, front - 0.3, [rng.random_range(0.6..2.4), 0.6, height - 0.5]);
+            draft.body(
+                u,
+                front - 0.3,
+                [rng.random_range(0.6..2.4), 0.6, height - 0.5],
+            );
             continue;
         }
         for floor in 1..floors {
@@ -212,14 +291,21 @@ fn tower(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let (mut size, mut z) = ([width, depth], 0.0);
     let [mut u, mut v] = [0.0, 0.0];
     for stage in 0..stages {
-        let height = if stage == 0 { rng.random_range(5.0..10.0) } else { rng.random_range(8.0..18.0) };
+        let height = if stage == 0 {
+            rng.random_range(5.0..10.0)
+        } else {
+            rng.random_range(8.0..18.0)
+        };
         if stage == 0 {
             draft.body(u, v, [size[0], size[1], height]);
         } else {
             draft.block_at([u, v, z], [size[0], size[1], height]);
         }
         z += height;
-        let next = [size[0] * rng.random_range(0.6..0.9), size[1] * rng.random_range(0.6..0.9)];
+        let next = [
+            size[0] * rng.random_range(0.6..0.9),
+            size[1] * rng.random_range(0.6..0.9),
+        ];
         u += rng.random_range(-0.5..0.5) * (size[0] - next[0]);
         v += rng.random_range(-0.5..0.5) * (size[1] - next[1]);
         size = next;
@@ -228,7 +314,11 @@ fn tower(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     draft.cylinder([u, v, z + 2.5], [0.15, rng.random_range(3.0..9.0)]);
     // An entrance hall at the foot would leave the lot; corner piers mark the front instead.
     for side in [-0.5, 0.5] {
-        draft.body(side * (width - 1.0), -depth / 2.0 + 0.5, [1.0, 1.0, rng.random_range(10.0..16.0)]);
+        draft.body(
+            side * (width - 1.0),
+            -depth / 2.0 + 0.5,
+            [1.0, 1.0, rng.random_range(10.0..16.0)],
+        );
     }
 }
 
@@ -237,22 +327,47 @@ fn shop(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let height = rng.random_range(3.8..6.5);
     draft.body(0.0, awning / 2.0, [width, depth - awning, height]);
     let front = -depth / 2.0;
-    draft.block_at([0.0, front + awning / 2.0, 2.9], [width * rng.random_range(0.6..1.0), awning, 0.2]);
+    draft.block_at(
+        [0.0, front + awning / 2.0, 2.9],
+        [width * rng.random_range(0.6..1.0), awning, 0.2],
+    );
     let posts = (width / 5.0).floor().max(1.0) as u32;
     for post in 0..=posts {
         let u = (f64::from(post) / f64::from(posts) - 0.5) * (width - 0.6);
         draft.cylinder([u, front + 0.3, 0.0], [0.1, 2.9]);
     }
-    let sign = [rng.random_range(-0.3..0.3) * width, front + awning + 0.3, height];
-    draft.block_at(sign, [rng.random_range(2.0..5.0), 0.4, rng.random_range(0.8..1.8)]);
+    let sign = [
+        rng.random_range(-0.3..0.3) * width,
+        front + awning + 0.3,
+        height,
+    ];
+    draft.block_at(
+        sign,
+        [rng.random_range(2.0..5.0), 0.4, rng.random_range(0.8..1.8)],
+    );
     if rng.random_bool(0.5) {
-        let upper = [width * rng.random_range(0.35..0.7), (depth - awning) * 0.8, rng.random_range(2.8..6.0)];
+        let upper = [
+            width * rng.random_range(0.35..0.7),
+            (depth - awning) * 0.8,
+            rng.random_range(2.8..6.0),
+        ];
         let u = rng.random_range(-0.5..0.5) * (width - upper[0]);
         draft.block_at([u, awning / 2.0, height], upper);
     }
     for _ in 0..rng.random_range(1..=3) {
-        let at = [rng.random_range(-0.4..0.4) * width, rng.random_range(0.0..0.35) * depth, height];
-        draft.block_at(at, [rng.random_range(1.0..2.5), rng.random_range(1.0..2.0), rng.random_range(0.8..1.6)]);
+        let at = [
+            rng.random_range(-0.4..0.4) * width,
+            rng.random_range(0.0..0.35) * depth,
+            height,
+        ];
+        draft.block_at(
+            at,
+            [
+                rng.random_range(1.0..2.5),
+                rng.random_range(1.0..2.0),
+                rng.random_range(0.8..1.6),
+            ],
+        );
     }
 }
 
@@ -261,24 +376,44 @@ fn hall(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let height = rng.random_range(5.5..9.5);
     draft.body(0.0, ramp / 2.0, [width, depth - ramp, height]);
     match rng.random_range(0..3) {
-        0 => draft.gable(0.0, ramp / 2.0, height, [width, depth - ramp], rng.random_range(1.2..2.5), true),
+        0 => draft.gable(
+            0.0,
+            ramp / 2.0,
+            height,
+            [width, depth - ramp],
+            rng.random_range(1.2..2.5),
+            true,
+        ),
         1 => {
             // A saw-tooth roof.
             let teeth = (width / 6.0).floor().max(2.0) as u32;
             for tooth in 0..teeth {
                 let u = ((f64::from(tooth) + 0.25) / f64::from(teeth) - 0.5) * width;
-                draft.block_at([u, ramp / 2.0, height], [width / f64::from(teeth) * 0.4, depth - ramp, 1.6]);
+                draft.block_at(
+                    [u, ramp / 2.0, height],
+                    [width / f64::from(teeth) * 0.4, depth - ramp, 1.6],
+                );
             }
         }
-        _ => draft.block_at([0.2 * width, 0.1 * depth, height], [0.4 * width, 0.5 * depth, rng.random_range(1.5..4.0)]),
+        _ => draft.block_at(
+            [0.2 * width, 0.1 * depth, height],
+            [0.4 * width, 0.5 * depth, rng.random_range(1.5..4.0)],
+        ),
     }
     let docks = rng.random_range(1..=4);
     for dock in 0..docks {
         let u = ((f64::from(dock) + 0.5) / f64::from(docks) - 0.5) * width * 0.9;
-        draft.body(u, -depth / 2.0 + ramp / 2.0, [rng.random_range(2.4..3.6), ramp, rng.random_range(0.8..3.4)]);
+        draft.body(
+            u,
+            -depth / 2.0 + ramp / 2.0,
+            [rng.random_range(2.4..3.6), ramp, rng.random_range(0.8..3.4)],
+        );
     }
     if rng.random_bool(0.35) {
-        draft.cylinder([0.4 * width, 0.3 * depth, 0.0], [rng.random_range(0.5..0.9), rng.random_range(14.0..26.0)]);
+        draft.cylinder(
+            [0.4 * width, 0.3 * depth, 0.0],
+            [rng.random_range(0.5..0.9), rng.random_range(14.0..26.0)],
+        );
     }
 }
 
@@ -287,7 +422,14 @@ fn church(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let nave = depth - tower;
     let height = rng.random_range(6.0..9.0);
     draft.body(0.0, tower / 2.0, [width * 0.75, nave, height]);
-    draft.gable(0.0, tower / 2.0, height, [width * 0.75, nave], rng.random_range(4.0..6.0), false);
+    draft.gable(
+        0.0,
+        tower / 2.0,
+        height,
+        [width * 0.75, nave],
+        rng.random_range(4.0..6.0),
+        false,
+    );
     draft.body(0.0, depth * 0.15, [width, tower, height * 0.9]);
     let top = rng.random_range(14.0..22.0);
     let front = -depth / 2.0 + tower / 2.0;
@@ -307,7 +449,10 @@ fn tanks(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         let height = rng.random_range(5.0..14.0);
         if rng.random_bool(0.25) {
             // A water tower: a tank on a stem.
-            draft.cylinder([u, 0.0, -FOOTING_M], [radius * 0.35, height + FOOTING_M + 4.0]);
+            draft.cylinder(
+                [u, 0.0, -FOOTING_M],
+                [radius * 0.35, height + FOOTING_M + 4.0],
+            );
             draft.cylinder([u, 0.0, height + 4.0], [radius * 0.9, 5.0]);
         } else {
             draft.cylinder([u, 0.0, -FOOTING_M], [radius, height + FOOTING_M]);
@@ -318,7 +463,11 @@ fn tanks(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
 
 fn petrol_station(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let kiosk = depth * 0.35;
-    draft.body(0.0, (depth - kiosk) / 2.0, [width * 0.6, kiosk, rng.random_range(3.2..4.4)]);
+    draft.body(
+        0.0,
+        (depth - kiosk) / 2.0,
+        [width * 0.6, kiosk, rng.random_range(3.2..4.4)],
+    );
     let (roof_width, roof_depth) = (width * 0.8, depth * 0.5);
     let v = -depth / 2.0 + roof_depth / 2.0 + 0.5;
     draft.block_at([0.0, v, 5.0], [roof_width, roof_depth, 0.9]);
@@ -340,11 +489,25 @@ mod tests {
     #[test]
     fn no_building_reaches_beyond_its_lot() {
         use Style::*;
-        for style in [House, Row, Block, Tower, Shop, Hall, Church, Tanks, PetrolStation] {
+        for style in [
+            House,
+            Row,
+            Block,
+            Tower,
+            Shop,
+            Hall,
+            Church,
+            Tanks,
+            PetrolStation,
+        ] {
             for seed in 0..60 {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let [width_m, depth_m] = style.lot_m(&mut rng);
-                let lot = Lot { foot: PartFootprint::new(Pose2::new(0.0, 0.0, 0.0), 0.0), width_m, depth_m };
+                let lot = Lot {
+                    foot: PartFootprint::new(Pose2::new(0.0, 0.0, 0.0), 0.0),
+                    width_m,
+                    depth_m,
+                };
                 let parts = build(style, &lot, &mut rng);
                 assert!(parts.len() > 1 || style == Tanks);
                 for part in parts {
@@ -353,7 +516,10 @@ mod tests {
                         && high[0] <= width_m / 2.0 + 0.35
                         && low[1] >= -depth_m / 2.0 - 0.35
                         && high[1] <= depth_m / 2.0 + 0.35;
-                    assert!(inside, "{style:?} {seed}: {part:?} in {width_m} x {depth_m}");
+                    assert!(
+                        inside,
+                        "{style:?} {seed}: {part:?} in {width_m} x {depth_m}"
+                    );
                     let half = part.shape.half_footprint_m();
                     assert!(half[0] > 0.0 && half[1] > 0.0 && part.shape.half_height_m() > 0.0);
                 }

@@ -37,14 +37,30 @@ pub(super) struct Side {
 /// Both sides of every road outside junctions.
 pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
     let mut sides = Vec::new();
-    for (index, road) in network.roads.iter().enumerate().filter(|(_, road)| road.junction.is_none()) {
+    for (index, road) in network
+        .roads
+        .iter()
+        .enumerate()
+        .filter(|(_, road)| road.junction.is_none())
+    {
         let [left, right] = [drives(road, true), drives(road, false)];
         for sign in [-1.0, 1.0] {
             let zone = zone(road);
-            let along = if sign < 0.0 { right != road.left_hand } else { left == road.left_hand };
+            let along = if sign < 0.0 {
+                right != road.left_hand
+            } else {
+                left == road.left_hand
+            };
             let one_way_left = (sign > 0.0 && !left) || (sign < 0.0 && !right);
             let median = one_way_left && zone == Zone::Motorway;
-            sides.push(Side { road: index, sign, zone, length_m: road.length_m, along, median });
+            sides.push(Side {
+                road: index,
+                sign,
+                zone,
+                length_m: road.length_m,
+                along,
+                median,
+            });
         }
     }
     sides
@@ -53,12 +69,24 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
 impl Side {
     /// The pose `out_m` beyond the paved area, `s_m` along the road (also a little before its start or behind its end),
     /// looking along the road.
-    pub(super) fn beyond_paved(&self, surface: &Surface, network: &RoadNetwork, s_m: f64, out_m: f64) -> Pose2 {
+    pub(super) fn beyond_paved(
+        &self,
+        surface: &Surface,
+        network: &RoadNetwork,
+        s_m: f64,
+        out_m: f64,
+    ) -> Pose2 {
         self.beyond(surface, network, s_m, out_m, |cut| cut.paved_m)
     }
 
     /// The same, from the edge of the carriageway.
-    pub(super) fn beyond_kerb(&self, surface: &Surface, network: &RoadNetwork, s_m: f64, out_m: f64) -> Pose2 {
+    pub(super) fn beyond_kerb(
+        &self,
+        surface: &Surface,
+        network: &RoadNetwork,
+        s_m: f64,
+        out_m: f64,
+    ) -> Pose2 {
         self.beyond(surface, network, s_m, out_m, |cut| cut.carriageway_m)
     }
 
@@ -82,7 +110,11 @@ impl Side {
     /// Width of pavement and verge on this side, metres.
     pub(super) fn pavement_m(&self, surface: &Surface, s_m: f64) -> f64 {
         let cut = cut_at(surface, self.road, s_m);
-        if self.sign > 0.0 { cut.paved_m[1] - cut.carriageway_m[1] } else { cut.carriageway_m[0] - cut.paved_m[0] }
+        if self.sign > 0.0 {
+            cut.paved_m[1] - cut.carriageway_m[1]
+        } else {
+            cut.carriageway_m[0] - cut.paved_m[0]
+        }
     }
 
     /// Angle by which something that faces the road from this side is turned against the road's direction, radians.
@@ -101,13 +133,23 @@ impl Side {
         let inside = s_m.clamp(0.0, self.length_m);
         let cut = cut_at(surface, self.road, inside);
         let [low, high] = range(cut).map(|t_m| cut.aside_m(t_m));
-        let t = if self.sign > 0.0 { high + out_m } else { low - out_m };
-        network.roads[self.road].pose_at(inside).moved(s_m - inside, t, 0.0)
+        let t = if self.sign > 0.0 {
+            high + out_m
+        } else {
+            low - out_m
+        };
+        network.roads[self.road]
+            .pose_at(inside)
+            .moved(s_m - inside, t, 0.0)
     }
 }
 
 /// The cross-section nearest to `s_m`, at or before it.
-pub(super) fn cut_at(surface: &Surface, road: usize, s_m: f64) -> &super::super::surface::CrossSection {
+pub(super) fn cut_at(
+    surface: &Surface,
+    road: usize,
+    s_m: f64,
+) -> &super::super::surface::CrossSection {
     let cuts = &surface.roads[road];
     let after = cuts.partition_point(|cut| cut.s_m <= s_m);
     &cuts[after.saturating_sub(1)]
@@ -125,13 +167,19 @@ fn zone(road: &Road) -> Zone {
     let section = &road.sections[road.section_at(middle)];
     let lanes = || section.left.iter().chain(&section.right);
     let driving = |side: &[super::super::road::RoadLane]| -> f64 {
-        side.iter().filter(|lane| lane.kind == LaneKind::Driving).map(|lane| lane.width.at(middle - section.s_m)).sum()
+        side.iter()
+            .filter(|lane| lane.kind == LaneKind::Driving)
+            .map(|lane| lane.width.at(middle - section.s_m))
+            .sum()
     };
     if lanes().any(|lane| lane.kind == LaneKind::Sidewalk) {
         Zone::Street
     } else if driving(&section.left).max(driving(&section.right)) > MOTORWAY_WIDTH_M {
         Zone::Motorway
-    } else if road.speed_limit_mps(middle).is_some_and(|limit| limit > FAST_MPS) {
+    } else if road
+        .speed_limit_mps(middle)
+        .is_some_and(|limit| limit > FAST_MPS)
+    {
         Zone::Rural
     } else {
         Zone::Street

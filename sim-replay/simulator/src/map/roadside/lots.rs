@@ -22,10 +22,16 @@ pub(super) const DEPTH_M: f64 = 2.0 * BAY_M[0] + AISLE_M + 1.4;
 pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
     let count = ((lot.width_m - 1.0) / BAY_M[1]).floor() as u32;
     let island = rng.random_range(2..=4.max(count / 2));
-    for (v, turn) in [(-(AISLE_M + BAY_M[0]) / 2.0, -1.0), ((AISLE_M + BAY_M[0]) / 2.0, 1.0)] {
+    for (v, turn) in [
+        (-(AISLE_M + BAY_M[0]) / 2.0, -1.0),
+        ((AISLE_M + BAY_M[0]) / 2.0, 1.0),
+    ] {
         for bay in 0..count {
             let u = (f64::from(bay) + 0.5 - f64::from(count) / 2.0) * BAY_M[1];
-            let pose = lot.foot.pose.moved(u, v, turn * std::f64::consts::FRAC_PI_2);
+            let pose = lot
+                .foot
+                .pose
+                .moved(u, v, turn * std::f64::consts::FRAC_PI_2);
             if bay % island == island - 1 && rng.random_bool(0.6) {
                 let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
                 let parts = if rng.random_bool(0.6) {
@@ -38,18 +44,40 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
             }
             let center_m = site.on_ground(pose);
             // Some drivers park backwards.
-            let yaw_rad = if rng.random_bool(0.3) { pose.reversed().heading_rad } else { pose.heading_rad };
-            site.parking.push(ParkingSpot { center_m, yaw_rad, roll_rad: 0.0, length_m: BAY_M[0], width_m: BAY_M[1] });
+            let yaw_rad = if rng.random_bool(0.3) {
+                pose.reversed().heading_rad
+            } else {
+                pose.heading_rad
+            };
+            site.parking.push(ParkingSpot {
+                center_m,
+                yaw_rad,
+                roll_rad: 0.0,
+                length_m: BAY_M[0],
+                width_m: BAY_M[1],
+            });
         }
     }
-    let back = PartFootprint::new(lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0), lot.foot.z_m);
+    let back = PartFootprint::new(
+        lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0),
+        lot.foot.z_m,
+    );
     let height = rng.random_range(0.6..2.2);
-    let wall = back.cuboid(SolidKind::Wall, [0.0, 0.0, -0.5], [lot.width_m - 0.2, 0.25, height + 0.5], 0.4);
+    let wall = back.cuboid(
+        SolidKind::Wall,
+        [0.0, 0.0, -0.5],
+        [lot.width_m - 0.2, 0.25, height + 0.5],
+        0.4,
+    );
     site.place(&[wall]);
 }
 
 /// Outline of a lot.
 pub(super) fn outline(lot: &Lot) -> Rectangle {
     let pose = lot.foot.pose;
-    Rectangle { center_m: [pose.x, pose.y], half_m: [lot.width_m / 2.0, lot.depth_m / 2.0], yaw_rad: pose.heading_rad }
+    Rectangle {
+        center_m: [pose.x, pose.y],
+        half_m: [lot.width_m / 2.0, lot.depth_m / 2.0],
+        yaw_rad: pose.heading_rad,
+    }
 }

@@ -54,10 +54,19 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
             0.5,
         ));
     }
-    parts.push(wall(SolidKind::Pole, cut.at(low), cut.at(high), [z + clear, z + clear + 0.6], 0.5, 0.5));
+    parts.push(wall(
+        SolidKind::Pole,
+        cut.at(low),
+        cut.at(high),
+        [z + clear, z + clear + 0.6],
+        0.5,
+        0.5,
+    ));
     let boards = rng.random_range(1..=3);
     for board in 0..boards {
-        let t = low + (high - low) * (f64::from(board) + 0.5) / f64::from(boards) + rng.random_range(-0.5..0.5);
+        let t = low
+            + (high - low) * (f64::from(board) + 0.5) / f64::from(boards)
+            + rng.random_range(-0.5..0.5);
         let foot = PartFootprint::new(cut.pose.moved(0.0, t, 0.0), z);
         let size = [0.15, rng.random_range(2.0..4.0), rng.random_range(1.2..2.6)];
         parts.push(foot.cuboid(SolidKind::Sign, [-0.35, 0.0, clear - 0.2], size, 0.95));
@@ -69,7 +78,10 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let cut = *cut_at(site.surface, side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 1.6, cut.carriageway_m[1] + 1.6];
-    let (z, width) = (cut.range_m()[1] + rng.random_range(5.3..6.2), rng.random_range(2.4..4.5));
+    let (z, width) = (
+        cut.range_m()[1] + rng.random_range(5.3..6.2),
+        rng.random_range(2.4..4.5),
+    );
     let (a, b) = (cut.at(low), cut.at(high));
     let mut parts = vec![wall(SolidKind::BridgeDeck, a, b, [z, z + 0.5], width, 0.4)];
     for edge in [-0.5, 0.5] {
@@ -86,7 +98,12 @@ fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
             return;
         }
         let foot = PartFootprint::new(pose, ground);
-        parts.push(foot.cuboid(SolidKind::Pillar, [0.0, 0.0, -0.5], [width * 0.6, 0.7, z - ground + 0.5], 0.4));
+        parts.push(foot.cuboid(
+            SolidKind::Pillar,
+            [0.0, 0.0, -0.5],
+            [width * 0.6, 0.7, z - ground + 0.5],
+            0.4,
+        ));
     }
     site.try_place(&parts, 0.0, true);
 }
@@ -98,14 +115,27 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
         let (height, step) = (rng.random_range(2.2..5.0), rng.random_range(3.5..6.0));
         let end = (s + length).min(side.length_m);
         while s + step < end {
-            let [a, b] = [s, s + step].map(|s| side.beyond_paved(site.surface, site.network, s, out));
+            let [a, b] =
+                [s, s + step].map(|s| side.beyond_paved(site.surface, site.network, s, out));
             let ground = [a, b].map(|pose| site.ground_m([pose.x, pose.y]));
             let (low, high) = (ground[0].min(ground[1]), ground[0].max(ground[1]));
             // Panels of slightly different height between posts; some are missing or glazed (lower).
-            let own = height * if rng.random_bool(0.08) { 0.45 } else { rng.random_range(0.94..1.06) };
+            let own = height
+                * if rng.random_bool(0.08) {
+                    0.45
+                } else {
+                    rng.random_range(0.94..1.06)
+                };
             let near_road = (low - side.road_m(site.surface, site.network, s)).abs() < 3.0;
             if near_road {
-                let panel = wall(SolidKind::NoiseWall, [a.x, a.y], [b.x, b.y], [low - 0.3, high + own], 0.2, 0.35);
+                let panel = wall(
+                    SolidKind::NoiseWall,
+                    [a.x, a.y],
+                    [b.x, b.y],
+                    [low - 0.3, high + own],
+                    0.2,
+                    0.35,
+                );
                 let post = PartFootprint::new(a, ground[0]).cuboid(
                     SolidKind::NoiseWall,
                     [0.0, 0.0, -0.3],
@@ -130,8 +160,14 @@ fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
         let parts: Vec<Solid> = match rng.random_range(0..6) {
             0 => {
                 let size = [0.1, rng.random_range(1.5..3.2), rng.random_range(1.0..2.4)];
-                let posts = [-0.4, 0.4]
-                    .map(|v| foot.cylinder(SolidKind::Pole, [0.1, v * size[1], -0.2], [0.07, 2.0 + size[2]], 0.5));
+                let posts = [-0.4, 0.4].map(|v| {
+                    foot.cylinder(
+                        SolidKind::Pole,
+                        [0.1, v * size[1], -0.2],
+                        [0.07, 2.0 + size[2]],
+                        0.5,
+                    )
+                });
                 let board = foot.cuboid(SolidKind::Sign, [0.0, 0.0, 1.8], size, 0.95);
                 vec![posts[0], posts[1], board]
             }
@@ -161,10 +197,18 @@ fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             2 => mast(site, side, s, rng),
             3..=4 => {
                 // A row of one species.
-                let (species, out, step) =
-                    (Species::random(rng), rng.random_range(4.0..9.0), rng.random_range(4.0..8.0));
+                let (species, out, step) = (
+                    Species::random(rng),
+                    rng.random_range(4.0..9.0),
+                    rng.random_range(4.0..8.0),
+                );
                 for place in 0..rng.random_range(3..=8) {
-                    let pose = side.beyond_paved(site.surface, site.network, s + f64::from(place) * step, out);
+                    let pose = side.beyond_paved(
+                        site.surface,
+                        site.network,
+                        s + f64::from(place) * step,
+                        out,
+                    );
                     plant(site, pose, species, rng.random_range(0.8..1.2), rng);
                 }
             }
@@ -182,16 +226,34 @@ fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
-    let style = [Style::Hall, Style::Hall, Style::Block, Style::Tanks, Style::Tower][rng.random_range(0..5)];
+    let style = [
+        Style::Hall,
+        Style::Hall,
+        Style::Block,
+        Style::Tanks,
+        Style::Tower,
+    ][rng.random_range(0..5)];
     let [width_m, depth_m] = style.lot_m(rng);
     let out = rng.random_range(6.0..30.0) + depth_m / 2.0;
     let pose = side.beyond_paved(site.surface, site.network, s, out);
-    let pose = if side.sign > 0.0 { pose } else { pose.reversed() };
+    let pose = if side.sign > 0.0 {
+        pose
+    } else {
+        pose.reversed()
+    };
     let half_m = [width_m / 2.0, depth_m / 2.0];
-    let rectangle = Rectangle { center_m: [pose.x, pose.y], half_m, yaw_rad: pose.heading_rad };
+    let rectangle = Rectangle {
+        center_m: [pose.x, pose.y],
+        half_m,
+        yaw_rad: pose.heading_rad,
+    };
     let [low, high] = site.ground_range_m(&rectangle);
     if high - low < 3.0 && site.is_free(&rectangle.grown(0.5), [low - 1.5, low + 40.0], true) {
-        let lot = Lot { foot: PartFootprint::new(pose, low), width_m, depth_m };
+        let lot = Lot {
+            foot: PartFootprint::new(pose, low),
+            width_m,
+            depth_m,
+        };
         let parts = build(style, &lot, rng);
         site.place(&parts);
         site.take(&lots::outline(&lot), [low - 1.5, low + 40.0]);
@@ -201,16 +263,29 @@ fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 /// A mast for power lines or radio: legs and arms.
 fn mast(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let pose = side.beyond_paved(site.surface, site.network, s, rng.random_range(8.0..30.0));
-    let foot = PartFootprint::new(pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)), site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(
+        pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)),
+        site.ground_m([pose.x, pose.y]),
+    );
     let (height, spread) = (rng.random_range(14.0..28.0), rng.random_range(0.9..2.2));
     let mut parts = Vec::new();
     for (u, v) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
         let at = [u * spread, v * spread, -0.5];
         parts.push(foot.cuboid(SolidKind::Pole, at, [0.25, 0.25, height * 0.6], 0.5));
     }
-    parts.push(foot.cuboid(SolidKind::Pole, [0.0, 0.0, height * 0.6 - 0.5], [0.9, 0.9, height * 0.4], 0.5));
+    parts.push(foot.cuboid(
+        SolidKind::Pole,
+        [0.0, 0.0, height * 0.6 - 0.5],
+        [0.9, 0.9, height * 0.4],
+        0.5,
+    ));
     for arm in [0.62, 0.78, 0.94] {
-        parts.push(foot.cuboid(SolidKind::Pole, [0.0, 0.0, height * arm], [0.3, 6.0 + 4.0 * (1.0 - arm), 0.3], 0.5));
+        parts.push(foot.cuboid(
+            SolidKind::Pole,
+            [0.0, 0.0, height * arm],
+            [0.3, 6.0 + 4.0 * (1.0 - arm), 0.3],
+            0.5,
+        ));
     }
     debug_assert!(height * 0.6 > HEADROOM_M);
     site.try_place(&parts, 0.3, true);

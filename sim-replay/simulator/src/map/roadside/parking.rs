@@ -17,7 +17,9 @@ const CORNER_M: f64 = 6.0;
 /// Spots in parking lanes; where a street has none, bays behind the pavement in groups.
 pub(super) fn place_along_kerbs(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
-        if side.zone != Zone::Street || site.network.roads[side.road].length_m < 2.0 * CORNER_M + SPOT_M[0] {
+        if side.zone != Zone::Street
+            || site.network.roads[side.road].length_m < 2.0 * CORNER_M + SPOT_M[0]
+        {
             continue;
         }
         if has_parking_lane(site, &side) {
@@ -30,7 +32,11 @@ pub(super) fn place_along_kerbs(site: &mut Site, rng: &mut ChaCha8Rng) {
 
 fn has_parking_lane(site: &Site, side: &Side) -> bool {
     let section = &site.network.roads[side.road].sections[0];
-    let lanes = if side.sign > 0.0 { &section.left } else { &section.right };
+    let lanes = if side.sign > 0.0 {
+        &section.left
+    } else {
+        &section.right
+    };
     lanes.iter().any(|lane| lane.kind == LaneKind::Parking)
 }
 
@@ -57,9 +63,18 @@ fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
                 break;
             }
             let pavement = side.pavement_m(site.surface, middle);
-            let pose = side.beyond_kerb(site.surface, site.network, middle, pavement + SPOT_M[1] / 2.0 + 0.2);
+            let pose = side.beyond_kerb(
+                site.surface,
+                site.network,
+                middle,
+                pavement + SPOT_M[1] / 2.0 + 0.2,
+            );
             let half_m = [SPOT_M[0] / 2.0, SPOT_M[1] / 2.0 + 0.1];
-            let rectangle = Rectangle { center_m: [pose.x, pose.y], half_m, yaw_rad: pose.heading_rad };
+            let rectangle = Rectangle {
+                center_m: [pose.x, pose.y],
+                half_m,
+                yaw_rad: pose.heading_rad,
+            };
             let road = side.road_m(site.surface, site.network, middle);
             let [low, high] = site.ground_range_m(&rectangle);
             let z_m = [road - 0.5, road + 3.5];
@@ -78,9 +93,27 @@ fn push_spot(site: &mut Site, side: &Side, s_m: f64, out_m: f64) {
     let pose = side.beyond_kerb(site.surface, site.network, s_m, out_m);
     let ground = site.ground_m([pose.x, pose.y]);
     // In a parking lane the spot lies on the road, which may be a deck.
-    let z = if out_m < 0.0 { side.road_m(site.surface, site.network, s_m) } else { ground };
-    let bank_rad = if out_m < 0.0 { cut_at(site.surface, side.road, s_m).bank_rad() } else { 0.0 };
-    let (pose, roll_rad) = if side.along { (pose, bank_rad) } else { (pose.reversed(), -bank_rad) };
+    let z = if out_m < 0.0 {
+        side.road_m(site.surface, site.network, s_m)
+    } else {
+        ground
+    };
+    let bank_rad = if out_m < 0.0 {
+        cut_at(site.surface, side.road, s_m).bank_rad()
+    } else {
+        0.0
+    };
+    let (pose, roll_rad) = if side.along {
+        (pose, bank_rad)
+    } else {
+        (pose.reversed(), -bank_rad)
+    };
     let (center_m, yaw_rad) = ([pose.x, pose.y, z], pose.heading_rad);
-    site.parking.push(ParkingSpot { center_m, yaw_rad, roll_rad, length_m: SPOT_M[0], width_m: SPOT_M[1] });
+    site.parking.push(ParkingSpot {
+        center_m,
+        yaw_rad,
+        roll_rad,
+        length_m: SPOT_M[0],
+        width_m: SPOT_M[1],
+    });
 }

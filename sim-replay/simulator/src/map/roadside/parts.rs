@@ -25,7 +25,12 @@ impl PartFootprint {
         reflectivity: f32,
     ) -> Solid {
         let half_m = size_m.map(|length| length / 2.0);
-        self.solid(kind, Shape::Box { half_m }, [u, v, lift_m + half_m[2]], reflectivity)
+        self.solid(
+            kind,
+            Shape::Box { half_m },
+            [u, v, lift_m + half_m[2]],
+            reflectivity,
+        )
     }
 
     /// An upright cylinder.
@@ -36,18 +41,39 @@ impl PartFootprint {
         [radius_m, height_m]: [f64; 2],
         reflectivity: f32,
     ) -> Solid {
-        let shape = Shape::Cylinder { radius_m, half_height_m: height_m / 2.0 };
+        let shape = Shape::Cylinder {
+            radius_m,
+            half_height_m: height_m / 2.0,
+        };
         self.solid(kind, shape, [u, v, lift_m + height_m / 2.0], reflectivity)
     }
 
     /// An ellipsoid with its middle `lift_m` over the foot.
-    pub(super) fn ellipsoid(&self, kind: SolidKind, center_m: [f64; 3], radii_m: [f64; 3], reflectivity: f32) -> Solid {
+    pub(super) fn ellipsoid(
+        &self,
+        kind: SolidKind,
+        center_m: [f64; 3],
+        radii_m: [f64; 3],
+        reflectivity: f32,
+    ) -> Solid {
         self.solid(kind, Shape::Ellipsoid { radii_m }, center_m, reflectivity)
     }
 
-    fn solid(&self, kind: SolidKind, shape: Shape, [u, v, w]: [f64; 3], reflectivity: f32) -> Solid {
+    fn solid(
+        &self,
+        kind: SolidKind,
+        shape: Shape,
+        [u, v, w]: [f64; 3],
+        reflectivity: f32,
+    ) -> Solid {
         let at = self.pose.moved(u, v, 0.0);
-        Solid::new(kind, shape, [at.x, at.y, self.z_m + w], self.pose.heading_rad, reflectivity)
+        Solid::new(
+            kind,
+            shape,
+            [at.x, at.y, self.z_m + w],
+            self.pose.heading_rad,
+            reflectivity,
+        )
     }
 }
 
@@ -61,7 +87,21 @@ pub(super) fn wall(
     reflectivity: f32,
 ) -> Solid {
     let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
-    let half_m = [dx.hypot(dy) / 2.0, thickness_m / 2.0, (top_m - bottom_m) / 2.0];
-    let center_m = [(from[0] + to[0]) / 2.0, (from[1] + to[1]) / 2.0, (bottom_m + top_m) / 2.0];
-    Solid::new(kind, Shape::Box { half_m }, center_m, dy.atan2(dx), reflectivity)
+    let half_m = [
+        dx.hypot(dy) / 2.0,
+        thickness_m / 2.0,
+        (top_m - bottom_m) / 2.0,
+    ];
+    let center_m = [
+        (from[0] + to[0]) / 2.0,
+        (from[1] + to[1]) / 2.0,
+        (bottom_m + top_m) / 2.0,
+    ];
+    Solid::new(
+        kind,
+        Shape::Box { half_m },
+        center_m,
+        dy.atan2(dx),
+        reflectivity,
+    )
 }

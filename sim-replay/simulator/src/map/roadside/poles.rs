@@ -28,7 +28,9 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
             }
             Zone::Rural => signs(site, &side, 50.0..140.0, rng),
             // Lit stretches and dark ones.
-            Zone::Motorway if rng.random_bool(0.5) => lamps(site, &side, 38.0..55.0, 9.0..13.0, rng),
+            Zone::Motorway if rng.random_bool(0.5) => {
+                lamps(site, &side, 38.0..55.0, 9.0..13.0, rng)
+            }
             Zone::Motorway => {}
         }
     }
@@ -43,7 +45,11 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
             lights |= signal.dynamic;
             let pose = beside_line(road, signal.s_m, signal.t_m, signal.heading_rad);
             let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
-            let parts = if signal.dynamic { light(foot) } else { sign(foot, rng) };
+            let parts = if signal.dynamic {
+                light(foot)
+            } else {
+                sign(foot, rng)
+            };
             beside_carriageway(site, &parts, signal.t_m);
         }
         for object in road.objects.iter().filter(|object| is_sign(&object.label)) {
@@ -71,7 +77,10 @@ fn beside_carriageway(site: &mut Site, parts: &[Solid], t_m: f64) {
                 // Their own y axis points across the road.
                 let pose = Pose2::new(part.center_m[0], part.center_m[1], part.yaw_rad);
                 let pose = pose.moved(0.0, shift * t_m.signum(), 0.0);
-                Solid { center_m: [pose.x, pose.y, part.center_m[2]], ..*part }
+                Solid {
+                    center_m: [pose.x, pose.y, part.center_m[2]],
+                    ..*part
+                }
             })
             .collect();
         if site.try_place(&moved, 0.05, false) {
@@ -105,8 +114,18 @@ fn sign(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
         _ => [rng.random_range(0.9..1.8), rng.random_range(0.4..0.9)],
     };
     vec![
-        foot.cylinder(SolidKind::Pole, [0.06, 0.0, -0.2], [0.04, height + tall + 0.2], 0.5),
-        foot.cuboid(SolidKind::Sign, [0.0, 0.0, height], [0.04, width, tall], 0.95),
+        foot.cylinder(
+            SolidKind::Pole,
+            [0.06, 0.0, -0.2],
+            [0.04, height + tall + 0.2],
+            0.5,
+        ),
+        foot.cuboid(
+            SolidKind::Sign,
+            [0.0, 0.0, height],
+            [0.04, width, tall],
+            0.95,
+        ),
     ]
 }
 
@@ -131,9 +150,24 @@ fn lamps(
         let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
         let arm = height * 0.2;
         let parts = [
-            foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [POST_M + height * 0.006, height + 0.2], 0.5),
-            foot.cuboid(SolidKind::Pole, [arm / 2.0, 0.0, height - 0.1], [arm, 0.1, 0.1], 0.5),
-            foot.cuboid(SolidKind::Pole, [arm, 0.0, height - 0.15], [0.7, 0.3, 0.15], 0.5),
+            foot.cylinder(
+                SolidKind::Pole,
+                [0.0, 0.0, -0.2],
+                [POST_M + height * 0.006, height + 0.2],
+                0.5,
+            ),
+            foot.cuboid(
+                SolidKind::Pole,
+                [arm / 2.0, 0.0, height - 0.1],
+                [arm, 0.1, 0.1],
+                0.5,
+            ),
+            foot.cuboid(
+                SolidKind::Pole,
+                [arm, 0.0, height - 0.15],
+                [0.7, 0.3, 0.15],
+                0.5,
+            ),
         ];
         site.try_place(&parts, 0.05, false);
         s += rhythm * rng.random_range(0.9..1.1);
@@ -143,10 +177,17 @@ fn lamps(
 /// A traffic light where this side's traffic enters a junction, for most junctions.
 fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let road = &site.network.roads[side.road];
-    let (link, s) = if side.along { (road.successor, side.length_m - 0.6) } else { (road.predecessor, 0.6) };
-    let Some(RoadLink::Junction(junction)) = link else { return };
+    let (link, s) = if side.along {
+        (road.successor, side.length_m - 0.6)
+    } else {
+        (road.predecessor, 0.6)
+    };
+    let Some(RoadLink::Junction(junction)) = link else {
+        return;
+    };
     // The same result for every road of the junction.
-    let lit = !(junction * 7 + site.network.junctions[junction].connections.len()).is_multiple_of(3);
+    let lit =
+        !(junction * 7 + site.network.junctions[junction].connections.len()).is_multiple_of(3);
     if !lit || !side.is_near(site.network) {
         return;
     }
@@ -158,8 +199,18 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     if rng.random_bool(0.3) {
         parts[0] = foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.12, 6.6], 0.5);
         let over = if road.left_hand { -1.0 } else { 1.0 };
-        parts.push(foot.cuboid(SolidKind::Pole, [0.0, over * 1.7, 6.0], [0.12, 3.2, 0.12], 0.5));
-        parts.push(foot.cuboid(SolidKind::Sign, [-0.2, over * 3.0, 5.2], [0.25, 0.45, 1.2], 0.6));
+        parts.push(foot.cuboid(
+            SolidKind::Pole,
+            [0.0, over * 1.7, 6.0],
+            [0.12, 3.2, 0.12],
+            0.5,
+        ));
+        parts.push(foot.cuboid(
+            SolidKind::Sign,
+            [-0.2, over * 3.0, 5.2],
+            [0.25, 0.45, 1.2],
+            0.6,
+        ));
     }
     site.try_place(&parts, 0.02, false);
 }
@@ -167,10 +218,17 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 fn signs(site: &mut Site, side: &Side, distance_m: std::ops::Range<f64>, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..distance_m.end);
     while s < side.length_m - 2.0 {
-        let out = if side.zone == Zone::Street { rng.random_range(0.5..0.9) } else { rng.random_range(0.8..1.6) };
+        let out = if side.zone == Zone::Street {
+            rng.random_range(0.5..0.9)
+        } else {
+            rng.random_range(0.8..1.6)
+        };
         let pose = side.beyond_kerb(site.surface, site.network, s, out);
         let pose = if side.along { pose } else { pose.reversed() };
-        let parts = sign(PartFootprint::new(pose, site.ground_m([pose.x, pose.y])), rng);
+        let parts = sign(
+            PartFootprint::new(pose, site.ground_m([pose.x, pose.y])),
+            rng,
+        );
         site.try_place(&parts, 0.05, false);
         s += rng.random_range(distance_m.clone());
     }
@@ -181,9 +239,16 @@ fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..20.0);
     while s < side.length_m - 3.0 {
         let pavement = side.pavement_m(site.surface, s);
-        let out = if rng.random_bool(0.5) { 0.6 } else { (pavement - 0.4).max(0.6) };
+        let out = if rng.random_bool(0.5) {
+            0.6
+        } else {
+            (pavement - 0.4).max(0.6)
+        };
         let pose = side.beyond_kerb(site.surface, site.network, s, out);
-        let foot = PartFootprint::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+        let foot = PartFootprint::new(
+            pose.moved(0.0, 0.0, side.facing_rad()),
+            site.ground_m([pose.x, pose.y]),
+        );
         let kind = SolidKind::StreetFurniture;
         let parts = match rng.random_range(0..12) {
             0..=2 => vec![foot.cylinder(kind, [0.0, 0.0, -0.1], [0.25, 1.0], 0.4)],
@@ -191,7 +256,14 @@ fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             5..=6 => vec![foot.cuboid(kind, [0.0, 0.0, -0.1], [0.45, 1.1, 1.4], 0.5)],
             7..=8 => vec![foot.cuboid(kind, [0.0, 0.0, -0.1], [0.6, 1.8, 0.95], 0.4)],
             9 => (0..4)
-                .map(|i| foot.cylinder(SolidKind::Pole, [0.0, 1.4 * f64::from(i), -0.1], [0.07, 1.0], 0.5))
+                .map(|i| {
+                    foot.cylinder(
+                        SolidKind::Pole,
+                        [0.0, 1.4 * f64::from(i), -0.1],
+                        [0.07, 1.0],
+                        0.5,
+                    )
+                })
                 .collect(),
             10 => shelter(site, side, s, rng),
             _ => kiosk(site, side, s, pavement, rng),
@@ -206,20 +278,41 @@ fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid>
     let pavement = cut_at(site.surface, side.road, s);
     let depth = side.pavement_m(site.surface, pavement.s_m).clamp(1.2, 1.7);
     let pose = side.beyond_kerb(site.surface, site.network, s, 0.5 + depth / 2.0);
-    let foot = PartFootprint::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(
+        pose.moved(0.0, 0.0, side.facing_rad()),
+        site.ground_m([pose.x, pose.y]),
+    );
     let length = rng.random_range(3.0..4.6);
     let kind = SolidKind::StreetFurniture;
     vec![
-        foot.cuboid(kind, [-depth / 2.0 + 0.05, 0.0, -0.1], [0.08, length, 2.5], 0.3),
-        foot.cuboid(kind, [0.0, length / 2.0 - 0.05, -0.1], [depth, 0.08, 2.5], 0.3),
+        foot.cuboid(
+            kind,
+            [-depth / 2.0 + 0.05, 0.0, -0.1],
+            [0.08, length, 2.5],
+            0.3,
+        ),
+        foot.cuboid(
+            kind,
+            [0.0, length / 2.0 - 0.05, -0.1],
+            [depth, 0.08, 2.5],
+            0.3,
+        ),
         foot.cuboid(kind, [0.0, 0.0, 2.4], [depth, length, 0.15], 0.4),
-        foot.cuboid(kind, [-depth / 2.0 + 0.35, 0.0, -0.1], [0.4, length * 0.7, 0.6], 0.4),
+        foot.cuboid(
+            kind,
+            [-depth / 2.0 + 0.35, 0.0, -0.1],
+            [0.4, length * 0.7, 0.6],
+            0.4,
+        ),
     ]
 }
 
 fn kiosk(site: &Site, side: &Side, s: f64, pavement: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let pose = side.beyond_kerb(site.surface, site.network, s, pavement + 1.3);
-    let foot = PartFootprint::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(
+        pose.moved(0.0, 0.0, side.facing_rad()),
+        site.ground_m([pose.x, pose.y]),
+    );
     let kind = SolidKind::StreetFurniture;
     let width = rng.random_range(2.2..3.6);
     vec![

@@ -30,8 +30,15 @@ pub(super) struct Site<'a> {
 impl<'a> Site<'a> {
     pub(super) fn new(network: &'a RoadNetwork, surface: &'a Surface, ground: &'a Ground) -> Self {
         let index = CellIndex::new(surface.bounds_m, CELL_M);
-        let mut site =
-            Self { network, surface, ground, solids: Vec::new(), parking: Vec::new(), taken: Vec::new(), index };
+        let mut site = Self {
+            network,
+            surface,
+            ground,
+            solids: Vec::new(),
+            parking: Vec::new(),
+            taken: Vec::new(),
+            index,
+        };
         for junction in 0..network.junctions.len() {
             site.keep_junction_free(junction);
         }
@@ -40,7 +47,8 @@ impl<'a> Site<'a> {
 
     /// True if a rectangle is free of roads and of everything placed, between two heights.
     pub(super) fn is_free(&self, rectangle: &Rectangle, z_m: [f64; 2], pavements: bool) -> bool {
-        self.surface.is_clear(rectangle, z_m, HEADROOM_M, pavements) && !self.is_taken(&rectangle.corners(), z_m)
+        self.surface.is_clear(rectangle, z_m, HEADROOM_M, pavements)
+            && !self.is_taken(&rectangle.corners(), z_m)
     }
 
     /// Takes a rectangle between two heights.
@@ -76,8 +84,13 @@ impl<'a> Site<'a> {
     /// Lowest and highest terrain under the corners and the middle of a rectangle, metres.
     pub(super) fn ground_range_m(&self, rectangle: &Rectangle) -> [f64; 2] {
         let corners: Quad = rectangle.corners();
-        let heights = corners.iter().chain(std::iter::once(&rectangle.center_m)).map(|&corner| self.ground_m(corner));
-        heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)])
+        let heights = corners
+            .iter()
+            .chain(std::iter::once(&rectangle.center_m))
+            .map(|&corner| self.ground_m(corner));
+        heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| {
+            [low.min(z), high.max(z)]
+        })
     }
 
     /// A pose on the terrain as position.
@@ -100,11 +113,18 @@ impl<'a> Site<'a> {
     /// Reserves the hull of a junction's lanes, so that nothing is placed between them.
     fn keep_junction_free(&mut self, junction: usize) {
         let inside = |road: u32| self.network.roads[road as usize].junction == Some(junction);
-        let patches = self.surface.patches.iter().filter(|patch| patch.carriageway && inside(patch.road));
+        let patches = self
+            .surface
+            .patches
+            .iter()
+            .filter(|patch| patch.carriageway && inside(patch.road));
         let (mut points, mut z_m) = (Vec::new(), [f64::INFINITY, f64::NEG_INFINITY]);
         for patch in patches {
             points.extend(patch.quad);
-            z_m = [z_m[0].min(patch.z_m[0]).min(patch.z_m[3]), z_m[1].max(patch.z_m[1]).max(patch.z_m[2])];
+            z_m = [
+                z_m[0].min(patch.z_m[0]).min(patch.z_m[3]),
+                z_m[1].max(patch.z_m[1]).max(patch.z_m[2]),
+            ];
         }
         let [low, high] = bounds(&points);
         if points.len() > 2 && (high[0] - low[0]).max(high[1] - low[1]) < MAX_JUNCTION_M {
@@ -116,11 +136,15 @@ impl<'a> Site<'a> {
 /// Convex hull, anticlockwise (Andrew's monotone chain).
 fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
     points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
-    let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+    let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| {
+        (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    };
     let half = |points: &mut dyn Iterator<Item = [f64; 2]>| {
         let mut chain: Vec<[f64; 2]> = Vec::new();
         for point in points {
-            while chain.len() > 1 && turn(chain[chain.len() - 2], chain[chain.len() - 1], point) <= 0.0 {
+            while chain.len() > 1
+                && turn(chain[chain.len() - 2], chain[chain.len() - 1], point) <= 0.0
+            {
                 chain.pop();
             }
             chain.push(point);
@@ -139,7 +163,17 @@ mod tests {
 
     #[test]
     fn hull_keeps_the_corners_only() {
-        let points = vec![[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [2.0, 2.0], [0.0, 2.0], [1.0, 0.0]];
-        assert_eq!(hull(points), [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]);
+        let points = vec![
+            [0.0, 0.0],
+            [2.0, 0.0],
+            [1.0, 1.0],
+            [2.0, 2.0],
+            [0.0, 2.0],
+            [1.0, 0.0],
+        ];
+        assert_eq!(
+            hull(points),
+            [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]
+        );
     }
 }

@@ -30,16 +30,28 @@ impl Species {
 }
 
 /// Trunk and crown; `size` is about 1 for a grown tree.
-pub(super) fn tree(foot: PartFootprint, species: Species, size: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+pub(super) fn tree(
+    foot: PartFootprint,
+    species: Species,
+    size: f64,
+    rng: &mut ChaCha8Rng,
+) -> Vec<Solid> {
     let leaves = rng.random_range(0.2..0.45);
     let trunk = |radius_m: f64, height_m: f64| {
-        foot.cylinder(SolidKind::TreeTrunk, [0.0, 0.0, -0.3], [radius_m, height_m + 0.3], 0.25)
+        foot.cylinder(
+            SolidKind::TreeTrunk,
+            [0.0, 0.0, -0.3],
+            [radius_m, height_m + 0.3],
+            0.25,
+        )
     };
-    let crown = |at: [f64; 3], radii: [f64; 3]| foot.ellipsoid(SolidKind::TreeCrown, at, radii, leaves);
+    let crown =
+        |at: [f64; 3], radii: [f64; 3]| foot.ellipsoid(SolidKind::TreeCrown, at, radii, leaves);
     match species {
         Species::Broadleaf => {
             let clear = rng.random_range(1.8..3.0) * size;
-            let [rx, ry, rz] = [1.4..2.6, 1.4..2.6, 1.3..2.4].map(|range| rng.random_range(range) * size);
+            let [rx, ry, rz] =
+                [1.4..2.6, 1.4..2.6, 1.3..2.4].map(|range| rng.random_range(range) * size);
             let mut parts = vec![
                 trunk(rng.random_range(0.12..0.28) * size, clear + rz),
                 crown([0.0, 0.0, clear + rz], [rx, ry, rz]),
@@ -47,7 +59,11 @@ pub(super) fn tree(foot: PartFootprint, species: Species, size: f64, rng: &mut C
             // Large crowns are lobed.
             if size > 0.9 {
                 let turn: f64 = rng.random_range(0.0..std::f64::consts::TAU);
-                let at = [0.6 * rx * turn.cos(), 0.6 * ry * turn.sin(), clear + rz * rng.random_range(1.1..1.6)];
+                let at = [
+                    0.6 * rx * turn.cos(),
+                    0.6 * ry * turn.sin(),
+                    clear + rz * rng.random_range(1.1..1.6),
+                ];
                 parts.push(crown(at, [0.7 * rx, 0.7 * ry, 0.7 * rz]));
             }
             parts
@@ -57,25 +73,42 @@ pub(super) fn tree(foot: PartFootprint, species: Species, size: f64, rng: &mut C
             let radius = height * rng.random_range(0.13..0.2);
             let mut parts = vec![trunk(0.16 * size, height * 0.5)];
             for (level, share) in [(0.28, 1.0), (0.52, 0.72), (0.76, 0.42)] {
-                parts.push(crown([0.0, 0.0, level * height], [radius * share, radius * share, 0.22 * height]));
+                parts.push(crown(
+                    [0.0, 0.0, level * height],
+                    [radius * share, radius * share, 0.22 * height],
+                ));
             }
             parts
         }
         Species::Columnar => {
             let height = rng.random_range(7.0..14.0) * size;
             let radius = rng.random_range(0.7..1.2) * size;
-            vec![trunk(0.14 * size, height * 0.4), crown([0.0, 0.0, 0.55 * height], [radius, radius, 0.45 * height])]
+            vec![
+                trunk(0.14 * size, height * 0.4),
+                crown([0.0, 0.0, 0.55 * height], [radius, radius, 0.45 * height]),
+            ]
         }
         Species::Bush => {
             let radius = rng.random_range(0.5..1.1) * size;
             let height = rng.random_range(0.5..1.0) * size;
-            vec![foot.ellipsoid(SolidKind::Hedge, [0.0, 0.0, height * 0.7], [radius, radius * 0.9, height], leaves)]
+            vec![foot.ellipsoid(
+                SolidKind::Hedge,
+                [0.0, 0.0, height * 0.7],
+                [radius, radius * 0.9, height],
+                leaves,
+            )]
         }
     }
 }
 
 /// Plants a tree at a pose on the ground, if all of it finds room.
-pub(super) fn plant(site: &mut Site, pose: Pose2, species: Species, size: f64, rng: &mut ChaCha8Rng) -> bool {
+pub(super) fn plant(
+    site: &mut Site,
+    pose: Pose2,
+    species: Species,
+    size: f64,
+    rng: &mut ChaCha8Rng,
+) -> bool {
     let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
     let parts = tree(foot, species, size, rng);
     // Crowns may touch; the trunk keeps its distance from walls and poles by the crown around it.
@@ -91,13 +124,24 @@ pub(super) fn place_along_streets(site: &mut Site, rng: &mut ChaCha8Rng) {
         {
             continue;
         }
-        let species = if rng.random_bool(0.8) { Species::Broadleaf } else { Species::Columnar };
+        let species = if rng.random_bool(0.8) {
+            Species::Broadleaf
+        } else {
+            Species::Columnar
+        };
         let (rhythm, size) = (rng.random_range(8.0..18.0), rng.random_range(0.55..0.95));
         let mut s = rng.random_range(4.0..14.0);
         while s < side.length_m - 4.0 {
             if rng.random_bool(0.85) {
-                let pose = side.beyond_kerb(site.surface, site.network, s, rng.random_range(0.7..1.0));
-                plant(site, pose, species, size * rng.random_range(0.85..1.15), rng);
+                let pose =
+                    side.beyond_kerb(site.surface, site.network, s, rng.random_range(0.7..1.0));
+                plant(
+                    site,
+                    pose,
+                    species,
+                    size * rng.random_range(0.85..1.15),
+                    rng,
+                );
             }
             s += rhythm * rng.random_range(0.8..1.25);
         }

@@ -8,7 +8,8 @@
 mod tiles;
 
 use perception::int8::{
-    ActivationScales, ConvGeometry, Int8Convolution, LayerFormat, Quantisation, QuantiseError, ScaleSearch,
+    ActivationScales, ConvGeometry, Int8Convolution, LayerFormat, Quantisation, QuantiseError,
+    ScaleSearch,
 };
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
@@ -41,8 +42,15 @@ impl MapRefinement {
     /// Its variables are `refine.*` below `path`; `hidden` are the channels between its two convolutions.
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64) -> Self {
         let path = path / "refine";
-        let around = nn::ConvConfig { padding: 1, ..Default::default() };
-        let neutral = nn::ConvConfig { ws_init: Init::Const(0.0), bs_init: Init::Const(0.0), ..around };
+        let around = nn::ConvConfig {
+            padding: 1,
+            ..Default::default()
+        };
+        let neutral = nn::ConvConfig {
+            ws_init: Init::Const(0.0),
+            bs_init: Init::Const(0.0),
+            ..around
+        };
         Self {
             convolutions: [
                 nn::conv2d(&path / "conv0", channels, hidden, 3, around),
@@ -53,7 +61,12 @@ impl MapRefinement {
     }
 
     /// `[1, C, H, W]` of a fused map of that shape; `likely` `[1, 1, H, W]` is larger where a vehicle is more likely.
-    pub(crate) fn forward(&self, fused: Tensor, likely: Option<&Tensor>, train: bool) -> Result<Tensor, TchError> {
+    pub(crate) fn forward(
+        &self,
+        fused: Tensor,
+        likely: Option<&Tensor>,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
         let (_, _, height, width) = fused.size4()?;
         if let (Some(int8), false, true) = (&self.int8, train, Tiles::fit([height, width])) {
             return int8.forward(fused, likely);
@@ -73,21 +86,49 @@ impl MapRefinement {
         let (input, hidden) = (scales.get(INPUT)?, scales.get(HIDDEN)?);
         let [first, second] = &self.convolutions;
         let quantised = |convolution: &nn::Conv2D, format| {
-            let geometry = ConvGeometry { stride: 1, padding: 0, upsampling: 1 };
+            let geometry = ConvGeometry {
+                stride: 1,
+                padding: 0,
+                upsampling: 1,
+            };
             Int8Convolution::new(&convolution.ws, convolution.bs.as_ref(), geometry, format)
         };
         let convolutions = [
-            quantised(first, LayerFormat { input, output: Some(hidden.scale), relu: true })?,
-            quantised(second, LayerFormat { input: hidden, output: None, relu: false })?,
+            quantised(
+                first,
+                LayerFormat {
+                    input,
+                    output: Some(hidden.scale),
+                    relu: true,
+                },
+            )?,
+            quantised(
+                second,
+                LayerFormat {
+                    input: hidden,
+                    output: None,
+                    relu: false,
+                },
+            )?,
         ];
-        self.int8 = Some(Int8Refinement { input, convolutions });
+        self.int8 = Some(Int8Refinement {
+            input,
+            convolutions,
+        });
         Ok(())
     }
 }
 
 /// A size-preserving 3x3 convolution.
 fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
-    maps.f_conv2d(&convolution.ws, convolution.bs.as_ref(), [1, 1], [1, 1], [1, 1], 1)
+    maps.f_conv2d(
+        &convolution.ws,
+        convolution.bs.as_ref(),
+        [1, 1],
+        [1, 1],
+        [1, 1],
+        1,
+    )
 }
 
 impl Int8Refinement {
@@ -99,7 +140,10 @@ impl Int8Refinement {
             None => Tiles::all([height, width]),
         };
         let [first, second] = &self.convolutions;
-        let input = tiles.cut(&self.input.quantise(&fused)?, f64::from(self.input.zero_point))?;
+        let input = tiles.cut(
+            &self.input.quantise(&fused)?,
+            f64::from(self.input.zero_point),
+        )?;
         let hidden = first.forward(&input)?.f_mul(&tiles.hidden_mask()?)?;
         tiles.add_to(&fused, &second.forward(&hidden)?)?;
         Ok(fused)
@@ -119,7 +163,10 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let refinement = MapRefinement::new(&variables.root(), 8, 12);
         let fused = Tensor::rand([1, 8, 16, 24], (Kind::Float, Device::Cpu));
-        assert_eq!(refinement.forward(fused.copy(), None, false).unwrap(), fused);
+        assert_eq!(
+            refinement.forward(fused.copy(), None, false).unwrap(),
+            fused
+        );
     }
 
     #[test]
@@ -131,14 +178,29 @@ mod tests {
         let fused = Tensor::rand([1, 8, 16, 24], (Kind::Float, Device::Cpu)) * 4.0 - 0.5;
         let weight = &variables.variables()["refine.conv1.weight"];
         let _ = tch::no_grad(|| weight.shallow_clone().normal_(0.0, 0.1));
-        let (exact, mut search) = (refinement.forward(fused.copy(), None, true).unwrap(), ScaleSearch::default());
+        let (exact, mut search) = (
+            refinement.forward(fused.copy(), None, true).unwrap(),
+            ScaleSearch::default(),
+        );
         tch::no_grad(|| refinement.observe(&fused, &mut search)).unwrap();
         tch::no_grad(|| refinement.quantise(&search.scales())).unwrap();
         let found = tch::no_grad(|| refinement.forward(fused.copy(), None, false)).unwrap();
-        let error = (&found - &exact).square().mean(Kind::Float).sqrt().double_value(&[]);
-        assert!(error > 0.0 && error < 0.03 * (&exact - &fused).std(true).double_value(&[]), "{error}");
+        let error = (&found - &exact)
+            .square()
+            .mean(Kind::Float)
+            .sqrt()
+            .double_value(&[]);
+        assert!(
+            error > 0.0 && error < 0.03 * (&exact - &fused).std(true).double_value(&[]),
+            "{error}"
+        );
         assert_eq!(refinement.forward(fused.copy(), None, true).unwrap(), exact);
-        let missing = MapRefinement::new(&variables.root(), 8, 12).quantise(&Default::default()).unwrap_err();
-        assert!(missing.to_string().contains("fusion.refine.input"), "{missing}");
+        let missing = MapRefinement::new(&variables.root(), 8, 12)
+            .quantise(&Default::default())
+            .unwrap_err();
+        assert!(
+            missing.to_string().contains("fusion.refine.input"),
+            "{missing}"
+        );
     }
 }

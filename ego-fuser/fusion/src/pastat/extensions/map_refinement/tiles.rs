@@ -33,13 +33,18 @@ impl Tiles {
         order.sort_by(|a, b| by_tile[*b].total_cmp(&by_tile[*a]));
         order.truncate(wanted);
         order.sort_unstable();
-        Ok(Self { first_cells: order.into_iter().map(|tile| all[tile]).collect(), size: [height, width] })
+        Ok(Self {
+            first_cells: order.into_iter().map(|tile| all[tile]).collect(),
+            size: [height, width],
+        })
     }
 
     /// All tiles of a map.
     pub(super) fn all(size: [i64; 2]) -> Self {
         let starts = |cells: i64| (0..cells).step_by(EDGE as usize);
-        let first_cells = starts(size[0]).flat_map(|row| starts(size[1]).map(move |column| [row, column])).collect();
+        let first_cells = starts(size[0])
+            .flat_map(|row| starts(size[1]).map(move |column| [row, column]))
+            .collect();
         Self { first_cells, size }
     }
 
@@ -51,22 +56,32 @@ impl Tiles {
     /// The tiles of a map `[1, C, H, W]` with the cells around them, channels innermost in memory:
     /// `[K, C, EDGE + 4, EDGE + 4]`; `outside` beyond the edges of the map.
     pub(super) fn cut(&self, map: &Tensor, outside: f64) -> Result<Tensor, TchError> {
-        let padded = map.f_pad([MARGIN; 4], "constant", outside)?.f_permute([0, 2, 3, 1])?.f_squeeze_dim(0)?;
+        let padded = map
+            .f_pad([MARGIN; 4], "constant", outside)?
+            .f_permute([0, 2, 3, 1])?
+            .f_squeeze_dim(0)?;
         let edge = EDGE + 2 * MARGIN;
-        let tile = |&[row, column]: &[i64; 2]| padded.f_narrow(0, row, edge)?.f_narrow(1, column, edge);
-        let tiles: Vec<Tensor> = self.first_cells.iter().map(tile).collect::<Result<_, TchError>>()?;
+        let tile =
+            |&[row, column]: &[i64; 2]| padded.f_narrow(0, row, edge)?.f_narrow(1, column, edge);
+        let tiles: Vec<Tensor> = self
+            .first_cells
+            .iter()
+            .map(tile)
+            .collect::<Result<_, TchError>>()?;
         Tensor::f_stack(&tiles, 0)?.f_permute([0, 3, 1, 2])
     }
 
     /// `[K, 1, EDGE + 2, EDGE + 2]`, `u8`: 1 on the map and 0 beyond its edges, where the second convolution is padded.
     pub(super) fn hidden_mask(&self) -> Result<Tensor, TchError> {
         let on_map = |first: i64, cells: i64| {
-            (-HIDDEN_MARGIN..EDGE + HIDDEN_MARGIN).map(move |step| u8::from((0..cells).contains(&(first + step))))
+            (-HIDDEN_MARGIN..EDGE + HIDDEN_MARGIN)
+                .map(move |step| u8::from((0..cells).contains(&(first + step))))
         };
         let edge = EDGE + 2 * HIDDEN_MARGIN;
         let masks: Vec<u8> = (self.first_cells.iter())
             .flat_map(|&[row, column]| {
-                on_map(row, self.size[0]).flat_map(move |row| on_map(column, self.size[1]).map(move |on| row * on))
+                on_map(row, self.size[0])
+                    .flat_map(move |row| on_map(column, self.size[1]).map(move |on| row * on))
             })
             .collect();
         Tensor::f_from_slice(&masks)?.f_view([-1, 1, edge, edge])
@@ -95,7 +110,10 @@ mod tests {
         // Row 7 and column 9 are in the first row and second column of tiles and near three others.
         let tiles = Tiles::most_likely(&likely, 4.0 / 6.0).unwrap();
         assert_eq!(tiles.first_cells, [[0, 0], [0, 8], [8, 0], [8, 8]]);
-        assert_eq!(Tiles::most_likely(&likely, 0.0).unwrap().first_cells.len(), 1);
+        assert_eq!(
+            Tiles::most_likely(&likely, 0.0).unwrap().first_cells.len(),
+            1
+        );
         assert!(Tiles::fit([16, 24]) && !Tiles::fit([16, 20]) && !Tiles::fit([0, 8]));
     }
 
@@ -105,12 +123,32 @@ mod tests {
         let tiles = Tiles::all([16, 16]);
         let cut = tiles.cut(&map, -1.0).unwrap();
         assert_eq!(cut.size(), [4, 1, 12, 12]);
-        assert_eq!((cut.double_value(&[0, 0, 1, 1]), cut.double_value(&[3, 0, 2, 2])), (-1.0, 8.0 * 16.0 + 8.0));
+        assert_eq!(
+            (
+                cut.double_value(&[0, 0, 1, 1]),
+                cut.double_value(&[3, 0, 2, 2])
+            ),
+            (-1.0, 8.0 * 16.0 + 8.0)
+        );
         let mask = tiles.hidden_mask().unwrap();
-        assert_eq!([mask.int64_value(&[0, 0, 0, 5]), mask.int64_value(&[0, 0, 9, 9])], [0, 1]);
-        assert_eq!([mask.int64_value(&[3, 0, 0, 0]), mask.int64_value(&[3, 0, 9, 1])], [1, 0]);
+        assert_eq!(
+            [
+                mask.int64_value(&[0, 0, 0, 5]),
+                mask.int64_value(&[0, 0, 9, 9])
+            ],
+            [0, 1]
+        );
+        assert_eq!(
+            [
+                mask.int64_value(&[3, 0, 0, 0]),
+                mask.int64_value(&[3, 0, 9, 1])
+            ],
+            [1, 0]
+        );
         let sum = map.copy();
-        tiles.add_to(&sum, &cut.narrow(2, 2, 8).narrow(3, 2, 8)).unwrap();
+        tiles
+            .add_to(&sum, &cut.narrow(2, 2, 8).narrow(3, 2, 8))
+            .unwrap();
         assert_eq!(sum, &map * 2.0);
     }
 }

@@ -53,8 +53,18 @@ pub(crate) struct TemporalMemory {
 impl TemporalMemory {
     /// Its variables are `recall.*` below `path`.
     pub(crate) fn new(path: &nn::Path<'_>, config: &PastatConfig, memory: &MemoryConfig) -> Self {
-        let PastatConfig { channels, dim, patch, frames, .. } = *config;
-        Self::of_size(&(path / "recall"), [channels, dim, patch, frames as i64 - 1], memory)
+        let PastatConfig {
+            channels,
+            dim,
+            patch,
+            frames,
+            ..
+        } = *config;
+        Self::of_size(
+            &(path / "recall"),
+            [channels, dim, patch, frames as i64 - 1],
+            memory,
+        )
     }
 
     /// `fused` `[1, C, H, W]`, the maximum of all agents' newest maps, with the ego's own and earlier maps blended in
@@ -67,45 +77,98 @@ impl TemporalMemory {
         fine: &FineMaps,
         context: &Tensor,
     ) -> Result<Tensor, TchError> {
-        let earlier = aligned.earlier.as_ref().and_then(|earlier| earlier.full_resolution.as_ref());
-        let Some((maps, classes)) = earlier else { return Ok(fused) };
+        let earlier = aligned
+            .earlier
+            .as_ref()
+            .and_then(|earlier| earlier.full_resolution.as_ref());
+        let Some((maps, classes)) = earlier else {
+            return Ok(fused);
+        };
         let maps = self.placed(maps, coarse, fine.corrections.as_ref())?;
         if maps.is_empty() {
             return Ok(fused);
         }
         let likely = classes.likely(&fused)?;
-        self.forward([&fused, &fine.own], &Earlier { maps, grid: &aligned.grid }, context, &likely)
+        self.forward(
+            [&fused, &fine.own],
+            &Earlier {
+                maps,
+                grid: &aligned.grid,
+            },
+            context,
+            &likely,
+        )
     }
 
     /// The earlier maps that take part, each with its time step and its sender's corrected pose.
     fn placed<'a>(
         &self,
         maps: &'a [FullResolutionMap],
-        CoarseMaps { origins, earlier_entries, .. }: &CoarseMaps,
+        CoarseMaps {
+            origins,
+            earlier_entries,
+            ..
+        }: &CoarseMaps,
         corrections: Option<&Tensor>,
     ) -> Result<Vec<(usize, Pose, &'a FullResolutionMap)>, TchError> {
         let steps = self.step.size()[0] as usize - 1;
         let first = origins.count() - earlier_entries.len();
-        let corrections = corrections.map(|corrections| settled(origins, corrections, first)).transpose()?;
+        let corrections = corrections
+            .map(|corrections| settled(origins, corrections, first))
+            .transpose()?;
         let place = |(index, &entry): (usize, &usize)| {
-            let step = origins.steps_back[first + index].checked_sub(1).filter(|step| *step < steps)?;
+            let step = origins.steps_back[first + index]
+                .checked_sub(1)
+                .filter(|step| *step < steps)?;
             let (pose, map) = (&origins.ego_from_cav[first + index], maps.get(entry)?);
-            Some((step, corrections.as_ref().map_or(*pose, |corrections| moved(pose, &corrections[index])), map))
+            Some((
+                step,
+                corrections
+                    .as_ref()
+                    .map_or(*pose, |corrections| moved(pose, &corrections[index])),
+                map,
+            ))
         };
-        Ok(earlier_entries.iter().enumerate().filter_map(place).collect())
+        Ok(earlier_entries
+            .iter()
+            .enumerate()
+            .filter_map(place)
+            .collect())
     }
 
     /// Its variables lie below `path`. For maps of `channels`, tokens of `dim` with `patch` cells along each edge, and
     /// `steps` time steps before the newest.
-    fn of_size(path: &nn::Path<'_>, [channels, dim, patch, steps]: [i64; 4], config: &MemoryConfig) -> Self {
+    fn of_size(
+        path: &nn::Path<'_>,
+        [channels, dim, patch, steps]: [i64; 4],
+        config: &MemoryConfig,
+    ) -> Self {
         let MemoryConfig { hidden, share } = *config;
-        let around = nn::ConvConfig { padding: 1, ..Default::default() };
-        let bare = nn::ConvConfig { bias: false, ..around };
-        let neutral = nn::ConvConfig { ws_init: Init::Const(0.0), bs_init: Init::Const(0.0), ..Default::default() };
+        let around = nn::ConvConfig {
+            padding: 1,
+            ..Default::default()
+        };
+        let bare = nn::ConvConfig {
+            bias: false,
+            ..around
+        };
+        let neutral = nn::ConvConfig {
+            ws_init: Init::Const(0.0),
+            bs_init: Init::Const(0.0),
+            ..Default::default()
+        };
         Self {
             now: nn::conv2d(path / "now", channels, hidden, 3, around),
             past: nn::conv2d(path / "past", channels, hidden, 3, bare),
-            token: nn::linear(path / "token", dim, hidden, nn::LinearConfig { bias: false, ..Default::default() }),
+            token: nn::linear(
+                path / "token",
+                dim,
+                hidden,
+                nn::LinearConfig {
+                    bias: false,
+                    ..Default::default()
+                },
+            ),
             step: path.var("step", &[1 + steps, hidden], Init::Const(0.0)),
             gate: nn::conv2d(path / "gate", hidden, channels, 1, neutral),
             patch,
@@ -130,50 +193,85 @@ impl TemporalMemory {
         let selection = Selection::most_likely(likely, self.patch, self.share)?;
         let at = Places::of(&selection, width, now.device())?;
         let cells = channels_last(now)?.f_flatten(0, 2)?;
-        let own = channels_last(&own.f_unsqueeze(0)?)?.f_flatten(0, 2)?.f_index_select(0, &at.near)?;
+        let own = channels_last(&own.f_unsqueeze(0)?)?
+            .f_flatten(0, 2)?
+            .f_index_select(0, &at.near)?;
         let shown = cells.f_index_select(0, &at.near)?;
-        let known = beside(&self.now, &shown, &at.around)? + self.token_features(ego, &at.patches)?;
+        let known =
+            beside(&self.now, &shown, &at.around)? + self.token_features(ego, &at.patches)?;
         let now = shown.f_index_select(0, &at.middle)?;
         let gate = self.gate(0, &own, &known, &at)?;
         let mut change = gate * (own.f_index_select(0, &at.middle)? - &now);
-        for (step, CellSamples { features, mask }) in FullResolutionMap::seen(&past.maps, &selection.near, past.grid)? {
+        for (step, CellSamples { features, mask }) in
+            FullResolutionMap::seen(&past.maps, &selection.near, past.grid)?
+        {
             let gate = self.gate(1 + step, &features, &known, &at)?;
             let apart = features.f_index_select(0, &at.middle)? - &now;
             // Cells without valid data in any map get no blending.
             change = change.f_addcmul(&gate, &(apart * mask.f_index_select(0, &at.middle)?))?;
         }
         let blended = cells.f_index_add(0, &at.cells, &change)?;
-        blended.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
+        blended
+            .f_view([1, height, width, channels])?
+            .f_permute([0, 3, 1, 2])
     }
 
     /// `[P, C]`: weight of the `features` `[R, C]` of a time step, given the tokens' features `known` `[P, hidden]`.
-    fn gate(&self, step: usize, features: &Tensor, known: &Tensor, at: &Places) -> Result<Tensor, TchError> {
+    fn gate(
+        &self,
+        step: usize,
+        features: &Tensor,
+        known: &Tensor,
+        at: &Places,
+    ) -> Result<Tensor, TchError> {
         let step = self.step.f_get(step as i64)?;
         let hidden = (beside(&self.past, features, &at.around)? + known + step).f_relu()?;
-        hidden.f_linear(&self.gate.ws.f_flatten(1, 3)?, self.gate.bs.as_ref())?.f_tanh()
+        hidden
+            .f_linear(&self.gate.ws.f_flatten(1, 3)?, self.gate.bs.as_ref())?
+            .f_tanh()
     }
 
     /// Features of the tokens, on the cells of some `patches`: `[P, hidden]`.
     fn token_features(&self, ego: &Tensor, patches: &Tensor) -> Result<Tensor, TchError> {
-        let features = self.token.forward(&ego.f_flatten(0, 2)?.f_index_select(0, patches)?);
+        let features = self
+            .token
+            .forward(&ego.f_flatten(0, 2)?.f_index_select(0, patches)?);
         let (patches, hidden) = features.size2()?;
         let each = self.patch * self.patch;
-        features.f_unsqueeze(1)?.f_expand([patches, each, hidden], false)?.f_reshape([-1, hidden])
+        features
+            .f_unsqueeze(1)?
+            .f_expand([patches, each, hidden], false)?
+            .f_reshape([-1, hidden])
     }
 }
 
 /// Shift along x and y, metres, and rotation, radians: corrections of the entries from `first` on, the earlier ones,
 /// given those of all but the very first, `corrections` `[N - 1, 3]`. A correction close to that of its agent's newest
 /// map is replaced by it.
-fn settled(origins: &Origins, corrections: &Tensor, first: usize) -> Result<Vec<[f64; 3]>, TchError> {
-    let corrections = Vec::<f64>::try_from(corrections.f_detach()?.f_to_kind(Kind::Double)?.f_reshape(-1)?)?;
+fn settled(
+    origins: &Origins,
+    corrections: &Tensor,
+    first: usize,
+) -> Result<Vec<[f64; 3]>, TchError> {
+    let corrections = Vec::<f64>::try_from(
+        corrections
+            .f_detach()?
+            .f_to_kind(Kind::Double)?
+            .f_reshape(-1)?,
+    )?;
     let all: Vec<[f64; 3]> = std::iter::once([0.0; 3])
-        .chain(corrections.chunks_exact(3).map(|found| [found[0], found[1], found[2]]))
+        .chain(
+            corrections
+                .chunks_exact(3)
+                .map(|found| [found[0], found[1], found[2]]),
+        )
         .collect();
     let settle = |entry: usize| {
         let is_same_agent = |newest: &usize| origins.agent[*newest] == origins.agent[entry];
         let newest = (0..first).find(is_same_agent).map(|newest| all[newest]);
-        let is_near = |newest: &[f64; 3]| (newest[0] - all[entry][0]).hypot(newest[1] - all[entry][1]) < SAME_PLACE_M;
+        let is_near = |newest: &[f64; 3]| {
+            (newest[0] - all[entry][0]).hypot(newest[1] - all[entry][1]) < SAME_PLACE_M
+        };
         newest.filter(is_near).unwrap_or(all[entry])
     };
     Ok((first..all.len()).map(settle).collect())
@@ -196,7 +294,11 @@ struct Places {
 impl Places {
     fn of(selection: &Selection, width: i64, device: Device) -> Result<Self, TchError> {
         let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(device);
-        let near: Vec<i64> = selection.near.iter().map(|&[row, column]| row as i64 * width + column as i64).collect();
+        let near: Vec<i64> = selection
+            .near
+            .iter()
+            .map(|&[row, column]| row as i64 * width + column as i64)
+            .collect();
         let around = index(&selection.around)?.f_view([-1, AROUND])?;
         Ok(Self {
             patches: index(&selection.patches)?,
@@ -222,7 +324,10 @@ impl Around {
     fn of(around: &Tensor) -> Result<Self, TchError> {
         let options = (Kind::Int64, around.device());
         let results = (around * AROUND + Tensor::f_arange(AROUND, options)?).f_flatten(0, 1)?;
-        Ok(Self { first: Tensor::f_arange(around.size2()?.0, options)? * AROUND, results })
+        Ok(Self {
+            first: Tensor::f_arange(around.size2()?.0, options)? * AROUND,
+            results,
+        })
     }
 }
 
@@ -233,13 +338,27 @@ impl Around {
 fn beside(
     convolution: &nn::Conv2D,
     shown: &Tensor,
-    Around { results: rows, first }: &Around,
+    Around {
+        results: rows,
+        first,
+    }: &Around,
 ) -> Result<Tensor, TchError> {
     let hidden = convolution.ws.size4()?.0;
     let weight = convolution.ws.f_permute([2, 3, 0, 1])?.f_flatten(0, 2)?;
     let shown = shown.f_constant_pad_nd([0, 0, 0, 1])?;
-    let results = shown.f_linear(&weight, None::<&Tensor>)?.f_view([-1, hidden])?;
-    let (sums, ..) = Tensor::f_embedding_bag(&results, rows, first, false, SUM, false, None::<&Tensor>, false)?;
+    let results = shown
+        .f_linear(&weight, None::<&Tensor>)?
+        .f_view([-1, hidden])?;
+    let (sums, ..) = Tensor::f_embedding_bag(
+        &results,
+        rows,
+        first,
+        false,
+        SUM,
+        false,
+        None::<&Tensor>,
+        false,
+    )?;
     match &convolution.bs {
         Some(bias) => sums.f_add(bias),
         None => Ok(sums),
@@ -258,37 +377,91 @@ mod tests {
     #[test]
     fn a_convolution_at_some_cells_is_that_of_all_of_them() {
         let variables = VarStore::new(Device::Cpu);
-        let around = nn::ConvConfig { padding: 1, ..Default::default() };
+        let around = nn::ConvConfig {
+            padding: 1,
+            ..Default::default()
+        };
         let convolution = nn::conv2d(variables.root(), 3, 5, 3, around);
         let map = uniform(4, &[1, 3, 4, 6]);
-        let all = convolution.forward(&map).flatten(2, 3).squeeze_dim(0).transpose(0, 1);
+        let all = convolution
+            .forward(&map)
+            .flatten(2, 3)
+            .squeeze_dim(0)
+            .transpose(0, 1);
         let selection = Selection::most_likely(&uniform(5, &[1, 1, 4, 6]), 2, 0.5).unwrap();
         let of = |places: &[i64]| Tensor::from_slice(places);
-        let near: Vec<i64> = selection.near.iter().map(|[row, column]| (row * 6 + column) as i64).collect();
-        let shown = map.flatten(2, 3).squeeze_dim(0).transpose(0, 1).index_select(0, &of(&near));
-        let some =
-            beside(&convolution, &shown, &Around::of(&of(&selection.around).view([-1, AROUND])).unwrap()).unwrap();
-        assert!(some.allclose(&all.index_select(0, &of(&selection.cells)), 1e-5, 1e-5, false));
+        let near: Vec<i64> = selection
+            .near
+            .iter()
+            .map(|[row, column]| (row * 6 + column) as i64)
+            .collect();
+        let shown = map
+            .flatten(2, 3)
+            .squeeze_dim(0)
+            .transpose(0, 1)
+            .index_select(0, &of(&near));
+        let some = beside(
+            &convolution,
+            &shown,
+            &Around::of(&of(&selection.around).view([-1, AROUND])).unwrap(),
+        )
+        .unwrap();
+        assert!(some.allclose(
+            &all.index_select(0, &of(&selection.cells)),
+            1e-5,
+            1e-5,
+            false
+        ));
     }
 
     /// The blend equals that of all cells where a vehicle is likely; elsewhere the newest map is unchanged.
     #[test]
     fn blended_cells_do_not_depend_on_the_selection_of_others() {
-        let grid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+        let grid = BevGrid {
+            x_min_m: -8.0,
+            y_min_m: -4.0,
+            cell_m: 0.5,
+            width: 32,
+            height: 16,
+        };
         let variables = VarStore::new(Device::Cpu);
-        let mut memory =
-            TemporalMemory::of_size(&variables.root(), [4, 6, 2, 2], &MemoryConfig { hidden: 5, share: 0.25 });
+        let mut memory = TemporalMemory::of_size(
+            &variables.root(),
+            [4, 6, 2, 2],
+            &MemoryConfig {
+                hidden: 5,
+                share: 0.25,
+            },
+        );
         redraw(&variables, &["now", "past", "token", "step", "gate"], 0.3);
-        let maps: Vec<FullResolutionMap> =
-            (0..3).map(|seed| FullResolutionMap::of(&uniform(seed, &[1, 4, 16, 32]), None).unwrap()).collect();
+        let maps: Vec<FullResolutionMap> = (0..3)
+            .map(|seed| FullResolutionMap::of(&uniform(seed, &[1, 4, 16, 32]), None).unwrap())
+            .collect();
         let poses = [0.0, 2.0, -1.0].map(|x_m| Pose::from_xyz_yaw([x_m, 0.3, 0.0], 0.1 * x_m));
-        let maps =
-            || [0, 1, 1].into_iter().zip(poses).zip(&maps).map(|((step, pose), map)| (step, pose, map)).collect();
+        let maps = || {
+            [0, 1, 1]
+                .into_iter()
+                .zip(poses)
+                .zip(&maps)
+                .map(|((step, pose), map)| (step, pose, map))
+                .collect()
+        };
         let (now, likely) = (uniform(7, &[1, 4, 16, 32]), uniform(8, &[1, 1, 16, 32]));
         let own = now.get(0) * 0.9;
         let ego = uniform(9, &[1, 8, 16, 6]);
         let blended = |memory: &TemporalMemory| {
-            no_grad(|| memory.forward([&now, &own], &Earlier { maps: maps(), grid: &grid }, &ego, &likely)).unwrap()
+            no_grad(|| {
+                memory.forward(
+                    [&now, &own],
+                    &Earlier {
+                        maps: maps(),
+                        grid: &grid,
+                    },
+                    &ego,
+                    &likely,
+                )
+            })
+            .unwrap()
         };
         let few = blended(&memory);
         memory.share = 1.0;
@@ -305,9 +478,19 @@ mod tests {
     fn a_correction_near_that_of_the_agents_newest_is_the_same() {
         let of = |agent| MapMetadata::fresh(agent, Pose::IDENTITY);
         let origins = Origins::of(&[of(0), of(7), of(0), of(7), of(7), of(3)]);
-        let corrections = [0.5, 0.4, 0.01, 0.3, -0.3, 0.02, 0.9, 0.1, 0.0, 1.5, 0.4, 0.03, 0.1, 0.0, 0.0];
+        let corrections = [
+            0.5, 0.4, 0.01, 0.3, -0.3, 0.02, 0.9, 0.1, 0.0, 1.5, 0.4, 0.03, 0.1, 0.0, 0.0,
+        ];
         let settled = settled(&origins, &Tensor::from_slice(&corrections).view([5, 3]), 2).unwrap();
         // The ego's newest is not moved; another of the same vehicle is too far off; of the last there is no newest.
-        assert_eq!(settled, [[0.0; 3], [0.5, 0.4, 0.01], [1.5, 0.4, 0.03], [0.1, 0.0, 0.0]]);
+        assert_eq!(
+            settled,
+            [
+                [0.0; 3],
+                [0.5, 0.4, 0.01],
+                [1.5, 0.4, 0.03],
+                [0.1, 0.0, 0.0]
+            ]
+        );
     }
 }

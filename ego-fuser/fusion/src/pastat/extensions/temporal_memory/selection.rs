@@ -9,7 +9,17 @@ pub(super) const AROUND: i64 = 9;
 const MARGIN_CELLS: i64 = 2;
 
 /// Offsets of the nine cells, rows and columns from the first, row by row.
-const BESIDE: [[usize; 2]; AROUND as usize] = [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2]];
+const BESIDE: [[usize; 2]; AROUND as usize] = [
+    [0, 0],
+    [0, 1],
+    [0, 2],
+    [1, 0],
+    [1, 1],
+    [1, 2],
+    [2, 0],
+    [2, 1],
+    [2, 2],
+];
 
 /// The cells of a few patches, patch by patch and row by row, and their neighbours.
 #[derive(Debug)]
@@ -31,24 +41,36 @@ impl Selection {
         let (_, _, height, width) = likely.size4()?;
         let window = patch + 2 * MARGIN_CELLS;
         let margin = [MARGIN_CELLS; 2];
-        let by_patch = likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
+        let by_patch =
+            likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
         let by_patch: Vec<f32> = Vec::try_from(by_patch.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
         let wanted = ((by_patch.len() as f64 * share).ceil() as usize).clamp(1, by_patch.len());
         let mut patches: Vec<usize> = (0..by_patch.len()).collect();
         patches.sort_by(|a, b| by_patch[*b].total_cmp(&by_patch[*a]));
         patches.truncate(wanted);
         patches.sort_unstable();
-        Ok(Self::of(&patches, patch as usize, [height as usize, width as usize]))
+        Ok(Self::of(
+            &patches,
+            patch as usize,
+            [height as usize, width as usize],
+        ))
     }
 
     fn of(patches: &[usize], patch: usize, [height, width]: [usize; 2]) -> Self {
         let cells_of = |index: &usize| {
-            let (row, column) = (index / (width / patch) * patch, index % (width / patch) * patch);
-            (row..row + patch).flat_map(move |row| (column..column + patch).map(move |column| [row, column]))
+            let (row, column) = (
+                index / (width / patch) * patch,
+                index % (width / patch) * patch,
+            );
+            (row..row + patch)
+                .flat_map(move |row| (column..column + patch).map(move |column| [row, column]))
         };
         let cells: Vec<[usize; 2]> = patches.iter().flat_map(cells_of).collect();
         let on_map = |[row, column]: [usize; 2], [down, right]: [usize; 2]| {
-            let [row, column] = [(row + down).checked_sub(1)?, (column + right).checked_sub(1)?];
+            let [row, column] = [
+                (row + down).checked_sub(1)?,
+                (column + right).checked_sub(1)?,
+            ];
             (row < height && column < width).then_some(row * width + column)
         };
         let beside = |&cell: &[usize; 2]| BESIDE.map(|step| on_map(cell, step));
@@ -57,15 +79,25 @@ impl Selection {
             place[cell] = Some(0);
         }
         let mut near = Vec::new();
-        for (cell, place) in place.iter_mut().enumerate().filter(|(_, place)| place.is_some()) {
+        for (cell, place) in place
+            .iter_mut()
+            .enumerate()
+            .filter(|(_, place)| place.is_some())
+        {
             *place = Some(near.len() as i64);
             near.push([cell / width, cell % width]);
         }
-        let place_of = |cell: Option<usize>| cell.and_then(|cell| place[cell]).unwrap_or(near.len() as i64);
+        let place_of = |cell: Option<usize>| {
+            cell.and_then(|cell| place[cell])
+                .unwrap_or(near.len() as i64)
+        };
         Self {
             patches: patches.iter().map(|&patch| patch as i64).collect(),
             around: cells.iter().flat_map(beside).map(place_of).collect(),
-            cells: cells.iter().map(|[row, column]| (row * width + column) as i64).collect(),
+            cells: cells
+                .iter()
+                .map(|[row, column]| (row * width + column) as i64)
+                .collect(),
             near,
         }
     }
@@ -84,8 +116,21 @@ mod tests {
         // Four cells along each edge: within two cells of it lie the patches in rows 1 and 2, columns 2 and 3.
         let selection = Selection::most_likely(&likely, 4, 4.0 / 24.0).unwrap();
         assert_eq!(selection.patches, [8, 9, 14, 15]);
-        assert_eq!((selection.cells.len(), selection.around.len()), (64, 64 * 9));
-        assert_eq!(&selection.cells[..6], [4 * 24 + 8, 4 * 24 + 9, 4 * 24 + 10, 4 * 24 + 11, 5 * 24 + 8, 5 * 24 + 9]);
+        assert_eq!(
+            (selection.cells.len(), selection.around.len()),
+            (64, 64 * 9)
+        );
+        assert_eq!(
+            &selection.cells[..6],
+            [
+                4 * 24 + 8,
+                4 * 24 + 9,
+                4 * 24 + 10,
+                4 * 24 + 11,
+                5 * 24 + 8,
+                5 * 24 + 9
+            ]
+        );
         // One cell more on each side.
         assert_eq!(selection.near.len(), 100);
         assert_eq!((selection.near[0], selection.near[99]), ([3, 7], [12, 16]));
@@ -97,15 +142,27 @@ mod tests {
         let selection = Selection::of(&[0, 5], 2, [4, 6]);
         assert_eq!(selection.near.len(), 3 * 3 + 3 * 3);
         let beyond = selection.near.len() as i64;
-        assert_eq!(selection.around[..9], [beyond, beyond, beyond, beyond, 0, 1, beyond, 3, 4]);
-        assert_eq!(selection.around[7 * 9..], [13, 14, beyond, 16, 17, beyond, beyond, beyond, beyond]);
+        assert_eq!(
+            selection.around[..9],
+            [beyond, beyond, beyond, beyond, 0, 1, beyond, 3, 4]
+        );
+        assert_eq!(
+            selection.around[7 * 9..],
+            [13, 14, beyond, 16, 17, beyond, beyond, beyond, beyond]
+        );
     }
 
     #[test]
     fn there_is_always_one_and_never_more_than_all() {
         let likely = Tensor::full([1, 1, 4, 4], f64::NAN, (Kind::Float, Device::Cpu));
         for (share, count) in [(0.0, 1), (0.3, 2), (1.0, 4), (9.0, 4), (f64::NAN, 1)] {
-            assert_eq!(Selection::most_likely(&likely, 2, share).unwrap().patches.len(), count);
+            assert_eq!(
+                Selection::most_likely(&likely, 2, share)
+                    .unwrap()
+                    .patches
+                    .len(),
+                count
+            );
         }
     }
 }

@@ -4,7 +4,8 @@ use protocol::{CavId, Handedness, Pose};
 
 use super::{assert_same, expected, open, options, ticks, write};
 use crate::generate::layout::{
-    AgentFrame, BoxAnchor, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, Simulated, SweepVariant,
+    AgentFrame, BoxAnchor, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, Simulated,
+    SweepVariant,
 };
 use crate::generate::positioning::Fix;
 use crate::generate::raycast::Placement;
@@ -13,8 +14,10 @@ use dataset::Layout;
 use dataset::frame::{Frame, Object, ObjectClass};
 
 /// Layouts for which there is a reader.
-const LAYOUTS: [(SceneLayout, Layout); 2] =
-    [(SceneLayout::V2v4real, Layout::V2V4REAL), (SceneLayout::V2xreal, Layout::V2XREAL)];
+const LAYOUTS: [(SceneLayout, Layout); 2] = [
+    (SceneLayout::V2v4real, Layout::V2V4REAL),
+    (SceneLayout::V2xreal, Layout::V2XREAL),
+];
 
 #[test]
 fn a_scene_is_the_same_in_every_layout_that_is_read() {
@@ -22,7 +25,10 @@ fn a_scene_is_the_same_in_every_layout_that_is_read() {
     for (layout, found) in LAYOUTS {
         let folder = tempfile::tempdir().unwrap();
         let summary = write(layout, folder.path());
-        assert_eq!((summary.layout, summary.scenarios, summary.agent_frames), (layout, 2, 8));
+        assert_eq!(
+            (summary.layout, summary.scenarios, summary.agent_frames),
+            (layout, 2, 8)
+        );
         assert!(summary.omitted.is_empty(), "{:?}", summary.omitted);
         let dataset = open(folder.path());
         assert_eq!(dataset.layout, found);
@@ -35,18 +41,53 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
     let expected = expected();
     let [first, second, third] = [(); 3].map(|()| tempfile::tempdir().unwrap());
     write(SceneLayout::Opv2v, first.path());
-    let into = |layout, out: &std::path::Path| ConvertOptions { out: out.to_owned(), layout, force: false };
-    let there = convert(&open(first.path()), &into(SceneLayout::V2v4real, second.path()), &|_, _| {}).unwrap();
-    assert_eq!((there.scenarios, there.agent_frames, there.left_out.is_nothing()), (2, 8, true));
-    assert_same(&ticks(&open(second.path())), &expected, SceneLayout::V2v4real);
-    convert(&open(second.path()), &into(SceneLayout::Opv2v, third.path()), &|_, _| {}).unwrap();
+    let into = |layout, out: &std::path::Path| ConvertOptions {
+        out: out.to_owned(),
+        layout,
+        force: false,
+    };
+    let there = convert(
+        &open(first.path()),
+        &into(SceneLayout::V2v4real, second.path()),
+        &|_, _| {},
+    )
+    .unwrap();
+    assert_eq!(
+        (
+            there.scenarios,
+            there.agent_frames,
+            there.left_out.is_nothing()
+        ),
+        (2, 8, true)
+    );
+    assert_same(
+        &ticks(&open(second.path())),
+        &expected,
+        SceneLayout::V2v4real,
+    );
+    convert(
+        &open(second.path()),
+        &into(SceneLayout::Opv2v, third.path()),
+        &|_, _| {},
+    )
+    .unwrap();
     let back = open(third.path());
     assert_eq!(back.layout, Layout::OPV2V);
     assert_same(&ticks(&back), &expected, SceneLayout::Opv2v);
-    let names = |path| open(path).scenarios.iter().map(|scenario| scenario.name.clone()).collect::<Vec<_>>();
+    let names = |path| {
+        open(path)
+            .scenarios
+            .iter()
+            .map(|scenario| scenario.name.clone())
+            .collect::<Vec<_>>()
+    };
     assert_eq!(names(first.path()), names(third.path()));
     // Existing files are not overwritten without `force`.
-    let again = convert(&open(first.path()), &into(SceneLayout::Opv2v, third.path()), &|_, _| {});
+    let again = convert(
+        &open(first.path()),
+        &into(SceneLayout::Opv2v, third.path()),
+        &|_, _| {},
+    );
     assert!(again.unwrap_err().to_string().contains("is not empty"));
 }
 
@@ -54,21 +95,49 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
 fn copies_and_radar_come_through_a_conversion() {
     let [first, second] = [(); 2].map(|()| tempfile::tempdir().unwrap());
     let plain = options(SceneLayout::Opv2v, first.path());
-    generate(&SynthOptions { scenes: 1, frames: 1, copies: vec![Weather::Fog], ..plain }, &|_| {}).unwrap();
-    let into = ConvertOptions { out: second.path().to_owned(), layout: SceneLayout::Opv2v, force: false };
+    generate(
+        &SynthOptions {
+            scenes: 1,
+            frames: 1,
+            copies: vec![Weather::Fog],
+            ..plain
+        },
+        &|_| {},
+    )
+    .unwrap();
+    let into = ConvertOptions {
+        out: second.path().to_owned(),
+        layout: SceneLayout::Opv2v,
+        force: false,
+    };
     convert(&open(first.path()), &into, &|_, _| {}).unwrap();
     let (from, to) = (open(first.path()), open(second.path()));
     let (from, to) = (&from.scenarios[0], &to.scenarios[0]);
-    assert_eq!((&from.lidar_variants, to.has_radar), (&to.lidar_variants, true));
+    assert_eq!(
+        (&from.lidar_variants, to.has_radar),
+        (&to.lidar_variants, true)
+    );
     assert_eq!(from.ticks, to.ticks);
     let variant = from.lidar_variants[0].as_str();
-    let radar = dataset::LoadOptions { radar: true, ..Default::default() };
+    let radar = dataset::LoadOptions {
+        radar: true,
+        ..Default::default()
+    };
     for agent in 0..2 {
-        let [was, is] = [from, to].map(|scenario| scenario.load_points(agent, 0, Some(variant)).unwrap());
+        let [was, is] =
+            [from, to].map(|scenario| scenario.load_points(agent, 0, Some(variant)).unwrap());
         assert_eq!((was.points, was.labels), (is.points, is.labels));
         let [was, is] = [from, to].map(|scenario| scenario.load(agent, 0, &radar).unwrap());
-        assert_eq!((was.points, was.radar, was.objects.len()), (is.points, is.radar, is.objects.len()));
-        assert!(was.objects.iter().zip(&is.objects).all(|(was, is)| was.id == is.id && was.size_m == is.size_m));
+        assert_eq!(
+            (was.points, was.radar, was.objects.len()),
+            (is.points, is.radar, is.objects.len())
+        );
+        assert!(
+            was.objects
+                .iter()
+                .zip(&is.objects)
+                .all(|(was, is)| was.id == is.id && was.size_m == is.size_m)
+        );
     }
 }
 
@@ -81,25 +150,50 @@ fn frame() -> AgentFrame {
         size_m: [4.0, 2.0, 1.5],
         speed_mps: Some(2.5),
     };
-    let objects = vec![object(7, ObjectClass::Van, 10.0), object(9, ObjectClass::Pedestrian, 20.0)];
-    let anchor = |x| BoxAnchor { location_m: [x, 5.0, 0.0], center_offset_m: [0.0, 0.0, 0.75] };
+    let objects = vec![
+        object(7, ObjectClass::Van, 10.0),
+        object(9, ObjectClass::Pedestrian, 20.0),
+    ];
+    let anchor = |x| BoxAnchor {
+        location_m: [x, 5.0, 0.0],
+        center_offset_m: [0.0, 0.0, 0.75],
+    };
     let estimate = Placement::level([1.5, 2.0, 0.0], 0.0);
-    let fix = Fix { gnss_m: [0.0; 3], heading_rad: 0.0, speed_mps: 10.25, yaw_rate_radps: 0.0, estimate };
+    let fix = Fix {
+        gnss_m: [0.0; 3],
+        heading_rad: 0.0,
+        speed_mps: 10.25,
+        yaw_rate_radps: 0.0,
+        estimate,
+    };
     let frame = Frame {
-        points: protocol::PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]] },
+        points: protocol::PointCloud {
+            xyzi: vec![[1.0, 2.0, 3.0, 0.5]],
+        },
         world_from_lidar: Some(Pose::from_xyz_yaw([1.0, 2.0, 1.95], 0.0)),
         world_from_vehicle: Some(Pose::from_xyz_yaw([1.5, 2.0, 0.0], 0.0)),
         gnss_world_from_vehicle: Some(estimate.isometry().into()),
         speed_mps: Some(10.0),
         objects,
-        ..Frame::empty(CavId::new("1000").unwrap(), 3_000_000_000, Handedness::Right)
+        ..Frame::empty(
+            CavId::new("1000").unwrap(),
+            3_000_000_000,
+            Handedness::Right,
+        )
     };
-    let variants = vec![SweepVariant { name: "fog".into(), points: vec![[1.0, 2.0, 3.0, 0.2]], labels: vec![1] }];
+    let variants = vec![SweepVariant {
+        name: "fog".into(),
+        points: vec![[1.0, 2.0, 3.0, 0.2]],
+        labels: vec![1],
+    }];
     AgentFrame {
         agent: 0,
         frame,
         variants,
-        simulated: Some(Simulated { fix, anchors: vec![anchor(10.0), anchor(20.0)] }),
+        simulated: Some(Simulated {
+            fix,
+            anchors: vec![anchor(10.0), anchor(20.0)],
+        }),
     }
 }
 
@@ -108,14 +202,25 @@ fn files_of_opv2v_have_this_text() {
     let folder = tempfile::tempdir().unwrap();
     let header = SceneHeader {
         name: "test/a".into(),
-        agents: vec![SceneAgent { id: CavId::new("1000").unwrap(), is_roadside: false }],
+        agents: vec![SceneAgent {
+            id: CavId::new("1000").unwrap(),
+            is_roadside: false,
+        }],
         capture_nanos: vec![3_000_000_000],
         tick_nanos: 50_000_000,
         origin: "world: {}\n".into(),
     };
     let mut writer = SceneLayout::Opv2v.writer(folder.path());
     writer.begin(&header).unwrap();
-    writer.write(&Moment { index: 0, frames: vec![frame()] }, &Omissions::default()).unwrap();
+    writer
+        .write(
+            &Moment {
+                index: 0,
+                frames: vec![frame()],
+            },
+            &Omissions::default(),
+        )
+        .unwrap();
     writer.end().unwrap();
     let file = |name: &str| std::fs::read(folder.path().join("test/a").join(name)).unwrap();
     assert_eq!(file("data_protocol.yaml"), b"world: {}\n");
@@ -193,10 +298,24 @@ vehicles:
     obj_type: Pedestrian
     speed: 9
 ";
-    assert_eq!(String::from_utf8(file("1000/000060.yaml")).unwrap(), expected);
+    assert_eq!(
+        String::from_utf8(file("1000/000060.yaml")).unwrap(),
+        expected
+    );
     // x, mirrored y, z, intensity; the copy keeps intensity in the red byte and the label in the green one.
-    let point = |fourth: f32| [1.0, -2.0, 3.0, fourth].into_iter().flat_map(f32::to_le_bytes).collect::<Vec<u8>>();
+    let point = |fourth: f32| {
+        [1.0, -2.0, 3.0, fourth]
+            .into_iter()
+            .flat_map(f32::to_le_bytes)
+            .collect::<Vec<u8>>()
+    };
     assert!(file("1000/000060.pcd").ends_with(&point(0.5)));
     assert!(file("1000/000060_fog.pcd").ends_with(&point(f32::from_bits(0x0033_0100))));
-    assert_eq!(std::fs::read_dir(folder.path().join("test/a")).unwrap().count(), 2, "no mark is left");
+    assert_eq!(
+        std::fs::read_dir(folder.path().join("test/a"))
+            .unwrap()
+            .count(),
+        2,
+        "no mark is left"
+    );
 }

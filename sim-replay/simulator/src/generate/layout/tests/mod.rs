@@ -25,7 +25,13 @@ use dataset::{self, Dataset, LoadOptions};
 /// Two scenes of two agents at two capture times.
 fn options(layout: SceneLayout, out: &Path) -> SynthOptions {
     let options = SynthOptions::new(Subset::V2vdet, 7, out.to_owned());
-    SynthOptions { layout, scenes: 2, frames: 2, agents: 2..=2, ..options }
+    SynthOptions {
+        layout,
+        scenes: 2,
+        frames: 2,
+        agents: 2..=2,
+        ..options
+    }
 }
 
 fn write(layout: SceneLayout, out: &Path) -> Summary {
@@ -44,13 +50,24 @@ struct Tick {
 
 /// Frames of one capture time, ego first.
 fn tick_of(frames: &[Frame]) -> Tick {
-    let poses: Vec<_> = frames.iter().map(|frame| frame.world_from_lidar.unwrap().isometry()).collect();
+    let poses: Vec<_> = frames
+        .iter()
+        .map(|frame| frame.world_from_lidar.unwrap().isometry())
+        .collect();
     let ego_from_world = poses[0].inverse();
     let mut seen = std::collections::HashSet::new();
-    let objects = frames.iter().flat_map(|frame| &frame.objects).filter(|object| seen.insert(object.id));
+    let objects = frames
+        .iter()
+        .flat_map(|frame| &frame.objects)
+        .filter(|object| seen.insert(object.id));
     Tick {
-        boxes: objects.map(|object| upright_box(object, &ego_from_world)).collect(),
-        clouds: frames.iter().map(|frame| frame.points.xyzi.clone()).collect(),
+        boxes: objects
+            .map(|object| upright_box(object, &ego_from_world))
+            .collect(),
+        clouds: frames
+            .iter()
+            .map(|frame| frame.points.xyzi.clone())
+            .collect(),
         poses,
     }
 }
@@ -61,7 +78,9 @@ fn ticks(dataset: &Dataset) -> Vec<Tick> {
     for scenario in &dataset.scenarios {
         for tick in 0..scenario.ticks.len() {
             let load = |agent: usize| scenario.load(agent, tick, &LoadOptions::default()).unwrap();
-            ticks.push(tick_of(&(0..scenario.agents.len()).map(load).collect::<Vec<_>>()));
+            ticks.push(tick_of(
+                &(0..scenario.agents.len()).map(load).collect::<Vec<_>>(),
+            ));
         }
     }
     ticks
@@ -79,7 +98,12 @@ fn expected() -> Vec<Tick> {
     write(SceneLayout::Opv2v, folder.path());
     let ticks = ticks(&open(folder.path()));
     assert_eq!(ticks.len(), 4);
-    assert!(ticks.iter().all(|tick| tick.poses.len() == 2 && tick.boxes.len() > 3), "{ticks:?}");
+    assert!(
+        ticks
+            .iter()
+            .all(|tick| tick.poses.len() == 2 && tick.boxes.len() > 3),
+        "{ticks:?}"
+    );
     ticks
 }
 
@@ -101,11 +125,19 @@ fn assert_same(ticks: &[Tick], expected: &[Tick], layout: SceneLayout) {
 fn assert_same_pose(pose: &Isometry3<f64>, expected: &Isometry3<f64>, layout: SceneLayout) {
     let distance = (pose.translation.vector - expected.translation.vector).norm();
     // Maps are some hundred metres wide, where the last bit of a double is 1e-13 m.
-    assert!(distance < 1e-9 && pose.rotation.angle_to(&expected.rotation) < 1e-7, "{layout:?}: {distance}");
+    assert!(
+        distance < 1e-9 && pose.rotation.angle_to(&expected.rotation) < 1e-7,
+        "{layout:?}: {distance}"
+    );
 }
 
 fn assert_same_points(cloud: &[[f32; 4]], expected: &[[f32; 4]], layout: SceneLayout) {
-    assert!(cloud.len() == expected.len() && !cloud.is_empty(), "{layout:?}: {} {}", cloud.len(), expected.len());
+    assert!(
+        cloud.len() == expected.len() && !cloud.is_empty(),
+        "{layout:?}: {} {}",
+        cloud.len(),
+        expected.len()
+    );
     for ([x, y, z, i], [ex, ey, ez, expected]) in cloud.iter().zip(expected) {
         assert_eq!([x, y, z], [ex, ey, ez], "{layout:?}");
         let one_step = *i == *expected || *i == expected.next_up() || *i == expected.next_down();
@@ -115,12 +147,23 @@ fn assert_same_points(cloud: &[[f32; 4]], expected: &[[f32; 4]], layout: SceneLa
 
 fn assert_same_boxes(boxes: &[Box3d], expected: &[Box3d], layout: SceneLayout) {
     assert_eq!(boxes.len(), expected.len(), "{layout:?}");
-    let distance =
-        |a: &Box3d, b: &Box3d| (0..3).map(|axis| (a.center_m[axis] - b.center_m[axis]).powi(2)).sum::<f64>().sqrt();
+    let distance = |a: &Box3d, b: &Box3d| {
+        (0..3)
+            .map(|axis| (a.center_m[axis] - b.center_m[axis]).powi(2))
+            .sum::<f64>()
+            .sqrt()
+    };
     for expected in expected {
-        let nearest = boxes.iter().min_by(|a, b| distance(a, expected).total_cmp(&distance(b, expected))).unwrap();
-        let turn = ((nearest.heading_rad - expected.heading_rad) / 2.0).sin().abs();
-        let sizes = (0..3).map(|axis| (nearest.size_m[axis] - expected.size_m[axis]).abs()).fold(0.0, f64::max);
+        let nearest = boxes
+            .iter()
+            .min_by(|a, b| distance(a, expected).total_cmp(&distance(b, expected)))
+            .unwrap();
+        let turn = ((nearest.heading_rad - expected.heading_rad) / 2.0)
+            .sin()
+            .abs();
+        let sizes = (0..3)
+            .map(|axis| (nearest.size_m[axis] - expected.size_m[axis]).abs())
+            .fold(0.0, f64::max);
         assert!(
             distance(nearest, expected) < 1e-6 && turn < 1e-6 && sizes < 1e-6,
             "{layout:?}: {nearest:?} {expected:?}"
@@ -129,7 +172,8 @@ fn assert_same_boxes(boxes: &[Box3d], expected: &[Box3d], layout: SceneLayout) {
 }
 
 fn json(path: &Path) -> Value {
-    let text = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let text =
+        std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     serde_json::from_str(&text).unwrap()
 }
 
@@ -137,7 +181,11 @@ fn json(path: &Path) -> Value {
 fn numbers(value: &Value) -> Vec<f64> {
     match value {
         Value::Array(items) => items.iter().flat_map(numbers).collect(),
-        value => vec![value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))],
+        value => vec![
+            value
+                .as_f64()
+                .unwrap_or_else(|| panic!("{value} is no number")),
+        ],
     }
 }
 
@@ -151,7 +199,13 @@ fn from_rows(rotation: &[f64], translation: &[f64]) -> Isometry3<f64> {
 /// An object without a name of its own.
 fn object(id: i64, world_from_object: Isometry3<f64>, size_m: [f64; 3]) -> Object {
     let class = dataset::frame::ObjectClass::Car;
-    Object { id, class, world_from_object: Pose::from(world_from_object), size_m, speed_mps: None }
+    Object {
+        id,
+        class,
+        world_from_object: Pose::from(world_from_object),
+        size_m,
+        speed_mps: None,
+    }
 }
 
 /// Rows of `N` floats.
@@ -159,7 +213,10 @@ fn floats<const N: usize>(path: &Path) -> Vec<[f32; N]> {
     let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let (numbers, rest) = bytes.as_chunks::<4>();
     assert!(rest.is_empty());
-    let numbers: Vec<f32> = numbers.iter().map(|number| f32::from_le_bytes(*number)).collect();
+    let numbers: Vec<f32> = numbers
+        .iter()
+        .map(|number| f32::from_le_bytes(*number))
+        .collect();
     let (rows, rest) = numbers.as_chunks::<N>();
     assert!(rest.is_empty());
     rows.to_vec()

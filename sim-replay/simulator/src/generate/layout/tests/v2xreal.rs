@@ -11,7 +11,10 @@ use dataset::carla_pose::CarlaPose;
 use dataset::ground_truth::upright_box;
 
 fn sorted(folder: &Path) -> Vec<PathBuf> {
-    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
     paths.sort();
     paths
 }
@@ -34,27 +37,45 @@ fn tick(yamls: &[PathBuf]) -> Tick {
                 ["location", "center", "angle", "extent"].map(|key| numbers(&vehicle[key]));
             let place = (0..3).map(|axis| location[axis] + center[axis]);
             let six: Vec<f64> = place.chain(angle).collect();
-            assert!(["Car", "Van", "Truck", "Bus"].contains(&vehicle["obj_type"].as_str().unwrap()));
+            assert!(
+                ["Car", "Van", "Truck", "Bus"].contains(&vehicle["obj_type"].as_str().unwrap())
+            );
             let size = [0, 1, 2].map(|axis| 2.0 * extent[axis]);
             objects.insert(id.clone(), object(0, pose(&six), size));
         }
     }
     let ego_from_world = tick.poses[0].inverse();
-    tick.boxes = objects.values().map(|object| upright_box(object, &ego_from_world)).collect();
+    tick.boxes = objects
+        .values()
+        .map(|object| upright_box(object, &ego_from_world))
+        .collect();
     tick
 }
 
 #[test]
 fn v2xreal_keeps_poses_points_and_boxes() {
     let folder = tempfile::tempdir().unwrap();
-    assert!(write(SceneLayout::V2xreal, folder.path()).omitted.is_empty());
+    assert!(
+        write(SceneLayout::V2xreal, folder.path())
+            .omitted
+            .is_empty()
+    );
     let mut ticks = Vec::new();
     for scenario in sorted(folder.path()) {
-        let agents: Vec<PathBuf> = sorted(&scenario).into_iter().filter(|path| path.is_dir()).collect();
+        let agents: Vec<PathBuf> = sorted(&scenario)
+            .into_iter()
+            .filter(|path| path.is_dir())
+            .collect();
         let is_yaml = |path: &PathBuf| path.extension().is_some_and(|kind| kind == "yaml");
-        let [first, second] = [0, 1].map(|agent: usize| sorted(&agents[agent]).into_iter().filter(is_yaml).collect());
+        let [first, second] =
+            [0, 1].map(|agent: usize| sorted(&agents[agent]).into_iter().filter(is_yaml).collect());
         let (first, second): (Vec<PathBuf>, Vec<PathBuf>) = (first, second);
-        ticks.extend(first.into_iter().zip(second).map(|(first, second)| tick(&[first, second])));
+        ticks.extend(
+            first
+                .into_iter()
+                .zip(second)
+                .map(|(first, second)| tick(&[first, second])),
+        );
     }
     assert_same(&ticks, &expected(), SceneLayout::V2xreal);
 }

@@ -68,14 +68,23 @@ fn a_connection_serves_traffic_of_both_directions() {
         1,
     );
     let other = self::graph(&from_there);
-    let pairs = |graph: &LaneGraph| graph.lanes.iter().map(|lane| lane.successors.clone()).collect::<Vec<_>>();
+    let pairs = |graph: &LaneGraph| {
+        graph
+            .lanes
+            .iter()
+            .map(|lane| lane.successors.clone())
+            .collect::<Vec<_>>()
+    };
     assert_eq!(pairs(&graph), pairs(&other));
 }
 
 #[test]
 fn a_connection_without_lane_links_links_lanes_of_one_id() {
     let graph = graph(&EXIT.replacen(r#"<laneLink from="-1" to="-1"/>"#, "", 1));
-    assert_eq!(starting(&graph, 0.0, -1.5).successors, [starting(&graph, 60.0, -1.5).id]);
+    assert_eq!(
+        starting(&graph, 0.0, -1.5).successors,
+        [starting(&graph, 60.0, -1.5).id]
+    );
 }
 
 #[test]
@@ -83,5 +92,12 @@ fn a_connection_onto_a_road_that_is_not_there_is_left_out_and_named() {
     let network = read(&EXIT.replacen(r#"linkedRoad="off""#, r#"linkedRoad="gone""#, 1)).unwrap();
     assert_eq!(network.junctions[0].connections.len(), 1);
     let expected = "line 20: junction j: <connection> linkedRoad=\"gone\", expected the id of a road of this map; connection left out";
-    assert_eq!(network.findings.iter().map(ToString::to_string).collect::<Vec<_>>(), [expected]);
+    assert_eq!(
+        network
+            .findings
+            .iter()
+            .map(ToString::to_string)
+            .collect::<Vec<_>>(),
+        [expected]
+    );
 }

@@ -47,7 +47,10 @@ const LINE: &str = r#"<geometry s="0" x="0" y="0" hdg="0" length="50"><line/></g
 
 fn with_findings(text: &str) -> (Road, Vec<String>) {
     let mut network = read(text).unwrap();
-    (network.roads.remove(0), network.findings.iter().map(ToString::to_string).collect())
+    (
+        network.roads.remove(0),
+        network.findings.iter().map(ToString::to_string).collect(),
+    )
 }
 
 fn graph(text: &str) -> LaneGraph {
@@ -83,8 +86,17 @@ fn borders_give_the_widths_between_them() {
     // Lanes go on over the sections, each in its place.
     let lanes = graph(BORDERS).lanes;
     assert_eq!(lanes.len(), 6);
-    assert_eq!(lanes.iter().map(|lane| lane.successors.len()).sum::<usize>(), 3);
-    let lane = lanes.iter().find(|lane| (lane.centerline[0][1] + 1.5).abs() < 1e-9).unwrap();
+    assert_eq!(
+        lanes
+            .iter()
+            .map(|lane| lane.successors.len())
+            .sum::<usize>(),
+        3
+    );
+    let lane = lanes
+        .iter()
+        .find(|lane| (lane.centerline[0][1] + 1.5).abs() < 1e-9)
+        .unwrap();
     assert!((lane.width_m - 3.0).abs() < 1e-9);
 }
 
@@ -94,16 +106,23 @@ fn borders_count_from_the_reference_line_whatever_the_lane_offset_is() {
     let (road, _) = with_findings(&BORDERS.replacen("<lanes>", offset, 1));
     for (section, s) in [(0, 10.0), (1, 50.0)] {
         let [low, high] = road.lane_span_m(section, 1, s);
-        assert!((low - (0.5 + 0.01 * s)).abs() < 1e-9 && (high - 3.5).abs() < 1e-9, "{low} {high}");
+        assert!(
+            (low - (0.5 + 0.01 * s)).abs() < 1e-9 && (high - 3.5).abs() < 1e-9,
+            "{low} {high}"
+        );
         assert!((road.lane_span_m(section, -1, s)[0] + 3.0).abs() < 1e-9);
     }
 }
 
 #[test]
 fn a_border_inside_the_inner_one_is_named() {
-    let (road, findings) = with_findings(&BORDERS.replacen(r#"a="-3" b="-0.1""#, r#"a="-2" b="0""#, 1));
+    let (road, findings) =
+        with_findings(&BORDERS.replacen(r#"a="-3" b="-0.1""#, r#"a="-2" b="0""#, 1));
     assert_eq!(road.lane_span_m(0, -2, 5.0), [-3.0, -3.0]);
-    assert!(findings[0].contains("has <border> 1.000 m inside the inner border"), "{findings:?}");
+    assert!(
+        findings[0].contains("has <border> 1.000 m inside the inner border"),
+        "{findings:?}"
+    );
 }
 
 #[test]
@@ -122,10 +141,16 @@ fn speeds_in_every_unit_and_those_that_are_none() {
     ] {
         let (found, findings) = limit(speed);
         assert_eq!(findings, Vec::<String>::new());
-        assert!(found == expected || (found.unwrap() - expected.unwrap()).abs() < 1e-9, "{speed}: {found:?}");
+        assert!(
+            found == expected || (found.unwrap() - expected.unwrap()).abs() < 1e-9,
+            "{speed}: {found:?}"
+        );
     }
     for (speed, named) in [
-        (r#"max="-1" unit="km/h""#, "max=\"-1\", expected a value from 0 to 1000"),
+        (
+            r#"max="-1" unit="km/h""#,
+            "max=\"-1\", expected a value from 0 to 1000",
+        ),
         (r#"max="0""#, "max=\"0\""),
         (r#"max="fast""#, "max=\"fast\", expected a number"),
         (r#"max="10" unit="knots""#, "unit=\"knots\""),
@@ -133,17 +158,25 @@ fn speeds_in_every_unit_and_those_that_are_none() {
     ] {
         let (found, findings) = limit(&format!("<speed {speed}/>"));
         assert_eq!((found, findings.len()), (None, 1), "{findings:?}");
-        assert_eq!(findings[0], format!("line 4: road r: <speed> {named}; speed limit treated as absent"));
+        assert_eq!(
+            findings[0],
+            format!("line 4: road r: <speed> {named}; speed limit treated as absent")
+        );
     }
     // The road's own limit holds then, and so it does for its type.
     let text = one_road("", LINE, r#"<speed max="-1"/>"#);
-    let text =
-        text.replacen("<planView>", r#"<type s="0" type="town"><speed max="20" unit="m/s"/></type><planView>"#, 1);
+    let text = text.replacen(
+        "<planView>",
+        r#"<type s="0" type="town"><speed max="20" unit="m/s"/></type><planView>"#,
+        1,
+    );
     assert_eq!(graph(&text).lanes[0].speed_limit_mps, 20.0);
     let (_, findings) = limit(r#"<speed sOffset="0" max="10"/><speed sOffset="20" max="20"/>"#);
     assert_eq!(
         findings,
-        ["line 4: road r: <speed> sOffset=\"20\"; left out: the first limit holds for the whole lane"]
+        [
+            "line 4: road r: <speed> sOffset=\"20\"; left out: the first limit holds for the whole lane"
+        ]
     );
 }
 
@@ -151,15 +184,23 @@ fn speeds_in_every_unit_and_those_that_are_none() {
 fn a_parameter_without_a_range_is_normalized() {
     let cubic = |range: &str, scale: f64| {
         let [u, v2, v3] = [50.0 / scale, 3.0 / scale.powi(2), -2.0 / scale.powi(3)];
-        let shape = format!(r#"<paramPoly3 aU="0" bU="{u}" cU="0" dU="0" aV="0" bV="0" cV="{v2}" dV="{v3}" {range}/>"#);
+        let shape = format!(
+            r#"<paramPoly3 aU="0" bU="{u}" cU="0" dU="0" aV="0" bV="0" cV="{v2}" dV="{v3}" {range}/>"#
+        );
         let (road, findings) = with_findings(&one_road("", &LINE.replace("<line/>", &shape), ""));
-        assert!((road.pose_at(50.0).x - 50.0).abs() < 1e-9 && (road.pose_at(50.0).y - 1.0).abs() < 1e-9, "{range}");
+        assert!(
+            (road.pose_at(50.0).x - 50.0).abs() < 1e-9 && (road.pose_at(50.0).y - 1.0).abs() < 1e-9,
+            "{range}"
+        );
         findings
     };
     assert_eq!(cubic("", 1.0), Vec::<String>::new());
     assert_eq!(cubic(r#"pRange="normalized""#, 1.0), Vec::<String>::new());
     assert_eq!(cubic(r#"pRange="arcLength""#, 50.0), Vec::<String>::new());
-    assert!(cubic(r#"pRange="length""#, 1.0)[0].contains("pRange=\"length\"; treated as absent: normalized"));
+    assert!(
+        cubic(r#"pRange="length""#, 1.0)[0]
+            .contains("pRange=\"length\"; treated as absent: normalized")
+    );
     assert!(cubic("", 50.0)[0].contains("arcLength is used"));
 }
 
@@ -177,22 +218,43 @@ fn a_short_piece_with_an_absurd_bend_becomes_a_straight_line() {
                <geometry s="20.04" x="20.04" y="0" hdg="0" length="29.96"><line/></geometry>"#
         );
         let (road, findings) = with_findings(&one_road("", &geometry, ""));
-        assert!(findings.len() == 1 && findings[0].contains("built as a straight line"), "{findings:?}");
+        assert!(
+            findings.len() == 1 && findings[0].contains("built as a straight line"),
+            "{findings:?}"
+        );
         assert!(findings[0].starts_with("line 3: road r: "), "{findings:?}");
         let length: f64 = graph(&one_road("", &geometry, "")).lanes[0].length_m;
-        assert!((length - 50.0).abs() < 1e-6 && road.pose_at(20.02).y == 0.0, "{length}");
+        assert!(
+            (length - 50.0).abs() < 1e-6 && road.pose_at(20.02).y == 0.0,
+            "{length}"
+        );
     }
 }
 
 #[test]
 fn files_of_every_encoding_give_the_same_map() {
-    let declared = SMALL.replacen(r#"<?xml version="1.0"?>"#, r#"<?xml version="1.0" encoding="ISO-8859-1"?>"#, 1);
+    let declared = SMALL.replacen(
+        r#"<?xml version="1.0"?>"#,
+        r#"<?xml version="1.0" encoding="ISO-8859-1"?>"#,
+        1,
+    );
     let named = declared.replace(r#"name="lamp""#, "name=\"Stra\u{df}e\"");
-    let latin: Vec<u8> = named.chars().map(|character| u8::try_from(u32::from(character)).unwrap()).collect();
-    let wide: Vec<u8> = format!("\u{feff}{named}").encode_utf16().flat_map(u16::to_be_bytes).collect();
+    let latin: Vec<u8> = named
+        .chars()
+        .map(|character| u8::try_from(u32::from(character)).unwrap())
+        .collect();
+    let wide: Vec<u8> = format!("\u{feff}{named}")
+        .encode_utf16()
+        .flat_map(u16::to_be_bytes)
+        .collect();
     for bytes in [latin, wide, format!("\u{feff}{named}").into_bytes()] {
         let network = read_bytes(&bytes).unwrap();
-        assert_eq!((network.roads.len(), network.findings.len()), (2, 0), "{:?}", network.findings);
+        assert_eq!(
+            (network.roads.len(), network.findings.len()),
+            (2, 0),
+            "{:?}",
+            network.findings
+        );
         assert_eq!(network.roads[0].objects[0].label, "pole Stra\u{df}e");
     }
 }
@@ -205,15 +267,31 @@ fn parts_that_are_not_built_are_reported() {
             "<surface><CRG file=\"a.crg\"/></surface><lanes>",
             "<CRG> file=\"a.crg\"; left out: the road is built without it",
         ),
-        ("<lanes>", "<weather/><lanes>", "<weather> is not supported; left out"),
-        ("<header", "<include file=\"b.xodr\"/><header", "<include> file=\"b.xodr\"; left out"),
+        (
+            "<lanes>",
+            "<weather/><lanes>",
+            "<weather> is not supported; left out",
+        ),
+        (
+            "<header",
+            "<include file=\"b.xodr\"/><header",
+            "<include> file=\"b.xodr\"; left out",
+        ),
         (
             "type=\"sidewalk\">",
             "type=\"sidewalk\"><height sOffset=\"0\" inner=\"0.1\" outer=\"0.12\"/>",
             "<lane> type=\"sidewalk\" has <height> up to 0.12 m; height over the road left out",
         ),
-        ("type=\"sidewalk\"", "type=\"heliport\"", "<lane> type=\"heliport\"; not driven on"),
-        ("id=\"a\" length", "rule=\"MHT\" id=\"a\" length", "<road> rule=\"MHT\"; treated as absent: RHT"),
+        (
+            "type=\"sidewalk\"",
+            "type=\"heliport\"",
+            "<lane> type=\"heliport\"; not driven on",
+        ),
+        (
+            "id=\"a\" length",
+            "rule=\"MHT\" id=\"a\" length",
+            "<road> rule=\"MHT\"; treated as absent: RHT",
+        ),
         (
             "<junction id=\"7\" name=\"\"/>",
             "<junction id=\"7\" type=\"virtual\"/>",
@@ -232,7 +310,8 @@ fn parts_that_are_not_built_are_reported() {
 }
 
 #[test]
-fn sections_without_lane_links_go_on_where_they_are_one_lane_and_links_that_do_not_meet_are_named() {
+fn sections_without_lane_links_go_on_where_they_are_one_lane_and_links_that_do_not_meet_are_named()
+{
     let counts = |text: &str| lane_builder::lane_graph(&read(text).unwrap()).1;
     let unlinked = |text: &str| {
         ["<successor id=\"-2\"/>", "<predecessor id=\"-2\"/>"]
@@ -240,15 +319,35 @@ fn sections_without_lane_links_go_on_where_they_are_one_lane_and_links_that_do_n
             .fold(text.to_owned(), |text, link| text.replacen(link, "", 1))
     };
     let linked = counts(BORDERS);
-    assert_eq!((linked.made, linked.refused, linked.findings.len()), (3, 0, 0));
+    assert_eq!(
+        (linked.made, linked.refused, linked.findings.len()),
+        (3, 0, 0)
+    );
     let found = counts(&unlinked(BORDERS));
     let named = "road 1: <link> leads from lane -2 to no lane, though lane -2 continues; lanes of one id linked";
-    assert_eq!((found.made, found.findings[0].to_string().as_str()), (3, named));
+    assert_eq!(
+        (found.made, found.findings[0].to_string().as_str()),
+        (3, named)
+    );
     // A lane that is linked from one side only, or is another one, ends.
-    assert_eq!(counts(&BORDERS.replacen("<successor id=\"-2\"/>", "", 1)).made, 2);
+    assert_eq!(
+        counts(&BORDERS.replacen("<successor id=\"-2\"/>", "", 1)).made,
+        2
+    );
     let narrow = r#"<border sOffset="0" a="5" b="0" c="0" d="0"/>"#;
-    assert_eq!(counts(&unlinked(&BORDERS.replacen(narrow, &narrow.replace("5", "3.2"), 1))).made, 2);
+    assert_eq!(
+        counts(&unlinked(&BORDERS.replacen(
+            narrow,
+            &narrow.replace("5", "3.2"),
+            1
+        )))
+        .made,
+        2
+    );
     let apart = counts(&SMALL.replacen(r#"x="50" y="0""#, r#"x="50" y="1""#, 1));
     let named = "road a: <laneLink> leads from lane -1 onto lane -1 of road b, 1.00 m away, 0.00 m in height, turned by 0.02 rad; link left out";
-    assert_eq!((apart.refused, apart.findings[0].to_string().as_str()), (1, named));
+    assert_eq!(
+        (apart.refused, apart.findings[0].to_string().as_str()),
+        (1, named)
+    );
 }

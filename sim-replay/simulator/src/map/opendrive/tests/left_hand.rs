@@ -46,7 +46,11 @@ fn graph(text: &str) -> LaneGraph {
 
 fn starting(graph: &LaneGraph, x: f64, y: f64) -> &Lane {
     let starts = |lane: &&Lane| (lane.centerline[0][0] - x).hypot(lane.centerline[0][1] - y) < 1e-6;
-    graph.lanes.iter().find(starts).unwrap_or_else(|| panic!("no lane starts at {x}, {y}"))
+    graph
+        .lanes
+        .iter()
+        .find(starts)
+        .unwrap_or_else(|| panic!("no lane starts at {x}, {y}"))
 }
 
 #[test]
@@ -56,7 +60,10 @@ fn lanes_on_the_left_lead_along_and_go_on_through_the_junction() {
     // Eastwards on the left of the line, where y is positive; westwards on the other side.
     for lane in &graph.lanes {
         let is_left = lane.centerline[0][1] > 0.0;
-        assert!((lane.start_heading_rad().cos() - if is_left { 1.0 } else { -1.0 }).abs() < 1e-9, "{lane:?}");
+        assert!(
+            (lane.start_heading_rad().cos() - if is_left { 1.0 } else { -1.0 }).abs() < 1e-9,
+            "{lane:?}"
+        );
     }
     let eastwards = starting(&graph, 0.0, 1.5);
     let ahead = starting(&graph, 80.0, 1.5);
@@ -70,28 +77,53 @@ fn lanes_on_the_left_lead_along_and_go_on_through_the_junction() {
     assert_eq!(back.successors, [starting(&graph, 80.0, -1.5).id]);
     // The outer lane lies to the left of the inner one, seen by its driver.
     let outer = starting(&graph, 0.0, 4.5);
-    assert_eq!((eastwards.left, eastwards.right, outer.right), (Some(outer.id), None, Some(eastwards.id)));
+    assert_eq!(
+        (eastwards.left, eastwards.right, outer.right),
+        (Some(outer.id), None, Some(eastwards.id))
+    );
 }
 
 #[test]
 fn the_rule_is_that_of_each_road_and_right_hand_traffic_is_the_default() {
     for rule in ["", r#" rule="RHT""#] {
         let graph = graph(&SMALL.replacen(r#" name="">"#, &format!("{rule}>"), 1));
-        assert!(graph.lanes.iter().any(|lane| lane.centerline[0][1] < 0.0 && lane.start_heading_rad().abs() < 1e-9));
+        assert!(
+            graph
+                .lanes
+                .iter()
+                .any(|lane| lane.centerline[0][1] < 0.0 && lane.start_heading_rad().abs() < 1e-9)
+        );
     }
     // One road of a map keeps left; its neighbour keeps right and their lanes do not meet.
     let network = read(&SMALL.replacen(r#" name="">"#, r#" rule="LHT">"#, 1)).unwrap();
-    assert_eq!(network.roads.iter().map(|road| road.left_hand).collect::<Vec<_>>(), [true, false]);
+    assert_eq!(
+        network
+            .roads
+            .iter()
+            .map(|road| road.left_hand)
+            .collect::<Vec<_>>(),
+        [true, false]
+    );
     let (graph, _) = lane_builder::lane_graph(&network);
     assert!(graph.lanes.iter().all(|lane| lane.successors.is_empty()));
 }
 
 #[test]
 fn a_reversed_lane_leads_against_its_side() {
-    let text =
-        TEE.replacen(r#"<lane id="2" type="driving">"#, r#"<lane id="2" type="driving" direction="reversed">"#, 1);
+    let text = TEE.replacen(
+        r#"<lane id="2" type="driving">"#,
+        r#"<lane id="2" type="driving" direction="reversed">"#,
+        1,
+    );
     let graph = graph(&text);
     let reversed = starting(&graph, 80.0, 4.5);
     assert!((reversed.start_heading_rad().cos() + 1.0).abs() < 1e-9);
-    assert_eq!((reversed.left, reversed.right, starting(&graph, 0.0, 1.5).left), (None, None, None));
+    assert_eq!(
+        (
+            reversed.left,
+            reversed.right,
+            starting(&graph, 0.0, 1.5).left
+        ),
+        (None, None, None)
+    );
 }

@@ -51,7 +51,9 @@ fn changed(from: &str, to: &str) -> (RoadNetwork, Vec<String>) {
 
 fn error_of(from: &str, to: &str) -> String {
     assert!(SMALL.contains(from));
-    read(&SMALL.replacen(from, to, 1)).expect_err("the change should be refused").to_string()
+    read(&SMALL.replacen(from, to, 1))
+        .expect_err("the change should be refused")
+        .to_string()
 }
 
 /// Findings of the small map when it is changed so that one road cannot be built.
@@ -68,10 +70,21 @@ fn small_map_is_read_and_its_lanes_follow_each_other() {
     assert_eq!(road.sections[0].right[1].kind, LaneKind::Sidewalk);
     assert_eq!(network.roads[1].successor, Some(RoadLink::Junction(0)));
     assert_eq!(network.findings, []);
-    assert_eq!((road.objects.len(), road.signals.len(), road.structures.len()), (1, 1, 1));
+    assert_eq!(
+        (
+            road.objects.len(),
+            road.signals.len(),
+            road.structures.len()
+        ),
+        (1, 1, 1)
+    );
     let (graph, counts) = lane_builder::lane_graph(&network);
     assert_eq!((graph.lanes.len(), counts.made, counts.refused), (3, 1, 0));
-    let first = graph.lanes.iter().find(|lane| !lane.successors.is_empty()).unwrap();
+    let first = graph
+        .lanes
+        .iter()
+        .find(|lane| !lane.successors.is_empty())
+        .unwrap();
     assert!((first.length_m - 50.0).abs() < 1e-6 && (first.speed_limit_mps - 10.0).abs() < 1e-9);
     assert_eq!(first.centerline[0], [0.0, -1.75, 1.0]);
     let (end, heading) = first.at(first.length_m);
@@ -79,20 +92,38 @@ fn small_map_is_read_and_its_lanes_follow_each_other() {
     // The second lane lies outside the bend of radius 20 to the left.
     let second = graph.lane(first.successors[0]);
     assert!((second.length_m - 21.75 * std::f64::consts::FRAC_PI_2).abs() < 1e-2);
-    let opposite = graph.lanes.iter().find(|lane| lane.centerline[0][0] > 49.0 && lane.centerline[0][1] > 0.0).unwrap();
+    let opposite = graph
+        .lanes
+        .iter()
+        .find(|lane| lane.centerline[0][0] > 49.0 && lane.centerline[0][1] > 0.0)
+        .unwrap();
     assert!((opposite.end_heading_rad().abs() - std::f64::consts::PI).abs() < 1e-9);
 }
 
 #[test]
 fn a_file_that_is_no_map_is_refused() {
     assert!(error_of("</OpenDRIVE>", "").contains("not well-formed XML"));
-    assert!(error_of("<OpenDRIVE>", "<!DOCTYPE a [<!ENTITY b \"c\">]><OpenDRIVE>").contains("not well-formed XML"));
-    let text = SMALL.replace("<OpenDRIVE>", "<Other>").replace("</OpenDRIVE>", "</Other>");
-    assert_eq!(read(&text).unwrap_err().to_string(), "line 2: <Other> is the root; expected <OpenDRIVE>");
-    assert_eq!(read("<OpenDRIVE/>").unwrap_err().to_string(), "line 1: <OpenDRIVE> has no <road>");
+    assert!(
+        error_of("<OpenDRIVE>", "<!DOCTYPE a [<!ENTITY b \"c\">]><OpenDRIVE>")
+            .contains("not well-formed XML")
+    );
+    let text = SMALL
+        .replace("<OpenDRIVE>", "<Other>")
+        .replace("</OpenDRIVE>", "</Other>");
+    assert_eq!(
+        read(&text).unwrap_err().to_string(),
+        "line 2: <Other> is the root; expected <OpenDRIVE>"
+    );
+    assert_eq!(
+        read("<OpenDRIVE/>").unwrap_err().to_string(),
+        "line 1: <OpenDRIVE> has no <road>"
+    );
     // Where no road is left, the first fault is the error.
-    let text = SMALL.replace("<line/>", "<helix/>").replace("curvature=", "curve=");
-    let expected = "line 7: <geometry> holds <helix>; expected line, arc, spiral, poly3 or paramPoly3";
+    let text = SMALL
+        .replace("<line/>", "<helix/>")
+        .replace("curvature=", "curve=");
+    let expected =
+        "line 7: <geometry> holds <helix>; expected line, arc, spiral, poly3 or paramPoly3";
     assert_eq!(read(&text).unwrap_err().to_string(), expected);
 }
 
@@ -112,7 +143,10 @@ fn a_road_that_cannot_be_built_is_left_out_with_line_element_attribute_and_value
     );
     assert!(left_out("<line/>", "<helix/>").contains("holds <helix>"));
     // The road that leads to it loses its link, and a finding names that too.
-    let (network, findings) = changed(r#"y="0" hdg="0" length="31.4159265""#, r#"y="nowhere" length="31.4159265""#);
+    let (network, findings) = changed(
+        r#"y="0" hdg="0" length="31.4159265""#,
+        r#"y="nowhere" length="31.4159265""#,
+    );
     assert_eq!(network.roads[0].successor, None);
     assert_eq!(
         findings[1],
@@ -124,13 +158,23 @@ fn a_road_that_cannot_be_built_is_left_out_with_line_element_attribute_and_value
 fn an_odd_part_of_a_road_is_treated_as_absent_and_named() {
     let only = |from: &str, to: &str| {
         let (network, findings) = changed(from, to);
-        assert_eq!((network.roads.len(), findings.len()), (2, 1), "{findings:?}");
+        assert_eq!(
+            (network.roads.len(), findings.len()),
+            (2, 1),
+            "{findings:?}"
+        );
         (network, findings.into_iter().next().unwrap())
     };
     for length in ["fifty", "40"] {
-        let (network, finding) = only(r#"length="50" junction"#, &format!(r#"length="{length}" junction"#));
+        let (network, finding) = only(
+            r#"length="50" junction"#,
+            &format!(r#"length="{length}" junction"#),
+        );
         assert!((network.roads[0].length_m - 50.0).abs() < 1e-9);
-        assert!(finding.ends_with("; the length of its reference line is used"), "{finding}");
+        assert!(
+            finding.ends_with("; the length of its reference line is used"),
+            "{finding}"
+        );
     }
     let (network, finding) = only(r#"elementId="b""#, r#"elementId="c""#);
     assert_eq!(network.roads[0].successor, None);
@@ -141,30 +185,54 @@ fn an_odd_part_of_a_road_is_treated_as_absent_and_named() {
     for id in ["-3", "-2147483648", "2", "x"] {
         let (network, finding) = only(r#"<lane id="-2""#, &format!(r#"<lane id="{id}""#));
         assert_eq!(network.roads[0].sections[0].right.len(), 1);
-        assert!(finding.starts_with(&format!("line 15: road a: <lane> id=\"{id}\"")), "{finding}");
+        assert!(
+            finding.starts_with(&format!("line 15: road a: <lane> id=\"{id}\"")),
+            "{finding}"
+        );
         assert!(finding.ends_with("; lane left out"), "{finding}");
     }
     let (network, finding) = only(r#"s="5" t="-4""#, r#"s="5" t="?""#);
-    assert!(network.roads[0].signals.is_empty() && finding.ends_with("; left out"), "{finding}");
-    let (_, finding) = only(r#"elementType="junction" elementId="7""#, r#"elementType="junction" elementId="8""#);
-    assert!(finding.contains("the id of a junction of this map"), "{finding}");
+    assert!(
+        network.roads[0].signals.is_empty() && finding.ends_with("; left out"),
+        "{finding}"
+    );
+    let (_, finding) = only(
+        r#"elementType="junction" elementId="7""#,
+        r#"elementType="junction" elementId="8""#,
+    );
+    assert!(
+        finding.contains("the id of a junction of this map"),
+        "{finding}"
+    );
 }
 
 #[test]
 fn unbounded_cubics_are_clamped_to_the_limits_of_a_road() {
     let wild = [
-        (r#"laneOffset s="0" a="0" b="0""#, r#"laneOffset s="0" a="0" b="10000000""#),
-        (r#"laneOffset s="0" a="0" b="0" c="0" d="0""#, r#"laneOffset s="0" a="0" b="0" c="0" d="-9999999""#),
+        (
+            r#"laneOffset s="0" a="0" b="0""#,
+            r#"laneOffset s="0" a="0" b="10000000""#,
+        ),
+        (
+            r#"laneOffset s="0" a="0" b="0" c="0" d="0""#,
+            r#"laneOffset s="0" a="0" b="0" c="0" d="-9999999""#,
+        ),
         // A peak between the places where widths are checked.
-        (r#"sOffset="0" a="2" b="0" c="0" d="0""#, r#"sOffset="49" a="0" b="10000000" c="-10000000" d="0""#),
+        (
+            r#"sOffset="0" a="2" b="0" c="0" d="0""#,
+            r#"sOffset="49" a="0" b="10000000" c="-10000000" d="0""#,
+        ),
     ];
     for (from, to) in wild {
         assert!(SMALL.contains(from));
         let network = read(&SMALL.replacen(from, to, 1)).unwrap();
         for place in 0..=500 {
-            let spans = [-2, -1, 1].map(|lane| network.roads[0].lane_span_m(0, lane, f64::from(place) / 10.0));
+            let spans = [-2, -1, 1]
+                .map(|lane| network.roads[0].lane_span_m(0, lane, f64::from(place) / 10.0));
             assert!(
-                spans.iter().all(|[low, high]| *low >= -1200.0 && *high <= 1200.0 && low <= high),
+                spans
+                    .iter()
+                    .all(|[low, high]| *low >= -1200.0 && *high <= 1200.0 && low <= high),
                 "{to}: {spans:?}"
             );
         }
@@ -174,20 +242,36 @@ fn unbounded_cubics_are_clamped_to_the_limits_of_a_road() {
 #[test]
 fn tunnels_together_are_no_longer_than_their_road() {
     let tunnels = [(30, 100), (0, 20), (10, 25), (12, 3), (30, 100), (49, 0)];
-    let tunnels = tunnels.map(|(s, length)| format!(r#"<tunnel s="{s}" length="{length}"/>"#)).concat();
+    let tunnels = tunnels
+        .map(|(s, length)| format!(r#"<tunnel s="{s}" length="{length}"/>"#))
+        .concat();
     let network = read(&SMALL.replacen("</objects>", &format!("{tunnels}</objects>"), 1)).unwrap();
     let structures = &network.roads[0].structures;
-    let spans: Vec<_> = structures.iter().filter(|it| it.tunnel).map(|it| (it.s_m, it.length_m)).collect();
+    let spans: Vec<_> = structures
+        .iter()
+        .filter(|it| it.tunnel)
+        .map(|it| (it.s_m, it.length_m))
+        .collect();
     assert_eq!(spans, [(0.0, 20.0), (20.0, 15.0), (35.0, 15.0)]);
     assert_eq!(structures.len(), 4, "the bridge stays");
 }
 
 #[test]
 fn deep_nesting_and_large_files_are_refused_or_read_without_overflow() {
-    let deep = format!("<OpenDRIVE>{}{}</OpenDRIVE>", "<a>".repeat(200_000), "</a>".repeat(200_000));
+    let deep = format!(
+        "<OpenDRIVE>{}{}</OpenDRIVE>",
+        "<a>".repeat(200_000),
+        "</a>".repeat(200_000)
+    );
     assert!(read(&deep).is_err());
     let large = " ".repeat(MAX_BYTES + 1);
-    assert_eq!(read(&large).unwrap_err(), OpenDriveError::TooLarge { bytes: MAX_BYTES + 1, limit: MAX_BYTES });
+    assert_eq!(
+        read(&large).unwrap_err(),
+        OpenDriveError::TooLarge {
+            bytes: MAX_BYTES + 1,
+            limit: MAX_BYTES
+        }
+    );
 }
 
 /// A document of every kind that is read, small enough to be damaged anywhere.
@@ -197,12 +281,20 @@ const KINDS: [&str; 4] = [SMALL, kinds::BORDERS, direct::EXIT, lateral::BANKED];
 fn build_all(network: &RoadNetwork) {
     let (graph, _) = lane_builder::lane_graph(network);
     for lane in &graph.lanes {
-        assert!(lane.centerline.len() >= 2 && lane.centerline.iter().flatten().all(|c| c.is_finite()));
+        assert!(
+            lane.centerline.len() >= 2 && lane.centerline.iter().flatten().all(|c| c.is_finite())
+        );
         assert!(lane.banks_rad.is_empty() || lane.banks_rad.len() == lane.centerline.len());
         assert!(lane.banks_rad.iter().all(|bank| bank.is_finite()));
     }
     let surface = super::super::surface::Surface::new(network);
-    assert!(surface.patches.iter().flat_map(|patch| patch.z_m).all(f64::is_finite));
+    assert!(
+        surface
+            .patches
+            .iter()
+            .flat_map(|patch| patch.z_m)
+            .all(f64::is_finite)
+    );
 }
 
 proptest! {
