@@ -1,8 +1,8 @@
 //! Feature store: maps of a frozen encoder, computed once and kept on disk.
 //!
 //! Methods with a common encoder differ in the fusion of its maps; the encoder, which takes most of the time, need not
-//! run again for each of them, nor for each pass over the data. The file belongs to one encoder, one set of data (its
-//! contents) and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each
+//! run again for each of them, nor for each pass over the data. The file belongs to one encoder with its settings, one
+//! set of data (its contents), one program and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each
 //! after its length: truncated or changed messages are detected.
 
 mod sweep_encoder;
@@ -18,7 +18,10 @@ use perception::detector::{Detector, DetectorError};
 use perception::train::{Prefetch, TrainingError};
 use perception::weights::{Weights, WeightsError};
 use protocol::message::Bev;
+use protocol::text::hex;
 use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
+use sha2::{Digest, Sha256};
+use support::file_digests::FileDigests;
 use tch::{Device, TchError, Tensor};
 
 use sweep_encoder::SweepEncoder;
@@ -83,6 +86,40 @@ pub fn is_encoder(name: &str) -> bool {
         .any(|prefix| name.starts_with(prefix))
 }
 
+/// Name of the file: digests of the encoder's weights, of the data, and of all else that maps depend on.
+fn file_name(
+    kept: &KeptMaps,
+    weights: &Weights,
+    scenarios: &[Scenario],
+    digests: &FileDigests,
+) -> Result<String, FeatureStoreError> {
+    let program = digests
+        .program_sha256()
+        .map_err(|source| FeatureStoreError::Io {
+            path: kept.folder.clone(),
+            source,
+        })?;
+    let scales = weights
+        .activation_scales()?
+        .map(|scales| scales.sha256_of(is_encoder));
+    let settings = format!(
+        "{:?} {:?} {} {scales:?} {program} {WIRE_VERSION}",
+        weights.detector_config()?,
+        kept.dtype,
+        kept.intensity_scale,
+    );
+    let parts = [
+        weights.sha256_of(is_encoder),
+        dataset::content_sha256(scenarios, None, digests),
+        hex(&Sha256::digest(settings)),
+    ];
+    let parts: Vec<String> = parts
+        .iter()
+        .map(|digest| digest.chars().take(HASH_DIGITS).collect())
+        .collect();
+    Ok(format!("{}.maps", parts.join("-")))
+}
+
 /// Maps of the sweeps of some scenarios, one after another in a file.
 #[derive(Debug)]
 pub struct FeatureStore {
@@ -99,7 +136,8 @@ pub struct FeatureStore {
 }
 
 impl FeatureStore {
-    /// Opens the file of these scenarios and encodes the missing sweeps on `threads` CPU threads, up to its size.
+    /// Opens the file of these scenarios and encodes the missing sweeps on `threads` CPU threads, up to its size;
+    /// `digests` has those of files that were read before.
     ///
     /// `on_sweep` gets the number of stored sweeps and of all. An interrupted run is continued.
     ///
@@ -109,27 +147,13 @@ impl FeatureStore {
         kept: &KeptMaps,
         weights: &Arc<Weights>,
         scenarios: &[Scenario],
+        digests: &FileDigests,
         threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, FeatureStoreError> {
-        let [encoder, data] = [
-            weights.sha256_of(is_encoder),
-            dataset::content_sha256(scenarios),
-        ];
-        let dtype = format!("{:?}", kept.dtype).to_lowercase();
-        let scale = match kept.intensity_scale {
-            IntensityScale::AUTO => String::new(),
-            scale => format!("-intensity{scale}"),
-        };
-        let scales = weights
-            .activation_scales()?
-            .map(|scales| scales.sha256_of(is_encoder));
-        let precision = scales.map_or(String::new(), |scales| {
-            format!("-int8-{}", &scales[..HASH_DIGITS])
-        });
-        let [encoder, data] = [&encoder[..HASH_DIGITS], &data[..HASH_DIGITS]];
-        let name = format!("{encoder}-{data}-{dtype}{scale}{precision}-wire{WIRE_VERSION}.maps");
-        let path = kept.folder.join(name);
+        let path = kept
+            .folder
+            .join(file_name(kept, weights, scenarios, digests)?);
         let io = |source| FeatureStoreError::Io {
             path: path.clone(),
             source,

@@ -3,7 +3,8 @@
 //! - [`command_line`]: parsing, verbosity, completions; [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files
 //!   that come with the programs.
 //! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
-//! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, atomic writes, CSV.
+//! - [`bounded_file`], [`atomic_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size, atomic writes,
+//!   CSV, SHA-256 of whole files.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`rounding`]: floats to integers.
 //! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run.
@@ -35,6 +36,7 @@ pub mod cli;
 pub mod command_line;
 mod command_tree;
 pub mod csv_file;
+pub mod file_digests;
 pub mod nanos;
 pub mod output;
 pub mod progress;

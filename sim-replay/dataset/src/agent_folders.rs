@@ -294,9 +294,14 @@ impl ScenarioFolder {
         self.stems.iter().zip(times).map(tick).collect()
     }
 
+    /// The file that may state the length of a tick.
+    pub(super) fn tick_length(&self) -> PathBuf {
+        self.dir.join("data_protocol.yaml")
+    }
+
     /// `world.fixed_delta_seconds` of `data_protocol.yaml` in nanoseconds, if there is such a file and key.
     fn tick_nanos(&self) -> Result<Option<u64>, ReadError> {
-        let path = self.dir.join("data_protocol.yaml");
+        let path = self.tick_length();
         if !path.is_file() {
             return Ok(None);
         }

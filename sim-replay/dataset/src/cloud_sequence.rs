@@ -51,6 +51,8 @@ const SAME_TIME_S: f64 = 1e-3;
 
 #[derive(Debug)]
 struct Sequence {
+    /// File of the poses.
+    poses: PathBuf,
     /// File and pose by stem.
     clouds: BTreeMap<String, (PathBuf, Pose)>,
     sweeps: Sweeps,
@@ -128,7 +130,11 @@ fn open(
         .into_iter()
         .map(|((_, stem), cloud)| (stem, cloud))
         .collect();
-    let source = Arc::new(Sequence { clouds, sweeps });
+    let source = Arc::new(Sequence {
+        poses: path,
+        clouds,
+        sweeps,
+    });
     Ok(single_vehicle(
         files::name_below(root, dir),
         Layout(&CLOUDS),
@@ -287,6 +293,12 @@ impl FrameSource for Sequence {
     ) -> Result<PcdCloud, ReadError> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
+    }
+
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.push(self.poses.clone());
+        files
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

@@ -93,8 +93,7 @@ impl FrameSource for Split {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(Pose::IDENTITY);
         if self.has_labels {
-            let calibration =
-                Calibration::read(&self.dir.join("calib").join(format!("{}.txt", tick.stem)))?;
+            let calibration = Calibration::read(&self.calibration(tick))?;
             let rectified = calibration.rotation("R0_rect")?.isometry();
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
             (frame.objects, frame.problems) =
@@ -113,8 +112,15 @@ impl FrameSource for Split {
             .read(agent, &self.points_path(agent, tick, variant))
     }
 
-    fn annotation_path(&self, _agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        self.has_labels.then(|| self.labels(tick))
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        self.sweeps.samples(agent)
+    }
+
+    fn frame_files(&self, _agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
+        if !self.has_labels {
+            return Vec::new();
+        }
+        vec![self.calibration(tick), self.labels(tick)]
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
@@ -125,6 +131,10 @@ impl FrameSource for Split {
 impl Split {
     fn labels(&self, tick: &Tick) -> PathBuf {
         self.dir.join("label_2").join(format!("{}.txt", tick.stem))
+    }
+
+    fn calibration(&self, tick: &Tick) -> PathBuf {
+        self.dir.join("calib").join(format!("{}.txt", tick.stem))
     }
 }
 

@@ -165,6 +165,13 @@ impl FrameSource for Sequence {
             .read(agent, &self.points_path(agent, tick, variant))
     }
 
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.extend(["calib.txt", "times.txt"].map(|name| self.dir.join(name)));
+        files.extend(poses_path(&self.dir));
+        files
+    }
+
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
         self.dir.join("velodyne").join(format!("{}.bin", tick.stem))
     }

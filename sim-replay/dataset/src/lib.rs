@@ -219,9 +219,13 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
         CameraImages::default()
     }
 
-    /// The file with the pose and objects of this frame alone, in layouts that have one.
-    fn annotation_path(&self, _agent: &CavId, _tick: &Tick) -> Option<PathBuf> {
-        None
+    /// The files that all frames of an agent are read from: tables, poses, times, and the sweeps that determine how the
+    /// others are read. A change of any file of a frame is a change of the data ([`content_sha256`]).
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf>;
+
+    /// The files with pose, objects and calibration of one frame, in layouts that have such.
+    fn frame_files(&self, _agent: &CavId, _tick: &Tick) -> Vec<PathBuf> {
+        Vec::new()
     }
 
     /// The file with the LiDAR's points.

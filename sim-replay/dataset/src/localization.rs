@@ -59,6 +59,13 @@ const CONVERTED: &str = "velodyne_left";
 /// NCLT's original points.
 const RAW: &str = "velodyne_sync";
 
+/// Poses in the axes of QEOxford, better aligned.
+const ALIGNED_POSES: &str = "velodyne_left_calibrateFalse.h5";
+/// Poses as LightLoc converts them.
+const PLAIN_POSES: &str = "velodyne_left_False.h5";
+/// LightLoc's names of the scenes.
+const SCENES: [&str; 3] = ["NCLT", "Oxford", "QEOxford"];
+
 /// Storage of the points of a sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Storage {
@@ -80,6 +87,8 @@ impl Storage {
 #[derive(Debug)]
 struct Sequence {
     points_dir: PathBuf,
+    /// Files of poses, whether or not they exist.
+    pose_files: Vec<PathBuf>,
     /// By microseconds; empty if no file has any.
     world_from_lidar: BTreeMap<u64, Pose>,
     sweeps: Sweeps,
@@ -155,6 +164,7 @@ pub(super) fn open(
     let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
     let source = Sequence {
         points_dir,
+        pose_files: pose_files(dir),
         world_from_lidar: poses.unwrap_or_default(),
         sweeps,
     };
@@ -206,14 +216,14 @@ fn poses_as_stored(
     problems: &mut Vec<ReadError>,
 ) -> Result<Option<StoredPoses>, ReadError> {
     let is_nclt = storage != Storage::Oxford;
-    let aligned = dir.join("velodyne_left_calibrateFalse.h5");
+    let aligned = dir.join(ALIGNED_POSES);
     if aligned.is_file() {
         return Ok(Some((
             "QEOxford",
             hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?,
         )));
     }
-    let plain = dir.join("velodyne_left_False.h5");
+    let plain = dir.join(PLAIN_POSES);
     if plain.is_file() {
         let scene = if is_nclt { "NCLT" } else { "Oxford" };
         return Ok(Some((
@@ -232,14 +242,26 @@ fn poses_as_stored(
     Ok(Some(("NCLT", stamps.keys().filter_map(at).collect())))
 }
 
+/// File of the mean position of a scene's training sequences.
+fn middle_file(dir: &Path, scene: &str) -> Option<PathBuf> {
+    let name = format!("{scene}_pose_stats.txt");
+    files::above(dir)
+        .map(|above| above.join(&name))
+        .find(|path| path.is_file())
+}
+
+/// Files that poses of a sequence may come from.
+fn pose_files(dir: &Path) -> Vec<PathBuf> {
+    let mut files = vec![dir.join(ALIGNED_POSES), dir.join(PLAIN_POSES)];
+    files.extend(nclt_ground_truth::find(dir, &own_name(dir)));
+    files.extend(SCENES.iter().filter_map(|scene| middle_file(dir, scene)));
+    files
+}
+
 /// Mean that LightLoc subtracts from all positions of a scene, metres in the axes of the poses' file; zero without its
 /// file.
 fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
-    let name = format!("{scene}_pose_stats.txt");
-    let Some(path) = files::above(dir)
-        .map(|above| above.join(&name))
-        .find(|path| path.is_file())
-    else {
+    let Some(path) = middle_file(dir, scene) else {
         return Ok(Translation3::identity());
     };
     let [x, y, z] = first_row(&path)?;
@@ -308,6 +330,12 @@ impl FrameSource for Sequence {
             (*y, *z) = (-*y, -*z);
         }
         Ok(cloud)
+    }
+
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.extend_from_slice(&self.pose_files);
+        files
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

@@ -194,6 +194,10 @@ mod tests {
             Ok(PcdCloud::of_finite(vec![[1.0, 2.0, 3.0, 0.5]], Vec::new()))
         }
 
+        fn shared_files(&self, _: &CavId) -> Vec<PathBuf> {
+            Vec::new()
+        }
+
         fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {
             self.0.clone()
         }

@@ -86,9 +86,17 @@ impl FrameSource for Opv2v {
         found
     }
 
-    fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        let has_yaml = !self.folder.without_yaml.contains(agent);
-        has_yaml.then(|| self.folder.yaml(agent, &tick.stem))
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.push(self.folder.tick_length());
+        files
+    }
+
+    fn frame_files(&self, agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
+        if self.folder.without_yaml.contains(agent) {
+            return Vec::new();
+        }
+        vec![self.folder.yaml(agent, &tick.stem)]
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {

@@ -99,6 +99,13 @@ impl Sweeps {
         Self::new(storage, options).with_agent(super::single_vehicle_id(), files)
     }
 
+    /// Files of an agent that may determine how its others are read.
+    pub(super) fn samples(&self, agent: &CavId) -> Vec<PathBuf> {
+        self.agents
+            .get(agent)
+            .map_or_else(Vec::new, |agent| agent.files.clone())
+    }
+
     /// Reads a sweep of an agent: plain or a variant, in the frame and handedness of the file, intensities 0 to 1.
     ///
     /// # Errors

@@ -299,6 +299,11 @@ impl FrameSource for Recorded {
         found
     }
 
+    /// None besides that of the sweeps.
+    fn shared_files(&self, _: &CavId) -> Vec<PathBuf> {
+        Vec::new()
+    }
+
     fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {
         self.recording.path().into()
     }

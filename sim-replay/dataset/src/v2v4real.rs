@@ -43,8 +43,14 @@ impl FrameSource for V2v4Real {
             .read(agent, &self.points_path(agent, tick, variant))
     }
 
-    fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        Some(self.folder.yaml(agent, &tick.stem))
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.push(self.folder.tick_length());
+        files
+    }
+
+    fn frame_files(&self, agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
+        vec![self.folder.yaml(agent, &tick.stem)]
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {

@@ -20,6 +20,7 @@ use perception::inference::Inference;
 use perception::weights::Weights;
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
 use runner::experiment::table::{self, TableObserver, TableSpec};
+use support::file_digests::FileDigests;
 use tests::locks::random_generator_lock;
 use tests::scene;
 use tests::training::{Ear, config, small};
@@ -98,7 +99,15 @@ fn evaluate(
             limit_bytes: u64::MAX,
             intensity_scale: IntensityScale::AUTO,
         };
-        let store = FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| {}).unwrap();
+        let store = FeatureStore::open(
+            &kept,
+            &weights,
+            &scenarios,
+            &FileDigests::default(),
+            2,
+            &mut |_, _| {},
+        )
+        .unwrap();
         evaluator = evaluator.with_maps(MapSource::new(store.into(), weights));
     }
     let mut frames = Vec::new();
@@ -199,8 +208,15 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
             intensity_scale: IntensityScale::AUTO,
         };
         let mut encoded = 0;
-        let store =
-            FeatureStore::open(&kept, &weights, &scenarios, 2, &mut |_, _| encoded += 1).unwrap();
+        let store = FeatureStore::open(
+            &kept,
+            &weights,
+            &scenarios,
+            &FileDigests::default(),
+            2,
+            &mut |_, _| encoded += 1,
+        )
+        .unwrap();
         (store, encoded)
     };
     let (few, encoded) = open(1);

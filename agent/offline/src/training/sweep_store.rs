@@ -12,6 +12,7 @@ use rand::Rng;
 use super::error::LocalizerTrainError;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 use perception::train::{DataListing, Prefetch};
+use support::file_digests::FileDigests;
 
 /// Unit of stored coordinates, metres.
 const UNIT_M: f32 = 0.01;
@@ -151,7 +152,11 @@ impl SweepList {
         if places.is_empty() {
             return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
         }
-        let sha256 = dataset::content_sha256(scenarios.iter().map(AsRef::as_ref));
+        let sha256 = dataset::content_sha256(
+            scenarios.iter().map(AsRef::as_ref),
+            None,
+            &FileDigests::default(),
+        );
         Ok(Self {
             places,
             sha256,

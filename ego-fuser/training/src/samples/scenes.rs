@@ -9,6 +9,7 @@ use dataset::frame::Frame;
 use dataset::{self, LoadOptions, OpenOptions, Scenario};
 use perception::train::DataListing;
 use protocol::PointCloud;
+use support::file_digests::FileDigests;
 
 use super::error::SampleError;
 
@@ -163,7 +164,7 @@ impl SceneSet {
     pub fn data(&self) -> DataListing {
         let sha256 = self
             .sha256
-            .get_or_init(|| dataset::content_sha256(&self.scenarios))
+            .get_or_init(|| dataset::content_sha256(&self.scenarios, None, &FileDigests::default()))
             .clone();
         let problems = self
             .problems

@@ -11,6 +11,7 @@ use super::observer::Observer;
 use crate::feature_store::{FeatureStore, FeatureStoreError, KeptMaps, MapSource, is_encoder};
 use crate::samples::{Augmentation, SampleConfig, SampleError, SceneSet};
 use fusion::model::{CooperativeModel, ModelError};
+use support::file_digests::FileDigests;
 
 /// A frozen encoder, and the store of its maps.
 pub(super) struct FrozenEncoder<'a> {
@@ -55,6 +56,7 @@ impl<'a> FrozenEncoder<'a> {
             self.kept,
             &self.weights,
             scenes.scenarios(),
+            &FileDigests::default(),
             self.threads,
             on_sweep,
         );

@@ -1,15 +1,19 @@
-//! Index of DAIR-V2X and V2X-Seq: pairs of frames with time and batch or sequence, from three files `data_info.json`.
+//! Index of DAIR-V2X and V2X-Seq: pairs of frames with time and batch or sequence, from two files `data_info.json`.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::Path;
 
+use super::Side;
 use super::calibration::offset_m;
-use super::{Side, VEHICLE_SIDE};
 use crate::json::Field;
 use crate::{Layout, ReadError, Tick, json_table};
 
 /// The pairs, below the root.
 pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
+/// Capture times of the vehicle's frames, below the root.
+const CAPTURES: &str = "vehicle-side/data_info.json";
+/// Files of the index, below the root.
+pub(super) const FILES: [&str; 2] = [COOPERATIVE, CAPTURES];
 /// Largest `data_info.json` that is read, bytes. Those published have up to 20 MB.
 const MAX_BYTES: u64 = 512 << 20;
 
@@ -105,10 +109,7 @@ impl Index {
                         "no entry for vehicle frame {}: the pair is left out",
                         pair.vehicle
                     );
-                    problems.push(ReadError::malformed(
-                        &root.join(VEHICLE_SIDE).join("data_info.json"),
-                        reason,
-                    ));
+                    problems.push(ReadError::malformed(&root.join(CAPTURES), reason));
                 }
             }
         }
@@ -240,7 +241,7 @@ fn read_captures(
     kind: Kind,
     problems: &mut Vec<ReadError>,
 ) -> HashMap<String, Capture> {
-    let path = root.join(VEHICLE_SIDE).join("data_info.json");
+    let path = root.join(CAPTURES);
     let mut captures = HashMap::new();
     let read = json_table::read(
         &path,

@@ -267,18 +267,21 @@ impl Sides {
         self.root.join(folder).join(format!("{id}.json"))
     }
 
-    /// The first required file of a side that does not exist.
-    fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
-        let calibrations = match side {
+    fn calibrations(&self, pair: &Pair, side: Side) -> Vec<PathBuf> {
+        match side {
             Side::Vehicle => calibration::VEHICLE
                 .map(|folder| self.calibration(folder, &pair.vehicle))
                 .to_vec(),
             Side::Infrastructure => {
                 vec![self.calibration(calibration::INFRASTRUCTURE, &pair.infrastructure)]
             }
-        };
+        }
+    }
+
+    /// The first required file of a side that does not exist.
+    fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
         std::iter::once(self.points(pair, side))
-            .chain(calibrations)
+            .chain(self.calibrations(pair, side))
             .find(|path| !path.is_file())
     }
 }
@@ -381,12 +384,23 @@ impl FrameSource for Source {
             .read(agent, &self.points_path(agent, tick, variant))
     }
 
-    fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        let pair = self.pairs.get(&tick.stem)?;
-        Some(match Side::of(agent) {
-            Side::Vehicle => self.sides.cooperative_labels(pair),
-            Side::Infrastructure => self.sides.labels(pair, Side::Infrastructure),
-        })
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.extend(index::FILES.map(|file| self.sides.root.join(file)));
+        files
+    }
+
+    /// Of both sides: the frame of one needs the pose and the ids of the other.
+    fn frame_files(&self, _agent: &CavId, tick: &Tick) -> Vec<PathBuf> {
+        let Some(pair) = self.pairs.get(&tick.stem) else {
+            return Vec::new();
+        };
+        let mut files = vec![self.sides.cooperative_labels(pair)];
+        for side in [Side::Vehicle, Side::Infrastructure] {
+            files.extend(self.sides.calibrations(pair, side));
+            files.push(self.sides.labels(pair, side));
+        }
+        files
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

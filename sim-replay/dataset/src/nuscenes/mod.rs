@@ -261,6 +261,7 @@ impl Builder<'_> {
             source_handedness: Handedness::Right,
             source: Arc::new(Source {
                 root: self.root.to_owned(),
+                version: self.version.to_owned(),
                 layout: self.layout,
                 moments: contents,
                 sweeps,
@@ -366,6 +367,8 @@ struct Moment {
 #[derive(Debug)]
 struct Source {
     root: PathBuf,
+    /// Folder of the tables.
+    version: PathBuf,
     layout: Layout,
     /// By the stem of the tick.
     moments: HashMap<String, Moment>,
@@ -427,6 +430,12 @@ impl FrameSource for Source {
         let mut cloud = self.sweeps.read(agent, &self.root.join(&sweep.file))?;
         sweep.turns().apply(&mut cloud.points);
         Ok(cloud)
+    }
+
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.extend(tables::NAMES.map(|name| self.version.join(name)));
+        files
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

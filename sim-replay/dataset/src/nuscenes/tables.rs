@@ -13,6 +13,18 @@ use crate::frame::Object;
 use crate::json::Field;
 use crate::json_table::{self, Keys};
 
+/// The tables that are read.
+pub(super) const NAMES: [&str; 9] = [
+    "sensor.json",
+    "calibrated_sensor.json",
+    "scene.json",
+    "sample.json",
+    "sample_data.json",
+    "ego_pose.json",
+    "sample_annotation.json",
+    "category.json",
+    "instance.json",
+];
 /// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
 const MAX_BYTES: u64 = 4 << 30;
 /// Largest deviation of a published quaternion's length from 1; it is normalized.
