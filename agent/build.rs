@@ -4,7 +4,7 @@
 
 use std::env;
 
-fn main() {
+pub(crate) fn main() {
     // No other file is an input; Cargo compiles and runs this script again by itself when it changes.
     println!("cargo:rerun-if-env-changed=LIBTORCH");
     // Set by the build script of torch-sys, however it found libtorch.

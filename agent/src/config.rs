@@ -6,7 +6,7 @@ use std::str::FromStr;
 
 use bus::{BusConfig, ProcessConfig};
 use protocol::config::{FieldError, within};
-use protocol::{CavId, CodecConfig, RunId, Stream};
+use protocol::{CavId, CodecConfig, ConfidenceGate, RunId, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -127,6 +127,19 @@ pub struct AgentSettings {
     pub falsification: Option<Falsification>,
 }
 
+/// Place of a vehicle in a fleet.
+#[derive(Debug, Clone, Copy)]
+pub struct FleetPlace<'a> {
+    /// Name of the recorded scenario.
+    pub scenario: &'a str,
+    /// Index among the vehicles of the fleet.
+    pub index: usize,
+    /// True for the vehicle of the ego.
+    pub is_ego: bool,
+    /// Gate of the method for feature maps without one.
+    pub gate: Option<ConfidenceGate>,
+}
+
 /// A message beside the pose.
 #[derive(
     Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
@@ -192,6 +205,40 @@ impl Threads {
 }
 
 impl AgentSettings {
+    /// Settings of one vehicle of a fleet, the same on every clock and in evaluations.
+    ///
+    /// Tracked vehicles measure in turn. Some pose errors spare the ego ([`spares_ego`](localization::pose_source::NoiseMode::spares_ego)). Its own agent sends
+    /// over no link: its map is neither restricted nor adapted.
+    #[must_use]
+    pub fn in_fleet(self, place: FleetPlace<'_>) -> Self {
+        let turn = u32::try_from(place.index).unwrap_or(u32::MAX);
+        let pose = self.pose.for_scenario(place.scenario).with_turn(turn);
+        let codec = self.codec;
+        if !place.is_ego {
+            let gate = codec.gate.or(place.gate);
+            return Self {
+                pose,
+                codec: CodecConfig { gate, ..codec },
+                ..self
+            };
+        }
+        Self {
+            pose: match pose {
+                PoseSourceConfig::Noisy(noisy) if noisy.mode.spares_ego() => {
+                    PoseSourceConfig::Recorded
+                }
+                pose => pose,
+            },
+            codec: CodecConfig {
+                gate: None,
+                budget_bytes: None,
+                ..codec
+            },
+            rate: RateConfig::default(),
+            ..self
+        }
+    }
+
     /// Checks the values.
     ///
     /// # Errors
@@ -233,5 +280,61 @@ impl AgentConfig {
             sweep_log: self.sweep_log.clone(),
             ..NodeOptions::default()
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use localization::pose_source::{NoiseMode, NoisyPoseConfig, TrackedPoseConfig};
+
+    use super::*;
+
+    fn in_fleet(pose: PoseSourceConfig, index: usize, is_ego: bool) -> AgentSettings {
+        let settings = AgentSettings {
+            pose,
+            codec: CodecConfig {
+                budget_bytes: Some(4000),
+                ..CodecConfig::default()
+            },
+            ..AgentSettings::default()
+        };
+        settings.in_fleet(FleetPlace {
+            scenario: "town1",
+            index,
+            is_ego,
+            gate: None,
+        })
+    }
+
+    #[test]
+    fn a_fixed_error_spares_the_ego() {
+        let noisy = |mode| {
+            PoseSourceConfig::Noisy(NoisyPoseConfig {
+                mode,
+                ..NoisyPoseConfig::default()
+            })
+        };
+        let fixed = noisy(NoiseMode::Fixed);
+        let recorded = in_fleet(fixed.clone(), 0, true).pose;
+        assert_eq!(recorded, PoseSourceConfig::Recorded);
+        assert_eq!(in_fleet(fixed.clone(), 1, false).pose, fixed);
+        let independent = noisy(NoiseMode::Independent);
+        assert_eq!(in_fleet(independent.clone(), 0, true).pose, independent);
+    }
+
+    #[test]
+    fn tracked_vehicles_measure_in_turn_and_the_map_of_the_ego_is_whole() {
+        let phase = |settings: AgentSettings| match settings.pose {
+            PoseSourceConfig::Tracked(tracked) => tracked.phase,
+            other => panic!("{other:?}"),
+        };
+        let tracked = PoseSourceConfig::Tracked(TrackedPoseConfig::default());
+        let [ego, neighbour] =
+            [(2, true), (3, false)].map(|(index, is_ego)| in_fleet(tracked.clone(), index, is_ego));
+        assert_eq!(
+            (ego.codec.budget_bytes, neighbour.codec.budget_bytes),
+            (None, Some(4000))
+        );
+        assert_eq!((phase(ego), phase(neighbour)), (2, 3));
     }
 }

@@ -11,7 +11,6 @@ use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
     Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription,
-    unix_nanos,
 };
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
@@ -19,7 +18,6 @@ use protocol::{
     CavId, DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role,
     Stream, Topic, wire,
 };
-use support::nanos;
 use support::sweep_log::SweepLog;
 
 use crate::agent::{Agent, AgentInput, Perception};
@@ -308,15 +306,12 @@ impl<'a> Node<'a> {
             used.iter()
                 .filter(|(_, is_used)| *is_used)
                 .for_each(|(topic, _)| self.bus.stats().received(topic));
-            let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else {
                 continue;
             };
-            self.bus
-                .stats()
-                .timed("lidar transport", Duration::from_nanos(transport));
+            self.bus.stats().timed("lidar transport", sweep.transport());
             self.bus.stats().received(&self.lidar);
-            let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
+            let arrived_nanos = sweep.unix_nanos();
             self.process(&AgentInput {
                 capture_nanos,
                 cloud: &points,

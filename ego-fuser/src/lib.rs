@@ -1,7 +1,7 @@
 //! Ego of a collaborating fleet: received BEV feature maps, poses and boxes in, detections around the ego out.
 //!
 //! - [`ego`]: the pipeline, the same live and offline; [`node`]: the process around it.
-//! - [`pairing`]: the messages that belong to a frame.
+//! - [`pairing`]: the messages that belong to a frame; [`silence`]: the neighbours that it waits for.
 //! - [`misbehaviour`]: neighbours whose messages contradict the ego's perception.
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
@@ -32,4 +32,5 @@ pub mod node;
 pub(crate) mod pace_control;
 pub mod pairing;
 mod peer_models;
+pub mod silence;
 pub mod view;

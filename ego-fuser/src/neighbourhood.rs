@@ -6,12 +6,12 @@ use std::sync::Arc;
 use bus::{Bus, BusError, Inbox, Membership, Subscription};
 use protocol::{CavId, Role, Stream, Topic};
 
+use crate::silence::Silence;
+
 /// Largest number of subscribed neighbours: a flood of tokens must not become a flood of subscriptions.
 const MAX_NEIGHBOURS: usize = 64;
 /// Largest number of vehicles that wait for a subscription.
 const MAX_QUEUED: usize = 256;
-/// Consecutive frames without a message after which a neighbour is not awaited any more, until its next message.
-const SILENT_AFTER: u32 = 3;
 
 /// The other agents of the run.
 pub(crate) struct Neighbourhood {
@@ -20,18 +20,14 @@ pub(crate) struct Neighbourhood {
     over_link: bool,
     allowed: Option<BTreeSet<CavId>>,
     membership: Membership,
-    members: BTreeMap<CavId, Member>,
+    members: BTreeMap<CavId, Vec<Subscription>>,
+    silence: Silence,
     queue: Queue,
 }
 
 /// Vehicles beyond the limit when they joined, first in first out: their tokens are not announced again.
 #[derive(Default)]
 struct Queue(VecDeque<CavId>);
-
-struct Member {
-    silent_frames: u32,
-    _subscriptions: Vec<Subscription>,
-}
 
 /// Topic on which an ego receives a vehicle: direct, or behind the link emulation if there is one. Its own agent is
 /// always received directly.
@@ -77,6 +73,7 @@ impl Neighbourhood {
             allowed,
             membership,
             members,
+            silence: Silence::default(),
             queue,
         })
     }
@@ -89,6 +86,7 @@ impl Neighbourhood {
                 self.queue.add(cav);
             } else if !is_there {
                 self.queue.remove(&cav);
+                self.silence.reset(&cav);
                 if self.members.remove(&cav).is_some() {
                     tracing::info!(%cav, "a neighbour has left");
                     gone.push(cav);
@@ -110,13 +108,7 @@ impl Neighbourhood {
         let subscriptions = topics
             .map(|topic| bus.subscribe(topic, inbox))
             .collect::<Result<_, _>>()?;
-        self.members.insert(
-            cav,
-            Member {
-                silent_frames: 0,
-                _subscriptions: subscriptions,
-            },
-        );
+        self.members.insert(cav, subscriptions);
         Ok(())
     }
 
@@ -136,24 +128,17 @@ impl Neighbourhood {
 
     /// Members whose messages a frame waits for.
     pub(crate) fn awaited(&self) -> impl Iterator<Item = &CavId> {
-        self.members
-            .iter()
-            .filter(|(_, member)| member.silent_frames < SILENT_AFTER)
-            .map(|(cav, _)| cav)
+        self.members().filter(|cav| self.silence.is_awaited(cav))
     }
 
     /// Records a message from `cav`.
     pub(crate) fn received(&mut self, cav: &CavId) {
-        if let Some(member) = self.members.get_mut(cav) {
-            member.silent_frames = 0;
-        }
+        self.silence.reset(cav);
     }
 
     /// Records that a frame was decided without a message from `cav`.
     pub(crate) fn missed(&mut self, cav: &CavId) {
-        if let Some(member) = self.members.get_mut(cav) {
-            member.silent_frames = member.silent_frames.saturating_add(1);
-        }
+        self.silence.missed(cav);
     }
 }
 

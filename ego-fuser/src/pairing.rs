@@ -170,6 +170,15 @@ impl<T> Pairing<T> {
         (paired, dropped)
     }
 
+    /// True if a CAV's message for the ego's frame waits, or a later one: then this frame's own is lost, and waiting for
+    /// it is useless.
+    #[must_use]
+    pub fn has_reached(&self, cav: &CavId, ego_capture_nanos: u64) -> bool {
+        let lead_nanos = self.config.max_lead_nanos;
+        self.capture_times(cav)
+            .any(|time| time.saturating_add(lead_nanos) >= ego_capture_nanos)
+    }
+
     /// The capture times of messages of a CAV that wait, oldest first.
     pub fn capture_times(&self, cav: &CavId) -> impl Iterator<Item = u64> + '_ {
         self.waiting

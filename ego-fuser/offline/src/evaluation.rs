@@ -17,13 +17,14 @@ use std::path::PathBuf;
 
 use agent::agent::Agent;
 use agent::attack::{Attack, AttackConfig};
+use agent::config::{AgentSettings, FleetPlace};
 use agent::rate::RateConfig;
 use dataset::class_set::ClassSet;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
 use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::{LeftOut, LoadOptions, Scenario};
-use localization::pose_source::{NoiseMode, PoseSourceConfig};
+use localization::pose_source::PoseSourceConfig;
 use perception::detector::Detector;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
@@ -41,7 +42,7 @@ use training::feature_store::MapSource;
 pub use error::EvaluateError;
 use participant::Participant;
 use sent::{Sent, stamp, view};
-use stepped::{RemotePool, SteppedConfig, VehicleConfig};
+use stepped::{RemotePool, SteppedConfig};
 use sweeps::Sweep;
 
 /// Configuration of an evaluation.
@@ -130,11 +131,6 @@ impl Evaluator {
             |protocol| protocol.rule_within(area.lidar_range_m),
         );
         let ego = ego.with_comm_range(rule.comm_range_m);
-        let codec = CodecConfig {
-            gate: config.codec.gate.or(ego.method().gate()),
-            ..config.codec
-        };
-        let config = EvaluateConfig { codec, ..config };
         Ok(Self {
             weights,
             ego,
@@ -237,8 +233,9 @@ impl Evaluator {
             ..LoadOptions::default()
         };
         let mut participants = Vec::with_capacity(scenario.agents.len());
-        for cav in &scenario.agents {
-            participants.push(self.participant(scenario, cav, participants.is_empty(), None)?);
+        for (index, cav) in scenario.agents.iter().enumerate() {
+            let settings = self.settings(scenario, index);
+            participants.push(self.participant(scenario, cav, &settings)?);
         }
         let places: Vec<usize> = (0..participants.len()).collect();
         for tick in 0..scenario.ticks.len() {
@@ -253,26 +250,35 @@ impl Evaluator {
         Ok(ControlFlow::Continue(()))
     }
 
+    /// Settings of the vehicle of an index, where it has none of its own; that of the first is the ego.
+    fn settings(&self, scenario: &Scenario, index: usize) -> AgentSettings {
+        let EvaluateConfig {
+            pose_source,
+            codec,
+            rate,
+            ..
+        } = &self.config;
+        let settings = AgentSettings {
+            pose: pose_source.clone(),
+            codec: *codec,
+            rate: *rate,
+            falsification: None,
+        };
+        settings.in_fleet(FleetPlace {
+            scenario: &scenario.name,
+            index,
+            is_ego: index == 0,
+            gate: self.ego.method().gate(),
+        })
+    }
+
     /// A vehicle with its pipeline.
     fn participant(
         &self,
         scenario: &Scenario,
         cav: &CavId,
-        is_ego: bool,
-        own: Option<&VehicleConfig>,
+        settings: &AgentSettings,
     ) -> Result<Participant, EvaluateError> {
-        let all = &self.config.pose_source;
-        let source = match own {
-            Some(own) => own.pose_source.clone(),
-            None if is_ego => source_of_ego(all),
-            None => all.clone(),
-        };
-        // Messages of the ego's own vehicle are not transmitted on the link.
-        let rate = if is_ego {
-            RateConfig::default()
-        } else {
-            own.map_or(self.config.rate, |own| own.rate)
-        };
         let detector =
             Detector::from_weights(&self.weights, &self.weights.detector_config()?, Device::Cpu)?;
         let place = scenario
@@ -280,17 +286,14 @@ impl Evaluator {
             .iter()
             .position(|agent| agent == cav)
             .unwrap_or(0);
-        let attack = match own.and_then(|own| own.falsification) {
+        let attack = match settings.falsification {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
             None => self.config.attack.and_then(|attack| attack.of(place, cav)),
         };
         let inference = Inference::new(Device::Cpu, self.config.precision);
-        let agent = Agent::new(
-            cav.clone(),
-            source.for_scenario(&scenario.name).build(inference)?,
-            detector,
-        );
-        Ok(Participant::new(agent.within(rate), attack))
+        let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
+        let agent = agent.within(settings.rate);
+        Ok(Participant::new(agent, attack, settings.codec))
     }
 
     /// True if sweeps have to be read at all.
@@ -311,11 +314,6 @@ impl Evaluator {
         for Sweep { place, frame, map } in sweeps {
             // Without an exchange, neighbours have nothing to encode; their poses are still needed.
             let is_needed = place == 0 || self.ego.method().exchange() != Exchange::Nothing;
-            let codec = if place == 0 {
-                of_the_ego(self.config.codec)
-            } else {
-                self.config.codec
-            };
             let participant = &mut participants[place];
             participant.capture(sent.last());
             sent.push(view(
@@ -323,7 +321,6 @@ impl Evaluator {
                 &frame,
                 map.as_ref(),
                 is_needed.then_some(exchange),
-                &codec,
             )?);
             frames.push(frame);
         }
@@ -422,25 +419,5 @@ pub(crate) fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
         comm_range_m: Ego::COMM_RANGE_M,
         min_corners: 8,
         classes: ClassSet::VEHICLES,
-    }
-}
-
-/// The codec of the ego's own map, which is not restricted by a gate or a budget.
-fn of_the_ego(codec: CodecConfig) -> CodecConfig {
-    CodecConfig {
-        gate: None,
-        budget_bytes: None,
-        ..codec
-    }
-}
-
-/// Source of the ego's own poses: one fixed offset does not apply to it, as in the reference code. With the same offset
-/// on all vehicles the relative poses would hardly change.
-fn source_of_ego(all: &PoseSourceConfig) -> PoseSourceConfig {
-    match all {
-        PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Fixed => {
-            PoseSourceConfig::Recorded
-        }
-        other => other.clone(),
     }
 }

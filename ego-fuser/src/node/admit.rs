@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use bus::{Arrival, unix_nanos};
+use bus::Arrival;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{CavId, DropReason, HEADER_LEN, PoseEstimate, Stamp, Stream, wire};
 
@@ -33,10 +33,7 @@ impl Node<'_> {
             return;
         };
         self.bus.stats().timed("decode", began.elapsed());
-        let transport =
-            Duration::from_nanos(unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos));
-        // Decoding, which lies between arrival and now, is part of the wait.
-        let transport = transport.saturating_sub(arrival.at.elapsed());
+        let transport = arrival.transport();
         self.bus
             .stats()
             .timed(&format!("{} transport", self.stream), transport);

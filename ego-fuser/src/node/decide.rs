@@ -49,18 +49,13 @@ impl Node<'_> {
     }
 
     fn is_complete(&self, capture_nanos: u64) -> bool {
-        let tolerance = self.options.pairing.max_lead_nanos;
         self.neighbourhood
             .iter()
             .flat_map(Neighbourhood::awaited)
             .all(|cav| {
-                // Or a later one: then this frame's own is lost, and waiting is useless.
                 self.ended.contains(cav)
                     || self.models.is_other(cav)
-                    || self
-                        .pairing
-                        .capture_times(cav)
-                        .any(|time| time.saturating_add(tolerance) >= capture_nanos)
+                    || self.pairing.has_reached(cav, capture_nanos)
             })
     }
 

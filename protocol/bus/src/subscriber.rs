@@ -2,12 +2,13 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use protocol::{
     Control, DropReason, Header, Key, KeyExpr, Kind, Limits, Payload, Stream, Topic, WireError,
     wire,
 };
+use support::nanos;
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SourceInfo};
@@ -70,6 +71,19 @@ pub struct Arrival {
 }
 
 impl Arrival {
+    /// Arrival time on the system clock, nanoseconds.
+    #[must_use]
+    pub fn unix_nanos(&self) -> u64 {
+        unix_nanos().saturating_sub(nanos::of(self.at.elapsed()))
+    }
+
+    /// Time from the publication to the arrival; what the message waits for here is no part of it.
+    #[must_use]
+    pub fn transport(&self) -> Duration {
+        let published = self.header.stamp.publish_nanos;
+        Duration::from_nanos(self.unix_nanos().saturating_sub(published))
+    }
+
     /// Bytes on the wire, without the overhead of the transport.
     #[must_use]
     pub fn wire_bytes(&self) -> u64 {

@@ -215,8 +215,8 @@ impl NoisyPoseConfig {
 )]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseMode {
-    /// One offset for all agents and frames, as in the reference code, which resets its seed at every call. There the
-    /// ego has no error; give its agent the `recorded` source to reproduce that.
+    /// One offset for all neighbours and frames, as in OpenCOOD's code, which resets its seed at every call. The ego has
+    /// no error, there as in every run and evaluation here; an agent that is started alone has the offset.
     Fixed,
     /// Drawn anew for every agent and frame.
     #[default]
@@ -225,6 +225,15 @@ pub enum NoiseMode {
     Autoregressive,
     /// Measured errors of a pose generator, from a table.
     Replayed,
+}
+
+impl NoiseMode {
+    /// True if the ego's pose has no error, as in OpenCOOD's code: with one offset on all vehicles the relative poses
+    /// would hardly change.
+    #[must_use]
+    pub fn spares_ego(self) -> bool {
+        self == Self::Fixed
+    }
 }
 
 /// Error of setting up a pose source.

@@ -16,6 +16,8 @@ use super::sent::Sent;
 pub(super) struct Participant {
     agent: Agent,
     attack: Option<Attack>,
+    /// Encoding of its maps.
+    codec: CodecConfig,
     times: PoseTimes,
 }
 
@@ -29,10 +31,11 @@ pub(super) struct PoseTimes {
 }
 
 impl Participant {
-    pub(super) fn new(agent: Agent, attack: Option<Attack>) -> Self {
+    pub(super) fn new(agent: Agent, attack: Option<Attack>, codec: CodecConfig) -> Self {
         Self {
             agent,
             attack,
+            codec,
             times: PoseTimes::default(),
         }
     }
@@ -99,13 +102,12 @@ impl Participant {
     pub(super) fn write_map(
         &mut self,
         perception: Perception,
-        codec: &CodecConfig,
         capture_nanos: u64,
     ) -> Result<EncodedFeatures, WireError> {
         self.agent.write_map(
             perception.features,
             &perception.confidence,
-            codec,
+            &self.codec,
             capture_nanos,
         )
     }

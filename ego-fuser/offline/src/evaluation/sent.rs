@@ -5,8 +5,7 @@ use agent::attack::CapturedMessages;
 use dataset::frame::Frame;
 use protocol::message::{Bev, Boxes, Payload, Points};
 use protocol::{
-    CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError,
-    wire,
+    CavId, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire,
 };
 use tch::Tensor;
 
@@ -92,7 +91,6 @@ pub(super) fn view(
     frame: &Frame,
     map: Option<&Tensor>,
     exchange: Option<Exchange>,
-    codec: &CodecConfig,
 ) -> Result<Sent, EvaluateError> {
     let input = AgentInput {
         capture_nanos: frame.capture_nanos,
@@ -129,7 +127,7 @@ pub(super) fn view(
         }
         Some(Exchange::Features | Exchange::Nothing) => {
             let perception = participant.perceive(frame, map)?;
-            let features = participant.write_map(perception, codec, frame.capture_nanos)?;
+            let features = participant.write_map(perception, frame.capture_nanos)?;
             let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
             let rate = message.features.rate;
             let content = Content::Features(message.features.decode(&Limits::default())?);

@@ -1,5 +1,6 @@
 //! Simulation time: compute times are given, the link emulation determines arrivals, and the ego fuses at each tick
-//! exactly the messages that have arrived by its deadline.
+//! exactly the messages that have arrived when it decides. It decides as the live ego does: once the messages of all
+//! awaited neighbours are there, at the latest when the deadline passes or its own next map arrives.
 //!
 //! No wall clock is read, so the same inputs and seed give the same result on a busy and on an idle machine. The
 //! pipelines, the pairing and the link emulation are those of the live processes.
@@ -12,16 +13,12 @@ use std::collections::{BTreeMap, VecDeque};
 use std::ops::{ControlFlow, Range};
 use std::path::PathBuf;
 
-use agent::attack::Falsification;
-use agent::rate::RateConfig;
+use agent::config::AgentSettings;
 use dataset::frame::Frame;
 use dataset::ground_truth;
 use dataset::{LoadOptions, Scenario};
 use link::{LinkConfig, LinkEmulator};
-use localization::pose_source::PoseSourceConfig;
-use protocol::{
-    CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
-};
+use protocol::{CavId, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
 use support::random::derive_seed;
 
 pub use compute::ComputeTimes;
@@ -30,10 +27,11 @@ pub use remote::{RemoteError, RemotePool};
 use super::participant::Participant;
 use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
-use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
+use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
 use ego_fuser::ego::{Skipped, View};
 use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
+use ego_fuser::silence::Silence;
 use fusion::method::Exchange;
 
 /// Configuration of a fleet in simulation time.
@@ -45,7 +43,7 @@ pub struct SteppedConfig {
     pub link_folder: PathBuf,
     /// Seed of losses and delays. Every scenario derives its own from it.
     pub seed: u64,
-    /// Deadline of the ego after its tick, nanoseconds.
+    /// Longest time that the ego waits for its neighbours after its own map has arrived, nanoseconds.
     pub deadline_nanos: u64,
     /// Pairing of messages with a frame.
     pub pairing: PairingConfig,
@@ -53,8 +51,8 @@ pub struct SteppedConfig {
     pub compute: ComputeTimes,
     /// Vehicles that take part.
     pub crew: AgentPool,
-    /// Vehicles with settings of their own.
-    pub vehicles: BTreeMap<CavId, VehicleConfig>,
+    /// Vehicles with settings of their own, as [`AgentSettings::in_fleet`] gives them.
+    pub vehicles: BTreeMap<CavId, AgentSettings>,
     /// Ticks of a scenario; clipped to the available ones.
     pub ticks: Range<usize>,
     /// A variant of the sweeps, see [`Scenario::lidar_variants`].
@@ -69,19 +67,6 @@ pub enum AgentPool {
     First(usize),
     /// These, the ego first; the others are ignored completely.
     Named(Vec<CavId>),
-}
-
-/// Settings of one vehicle.
-#[derive(Debug, Clone, PartialEq)]
-pub struct VehicleConfig {
-    /// Source of its pose.
-    pub pose_source: PoseSourceConfig,
-    /// Encoding of its maps.
-    pub codec: CodecConfig,
-    /// Its rate control. There is no queue to observe.
-    pub rate: RateConfig,
-    /// Field that it falsifies; absent: none.
-    pub falsification: Option<Falsification>,
 }
 
 /// Runs a scenario; `on_frame` may end it. Each frame's stamp has the time at which the ego published it.
@@ -116,7 +101,7 @@ struct Member {
 
 /// Location of a vehicle's pipeline.
 enum Pipeline {
-    Here(Box<Participant>, CodecConfig),
+    Here(Box<Participant>),
     /// In a process of its own.
     Elsewhere,
 }
@@ -125,8 +110,6 @@ enum Pipeline {
 struct Computed {
     /// Absent where the ego's sweep cannot be read.
     own: Option<View>,
-    /// Neighbours that sent something.
-    senders: Vec<CavId>,
     /// Of all vehicles that take part, the ego first.
     frames: Vec<Frame>,
     poses: Vec<PoseEstimate>,
@@ -145,9 +128,10 @@ struct Run<'a> {
     end: usize,
     computed: VecDeque<Computed>,
     delivery: DelayedDelivery,
+    /// Messages that arrive after the last decision, in order of time.
+    arriving: VecDeque<Arrived>,
     pairing: Pairing<Envelope>,
-    /// When messages arrived, by vehicle: capture time and arrival.
-    arrivals: BTreeMap<CavId, VecDeque<(u64, u64)>>,
+    silence: Silence,
     /// Time at which the ego finishes its current fusion, nanoseconds.
     ego_free_nanos: u64,
 }
@@ -171,19 +155,13 @@ impl<'a> Run<'a> {
                 });
                 continue;
             }
-            let own = config.vehicles.get(cav);
-            let codec = own.map_or(evaluator.config.codec, |own| own.codec);
-            let gate = codec.gate.or(evaluator.ego.method().gate());
-            let codec = if crew.is_empty() {
-                of_the_ego(codec)
-            } else {
-                CodecConfig { gate, ..codec }
-            };
-            let participant = evaluator.participant(scenario, cav, crew.is_empty(), own)?;
+            let own = config.vehicles.get(cav).cloned();
+            let settings = own.unwrap_or_else(|| evaluator.settings(scenario, crew.len()));
+            let participant = evaluator.participant(scenario, cav, &settings)?;
             crew.push(Member {
                 place,
                 cav: cav.clone(),
-                pipeline: Pipeline::Here(Box::new(participant), codec),
+                pipeline: Pipeline::Here(Box::new(participant)),
             });
         }
         let is_witness =
@@ -214,8 +192,9 @@ impl<'a> Run<'a> {
             next: ticks.start,
             end: ticks.end,
             computed: VecDeque::new(),
+            arriving: VecDeque::new(),
             pairing: Pairing::new(config.pairing),
-            arrivals: BTreeMap::new(),
+            silence: Silence::default(),
             ego_free_nanos: 0,
         })
     }
@@ -239,7 +218,6 @@ impl<'a> Run<'a> {
         if sweeps.first().map(|ego| ego.place) != ego_place {
             self.computed.push_back(Computed {
                 own: None,
-                senders: vec![],
                 frames: vec![],
                 poses: vec![],
             });
@@ -247,13 +225,12 @@ impl<'a> Run<'a> {
         }
         let all = self.perceive(&sweeps)?;
         let mut frames: Vec<Frame> = sweeps.into_iter().map(|sweep| sweep.frame).collect();
-        let (mut poses, mut senders, mut own) = (Vec::with_capacity(all.len()), Vec::new(), None);
+        let (mut poses, mut own) = (Vec::with_capacity(all.len()), None);
         for (place, sent) in all.into_iter().enumerate() {
             poses.push(sent.pose);
             if place == 0 {
                 own = sent.view();
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
-                senders.push(sent.cav.clone());
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 enqueue(
                     &mut self.delivery,
@@ -273,12 +250,7 @@ impl<'a> Run<'a> {
             .load_tick(tick, self.observers.iter().copied(), &blind);
         self.evaluator.left_out.add_tick(&observers);
         frames.extend(observers.frames.into_iter().map(|(_, frame)| frame));
-        self.computed.push_back(Computed {
-            own,
-            senders,
-            frames,
-            poses,
-        });
+        self.computed.push_back(Computed { own, frames, poses });
         Ok(())
     }
 
@@ -296,9 +268,9 @@ impl<'a> Run<'a> {
             let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else {
                 continue;
             };
-            if let Pipeline::Here(participant, codec) = &mut member.pipeline {
+            if let Pipeline::Here(participant) = &mut member.pipeline {
                 participant.capture(all.last());
-                all.push(view(participant, frame, map.as_ref(), exchange, codec)?);
+                all.push(view(participant, frame, map.as_ref(), exchange)?);
             }
         }
         Ok(all)
@@ -309,7 +281,7 @@ impl<'a> Run<'a> {
             .config
             .vehicles
             .values()
-            .any(|own| own.pose_source.looks_at_sweeps());
+            .any(|own| own.pose.looks_at_sweeps());
         let points = own || self.evaluator.remote.is_some() || self.evaluator.needs_points();
         LoadOptions {
             points,
@@ -322,38 +294,23 @@ impl<'a> Run<'a> {
     fn decide(&mut self, tick: usize) -> Result<Option<EvaluatedFrame>, EvaluateError> {
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
         let compute = self.config.compute;
-        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
-        let closes_nanos = capture_nanos
-            .saturating_add(self.config.deadline_nanos)
-            .max(ready_nanos);
-        while self.next < self.end && self.scenario.ticks[self.next].capture_nanos <= closes_nanos {
+        while self.next <= tick {
             self.compute()?;
         }
-        for arrived in self.delivery.until(closes_nanos) {
-            self.take_in(arrived);
-        }
-        let computed = self
-            .computed
-            .pop_front()
-            .expect("a tick closes after it began");
-        let Computed {
+        let Some(Computed {
             own: Some(own),
-            senders,
             frames,
             poses,
-        } = computed
+        }) = self.computed.pop_front()
         else {
             return Ok(None);
         };
-        let decided_nanos = self
-            .complete_nanos(capture_nanos, &senders)
-            .unwrap_or(closes_nanos)
-            .max(ready_nanos);
-        let done_nanos = decided_nanos
-            .max(self.ego_free_nanos)
-            .saturating_add(compute.fuse_nanos());
+        // Arrival of the own map.
+        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
+        let decided_nanos = self.wait(capture_nanos, ready_nanos)?;
+        let done_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
         self.ego_free_nanos = done_nanos;
-        let mut result = self.fuse(tick, &own, &senders)?;
+        let mut result = self.fuse(tick, &own)?;
         // Measured times would differ in every run.
         let stage = |name: &str, nanos| StageTiming {
             stage: name.into(),
@@ -382,48 +339,80 @@ impl<'a> Run<'a> {
         }))
     }
 
+    /// Takes in messages until the ego decides on the frame; returns the time at which it does.
+    fn wait(&mut self, capture_nanos: u64, ready_nanos: u64) -> Result<u64, EvaluateError> {
+        let deadline_nanos = ready_nanos.saturating_add(self.config.deadline_nanos);
+        // It may still fuse the frame before.
+        let begins_nanos = ready_nanos.max(self.ego_free_nanos);
+        let mut closes_nanos = begins_nanos.max(deadline_nanos);
+        loop {
+            // A frame that is followed by a newer one waits no longer.
+            if let Some(next) = self.computed.iter().find_map(|next| next.own.as_ref()) {
+                let arrives_nanos = next
+                    .capture_nanos
+                    .saturating_add(self.config.compute.agent_nanos());
+                closes_nanos = closes_nanos.min(begins_nanos.max(arrives_nanos));
+            }
+            let next = self
+                .scenario
+                .ticks
+                .get(self.next)
+                .filter(|_| self.next < self.end);
+            if next.is_none_or(|next| next.capture_nanos > closes_nanos) {
+                break;
+            }
+            self.compute()?;
+        }
+        self.arriving.extend(self.delivery.until(closes_nanos));
+        while let Some(arrived) = self.next_arrival(begins_nanos) {
+            self.take_in(arrived);
+        }
+        let mut decided_nanos = begins_nanos;
+        while !self.is_complete(capture_nanos) {
+            let Some(arrived) = self.next_arrival(closes_nanos) else {
+                return Ok(closes_nanos);
+            };
+            decided_nanos = arrived.nanos;
+            self.take_in(arrived);
+        }
+        Ok(decided_nanos)
+    }
+
+    /// The next message that arrives by a time.
+    fn next_arrival(&mut self, by_nanos: u64) -> Option<Arrived> {
+        let is_due = self.arriving.front()?.nanos <= by_nanos;
+        if is_due {
+            self.arriving.pop_front()
+        } else {
+            None
+        }
+    }
+
     /// Queues an arrived message for its tick.
     fn take_in(&mut self, arrived: Arrived) {
-        let Arrived { nanos, envelope } = arrived;
+        let envelope = arrived.envelope;
         let (cav, capture_nanos) = (envelope.view.cav.clone(), envelope.view.capture_nanos);
-        let arrivals = self.arrivals.entry(cav.clone()).or_default();
-        arrivals.push_back((capture_nanos, nanos));
-        if arrivals.len() > self.config.pairing.depth {
-            arrivals.pop_front();
-        }
+        self.silence.reset(&cav);
         if let Some(lost) = self.pairing.insert(&cav, capture_nanos, envelope) {
             self.delivery.dropped(&lost.cav, lost.reason);
         }
     }
 
-    /// Arrival of the last of the senders' messages of a tick; `None` where one is missing.
-    fn complete_nanos(&self, capture_nanos: u64, senders: &[CavId]) -> Option<u64> {
-        if self.evaluator.ego.method().exchange() == Exchange::Nothing {
-            return Some(capture_nanos);
-        }
-        let of_tick = |(time, _): &&(u64, u64)| {
-            time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos
-        };
-        let mut complete_nanos = capture_nanos;
-        for cav in senders {
-            let arrivals = self.arrivals.get(cav)?;
-            complete_nanos = complete_nanos.max(
-                arrivals
-                    .iter()
-                    .filter(of_tick)
-                    .map(|(_, nanos)| *nanos)
-                    .min()?,
-            );
-        }
-        Some(complete_nanos)
+    /// True if a frame waits for nothing more.
+    fn is_complete(&self, capture_nanos: u64) -> bool {
+        self.neighbours().all(|cav| {
+            !self.silence.is_awaited(cav) || self.pairing.has_reached(cav, capture_nanos)
+        })
     }
 
-    fn fuse(
-        &mut self,
-        tick: usize,
-        own: &View,
-        senders: &[CavId],
-    ) -> Result<protocol::Detections, EvaluateError> {
+    /// Vehicles whose messages the ego can use.
+    fn neighbours(&self) -> impl Iterator<Item = &CavId> {
+        let exchanges = self.evaluator.ego.method().exchange() != Exchange::Nothing;
+        let neighbours = self.crew.iter().skip(1).filter(move |_| exchanges);
+        neighbours.map(|member| &member.cav)
+    }
+
+    fn fuse(&mut self, tick: usize, own: &View) -> Result<protocol::Detections, EvaluateError> {
         let (paired, dropped) = self.pairing.pair(own.capture_nanos);
         let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
         for Paired {
@@ -455,27 +444,25 @@ impl<'a> Run<'a> {
         let mut result =
             self.evaluator
                 .report(tick - self.config.ticks.start, own, &views, &bytes, output);
-        if self.evaluator.ego.method().exchange() != Exchange::Nothing {
-            for cav in senders
-                .iter()
-                .filter(|cav| views.iter().all(|view| view.cav != **cav))
-            {
-                let reason = dropped
-                    .iter()
-                    .rev()
-                    .find(|lost| lost.cav == *cav)
-                    .map(|lost| lost.reason);
-                result.skipped.push(SkippedNeighbour {
-                    cav: cav.clone(),
-                    reason,
-                });
-            }
+        let silent: Vec<CavId> = self
+            .neighbours()
+            .filter(|cav| views.iter().all(|view| view.cav != **cav))
+            .cloned()
+            .collect();
+        for cav in silent {
+            self.silence.missed(&cav);
+            let lost = dropped.iter().rev().find(|lost| lost.cav == cav);
+            let reason = lost.map(|lost| lost.reason);
+            result.skipped.push(SkippedNeighbour { cav, reason });
         }
         Ok(result)
     }
 
     /// Closes the accounting: messages still on the link or queued for a tick that will not come are in flight.
     fn close(&mut self) {
+        while let Some(arrived) = self.arriving.pop_front() {
+            self.take_in(arrived);
+        }
         for member in self.crew.iter().skip(1) {
             let cav = &member.cav;
             let waiting = self.pairing.forget(cav) as u64;

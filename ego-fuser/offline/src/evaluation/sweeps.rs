@@ -20,7 +20,7 @@ pub(super) struct Sweep {
 
 impl Evaluator {
     /// Reads the frames of the agents at `places` at a tick. Absent agents and frames that cannot be read are left out
-    /// and counted; `with_maps` selects the agents whose maps are needed.
+    /// and counted; the first of them is the ego; `with_maps` selects the agents whose maps are needed.
     pub(super) fn sweeps(
         &mut self,
         scenario: &Scenario,
@@ -29,14 +29,20 @@ impl Evaluator {
         load: &LoadOptions,
         with_maps: impl Fn(usize) -> bool,
     ) -> Result<Vec<Sweep>, EvaluateError> {
-        let loaded = scenario.load_tick(tick, places.iter().copied(), load);
+        let mut loaded = scenario.load_tick(tick, places.iter().copied(), load);
+        // The account takes the first as the ego, which may be any agent of the recording.
+        let rank = |agent: usize| places.iter().position(|&place| place == agent);
+        for (agent, _) in &mut loaded.unreadable {
+            *agent = rank(*agent).unwrap_or(usize::MAX);
+        }
         self.left_out.add_tick(&loaded);
         let mut sweeps = Vec::with_capacity(loaded.frames.len());
         for (place, frame) in loaded.frames {
             match self.map_of(scenario, place, tick, with_maps(place)) {
                 Ok(map) => sweeps.push(Sweep { place, frame, map }),
                 Err(FeatureStoreError::Read(error)) => {
-                    self.left_out.add_unreadable(place, Problem::from(&error))
+                    let rank = rank(place).unwrap_or(usize::MAX);
+                    self.left_out.add_unreadable(rank, Problem::from(&error));
                 }
                 Err(other) => return Err(Box::new(other).into()),
             }

@@ -4,9 +4,7 @@ use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
 use dataset::frame::Frame;
-use localization::pose_source::{
-    NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable,
-};
+use localization::pose_source::{NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
 use protocol::config::within;
 use protocol::{CavId, Pose, PoseEstimate};
 use rand::Rng;
@@ -69,7 +67,7 @@ impl SamplePoses {
                 ..DrawnError::default()
             });
         };
-        let spares_ego = noise.mode == NoiseMode::Fixed;
+        let spares_ego = noise.mode.spares_ego();
         let noise = NoisyPose::new(&NoisyPoseConfig {
             seed,
             ..noise.clone()
@@ -222,6 +220,7 @@ impl DrawnError {
 
 #[cfg(test)]
 mod tests {
+    use localization::pose_source::NoiseMode;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 

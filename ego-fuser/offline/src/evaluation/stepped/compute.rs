@@ -171,7 +171,8 @@ impl Evaluator {
             .agents
             .iter()
             .take(MEASURED_VEHICLES)
-            .map(|cav| self.participant(scenario, cav, true, None))
+            .enumerate()
+            .map(|(index, cav)| self.participant(scenario, cav, &self.settings(scenario, index)))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
         let Samples {
             mut pose,
@@ -190,16 +191,7 @@ impl Evaluator {
                 let frame = scenario.load(place, tick, &LoadOptions::default())?;
                 motion = frame.motion();
                 let began = Instant::now();
-                sent.extend(
-                    view(
-                        participant,
-                        &frame,
-                        None,
-                        Some(exchange),
-                        &self.config.codec,
-                    )?
-                    .into_view(),
-                );
+                sent.extend(view(participant, &frame, None, Some(exchange))?.into_view());
                 let all = began.elapsed();
                 let times = participant.pose_times();
                 pose.push(ms(times.estimate));
