@@ -1,7 +1,8 @@
-//! Scores of a frame that was evaluated offline or in simulation time.
+//! Scores of frames that were evaluated offline or in simulation time.
 
 use deploy::score::FrameScores;
-use ego_fuser_offline::evaluation::EvaluatedFrame;
+use deploy::score::metrics::Metrics;
+use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator};
 use protocol::CavId;
 
 /// Scores a frame; if compute times are emulated, its stamp is the time of publication.
@@ -32,4 +33,27 @@ pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bo
         &poses,
         truth,
     );
+}
+
+/// Metrics of an evaluation that took so many seconds on its clock, with the data that it left out.
+pub(crate) fn metrics(
+    board: &FrameScores,
+    evaluator: &Evaluator,
+    clock: &str,
+    pose_source: &str,
+    seconds: f64,
+) -> Metrics {
+    let metrics = Metrics::of(
+        board,
+        clock,
+        [evaluator.ego().method().name(), pose_source],
+        seconds,
+        evaluator.ledger(),
+        Some(evaluator.sent_bytes()),
+    );
+    Metrics {
+        left_out: evaluator.left_out().clone(),
+        protocol: evaluator.protocol(),
+        ..metrics
+    }
 }

@@ -4,18 +4,19 @@ mod error;
 mod processes;
 mod routes;
 
+use std::io;
 use std::path::{Path, PathBuf};
 
-use agent::config::Publish;
+use agent::config::{AgentSettings, FleetPlace, Publish};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::ground_truth::GroundTruthRule;
-use dataset::{self, OpenOptions};
+use dataset::{self, OpenOptions, Scenario as Recorded};
 use deploy::operate::keys::KeyError;
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
 use fusion::Exchange;
 use fusion::Method;
-use link::LinkEmulator;
+use link::{LinkConfig, LinkEmulator};
 use localization::baselines::load_baseline;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localizer, LocalizerError};
@@ -25,11 +26,13 @@ use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::{CavId, Principal, Role};
 use sim_replay::config::SceneConfig;
+use support::file_digests::FileDigests;
 use tch::Device;
 
 pub use self::error::FleetError;
 pub use self::processes::SessionContext;
 use crate::scenario::Scenario;
+use crate::scenario::fingerprint::{Provenance, files_of};
 use crate::scenario::weights_choice::weights_of;
 
 /// The program that runs fleets.
@@ -46,8 +49,8 @@ pub struct Fleet {
     pub ego: CavId,
     /// Number of ticks to play; `None`: until the run is ended.
     pub ticks: Option<usize>,
-    /// Folder of the recorded scenario, for its hash.
-    pub scene_dir: PathBuf,
+    /// The recorded scenario, with all its vehicles.
+    pub recorded: Recorded,
     /// Configuration of the model, from its weights.
     pub detector: DetectorConfig,
     /// Evaluation protocol of the run.
@@ -180,9 +183,6 @@ impl Fleet {
         } else {
             Some(scene.frames.map_or(left, |frames| frames.min(left)))
         };
-        let scene_dir = Some(scene.dir.join(&name))
-            .filter(|folder| folder.is_dir())
-            .unwrap_or(scene.dir.clone());
         scene.scenario = Some(name);
         scene.agents.clone_from(&agents);
         scenario.ego.id = Some(ego.clone());
@@ -191,7 +191,7 @@ impl Fleet {
             agents,
             ego,
             ticks,
-            scene_dir,
+            recorded: recorded.clone(),
             detector,
             protocol,
         })
@@ -208,6 +208,17 @@ impl Fleet {
     pub(crate) fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
         u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
+    }
+
+    /// Settings of a vehicle, for its process and for simulation time alike.
+    pub(crate) fn settings_of(&self, cav: &CavId) -> AgentSettings {
+        let index = self.agents.iter().position(|agent| agent == cav);
+        self.scenario.settings_of(cav).in_fleet(FleetPlace {
+            scenario: self.scenario.scene.scenario.as_deref().unwrap_or_default(),
+            index: index.unwrap_or_default(),
+            is_ego: *cav == self.ego,
+            gate: self.scenario.method.gate(),
+        })
     }
 
     /// Name of the pose source that all vehicles share, or `mixed`.
@@ -255,6 +266,35 @@ impl Fleet {
             .transpose()
     }
 
+    /// Digests of the programs, and of all files that the run reads.
+    ///
+    /// # Errors
+    /// The first file that cannot be read, by name.
+    pub(crate) fn provenance(&self, programs: &Path) -> io::Result<Provenance> {
+        let Scenario {
+            scene,
+            models,
+            method,
+            link,
+            ..
+        } = &self.scenario;
+        let settings = self.agents.iter().map(|cav| self.settings_of(cav));
+        let poses: Vec<_> = settings.map(|settings| settings.pose).collect();
+        // Opened before, when the run was planned.
+        let link = link
+            .as_ref()
+            .and_then(|link| LinkConfig::open(&link.model).ok());
+        let link = link.as_ref().map(|(link, folder)| (link, folder.as_path()));
+        let files = files_of(*method, models.weights.clone(), &poses, link);
+        let mut data = self.recorded.clone();
+        data.agents.clone_from(&self.agents);
+        data.ticks.drain(..scene.seek);
+        data.ticks.truncate(scene.frames.unwrap_or(usize::MAX));
+        let digests = FileDigests::default();
+        let data_sha256 = dataset::content_sha256([&data], scene.variant.as_deref(), &digests);
+        Provenance::collect(&Self::programs(programs), data_sha256, files, &digests)
+    }
+
     /// Executables of a fleet.
     #[must_use]
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
@@ -284,7 +324,7 @@ fn publish(method: Method) -> Publish {
 }
 
 /// Options with which a scenario's data set is opened.
-pub(crate) fn open_options(scene: &SceneConfig) -> OpenOptions {
+fn open_options(scene: &SceneConfig) -> OpenOptions {
     OpenOptions {
         intensity_scale: scene.intensity_scale,
         ..OpenOptions::default()

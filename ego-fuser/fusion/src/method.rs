@@ -4,6 +4,7 @@ use std::borrow::Cow;
 use std::ffi::OsStr;
 use std::fmt;
 use std::hash::{Hash, Hasher};
+use std::path::Path;
 use std::str::FromStr;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser, ValueParserFactory};
@@ -72,6 +73,12 @@ impl Method {
     #[must_use]
     pub const fn name(self) -> &'static str {
         self.0.name
+    }
+
+    /// The TorchScript file of a method `script:FILE.pt`.
+    #[must_use]
+    pub fn script_file(self) -> Option<&'static Path> {
+        self.name().strip_prefix(script::PREFIX).map(Path::new)
     }
 
     /// One line for `--help` and tables.

@@ -1,8 +1,9 @@
 //! Command line: messages and exit codes of wrong input, closed outputs, sibling programs, options in service files,
-//! poses of single clouds, fusion methods from files, trainings that are stopped and resumed.
+//! poses of single clouds, fusion methods from files, shipped experiments, trainings that are stopped and resumed.
 
 mod closed_output;
 mod evaluation;
+mod experiments;
 mod interruption;
 mod locate;
 mod programs;

@@ -40,7 +40,13 @@ fn average_precision(scene: &Path, method: Method) -> Value {
         },
         ..EvaluationOptions::default()
     };
-    let metrics = evaluate(&options, method, &mut || {}).unwrap();
+    let data = options
+        .part
+        .open(&options.dataset, &options.protocol)
+        .unwrap();
+    let metrics = evaluate(&options, &data, method, &mut || {})
+        .unwrap()
+        .metrics;
     assert_eq!(metrics.frames, 4);
     json!([metrics.ap_global, metrics.ap_frame_order])
 }

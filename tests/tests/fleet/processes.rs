@@ -101,7 +101,9 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     }
     let resolved = Scenario::load(&run.join("scenario.yaml")).unwrap();
     assert_eq!(resolved.scene.agents.len(), 2);
-    assert_eq!(resolved.provenance.unwrap().scene_files, 32);
+    let provenance = resolved.provenance.unwrap();
+    assert_eq!(provenance.data_sha256.len(), 64);
+    assert_eq!(provenance.files_sha256.len(), 1, "the weights");
 }
 
 #[test]

@@ -18,6 +18,11 @@ use tests::fleet::{programs, results, write_scenario, write_sighted_weights};
 use tests::locks::exclusive_lock;
 
 const TICKS: usize = 8;
+/// A method that comes with the programs.
+const ATTENTION: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../deploy/examples/attention.pt"
+);
 const MS: u64 = 1_000_000;
 
 /// A fleet with zero compute times, over a link.
@@ -496,6 +501,7 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
         "{}",
         text_of(&dry)
     );
+    assert!(!folder.path().join("dry").exists(), "nothing is written");
 
     let foreign = folder.path().join("one/maps/of-another-program.maps");
     fs::create_dir_all(foreign.parent().unwrap()).unwrap();
@@ -661,4 +667,75 @@ fn an_evaluation_crosses_a_link() {
         (&metrics["clock"], &metrics["age_ms"]["p50"]),
         (&"stepped".into(), &100.0.into())
     );
+}
+
+#[test]
+fn a_dry_run_generates_no_data_set() {
+    let folder = tempfile::tempdir().unwrap();
+    write_sighted_weights(&folder.path().join("weights.safetensors"));
+    let text = "name: e\ndataset: scene\nweights: weights.safetensors\n\
+        generate: {seed: 1201, scenarios: 2, frames: 3, agents: [2, 2]}\ngrid: {method: [max], loss: [0, 0.5]}\n";
+    fs::write(folder.path().join("experiment.yaml"), text).unwrap();
+    let dry = sweep(folder.path(), "dry", "1", &["--dry-run"]);
+    assert!(dry.status.success(), "{}", text_of(&dry));
+    assert!(
+        text_of(&dry).contains("2 runs of 6 frames; the data set"),
+        "{}",
+        text_of(&dry)
+    );
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2);
+}
+
+#[test]
+fn a_run_of_a_sweep_is_computed_anew_after_any_change_of_its_files() {
+    let folder = scene();
+    let script = folder.path().join("fusion/mine.pt");
+    fs::create_dir(folder.path().join("fusion")).unwrap();
+    fs::copy(ATTENTION, &script).unwrap();
+    let text = format!(
+        "name: e\ndataset: scene\nweights: weights.safetensors\nticks: 2\ngrid: {{method: [\"script:{}\"]}}\n",
+        script.display()
+    );
+    fs::write(folder.path().join("experiment.yaml"), text).unwrap();
+    let done_before = || {
+        let output = sweep(folder.path(), "out", "1", &[]);
+        assert!(output.status.success(), "{}", text_of(&output));
+        text_of(&output).contains("1 done before")
+    };
+    assert!(!done_before());
+    assert!(done_before());
+    let cloud = folder.path().join("scene/4288/000062.pcd");
+    let mut points = fs::read(&cloud).unwrap();
+    let middle = points.len() / 2;
+    points[middle] ^= 1;
+    fs::write(&cloud, points).unwrap();
+    assert!(!done_before(), "a bit of a point");
+    let labels = folder.path().join("scene/4288/000062.yaml");
+    let moved = fs::read_to_string(&labels).unwrap().replace("0.8]", "0.9]");
+    fs::write(&labels, moved).unwrap();
+    assert!(!done_before(), "a label");
+    fs::write(&script, b"no TorchScript").unwrap();
+    let output = sweep(folder.path(), "out", "1", &[]);
+    assert_eq!(output.status.code(), Some(2), "{}", text_of(&output));
+}
+
+#[test]
+fn an_unreadable_sweep_is_counted_as_in_a_live_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let rest = "clock: stepped\nstepped: {compute: {pose_ms: 10, map_ms: 40, fuse_ms: 20}}\nego: {id: \"4288\"}";
+    let scenario = write_scenario(folder.path(), 3, "", rest);
+    let cut_off = |cav: &str| {
+        let path = folder.path().join(format!("scene/{cav}/000062.pcd"));
+        let bytes = fs::read(&path).unwrap();
+        fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    };
+    cut_off("4279");
+    let neighbour = run_up(folder.path(), &scenario, "neighbour");
+    assert!(neighbour.lost_data());
+    let left_out = &neighbour.metrics.left_out;
+    assert_eq!((left_out.frames, left_out.ticks), (1, 0));
+    cut_off("4288");
+    let ego = run_up(folder.path(), &scenario, "ego");
+    assert_eq!(ego.metrics.left_out.ticks, 1);
+    assert_eq!(results(ego.folder.path()).len(), 2);
 }

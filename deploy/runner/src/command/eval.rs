@@ -19,7 +19,7 @@ use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
 use protocol::CodecConfig;
 use protocol::config::{FieldError, Section};
-use runner::experiment::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
+use runner::experiment::evaluation::{EvaluationOptions, Part, evaluate};
 use runner::experiment::report;
 use runner::experiment::table::{self, TableObserver, TableSpec};
 use support::output;
@@ -138,11 +138,13 @@ impl Arguments {
             return tables(spec, out);
         }
         let options = self.options()?;
-        let bar = progress::bar(self.method.len() * frame_count(&options)?, "frames");
+        let data = options.part.open(&options.dataset, &options.protocol)?;
+        let frames = self.method.len() * options.frame_count(&data);
+        let bar = progress::bar(frames, "frames");
         let mut all = Vec::new();
         for &method in &self.method {
             bar.set_message(method.name());
-            all.push(evaluate(&options, method, &mut || bar.inc(1))?);
+            all.push(evaluate(&options, &data, method, &mut || bar.inc(1))?.metrics);
         }
         bar.finish_and_clear();
         match (self.json, &all[..]) {

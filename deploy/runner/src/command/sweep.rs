@@ -19,7 +19,7 @@ pub(crate) struct Arguments {
     /// Number of compute processes, each with one thread. The results do not depend on it.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: u16,
-    /// Only print the number of runs and the time that they will take.
+    /// Only print the number of runs and the time that they will take; nothing is written.
     #[arg(long)]
     dry_run: bool,
     /// Keep the feature maps of all sweeps after the last run: a grid that is extended later needs no encoding again.
@@ -38,27 +38,26 @@ impl Arguments {
             Some(out) => out,
             None => PathBuf::from("sweeps").join(Experiment::read(&self.experiment)?.name),
         };
+        let jobs = usize::from(self.jobs);
+        if self.dry_run {
+            Sweep::announce(&self.experiment, &out, jobs)?;
+            return Ok(Outcome::Done);
+        }
         let sweep = Sweep::open(&self.experiment, &out)?;
         if self.worker {
             sweep.work()?;
             return Ok(Outcome::Done);
         }
-        let jobs = usize::from(self.jobs);
-        let options = SweepOptions {
-            out: out.clone(),
+        let swept = sweep.run(&SweepOptions {
             jobs,
-            dry_run: self.dry_run,
             keep_maps: self.keep_maps,
-        };
-        let swept = sweep.run(&options)?;
+        })?;
         output::text(&swept.table)?;
-        if !self.dry_run {
-            note_maps(&out.join("maps"));
-            output::note(format_args!(
-                "all columns and the report: {}",
-                out.display()
-            ));
-        }
+        note_maps(&out.join("maps"));
+        output::note(format_args!(
+            "all columns and the report: {}",
+            out.display()
+        ));
         Ok(left_out(swept.left_out.iter()))
     }
 }

@@ -1,8 +1,10 @@
 //! Offline evaluation of a method on recorded scenes: without delays, or with link emulation in simulation time.
 
+use std::collections::BTreeMap;
+use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use agent::attack::AttackConfig;
@@ -19,11 +21,14 @@ use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
 use perception::weights::Weights;
-use protocol::{CavId, CodecConfig};
+use protocol::{CavId, CodecConfig, Counts, Stream, Topic};
+use support::file_digests::FileDigests;
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
-use crate::evaluated_frame::judge;
+use crate::evaluated_frame::{judge, metrics};
+use crate::experiment::cell::{CellKey, MessageCounts};
 use crate::experiment::frame_files::{FrameFiles, FrameFilesError};
+use crate::scenario::fingerprint::{Provenance, files_of};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Settings of an evaluation.
@@ -71,6 +76,22 @@ pub struct OpenedData {
     pub protocol: EvaluationProtocol,
     /// Parts of the data set that cannot be used.
     pub problems: Vec<ReadError>,
+    /// Digests of the files that were read so far.
+    pub digests: FileDigests,
+    /// SHA-256 of each part that was asked for, by the number of its scenarios and the variant of its sweeps.
+    parts: Mutex<BTreeMap<(Option<usize>, Option<String>), String>>,
+}
+
+impl OpenedData {
+    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.
+    fn sha256(&self, part: &Part, variant: Option<&str>) -> String {
+        let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+        let place = (part.scenarios, variant.map(str::to_owned));
+        let sha256 = parts.entry(place).or_insert_with(|| {
+            dataset::content_sha256(part.chosen(&self.scenarios), variant, &self.digests)
+        });
+        sha256.clone()
+    }
 }
 
 /// A part of a data set.
@@ -115,11 +136,16 @@ impl Part {
             scenarios,
             protocol,
             problems: dataset.problems,
+            digests: FileDigests::default(),
+            parts: Mutex::default(),
         })
     }
 
     /// The requested scenarios.
-    pub fn chosen<'a>(&self, scenarios: &'a [Scenario]) -> impl Iterator<Item = &'a Scenario> {
+    pub fn chosen<'a>(
+        &self,
+        scenarios: &'a [Scenario],
+    ) -> impl Iterator<Item = &'a Scenario> + use<'a> {
         let count = self
             .scenarios
             .map_or(scenarios.len(), |most| most.min(scenarios.len()));
@@ -149,6 +175,9 @@ pub enum EvaluationError {
     /// The data set has no frame to evaluate.
     #[error("{}: there is no frame in it", .0.display())]
     Empty(PathBuf),
+    /// A file cannot be hashed.
+    #[error(transparent)]
+    Digest(io::Error),
     /// There are no weights for a method.
     #[error(transparent)]
     Weights(#[from] WeightsChoiceError),
@@ -160,52 +189,109 @@ pub enum EvaluationError {
     Files(#[from] FrameFilesError),
 }
 
-/// Number of frames to evaluate in a data set, over all scenarios.
-///
-/// # Errors
-/// [`EvaluationError`] when the data set cannot be read.
-pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let scenarios = options
-        .part
-        .open(&options.dataset, &options.protocol)?
-        .scenarios;
-    let ticks = options
-        .part
-        .chosen(&scenarios)
-        .map(|scenario| scenario.ticks.len())
-        .sum();
-    Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
+impl EvaluationOptions {
+    /// Number of frames to evaluate, over all scenarios.
+    #[must_use]
+    pub fn frame_count(&self, data: &OpenedData) -> usize {
+        let scenarios = self.part.chosen(&data.scenarios);
+        let ticks = scenarios.map(|scenario| scenario.ticks.len()).sum();
+        self.frames.map_or(ticks, |frames| frames.min(ticks))
+    }
+
+    /// Identity of the result of a method: these settings, and the digests of all that they are applied to.
+    ///
+    /// # Errors
+    /// [`EvaluationError`] names the file that cannot be read.
+    pub fn key(&self, data: &OpenedData, method: Method) -> Result<CellKey, EvaluationError> {
+        let stepped = self.stepped.as_ref();
+        let link = stepped.map(|stepped| (&stepped.link, stepped.link_folder.as_path()));
+        let variant = stepped.and_then(|stepped| stepped.lidar_variant.as_deref());
+        let vehicles = stepped.into_iter().flat_map(|stepped| &stepped.vehicles);
+        let poses =
+            std::iter::once(&self.pose_source).chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
+        let files = files_of(method, weights_of(&self.weights, method)?, poses, link);
+        let data_sha256 = data.sha256(&self.part, variant);
+        let provenance = Provenance::collect(&[], data_sha256, files, &data.digests)
+            .map_err(EvaluationError::Digest)?;
+        // The contents of data and weights count, their places do not; kept maps change no result.
+        let settings = Self {
+            dataset: PathBuf::new(),
+            weights: PathBuf::new(),
+            maps: None,
+            out: None,
+            ..self.clone()
+        };
+        Ok(CellKey {
+            method,
+            sha256: provenance.key(&format!("{method} {settings:?}")),
+            provenance,
+        })
+    }
 }
 
-/// Evaluates one method over all scenarios, the first vehicle of each being the ego; `on_frame` is called after every
-/// frame. Frames and parts that cannot be read are left out and counted in [`Metrics::left_out`].
+/// Result of an evaluation.
+#[derive(Debug, Clone)]
+pub struct Evaluation {
+    /// Metrics.
+    pub metrics: Metrics,
+    /// Number of neighbours' messages that were fused, over all frames.
+    pub used: u64,
+    /// Counts of the messages that are fused, if the link is emulated.
+    pub messages: MessageCounts,
+}
+
+/// Evaluates one method over the chosen scenarios, the first vehicle of each being the ego; `on_frame` is called after
+/// every frame. Frames and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
 /// # Errors
-/// [`EvaluationError`] when the data set cannot be opened, and when no frame can be evaluated.
+/// [`EvaluationError`] when no frame can be evaluated.
 pub fn evaluate(
     options: &EvaluationOptions,
+    data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
-) -> Result<Metrics, EvaluationError> {
-    let (board, evaluator, began) = judged(options, method, on_frame)?;
-    Ok(metrics(&board, &evaluator, options, began))
+) -> Result<Evaluation, EvaluationError> {
+    let began = Instant::now();
+    let (board, evaluator) = judged(options, data, method, on_frame)?;
+    let (clock, seconds) = match options.stepped {
+        Some(_) => ("stepped", board.seconds()),
+        None => ("offline", began.elapsed().as_secs_f64()),
+    };
+    let poses = options.pose_source.name();
+    let metrics = metrics(&board, &evaluator, clock, poses, seconds);
+    let used = board.records().iter().map(|record| record.fused as u64);
+    let mut messages = Counts::default();
+    for (account, counts) in evaluator.ledger().iter() {
+        if !matches!(
+            account.topic,
+            Topic::Stream {
+                stream: Stream::Pose,
+                ..
+            }
+        ) {
+            messages.add(counts);
+        }
+    }
+    Ok(Evaluation {
+        metrics,
+        used: used.sum(),
+        messages: messages.into(),
+    })
 }
 
-/// Like [`evaluate`], but returns the scores of all frames in addition to the metrics.
-///
-/// # Errors
-/// As [`evaluate`].
-pub(crate) fn judged(
+/// Scores of all frames, and the evaluator with its accounts.
+fn judged(
     options: &EvaluationOptions,
+    data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
-) -> Result<(FrameScores, Evaluator, Instant), EvaluationError> {
-    let began = Instant::now();
+) -> Result<(FrameScores, Evaluator), EvaluationError> {
     let OpenedData {
         scenarios,
         protocol,
         problems,
-    } = options.part.open(&options.dataset, &options.protocol)?;
+        ..
+    } = data;
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
@@ -224,12 +310,12 @@ pub(crate) fn judged(
         .as_ref()
         .filter(|_| method.exchange() != Exchange::Points)
     {
-        evaluator = evaluator.with_maps(maps(kept, &weights, options.precision, &scenarios)?);
+        evaluator = evaluator.with_maps(maps(kept, &weights, options.precision, data)?);
     }
     if let Some(stepped) = &options.stepped {
         evaluator = evaluator.with_link(stepped.clone());
     }
-    evaluator.add_left_out_files(&problems);
+    evaluator.add_left_out_files(problems);
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().sent_channels();
     let map_values =
@@ -246,7 +332,7 @@ pub(crate) fn judged(
         .as_ref()
         .map(|out| FrameFiles::create(out, method))
         .transpose()?;
-    for scenario in options.part.chosen(&scenarios) {
+    for scenario in options.part.chosen(scenarios) {
         let Some(ego) = scenario.agents.first() else {
             continue;
         };
@@ -279,7 +365,7 @@ pub(crate) fn judged(
         .filter(|board| !board.records().is_empty())
         .ok_or(EvaluationError::Empty(options.dataset.clone()))?;
     files.map(|files| files.finish(&board)).transpose()?;
-    Ok((board, evaluator, began))
+    Ok((board, evaluator))
 }
 
 /// Feature maps of all sweeps, from the cache or encoded now.
@@ -287,42 +373,23 @@ fn maps(
     kept: &KeptMaps,
     weights: &Path,
     precision: InferencePrecision,
-    scenarios: &[Scenario],
+    data: &OpenedData,
 ) -> Result<MapSource, EvaluationError> {
     let weights = Arc::new(
         Weights::load(weights)
             .map_err(EvaluateError::from)?
             .with_precision(precision),
     );
-    let store = FeatureStore::open(kept, &weights, scenarios, 1, &mut |_, _| {});
+    let store = FeatureStore::open(
+        kept,
+        &weights,
+        &data.scenarios,
+        &data.digests,
+        1,
+        &mut |_, _| {},
+    );
     Ok(MapSource::new(
         Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?),
         weights,
     ))
-}
-
-pub(crate) fn metrics(
-    board: &FrameScores,
-    evaluator: &Evaluator,
-    options: &EvaluationOptions,
-    began: Instant,
-) -> Metrics {
-    let (clock, seconds) = match options.stepped {
-        Some(_) => ("stepped", board.seconds()),
-        None => ("offline", began.elapsed().as_secs_f64()),
-    };
-    let names = [evaluator.ego().method().name(), options.pose_source.name()];
-    let metrics = Metrics::of(
-        board,
-        clock,
-        names,
-        seconds,
-        evaluator.ledger(),
-        Some(evaluator.sent_bytes()),
-    );
-    Metrics {
-        left_out: evaluator.left_out().clone(),
-        protocol: evaluator.protocol(),
-        ..metrics
-    }
 }

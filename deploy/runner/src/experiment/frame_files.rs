@@ -10,6 +10,7 @@ use deploy::score::FrameScores;
 use ego_fuser_offline::evaluation::EvaluatedFrame;
 use fusion::Method;
 
+use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
 
 /// Files of one method in a folder of its own: `detections.jsonl`, `truth.jsonl`, `frames.csv` and
@@ -83,14 +84,4 @@ impl FrameFiles {
             source,
         })
     }
-}
-
-/// Name of a method as a name of files.
-fn file_name(method: Method) -> String {
-    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
-    method
-        .name()
-        .chars()
-        .map(|letter| if is_plain(letter) { letter } else { '-' })
-        .collect()
 }

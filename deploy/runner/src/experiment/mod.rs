@@ -1,5 +1,6 @@
 //! Experiments: evaluation, tables and sweeps, and their metrics and reports.
 
+pub mod cell;
 pub mod evaluation;
 mod frame_files;
 pub mod report;

@@ -34,6 +34,7 @@ pub fn run_report(result: &RunResult) -> String {
 
 /// Prints the reasons for exit code 3 to standard error, `with_method` under the method of the run.
 pub fn print_loss(result: &RunResult, with_method: bool) {
+    result.metrics.left_out.print();
     if let Some(sentence) = loss::sentence(result) {
         let method = if with_method {
             format!("{}: ", result.metrics.method)

@@ -4,7 +4,6 @@ use std::net::SocketAddr;
 use std::path::Path;
 
 use agent::config::AgentConfig;
-use agent::rate::RateConfig;
 use bus::{BusConfig, Endpoint};
 use deploy::operate::run_folder::{CHECKPOINT, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
 use deploy::operate::security::RunKeys;
@@ -12,7 +11,7 @@ use deploy::operate::supervise::{ProcessSpec, RestartPolicy};
 use deploy::operate::{RECORDER, REPLAY};
 use ego_fuser::config::EgoConfig;
 use fusion::Exchange;
-use protocol::{CavId, CodecConfig, RunId, Stream};
+use protocol::{CavId, RunId, Stream};
 use serde::Serialize;
 use sim_replay::config::{
     LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig,
@@ -138,30 +137,8 @@ impl Fleet {
         context: &SessionContext<'_>,
         bus: BusConfig,
     ) -> AgentConfig {
-        let mut settings = self.scenario.settings_of(cav);
-        let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
-        let turn = self
-            .agents
-            .iter()
-            .position(|agent| agent == cav)
-            .and_then(|turn| u32::try_from(turn).ok());
-        settings.pose = settings
-            .pose
-            .for_scenario(scene)
-            .with_turn(turn.unwrap_or_default());
-        let is_ego = *cav == self.ego;
-        if is_ego {
-            // It sends to its own ego, not over the link, and the ego needs its complete feature map.
-            settings.codec = CodecConfig {
-                gate: None,
-                budget_bytes: None,
-                ..settings.codec
-            };
-            settings.rate = RateConfig::default();
-        } else {
-            settings.codec.gate = settings.codec.gate.or(self.scenario.method.gate());
-        }
-        let notes_sweeps = is_ego && self.scenario.clock == Clock::Wall;
+        let settings = self.settings_of(cav);
+        let notes_sweeps = *cav == self.ego && self.scenario.clock == Clock::Wall;
         AgentConfig {
             run: context.run.clone(),
             cav: cav.clone(),

@@ -17,7 +17,7 @@ use crate::fleet::{Fleet, RUNNER};
 use crate::run::RunError;
 use crate::run::loss::listed;
 use crate::run::machine::{speed_of_many, this_machine};
-use crate::run::stepped::{evaluate_config, recorded};
+use crate::run::stepped::evaluate_config;
 
 /// Time for computing frames; loading the models comes on top.
 const BUDGET: Duration = Duration::from_millis(600);
@@ -65,7 +65,7 @@ pub fn estimate_apart(fleet: &Fleet, programs: &Path) -> io::Result<Option<Capac
 /// [`RunError`] when models or frames cannot be loaded or computed.
 pub fn estimate(fleet: &Fleet) -> Result<Option<Capacity>, RunError> {
     let scene = &fleet.scenario.scene;
-    let recorded = recorded(fleet)?;
+    let recorded = &fleet.recorded;
     let steps = recorded
         .ticks
         .windows(2)
@@ -78,7 +78,7 @@ pub fn estimate(fleet: &Fleet) -> Result<Option<Capacity>, RunError> {
     let vehicles = fleet.agents.len();
     let mut evaluator = Evaluator::new(evaluate_config(fleet))?;
     let (began, before_s) = (Instant::now(), process_cpu_s());
-    let elapsed = evaluator.estimate(&recorded, vehicles, BUDGET)?;
+    let elapsed = evaluator.estimate(recorded, vehicles, BUDGET)?;
     // Share of a core that other programs leave.
     let left = ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
     let [pose_ms, map_ms, fuse_ms] =

@@ -51,6 +51,8 @@ fn reasons(result: &RunResult) -> Vec<String> {
             result.balance.discrepancies.len()
         ));
     }
+    let left_out = &result.metrics.left_out;
+    reasons.extend((!left_out.is_nothing()).then(|| left_out.to_string()));
     reasons.extend(result.failures.iter().cloned());
     reasons.extend(
         result
@@ -96,6 +98,8 @@ fn help(result: &RunResult) -> Option<String> {
             .remedies
             .as_ref()
             .map(|remedies| format!("{remedies} would answer more"))
+    } else if !result.metrics.left_out.is_nothing() {
+        None
     } else {
         Some(log(result.folder.path()))
     }

@@ -357,13 +357,8 @@ fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: 
 
 /// Hashes programs, weights and scene during the run.
 fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
-    let (programs, weights) = (
-        Fleet::programs(programs),
-        fleet.scenario.models.weights.clone(),
-    );
-    let scene = fleet.scene_dir.clone();
-    let poses = fleet.scenario.poses();
-    std::thread::spawn(move || Provenance::collect(&programs, &weights, &poses, &scene))
+    let (fleet, programs) = (fleet.clone(), programs.to_owned());
+    std::thread::spawn(move || fleet.provenance(&programs))
 }
 
 /// Writes the run folder; files that cannot be written are listed in the result, which is not lost with them.

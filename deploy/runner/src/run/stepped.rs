@@ -7,29 +7,22 @@ use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
-use agent::config::AgentSettings;
-use dataset::{self, Scenario as Recorded};
 use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
-use deploy::score::metrics::Metrics;
-use ego_fuser_offline::evaluation::stepped::{
-    AgentPool, ComputeTimes, SteppedConfig, VehicleConfig,
-};
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use link::LinkConfig;
-use localization::pose_source::PoseSourceConfig;
-use protocol::{CavId, RunId};
+use protocol::RunId;
 use support::progress;
 
-use crate::evaluated_frame::judge;
-use crate::fleet::{Fleet, FleetError, open_options};
+use crate::evaluated_frame::{judge, metrics};
+use crate::fleet::{Fleet, FleetError};
 use crate::frame_lines::FrameLines;
 use crate::run::RunError;
 use crate::run::agent_pool::CrewProcesses;
 use crate::run::ledger_report::LedgerReport;
 use crate::run::run_fleet::{RunOptions, RunResult};
-use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Scenario, Stepped};
 
 /// Runs a scenario in simulation time to its end.
@@ -39,7 +32,6 @@ use crate::scenario::{Scenario, Stepped};
 pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
     let mut fleet = Fleet::plan(scenario)?;
     fleet.scenario.models.threads.apply();
-    let recorded = recorded(&fleet)?;
     let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
     let compute = match fleet
         .scenario
@@ -48,7 +40,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
         .and_then(|stepped| stepped.compute)
     {
         Some(compute) => compute,
-        None => evaluator.measure(&recorded)?,
+        None => evaluator.measure(&fleet.recorded)?,
     };
     // Written into the run's scenario, from which another run can take it.
     let processes = fleet
@@ -66,7 +58,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
         .unwrap_or_else(|| name_of_now(options.prefix));
     let mut evaluator = evaluator.with_link(stepped_config(&fleet, compute)?);
     let folder = RunFolder::create(&options.runs, &run)?;
-    let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
+    let result = go(&fleet, &mut evaluator, (&run, &folder), options);
     if result.as_ref().is_err_and(RunError::is_refusal) {
         folder.remove();
     }
@@ -76,7 +68,6 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
 /// Runs a fleet under the given run name in the given folder.
 fn go(
     fleet: &Fleet,
-    recorded: &Recorded,
     evaluator: &mut Evaluator,
     (run, folder): (&RunId, &RunFolder),
     options: &RunOptions,
@@ -92,21 +83,11 @@ fn go(
         evaluator.set_processes(Some(remote));
         processes
     });
-    let board = play(fleet, recorded, evaluator, folder)?;
+    let board = play(fleet, evaluator, folder)?;
     evaluator.set_processes(None);
     let killed = processes.map(CrewProcesses::end).unwrap_or_default();
     let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
     Ok(RunResult { killed, ..result })
-}
-
-/// Recorded scenario of the fleet.
-pub(super) fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
-    let scene = &fleet.scenario.scene;
-    let scenarios = dataset::open_with(&scene.dir, &open_options(scene))?.scenarios;
-    let found = scenarios
-        .into_iter()
-        .find(|known| Some(&known.name) == scene.scenario.as_ref());
-    found.ok_or_else(|| FleetError::Empty(scene.dir.clone()))
 }
 
 pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
@@ -115,7 +96,7 @@ pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
         weights: scenario.models.weights.clone(),
         precision: scenario.models.precision,
         method: Some(scenario.method),
-        pose_source: for_scene(&scenario.agents.pose, scenario),
+        pose_source: scenario.agents.pose.clone(),
         codec: scenario.agents.codec,
         rate: scenario.agents.rate,
         protocol: Some(fleet.protocol.clone()),
@@ -140,7 +121,7 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
     let vehicles = fleet
         .agents
         .iter()
-        .map(|cav| (cav.clone(), vehicle(&fleet.scenario, cav)));
+        .map(|cav| (cav.clone(), fleet.settings_of(cav)));
     let last = fleet.ticks.map_or(usize::MAX, |ticks| scene.seek + ticks);
     Ok(SteppedConfig {
         link: config,
@@ -156,30 +137,9 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
     })
 }
 
-fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
-    let AgentSettings {
-        pose,
-        codec,
-        rate,
-        falsification,
-    } = scenario.settings_of(cav);
-    VehicleConfig {
-        pose_source: for_scene(&pose, scenario),
-        codec,
-        rate,
-        falsification,
-    }
-}
-
-/// The source as in the configuration of an agent's process.
-fn for_scene(pose: &PoseSourceConfig, scenario: &Scenario) -> PoseSourceConfig {
-    pose.for_scenario(scenario.scene.scenario.as_deref().unwrap_or_default())
-}
-
 /// Computes all ticks; detections are appended to their file.
 fn play(
     fleet: &Fleet,
-    recorded: &Recorded,
     evaluator: &mut Evaluator,
     folder: &RunFolder,
 ) -> Result<FrameScores, RunError> {
@@ -194,7 +154,7 @@ fn play(
     };
     let mut lines = FrameLines::create(folder.path()).map_err(unwritable)?;
     let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
-    let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
+    let _ = evaluator.run(&fleet.recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
         let is_written = lines.add(None, &frame);
         judge(&mut board, frame, true);
@@ -218,14 +178,12 @@ fn write(
 ) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
-    let names = [fleet.scenario.method.name(), fleet.pose_source()];
-    let metrics = Metrics::of(
+    let metrics = metrics(
         board,
+        evaluator,
         "stepped",
-        names,
+        fleet.pose_source(),
         board.seconds(),
-        ledger,
-        Some(evaluator.sent_bytes()),
     );
     folder.write_json(deploy::score::metrics::FILE, &metrics)?;
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
@@ -235,14 +193,7 @@ fn write(
         "ledger.json",
         &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)),
     )?;
-    let models = &fleet.scenario.models;
-    let programs = Fleet::programs(&options.programs);
-    let provenance = Provenance::collect(
-        &programs,
-        &models.weights,
-        &fleet.scenario.poses(),
-        &fleet.scene_dir,
-    );
+    let provenance = fleet.provenance(&options.programs);
     let provenance = provenance
         .inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}"))
         .ok();

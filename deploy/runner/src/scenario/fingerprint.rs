@@ -1,199 +1,196 @@
-//! Provenance of a run: hashes of its programs, weights and scene.
+//! Provenance of a result: digests of the programs, of the data, and of every other file that it was made of.
 
-use std::fs::File;
-use std::io::{self, Read};
+use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
 
-use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
+use fusion::Method;
+use link::LinkConfig;
+use localization::pose_source::PoseSourceConfig;
 use protocol::text::hex;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use support::file_digests::FileDigests;
 
-/// Provenance of a run, part of the `scenario.yaml` of a run folder.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+/// Everything that a result was made of besides its settings.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// Version of the programs.
     pub version: String,
-    /// SHA-256 over the executables of the program folder.
+    /// Commit of the checkout that they were built in; `unknown` outside one.
+    pub commit: String,
+    /// SHA-256 of the program, or over all programs of a run.
     pub program_sha256: String,
-    /// SHA-256 of the weights file.
-    pub weights_sha256: String,
-    /// SHA-256 of the localizer's encoder and of its head, if a vehicle localizes itself.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub localizer_sha256: Option<[String; 2]>,
-    /// SHA-256 of the baseline's weights, if a vehicle localizes itself with it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub baseline_sha256: Option<String>,
-    /// SHA-256 over names and contents of the scenario's point clouds and annotations; images do not count.
-    pub scene_sha256: String,
-    /// Number of files that `scene_sha256` covers.
-    pub scene_files: usize,
+    /// SHA-256 over names, capture times and whole files of the evaluated sweeps and their annotations.
+    pub data_sha256: String,
+    /// SHA-256 of every other file by its path: weights, TorchScript module, encoders and heads of the localization,
+    /// tables of poses and errors, traces of the link.
+    pub files_sha256: BTreeMap<PathBuf, String>,
 }
 
 impl Provenance {
-    /// Hashes programs, weights and scene. Reads the whole scene: seconds for gigabytes.
+    /// Hashes programs and files, besides the data of that hash; without `programs`, the one that runs.
     ///
     /// # Errors
     /// The first file that cannot be read, by name.
     pub fn collect(
         programs: &[PathBuf],
-        weights: &Path,
-        poses: &[PoseSourceConfig],
-        scene: &Path,
+        data_sha256: String,
+        files: impl IntoIterator<Item = PathBuf>,
+        digests: &FileDigests,
     ) -> io::Result<Self> {
-        let scene_files = scene_files(scene)?;
-        let (mut localizer_sha256, mut baseline_sha256) = (None, None);
-        for pose in poses {
-            match pose {
-                PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
-                | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
-                    localizer_sha256 = Some([hash_file(encoder)?.1, hash_file(head)?.1]);
-                }
-                PoseSourceConfig::Baseline(network) => {
-                    baseline_sha256 = Some(hash_file(&network.weights)?.1)
-                }
-                PoseSourceConfig::Recorded
-                | PoseSourceConfig::Noisy(_)
-                | PoseSourceConfig::Cached(_) => {}
-            }
-        }
+        let files_sha256 = files
+            .into_iter()
+            .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
+            .collect::<io::Result<_>>()?;
         Ok(Self {
             version: env!("CARGO_PKG_VERSION").into(),
-            program_sha256: hash_all(
-                programs
-                    .first()
-                    .and_then(|path| path.parent())
-                    .unwrap_or(scene),
-                programs,
-            )?,
-            weights_sha256: hash_file(weights)?.1,
-            localizer_sha256,
-            baseline_sha256,
-            scene_sha256: hash_all(scene, &scene_files)?,
-            scene_files: scene_files.len(),
+            commit: env!("V2VLOC_COMMIT").into(),
+            program_sha256: match programs {
+                [] => digests.program_sha256()?,
+                programs => hash_programs(programs, digests)?,
+            },
+            data_sha256,
+            files_sha256,
         })
     }
-}
 
-/// Files of a scene that a run reads: all but images, in the order of names.
-fn scene_files(scene: &Path) -> io::Result<Vec<PathBuf>> {
-    if scene.is_file() {
-        return Ok(vec![scene.to_path_buf()]);
-    }
-    let mut files = Vec::new();
-    let mut folders = vec![scene.to_path_buf()];
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(&folder).map_err(|error| named(error, &folder))? {
-            let path = entry?.path();
-            let is_image = path
-                .extension()
-                .is_some_and(|kind| kind == "png" || kind == "jpg");
-            if path.is_dir() {
-                folders.push(path);
-            } else if !is_image {
-                files.push(path);
-            }
+    /// SHA-256 of the settings, written as text, and of all that they were applied to.
+    #[must_use]
+    pub fn key(&self, settings: &str) -> String {
+        let mut hash = Sha256::new();
+        for part in [&self.program_sha256, &self.data_sha256] {
+            hash.update(part);
         }
+        self.files_sha256
+            .values()
+            .for_each(|sha256| hash.update(sha256));
+        hash.update(settings);
+        hex(&hash.finalize())
     }
-    files.sort();
-    Ok(files)
 }
 
-/// One hash over many files: name below `root`, length and content of each. The path of `root` does not count.
-fn hash_all(root: &Path, files: &[PathBuf]) -> io::Result<String> {
+/// Files that a method reads beside the data: its weights, its TorchScript module, those of the pose sources, and the
+/// trace of the link, whose paths are relative to a folder.
+pub(crate) fn files_of<'a>(
+    method: Method,
+    weights: PathBuf,
+    poses: impl IntoIterator<Item = &'a PoseSourceConfig>,
+    link: Option<(&LinkConfig, &Path)>,
+) -> Vec<PathBuf> {
+    let mut files = vec![weights];
+    files.extend(method.script_file().map(Path::to_owned));
+    for source in poses {
+        files.extend(source.files().into_iter().map(Path::to_owned));
+    }
+    let trace = link.and_then(|(link, folder)| Some(folder.join(link.trace_file()?)));
+    files.extend(trace);
+    files
+}
+
+/// One hash over many programs: name and content of each.
+fn hash_programs(programs: &[PathBuf], digests: &FileDigests) -> io::Result<String> {
     let mut all = Sha256::new();
-    for path in files {
-        let (length, hash) = hash_file(path)?;
-        all.update(format!(
-            "{} {length} {hash}\n",
-            path.strip_prefix(root).unwrap_or(path).display()
-        ));
+    for path in programs {
+        let name = path.file_name().unwrap_or_default().display();
+        all.update(format!("{name} {}\n", digests.sha256(path)?));
     }
     Ok(hex(&all.finalize()))
 }
 
-/// Length and hash of a file, as `sha256sum` prints it.
-pub(crate) fn hash_file(path: &Path) -> io::Result<(u64, String)> {
-    let mut file = File::open(path).map_err(|error| named(error, path))?;
-    let mut hash = Sha256::new();
-    let mut buffer = vec![0; 1 << 20];
-    let mut length = 0;
-    loop {
-        match file.read(&mut buffer).map_err(|error| named(error, path))? {
-            0 => return Ok((length, hex(&hash.finalize()))),
-            count => {
-                length += count as u64;
-                hash.update(&buffer[..count]);
-            }
-        }
-    }
-}
-
-fn named(error: io::Error, path: &Path) -> io::Error {
-    io::Error::new(error.kind(), format!("{}: {error}", path.display()))
-}
-
 #[cfg(test)]
 mod tests {
-    use localization::pose_source::{BaselinePoseConfig, PgcConfig};
+    use link::{CapacityConfig, TraceConfig};
+    use localization::pose_source::{
+        BaselinePoseConfig, CachedPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig,
+    };
 
     use super::*;
 
-    fn scene(folder: &Path, point: &str) -> PathBuf {
-        let agent = folder.join("scene/4279");
-        std::fs::create_dir_all(&agent).unwrap();
-        std::fs::write(agent.join("000069.pcd"), point).unwrap();
-        std::fs::write(agent.join("000069.yaml"), "a: 1").unwrap();
-        std::fs::write(agent.join("000069_camera0.png"), point).unwrap();
-        folder.join("scene")
+    /// Two heads of one encoder, a baseline, a table of poses and one of errors.
+    fn poses(folder: &Path) -> Vec<PoseSourceConfig> {
+        let pgc = |head: &str| {
+            PoseSourceConfig::Pgc(PgcConfig {
+                encoder: folder.join("encoder"),
+                head: folder.join(head),
+                ..Default::default()
+            })
+        };
+        vec![
+            pgc("town1"),
+            pgc("town4"),
+            PoseSourceConfig::Baseline(BaselinePoseConfig {
+                weights: folder.join("baseline"),
+                ..Default::default()
+            }),
+            PoseSourceConfig::Cached(CachedPoseConfig {
+                file: folder.join("poses"),
+                ..Default::default()
+            }),
+            PoseSourceConfig::Noisy(NoisyPoseConfig {
+                mode: NoiseMode::Replayed,
+                table: Some(folder.join("errors")),
+                ..Default::default()
+            }),
+        ]
     }
 
     #[test]
-    fn a_changed_point_changes_the_hash_and_a_moved_folder_does_not() {
-        let [one, two, three] = [(); 3].map(|()| tempfile::tempdir().unwrap());
-        let weights = one.path().join("w.safetensors");
-        std::fs::write(&weights, b"weights").unwrap();
-        let file = || weights.clone();
-        let poses = [
-            PoseSourceConfig::Pgc(PgcConfig {
-                encoder: file(),
-                head: file(),
-                ..Default::default()
-            }),
-            PoseSourceConfig::Baseline(BaselinePoseConfig {
-                weights: file(),
-                ..Default::default()
-            }),
+    fn a_flipped_byte_of_any_file_changes_the_key_and_a_moved_folder_does_not() {
+        let names = [
+            "weights",
+            "script.pt",
+            "encoder",
+            "town1",
+            "town4",
+            "baseline",
+            "poses",
+            "errors",
+            "trace.csv",
         ];
-        let collect = |scene: &Path| {
-            Provenance::collect(std::slice::from_ref(&weights), &weights, &poses, scene).unwrap()
+        let [one, other] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+        for folder in [&one, &other] {
+            for name in names {
+                std::fs::write(folder.path().join(name), name).unwrap();
+            }
+        }
+        let key = |folder: &Path| {
+            let method = format!("script:{}", folder.join("script.pt").display());
+            let trace = TraceConfig::new(Path::new("trace.csv"));
+            let link = LinkConfig {
+                capacity: CapacityConfig::Trace(trace),
+                ..LinkConfig::default()
+            };
+            let files = files_of(
+                method.parse().unwrap(),
+                folder.join("weights"),
+                &poses(folder),
+                Some((&link, folder)),
+            );
+            let digests = FileDigests::default();
+            let provenance = Provenance::collect(&[], "data".into(), files, &digests).unwrap();
+            assert_eq!(provenance.files_sha256.len(), names.len());
+            provenance.key("settings")
         };
-        let first = collect(&scene(one.path(), "0 0 0"));
-        assert_eq!(first.scene_files, 2, "images do not count");
-        // From `printf weights | sha256sum`.
-        assert!(
-            first.weights_sha256.starts_with("9a129038d9a00aed"),
-            "{}",
-            first.weights_sha256
-        );
-        assert_eq!(
-            first.localizer_sha256.as_ref().unwrap()[1],
-            first.weights_sha256
-        );
-        assert_eq!(first.baseline_sha256.as_ref(), Some(&first.weights_sha256));
-        assert_eq!(first, collect(&scene(two.path(), "0 0 0")));
-        assert_ne!(
-            first.scene_sha256,
-            collect(&scene(three.path(), "0 0 1")).scene_sha256
-        );
+        let original = key(one.path());
+        assert_eq!(key(other.path()), original);
+        for name in names {
+            let path = one.path().join(name);
+            let mut flipped = name.as_bytes().to_vec();
+            flipped[0] ^= 1;
+            std::fs::write(&path, flipped).unwrap();
+            assert_ne!(key(one.path()), original, "{name}");
+            std::fs::write(&path, name).unwrap();
+        }
     }
 
     #[test]
     fn a_missing_file_is_named() {
-        let error = Provenance::collect(&[], Path::new("/nowhere/w"), &[], Path::new("/nowhere"))
-            .unwrap_err();
-        assert!(error.to_string().starts_with("/nowhere"), "{error}");
+        let digests = FileDigests::default();
+        let missing = [PathBuf::from("/nowhere/w")];
+        let error = Provenance::collect(&[], String::new(), missing, &digests).unwrap_err();
+        assert!(error.to_string().starts_with("/nowhere/w"), "{error}");
     }
 }

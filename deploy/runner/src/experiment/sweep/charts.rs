@@ -6,7 +6,7 @@ use deploy::score::metrics::Metrics;
 use figures::{Axis, Chart, Mark, Series};
 use fusion::Exchange;
 
-use super::cell::Cell;
+use super::Run;
 use super::grid::Point;
 use super::spec::Experiment;
 
@@ -23,7 +23,7 @@ struct Dimension {
     name: &'static str,
     label: &'static str,
     is_logarithmic: bool,
-    value: fn(&Cell) -> Option<f64>,
+    value: fn(&Run) -> Option<f64>,
     /// Label that distinguishes series by it, if it is not on the axis.
     text: fn(&Point) -> Option<String>,
 }
@@ -33,21 +33,21 @@ const DIMENSIONS: [Dimension; 7] = [
         name: "latency",
         label: "latency, ms",
         is_logarithmic: false,
-        value: |cell| cell.key.point.latency_ms,
+        value: |run| run.point.latency_ms,
         text: |point| point.latency_ms.map(|ms| format!("{ms} ms")),
     },
     Dimension {
         name: "jitter",
         label: "standard deviation of the latency, ms",
         is_logarithmic: false,
-        value: |cell| cell.key.point.jitter_ms,
+        value: |run| run.point.jitter_ms,
         text: |point| point.jitter_ms.map(|ms| format!("jitter {ms} ms")),
     },
     Dimension {
         name: "bandwidth",
         label: "rate of a link, Mbit/s",
         is_logarithmic: true,
-        value: |cell| cell.key.point.bandwidth_mbps,
+        value: |run| run.point.bandwidth_mbps,
         text: |point| {
             Some(
                 point
@@ -60,14 +60,14 @@ const DIMENSIONS: [Dimension; 7] = [
         name: "loss",
         label: "share of messages lost",
         is_logarithmic: false,
-        value: |cell| cell.key.point.loss,
+        value: |run| run.point.loss,
         text: |point| point.loss.map(|share| format!("loss {share}")),
     },
     Dimension {
         name: "pose_noise",
         label: "pose noise, m (degrees alike)",
         is_logarithmic: false,
-        value: |cell| cell.key.point.pose_noise.map(|noise| noise.position_std_m),
+        value: |run| run.point.pose_noise.map(|noise| noise.position_std_m),
         text: |point| {
             point
                 .pose_noise
@@ -78,14 +78,14 @@ const DIMENSIONS: [Dimension; 7] = [
         name: "agents",
         label: "vehicles that take part",
         is_logarithmic: false,
-        value: |cell| cell.key.point.agents.map(|agents| agents as f64),
+        value: |run| run.point.agents.map(|agents| agents as f64),
         text: |point| point.agents.map(|agents| format!("{agents} vehicles")),
     },
     Dimension {
         name: "bytes",
         label: "log2 of a message's bytes",
         is_logarithmic: false,
-        value: |cell| cell.metrics.comm.log2_payload,
+        value: |run| run.cell.metrics.comm.log2_payload,
         text: codec,
     },
 ];
@@ -104,11 +104,11 @@ fn codec(point: &Point) -> Option<String> {
 }
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.
-pub(super) fn figures(experiment: &Experiment, cells: &[Cell]) -> Vec<Figure> {
+pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
     let varies = |dimension: &Dimension| {
-        let mut texts: Vec<_> = cells
+        let mut texts: Vec<_> = runs
             .iter()
-            .filter_map(|cell| (dimension.text)(&cell.key.point))
+            .filter_map(|run| (dimension.text)(&run.point))
             .collect();
         texts.sort();
         texts.dedup();
@@ -119,7 +119,7 @@ pub(super) fn figures(experiment: &Experiment, cells: &[Cell]) -> Vec<Figure> {
         .collect();
     let figure = |&place: &usize| {
         let chart = |title: &str, precision: fn(&Metrics) -> Option<f64>| {
-            chart(experiment, cells, place, &varying, title, precision)
+            chart(experiment, runs, place, &varying, title, precision)
         };
         let charts = [
             chart("AP@0.5", |metrics| metrics.ap_global.at_50),
@@ -148,7 +148,7 @@ fn file_name(place: usize) -> &'static str {
 
 fn chart(
     experiment: &Experiment,
-    cells: &[Cell],
+    runs: &[Run],
     place: usize,
     varying: &[usize],
     title: &str,
@@ -157,11 +157,11 @@ fn chart(
     let dimension = &DIMENSIONS[place];
     // Along bytes, the cells of all values of a codec form one line.
     let mut series: Vec<(String, Points)> = Vec::new();
-    for cell in cells {
-        let (Some(x), Some(y)) = ((dimension.value)(cell), precision(&cell.metrics)) else {
+    for run in runs {
+        let (Some(x), Some(y)) = ((dimension.value)(run), precision(&run.cell.metrics)) else {
             continue;
         };
-        let point = &cell.key.point;
+        let point = &run.point;
         let others = varying.iter().filter(|other| **other != place);
         let texts = others.filter_map(|&other| (DIMENSIONS[other].text)(point));
         let name = std::iter::once(point.method.name().to_owned())

@@ -1,11 +1,13 @@
 //! `report.html`: figures, table and provenance, in one self-contained file.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-use super::cell::Cell;
+use super::Run;
 use super::spec::Experiment;
 use super::table::{NOTES, rows};
 use super::varying::VaryingTable;
+use crate::scenario::fingerprint::Provenance;
 
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
     color:#282c34;overflow-wrap:anywhere}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{flex:1 1 20rem;min-width:0;height:auto}figure{margin:1rem 0;display:flex;flex-wrap:wrap}\
@@ -18,7 +20,7 @@ const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;ma
 pub(super) fn page(
     experiment: &Experiment,
     spec: &str,
-    cells: &[Cell],
+    runs: &[Run],
     figures: &[Vec<String>],
 ) -> String {
     let title = if experiment.title.is_empty() {
@@ -32,15 +34,15 @@ pub(super) fn page(
          <title>{0}</title><style>{STYLE}</style></head><body>\n<h1>{0}</h1>\n",
         escaped(title)
     );
-    let frames = cells.first().map_or(0, |cell| cell.metrics.frames);
+    let frames = runs.first().map_or(0, |run| run.cell.metrics.frames);
     let _ = writeln!(
         page,
         "<p>{} runs of {frames} frames in simulation time; means over seeds in the figures. The table is \
          <code>{}.csv</code>.</p>",
-        cells.len(),
+        runs.len(),
         escaped(&experiment.name)
     );
-    let (columns, lines) = rows(experiment, cells);
+    let (columns, lines) = rows(experiment, runs);
     let columns: Vec<&str> = columns.iter().map(|column| column.trim()).collect();
     let table = VaryingTable::new(&columns, &lines);
     if let Some(sentence) = table.sentence() {
@@ -55,7 +57,7 @@ pub(super) fn page(
         let _ = writeln!(page, "<dt>{column}</dt><dd>{}</dd>", escaped(note));
     }
     page += "</dl>\n<h2>What it was made of</h2>\n<ul>\n";
-    for line in provenance(cells) {
+    for line in provenance(runs) {
         let _ = writeln!(page, "<li>{}</li>", escaped(&line));
     }
     let _ = writeln!(
@@ -110,23 +112,24 @@ fn escaped(text: &str) -> String {
         .replace('"', "&quot;")
 }
 
-/// Program, data and weights, each once.
-fn provenance(cells: &[Cell]) -> Vec<String> {
-    let mut lines: Vec<String> = cells
-        .iter()
-        .flat_map(|cell| {
-            let key = &cell.key;
-            [
-                format!("program SHA-256 {}", key.program_sha256),
-                format!("data SHA-256 {}", key.data_sha256),
-                format!(
-                    "weights of {} SHA-256 {}",
-                    key.point.method, key.weights_sha256
-                ),
-            ]
-        })
-        .collect();
-    lines.sort();
-    lines.dedup();
-    lines
+/// Program, data and all other files, each once.
+fn provenance(runs: &[Run]) -> Vec<String> {
+    let mut lines = BTreeSet::new();
+    for run in runs {
+        let Provenance {
+            version,
+            commit,
+            program_sha256,
+            data_sha256,
+            files_sha256,
+        } = &run.cell.key.provenance;
+        lines.insert(format!(
+            "program {version}, commit {commit}, SHA-256 {program_sha256}"
+        ));
+        lines.insert(format!("data SHA-256 {data_sha256}"));
+        for (file, sha256) in files_sha256 {
+            lines.insert(format!("{} SHA-256 {sha256}", file.display()));
+        }
+    }
+    lines.into_iter().collect()
 }

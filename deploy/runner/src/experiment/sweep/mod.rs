@@ -1,18 +1,19 @@
 //! Sweeps: a grid of runs in simulation time, one CSV, charts, a report.
 //!
-//! Runs are cached one by one by all their inputs, so that an interrupted sweep resumes. The same experiment gives the
+//! Runs are cached one by one by everything that they are made of, so that an interrupted sweep resumes. The same experiment gives the
 //! same CSV, byte for byte, with one process or with many.
 
-mod cell;
 mod charts;
 mod check;
 mod grid;
 mod html;
+mod point_options;
 mod spec;
 mod table;
 mod varying;
 mod workers;
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::{self, BufRead, Write};
 use std::path::{Path, PathBuf};
@@ -20,7 +21,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bus::config_file::ConfigError;
-use dataset::{self, LeftOut, ReadError, Scenario};
+use dataset::{LeftOut, Scenario};
 use ego_fuser_offline::evaluation::EvaluateError;
 use figures;
 use figures::FigureError;
@@ -31,13 +32,13 @@ use support::output;
 use support::progress;
 use training::feature_store::FeatureStore;
 
-pub use cell::{Cell, CellKey, MessageCounts};
 pub use grid::{Point, points};
 pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
 use self::varying::VaryingTable;
-use crate::experiment::evaluation::{EvaluationError, evaluate};
+use crate::experiment::cell::{Cell, CellError, CellKey};
+use crate::experiment::evaluation::{Evaluation, EvaluationError, OpenedData, evaluate};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Number of ticks that are timed before a sweep begins, for its estimate.
@@ -74,9 +75,6 @@ pub enum SweepError {
     /// The experiment cannot be read.
     #[error(transparent)]
     File(#[from] ConfigError),
-    /// The data set cannot be read.
-    #[error("dataset: {0}")]
-    Dataset(#[from] ReadError),
     /// The data set cannot be generated.
     #[error("generate: {0}")]
     Generate(#[from] SynthError),
@@ -86,6 +84,9 @@ pub enum SweepError {
     /// The link cannot be used.
     #[error("link: {0}")]
     Link(#[from] LinkError),
+    /// A cached run cannot be used.
+    #[error(transparent)]
+    Cell(#[from] CellError),
     /// A run cannot be computed.
     #[error(transparent)]
     Evaluation(#[from] Box<EvaluationError>),
@@ -108,14 +109,19 @@ impl SweepError {
 /// Settings of a sweep.
 #[derive(Debug, Clone)]
 pub struct SweepOptions {
-    /// Folder of the results.
-    pub out: PathBuf,
     /// Number of compute processes.
     pub jobs: usize,
-    /// Only print the number of missing runs.
-    pub dry_run: bool,
     /// True to keep the feature maps, for further runs of other settings.
     pub keep_maps: bool,
+}
+
+/// A computed run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Run {
+    /// Point of the grid.
+    pub point: Point,
+    /// Result.
+    pub cell: Cell,
 }
 
 /// Reads, prepares and runs an experiment.
@@ -124,11 +130,7 @@ pub struct Sweep {
     file: PathBuf,
     experiment: Experiment,
     points: Vec<Point>,
-    /// All scenarios of the data set, for which feature maps are cached.
-    all: Vec<Scenario>,
-    /// The evaluated scenarios.
-    scenarios: Vec<Scenario>,
-    keys: Vec<CellKey>,
+    data: OpenedData,
     out: PathBuf,
 }
 
@@ -140,12 +142,41 @@ impl Sweep {
     pub fn open(file: &Path, out: &Path) -> Result<Self, SweepError> {
         let experiment = Experiment::read(file)?;
         generate(&experiment)?;
+        Self::over(experiment, file, out)
+    }
+
+    /// Prints the number of runs and the time that they will take, and writes nothing: a data set that does not exist
+    /// is not generated, and its runs are not timed.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn announce(file: &Path, out: &Path, jobs: usize) -> Result<(), SweepError> {
+        let experiment = Experiment::read(file)?;
+        if let Some(generate) = &experiment.generate
+            && !is_generated(&experiment)?
+        {
+            let grid = &experiment.grid;
+            output::note(format_args!(
+                "{}: {} = {} runs of {} frames; the data set {} is generated first",
+                experiment.name,
+                check::product(grid),
+                points(grid).len(),
+                generate.scenarios * generate.frames,
+                experiment.dataset.display()
+            ));
+            return Ok(());
+        }
+        let sweep = Self::over(experiment, file, out)?;
+        let known = sweep.known(&sweep.keys()?)?;
+        sweep.print_estimate(&known, jobs)
+    }
+
+    fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self, SweepError> {
         let part = experiment.part();
-        let all = part
+        let data = part
             .open(&experiment.dataset, &experiment.protocol)
-            .map_err(Box::new)?
-            .scenarios;
-        let scenarios: Vec<Scenario> = part.chosen(&all).cloned().collect();
+            .map_err(Box::new)?;
+        let scenarios: Vec<Scenario> = part.chosen(&data.scenarios).cloned().collect();
         let spec = |problem| SweepError::Spec {
             path: file.to_owned(),
             problem,
@@ -158,29 +189,29 @@ impl Sweep {
         }
         check::check_scenes(&experiment, &scenarios).map_err(spec)?;
         let points = points(&experiment.grid);
-        let mut hashes = cell::Hashes::new(dataset::content_sha256(&scenarios));
-        let keys = points
-            .iter()
-            .map(|point| hashes.key(&experiment, point))
-            .collect::<Result<_, _>>()?;
         let (file, out) = (file.to_owned(), out.to_owned());
         Ok(Self {
             file,
             experiment,
             points,
-            all,
-            scenarios,
-            keys,
+            data,
             out,
         })
     }
 
+    /// Identity of the run of each point.
+    fn keys(&self) -> Result<Vec<CellKey>, SweepError> {
+        let key = |point: &Point| {
+            let options = point_options::options(&self.experiment, point, &self.maps())?;
+            Ok(options.key(&self.data, point.method).map_err(Box::new)?)
+        };
+        self.points.iter().map(key).collect()
+    }
+
     /// Cached runs, by place in the grid.
-    fn known(&self) -> Result<Vec<Option<Cell>>, SweepError> {
-        self.keys
-            .iter()
-            .map(|key| Cell::read(key, &self.cells()))
-            .collect()
+    fn known(&self, keys: &[CellKey]) -> Result<Vec<Option<Cell>>, SweepError> {
+        let read = |key| Ok(Cell::read(key, &self.cells())?);
+        keys.iter().map(read).collect()
     }
 
     fn cells(&self) -> PathBuf {
@@ -192,10 +223,8 @@ impl Sweep {
     }
 
     fn frames(&self) -> usize {
-        self.scenarios
-            .iter()
-            .map(|scenario| scenario.ticks.len())
-            .sum()
+        let scenarios = self.experiment.part().chosen(&self.data.scenarios);
+        scenarios.map(|scenario| scenario.ticks.len()).sum()
     }
 
     /// Computes the missing runs and writes table, charts and report.
@@ -207,47 +236,48 @@ impl Sweep {
             path: self.cells(),
             source,
         })?;
-        let known = self.known()?;
+        let keys = self.keys()?;
+        let known = self.known(&keys)?;
         let missing: Vec<usize> = (0..known.len())
             .filter(|&index| known[index].is_none())
             .collect();
-        self.announce(&known, &missing, options)?;
-        if options.dry_run {
-            return Ok(Swept::default());
-        }
+        self.print_estimate(&known, options.jobs)?;
         let maps = self.encode(&missing, options.jobs)?;
+        let missing: Vec<(usize, &CellKey)> = missing
+            .into_iter()
+            .map(|index| (index, &keys[index]))
+            .collect();
         self.compute(&missing, options.jobs)?;
-        let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
+        let cells: Option<Vec<Cell>> = self.known(&keys)?.into_iter().collect();
         let cells =
             cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
-        let table = self.write(&cells)?;
+        let runs: Vec<Run> = (self.points.iter().cloned().zip(cells))
+            .map(|(point, cell)| Run { point, cell })
+            .collect();
+        let table = self.write(&runs)?;
         if !options.keep_maps {
             remove_maps(&maps)?;
         }
         Ok(Swept {
             table,
-            left_out: cells
+            left_out: runs
                 .into_iter()
-                .map(|cell| cell.metrics.left_out)
+                .map(|run| run.cell.metrics.left_out)
                 .collect(),
         })
     }
 
     /// Prints the number of runs and the estimated time.
-    fn announce(
-        &self,
-        known: &[Option<Cell>],
-        missing: &[usize],
-        options: &SweepOptions,
-    ) -> Result<(), SweepError> {
+    fn print_estimate(&self, known: &[Option<Cell>], jobs: usize) -> Result<(), SweepError> {
         let (runs, frames) = (known.len(), self.frames());
+        let missing = known.iter().filter(|cell| cell.is_none()).count();
         output::note(format_args!(
             "{}: {} = {runs} runs of {frames} frames, {} done before",
             self.experiment.name,
             check::product(&self.experiment.grid),
-            runs - missing.len()
+            runs - missing
         ));
-        let Some(&first) = missing.first() else {
+        let Some(first) = known.iter().position(Option::is_none) else {
             return Ok(());
         };
         let done: Vec<&Cell> = known.iter().flatten().collect();
@@ -258,33 +288,27 @@ impl Sweep {
         } else {
             self.probe(&self.points[first])?
         };
-        let jobs = options.jobs.clamp(1, missing.len());
-        let minutes = per_frame * (missing.len() * frames) as f64 / jobs as f64 / 60.0;
+        let jobs = jobs.clamp(1, missing);
+        let minutes = per_frame * (missing * frames) as f64 / jobs as f64 / 60.0;
         output::note(format_args!(
-            "about {minutes:.1} minutes for {} runs with {jobs} jobs",
-            missing.len()
+            "about {minutes:.1} minutes for {missing} runs with {jobs} jobs"
         ));
         Ok(())
     }
 
     /// Time of a frame, seconds, from the first few without cached feature maps: an overestimate.
     fn probe(&self, point: &Point) -> Result<f64, SweepError> {
-        let mut options = cell::options(&self.experiment, point, &self.maps())?;
+        let mut options = point_options::options(&self.experiment, point, &self.maps())?;
         options.maps = None;
         options.part.scenarios = Some(1);
-        options.part.ticks = Some(
-            self.experiment
-                .ticks
-                .unwrap_or(PROBED_TICKS)
-                .min(PROBED_TICKS),
-        );
+        options.frames = Some(PROBED_TICKS);
         let began = Instant::now();
-        let metrics = evaluate(&options, point.method, &mut || {}).map_err(Box::new)?;
-        Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
+        let probed = evaluate(&options, &self.data, point.method, &mut || {}).map_err(Box::new)?;
+        Ok(began.elapsed().as_secs_f64() / probed.metrics.frames.max(1) as f64)
     }
 
     /// Computes the feature maps of all sweeps, once for each encoder that is needed; returns their files.
-    fn encode(&self, missing: &[usize], jobs: usize) -> Result<Vec<PathBuf>, SweepError> {
+    fn encode(&self, missing: &[usize], jobs: usize) -> Result<BTreeSet<PathBuf>, SweepError> {
         let methods = missing.iter().map(|&index| self.points[index].method);
         let mut files = Vec::new();
         for method in methods.filter(|method| method.exchange() != Exchange::Points) {
@@ -293,26 +317,29 @@ impl Sweep {
                 files.push(file);
             }
         }
-        let mut stored = Vec::new();
+        // Methods that share an encoder share a file of maps.
+        let mut stored = BTreeSet::new();
         for file in files {
             let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
             let weights =
                 perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
             let weights = Arc::new(weights.with_precision(self.experiment.precision));
             let bar = progress::bar(0, "sweeps encoded");
-            let kept = cell::kept_maps(&self.experiment, &self.maps());
-            let store = FeatureStore::open(&kept, &weights, &self.all, jobs, &mut |done, all| {
+            let kept = point_options::kept_maps(&self.experiment, &self.maps());
+            let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
+            let on_sweep = &mut |done, all| {
                 bar.set_length(all as u64);
                 bar.set_position(done as u64);
-            });
+            };
+            let store = FeatureStore::open(&kept, &weights, scenarios, digests, jobs, on_sweep);
             let store = store.map_err(|error| refused(Box::new(error).into()))?;
-            stored.push(store.path().to_owned());
+            stored.insert(store.path().to_owned());
             bar.finish_and_clear();
         }
         Ok(stored)
     }
 
-    fn compute(&self, missing: &[usize], jobs: usize) -> Result<(), SweepError> {
+    fn compute(&self, missing: &[(usize, &CellKey)], jobs: usize) -> Result<(), SweepError> {
         let bar = progress::bar(missing.len() * self.frames(), "frames");
         let done = std::sync::atomic::AtomicUsize::new(0);
         let on_done = || {
@@ -332,8 +359,8 @@ impl Sweep {
                 &on_done,
             )
         } else {
-            missing.iter().try_for_each(|&index| {
-                self.compute_one(index, &mut || bar.inc(1))?;
+            missing.iter().try_for_each(|&(index, key)| {
+                self.compute_one(index, key.clone(), &mut || bar.inc(1))?;
                 on_done();
                 Ok(())
             })
@@ -342,9 +369,29 @@ impl Sweep {
         computed
     }
 
-    fn compute_one(&self, index: usize, on_frame: &mut dyn FnMut()) -> Result<(), SweepError> {
-        let (point, key) = (&self.points[index], self.keys[index].clone());
-        cell::compute(&self.experiment, point, key, &self.maps(), on_frame)?.write(&self.cells())
+    /// Computes the run of a point and caches it.
+    fn compute_one(
+        &self,
+        index: usize,
+        key: CellKey,
+        on_frame: &mut dyn FnMut(),
+    ) -> Result<(), SweepError> {
+        let began = Instant::now();
+        let point = &self.points[index];
+        let options = point_options::options(&self.experiment, point, &self.maps())?;
+        let Evaluation {
+            metrics,
+            used,
+            messages,
+        } = evaluate(&options, &self.data, point.method, on_frame).map_err(Box::new)?;
+        let cell = Cell {
+            key,
+            metrics,
+            used,
+            messages,
+            wall_seconds: began.elapsed().as_secs_f64(),
+        };
+        Ok(cell.write(&self.cells())?)
     }
 
     /// Runs as a worker: computes the points that the parent process requests.
@@ -361,15 +408,16 @@ impl Sweep {
             writeln!(output, "{line}").and_then(|()| output.flush())
         };
         for line in io::stdin().lock().lines() {
-            let index: Option<usize> = line.map_err(gone)?.trim().parse().ok();
-            let Some(index) = index.filter(|index| *index < self.points.len()) else {
+            let request: Option<(usize, CellKey)> = serde_json::from_str(&line.map_err(gone)?).ok();
+            let Some((index, key)) = request.filter(|(index, _)| *index < self.points.len()) else {
                 reply(&format!("{} that is no point of the grid", workers::FAILED))
                     .map_err(gone)?;
                 continue;
             };
             // The parent may have ended; then the answer to the run fails too.
-            let computed =
-                self.compute_one(index, &mut || reply(workers::FRAME).unwrap_or_default());
+            let computed = self.compute_one(index, key, &mut || {
+                reply(workers::FRAME).unwrap_or_default()
+            });
             let answer = match computed {
                 Ok(()) => workers::DONE.to_owned(),
                 Err(error) => format!("{} {error}", workers::FAILED),
@@ -380,15 +428,15 @@ impl Sweep {
     }
 
     /// Writes table, charts and report; returns the table for a terminal.
-    fn write(&self, cells: &[Cell]) -> Result<String, SweepError> {
-        let text = csv(&self.experiment, cells);
+    fn write(&self, runs: &[Run]) -> Result<String, SweepError> {
+        let text = csv(&self.experiment, runs);
         let write = |name: &str, text: &str| {
             let path = self.out.join(name);
             fs::write(&path, text).map_err(|source| SweepError::Io { path, source })
         };
         write(&format!("{}.csv", self.experiment.name), &text)?;
         let mut drawings = Vec::new();
-        for figure in charts::figures(&self.experiment, cells) {
+        for figure in charts::figures(&self.experiment, runs) {
             let svg = figures::svg(&figure.charts)?;
             write(&format!("{}.svg", figure.name), &svg)?;
             // Charts of their own: side by side where there is room, and else below each other.
@@ -409,16 +457,16 @@ impl Sweep {
         })?;
         write(
             "report.html",
-            &html::page(&self.experiment, &spec, cells, &drawings),
+            &html::page(&self.experiment, &spec, runs, &drawings),
         )?;
-        let (columns, lines) = table::rows(&self.experiment, cells);
+        let (columns, lines) = table::rows(&self.experiment, runs);
         Ok(VaryingTable::new(&columns, &lines).text())
     }
 }
 
 /// Removes files of feature maps, which are most of what a sweep writes and are of no use once all runs are cached. Other
 /// files of their folder stay.
-fn remove_maps(files: &[PathBuf]) -> Result<(), SweepError> {
+fn remove_maps(files: &BTreeSet<PathBuf>) -> Result<(), SweepError> {
     for path in files {
         fs::remove_file(path).map_err(|source| SweepError::Io {
             path: path.clone(),
@@ -432,24 +480,35 @@ fn remove_maps(files: &[PathBuf]) -> Result<(), SweepError> {
     Ok(())
 }
 
-/// Generates the data set if it is requested and does not exist.
-fn generate(experiment: &Experiment) -> Result<(), SweepError> {
-    let Some(generate) = &experiment.generate else {
-        return Ok(());
-    };
-    let options = SynthOptions {
+/// Settings of the generator, if the experiment has a generated data set.
+fn generator(experiment: &Experiment) -> Option<SynthOptions> {
+    let generate = experiment.generate.as_ref()?;
+    Some(SynthOptions {
         frames: generate.frames,
         scenes: generate.scenarios,
         agents: generate.agents(),
         threads: std::thread::available_parallelism().map_or(1, usize::from),
         ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
+    })
+}
+
+/// True if no data set is requested, or it exists.
+fn is_generated(experiment: &Experiment) -> Result<bool, SweepError> {
+    let options = generator(experiment);
+    Ok(options.map_or(Ok(true), |options| generate::are_kept(&options))?)
+}
+
+/// Generates the data set if it is requested and does not exist.
+fn generate(experiment: &Experiment) -> Result<(), SweepError> {
+    let Some(options) = generator(experiment) else {
+        return Ok(());
     };
     if generate::are_kept(&options)? {
         return Ok(());
     }
     output::note(format_args!(
         "generating {} scenarios into {}",
-        generate.scenarios,
+        options.scenes,
         experiment.dataset.display()
     ));
     let bar = progress::percent_bar(options.scenarios());

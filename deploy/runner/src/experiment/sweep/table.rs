@@ -5,8 +5,9 @@ use fusion::Exchange;
 use protocol::DropReason;
 use support::csv_file::CsvText;
 
-use super::cell::Cell;
+use super::Run;
 use super::spec::Experiment;
+use crate::experiment::cell::Cell;
 
 /// Reasons with a column of their own; the last column is the sum of the others.
 const REASONS: [DropReason; 7] = [
@@ -78,34 +79,27 @@ pub(super) const NOTES: &[(&str, &str)] = &[
 
 /// The whole table.
 #[must_use]
-pub fn csv(experiment: &Experiment, cells: &[Cell]) -> String {
+pub fn csv(experiment: &Experiment, runs: &[Run]) -> String {
     let mut text = CsvText::new(COLUMNS);
-    cells
-        .iter()
-        .for_each(|cell| text.row(line(experiment, cell)));
+    runs.iter().for_each(|run| text.row(line(experiment, run)));
     text.finish()
 }
 
 /// Names of the columns, and the fields of each line.
-pub(super) fn rows(
-    experiment: &Experiment,
-    cells: &[Cell],
-) -> (Vec<&'static str>, Vec<Vec<String>>) {
+pub(super) fn rows(experiment: &Experiment, runs: &[Run]) -> (Vec<&'static str>, Vec<Vec<String>>) {
     (
         COLUMNS.split(',').collect(),
-        cells.iter().map(|cell| line(experiment, cell)).collect(),
+        runs.iter().map(|run| line(experiment, run)).collect(),
     )
 }
 
-fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
+fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
     let Cell {
-        key,
         metrics,
         used,
         messages,
-        wall_seconds: _,
+        ..
     } = cell;
-    let point = &key.point;
     let sends_maps = point.method.exchange() == Exchange::Features;
     let is_plain = sends_maps && point.codec.fit.is_none() && point.codec.zstd_level.is_none();
     let bandwidth = match point.bandwidth_mbps {

@@ -1,7 +1,7 @@
 //! Worker processes of a sweep, each with one compute thread.
 //!
-//! A worker is this program with `--worker`: it reads the number of a point from standard input, computes the run,
-//! caches it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.
+//! A worker is this program with `--worker`: it reads the number and the identity of a run from standard input, computes
+//! it, caches it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
@@ -9,6 +9,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Mutex;
 
 use super::SweepError;
+use crate::experiment::cell::CellKey;
 
 /// Answer of a worker: a frame is computed.
 pub(super) const FRAME: &str = "frame";
@@ -17,11 +18,14 @@ pub(super) const DONE: &str = "done";
 /// The run failed; the reason follows on the same line.
 pub(super) const FAILED: &str = "failed";
 
-/// Computes the points of these numbers with `jobs` processes; calls `on_frame` and `on_done` for each frame and run.
+/// Number and identity of a run.
+type Request<'r> = (usize, &'r CellKey);
+
+/// Computes these runs with `jobs` processes; calls `on_frame` and `on_done` for each frame and run.
 pub(super) fn run(
     file: &Path,
     out: &Path,
-    missing: &[usize],
+    missing: &[Request<'_>],
     jobs: usize,
     on_frame: &(dyn Fn() + Sync),
     on_done: &(dyn Fn() + Sync),
@@ -47,10 +51,10 @@ pub(super) fn run(
 }
 
 /// Feeds one worker until no run is left, or another worker has failed.
-fn serve(
+fn serve<'r>(
     file: &Path,
     out: &Path,
-    queue: &Mutex<impl Iterator<Item = usize>>,
+    queue: &Mutex<impl Iterator<Item = Request<'r>>>,
     failure: &Mutex<Option<SweepError>>,
     on_frame: &dyn Fn(),
     on_done: &dyn Fn(),
@@ -67,14 +71,15 @@ fn serve(
         {
             return Ok(());
         }
-        let Some(index) = queue
+        let Some(request) = queue
             .lock()
             .unwrap_or_else(std::sync::PoisonError::into_inner)
             .next()
         else {
             return Ok(());
         };
-        writeln!(input, "{index}").map_err(|error| SweepError::Worker(error.to_string()))?;
+        let request = serde_json::to_string(&request).unwrap_or_default();
+        writeln!(input, "{request}").map_err(|error| SweepError::Worker(error.to_string()))?;
         loop {
             let line = output
                 .next()

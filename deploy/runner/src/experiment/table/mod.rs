@@ -1,27 +1,27 @@
 //! Tables of methods: rows of methods and weights, columns of poses and delays, a cell for each, in Markdown and CSV.
 //!
-//! Cells are cached one by one by all their inputs, so that an interrupted run resumes and a changed row costs only
+//! Cells are cached one by one by everything that they are made of, so that an interrupted run resumes and a changed row costs only
 //! that row.
 
-mod cell;
 mod spec;
 mod text;
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::time::Instant;
 
 use agent::rate::RateConfig;
 use bus::config_file::ConfigError;
-use dataset::{self, IntensityScale, ReadError};
-use perception::boxes::postprocess::SCORE_THRESHOLD;
+use dataset::IntensityScale;
 
-pub use cell::{Cell, CellKey};
 pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
 
-use crate::experiment::evaluation::{EvaluationError, EvaluationOptions, Part, evaluate};
+use crate::experiment::cell::{Cell, CellError};
+use crate::experiment::evaluation::{
+    Evaluation, EvaluationError, EvaluationOptions, OpenedData, Part, evaluate,
+};
 use crate::scenario::weights_choice::WeightsChoiceError;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use training::feature_store::KeptMaps;
@@ -54,9 +54,9 @@ pub enum TableError {
     /// The folder of weights has none for a method.
     #[error(transparent)]
     Weights(#[from] WeightsChoiceError),
-    /// The data set cannot be read.
+    /// A cached cell cannot be used.
     #[error(transparent)]
-    Dataset(#[from] ReadError),
+    Cell(#[from] CellError),
     /// A cell cannot be evaluated.
     #[error(transparent)]
     Evaluation(#[from] Box<EvaluationError>),
@@ -65,8 +65,8 @@ pub enum TableError {
 /// The cells of a row: for each column one per training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FilledRow {
-    /// First column of the row.
-    pub label: String,
+    /// Method and first column of the row.
+    pub row: Row,
     /// Column by column, training by training.
     pub cells: Vec<Vec<Cell>>,
 }
@@ -76,8 +76,8 @@ pub struct FilledRow {
 pub struct FilledTable {
     /// Name of its files.
     pub name: String,
-    /// Titles of its columns.
-    pub columns: Vec<String>,
+    /// Conditions.
+    pub columns: Vec<Column>,
     /// Its rows.
     pub rows: Vec<FilledRow>,
 }
@@ -104,13 +104,10 @@ pub fn run(
         path: cells.clone(),
         source,
     })?;
-    let data_sha256 = dataset::content_sha256(&dataset::open(&spec.dataset)?.scenarios);
-    let run = Run {
-        spec,
-        cells,
-        data_sha256,
-        commit: commit(),
-    };
+    let data = Part::default()
+        .open(&spec.dataset, &spec.protocol)
+        .map_err(Box::new)?;
+    let run = Run { spec, cells, data };
     let mut filled = Vec::with_capacity(spec.tables.len());
     for table in &spec.tables {
         let table = run.fill(table, observer)?;
@@ -128,8 +125,7 @@ pub fn run(
 struct Run<'a> {
     spec: &'a TableSpec,
     cells: PathBuf,
-    data_sha256: String,
-    commit: String,
+    data: OpenedData,
 }
 
 impl Run<'_> {
@@ -147,19 +143,12 @@ impl Run<'_> {
                     |weights: &PathBuf| self.cell(table, row, column, weights, observer);
                 cells.push(weights.iter().map(of_training).collect::<Result<_, _>>()?);
             }
-            rows.push(FilledRow {
-                label: row.label(),
-                cells,
-            });
+            let row = row.clone();
+            rows.push(FilledRow { row, cells });
         }
-        let columns = table
-            .columns
-            .iter()
-            .map(|column| column.name.clone())
-            .collect();
         Ok(FilledTable {
             name: table.name.clone(),
-            columns,
+            columns: table.columns.clone(),
             rows,
         })
     }
@@ -172,34 +161,43 @@ impl Run<'_> {
         weights: &Path,
         observer: &mut dyn TableObserver,
     ) -> Result<Cell, TableError> {
-        let poses = row.poses.as_ref().unwrap_or(&column.poses).clone();
-        let key = CellKey {
-            method: row.method,
-            weights_sha256: cell::sha256(weights)?,
-            precision: self.spec.precision,
-            data_sha256: self.data_sha256.clone(),
-            poses_sha256: cell::pose_files(&poses)?,
-            poses: poses.clone(),
-            delay_ms: column.delay_ms,
-            dtype: self.spec.dtype,
-            frames: self.spec.frames,
-            scenarios: table.scenarios,
-            attack: column.attack,
-            trust: column.trust.then(MisbehaviourConfig::default),
-            protocol: self.spec.protocol.clone(),
-            score_threshold: SCORE_THRESHOLD,
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-        };
+        let options = self.options(table, row, column, weights);
+        let key = options.key(&self.data, row.method).map_err(Box::new)?;
         let known = Cell::read(&key, &self.cells)?;
         observer.cell(&table.name, &row.label(), &column.name, known.is_some());
         if let Some(cell) = known {
             return Ok(cell);
         }
-        let options = EvaluationOptions {
+        let began = Instant::now();
+        let Evaluation {
+            metrics,
+            used,
+            messages,
+        } = evaluate(&options, &self.data, row.method, &mut || observer.frame())
+            .map_err(Box::new)?;
+        let cell = Cell {
+            key,
+            metrics,
+            used,
+            messages,
+            wall_seconds: began.elapsed().as_secs_f64(),
+        };
+        cell.write(&self.cells)?;
+        Ok(cell)
+    }
+
+    fn options(
+        &self,
+        table: &Table,
+        row: &Row,
+        column: &Column,
+        weights: &Path,
+    ) -> EvaluationOptions {
+        EvaluationOptions {
             dataset: self.spec.dataset.clone(),
             weights: weights.to_owned(),
             precision: self.spec.precision,
-            pose_source: poses,
+            pose_source: row.poses.as_ref().unwrap_or(&column.poses).clone(),
             codec: self.spec.codec(),
             rate: RateConfig::default(),
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
@@ -218,33 +216,6 @@ impl Run<'_> {
             },
             protocol: self.spec.protocol.clone(),
             ..EvaluationOptions::default()
-        };
-        let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;
-        let cell = Cell {
-            key,
-            weights: weights.to_owned(),
-            commit: self.commit.clone(),
-            metrics,
-        };
-        cell.write(&self.cells)?;
-        Ok(cell)
+        }
     }
-}
-
-/// Commit of the checkout in the working directory, with `-dirty` if files differ from it.
-fn commit() -> String {
-    let output = Command::new("git")
-        .args([
-            "describe",
-            "--always",
-            "--dirty",
-            "--abbrev=12",
-            "--exclude=*",
-        ])
-        .output();
-    let description = output.ok().filter(|output| output.status.success());
-    description.map_or_else(
-        || "unknown".to_owned(),
-        |output| String::from_utf8_lossy(&output.stdout).trim().to_owned(),
-    )
 }

@@ -1,12 +1,14 @@
 //! Tables as Markdown and as CSV.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use deploy::score::metrics::ByIou;
 use support::csv_file::CsvText;
 
-use super::{Cell, FilledRow, FilledTable};
+use super::{FilledRow, FilledTable};
+use crate::experiment::cell::Cell;
+use crate::scenario::fingerprint::Provenance;
 
 /// Markdown table: AP@0.3/0.5/0.7 in per cent. A single column of conditions is expanded into both orderings and bytes;
 /// several show the global ordering only. The provenance follows below.
@@ -15,7 +17,10 @@ pub fn markdown(table: &FilledTable) -> String {
     let mut text = format!("# {}\n\n", table.name);
     let single = table.columns.len() == 1;
     let heads: Vec<String> = if single {
-        let global = format!("{}: AP@0.3 / 0.5 / 0.7, global order", table.columns[0]);
+        let global = format!(
+            "{}: AP@0.3 / 0.5 / 0.7, global order",
+            table.columns[0].name
+        );
         vec![
             global,
             "frame order".into(),
@@ -23,12 +28,13 @@ pub fn markdown(table: &FilledTable) -> String {
             "log2".into(),
         ]
     } else {
-        table.columns.clone()
+        let names = table.columns.iter().map(|column| column.name.clone());
+        names.collect()
     };
     // Writing to a string cannot fail.
     let _ = writeln!(text, "| method | {} |", heads.join(" | "));
     let _ = writeln!(text, "| --- |{}", " --- |".repeat(heads.len()));
-    for FilledRow { label, cells } in &table.rows {
+    for FilledRow { row, cells } in &table.rows {
         let values: Vec<String> = if single {
             let cells = &cells[0];
             let frame_order = precision(cells, |cell| cell.metrics.ap_frame_order);
@@ -46,7 +52,7 @@ pub fn markdown(table: &FilledTable) -> String {
                 .map(|cells| precision(cells, |cell| cell.metrics.ap_global))
                 .collect()
         };
-        let _ = writeln!(text, "| {label} | {} |", values.join(" | "));
+        let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));
     }
     if !single {
         text += "\nAP@0.3 / 0.5 / 0.7 in the global order.\n";
@@ -54,38 +60,39 @@ pub fn markdown(table: &FilledTable) -> String {
     text + &provenance(table)
 }
 
-/// Provenance of the values: frames, commits, data and weights.
+/// Provenance of the values: frames, programs, data, and every other file.
 fn provenance(table: &FilledTable) -> String {
-    let cells = || table.rows.iter().flat_map(|row| row.cells.iter().flatten());
-    let all = |value: &dyn Fn(&Cell) -> String| {
-        let mut values: Vec<String> = cells().map(value).collect();
-        values.sort();
-        values.dedup();
-        values.join(", ")
-    };
+    let (mut frames, mut programs, mut data) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
+    let mut files = BTreeSet::new();
+    for cell in table.rows.iter().flat_map(|row| row.cells.iter().flatten()) {
+        let Provenance {
+            version,
+            commit,
+            program_sha256,
+            data_sha256,
+            files_sha256,
+        } = &cell.key.provenance;
+        frames.insert(cell.metrics.frames.to_string());
+        programs.insert(format!(
+            "{version}, commit {commit}, SHA-256 `{program_sha256}`"
+        ));
+        data.insert(format!("`{data_sha256}`"));
+        files.extend(files_sha256);
+    }
     let mut text = format!(
-        "\nFrames: {}. Commit: {}. Data: contents SHA-256 {}. Weights:\n\n",
-        all(&|cell| cell.metrics.frames.to_string()),
-        all(&|cell| cell.commit.clone()),
-        all(&|cell| format!("`{}`", cell.key.data_sha256)),
+        "\nFrames: {}. Program: {}. Data: contents SHA-256 {}. Weights and other files:\n\n",
+        joined(frames),
+        joined(programs),
+        joined(data),
     );
-    let weights: BTreeMap<String, &Cell> = cells()
-        .map(|cell| {
-            (
-                format!("{} {}", cell.weights.display(), cell.key.weights_sha256),
-                cell,
-            )
-        })
-        .collect();
-    for cell in weights.values() {
-        let _ = writeln!(
-            text,
-            "- `{}`, SHA-256 `{}`",
-            cell.weights.display(),
-            cell.key.weights_sha256
-        );
+    for (file, sha256) in files {
+        let _ = writeln!(text, "- `{}`, SHA-256 `{sha256}`", file.display());
     }
     text
+}
+
+fn joined(values: BTreeSet<String>) -> String {
+    values.into_iter().collect::<Vec<_>>().join(", ")
 }
 
 /// CSV: a line per cell and training.
@@ -93,19 +100,26 @@ fn provenance(table: &FilledTable) -> String {
 pub fn csv(table: &FilledTable) -> String {
     let mut text = CsvText::new(
         "table,row,column,training,method,poses,delay_ms,frames,ap_global_30,ap_global_50,ap_global_70,ap_frame_30,\
-         ap_frame_50,ap_frame_70,payload_bytes_mean,log2_payload,pose_mean_m,pose_p95_m,no_pose,commit,weights_sha256,\
-         data_sha256",
+         ap_frame_50,ap_frame_70,payload_bytes_mean,log2_payload,pose_mean_m,pose_p95_m,no_pose,commit,program_sha256,\
+         data_sha256,files_sha256",
     );
-    for FilledRow { label, cells } in &table.rows {
+    for FilledRow { row, cells } in &table.rows {
         for (column, trainings) in table.columns.iter().zip(cells) {
             for (training, cell) in trainings.iter().enumerate() {
                 let place = [
                     table.name.clone(),
-                    label.clone(),
-                    column.clone(),
+                    row.label(),
+                    column.name.clone(),
                     training.to_string(),
                 ];
-                text.row(place.into_iter().chain(cell_fields(cell)));
+                let poses = row.poses.as_ref().unwrap_or(&column.poses);
+                let conditions = [
+                    row.method.to_string(),
+                    poses.name().to_owned(),
+                    column.delay_ms.to_string(),
+                ];
+                let fields = place.into_iter().chain(conditions);
+                text.row(fields.chain(cell_fields(cell)));
             }
         }
     }
@@ -113,18 +127,8 @@ pub fn csv(table: &FilledTable) -> String {
 }
 
 fn cell_fields(cell: &Cell) -> Vec<String> {
-    let Cell {
-        key,
-        metrics,
-        commit,
-        ..
-    } = cell;
-    let mut fields = vec![
-        key.method.to_string(),
-        key.poses.name().to_owned(),
-        key.delay_ms.to_string(),
-    ];
-    fields.push(metrics.frames.to_string());
+    let Cell { key, metrics, .. } = cell;
+    let mut fields = vec![metrics.frames.to_string()];
     for ByIou {
         at_30,
         at_50,
@@ -134,6 +138,9 @@ fn cell_fields(cell: &Cell) -> Vec<String> {
         fields.extend([at_30, at_50, at_70].map(plain));
     }
     let (comm, pose) = (&metrics.comm, &metrics.pose);
+    let files: Vec<&str> = (key.provenance.files_sha256.values())
+        .map(String::as_str)
+        .collect();
     fields.extend(
         [
             comm.payload_bytes_mean,
@@ -145,9 +152,10 @@ fn cell_fields(cell: &Cell) -> Vec<String> {
     );
     fields.extend([
         pose.no_pose.to_string(),
-        commit.clone(),
-        key.weights_sha256.clone(),
-        key.data_sha256.clone(),
+        key.provenance.commit.clone(),
+        key.provenance.program_sha256.clone(),
+        key.provenance.data_sha256.clone(),
+        files.join(" "),
     ]);
     fields
 }
@@ -191,12 +199,10 @@ fn plain(value: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use fusion::Method;
-    use localization::pose_source::PoseSourceConfig;
 
-    use dataset::evaluation_protocol::ProtocolConfig;
-
-    use super::super::CellKey;
+    use super::super::{Column, Row};
     use super::*;
+    use crate::experiment::cell::CellKey;
     use deploy::score::metrics::{Communication, Metrics};
 
     fn cell(method: Method, at_50: f64) -> Cell {
@@ -218,34 +224,44 @@ mod tests {
             method: method.name().into(),
             ..Metrics::default()
         };
+        let weights = ("w.safetensors".into(), format!("{at_50}"));
         let key = CellKey {
             method,
-            weights_sha256: format!("{at_50}"),
-            precision: Default::default(),
-            data_sha256: "d".into(),
-            poses: PoseSourceConfig::Recorded,
-            poses_sha256: vec![],
-            delay_ms: 0,
-            dtype: protocol::Dtype::F16,
-            frames: None,
-            scenarios: None,
-            attack: None,
-            trust: None,
-            protocol: ProtocolConfig::default(),
-            score_threshold: 0.1,
-            version: "1".into(),
+            sha256: "c".into(),
+            provenance: Provenance {
+                commit: "abc".into(),
+                data_sha256: "d".into(),
+                files_sha256: [weights].into(),
+                ..Provenance::default()
+            },
         };
         Cell {
             key,
-            weights: "w.safetensors".into(),
-            commit: "abc".into(),
             metrics,
+            used: 0,
+            messages: Default::default(),
+            wall_seconds: 0.0,
+        }
+    }
+
+    fn column(name: &str) -> Column {
+        Column {
+            name: name.into(),
+            poses: Default::default(),
+            delay_ms: 0,
+            attack: None,
+            trust: false,
         }
     }
 
     fn table(columns: &[&str]) -> FilledTable {
         let row = |method: Method, trainings: &[f64]| FilledRow {
-            label: format!("{method}, here"),
+            row: Row {
+                name: Some(format!("{method}, here")),
+                method,
+                weights: vec![],
+                poses: None,
+            },
             cells: columns
                 .iter()
                 .map(|_| trainings.iter().map(|&at_50| cell(method, at_50)).collect())
@@ -253,7 +269,7 @@ mod tests {
         };
         FilledTable {
             name: "main".into(),
-            columns: columns.iter().map(ToString::to_string).collect(),
+            columns: columns.iter().map(|name| column(name)).collect(),
             rows: vec![row(Method::NONE, &[0.5]), row(Method::PASTAT, &[0.6, 0.8])],
         }
     }
@@ -267,7 +283,7 @@ mod tests {
         );
         assert!(text.contains("70.00 ± 14.14"), "{text}");
         assert!(
-            text.contains("Commit: abc.") && text.contains("SHA-256 `0.6`") && text.contains("`d`"),
+            text.contains("commit abc,") && text.contains("SHA-256 `0.6`") && text.contains("`d`"),
             "{text}"
         );
     }

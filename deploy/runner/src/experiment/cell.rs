@@ -1,0 +1,172 @@
+//! Cells: results of evaluations, cached on disk by everything that they were made of. Sweeps and tables print them.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::{fs, io};
+
+use deploy::score::metrics::Metrics;
+use fusion::Method;
+use protocol::{Counts, DropReason};
+use serde::{Deserialize, Serialize};
+use support::atomic_file;
+
+use crate::scenario::fingerprint::Provenance;
+
+/// Digits of the key in the name of a file.
+const NAME_DIGITS: usize = 24;
+
+/// Identity of a result.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CellKey {
+    /// Fusion method.
+    pub method: Method,
+    /// SHA-256 over the settings, the programs, the data and all other files.
+    pub sha256: String,
+    /// Everything besides the settings.
+    pub provenance: Provenance,
+}
+
+/// A completed evaluation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Cell {
+    /// Identity.
+    pub key: CellKey,
+    /// Metrics.
+    pub metrics: Metrics,
+    /// Number of neighbours' messages that were fused, over all frames.
+    pub used: u64,
+    /// Counts of the messages that are fused: feature maps, boxes or points, without the pose messages.
+    pub messages: MessageCounts,
+    /// Compute time, seconds: for estimates, never for results.
+    pub wall_seconds: f64,
+}
+
+/// Message counts.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct MessageCounts {
+    /// Sent, including duplicates by the link.
+    pub sent: u64,
+    /// Used at least once.
+    pub received: u64,
+    /// In flight at the end of the scene.
+    pub in_flight: u64,
+    /// Not used, by reason.
+    pub dropped: BTreeMap<DropReason, u64>,
+}
+
+impl From<Counts> for MessageCounts {
+    fn from(counts: Counts) -> Self {
+        let Counts {
+            sent,
+            received,
+            in_flight,
+            dropped,
+            adapted: _,
+        } = counts;
+        Self {
+            sent,
+            received,
+            in_flight,
+            dropped,
+        }
+    }
+}
+
+/// Reason why a cell cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum CellError {
+    /// Error of the operating system.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: io::Error,
+    },
+    /// The file is no cached cell.
+    #[error("{}: {problem}; without the file it is computed anew", path.display())]
+    Malformed {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the JSON reader.
+        problem: String,
+    },
+}
+
+impl CellKey {
+    /// Cache file of the cell.
+    #[must_use]
+    fn file(&self, folder: &Path) -> PathBuf {
+        let digits: String = self.sha256.chars().take(NAME_DIGITS).collect();
+        folder.join(format!("{}-{digits}.json", file_name(self.method)))
+    }
+}
+
+impl Cell {
+    /// The cached cell; `None` if it does not exist.
+    ///
+    /// # Errors
+    /// [`CellError`] when the file cannot be read or is no cached cell.
+    pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>, CellError> {
+        let path = key.file(folder);
+        let text = match fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(source) => return Err(CellError::Io { path, source }),
+        };
+        let cell: Self = serde_json::from_str(&text).map_err(|error| CellError::Malformed {
+            path,
+            problem: error.to_string(),
+        })?;
+        Ok((cell.key.sha256 == key.sha256).then_some(cell))
+    }
+
+    /// Caches the cell; the file appears only when it is complete.
+    ///
+    /// # Errors
+    /// [`CellError::Io`] when it cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<(), CellError> {
+        let path = self.key.file(folder);
+        let text = serde_json::to_string_pretty(self).unwrap_or_default();
+        atomic_file::write(&path, text).map_err(|source| CellError::Io { path, source })
+    }
+}
+
+/// Name of a method as a name of files: that of a TorchScript file has its path in it.
+pub(crate) fn file_name(method: Method) -> String {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "._-".contains(letter);
+    method
+        .name()
+        .chars()
+        .map(|letter| if is_plain(letter) { letter } else { '-' })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_method_in_a_folder_is_cached_and_another_key_is_another_cell() {
+        let folder = tempfile::tempdir().unwrap();
+        let key = |sha256: &str| CellKey {
+            method: "script:fusion/mine.pt".parse().unwrap(),
+            sha256: sha256.repeat(32),
+            provenance: Provenance::default(),
+        };
+        let cell = Cell {
+            key: key("0a"),
+            metrics: Metrics::default(),
+            used: 3,
+            messages: MessageCounts::default(),
+            wall_seconds: 0.5,
+        };
+        cell.write(folder.path()).unwrap();
+        let read = |key: &CellKey| Cell::read(key, folder.path());
+        assert_eq!(read(&cell.key).unwrap(), Some(cell.clone()));
+        assert_eq!(read(&key("0b")).unwrap(), None);
+        fs::write(cell.key.file(folder.path()), "{").unwrap();
+        let message = read(&cell.key).unwrap_err().to_string();
+        assert!(message.contains("script-fusion-mine.pt-0a0a"), "{message}");
+    }
+}

@@ -1,0 +1,65 @@
+//! Settings of the evaluation of each point of a grid.
+
+use std::path::Path;
+
+use dataset::IntensityScale;
+use ego_fuser_offline::evaluation::EvaluateError;
+use fusion::Exchange;
+use perception::model_config::DetectorConfig;
+use perception::weights::Weights;
+use protocol::Dtype;
+use training::feature_store::KeptMaps;
+
+use super::SweepError;
+use super::grid::{self, Point};
+use super::spec::Experiment;
+use crate::experiment::evaluation::{EvaluationError, EvaluationOptions};
+use crate::scenario::weights_choice::weights_of;
+
+/// Settings of the evaluation of a point.
+pub(super) fn options(
+    experiment: &Experiment,
+    point: &Point,
+    maps: &Path,
+) -> Result<EvaluationOptions, SweepError> {
+    let weights = weights_of(&experiment.weights, point.method)?;
+    let read = Weights::load(&weights)
+        .map_err(EvaluateError::from)
+        .map_err(boxed)?;
+    let config: DetectorConfig = read.config().map_err(EvaluateError::from).map_err(boxed)?;
+    let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
+    Ok(EvaluationOptions {
+        dataset: experiment.dataset.clone(),
+        weights,
+        precision: experiment.precision,
+        pose_source: point.poses(experiment),
+        codec: point.codec(config.feature_grid(), channels),
+        rate: point.rate(),
+        trust: experiment.ego.trust(),
+        maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
+        stepped: Some(grid::stepped(
+            point.link(experiment)?,
+            point,
+            &experiment.ego,
+            experiment.compute,
+        )),
+        part: experiment.part(),
+        protocol: experiment.protocol.clone(),
+        ..EvaluationOptions::default()
+    })
+}
+
+/// Feature maps are cached losslessly, so that the cache changes no result.
+pub(super) fn kept_maps(experiment: &Experiment, folder: &Path) -> KeptMaps {
+    let limit_bytes = (experiment.maps_limit_gb * 1e9) as u64;
+    KeptMaps {
+        folder: folder.to_owned(),
+        dtype: Dtype::F32,
+        limit_bytes,
+        intensity_scale: IntensityScale::AUTO,
+    }
+}
+
+fn boxed(error: EvaluateError) -> SweepError {
+    SweepError::Evaluation(Box::new(EvaluationError::from(error)))
+}
