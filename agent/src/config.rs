@@ -245,12 +245,7 @@ impl AgentSettings {
     /// [`FieldError`] of the first value that is out of range.
     pub fn validate(&self) -> Result<(), FieldError> {
         self.pose.validate()?;
-        within(
-            "codec.zstd_level",
-            self.codec.zstd_level.unwrap_or(1),
-            1,
-            22,
-        )
+        self.codec.validate()
     }
 }
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Trains a fusion in PyTorch on maps that v2vloc kept, and writes it as a TorchScript file that v2vloc runs.
 
-    v2vloc eval --dataset SCENES --weights deploy/weights/lean-max.safetensors --method max --dtype f16 --maps maps
-    train_fusion_in_pytorch.py --dataset SCENES --maps maps/*.maps --weights deploy/weights/lean-max.safetensors trained.pt
+    v2vloc eval --dataset SCENES --weights deploy/weights/lean-max.safetensors --method max --dtype f16 --feature-maps maps
+    train_fusion_in_pytorch.py --dataset SCENES --feature-maps maps/*.maps --weights deploy/weights/lean-max.safetensors trained.pt
     v2vloc eval --dataset OTHER_SCENES --weights deploy/weights --method script:trained.pt max
 
 Encoder and detection head stay as they are; only the fusion between them is trained. It needs torch, safetensors and the
@@ -79,7 +79,7 @@ def train(fusion: nn.Module, samples: Samples, frames: list[int], minutes: float
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dataset", type=pathlib.Path, required=True, help="data set of the maps")
-    parser.add_argument("--maps", type=pathlib.Path, required=True, help="file of kept maps, .maps")
+    parser.add_argument("--feature-maps", type=pathlib.Path, required=True, help="file of kept maps, .maps")
     parser.add_argument("--weights", type=pathlib.Path, required=True, help="weights that made the maps, .safetensors")
     parser.add_argument("--minutes", type=float, default=15, help="CPU time of the training [default: 15]")
     parser.add_argument("file", help="file to write, .pt")
@@ -87,7 +87,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     random.seed(0)
-    samples = Samples(arguments.dataset, arguments.maps, arguments.weights)
+    samples = Samples(arguments.dataset, arguments.feature_maps, arguments.weights)
     # The last tenth, whole scenes, is held out.
     frames = list(range(len(samples)))
     training, held_out = frames[:len(frames) * 9 // 10], frames[len(frames) * 9 // 10:]

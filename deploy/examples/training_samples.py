@@ -1,6 +1,6 @@
 """Training samples of a fusion in PyTorch: maps on the ego's grid, and the detection loss of what a fusion makes of them.
 
-Reads a data set, the maps that `v2vloc eval --maps DIR` kept of it, and a weights file. Maps are turned and warped as
+Reads a data set, the maps that `v2vloc eval --feature-maps DIR` kept of it, and a weights file. Maps are turned and warped as
 v2vloc does before it calls a fusion; targets and loss are those of `ego-fuser train`.
 """
 import json

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Makes the animation of README: the page of `v2vloc view` on a recorded run, as an animated WebP.
 
-    v2vloc up deploy/scenarios/demo.yaml --scene scenes/v2vdet-1000-2x60 --method pastat --set scene.lockstep=true --record --name animation
+    v2vloc up deploy/scenarios/demo.yaml --dataset scenes/v2vdet-1000-2x60 --method pastat --set scene.lockstep=true --record --name animation
     deploy/tools/animate_view.py runs/animation deploy/results/demo.webp      # needs Chromium and Pillow
 
 `--every 2` takes every second frame of the run. The animation has the speed of the run.
@@ -62,7 +62,7 @@ def pictures(address: str, every: int) -> tuple[list[Image.Image], float]:
 
 def main():
     options = arguments()
-    view = subprocess.Popen([PROGRAMS / "v2vloc", "view", options.run, "--listen", "127.0.0.1:0"], stdout=subprocess.PIPE,
+    view = subprocess.Popen([PROGRAMS / "v2vloc", "view", options.run, "--page", "127.0.0.1:0"], stdout=subprocess.PIPE,
                             stderr=subprocess.STDOUT, text=True)
     try:
         address = next(match[0] for match in (re.search(r"http://\S+", line) for line in view.stdout) if match)

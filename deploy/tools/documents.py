@@ -7,9 +7,11 @@ A marker is an HTML comment on the line before a block:
     <!-- run: --frames 60 => --frames 5 -->      run with the left text replaced by the right
     <!-- run: background -->                     keeps running until the end of the page
     <!-- file: NAME -->                          the block is a file that later blocks read
-    <!-- not run: REASON -->                     options and paths are checked, nothing runs
+    <!-- not run: REASON -->                     options, values and paths are checked, nothing runs
+    <!-- not compared: REASON -->                an output of which nothing is the same in another run
 
-Parts are separated by `;`. Blocks of `text`, `json`, `mermaid` and `rust` need none.
+Parts are separated by `;`. Blocks of `text`, `json`, `mermaid` and `rust` need none. A block of `text` after a block
+that is run shows its output, which is compared by the rule of shown_output.py.
 """
 
 import pathlib
@@ -45,6 +47,8 @@ class Block:
     replacements: list[tuple[str, str]] = field(default_factory=list)
     codes: tuple[int, ...] = (0,)
     background: bool = False
+    # The output that the page shows after it.
+    shown: str = ""
 
     @property
     def place(self) -> str:
@@ -64,6 +68,8 @@ class Block:
             return None
         if not self.marker:
             return f"block of {self.language or 'no language'} without a marker"
+        if self.marker.startswith("not compared:") and self.language == "text":
+            return None
         if self.marker.startswith("not run:") and len(self.marker) > len("not run: "):
             return None
         if self.file:
@@ -103,6 +109,8 @@ def blocks(page: pathlib.Path) -> list[Block]:
             comment = re.fullmatch(r"\s*<!-- (.*?) -->", before)
             inside = Block(page, number, fence[1], "", comment[1] if comment else "")
         elif fence:
+            if inside.language == "text" and not inside.marker and found and found[-1].is_run:
+                found[-1].shown = inside.text
             found.append(inside)
             inside = None
         elif inside is not None:

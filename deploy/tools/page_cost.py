@@ -2,7 +2,7 @@
 """Measures the cost of an open page for a run: the same fleet repeatedly, with and without a reader of the page's stream.
 
     cargo build --release --workspace --bins
-    deploy/tools/page_cost.py [--rounds 4] [--frames 150] [--method max] [--scene DIR]
+    deploy/tools/page_cost.py [--rounds 4] [--frames 150] [--method max] [--dataset DIR]
 
 A round is a run with and one without, in alternating order, so that other load of the machine affects both. The reader
 reads and discards every frame, as a browser on another machine would; the server of the page runs on this one. Where Linux
@@ -32,14 +32,14 @@ def arguments():
     parser.add_argument("--frames", type=int, default=150)
     parser.add_argument("--method", default="max")
     parser.add_argument("--scenario", help="left out: recorded poses and all defaults, for which two cores suffice")
-    parser.add_argument("--scene", help="data set, split or scenario; left out: two vehicles are generated")
+    parser.add_argument("--dataset", help="data set, split or scenario; left out: two vehicles are generated")
     return parser.parse_args()
 
 
 def generate(folder, frames):
     """Two vehicles of seed 1000, as in the demo."""
     command = [PROGRAMS / "sim-replay", "synth", "--out", folder, "--subset", "v2vdet", "--seed", "1000"]
-    subprocess.run([*command, "--frames", str(frames), "--agents", "2"], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([*command, "--frames", str(frames), "--vehicles", "2"], check=True, stdout=subprocess.DEVNULL)
     return folder
 
 
@@ -63,7 +63,7 @@ class Page:
     """A viewer, and a reader of its stream."""
 
     def __init__(self, name, router):
-        command = [PROGRAMS / "v2vloc", "view", "--run", name, "--connect", router, "--listen", "127.0.0.1:0"]
+        command = [PROGRAMS / "v2vloc", "view", "--run", name, "--connect", router, "--page", "127.0.0.1:0"]
         self.viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         self.address = line_with(self.viewer.stderr, r"http://([\d.:]+)/")[1]
         self.moments = 0
@@ -90,7 +90,7 @@ class Page:
 
 def run(options, scene, folder, name, with_page):
     """Latencies of one run, and the number of frames that the page received."""
-    command = [PROGRAMS / "v2vloc", "up", options.scenario, "--scene", scene, "--method", options.method]
+    command = [PROGRAMS / "v2vloc", "up", options.scenario, "--dataset", scene, "--method", options.method]
     command += ["--frames", str(options.frames), "--name", name, "--runs", folder, "--json"]
     fleet = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     router = line_with(fleet.stderr, rf"run {name} at (\S+):")[1]
@@ -115,7 +115,7 @@ def main():
     options = arguments()
     with tempfile.TemporaryDirectory() as work:
         work = pathlib.Path(work)
-        scene = pathlib.Path(options.scene).resolve() if options.scene else generate(work / "scene", options.frames)
+        scene = pathlib.Path(options.dataset).resolve() if options.scene else generate(work / "scene", options.frames)
         options.scenario = options.scenario or scenario(work, scene)
         run(options, scene, work, "warm-up", False)
         pooled = {False: [], True: []}

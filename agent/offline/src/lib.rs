@@ -27,7 +27,6 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod evaluation;
-pub mod head_files;
 pub mod icp_map;
 pub mod mapping;
 pub mod sweep_database;

@@ -21,6 +21,14 @@ pub enum ConfigError {
         /// Condition on the value.
         must: &'static str,
     },
+    /// A module's file cannot be read.
+    #[error("{}: {problem}", file.display())]
+    ScriptFile {
+        /// The file.
+        file: PathBuf,
+        /// Error of the operating system.
+        problem: String,
+    },
     /// A module cannot be loaded.
     #[error("{}: not a TorchScript module: {reason}", file.display())]
     Script {

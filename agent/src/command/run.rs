@@ -62,7 +62,12 @@ fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
         .context("weights")?;
     Ok(Agent::new(
         config.cav.clone(),
-        config.settings.pose.build(inference)?,
+        config
+            .settings
+            .pose
+            .clone()
+            .with_networks()?
+            .build(inference)?,
         detector,
     ))
 }

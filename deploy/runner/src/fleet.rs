@@ -14,6 +14,7 @@ use dataset::{self, OpenOptions, Scenario as Recorded};
 use deploy::operate::keys::KeyError;
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
+use ego_fuser::ego::Ego;
 use fusion::Exchange;
 use fusion::Method;
 use link::{LinkConfig, LinkEmulator};
@@ -60,8 +61,8 @@ pub struct Fleet {
 /// Refuses options of a protocol that a live run takes from other fields.
 fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
     let options = [
-        ("agents", protocol.agents.is_some()),
-        ("ego", protocol.ego.is_some()),
+        ("agent_kinds", protocol.agent_kinds.is_some()),
+        ("ego_kind", protocol.ego_kind.is_some()),
         ("max_agents", protocol.max_agents.is_some()),
     ];
     match options.iter().find(|(_, is_given)| *is_given) {
@@ -81,6 +82,8 @@ impl Fleet {
         let mut scenario = scenario.clone();
         scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
         let detector = Weights::load(&scenario.models.weights)?.detector_config()?;
+        // As the ego-fuser does: weights of another method are refused before any process starts.
+        Ego::load(&scenario.models.weights, Some(scenario.method), Device::Cpu)?;
         scenario.poses().iter().try_for_each(load_networks)?;
         if let Some(link) = &scenario.link {
             LinkEmulator::open(&link.model, link.seed)?;

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use deploy::operate::keys::{KeyError, KeyPlan, make};
 use protocol::{CavId, Principal, Role};
+use serde_json::json;
 use support::output;
 
 use support::cli::BadInput;
@@ -74,7 +75,7 @@ impl Arguments {
             KeyError::Io { .. } => anyhow::Error::from(error),
         })?;
         if self.json {
-            output::line(serde_json::to_string_pretty(&written)?)?;
+            output::line(serde_json::to_string_pretty(&json!({ "files": written }))?)?;
         } else {
             written
                 .iter()

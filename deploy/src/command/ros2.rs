@@ -80,7 +80,7 @@ struct Sensors {
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
     lidar: Vec<AgentTopic>,
     /// Largest intensity of these messages, 255 for many drivers; agents get shares of it, 0 to 1.
-    #[arg(long, value_name = "VALUE", default_value_t = 1.0, value_parser = above_zero)]
+    #[arg(long, value_name = "VALUE", default_value_t = 1.0, requires = "lidar", value_parser = above_zero)]
     intensity_max: f32,
     /// Pass speed and yaw rate of a topic of nav_msgs/Odometry to an agent that has a --lidar, for example /odom=1000;
     /// repeatable.

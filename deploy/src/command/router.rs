@@ -28,13 +28,13 @@ pub(crate) struct Arguments {
     /// restricted to its own topics.
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
-    /// The only run that is admitted [default: any].
-    #[arg(long)]
+    /// The only run that is admitted (--keys) [default: any].
+    #[arg(long, requires = "keys")]
     run: Option<RunId>,
     /// Longest time for handing one map or sweep to one receiver on another host before its connection is closed,
     /// seconds. Other receivers do not wait for it.
-    #[arg(long, default_value_t = 5.0, value_parser = seconds)]
-    stall_limit: f64,
+    #[arg(long, value_name = "S", default_value_t = 5.0, value_parser = seconds)]
+    stall_limit_s: f64,
     /// Route the messages that processes of this machine have in shared memory there: sockets carry descriptors only.
     #[arg(long)]
     shared_memory: bool,
@@ -107,7 +107,7 @@ impl Arguments {
 
     fn options(&self) -> anyhow::Result<BusOptions> {
         let mut options = BusOptions::router(self.listen.clone());
-        options.stall_limit = Duration::from_secs_f64(self.stall_limit);
+        options.stall_limit = Duration::from_secs_f64(self.stall_limit_s);
         if self.shared_memory {
             options.shared_memory = SharedMemory::Attached;
         }

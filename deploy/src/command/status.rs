@@ -23,7 +23,7 @@ pub(crate) struct Arguments {
     #[arg(conflicts_with = "connect")]
     run: Option<PathBuf>,
     /// Folder of the run folders.
-    #[arg(long, default_value = "runs")]
+    #[arg(long, default_value = "runs", conflicts_with = "connect")]
     runs: PathBuf,
     /// Router of a run without a folder here, tcp/HOST:PORT: its processes are observed for 2.5 s.
     #[arg(long, requires = "name", value_name = "ENDPOINT")]

@@ -25,7 +25,7 @@ pub(crate) struct Arguments {
     #[arg(conflicts_with = "connect")]
     run: Option<PathBuf>,
     /// Folder of the run folders.
-    #[arg(long, default_value = "runs")]
+    #[arg(long, default_value = "runs", conflicts_with = "connect")]
     runs: PathBuf,
     /// Router of a live run without a folder here, tcp/HOST:PORT; `v2vloc up` prints it.
     #[arg(long, requires = "name", value_name = "ENDPOINT")]
@@ -38,20 +38,20 @@ pub(crate) struct Arguments {
     keys: Option<PathBuf>,
     /// Address of the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
-    listen: SocketAddr,
+    page: SocketAddr,
 }
 
 impl Arguments {
     /// Serves the page until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         match self.shown()? {
-            Shown::Recorded(path) => show_recorded(&path, self.listen)?,
+            Shown::Recorded(path) => show_recorded(&path, self.page)?,
             Shown::Live(name, router) => {
                 // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let bus = viewer_bus(&name, &router, self.keys.as_deref())?;
                 let run = Arc::new(LiveRun::start(bus)?);
-                until_stopped(self.listen, |address| serve_live(address, run))?;
+                until_stopped(self.page, |address| serve_live(address, run))?;
             }
         }
         Ok(Outcome::Done)

@@ -90,6 +90,14 @@ pub enum StatusError {
         /// Description of the error.
         problem: String,
     },
+    /// No run has this name or path.
+    #[error("there is no run {}, neither here nor in {}", name.display(), runs.display())]
+    NotThere {
+        /// Requested name or path.
+        name: PathBuf,
+        /// Folder of the run folders.
+        runs: PathBuf,
+    },
     /// No run in the folder.
     #[error("there is no run in {}", .0.display())]
     NoRun(PathBuf),
@@ -125,11 +133,15 @@ impl RunStatus {
     /// Folder of a run that is named by its path or by its name in `runs`; not named: the newest.
     ///
     /// # Errors
-    /// [`StatusError::NoRun`] when none is named and there is none.
+    /// [`StatusError::NotThere`], or [`StatusError::NoRun`] when none is named and there is none.
     pub fn folder(named: Option<PathBuf>, runs: &Path) -> Result<PathBuf, StatusError> {
         match named {
             Some(run) if run.is_dir() => Ok(run),
-            Some(name) => Ok(runs.join(name)),
+            Some(name) if runs.join(&name).is_dir() => Ok(runs.join(name)),
+            Some(name) => Err(StatusError::NotThere {
+                name,
+                runs: runs.to_owned(),
+            }),
             None => Self::newest(runs),
         }
     }

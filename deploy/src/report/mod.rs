@@ -86,6 +86,9 @@ pub enum ReportError {
         /// Error of the operating system.
         source: std::io::Error,
     },
+    /// The run ended before its first tick.
+    #[error("{}: nothing was played in this run: it ended before its first tick", .0.display())]
+    NothingPlayed(PathBuf),
     /// The file has another form.
     #[error("{}: {problem}", path.display())]
     Syntax {
@@ -130,7 +133,11 @@ impl RunReport {
     /// # Errors
     /// [`ReportError`] names the file.
     pub fn read(folder: &Path) -> Result<Self, ReportError> {
-        read_json(folder.join(FILE))
+        let report: Self = read_json(folder.join(FILE))?;
+        match report.pace.ticks {
+            0 => Err(ReportError::NothingPlayed(folder.to_owned())),
+            _ => Ok(report),
+        }
     }
 }
 

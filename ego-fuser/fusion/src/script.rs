@@ -68,6 +68,12 @@ impl FusionSettings for ScriptConfig {
     }
 
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        if let Err(error) = std::fs::File::open(&self.file) {
+            return Err(ConfigError::ScriptFile {
+                file: self.file.clone(),
+                problem: error.to_string(),
+            });
+        }
         let script = ScriptFusion::load(&self.file, path.device());
         Ok(Box::new(script.map_err(|source| ConfigError::Script {
             file: self.file.clone(),

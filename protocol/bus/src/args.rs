@@ -243,5 +243,6 @@ fn ours_at(level: &str) -> String {
         .iter()
         .map(|name| format!(",{name}={level}"))
         .collect();
-    format!("warn,zenoh_link_commons::quic=error{ours}")
+    // A router that does not answer is an error of ours, which names the endpoint and the remedy.
+    format!("warn,zenoh_link_commons::quic=error,zenoh::net::runtime::orchestrator=error{ours}")
 }

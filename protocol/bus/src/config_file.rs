@@ -1,10 +1,13 @@
 //! Configuration files: YAML of a bounded size into typed values, with errors that state file, line and field.
 
+use std::collections::BTreeMap;
 use std::fmt::{self, Display};
 use std::path::{Path, PathBuf};
 
 use protocol::config::FieldError;
 use serde::de::{DeserializeOwned, IgnoredAny};
+
+use super::unknown_field;
 
 /// Maximum size of a file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
@@ -78,7 +81,11 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, ConfigEr
             Err(no_yaml) => (no_yaml, None),
             Ok(_) => (error, field_of_error::<T>(text)),
         };
-        let reason = reason(&error);
+        let fields = match &field {
+            Some(nested) if nested.contains('.') => Vec::new(),
+            _ => fields_of(text),
+        };
+        let reason = unknown_field::explained(reason(&error), &fields);
         ConfigError::Syntax {
             path: path.into(),
             line: error.location().map(|location| location.line()),
@@ -94,6 +101,12 @@ fn reason(error: &serde_saphyr::Error) -> String {
     line.rsplit_once(" at line ")
         .map_or(line, |(reason, _)| reason)
         .to_owned()
+}
+
+/// Names of the fields on the top level of a text.
+fn fields_of(text: &str) -> Vec<String> {
+    serde_saphyr::from_str::<BTreeMap<String, IgnoredAny>>(text)
+        .map_or_else(|_| Vec::new(), |fields| fields.into_keys().collect())
 }
 
 /// Field at which a text stops being a `T`, for example `scene.rate`; `None` for the whole document.

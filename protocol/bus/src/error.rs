@@ -1,5 +1,6 @@
 //! Errors of the bus, each with its remedy.
 
+use std::io::ErrorKind;
 use std::path::PathBuf;
 
 use serde_json::Value;
@@ -102,6 +103,12 @@ impl BusError {
     /// True if the input is at fault, so that a retry has no effect.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
+        if let Self::Metrics { cause, .. } = self {
+            return matches!(
+                cause.kind(),
+                ErrorKind::AddrInUse | ErrorKind::AddrNotAvailable | ErrorKind::PermissionDenied
+            );
+        }
         matches!(
             self,
             Self::Endpoint(_)

@@ -68,6 +68,7 @@ mod shared_pool;
 pub mod shutdown;
 mod status_publisher;
 mod subscriber;
+mod unknown_field;
 mod watchdog;
 pub mod web;
 

@@ -53,7 +53,7 @@ class Run:
     def scene(self) -> pathlib.Path:
         folder = self.work / "scene"
         call("sim-replay", "synth", "--subset", "v2vdet", "--seed", 1000, "--scenes", 1, "--frames", FRAMES,
-             "--period", 0.1, "--agents", 2, "--out", folder)
+             "--period-s", 0.1, "--vehicles", 2, "--out", folder)
         return folder
 
     @cached_property
@@ -61,7 +61,7 @@ class Run:
         """Frames of a fleet that answers every tick, as they arrived."""
         endpoint = free_endpoint()
         settings = ("scene.lockstep=true", "agents.pose=recorded", f"network.listen={endpoint}")
-        command = [PROGRAMS / "v2vloc", "up", ROOT / "deploy/scenarios/demo.yaml", "--scene", self.scene, "--name", "fleet",
+        command = [PROGRAMS / "v2vloc", "up", ROOT / "deploy/scenarios/demo.yaml", "--dataset", self.scene, "--name", "fleet",
                    "--runs", self.work / "runs", "--method", "max", "--record", "--json"]
         command += [word for setting in settings for word in ("--set", setting)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT) as fleet:

@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::BevGrid;
 use crate::WireError;
+#[cfg(feature = "config")]
+use crate::config::FieldError;
 
 /// Widest kernel of the smoothing, cells.
 const MAX_KERNEL: u32 = 63;
@@ -101,6 +103,32 @@ impl FromStr for Smoothing {
 }
 
 impl ConfidenceGate {
+    /// Checks that a confidence can pass: a window smooths a confidence of 1 everywhere to the sum of its weights.
+    ///
+    /// # Errors
+    /// [`FieldError`] for a threshold that no cell exceeds, and for a window that cannot be used.
+    #[cfg(feature = "config")]
+    pub fn validate(&self) -> Result<(), FieldError> {
+        let weights = match self.smoothing {
+            Some(smoothing) => smoothing.weights().map_err(|error| {
+                let window = format!("{},{}", smoothing.kernel, smoothing.sigma);
+                FieldError::new("codec.gate.smoothing", window, error.to_string())
+            })?,
+            None => vec![1.0],
+        };
+        let highest = weights.iter().sum::<f32>().powi(2);
+        if self.threshold < highest {
+            return Ok(());
+        }
+        let rule =
+            format!("must be below {highest:.3}, the highest confidence, for any cell to be sent");
+        Err(FieldError::new(
+            "codec.gate.threshold",
+            self.threshold,
+            rule,
+        ))
+    }
+
     /// The cells that pass, in row-major order; `confidence` is `[H, W]` on `grid`, one finite value per cell.
     ///
     /// # Errors

@@ -61,7 +61,7 @@ pub struct CodecConfig {
         arg(
             long,
             value_name = "THRESHOLD[,CELLS,SIGMA|,none]",
-            allow_negative_numbers = true
+            allow_hyphen_values = true
         )
     )]
     pub gate: Option<ConfidenceGate>,
@@ -72,6 +72,18 @@ pub struct CodecConfig {
     #[cfg_attr(feature = "config", arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22)))]
     #[cfg_attr(feature = "config", schemars(range(min = 1, max = 22)))]
     pub zstd_level: Option<i32>,
+}
+
+#[cfg(feature = "config")]
+impl CodecConfig {
+    /// Checks the values.
+    ///
+    /// # Errors
+    /// [`FieldError`](crate::config::FieldError) of the first value that is out of range.
+    pub fn validate(&self) -> Result<(), crate::config::FieldError> {
+        crate::config::within("codec.zstd_level", self.zstd_level.unwrap_or(1), 1, 22)?;
+        self.gate.map_or(Ok(()), |gate| gate.validate())
+    }
 }
 
 /// Selection of the cells of a feature map.

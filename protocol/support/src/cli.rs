@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::fmt::{Debug, Display};
+use std::io::{self, ErrorKind};
 use std::process::ExitCode;
 
 use crate::output;
@@ -79,16 +80,27 @@ pub fn exit_code(
         }
         Err(error) => {
             output::error(chain_of(&error));
-            let is_bad = error
-                .chain()
-                .any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
-            if is_bad {
+            let is_bad =
+                |cause: &(dyn Error + 'static)| cause.is::<BadInput>() || is_bad_input(cause);
+            if error.chain().any(is_bad) && !error.chain().any(is_no_space) {
                 ExitCode::from(2)
             } else {
                 ExitCode::FAILURE
             }
         }
     }
+}
+
+/// True for a full disk or quota, which no input causes, whatever could not be written.
+fn is_no_space(cause: &(dyn Error + 'static)) -> bool {
+    if let Some(BadInput(inner)) = cause.downcast_ref() {
+        return inner.chain().any(is_no_space);
+    }
+    let kind = cause.downcast_ref::<io::Error>().map(io::Error::kind);
+    matches!(
+        kind,
+        Some(ErrorKind::StorageFull | ErrorKind::QuotaExceeded)
+    )
 }
 
 /// The chain of causes on one line, without causes that the message above them quotes already.
@@ -140,6 +152,19 @@ mod tests {
             .context("--frames")
             .map(|_| Outcome::Done);
         assert_eq!(code_of(bad), ExitCode::from(2));
+    }
+
+    #[test]
+    fn a_full_disk_is_no_bad_input_wherever_it_is_found() {
+        let full = || anyhow::Error::from(io::Error::from(ErrorKind::StorageFull));
+        for error in [
+            BadInput::of(full()).into(),
+            anyhow::Error::from(BadInput::of(full().context("out/frames.csv"))).context("max"),
+        ] {
+            assert_eq!(code_of(Err(error)), ExitCode::from(1));
+        }
+        let taken = io::Error::from(ErrorKind::AlreadyExists);
+        assert_eq!(code_of(Err(BadInput::of(taken).into())), ExitCode::from(2));
     }
 
     #[test]

@@ -9,6 +9,7 @@ use clap::{Arg, ArgAction, Command, Parser};
 use clap_complete::Shell;
 
 use crate::command_tree::CommandTree;
+use crate::list_values::with_lists_joined;
 use crate::output::{self, Verbosity};
 use crate::sibling_program::Sibling;
 
@@ -51,9 +52,12 @@ fn parse_with<P: Parser>(sibling: Option<&Sibling>) -> P {
     sibling
         .and_then(|sibling| sibling.exec_help(env::args_os()))
         .map(end);
-    let matches =
-        with_verbosity(sibling.map_or_else(P::command, |sibling| sibling.extend(P::command())))
-            .get_matches();
+    let own = P::command();
+    let command = sibling.map_or_else(|| own.clone(), |sibling| sibling.extend(own.clone()));
+    let command = with_negative_numbers(with_verbosity(command));
+    let matches = command
+        .clone()
+        .get_matches_from(with_lists_joined(&command, env::args_os()));
     output::set_verbosity(verbosity(
         matches.get_count("verbose"),
         matches.get_flag("quiet"),
@@ -62,6 +66,20 @@ fn parse_with<P: Parser>(sibling: Option<&Sibling>) -> P {
         .and_then(|sibling| sibling.exec_subcommand(&matches))
         .map(end);
     P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+}
+
+/// The command with negative numbers as values of its options: those that are out of bounds are named, not taken for
+/// options.
+fn with_negative_numbers(command: Command) -> Command {
+    command
+        .mut_args(|arg| {
+            let takes_values = arg.get_long().is_some() && arg.get_action().takes_values();
+            match takes_values && !arg.is_allow_hyphen_values_set() {
+                true => arg.allow_negative_numbers(true),
+                false => arg,
+            }
+        })
+        .mut_subcommands(with_negative_numbers)
 }
 
 /// The options of the verbosity on standard error.

@@ -37,6 +37,7 @@ pub mod command_line;
 mod command_tree;
 pub mod csv_file;
 pub mod file_digests;
+mod list_values;
 pub mod nanos;
 pub mod output;
 pub mod progress;

@@ -38,8 +38,8 @@ pub(super) fn work(bytes: u64) -> u128 {
 impl Capacity {
     pub(super) fn new(config: &CapacityConfig, trace: Option<&Trace>) -> Self {
         match (config, trace) {
-            (CapacityConfig::TokenBucket { rate_mbps, .. }, _) => {
-                Self::Constant(rounding::to_u64(rate_mbps * 1e6))
+            (CapacityConfig::TokenBucket { bandwidth_mbps, .. }, _) => {
+                Self::Constant(rounding::to_u64(bandwidth_mbps * 1e6))
             }
             (_, Some(Trace::Steps(steps))) => {
                 let mut done = 0;
@@ -150,7 +150,7 @@ mod tests {
         let step = |(index, &bits_per_s): (usize, &u64)| Step {
             from_nanos: index as u64 * 700_000_000,
             bits_per_s,
-            delay_ms: 0.0,
+            latency_ms: 0.0,
             loss: 0.0,
         };
         let trace = Trace::Steps(rates.iter().enumerate().map(step).collect());

@@ -104,18 +104,30 @@ pub enum CapacityConfig {
     /// A token bucket.
     TokenBucket {
         /// Long-run rate, Mbit/s.
-        rate_mbps: f64,
+        bandwidth_mbps: f64,
         /// Bytes that may be sent at once after a pause.
         #[serde(default)]
         burst_bytes: u64,
     },
-    /// Rates over time from a CSV file: `time_s,rate_mbps,delay_ms,loss`.
+    /// Rates over time from a CSV file: `time_s,bandwidth_mbps,latency_ms,loss`.
     Trace(TraceConfig),
     /// Delivery opportunities of 1,500 bytes each, in mahimahi's format: one line per packet, milliseconds; repeated.
     Mahimahi(TraceConfig),
 }
 
 impl CapacityConfig {
+    /// A rate without bursts, Mbit/s; infinite: unlimited.
+    #[must_use]
+    pub fn of_mbps(bandwidth_mbps: f64) -> Self {
+        match bandwidth_mbps == f64::INFINITY {
+            true => Self::Unlimited,
+            false => Self::TokenBucket {
+                bandwidth_mbps,
+                burst_bytes: 0,
+            },
+        }
+    }
+
     /// The trace of the capacity.
     pub(super) fn trace(&self) -> Option<&TraceConfig> {
         match self {
@@ -164,7 +176,7 @@ pub enum QueueDrop {
 /// Model of the propagation delay, after the last bit was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum DelayModel {
+pub enum LatencyModel {
     /// None.
     #[default]
     None,
@@ -191,7 +203,7 @@ pub enum DelayModel {
         /// Largest overhead, milliseconds.
         overhead_ms: f64,
         /// Rate that the size is divided by, Mbit/s.
-        rate_mbps: f64,
+        bandwidth_mbps: f64,
         /// Fixed part, milliseconds.
         fixed_ms: f64,
     },
@@ -273,7 +285,7 @@ pub struct LinkConfig {
     /// Queue before the link.
     pub queue: QueueConfig,
     /// Propagation delay of a message after its last bit was sent.
-    pub delay: DelayModel,
+    pub latency: LatencyModel,
     /// The time from publication to arrival is rounded down to a multiple of this, milliseconds; 0 for none. OpenCOOD's
     /// evaluation has only whole frames of 100 ms.
     pub floor_ms: f64,
@@ -300,8 +312,14 @@ impl LinkConfig {
     /// # Errors
     /// [`LinkError`] with the first invalid field.
     pub fn validate(&self) -> Result<(), LinkError> {
-        if let CapacityConfig::TokenBucket { rate_mbps, .. } = self.capacity {
-            bounded("capacity.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
+        if let CapacityConfig::TokenBucket { bandwidth_mbps, .. } = self.capacity {
+            bounded(
+                "capacity.bandwidth_mbps",
+                bandwidth_mbps,
+                1e-6,
+                1e6,
+                "1e-6 to 1e6",
+            )?;
         }
         bounded(
             "clock.offset_ms",
@@ -327,35 +345,41 @@ impl LinkConfig {
                 "-600,000 to 600,000 ms",
             )?;
         }
-        match self.delay {
-            DelayModel::None | DelayModel::Trace => {}
-            DelayModel::ConstantMs(ms) => time("delay", ms)?,
-            DelayModel::UniformMs([low, high]) => {
-                time("delay", low)?;
+        match self.latency {
+            LatencyModel::None | LatencyModel::Trace => {}
+            LatencyModel::ConstantMs(ms) => time("latency", ms)?,
+            LatencyModel::UniformMs([low, high]) => {
+                time("latency", low)?;
                 bounded(
-                    "delay",
+                    "latency",
                     high,
                     low,
                     MAX_MS,
                     "from the lower bound to 600,000 ms",
                 )?;
             }
-            DelayModel::Normal { mean_ms, std_ms } => {
-                time("delay.mean_ms", mean_ms)?;
-                time("delay.std_ms", std_ms)?;
+            LatencyModel::Normal { mean_ms, std_ms } => {
+                time("latency.mean_ms", mean_ms)?;
+                time("latency.std_ms", std_ms)?;
             }
-            DelayModel::BySize {
+            LatencyModel::BySize {
                 overhead_ms,
-                rate_mbps,
+                bandwidth_mbps,
                 fixed_ms,
             } => {
-                time("delay.overhead_ms", overhead_ms)?;
-                bounded("delay.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
-                time("delay.fixed_ms", fixed_ms)?;
+                time("latency.overhead_ms", overhead_ms)?;
+                bounded(
+                    "latency.bandwidth_mbps",
+                    bandwidth_mbps,
+                    1e-6,
+                    1e6,
+                    "1e-6 to 1e6",
+                )?;
+                time("latency.fixed_ms", fixed_ms)?;
             }
-            DelayModel::Lognormal { median_ms, sigma } => {
-                time("delay.median_ms", median_ms)?;
-                bounded("delay.sigma", sigma, 0.0, 5.0, "0 to 5")?;
+            LatencyModel::Lognormal { median_ms, sigma } => {
+                time("latency.median_ms", median_ms)?;
+                bounded("latency.sigma", sigma, 0.0, 5.0, "0 to 5")?;
             }
         }
         time("floor_ms", self.floor_ms)?;
@@ -423,8 +447,8 @@ impl LinkConfig {
             }
         };
         let has_steps = matches!(trace, Some(Trace::Steps(_)));
-        if self.delay == DelayModel::Trace && !has_steps {
-            return Err(LinkError::NoTrace { field: "delay" });
+        if self.latency == LatencyModel::Trace && !has_steps {
+            return Err(LinkError::NoTrace { field: "latency" });
         }
         if self.loss == LossModel::Trace && !has_steps {
             return Err(LinkError::NoTrace { field: "loss" });
@@ -464,8 +488,8 @@ mod tests {
 
     #[test]
     fn a_file_names_every_stage() {
-        let text = "medium: shared\ncapacity: {token_bucket: {rate_mbps: 27, burst_bytes: 3000}}\n\
-            queue: {bytes: 100000, drop: head, keep_last: true}\ndelay: {normal: {mean_ms: 10, std_ms: 3}}\n\
+        let text = "medium: shared\ncapacity: {token_bucket: {bandwidth_mbps: 27, burst_bytes: 3000}}\n\
+            queue: {bytes: 100000, drop: head, keep_last: true}\nlatency: {normal: {mean_ms: 10, std_ms: 3}}\n\
             loss: {gilbert_elliott: {to_bad: 0.01, to_good: 0.2}}\nloss_unit: fragment\n\
             reorder: {probability: 0.01, extra_ms: 30}\nduplicate: 0.001\noutages: [{from_s: 3, to_s: 13}]\n\
             clock: {offset_ms: -20, drift_ppm: 50, step: {at_s: 3, by_ms: 200}}\n";
@@ -494,7 +518,7 @@ mod tests {
     fn wrong_numbers_are_named() {
         let message = |config: LinkConfig| config.validate().unwrap_err().to_string();
         let rate = CapacityConfig::TokenBucket {
-            rate_mbps: 0.0,
+            bandwidth_mbps: 0.0,
             burst_bytes: 0,
         };
         assert!(
@@ -502,15 +526,15 @@ mod tests {
                 capacity: rate,
                 ..LinkConfig::default()
             })
-            .contains("rate_mbps is 0")
+            .contains("bandwidth_mbps is 0")
         );
-        let delay = DelayModel::UniformMs([5.0, 2.0]);
+        let latency = LatencyModel::UniformMs([5.0, 2.0]);
         assert!(
             message(LinkConfig {
-                delay,
+                latency,
                 ..LinkConfig::default()
             })
-            .contains("delay is 2")
+            .contains("latency is 2")
         );
         let clock = DeviceClock {
             offset_ms: f64::NAN,
@@ -540,10 +564,10 @@ mod tests {
             .contains("rising")
         );
         let config = LinkConfig {
-            delay: DelayModel::Trace,
+            latency: LatencyModel::Trace,
             ..LinkConfig::default()
         };
         let message = config.read_trace(Path::new(".")).unwrap_err().to_string();
-        assert!(message.contains("delay is trace"), "{message}");
+        assert!(message.contains("latency is trace"), "{message}");
     }
 }

@@ -288,9 +288,10 @@ impl LinkEmulator {
             self.schedule(end_nanos, packet, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
-        let delay_nanos = config
-            .delay
-            .draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
+        let delay_nanos =
+            config
+                .latency
+                .draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
         // No packet arrives before its last bit was sent, also with rounding.
         let arrival_nanos = config.floored(
             packet.submitted_nanos,
@@ -309,7 +310,7 @@ impl LinkEmulator {
         }
         let mut twice = random(Purpose::Duplicate);
         if config.duplicate > 0.0 && twice.chance(config.duplicate) {
-            let again_nanos = config.delay.draw(&mut twice, trace.as_ref(), &message);
+            let again_nanos = config.latency.draw(&mut twice, trace.as_ref(), &message);
             let copy_nanos = arrival_nanos.saturating_add(again_nanos);
             self.schedule(
                 arrival_nanos,

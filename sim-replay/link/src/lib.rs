@@ -40,9 +40,9 @@
 mod capacity;
 mod chance;
 mod config;
-mod delay;
 mod device_clock;
 mod emulator;
+mod latency;
 mod loss;
 mod preset;
 mod queue_server;
@@ -50,7 +50,7 @@ mod trace;
 mod trace_config;
 
 pub use config::{
-    CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, Outage,
+    CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, Outage,
     QueueConfig, QueueDrop, ReorderConfig,
 };
 pub use device_clock::{ClockStep, DeviceClock};

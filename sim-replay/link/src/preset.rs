@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::config::{
-    CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig,
+    CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig,
 };
 use support::bounded_file;
 
@@ -74,8 +74,8 @@ impl LinkConfig {
     /// # Errors
     /// [`LinkError::Preset`] lists the available names.
     pub fn preset(name: &str) -> Result<Self, LinkError> {
-        let shaped = |rate_mbps: f64, burst_bytes| CapacityConfig::TokenBucket {
-            rate_mbps,
+        let shaped = |bandwidth_mbps: f64, burst_bytes| CapacityConfig::TokenBucket {
+            bandwidth_mbps,
             burst_bytes,
         };
         let radio = QueueConfig {
@@ -87,15 +87,15 @@ impl LinkConfig {
             "ideal" => Self::default(),
             // OpenCOOD's `wild_setting`, async_mode `sim`: async_overhead 100 ms.
             "opencood-sim" => Self {
-                delay: DelayModel::ConstantMs(100.0),
+                latency: LatencyModel::ConstantMs(100.0),
                 floor_ms: 100.0,
                 ..Self::default()
             },
             // The same, async_mode `real`: transmission_speed 27 Mbit/s, backbone_delay 10 ms, U(0, async_overhead).
             "opencood-real" => Self {
-                delay: DelayModel::BySize {
+                latency: LatencyModel::BySize {
                     overhead_ms: 100.0,
-                    rate_mbps: 27.0,
+                    bandwidth_mbps: 27.0,
                     fixed_ms: 10.0,
                 },
                 floor_ms: 100.0,
@@ -108,7 +108,7 @@ impl LinkConfig {
                 medium: Medium::Shared,
                 capacity: shaped(6.0, 0),
                 queue: radio,
-                delay: DelayModel::UniformMs([1.0, 5.0]),
+                latency: LatencyModel::UniformMs([1.0, 5.0]),
                 keep_order: true,
                 loss: LossModel::Distance(vec![[50.0, 0.0], [100.0, 0.001], [300.0, 0.02]]),
                 loss_unit: LossUnit::Fragment,
@@ -120,7 +120,7 @@ impl LinkConfig {
                 medium: Medium::Shared,
                 capacity: shaped(8.0, 0),
                 queue: radio,
-                delay: DelayModel::UniformMs([5.0, 35.0]),
+                latency: LatencyModel::UniformMs([5.0, 35.0]),
                 keep_order: true,
                 loss: LossModel::Distance(vec![[100.0, 0.0], [200.0, 0.001], [400.0, 0.01]]),
                 loss_unit: LossUnit::Fragment,
@@ -131,7 +131,7 @@ impl LinkConfig {
             "5g-uu" => Self {
                 capacity: shaped(50.0, 64 << 10),
                 queue: radio,
-                delay: DelayModel::Lognormal {
+                latency: LatencyModel::Lognormal {
                     median_ms: 20.0,
                     sigma: 0.35,
                 },

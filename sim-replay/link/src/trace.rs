@@ -9,7 +9,7 @@ use support::csv_file::{CsvError, CsvFile, CsvRow};
 use support::rounding;
 
 /// First line of a CSV trace.
-const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
+const HEADER: &str = "time_s,bandwidth_mbps,latency_ms,loss";
 /// Bytes of a mahimahi delivery opportunity.
 pub(super) const OPPORTUNITY_BYTES: u64 = 1500;
 /// Longer files are refused, bytes.
@@ -57,7 +57,7 @@ pub struct Step {
     /// Rate, bit/s.
     pub bits_per_s: u64,
     /// Propagation delay, milliseconds.
-    pub delay_ms: f64,
+    pub latency_ms: f64,
     /// Probability of loss.
     pub loss: f64,
 }
@@ -72,7 +72,7 @@ pub enum Trace {
 }
 
 impl Trace {
-    /// Reads `time_s,rate_mbps,delay_ms,loss`: one line for every change, times rising, the first at `offset_nanos` or
+    /// Reads `time_s,bandwidth_mbps,latency_ms,loss`: one line for every change, times rising, the first at `offset_nanos` or
     /// before. The link begins at `offset_nanos`.
     ///
     /// # Errors
@@ -170,11 +170,11 @@ impl Trace {
 
 fn step(row: &CsvRow<'_>) -> Result<Step, CsvError> {
     let time_s = row.number(0, 0.0..=1e9, "0 to 1e9 seconds")?;
-    let rate_mbps = row.number(1, 0.0..=1e6, "0 to 1e6 Mbit/s")?;
+    let bandwidth_mbps = row.number(1, 0.0..=1e6, "0 to 1e6 Mbit/s")?;
     Ok(Step {
         from_nanos: rounding::to_u64(time_s * 1e9),
-        bits_per_s: rounding::to_u64(rate_mbps * 1e6),
-        delay_ms: row.number(2, 0.0..=600_000.0, "0 to 600,000 ms")?,
+        bits_per_s: rounding::to_u64(bandwidth_mbps * 1e6),
+        latency_ms: row.number(2, 0.0..=600_000.0, "0 to 600,000 ms")?,
         loss: row.number(3, 0.0..=1.0, "0 to 1")?,
     })
 }
@@ -208,7 +208,8 @@ mod tests {
 
     #[test]
     fn steps_hold_until_the_next() {
-        let (_folder, path) = file("time_s,rate_mbps,delay_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
+        let (_folder, path) =
+            file("time_s,bandwidth_mbps,latency_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
         let trace = Trace::read_csv(&path, 0).unwrap();
         let rate = |seconds: f64| trace.at((seconds * 1e9) as u64).unwrap().bits_per_s;
         assert_eq!(
@@ -219,7 +220,7 @@ mod tests {
 
     #[test]
     fn a_link_begins_at_any_moment_of_its_trace() {
-        let text = "time_s,rate_mbps,delay_ms,loss\n10,27,10,0\n12.5,1.5,40,0.1\n20,6,5,0\n";
+        let text = "time_s,bandwidth_mbps,latency_ms,loss\n10,27,10,0\n12.5,1.5,40,0.1\n20,6,5,0\n";
         let (_folder, path) = file(text);
         let steps = |offset_s: f64| match Trace::read_csv(&path, (offset_s * 1e9) as u64) {
             Ok(Trace::Steps(steps)) => Ok(steps
@@ -247,7 +248,7 @@ mod tests {
 
     #[test]
     fn faults_are_reported_with_their_line() {
-        let header = "time_s,rate_mbps,delay_ms,loss\n";
+        let header = "time_s,bandwidth_mbps,latency_ms,loss\n";
         for (text, line) in [
             ("1,2,3,0\n", 2),
             ("0,2,3,0\n0,2,3,0\n", 3),

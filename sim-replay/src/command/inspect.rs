@@ -42,6 +42,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         .is_some_and(|extension| extension.eq_ignore_ascii_case("xodr"))
         && args.dir.is_file()
     {
+        if args.protocol != ProtocolConfig::default()
+            || args.intensity_scale != IntensityScale::default()
+        {
+            let map = args.dir.display();
+            return Ok(Outcome::bad_input(&format_args!(
+                "{map}: a map has no intensities and no protocol: leave such options out"
+            )));
+        }
         return run_map(&args.dir, args.json);
     }
     let report = with_progress(args);

@@ -13,7 +13,7 @@ use simulator::map::RoadMapSource;
 use support::output;
 use support::progress;
 
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Findings of a map that are printed one by one.
 const PRINTED_FINDINGS: usize = 20;
@@ -41,15 +41,12 @@ pub(crate) struct Args {
     /// Determines roads, buildings, trees and signs.
     #[arg(long, default_value_t = 0)]
     map_seed: u64,
-    /// Scenarios of town1loc and town4loc, each another drive through the map.
-    #[arg(long, default_value_t = 1)]
-    traversals: usize,
-    /// Scenarios of v2vdet.
-    #[arg(long, default_value_t = 1)]
+    /// Number of scenarios; of town1loc and town4loc each is another drive through the map.
+    #[arg(long, value_name = "N", default_value_t = 1)]
     scenes: usize,
-    /// Agents of a v2vdet scenario: a number or a range.
-    #[arg(long, default_value = "2-4", value_parser = parse_agents)]
-    agents: RangeInclusive<usize>,
+    /// Vehicles of a v2vdet scenario, a number or a range [default: 2-4].
+    #[arg(long, value_name = "N|N-N", value_parser = parse_vehicles)]
+    vehicles: Option<RangeInclusive<usize>>,
     /// The weather of all scenarios.
     #[arg(long, value_enum, default_value_t)]
     weather: Weather,
@@ -57,7 +54,7 @@ pub(crate) struct Args {
     /// points (fog, snow) have 1 in the green byte of their colour, all others 0. Annotations are the objects hit by
     /// the plain sweep.
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WEATHER")]
-    copies: Vec<Weather>,
+    weather_copies: Vec<Weather>,
     /// Render the images of four cameras per vehicle (ahead, right, left, back; 100 degrees wide), for example 480x300.
     #[arg(long, value_name = "WIDTHxHEIGHT")]
     cameras: Option<ImageSize>,
@@ -65,8 +62,8 @@ pub(crate) struct Args {
     #[arg(long)]
     frames: Option<usize>,
     /// Simulated seconds from one frame to the next, a multiple of 0.05.
-    #[arg(long, default_value_t = 0.1)]
-    period: f64,
+    #[arg(long, value_name = "S", default_value_t = 0.1)]
+    period_s: f64,
     /// Write into a folder that is not empty; scenarios of the same name are replaced, and so are the common files of
     /// all scenarios.
     #[arg(long)]
@@ -82,8 +79,8 @@ pub(crate) struct Args {
 /// Generates and prints a summary to standard output.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let json = args.json;
-    let options = options(args);
-    let bar = progress::percent_bar(options.scenarios());
+    let options = options(args)?;
+    let bar = progress::percent_bar(options.scenes);
     let start = Instant::now();
     let result = generate::generate(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
@@ -103,28 +100,32 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     }
 }
 
-fn options(args: Args) -> SynthOptions {
-    SynthOptions {
+fn options(args: Args) -> Result<SynthOptions, BadInput> {
+    let defaults = SynthOptions::new(args.subset, args.seed, args.out);
+    if args.vehicles.is_some() && args.subset != Subset::V2vdet {
+        let subset = args.subset.name();
+        return Err(BadInput::new(format!(
+            "--vehicles is for --subset v2vdet: in {subset} one vehicle drives alone"
+        )));
+    }
+    Ok(SynthOptions {
         layout: args.layout,
         map: args.map,
         map_seed: args.map_seed,
-        traversals: args.traversals,
         scenes: args.scenes,
-        agents: args.agents,
         weather: args.weather,
-        copies: args.copies,
+        copies: args.weather_copies,
         cameras: args.cameras,
-        frames: args
-            .frames
-            .unwrap_or_else(|| SynthOptions::default_frames(args.subset)),
-        period_s: args.period,
+        period_s: args.period_s,
         force: args.force,
         threads: args
             .threads
             .unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
             .max(1),
-        ..SynthOptions::new(args.subset, args.seed, args.out)
-    }
+        agents: args.vehicles.unwrap_or_else(|| defaults.agents.clone()),
+        frames: args.frames.unwrap_or(defaults.frames),
+        ..defaults
+    })
 }
 
 /// Prints the parts that were not built as the map gives them to standard error.
@@ -196,7 +197,7 @@ fn parse_map(text: &str) -> Result<RoadMapSource, String> {
     }
 }
 
-fn parse_agents(text: &str) -> Result<RangeInclusive<usize>, String> {
+fn parse_vehicles(text: &str) -> Result<RangeInclusive<usize>, String> {
     let number = |text: &str| {
         text.trim()
             .parse::<usize>()
@@ -213,10 +214,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn agents_are_a_number_or_a_range() {
-        assert_eq!(parse_agents("3"), Ok(3..=3));
-        assert_eq!(parse_agents("2-4"), Ok(2..=4));
-        assert!(parse_agents("many").is_err());
+    fn vehicles_are_a_number_or_a_range() {
+        assert_eq!(parse_vehicles("3"), Ok(3..=3));
+        assert_eq!(parse_vehicles("2-4"), Ok(2..=4));
+        assert!(parse_vehicles("many").is_err());
     }
 
     #[test]

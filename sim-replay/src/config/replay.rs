@@ -12,7 +12,7 @@ use super::SceneConfig;
 use crate::stream::StreamOptions;
 use bus::{BusConfig, ProcessConfig, Route};
 use dataset::LoadOptions;
-use link::{CapacityConfig, DelayModel, LinkConfig, LossModel};
+use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
 /// Configuration of `sim-replay stream`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -122,17 +122,12 @@ impl SensorLinkConfig {
             return None;
         }
         Some(LinkConfig {
-            delay: match (latency_ms, jitter_ms) {
-                (None, _) => DelayModel::None,
-                (Some(mean_ms), None) => DelayModel::ConstantMs(mean_ms),
-                (Some(mean_ms), Some(std_ms)) => DelayModel::Normal { mean_ms, std_ms },
+            latency: match (latency_ms, jitter_ms) {
+                (None, _) => LatencyModel::None,
+                (Some(mean_ms), None) => LatencyModel::ConstantMs(mean_ms),
+                (Some(mean_ms), Some(std_ms)) => LatencyModel::Normal { mean_ms, std_ms },
             },
-            capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, |rate_mbps| {
-                CapacityConfig::TokenBucket {
-                    rate_mbps,
-                    burst_bytes: 0,
-                }
-            }),
+            capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, CapacityConfig::of_mbps),
             loss: loss.map_or(LossModel::None, LossModel::Bernoulli),
             // A vehicle's own bus does not reorder.
             keep_order: true,
@@ -167,6 +162,20 @@ impl ProcessConfig for ReplayConfig {
                 "must be given with jitter_ms",
             ));
         }
+        if self.sensor_link.seed != 0 && self.sensor_link.stages().is_none() {
+            return Err(FieldError::new(
+                "sensor_link.seed",
+                self.sensor_link.seed,
+                "must be left out without a link: give latency_ms, bandwidth_mbps or loss",
+            ));
+        }
+        if let (false, [ego, ..]) = (self.scene.lockstep, &self.wait.egos[..]) {
+            return Err(FieldError::new(
+                "wait.egos",
+                ego,
+                "must be left out unless scene.lockstep is true",
+            ));
+        }
         self.bus.validate()
     }
 }
@@ -192,11 +201,7 @@ impl ReplayConfig {
             await_agents: wait.await_agents,
             expect: wait.expect.clone(),
             ready_timeout: seconds(wait.ready_timeout_s),
-            lockstep: if scene.lockstep {
-                wait.egos.clone()
-            } else {
-                Vec::new()
-            },
+            lockstep: wait.egos.clone(),
             answer_timeout: seconds(wait.answer_timeout_s),
             link: self
                 .sensor_link

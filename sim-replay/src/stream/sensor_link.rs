@@ -129,7 +129,7 @@ mod tests {
     use protocol::{Handedness, PointCloud};
 
     use super::*;
-    use link::{CapacityConfig, DelayModel, LossModel};
+    use link::{CapacityConfig, LatencyModel, LossModel};
 
     fn held(cav: &CavId, tick: u64) -> DelayedSweep {
         let points = PointCloud {
@@ -175,10 +175,10 @@ mod tests {
         // 16 kB at 16 Mbit/s: 8 ms each, then 100 ms.
         let link = LinkConfig {
             capacity: CapacityConfig::TokenBucket {
-                rate_mbps: 16.0,
+                bandwidth_mbps: 16.0,
                 burst_bytes: 0,
             },
-            delay: DelayModel::ConstantMs(100.0),
+            latency: LatencyModel::ConstantMs(100.0),
             ..LinkConfig::default()
         };
         let mut link_under_test = SensorLink::new(&link, 1).unwrap();

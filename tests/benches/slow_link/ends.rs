@@ -90,7 +90,7 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Measurement> {
     );
     let config = LinkConfig {
         capacity: CapacityConfig::TokenBucket {
-            rate_mbps: cell.rate_mbps,
+            bandwidth_mbps: cell.rate_mbps,
             burst_bytes: 0,
         },
         queue: QueueConfig {

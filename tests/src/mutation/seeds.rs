@@ -238,7 +238,7 @@ pub const TABLES: &str = "dataset: scenes\nweights: weights\ndtype: f16\nframes:
 
 /// A trace of a link.
 pub(crate) const TRACE: &str =
-    "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
+    "time_s,bandwidth_mbps,latency_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
 
 /// Departure times of packets, milliseconds.
 pub(crate) const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";

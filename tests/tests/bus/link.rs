@@ -6,7 +6,7 @@ use std::time::Duration;
 use bus::shutdown::Stop;
 use bus::{Barrier, Bus, Event, InboxLimits, PublisherOptions, Route};
 use link::{
-    CapacityConfig, DelayModel, DeviceClock, LinkConfig, LinkEmulator, LossModel, TraceConfig,
+    CapacityConfig, DeviceClock, LatencyModel, LinkConfig, LinkEmulator, LossModel, TraceConfig,
 };
 use protocol::message::Points;
 use protocol::{
@@ -124,12 +124,12 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
 #[test]
 fn messages_come_late_in_order_and_unchanged() {
     let capacity = CapacityConfig::TokenBucket {
-        rate_mbps: 8.0,
+        bandwidth_mbps: 8.0,
         burst_bytes: 0,
     };
     let config = LinkConfig {
         capacity,
-        delay: DelayModel::ConstantMs(30.0),
+        latency: LatencyModel::ConstantMs(30.0),
         ..LinkConfig::default()
     };
     let Crossing {
@@ -207,7 +207,7 @@ fn a_clock_that_is_off_shows_in_the_capture_times() {
 fn a_long_delay_keeps_no_more_than_it_may() {
     // Without a rate there is no queue that could be full. All are sent long before the first arrives.
     let config = LinkConfig {
-        delay: DelayModel::ConstantMs(4000.0),
+        latency: LatencyModel::ConstantMs(4000.0),
         ..LinkConfig::default()
     };
     let room_for_two = NodeOptions {
@@ -235,7 +235,7 @@ fn a_link_that_carries_nothing_reports_it() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(
         folder.path().join("rates.csv"),
-        "time_s,rate_mbps,delay_ms,loss\n0,27,0,0\n60,0,0,0\n",
+        "time_s,bandwidth_mbps,latency_ms,loss\n0,27,0,0\n60,0,0,0\n",
     )
     .unwrap();
     let trace = TraceConfig {

@@ -136,9 +136,9 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
     let slow = [
         "--method",
         "attention",
-        "--bandwidth",
+        "--bandwidth-mbps",
         "27",
-        "--latency",
+        "--latency-ms",
         "100",
         "--deadline-ms",
         "200",
@@ -171,7 +171,16 @@ fn a_script_gives_the_precision_of_the_built_in_method_live() {
     ];
     let precision = |name: &str, method: &str| {
         let arguments = [
-            "up", &scenario, "--scene", &scene, "--runs", &runs, "--name", name, "--method", method,
+            "up",
+            &scenario,
+            "--dataset",
+            &scene,
+            "--runs",
+            &runs,
+            "--name",
+            name,
+            "--method",
+            method,
         ];
         let set = [
             "--set",

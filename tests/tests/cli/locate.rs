@@ -29,7 +29,6 @@ fn agent(arguments: &[&str]) -> Output {
 /// A short drive through a town of [`Subset::Town1loc`].
 fn drive(out: &Path, frames: usize, period_s: f64) -> PathBuf {
     let options = SynthOptions {
-        traversals: 1,
         frames,
         period_s,
         ..SynthOptions::new(Subset::Town1loc, 903, out.to_owned())

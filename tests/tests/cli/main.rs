@@ -1,11 +1,13 @@
-//! Command line: messages and exit codes of wrong input, closed outputs, sibling programs, options in service files,
-//! poses of single clouds, fusion methods from files, shipped experiments, trainings that are stopped and resumed.
+//! Command line: messages and exit codes of wrong input, forms of values, closed outputs, sibling programs, options in
+//! service files, poses of single clouds, fusion methods from files, shipped experiments, trainings that are stopped and
+//! resumed.
 
 mod closed_output;
 mod evaluation;
 mod experiments;
 mod interruption;
 mod locate;
+mod mistakes;
 mod programs;
 mod scenario_errors;
 mod services;

@@ -262,7 +262,7 @@ fn the_command_compares_recorded_vehicles() {
         "--boxes",
         "annotated",
     ]);
-    assert!(code == Some(2) && error.contains("--map"), "{error}");
+    assert!(code == Some(2) && error.contains("--icp-map"), "{error}");
     let (code, _, error) = run(&[
         "--dataset",
         folder.path().join("none").to_str().unwrap(),

@@ -278,7 +278,7 @@ fn radar_sees_what_moves() {
 fn traversals_of_a_town_differ_and_share_static_objects() {
     let folder = tempfile::tempdir().unwrap();
     let options = SynthOptions {
-        traversals: 2,
+        scenes: 2,
         frames: 30,
         period_s: 1.0,
         ..SynthOptions::new(Subset::Town1loc, 3, folder.path().to_owned())
@@ -471,7 +471,7 @@ fn bad_options_are_named() {
     });
     assert_eq!(
         period,
-        "--period is 0.12; expected a multiple of 0.05 s up to 500 s"
+        "--period-s is 0.12; expected a multiple of 0.05 s up to 500 s"
     );
     let agents = message(SynthOptions {
         agents: RangeInclusive::new(4, 2),
@@ -479,13 +479,16 @@ fn bad_options_are_named() {
     });
     assert_eq!(
         agents,
-        "--agents is 4-2; expected a number or a range within 1-7"
+        "--vehicles is 4-2; expected a number or a range within 1-7"
     );
     let copies = message(SynthOptions {
         copies: vec![Weather::Sunny],
         ..v2vdet(1, folder.path())
     });
-    assert_eq!(copies, "--copies is sunny; expected fog, snow or both");
+    assert_eq!(
+        copies,
+        "--weather-copies is sunny; expected fog, snow or both"
+    );
     let map = Some(RoadMapSource::OpenDrive("no/such/map.xodr".into()));
     let missing = message(SynthOptions {
         map,

@@ -214,7 +214,7 @@ fn sweeps_without_poses_are_localised_and_no_sweep_is_an_error() {
         let mut agent = Command::new(programs().join("agent"));
         agent
             .arg(command)
-            .arg("--scene")
+            .arg("--dataset")
             .arg(scene)
             .arg("--encoder")
             .arg(&encoder)

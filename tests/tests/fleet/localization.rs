@@ -26,7 +26,7 @@ fn eval(
 /// The same for other networks than encoder and head.
 fn eval_with(folder: &Path, networks: &[&OsStr], more: &[&str]) -> (Option<i32>, String, String) {
     let output = Command::new(programs().join("agent"))
-        .args(["eval", "--scene"])
+        .args(["eval", "--dataset"])
         .arg(folder.join("scene"))
         .args(networks)
         .args(more)
@@ -191,18 +191,12 @@ fn a_tracked_vehicle_has_an_accurate_pose_in_every_sweep_of_a_drive() {
     let folder = tempfile::tempdir().unwrap();
     let synth = Command::new(programs().join("sim-replay"))
         .args([
-            "synth",
-            "--subset",
-            "town1loc",
-            "--seed",
-            "1600",
-            "--traversals",
-            "1",
+            "synth", "--subset", "town1loc", "--seed", "1600", "--scenes", "1",
         ])
         .args([
             "--frames",
             "20",
-            "--period",
+            "--period-s",
             "0.1",
             "--threads",
             "1",

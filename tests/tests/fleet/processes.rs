@@ -111,7 +111,7 @@ fn a_fleet_runs_over_an_emulated_link() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     // 131 kB at 20 Mbit/s take 53 ms; the next message has to wait.
-    let link = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {constant_ms: 30}\n";
+    let link = "capacity: {token_bucket: {bandwidth_mbps: 20}}\nlatency: {constant_ms: 30}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     let rest = "link: {model: link.yaml}\nego: {deadline_ms: 5000}";
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);

@@ -41,15 +41,17 @@ fn a_vehicle_localizes_with_the_levels_that_its_detector_has_computed() {
     let folder = tempfile::tempdir().unwrap();
     let synth = Command::new(programs().join("sim-replay"))
         .args([
-            "synth",
-            "--subset",
-            "town1loc",
-            "--seed",
-            "1601",
-            "--traversals",
-            "1",
+            "synth", "--subset", "town1loc", "--seed", "1601", "--scenes", "1",
         ])
-        .args(["--frames", "3", "--period", "1", "--threads", "1", "--out"])
+        .args([
+            "--frames",
+            "3",
+            "--period-s",
+            "1",
+            "--threads",
+            "1",
+            "--out",
+        ])
         .arg(folder.path())
         .output()
         .unwrap();

@@ -9,7 +9,7 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
-use link::{ClockStep, DelayModel, DeviceClock, LinkConfig, LossModel};
+use link::{ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel};
 use protocol::{CodecConfig, DropReason, Dtype};
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
@@ -166,7 +166,7 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
         (250.0, 0.0, 200, 2),
     ] {
         let link = LinkConfig {
-            delay: DelayModel::ConstantMs(delay_ms),
+            latency: LatencyModel::ConstantMs(delay_ms),
             ..LinkConfig::default()
         };
         let compute = ComputeTimes {
@@ -201,7 +201,7 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
     }
     // Older than the age limit of the fusion.
     let link = LinkConfig {
-        delay: DelayModel::ConstantMs(450.0),
+        latency: LatencyModel::ConstantMs(450.0),
         ..LinkConfig::default()
     };
     let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
@@ -364,7 +364,7 @@ fn run_up(folder: &Path, scenario: &Path, runs: &str) -> RunResult {
 #[test]
 fn a_stepped_run_is_the_same_bytes_every_time() {
     let folder = tempfile::tempdir().unwrap();
-    let link = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    let link = "capacity: {token_bucket: {bandwidth_mbps: 20}}\nlatency: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     let rest = "clock: stepped\nstepped: {compute: {pose_ms: 10, map_ms: 40, fuse_ms: 20}}\n\
         link: {model: link.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5}}}}";
@@ -401,7 +401,7 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
     write_sighted_weights(&folder.path().join("weights.safetensors"));
-    let link = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    let link = "capacity: {token_bucket: {bandwidth_mbps: 20}}\nlatency: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
     fs::write(folder.path().join("link.yaml"), link).unwrap();
     // All settings that an agent's process needs: noise, codec, limits, one vehicle with settings of its own.
     for (method, rest) in [
@@ -506,8 +506,11 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     let foreign = folder.path().join("one/maps/of-another-program.maps");
     fs::create_dir_all(foreign.parent().unwrap()).unwrap();
     fs::write(&foreign, b"").unwrap();
-    let [one, many] = [("one", "1", [].as_slice()), ("many", "3", &["--keep-maps"])]
-        .map(|(out, jobs, more)| sweep(folder.path(), out, jobs, more));
+    let [one, many] = [
+        ("one", "1", [].as_slice()),
+        ("many", "3", &["--keep-feature-maps"]),
+    ]
+    .map(|(out, jobs, more)| sweep(folder.path(), out, jobs, more));
     assert!(
         one.status.success() && many.status.success(),
         "{}\n{}",
@@ -674,7 +677,7 @@ fn a_dry_run_generates_no_data_set() {
     let folder = tempfile::tempdir().unwrap();
     write_sighted_weights(&folder.path().join("weights.safetensors"));
     let text = "name: e\ndataset: scene\nweights: weights.safetensors\n\
-        generate: {seed: 1201, scenarios: 2, frames: 3, agents: [2, 2]}\ngrid: {method: [max], loss: [0, 0.5]}\n";
+        generate: {seed: 1201, scenes: 2, frames: 3, vehicles: [2, 2]}\ngrid: {method: [max], loss: [0, 0.5]}\n";
     fs::write(folder.path().join("experiment.yaml"), text).unwrap();
     let dry = sweep(folder.path(), "dry", "1", &["--dry-run"]);
     assert!(dry.status.success(), "{}", text_of(&dry));

@@ -28,7 +28,7 @@ use tests::locks::random_generator_lock;
 fn drives(out: &Path) -> PathBuf {
     let folder = out.join("drives");
     let options = SynthOptions {
-        traversals: 2,
+        scenes: 2,
         frames: 24,
         period_s: 0.5,
         ..SynthOptions::new(Subset::Town1loc, 11, folder.clone())

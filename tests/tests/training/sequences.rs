@@ -19,7 +19,7 @@ use tests::sequences::{Benchmark, LEFT_OUT, write};
 /// Two drives through one town.
 fn drives(folder: &Path) -> Vec<Scenario> {
     let options = SynthOptions {
-        traversals: 2,
+        scenes: 2,
         frames: 30,
         period_s: 0.5,
         ..SynthOptions::new(Subset::Town1loc, 12, folder.join("drives"))
@@ -84,7 +84,7 @@ fn train_head_on(sequences: &Path, encoder: &Path, out: &Path) -> PathBuf {
 fn eval(sequences: &Path, encoder: &Path, head: &Path) -> Value {
     let mut command = Command::new(programs().join("agent"));
     command
-        .args(["eval", "--json", "--scene"])
+        .args(["eval", "--json", "--dataset"])
         .arg(sequences)
         .arg("--encoder")
         .arg(encoder)

@@ -10,6 +10,7 @@ pub(crate) mod encoder_config;
 pub(crate) mod error;
 pub(crate) mod feature_norm;
 pub(crate) mod head_config;
+pub mod head_files;
 mod int8_block;
 mod int8_levels;
 mod levelling;

@@ -17,11 +17,14 @@ use crate::pgc::{Localize, Localizer, LocalizerError};
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct PgcConfig {
-    /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both (pose source pgc).
+    /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both. Absent: those that the head
+    /// names, beside it or released (pose sources pgc and tracked).
     #[arg(long, value_name = "FILE")]
+    #[serde(default)]
     pub encoder: PathBuf,
-    /// Weights of the scene-specific head (pose source pgc).
-    #[arg(long, value_name = "FILE")]
+    /// Weights of the scene-specific head: a file, the folder that `agent map` wrote, or a released one, town1 or town4
+    /// (pose sources pgc and tracked).
+    #[arg(long, value_name = "FILE|NAME")]
     pub head: PathBuf,
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence (pose source pgc).
     #[arg(long)]

@@ -30,6 +30,7 @@ pub(crate) use pose_table::CachedPose;
 pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
+use crate::pgc::head_files::{HeadFileError, encoder_or_named, head_file, is_name};
 use crate::pgc::{LocalizerError, LocalizerInput};
 
 /// Inputs of a source for one sweep.
@@ -204,6 +205,11 @@ impl NoisyPoseConfig {
                 "absent",
                 "must name the table of errors (--noise-table)",
             )),
+            (mode, Some(table)) if mode != NoiseMode::Replayed => Err(FieldError::new(
+                "noisy.table",
+                table.display(),
+                "must be left out unless mode is replayed",
+            )),
             _ => Ok(()),
         }
     }
@@ -330,10 +336,8 @@ impl PoseSourceConfig {
         match self {
             Self::Recorded => Ok(()),
             Self::Noisy(noise) => noise.validate(),
-            Self::Pgc(pgc) => named("encoder", "--encoder", &pgc.encoder)
-                .and_then(|()| named("head", "--head", &pgc.head)),
+            Self::Pgc(pgc) => named("head", "--head", &pgc.head),
             Self::Tracked(tracked) => {
-                named("encoder", "--encoder", &tracked.encoder)?;
                 named("head", "--head", &tracked.head)?;
                 tracked.validate()
             }
@@ -342,7 +346,27 @@ impl PoseSourceConfig {
         }
     }
 
-    /// The same with the paths of its files changed.
+    /// The same with the file of its head where it has the name of a released one, and with the encoder that the head
+    /// names where it has none.
+    ///
+    /// # Errors
+    /// [`HeadFileError`] when there is no such head, or no file is its encoder.
+    pub fn with_networks(mut self) -> Result<Self, HeadFileError> {
+        let networks = match &mut self {
+            Self::Pgc(pgc) => Some((&mut pgc.encoder, &mut pgc.head)),
+            Self::Tracked(tracked) => Some((&mut tracked.encoder, &mut tracked.head)),
+            Self::Recorded | Self::Noisy(_) | Self::Baseline(_) | Self::Cached(_) => None,
+        };
+        // A head that is not given is refused by the check of the values.
+        if let Some((encoder, head)) = networks.filter(|(_, head)| !head.as_os_str().is_empty()) {
+            *head = head_file(head)?;
+            let given = Some(encoder.as_path()).filter(|file| !file.as_os_str().is_empty());
+            *encoder = encoder_or_named(given, head)?;
+        }
+        Ok(self)
+    }
+
+    /// The same with the paths of its files changed. The name of a released head is no path.
     #[must_use]
     pub fn map_files(mut self, change: impl Fn(&Path) -> PathBuf) -> Self {
         let files: Vec<&mut PathBuf> = match &mut self {
@@ -353,7 +377,13 @@ impl PoseSourceConfig {
             Self::Baseline(network) => vec![&mut network.weights],
             Self::Cached(cached) => vec![&mut cached.file],
         };
-        files.into_iter().for_each(|file| *file = change(file));
+        for file in files {
+            let changed = change(file);
+            let is_path = changed.exists() || !is_name(file);
+            if is_path && !file.as_os_str().is_empty() {
+                *file = changed;
+            }
+        }
         self
     }
 

@@ -1,10 +1,12 @@
 //! Command-line options that choose and configure a pose source.
 
-use clap::{ArgMatches, Args, Command, FromArgMatches, ValueEnum};
+use clap::error::ErrorKind;
+use clap::parser::ValueSource;
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, ValueEnum};
 use protocol::config::{document, options_of};
 
 use super::{
-    BaselinePoseConfig, CachedPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
+    BaselinePoseConfig, CachedPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
     TrackedPoseConfig,
 };
 
@@ -65,12 +67,73 @@ impl FromArgMatches for PoseSourceConfig {
         Ok(source)
     }
 
-    /// Options of sources that are not chosen are ignored.
+    /// Options of a source that is not chosen are refused.
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
         let requested = Choice::from_arg_matches(matches)?.pose_source;
         if let Some(kind) = requested.filter(|kind| *kind != self.kind()) {
             *self = Self::new(kind);
         }
+        self.update_chosen(matches)?;
+        let given = |option: &Arg| {
+            matches.value_source(option.get_id().as_str()) == Some(ValueSource::CommandLine)
+        };
+        match options().find(|option| given(option) && !self.has_use_for(option.get_id().as_str()))
+        {
+            Some(option) => Err(self.refused(&option)),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The options of all sources.
+fn options() -> impl Iterator<Item = Arg> {
+    options_of::<NoisyPoseConfig>()
+        .chain(options_of::<PgcConfig>())
+        .chain(options_of::<TrackedPoseConfig>())
+        .chain(options_of::<BaselinePoseConfig>())
+        .chain(options_of::<CachedPoseConfig>())
+}
+
+impl PoseSourceConfig {
+    /// True if the option changes something of this source.
+    fn has_use_for(&self, option: &str) -> bool {
+        match self {
+            Self::Recorded => false,
+            Self::Noisy(noise) => match option {
+                "noise_position_std_m" | "noise_heading_std_deg" => {
+                    noise.mode != NoiseMode::Replayed
+                }
+                "noise_step_s" => noise.mode != NoiseMode::Fixed,
+                "noise_decay_s" => noise.mode == NoiseMode::Autoregressive,
+                // A table that is not replayed is refused with the other values.
+                option => option.starts_with("noise_"),
+            },
+            Self::Pgc(_) => ["encoder", "head", "lightloc"].contains(&option),
+            Self::Tracked(_) => {
+                ["encoder", "head"].contains(&option) || option.starts_with("tracking_")
+            }
+            Self::Baseline(_) => option == "baseline",
+            Self::Cached(_) => option == "poses",
+        }
+    }
+
+    fn refused(&self, option: &Arg) -> clap::Error {
+        let option = option.get_long().unwrap_or_default();
+        let mode = match self {
+            Self::Noisy(noise) => noise.mode.to_possible_value(),
+            _ => None,
+        };
+        let mode = mode.map_or_else(String::new, |mode| {
+            format!(", noise mode {}", mode.get_name())
+        });
+        let source = self.name();
+        clap::Error::raw(
+            ErrorKind::ArgumentConflict,
+            format!("--{option} has no effect on pose source {source}{mode}\n"),
+        )
+    }
+
+    fn update_chosen(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
         match self {
             Self::Recorded => Ok(()),
             Self::Noisy(noise) => noise.update_from_arg_matches(matches),
@@ -172,6 +235,46 @@ mod tests {
                 .validate()
                 .is_ok()
         );
+    }
+
+    #[test]
+    fn options_of_another_source_or_noise_mode_are_refused() {
+        for (words, refused) in [
+            (
+                "--noise-position-std-m=2",
+                "--noise-position-std-m has no effect on pose source recorded",
+            ),
+            ("--head=town1", "--head"),
+            ("--measure-every=2", "--measure-every"),
+            ("--poses=p.csv", "--poses"),
+            ("--baseline=b", "--baseline"),
+            ("--lightloc", "--lightloc"),
+            (
+                "--pose-source=tracked --head=h --lightloc",
+                "--lightloc has no effect on pose source tracked",
+            ),
+            (
+                "--pose-source=pgc --head=h --max-coast-s=1",
+                "--max-coast-s",
+            ),
+            (
+                "--pose-source=cached --poses=p.csv --noise-seed=1",
+                "--noise-seed",
+            ),
+            (
+                "--pose-source=noisy --noise-decay-s=1",
+                "--noise-decay-s has no effect on pose source noisy, noise mode independent",
+            ),
+            (
+                "--pose-source=noisy --noise-mode=fixed --noise-step-s=1",
+                "--noise-step-s",
+            ),
+        ] {
+            let words = ["p"].into_iter().chain(words.split(' '));
+            let error = Cli::try_parse_from(words).unwrap_err();
+            assert_eq!(error.exit_code(), 2);
+            assert!(error.to_string().contains(refused), "{error}");
+        }
     }
 
     #[test]

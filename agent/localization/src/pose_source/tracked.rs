@@ -19,11 +19,12 @@ use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, Tra
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct TrackedPoseConfig {
-    /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both.
+    /// Weights of the encoder: the scene encoder, or a detector whose backbone serves both. Absent: those that the head
+    /// names.
     #[arg(skip)]
     #[serde(default)]
     pub encoder: PathBuf,
-    /// Weights of the scene-specific head.
+    /// Weights of the scene-specific head, or the name of a released one.
     #[arg(skip)]
     #[serde(default)]
     pub head: PathBuf,

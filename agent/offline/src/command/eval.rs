@@ -8,16 +8,16 @@ use agent_offline::evaluation::{
     LocalizationSummary, evaluate, evaluate_source, reliability_charts, write_csv,
     write_error_table,
 };
-use agent_offline::head_files::{ENCODER_FILE, encoder_of};
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use agent_offline::sweep_database::read_database;
 use anyhow::Context;
-use clap::ValueEnum;
+use clap::{ArgGroup, ValueEnum};
 use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, Retrieval, load_baseline};
 use localization::pgc::confidence::{
     CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss,
 };
+use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer};
@@ -34,26 +34,35 @@ use serde_json::json;
 use support::output;
 use support::progress;
 
-use super::scene_heads::{SceneHeadFile, by_head};
+use super::scene_heads::{SceneHeadFile, by_head, with_files};
 use support::cli::{BadInput, Outcome};
+
+/// Options that change the tracker alone.
+const TRACKER_OPTIONS: [&str; 4] = [
+    "tracking_measure_every",
+    "tracking_phase",
+    "tracking_global_period_s",
+    "tracking_max_coast_s",
+];
 
 /// Localize recorded sweeps and compare with their true poses.
 #[derive(Debug, clap::Args)]
+#[command(group = ArgGroup::new("tracker").args(TRACKER_OPTIONS).multiple(true).requires("tracked"))]
 pub(crate) struct Args {
     /// Data sets, splits or scenarios of the heads' scenes; the layout is detected.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
-    scene: Vec<PathBuf>,
+    dataset: Vec<PathBuf>,
     /// Weights of the encoder, or of a detector that has it [default: those that each head names].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
-    /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0]. The
-    /// report is over all scenes together.
+    /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0]; FILE may be
+    /// the name of a released one (town1, town4). The report is over all scenes together.
     #[arg(
         long,
         visible_alias = "weights",
-        value_name = "[MAP=]FILE",
+        value_name = "[MAP=]FILE|NAME",
         num_args = 1..,
-        default_value = "deploy/weights/pgc-town1.safetensors"
+        default_value = "town1"
     )]
     head: Vec<SceneHeadFile>,
     /// Weights of a baseline (`agent train sgloc`, `diffloc`, `hypliloc`), instead of encoder and head.
@@ -81,13 +90,8 @@ pub(crate) struct Args {
     )]
     icp_map: Vec<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
-    #[arg(
-        long,
-        value_name = "METRES",
-        default_value_t = 5.0,
-        requires = "icp_map"
-    )]
-    map_spacing: f64,
+    #[arg(long, value_name = "M", default_value_t = 5.0, requires = "icp_map")]
+    map_spacing_m: f64,
     /// Follow each vehicle from sweep to sweep (pose source tracked), and localize every sweep by itself beside it;
     /// files are written of the tracked poses.
     #[arg(long, conflicts_with_all = ["baseline", "icp_map", "fit_confidence"])]
@@ -107,9 +111,9 @@ pub(crate) struct Args {
     /// Search for the pose.
     #[arg(long, value_enum, default_value_t = Search::Ransac)]
     solver: Search,
-    /// Seed of the search.
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
+    /// Seed of the search (--solver ransac) [default: 0].
+    #[arg(long, conflicts_with_all = ["retrieval", "icp_map"])]
+    seed: Option<u64>,
     /// Fit the confidence model and the rejection threshold to these sweeps, and write them into the head. Not on
     /// sweeps that results are reported on.
     #[arg(long)]
@@ -132,10 +136,10 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     error_table: Option<PathBuf>,
     /// Device to compute on.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, conflicts_with = "icp_map")]
     device: ComputeDevice,
-    /// Number format in which networks are computed.
-    #[arg(long, value_enum, default_value_t)]
+    /// Number format in which networks are computed; baselines are computed in floating point.
+    #[arg(long, value_enum, default_value_t, conflicts_with_all = ["icp_map", "baseline"])]
     precision: InferencePrecision,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
@@ -166,7 +170,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     check_good_loss(args.good_loss)
         .map_err(|error| BadInput::new(format!("--good-loss: {error}")))?;
-    let groups = by_head(&args.head, &args.scene)?;
+    if args.seed.is_some() && args.solver == Search::Sc2pcr {
+        return Err(BadInput::new("--seed is for --solver ransac: sc2pcr draws nothing").into());
+    }
+    let heads = match args.uses_head() {
+        true => with_files(&args.head)?,
+        false => args.head.clone(),
+    };
+    let groups = by_head(&heads, &args.dataset)?;
     if args.fit_confidence && groups.len() > 1 {
         let count = groups.len();
         return Err(
@@ -225,14 +236,14 @@ impl Args {
                 left_out,
             )?));
         }
-        if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
+        if !self.map_spacing_m.is_finite() || self.map_spacing_m < 0.0 {
             return Err(BadInput::new(format!(
-                "--map-spacing is {}, must be 0 or more",
-                self.map_spacing
+                "--map-spacing-m is {}, must be 0 or more",
+                self.map_spacing_m
             )));
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(BadInput::of)?;
+        let map = read_map(&self.icp_map, self.map_spacing_m, &config).map_err(BadInput::of)?;
         Ok(Subject::Source(Box::new(IcpMapPose::new(
             Arc::new(map),
             config,
@@ -254,7 +265,7 @@ impl Args {
 
     fn tracking(&self, head: &Path) -> Result<Subject, BadInput> {
         let config = TrackedPoseConfig {
-            encoder: self.encoder(head),
+            encoder: self.encoder(head)?,
             head: head.to_owned(),
             ..self.tracker.0.clone()
         };
@@ -272,7 +283,7 @@ impl Args {
     ) -> Result<Box<dyn Localize>, BadInput> {
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig {
-                seed: self.seed,
+                seed: self.seed.unwrap_or(0),
                 ..RansacConfig::default()
             }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
@@ -289,7 +300,7 @@ impl Args {
         } else {
             Localizer::load
         };
-        let mut localizer = load(&self.encoder(head), head, inference).map_err(BadInput::of)?;
+        let mut localizer = load(&self.encoder(head)?, head, inference).map_err(BadInput::of)?;
         if self.lightloc {
             return Ok(Box::new(LightLoc::new(localizer, plain)));
         }
@@ -319,12 +330,8 @@ impl Args {
         )))
     }
 
-    fn encoder(&self, head: &Path) -> PathBuf {
-        let beside = || head.with_file_name(ENCODER_FILE);
-        self.encoder
-            .clone()
-            .or_else(|| encoder_of(head).ok())
-            .unwrap_or_else(beside)
+    fn encoder(&self, head: &Path) -> Result<PathBuf, BadInput> {
+        encoder_or_named(self.encoder.as_deref(), head).map_err(BadInput::of)
     }
 
     fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use indicatif::ProgressBar;
+use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::{
     LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable,
@@ -14,7 +15,7 @@ use protocol::PoseEstimate;
 use support::output;
 use support::progress;
 
-use super::scene_heads::{SceneHeadFile, head_of};
+use super::scene_heads::{SceneHeadFile, head_of, with_files};
 use support::cli::{BadInput, Outcome};
 
 /// Localize every sweep of scenes once and write poses and confidences to a table, for training and evaluation.
@@ -24,12 +25,13 @@ use support::cli::{BadInput, Outcome};
 pub(crate) struct Args {
     /// Data sets, splits or scenarios.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
-    scene: Vec<PathBuf>,
-    /// Weights of the encoder, or of a detector that has it.
+    dataset: Vec<PathBuf>,
+    /// Weights of the encoder, or of a detector that has it [default: those that each head names].
     #[arg(long, value_name = "FILE")]
-    encoder: PathBuf,
-    /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0].
-    #[arg(long, value_name = "[MAP=]FILE", num_args = 1.., required = true)]
+    encoder: Option<PathBuf>,
+    /// Weights of the heads: FILE for all scenes, or MAP=FILE and MAP:SEED=FILE for generated ones [SEED: 0]; FILE may be
+    /// the name of a released one (town1, town4).
+    #[arg(long, value_name = "[MAP=]FILE|NAME", num_args = 1.., required = true)]
     head: Vec<SceneHeadFile>,
     /// The table.
     #[arg(long, value_name = "FILE")]
@@ -51,20 +53,21 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         PoseTable::default()
     };
     let mut scenarios = Vec::new();
-    for folder in &args.scene {
+    for folder in &args.dataset {
         scenarios.extend(dataset::open(folder).map_err(bad)?.scenarios);
     }
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // All heads are found before any is computed with.
+    let files = with_files(&args.head)?;
     let heads: Vec<&Path> = scenarios
         .iter()
-        .map(|scenario| head_of(&args.head, scenario))
+        .map(|scenario| head_of(&files, scenario))
         .collect::<Result<_, _>>()?;
     let first_head = heads.first().copied();
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
         let scenes: Vec<String> = args
-            .scene
+            .dataset
             .iter()
             .map(|scene| scene.display().to_string())
             .collect();
@@ -99,7 +102,7 @@ impl Args {
         bar: &ProgressBar,
     ) -> anyhow::Result<usize> {
         let config = PgcConfig {
-            encoder: self.encoder.clone(),
+            encoder: encoder_or_named(self.encoder.as_deref(), head).map_err(bad)?,
             head: head.to_owned(),
             ..PgcConfig::default()
         };

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use agent_offline::head_files::{encoder_of, head_file};
 use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
+use localization::pgc::head_files::{encoder_or_named, head_file};
 use localization::pgc::pose_solver::FoundPose;
 use localization::pgc::wrong_place::other_lidar_hint;
 use localization::pgc::{Localization, Localizer};
@@ -35,8 +35,8 @@ pub(crate) struct Args {
     #[arg(required = true, value_name = "CLOUD")]
     clouds: Vec<PathBuf>,
     /// Weights of the head of the place: a file, the folder that `agent map` wrote, or a released one (town1, town4).
-    #[arg(long, value_name = "FILE")]
-    head: String,
+    #[arg(long, value_name = "FILE|NAME")]
+    head: PathBuf,
     /// Weights of the encoder, or of a detector that has it [default: those that the head names, beside it or released].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
@@ -106,11 +106,7 @@ struct LocatedPose {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     let head = head_file(&args.head).map_err(BadInput::of)?;
-    let encoder = args
-        .encoder
-        .clone()
-        .map_or_else(|| encoder_of(&head), Ok)
-        .map_err(BadInput::of)?;
+    let encoder = encoder_or_named(args.encoder.as_deref(), &head).map_err(BadInput::of)?;
     let inference = Inference {
         precision: args.precision,
         ..Inference::default()

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use agent_offline::head_files::{ENCODER_FILE, released_encoder};
 use agent_offline::mapping::{MapConfig, MapError, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
+use localization::pgc::head_files::{ENCODER_FILE, released_encoder};
 use perception::compute_device::ComputeDevice;
 use perception::train::{
     ComputePrecision, Interruption, Length, ModelCard, RunConfig, TrainingBar, check_out,

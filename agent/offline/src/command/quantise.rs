@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use dataset::{LeftOut, LoadOptions};
 use localization::pgc::Localizer;
+use localization::pgc::head_files::encoder_or_named;
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
 use perception::weights::annotate;
@@ -16,10 +17,10 @@ use support::output;
 pub(crate) struct Args {
     /// Data sets, splits or scenarios of the scene.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
-    scene: Vec<PathBuf>,
-    /// Weights of the encoder, or of a detector that has it and its scales.
+    dataset: Vec<PathBuf>,
+    /// Weights of the encoder, or of a detector that has it and its scales [default: those that the head names].
     #[arg(long, value_name = "FILE")]
-    encoder: PathBuf,
+    encoder: Option<PathBuf>,
     /// Weights of the head; its parameters stay as they are.
     #[arg(long, value_name = "FILE")]
     head: PathBuf,
@@ -31,10 +32,11 @@ pub(crate) struct Args {
 /// Searches the scales and stores them.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(1);
+    let encoder = encoder_or_named(args.encoder.as_deref(), &args.head).map_err(BadInput::of)?;
     let localizer =
-        Localizer::load(&args.encoder, &args.head, Inference::FLOAT).map_err(BadInput::of)?;
+        Localizer::load(&encoder, &args.head, Inference::FLOAT).map_err(BadInput::of)?;
     let (mut search, mut left_out, mut observed) = (ScaleSearch::default(), LeftOut::default(), 0);
-    for folder in &args.scene {
+    for folder in &args.dataset {
         for scenario in dataset::open(folder).map_err(BadInput::of)?.scenarios {
             let all = scenario.ticks.len() * scenario.agents.len();
             for sweep in (0..all).step_by(all.div_ceil(usize::from(args.sweeps)).max(1)) {

@@ -5,10 +5,12 @@ use std::str::FromStr;
 
 use anyhow::Context;
 use dataset::{self, GeneratedMap, Scenario};
+use localization::pgc::head_files::head_file;
 
 use support::cli::BadInput;
 
-/// Weights and their scene: `FILE` for all scenes, `MAP=FILE` and `MAP:SEED=FILE` for generated ones.
+/// Weights and their scene: `FILE` for all scenes, `MAP=FILE` and `MAP:SEED=FILE` for generated ones; a file may be the
+/// name of a released head.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct SceneHeadFile {
     map: Option<GeneratedMap>,
@@ -37,6 +39,20 @@ impl FromStr for SceneHeadFile {
             weights: weights.into(),
         })
     }
+}
+
+/// The heads with their files, where released ones are named.
+///
+/// # Errors
+/// [`BadInput`] for a head that does not exist.
+pub(crate) fn with_files(heads: &[SceneHeadFile]) -> Result<Vec<SceneHeadFile>, BadInput> {
+    let found = heads.iter().map(|head| {
+        Ok(SceneHeadFile {
+            map: head.map.clone(),
+            weights: head_file(&head.weights).map_err(BadInput::of)?,
+        })
+    });
+    found.collect()
 }
 
 /// The weights of the head for a scenario.
@@ -139,7 +155,6 @@ mod tests {
         let scene = |subset, name: &str| {
             let out = folder.path().join(name);
             let options = SynthOptions {
-                traversals: 1,
                 frames: 1,
                 ..SynthOptions::new(subset, 11, out.clone())
             };

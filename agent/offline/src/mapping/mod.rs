@@ -18,12 +18,12 @@ pub use report::{HeldOutAccuracy, MapReport};
 use self::check::Check;
 use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
 use crate::evaluation::LocalizationSummary;
-use crate::head_files::ENCODER_FILE;
 use crate::training::{
     CELLS, FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps,
     SceneTrainConfig, SweepAugmentation, SweepList, train_scene_on,
 };
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
+use localization::pgc::head_files::ENCODER_FILE;
 use localization::pgc::{CellEncoder, Localizer, LocalizerError};
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};

@@ -32,8 +32,8 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     scenario: Option<PathBuf>,
     /// Folder of the generated scenes; an existing scene is used again.
-    #[arg(long, default_value = "scenes")]
-    scenes: PathBuf,
+    #[arg(long, value_name = "DIR", default_value = "scenes")]
+    scenes_dir: PathBuf,
     /// Folder of the run folders.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
@@ -48,10 +48,10 @@ pub(crate) struct Arguments {
     frames: usize,
     /// Vehicles that connect, 2 to 4.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4))]
-    agents: u8,
+    vehicles: u8,
     /// Fusion methods, one run each.
-    #[arg(long, value_delimiter = ',', default_values_t = [Method::NONE, Method::LATE, Method::MAX, Method::PASTAT])]
-    methods: Vec<Method>,
+    #[arg(long, value_name = "NAME", num_args = 1.., value_delimiter = ',', default_value = "none,late,max,pastat")]
+    method: Vec<Method>,
     /// Seconds of the scene per second: below 1 slower, for machines that do not keep up.
     #[arg(long, value_name = "TIMES", default_value_t = 1.0)]
     rate: f64,
@@ -65,7 +65,7 @@ pub(crate) struct Arguments {
         default_value = "127.0.0.1:8088",
         requires = "view"
     )]
-    listen: SocketAddr,
+    page: SocketAddr,
     /// Print the metrics of the last method's run as JSON instead of a table of all.
     #[arg(long)]
     json: bool,
@@ -80,10 +80,10 @@ impl Arguments {
         scenario.scene.rate = self.rate;
         let name = self.name.clone().unwrap_or_else(|| name_of_now("demo"));
         let mut results = Vec::new();
-        for &method in &self.methods {
+        for &method in &self.method {
             scenario.method = method;
             scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(BadInput::of)?);
-            if self.view && Some(&method) == self.methods.last() {
+            if self.view && Some(&method) == self.method.last() {
                 scenario.record.get_or_insert_default();
             }
             scenario.check(&file)?;
@@ -108,7 +108,7 @@ impl Arguments {
             .iter()
             .for_each(|result| report::print_loss(result, results.len() > 1));
         if let Some(last) = results.last().filter(|last| self.view && !last.interrupted) {
-            show_recorded(&last.folder.file("recording.mcap"), self.listen)?;
+            show_recorded(&last.folder.file("recording.mcap"), self.page)?;
         }
         Ok(Outcome::of(results.iter().any(RunResult::lost_data)))
     }
@@ -125,8 +125,8 @@ impl Arguments {
 
     /// Folder of the scene, which is generated if it does not exist.
     fn scene(&self) -> anyhow::Result<PathBuf> {
-        let scenes = std::path::absolute(&self.scenes)?;
-        let name = format!("v2vdet-{}-{}x{}", self.seed, self.agents, self.frames);
+        let scenes = std::path::absolute(&self.scenes_dir)?;
+        let name = format!("v2vdet-{}-{}x{}", self.seed, self.vehicles, self.frames);
         let folder = scenes.join(&name);
         let options = self.options(folder.clone());
         if generate::are_kept(&options).map_err(BadInput::of)? {
@@ -135,7 +135,7 @@ impl Arguments {
         output::note(format_args!(
             "generating {} frames of {} vehicles (seed {}) into {}",
             self.frames,
-            self.agents,
+            self.vehicles,
             self.seed,
             folder.display()
         ));
@@ -149,10 +149,10 @@ impl Arguments {
     }
 
     fn options(&self, out: PathBuf) -> SynthOptions {
-        let agents = usize::from(self.agents);
+        let vehicles = usize::from(self.vehicles);
         SynthOptions {
             frames: self.frames,
-            agents: agents..=agents,
+            agents: vehicles..=vehicles,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
             ..SynthOptions::new(Subset::V2vdet, self.seed, out)
         }
@@ -178,7 +178,7 @@ impl Arguments {
 
 /// Generates a scene with a progress bar.
 fn generate(options: &SynthOptions) -> anyhow::Result<()> {
-    let bar = progress::percent_bar(options.scenarios());
+    let bar = progress::percent_bar(options.scenes);
     let generated = generate::generate_whole(options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     match generated {

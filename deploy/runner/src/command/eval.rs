@@ -12,9 +12,9 @@ use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
-use fusion::Method;
+use fusion::{Exchange, Method};
 use indicatif::ProgressBar;
-use link::{CapacityConfig, DelayModel, LinkConfig};
+use link::{CapacityConfig, LatencyModel, LinkConfig};
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
 use protocol::CodecConfig;
@@ -30,8 +30,34 @@ use super::left_out;
 use support::cli::BadInput;
 use support::cli::Outcome;
 
+/// Options and groups of options that a file of tables states itself.
+const OF_ONE_TABLE: [&str; 22] = [
+    "dataset",
+    "method",
+    "weights",
+    "precision",
+    "pose_source",
+    "NoisyPoseConfig",
+    "PgcConfig",
+    "TrackedPoseConfig",
+    "BaselinePoseConfig",
+    "CachedPoseConfig",
+    "CodecConfig",
+    "RateConfig",
+    "emulation",
+    "delay_ms",
+    "attack",
+    "trust",
+    "feature_maps",
+    "frames",
+    "scenarios",
+    "intensity_scale",
+    "ProtocolConfig",
+    "json",
+];
+
 #[derive(Debug, clap::Args)]
-#[command(group = ArgGroup::new("emulation").args(["link", "bandwidth", "latency"]).multiple(true))]
+#[command(group = ArgGroup::new("emulation").args(["link", "bandwidth_mbps", "latency_ms"]).multiple(true))]
 pub(crate) struct Arguments {
     /// Data set, split or scenario; its layout is detected. The first vehicle of each scenario is the ego.
     #[arg(long, value_name = "DIR", required_unless_present = "table")]
@@ -44,10 +70,10 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", required_unless_present = "table")]
     weights: Option<PathBuf>,
     /// Number format in which networks are computed.
-    #[arg(long, value_enum, default_value_t, conflicts_with = "table")]
+    #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "method", "weights"], requires = "out")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = OF_ONE_TABLE, requires = "out")]
     table: Option<PathBuf>,
     /// Folder for detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with --table, of the
     /// tables [default: nothing is written].
@@ -61,17 +87,17 @@ pub(crate) struct Arguments {
     rate: Section<RateConfig>,
     /// Delay of the messages of neighbours, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
-    delay: u64,
+    delay_ms: u64,
     /// Link emulation between neighbours and ego, in simulation time: a preset of `sim-replay link`, or a file.
-    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay")]
+    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay_ms")]
     link: Option<String>,
-    /// Rate of the link, Mbit/s; replaces that of --link.
-    #[arg(long, value_name = "MBPS", conflicts_with = "delay")]
-    bandwidth: Option<f64>,
-    /// Delay of the link after the last bit, milliseconds; replaces that of --link.
-    #[arg(long, value_name = "MS", conflicts_with = "delay")]
-    latency: Option<f64>,
-    /// Same seed, same losses and delays (--link).
+    /// Rate of the link, Mbit/s, inf for unlimited; replaces that of --link.
+    #[arg(long, value_name = "MBPS", conflicts_with = "delay_ms")]
+    bandwidth_mbps: Option<f64>,
+    /// Latency of the link after the last bit, milliseconds; replaces that of --link.
+    #[arg(long, value_name = "MS", conflicts_with = "delay_ms")]
+    latency_ms: Option<f64>,
+    /// Same seed, same losses and latencies (--link).
     #[arg(long, default_value_t = 0, requires = "emulation")]
     seed: u64,
     /// Longest time that a frame waits for its neighbours, milliseconds (--link) [default: that of ego-fuser run].
@@ -83,8 +109,15 @@ pub(crate) struct Arguments {
     max_age_ms: Option<u64>,
     /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is reported
     /// (--link).
-    #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "emulation")]
-    compute: Vec<f64>,
+    #[arg(
+        long,
+        value_name = "MS,MS,MS",
+        value_delimiter = ',',
+        num_args = 1,
+        default_value = "0,0,0",
+        requires = "emulation"
+    )]
+    compute_ms: Vec<f64>,
     /// Attack by neighbours: falsified messages, to measure their effect on the ego.
     #[arg(long, value_enum, value_name = "ATTACK")]
     attack: Option<Falsification>,
@@ -99,8 +132,8 @@ pub(crate) struct Arguments {
     trust: bool,
     /// Keep the feature maps of the encoder in this folder, so that each is computed once for many evaluations.
     #[arg(long, value_name = "DIR")]
-    maps: Option<PathBuf>,
-    /// Largest number of frames to evaluate, over all scenarios [default: all].
+    feature_maps: Option<PathBuf>,
+    /// Largest number of frames of each scenario [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Largest number of scenarios to evaluate, evenly spread [default: all].
@@ -166,6 +199,8 @@ impl Arguments {
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
         self.pose.0.validate().map_err(bad)?;
+        self.codec.0.validate().map_err(bad)?;
+        self.check_methods()?;
         if self.rate.0.watch_queue && !self.emulates_link() {
             return Err(BadInput::new(
                 "--watch-queue: without --link there is no queue to watch",
@@ -177,27 +212,26 @@ impl Arguments {
             dataset: self.dataset.clone().unwrap_or_default(),
             weights: self.weights.clone().unwrap_or_default(),
             precision: self.precision,
-            pose_source: self.pose.0.clone(),
+            pose_source: self.pose.0.clone().with_networks().map_err(BadInput::of)?,
             codec,
             rate: self.rate.0,
-            delay_nanos: self.delay * 1_000_000,
+            delay_nanos: self.delay_ms * 1_000_000,
             attack: self.attack.map(|falsification| AttackConfig {
                 falsification,
                 attackers: self.attackers,
                 seed: self.attack_seed,
             }),
             trust: self.trust.then(MisbehaviourConfig::default),
-            maps: self.maps.as_ref().map(|folder| KeptMaps {
+            maps: self.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: codec.dtype,
                 limit_bytes: u64::MAX,
                 intensity_scale: self.intensity_scale,
             }),
-            frames: self.frames.map(at_most),
             stepped: self.emulates_link().then(|| self.stepped()).transpose()?,
             part: Part {
                 scenarios: self.scenarios.map(at_most),
-                ticks: None,
+                frames: self.frames.map(at_most),
                 intensity_scale: self.intensity_scale,
             },
             protocol: self.protocol.clone(),
@@ -205,36 +239,57 @@ impl Arguments {
         })
     }
 
+    /// Refuses options for messages that none of the methods sends.
+    fn check_methods(&self) -> Result<(), BadInput> {
+        let methods: Vec<&str> = self.method.iter().map(|method| method.name()).collect();
+        let methods = methods.join(", ");
+        let encodes =
+            self.codec.0 != CodecConfig::default() || self.rate.0 != RateConfig::default();
+        let exchange = || self.method.iter().map(|method| method.exchange());
+        if encodes
+            && self.feature_maps.is_none()
+            && exchange().all(|content| content != Exchange::Features)
+        {
+            return Err(BadInput::new(format!(
+                "options of the codec and of the rate are for feature maps: {methods} sends none"
+            )));
+        }
+        let listens = self.attack.is_some() || self.trust || self.delay_ms > 0;
+        if listens && exchange().all(|content| content == Exchange::Nothing) {
+            return Err(BadInput::new(format!(
+                "--attack, --trust and --delay-ms are for messages of neighbours: {methods} uses none"
+            )));
+        }
+        Ok(())
+    }
+
     fn emulates_link(&self) -> bool {
-        self.link.is_some() || self.bandwidth.is_some() || self.latency.is_some()
+        self.link.is_some() || self.bandwidth_mbps.is_some() || self.latency_ms.is_some()
     }
 
     fn stepped(&self) -> Result<SteppedConfig, BadInput> {
         let (mut link, link_folder) =
             LinkConfig::open(self.link.as_deref().unwrap_or("ideal")).map_err(BadInput::of)?;
-        if let Some(rate_mbps) = self.bandwidth {
-            link.capacity = CapacityConfig::TokenBucket {
-                rate_mbps,
-                burst_bytes: 0,
-            };
+        if let Some(bandwidth_mbps) = self.bandwidth_mbps {
+            link.capacity = CapacityConfig::of_mbps(bandwidth_mbps);
         }
-        if let Some(latency_ms) = self.latency {
-            link.delay = DelayModel::ConstantMs(latency_ms);
+        if let Some(latency_ms) = self.latency_ms {
+            link.latency = LatencyModel::ConstantMs(latency_ms);
         }
         link.validate().map_err(BadInput::of)?;
-        let &[pose_ms, map_ms, fuse_ms] = &self.compute[..] else {
+        let &[pose_ms, map_ms, fuse_ms] = &self.compute_ms[..] else {
             return Err(BadInput::new(format!(
-                "--compute takes 3 numbers, not {}",
-                self.compute.len()
+                "--compute-ms takes 3 numbers, not {}",
+                self.compute_ms.len()
             )));
         };
         if let Some(ms) = self
-            .compute
+            .compute_ms
             .iter()
             .find(|ms| !(0.0..=60_000.0).contains(*ms))
         {
             return Err(BadInput::new(format!(
-                "--compute: {ms} is not 0 to 60000 ms"
+                "--compute-ms: {ms} is not 0 to 60000 ms"
             )));
         }
         let defaults = EgoSettings::default();

@@ -23,8 +23,11 @@ pub(crate) struct Arguments {
     #[arg(long)]
     dry_run: bool,
     /// Keep the feature maps of all sweeps after the last run: a grid that is extended later needs no encoding again.
-    #[arg(long)]
-    keep_maps: bool,
+    #[arg(long, conflicts_with = "dry_run")]
+    keep_feature_maps: bool,
+    /// Print the settings and metrics of every run as JSON instead of a table.
+    #[arg(long, conflicts_with = "dry_run")]
+    json: bool,
     /// Compute the runs whose numbers come on standard input, for another sweep.
     #[arg(long, hide = true)]
     worker: bool,
@@ -50,15 +53,20 @@ impl Arguments {
         }
         let swept = sweep.run(&SweepOptions {
             jobs,
-            keep_maps: self.keep_maps,
+            keep_maps: self.keep_feature_maps,
         })?;
-        output::text(&swept.table)?;
+        match self.json {
+            true => output::line(serde_json::to_string_pretty(&swept.runs)?)?,
+            false => output::text(&swept.table)?,
+        }
         note_maps(&out.join("maps"));
         output::note(format_args!(
             "all columns and the report: {}",
             out.display()
         ));
-        Ok(left_out(swept.left_out.iter()))
+        Ok(left_out(
+            swept.runs.iter().map(|run| &run.cell.metrics.left_out),
+        ))
     }
 }
 

@@ -24,11 +24,11 @@ pub(crate) struct Arguments {
     runs: PathBuf,
     /// Data set, split or scenario in place of the scenario's.
     #[arg(long, value_name = "DIR")]
-    scene: Option<PathBuf>,
+    dataset: Option<PathBuf>,
     /// Fusion method in place of the scenario's, one of `ego-fuser methods`.
     #[arg(long)]
     method: Option<Method>,
-    /// Number of ticks to play in place of the scenario's.
+    /// Number of frames to play in place of the scenario's.
     #[arg(long)]
     frames: Option<usize>,
     /// Seconds of the scene per second in place of the scenario's: below 1 slower, for machines that do not keep up.
@@ -54,8 +54,8 @@ impl Arguments {
     /// Runs the scenario and prints the result.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let mut scenario = Scenario::read_with(&self.scenario, &self.set)?;
-        if let Some(scene) = self.scene {
-            scenario.scene.dir = std::path::absolute(scene)?;
+        if let Some(dataset) = self.dataset {
+            scenario.scene.dir = std::path::absolute(dataset)?;
         }
         scenario.run = self.name.or(scenario.run);
         scenario.method = self.method.unwrap_or(scenario.method);

@@ -54,8 +54,6 @@ pub struct EvaluationOptions {
     pub trust: Option<MisbehaviourConfig>,
     /// Cache of the encoders' feature maps, so that each is computed once for many evaluations.
     pub maps: Option<KeptMaps>,
-    /// Largest number of frames to evaluate, over all scenarios.
-    pub frames: Option<usize>,
     /// Run in simulation time with link emulation; absent: no link.
     pub stepped: Option<SteppedConfig>,
     /// Part of the data set to evaluate.
@@ -99,14 +97,14 @@ impl OpenedData {
 pub struct Part {
     /// Number of scenarios, evenly spread; absent: all.
     pub scenarios: Option<usize>,
-    /// Number of ticks from the start of each scenario; absent: all.
-    pub ticks: Option<usize>,
+    /// Number of frames from the start of each scenario; absent: all.
+    pub frames: Option<usize>,
     /// Divisor of the intensities of its sweeps.
     pub intensity_scale: IntensityScale,
 }
 
 impl Part {
-    /// Opens a data set: all its scenarios, each with the agents of the protocol and the requested ticks. Feature maps
+    /// Opens a data set: all its scenarios, each with the agents of the protocol and the requested frames. Feature maps
     /// are cached for all of them, so that another selection needs no others.
     ///
     /// # Errors
@@ -131,7 +129,7 @@ impl Part {
             .collect();
         scenarios
             .iter_mut()
-            .for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
+            .for_each(|scenario| scenario.ticks.truncate(self.frames.unwrap_or(usize::MAX)));
         Ok(OpenedData {
             scenarios,
             protocol,
@@ -193,9 +191,8 @@ impl EvaluationOptions {
     /// Number of frames to evaluate, over all scenarios.
     #[must_use]
     pub fn frame_count(&self, data: &OpenedData) -> usize {
-        let scenarios = self.part.chosen(&data.scenarios);
-        let ticks = scenarios.map(|scenario| scenario.ticks.len()).sum();
-        self.frames.map_or(ticks, |frames| frames.min(ticks))
+        let chosen = self.part.chosen(&data.scenarios);
+        chosen.map(|scenario| scenario.ticks.len()).sum()
     }
 
     /// Identity of the result of a method: these settings, and the digests of all that they are applied to.
@@ -320,7 +317,6 @@ fn judged(
     let channels = evaluator.ego().detector().config().sent_channels();
     let map_values =
         u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
-    let left = options.frames.unwrap_or(usize::MAX);
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
     let is_timed = options
         .stepped
@@ -351,7 +347,7 @@ fn judged(
                 .is_none_or(|files| files.add(&scenario.name, &frame));
             judge(board, frame, is_timed);
             on_frame();
-            if board.records().len() >= left || !is_written {
+            if !is_written {
                 ControlFlow::Break(())
             } else {
                 ControlFlow::Continue(())

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use dataset::ReadError;
+use ego_fuser::ego::EgoError;
 use link::LinkError;
 use localization::pgc::LocalizerError;
 use perception::weights::WeightsError;
@@ -80,6 +81,9 @@ pub enum FleetError {
     /// The weights cannot be used.
     #[error("weights: {0}")]
     Weights(#[from] WeightsError),
+    /// The ego cannot fuse with the weights.
+    #[error("weights: {0}")]
+    Ego(#[from] EgoError),
     /// There are no weights for the method.
     #[error(transparent)]
     NoWeights(#[from] WeightsChoiceError),

@@ -185,7 +185,7 @@ impl Fleet {
             wait: WaitConfig {
                 expect: self.recorded(self.routes()),
                 ready_timeout_s: self.scenario.timeouts.ready_s,
-                egos: vec![self.ego.clone()],
+                egos: Vec::from_iter(scene.lockstep.then(|| self.ego.clone())),
                 ..WaitConfig::default()
             },
             sensor_link: SensorLinkConfig::default(),

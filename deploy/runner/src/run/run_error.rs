@@ -69,7 +69,7 @@ impl RunError {
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
         match self {
-            Self::Network(error) => error.is_bad_input(),
+            Self::Network(error) | Self::Scorer(ScorerError::Bus(error)) => error.is_bad_input(),
             Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) | Self::Live { .. } => true,
             Self::Evaluate(error) => matches!(
                 **error,

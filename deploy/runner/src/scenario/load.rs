@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use bus::config_file::{self, ConfigError};
+use localization::pose_source::PoseSourceConfig;
 
 use super::{FieldOverride, Scenario, ScenarioError};
 
@@ -66,10 +67,17 @@ impl Scenario {
         {
             *place = absolute(place);
         }
-        agents.pose = std::mem::take(&mut agents.pose).map_files(absolute);
+        let with_files = |pose: PoseSourceConfig| {
+            let found = pose.map_files(absolute).with_networks();
+            found.map_err(|source| ScenarioError::Head {
+                path: path.into(),
+                source,
+            })
+        };
+        agents.pose = with_files(std::mem::take(&mut agents.pose))?;
         vehicles
             .values_mut()
-            .for_each(|own| own.map_pose(|pose| pose.map_files(absolute)));
+            .try_for_each(|own| own.change_pose(with_files))?;
         if let Some(link) = link.as_mut().filter(|link| !link.is_preset()) {
             link.model = absolute(Path::new(&link.model))
                 .to_string_lossy()
@@ -124,7 +132,7 @@ mod tests {
     use fusion::Method;
     use protocol::{CavId, Dtype};
 
-    use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseSourceConfig};
+    use localization::pose_source::{NoiseMode, NoisyPoseConfig};
 
     use super::*;
 

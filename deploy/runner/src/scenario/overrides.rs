@@ -49,13 +49,17 @@ impl AgentOverrides {
     }
 
     /// Changes the pose source, if the vehicle overrides it.
-    pub(super) fn map_pose(&mut self, change: impl FnOnce(PoseSourceConfig) -> PoseSourceConfig) {
+    pub(super) fn change_pose<E>(
+        &mut self,
+        change: impl FnOnce(PoseSourceConfig) -> Result<PoseSourceConfig, E>,
+    ) -> Result<(), E> {
         if !self.0.contains_key("pose") {
-            return;
+            return Ok(());
         }
-        let pose = change(self.over(&AgentSettings::default()).pose);
+        let pose = change(self.over(&AgentSettings::default()).pose)?;
         if let Ok(pose) = serde_json::to_value(pose) {
             self.0.insert("pose".into(), pose);
         }
+        Ok(())
     }
 }

@@ -188,10 +188,9 @@ impl Watcher {
     }
 
     fn give_up(&self, how: &str) -> bool {
-        let last_line = self
-            .log
-            .last_line()
-            .map_or(String::new(), |line| format!(": {line}"));
+        let last_line = self.log.last_line().map_or(String::new(), |line| {
+            format!(": {}", line.strip_prefix("error: ").unwrap_or(&line))
+        });
         let is_optional = self.spec.life == RestartPolicy::Optional;
         self.report(ProcessEventKind::GaveUp {
             how: format!("{how}{last_line}"),

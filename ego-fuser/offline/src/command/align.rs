@@ -43,28 +43,28 @@ pub(crate) struct Arguments {
     )]
     intensity_scale: IntensityScale,
     /// Methods; none named: all but icp-map.
-    #[arg(long, num_args = 1.., value_enum)]
+    #[arg(long, num_args = 1.., value_delimiter = ',', value_enum)]
     method: Vec<Method>,
     /// One more method: the poses of a source, described as in a scenario file. May be repeated.
     #[arg(long, value_name = "NAME=FILE.yaml")]
     pose_source: Vec<NamedSource>,
     /// Sources of boxes; with several, methods that match boxes have a row for each.
-    #[arg(long, value_enum, num_args = 1.., default_value = "detected")]
+    #[arg(long, value_enum, num_args = 1.., value_delimiter = ',', default_value = "detected")]
     boxes: Vec<Boxes>,
     /// Weights of the detector, for detected boxes.
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
     /// Drives through the same place with true poses from which the map of icp-map is built.
     #[arg(long, num_args = 1.., value_name = "DIR")]
-    map: Vec<PathBuf>,
+    icp_map: Vec<PathBuf>,
     /// Distance between two sweeps of the map, metres.
-    #[arg(long, default_value_t = 5.0)]
-    map_spacing: f64,
+    #[arg(long, value_name = "M", default_value_t = 5.0, requires = "icp_map")]
+    map_spacing_m: f64,
     /// Use every N-th tick of a scenario.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Largest number of ticks of every scenario.
-    #[arg(long)]
+    /// Largest number of frames of each scenario [default: all].
+    #[arg(long, value_name = "N")]
     frames: Option<usize>,
     /// Torch threads.
     #[arg(long, default_value_t = 1)]
@@ -83,7 +83,7 @@ enum Method {
     Icp,
     /// The same, starting at the difference of both GNSS poses.
     IcpGnss,
-    /// Each vehicle's sweep against a map (`--map`), starting at its GNSS pose.
+    /// Each vehicle's sweep against a map (`--icp-map`), starting at its GNSS pose.
     IcpMap,
     /// ICP on box centres, starting at the identity: the row "ICP" of the paper.
     BoxIcp,
@@ -186,14 +186,14 @@ impl Arguments {
     }
 
     fn icp_map(&self) -> Result<AlignmentSpec> {
-        if self.map.is_empty() || self.map_spacing.is_nan() || self.map_spacing < 0.0 {
+        if self.icp_map.is_empty() || self.map_spacing_m.is_nan() || self.map_spacing_m < 0.0 {
             return Err(BadInput::new(
-                "icp-map needs --map DIR, and a spacing that is not negative",
+                "icp-map needs --icp-map DIR, and a spacing that is not negative",
             )
             .into());
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.map, self.map_spacing, &config).map_err(BadInput::of)?;
+        let map = read_map(&self.icp_map, self.map_spacing_m, &config).map_err(BadInput::of)?;
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
         let build = move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>);
@@ -250,6 +250,7 @@ fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let bad = |error: &dyn std::fmt::Display| BadInput::new(format!("{}: {error}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
+    let config = config.with_networks().map_err(|error| bad(&error))?;
     // Built once without use, so that a missing file is found before the first scene.
     config
         .build(Inference::default())

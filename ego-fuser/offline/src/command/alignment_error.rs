@@ -31,10 +31,10 @@ pub(crate) struct Arguments {
     weights: PathBuf,
     /// Distances, metres.
     #[arg(long, value_delimiter = ',', default_value = "0,0.5,1,2")]
-    shifts: Vec<f64>,
+    shifts_m: Vec<f64>,
     /// Angles, degrees.
     #[arg(long, value_delimiter = ',', default_value = "1,2")]
-    turns: Vec<f64>,
+    turns_deg: Vec<f64>,
     /// Take every N-th tick of each scenario.
     #[arg(long, value_name = "N", default_value_t = 1)]
     every: usize,
@@ -51,14 +51,14 @@ impl Arguments {
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(1);
         let is_sensible = |value: &f64| (0.0..=100.0).contains(value);
-        if !self.shifts.iter().chain(&self.turns).all(is_sensible) {
-            return Err(BadInput::new("--shifts and --turns are 0 to 100").into());
+        if !self.shifts_m.iter().chain(&self.turns_deg).all(is_sensible) {
+            return Err(BadInput::new("--shifts-m and --turns-deg are 0 to 100").into());
         }
-        let shifts = self.shifts.iter().map(|&shift_m| Offset {
+        let shifts = self.shifts_m.iter().map(|&shift_m| Offset {
             shift_m,
             turn_deg: 0.0,
         });
-        let turns = self.turns.iter().map(|&turn_deg| Offset {
+        let turns = self.turns_deg.iter().map(|&turn_deg| Offset {
             shift_m: 0.0,
             turn_deg,
         });

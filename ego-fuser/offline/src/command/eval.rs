@@ -49,9 +49,9 @@ pub(crate) struct Arguments {
     /// Methods, one after another; none named: that of the weights.
     #[arg(long, value_name = "NAME", num_args = 1.., value_delimiter = ',')]
     method: Vec<Method>,
-    /// Largest number of frames of every scenario.
-    #[arg(long)]
-    frames: Option<usize>,
+    /// Largest number of frames of each scenario [default: all].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    frames: Option<u32>,
     #[command(flatten)]
     protocol: ProtocolConfig,
     /// Torch threads.
@@ -86,8 +86,7 @@ impl Arguments {
                 method,
                 ..EvaluateConfig::default()
             };
-            let (row, lost) =
-                evaluate(&config, &data, self.frames.unwrap_or(usize::MAX), self.json)?;
+            let (row, lost) = evaluate(&config, &data, self.json)?;
             left_out.merge(&lost);
             rows.push(row);
         }
@@ -122,10 +121,14 @@ impl Arguments {
             } = dataset::open_with(folder, &options).map_err(BadInput::of)?;
             left_out.add_files(&problems);
             let protocol = self.protocol.resolve(layout).map_err(BadInput::new)?;
-            let scenarios = scenarios
+            let mut scenarios: Vec<Scenario> = scenarios
                 .iter()
                 .filter_map(|scenario| protocol.arrange(scenario))
                 .collect();
+            let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
+            scenarios
+                .iter_mut()
+                .for_each(|scenario| scenario.ticks.truncate(most));
             Ok(Data {
                 protocol,
                 scenarios,
@@ -143,10 +146,9 @@ impl Arguments {
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let rule = detector.rule();
-        let frames = self.frames.unwrap_or(usize::MAX);
         let mut tally = Tally::default();
         for scenario in data.iter().flat_map(|data| &data.scenarios) {
-            for tick in 0..scenario.ticks.len().min(frames) {
+            for tick in 0..scenario.ticks.len() {
                 let loaded =
                     scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
                 left_out.add_tick(&loaded);
@@ -183,7 +185,6 @@ fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
 fn evaluate(
     config: &dyn Fn(&Data) -> EvaluateConfig,
     data: &[Data],
-    frames: usize,
     json: bool,
 ) -> Result<(serde_json::Value, LeftOut)> {
     let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
@@ -193,20 +194,14 @@ fn evaluate(
         let frame_count = data
             .scenarios
             .iter()
-            .map(|scenario| scenario.ticks.len().min(frames))
+            .map(|scenario| scenario.ticks.len())
             .sum();
         let bar = progress::bar(frame_count, "frames").with_message(name);
         for scenario in &data.scenarios {
-            let mut done = 0;
             let _ = evaluator.run(scenario, &mut |frame| {
                 tally.add(&frame);
                 bar.inc(1);
-                done += 1;
-                if done < frames {
-                    ControlFlow::Continue(())
-                } else {
-                    ControlFlow::Break(())
-                }
+                ControlFlow::Continue(())
             })?;
         }
         bar.finish_and_clear();

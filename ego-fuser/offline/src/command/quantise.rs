@@ -30,8 +30,8 @@ pub(crate) struct Arguments {
         hide_default_value = true
     )]
     intensity_scale: IntensityScale,
-    /// Number of frames of every scenario.
-    #[arg(long, default_value_t = 5)]
+    /// Number of frames of each scenario.
+    #[arg(long, value_name = "N", default_value_t = 5)]
     frames: usize,
 }
 

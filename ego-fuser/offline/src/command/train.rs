@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
+use clap::ArgGroup;
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{IntensityScale, Layout, OpenOptions};
 use fusion::Exchange;
@@ -25,6 +26,7 @@ use support::cli::BadInput;
 
 /// Trains a method on scenes; writes checkpoint, curve.csv and curve.png, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
+#[command(group = ArgGroup::new("noise").args(["noise_position_std_m", "noise_heading_std_deg"]).multiple(true))]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios to learn from.
     #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
@@ -43,9 +45,9 @@ pub(crate) struct Arguments {
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value_t = Method::NONE)]
     method: Method,
-    /// Network: lean or full; --init overrides it.
-    #[arg(long, default_value = "lean", value_parser = parse_config)]
-    config: DetectorConfig,
+    /// Network, lean or full; with --init it is that of the weights.
+    #[arg(long, value_name = "NAME", default_value = "lean", conflicts_with = "init", value_parser = parse_network)]
+    network: DetectorConfig,
     /// Weights to begin with, for example those of `none`.
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
@@ -69,29 +71,29 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", num_args = 1..)]
     poses: Vec<PathBuf>,
     /// Standard deviation of an additional error of x, y and z of the vehicles' poses, metres.
-    #[arg(long, default_value_t = 0.0)]
-    position_noise: f64,
+    #[arg(long, value_name = "M", default_value_t = 0.0)]
+    noise_position_std_m: f64,
     /// Standard deviation of an additional error of yaw of the vehicles' poses, degrees.
-    #[arg(long, default_value_t = 0.0)]
-    heading_noise: f64,
+    #[arg(long, value_name = "DEG", default_value_t = 0.0)]
+    noise_heading_std_deg: f64,
     /// Correlation of the errors of a sample's vehicles and time steps.
-    #[arg(long, value_enum, default_value_t)]
+    #[arg(long, value_enum, default_value_t, requires = "noise")]
     noise_mode: NoiseMode,
     /// Share of the samples with that error.
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, value_name = "SHARE", default_value_t = 1.0, requires = "noise")]
     noise_share: f64,
     /// Share of the samples in which one neighbour is 5 to 30 m from its reported pose, and overconfident.
     #[arg(long, default_value_t = 0.0)]
     lost_share: f64,
     /// Largest delay of neighbours' maps relative to the ego's in training, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=5_000))]
-    max_delay: u64,
+    max_delay_ms: u64,
     /// Largest number of ticks between two time steps of a method with history; every sample draws its own number.
     #[arg(long, default_value_t = 1)]
     gap: usize,
     /// Time steps of every vehicle [default: that of the method].
     #[arg(long)]
-    frames: Option<usize>,
+    time_steps: Option<usize>,
     /// Parts of pastat to leave out.
     #[arg(long, value_enum, value_delimiter = ',')]
     without: Vec<Part>,
@@ -102,19 +104,28 @@ pub(crate) struct Arguments {
     #[arg(long, requires = "init")]
     freeze_encoder: bool,
     /// Folder of such maps.
-    #[arg(long, value_name = "DIR", default_value = "runs/maps")]
-    maps: PathBuf,
+    #[arg(
+        long,
+        value_name = "DIR",
+        default_value = "runs/maps",
+        requires = "freeze_encoder"
+    )]
+    feature_maps: PathBuf,
     /// Largest size of them per set of data, gigabytes; sweeps beyond are encoded whenever they are needed.
-    #[arg(long, value_name = "GB", default_value_t = 8.0)]
-    maps_limit: f64,
+    #[arg(
+        long,
+        value_name = "GB",
+        default_value_t = 8.0,
+        requires = "freeze_encoder"
+    )]
+    feature_maps_limit_gb: f64,
     /// Numeric type of such maps.
-    #[arg(long, value_enum, default_value_t = Exactness::F16)]
-    maps_dtype: Exactness,
+    #[arg(long, value_enum, default_value_t = Exactness::F16, requires = "freeze_encoder")]
+    feature_maps_dtype: Exactness,
     /// Largest turn of a vehicle's frame in training, degrees.
-    #[arg(long, default_value_t = 45.0)]
-    turn: f64,
-    /// Of the protocol's options, `--max-agents` is of a sample [default: 5]; the order of average precision has no
-    /// effect.
+    #[arg(long, value_name = "DEG", default_value_t = 45.0)]
+    turn_deg: f64,
+    /// Of the protocol's options, `--max-agents` is of a sample [default: 5].
     #[command(flatten)]
     protocol: ProtocolConfig,
     /// Train for ego-only operation: samples of one vehicle, with its neighbours' annotations as additional targets
@@ -123,15 +134,15 @@ pub(crate) struct Arguments {
     ego_only: bool,
     /// Steps between two validations and checkpoints.
     #[arg(long, default_value_t = 500)]
-    validate_every: u64,
+    validate_every_steps: u64,
     /// Frames of a validation.
-    #[arg(long, default_value_t = 60)]
+    #[arg(long, value_name = "N", default_value_t = 60, requires = "validation")]
     validation_frames: usize,
     #[command(flatten)]
     options: TrainingOptions,
 }
 
-fn parse_config(name: &str) -> Result<DetectorConfig, String> {
+fn parse_network(name: &str) -> Result<DetectorConfig, String> {
     DetectorConfig::preset(name).ok_or_else(|| "there are lean and full".to_owned())
 }
 
@@ -161,9 +172,33 @@ impl Arguments {
         )
     }
 
+    /// Refuses options that change nothing of this training.
+    fn check_effects(&self) -> Result<(), BadInput> {
+        if self.protocol.ap_order.is_some() {
+            return Err(BadInput::new(
+                "--ap-order: the curve of a training has one order, by score over all frames",
+            ));
+        }
+        let neighbours = !self.poses.is_empty() || self.lost_share > 0.0 || self.max_delay_ms > 0;
+        if neighbours && self.method.exchange() == Exchange::Nothing {
+            return Err(BadInput::new(format!(
+                "--poses, --lost-share and --max-delay-ms are for messages of neighbours: {} uses none",
+                self.method
+            )));
+        }
+        if self.alignment_weight > 0.0 && self.method != Method::PASTAT {
+            return Err(BadInput::new(format!(
+                "--alignment-weight is for a fusion that corrects poses, pastat: {} corrects none",
+                self.method
+            )));
+        }
+        Ok(())
+    }
+
     fn config(&self) -> Result<TrainConfig> {
-        if !(0.0..=1.0).contains(&self.drop_neighbour) || self.validate_every == 0 {
-            let reason = "--drop-neighbour is a probability, --validate-every is above zero";
+        self.check_effects()?;
+        if !(0.0..=1.0).contains(&self.drop_neighbour) || self.validate_every_steps == 0 {
+            let reason = "--drop-neighbour is a probability, --validate-every-steps is above zero";
             return Err(BadInput::new(reason).into());
         }
         for folder in self.data.iter().chain(&self.validation) {
@@ -178,7 +213,7 @@ impl Arguments {
             .ground_truth;
         let samples = SampleConfig {
             augmentation: Augmentation {
-                turn_rad: self.turn.to_radians(),
+                turn_rad: self.turn_deg.to_radians(),
                 ..Augmentation::default()
             },
             drop_neighbour: self.drop_neighbour,
@@ -186,7 +221,7 @@ impl Arguments {
             moments: Moments {
                 frames: 1,
                 gap: self.gap,
-                max_delay_nanos: self.max_delay * 1_000_000,
+                max_delay_nanos: self.max_delay_ms * 1_000_000,
             },
             max_agents: self.protocol.max_agents.unwrap_or(5),
             comm_range_m: rule.comm_range_m,
@@ -212,16 +247,16 @@ impl Arguments {
                 ..OpenOptions::default()
             },
             method: self.method,
-            detector: self.config.clone(),
+            detector: self.network.clone(),
             init: self.init.clone(),
             fusion: self.fusion()?,
             frozen_encoder: self.freeze_encoder.then(|| KeptMaps {
-                folder: self.maps.clone(),
-                dtype: match self.maps_dtype {
+                folder: self.feature_maps.clone(),
+                dtype: match self.feature_maps_dtype {
                     Exactness::F16 => Dtype::F16,
                     Exactness::I8 => Dtype::I8,
                 },
-                limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64,
+                limit_bytes: (self.feature_maps_limit_gb.max(0.0) * 1e9) as u64,
                 intensity_scale: self.intensity_scale,
             }),
             run: RunConfig {
@@ -231,7 +266,7 @@ impl Arguments {
                 },
                 ..run
             },
-            validate_every: self.validate_every,
+            validate_every: self.validate_every_steps,
             validation_frames: self.validation_frames,
             samples,
             loss: LossConfig {
@@ -245,11 +280,11 @@ impl Arguments {
     /// The poses by which maps are aligned.
     fn poses(&self) -> Result<SamplePoses> {
         let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(BadInput::of);
-        let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
+        let is_noisy = self.noise_position_std_m != 0.0 || self.noise_heading_std_deg != 0.0;
         let noise = is_noisy.then(|| NoisyPoseConfig {
             mode: self.noise_mode,
-            position_std_m: self.position_noise,
-            heading_std_deg: self.heading_noise,
+            position_std_m: self.noise_position_std_m,
+            heading_std_deg: self.noise_heading_std_deg,
             ..NoisyPoseConfig::default()
         });
         let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
@@ -265,7 +300,7 @@ impl Arguments {
 
     /// The fusion, if the command line changes it.
     fn fusion(&self) -> Result<Option<FusionConfig>> {
-        if self.without.is_empty() && self.frames.is_none() {
+        if self.without.is_empty() && self.time_steps.is_none() {
             return Ok(None);
         }
         let detector = match &self.init {
@@ -273,12 +308,12 @@ impl Arguments {
                 let config = Weights::load(init).and_then(|weights| weights.config());
                 config.map_err(BadInput::of)?
             }
-            None => self.config.clone(),
+            None => self.network.clone(),
         };
         let fusion = ablated(
             &self.method.default_fusion(&detector),
             &self.without,
-            self.frames,
+            self.time_steps,
         );
         Ok(Some(fusion.map_err(BadInput::of)?))
     }

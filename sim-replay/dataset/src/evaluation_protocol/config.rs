@@ -26,8 +26,7 @@ pub struct ProtocolConfig {
         long = "ground-truth-range-m",
         value_name = "M,M,M,M,M,M",
         value_delimiter = ',',
-        num_args = 6,
-        allow_negative_numbers = true
+        allow_hyphen_values = true
     )]
     pub ground_truth_range_m: Option<Vec<f64>>,
     /// Corners of a box, of 8, that must lie within that range.
@@ -41,10 +40,10 @@ pub struct ProtocolConfig {
     pub max_agents: Option<usize>,
     /// Agents that take part.
     #[arg(long, value_enum)]
-    pub agents: Option<AgentKinds>,
+    pub agent_kinds: Option<AgentKinds>,
     /// The ego: the first vehicle or the first roadside unit.
     #[arg(long, value_enum)]
-    pub ego: Option<EgoKind>,
+    pub ego_kind: Option<EgoKind>,
     /// Order of detections in the average precision that is reported first.
     #[arg(long, value_enum)]
     pub ap_order: Option<ApOrder>,
@@ -73,8 +72,8 @@ impl ProtocolConfig {
         }
         protocol.max_agents =
             counted("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
-        protocol.agents = self.agents.unwrap_or(protocol.agents);
-        protocol.ego = self.ego.unwrap_or(protocol.ego);
+        protocol.agents = self.agent_kinds.unwrap_or(protocol.agents);
+        protocol.ego = self.ego_kind.unwrap_or(protocol.ego);
         protocol.ap_order = self.ap_order.unwrap_or(protocol.ap_order);
         Ok(protocol)
     }

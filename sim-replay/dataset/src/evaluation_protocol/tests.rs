@@ -130,7 +130,7 @@ fn agents_are_arranged_and_the_ticks_are_those_of_the_ego() {
         (names(&["1", "2", "-1", "-2"]), 4, vec![2, 3, 4, 4])
     );
     let units_first = ProtocolConfig {
-        ego: Some(EgoKind::Unit),
+        ego_kind: Some(EgoKind::Unit),
         ..config()
     };
     assert_eq!(
@@ -138,7 +138,7 @@ fn agents_are_arranged_and_the_ticks_are_those_of_the_ego() {
         (names(&["-1", "-2", "1", "2"]), 5, vec![3, 4, 4, 1, 1])
     );
     let vehicles = ProtocolConfig {
-        agents: Some(AgentKinds::Vehicles),
+        agent_kinds: Some(AgentKinds::Vehicles),
         ..config()
     };
     assert_eq!(
@@ -147,7 +147,7 @@ fn agents_are_arranged_and_the_ticks_are_those_of_the_ego() {
     );
     let two = ProtocolConfig {
         max_agents: Some(2),
-        agents: Some(AgentKinds::Units),
+        agent_kinds: Some(AgentKinds::Units),
         ..config()
     };
     assert_eq!(
@@ -162,7 +162,7 @@ fn a_scenario_without_agents_of_the_kind_is_left_out() {
     agent(dir.path(), "1", 0..2);
     let scenario = crate::open(dir.path()).unwrap().scenarios.remove(0);
     let units = ProtocolConfig {
-        agents: Some(AgentKinds::Units),
+        agent_kinds: Some(AgentKinds::Units),
         ..ProtocolConfig::default()
     };
     assert!(

@@ -2,7 +2,9 @@ use std::collections::BTreeSet;
 
 use proptest::prelude::*;
 
-use super::super::config::{DelayModel, LossModel, Outage, QueueConfig, QueueDrop, ReorderConfig};
+use super::super::config::{
+    LatencyModel, LossModel, Outage, QueueConfig, QueueDrop, ReorderConfig,
+};
 use super::*;
 
 const MS: u64 = 1_000_000;
@@ -21,10 +23,10 @@ fn packet(from: &str, sequence: u64, bytes: u64, submitted_nanos: u64) -> Packet
     }
 }
 
-fn shaped(rate_mbps: f64) -> LinkConfig {
+fn shaped(bandwidth_mbps: f64) -> LinkConfig {
     LinkConfig {
         capacity: CapacityConfig::TokenBucket {
-            rate_mbps,
+            bandwidth_mbps,
             burst_bytes: 0,
         },
         ..LinkConfig::default()
@@ -172,11 +174,11 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
 
 #[test]
 fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
-    let (rate_mbps, bytes) = (27.0, 30_000);
+    let (bandwidth_mbps, bytes) = (27.0, 30_000);
     for burst_bytes in [0, 100_000] {
         let config = LinkConfig {
             capacity: CapacityConfig::TokenBucket {
-                rate_mbps,
+                bandwidth_mbps,
                 burst_bytes,
             },
             queue: QueueConfig {
@@ -192,7 +194,7 @@ fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
         let span_s = (outcomes[1999].nanos - 1_000 * MS) as f64 * 1e-9;
         let rate = (2000 * bytes - burst_bytes) as f64 * 8e-6 / span_s;
         assert!(
-            (rate - rate_mbps).abs() < 0.01 * rate_mbps,
+            (rate - bandwidth_mbps).abs() < 0.01 * bandwidth_mbps,
             "{rate} Mbit/s with a burst of {burst_bytes}"
         );
         let at_once = outcomes
@@ -246,7 +248,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
     );
     for delay_ms in [0, 100, 200, 300, 400, 500] {
         let config = LinkConfig {
-            delay: DelayModel::ConstantMs(delay_ms as f64 + 30.0),
+            latency: LatencyModel::ConstantMs(delay_ms as f64 + 30.0),
             floor_ms: 100.0,
             ..LinkConfig::default()
         };
@@ -258,7 +260,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
 #[test]
 fn jitter_reorders_unless_order_is_kept() {
     let jitter = LinkConfig {
-        delay: DelayModel::UniformMs([0.0, 50.0]),
+        latency: LatencyModel::UniformMs([0.0, 50.0]),
         ..LinkConfig::default()
     };
     let order = |config: &LinkConfig| -> Vec<u64> {
@@ -290,7 +292,7 @@ fn jitter_reorders_unless_order_is_kept() {
 #[test]
 fn a_link_is_independent_of_other_links() {
     let config = LinkConfig {
-        delay: DelayModel::Normal {
+        latency: LatencyModel::Normal {
             mean_ms: 20.0,
             std_ms: 8.0,
         },
@@ -329,7 +331,7 @@ proptest! {
         let config = LinkConfig {
             medium: if shared { Medium::Shared } else { Medium::PerPair },
             queue: QueueConfig { bytes, drop, keep_last, ..QueueConfig::default() },
-            delay: DelayModel::UniformMs([1.0, 60.0]),
+            latency: LatencyModel::UniformMs([1.0, 60.0]),
             loss: LossModel::Bernoulli(0.1),
             duplicate: 0.1,
             ..shaped(6.0)

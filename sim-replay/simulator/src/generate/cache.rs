@@ -110,11 +110,11 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
             return differs("agents", agents.to_string(), wanted);
         }
     }
-    if scenarios.len() != options.scenarios() {
+    if scenarios.len() != options.scenes {
         return differs(
             "scenarios",
             scenarios.len().to_string(),
-            options.scenarios().to_string(),
+            options.scenes.to_string(),
         );
     }
     Ok(true)

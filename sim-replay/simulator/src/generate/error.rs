@@ -64,7 +64,7 @@ pub enum SynthError {
     NoRoad(String),
     /// Too few vehicles stay near the ego.
     #[error(
-        "scene {scenario}: {found} vehicles stay within {range_m} m of the ego, {wanted} are wanted; fewer --agents or --frames help"
+        "scene {scenario}: {found} vehicles stay within {range_m} m of the ego, {wanted} are wanted; fewer --vehicles or --frames help"
     )]
     TooFewCompanions {
         /// The scenario.

@@ -53,11 +53,9 @@ pub struct SynthOptions {
     pub map: Option<RoadMapSource>,
     /// Determines all static objects.
     pub map_seed: u64,
-    /// Traversals of a localization subset: one scenario each.
-    pub traversals: usize,
-    /// Scenes of V2VDet: one scenario each.
+    /// Number of scenarios; of a localization subset each is another traversal of the map.
     pub scenes: usize,
-    /// Number of agents of a V2VDet scene.
+    /// Number of agents of a V2VDet scenario.
     pub agents: RangeInclusive<usize>,
     /// The weather.
     pub weather: Weather,
@@ -86,7 +84,6 @@ impl SynthOptions {
             layout: SceneLayout::Opv2v,
             map: None,
             map_seed: 0,
-            traversals: 1,
             scenes: 1,
             agents: 2..=4,
             weather: Weather::Sunny,
@@ -103,16 +100,6 @@ impl SynthOptions {
     #[must_use]
     pub fn default_frames(subset: Subset) -> usize {
         if subset == Subset::V2vdet { 60 } else { 2000 }
-    }
-
-    /// Scenarios that will be written.
-    #[must_use]
-    pub fn scenarios(&self) -> usize {
-        if self.subset == Subset::V2vdet {
-            self.scenes
-        } else {
-            self.traversals
-        }
     }
 
     /// Steps of the simulation from one stored frame to the next.
@@ -141,7 +128,7 @@ impl SynthOptions {
         let is_multiple = (1.0..=1e4).contains(&steps) && (steps - steps.round()).abs() < 1e-6;
         check(
             is_multiple,
-            "--period",
+            "--period-s",
             self.period_s.to_string(),
             "expected a multiple of 0.05 s up to 500 s",
         )?;
@@ -157,12 +144,6 @@ impl SynthOptions {
             self.scenes.to_string(),
             "expected 1 to 10000",
         )?;
-        check(
-            (1..=1000).contains(&self.traversals),
-            "--traversals",
-            self.traversals.to_string(),
-            "expected 1 to 1000",
-        )?;
         let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
         let have_names = self
             .copies
@@ -170,14 +151,14 @@ impl SynthOptions {
             .all(|weather| weather.variant().is_some());
         check(
             have_names,
-            "--copies",
+            "--weather-copies",
             copies.join(","),
             "expected fog, snow or both",
         )?;
         let have_place = self.copies.is_empty() || self.layout == SceneLayout::Opv2v;
         check(
             have_place,
-            "--copies",
+            "--weather-copies",
             copies.join(","),
             "expected none, as the layout opv2v alone has copies of sweeps",
         )?;
@@ -208,7 +189,7 @@ impl SynthOptions {
             && *self.agents.end() <= 7;
         check(
             is_range,
-            "--agents",
+            "--vehicles",
             agents.clone(),
             "expected a number or a range within 1-7",
         )?;
@@ -224,7 +205,7 @@ impl SynthOptions {
         )?;
         check(
             *self.agents.start() >= 2,
-            "--agents",
+            "--vehicles",
             agents,
             "expected 2 or more, as the layout needs two agents",
         )

@@ -75,7 +75,7 @@ pub fn generate(
         total.findings.extend(map_model.findings.iter().cloned());
         let world = World::new(&map_model);
         let places = sources(options).len();
-        for number in (place..options.scenarios()).step_by(places) {
+        for number in (place..options.scenes).step_by(places) {
             let before = total.scenarios as u64 * 1000;
             let spec = spec(options, &map_model, number);
             let scene = Scene {

@@ -31,8 +31,8 @@ pub(crate) struct Args {
     #[command(flatten)]
     turns: SensorTurns,
     /// Largest random shift of the sensor along each horizontal axis, metres.
-    #[arg(long, value_name = "METRES", default_value_t = 1.0)]
-    shift: f64,
+    #[arg(long, value_name = "M", default_value_t = 1.0)]
+    shift_m: f64,
     #[command(flatten)]
     options: TrainingOptions,
 }
@@ -58,7 +58,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         "augmentation",
         format_args!(
             "turns up to {} degrees, shifts up to {} m",
-            args.turns.turn, args.shift
+            args.turns.turn_deg, args.shift_m
         ),
     );
     card.row(
@@ -79,13 +79,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 impl Args {
     fn config(&self) -> anyhow::Result<DiffLocTrainConfig> {
-        if !(0.0..=10.0).contains(&self.shift) {
+        if !(0.0..=10.0).contains(&self.shift_m) {
             return Err(bad(&format!(
-                "--shift is {}, must be 0 to 10 metres",
-                self.shift
+                "--shift-m is {}, must be 0 to 10 metres",
+                self.shift_m
             )));
         }
-        check_folders(self.sweeps.scenes.iter().chain(&self.validation))?;
+        check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;
         let run = run_config(&self.options, self.batch, self.lr)?;
         let optimizer = AdamWConfig {
             weight_decay: WEIGHT_DECAY,
@@ -93,14 +93,14 @@ impl Args {
             ..run.optimizer
         };
         Ok(DiffLocTrainConfig {
-            scenes: self.sweeps.scenes.clone(),
+            scenes: self.sweeps.dataset.clone(),
             validation: self.validation.clone(),
             network: DiffLocConfig {
                 scene_name: self.sweeps.scene_name.clone(),
                 ..DiffLocConfig::small()
             },
             turn_rad: self.turns.largest_rad()?,
-            shift_m: self.shift,
+            shift_m: self.shift_m,
             run: RunConfig { optimizer, ..run },
         })
     }

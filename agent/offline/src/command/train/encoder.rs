@@ -17,13 +17,13 @@ use super::options::{bad, check_folders, print_left_out, run_config};
 pub(crate) struct Args {
     /// Folders of sweeps, one scene each; drives through the same scene belong into one folder.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    scenes: Vec<PathBuf>,
+    dataset: Vec<PathBuf>,
     /// Folders of sweeps to validate on, one scene each.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    /// Network.
-    #[arg(long, default_value = "lean", value_parser = parse_config)]
-    config: SceneEncoderConfig,
+    /// Network: lean or full.
+    #[arg(long, default_value = "lean", value_parser = parse_network)]
+    network: SceneEncoderConfig,
     /// Pairs of sweeps per step.
     #[arg(long, default_value_t = 4)]
     batch: usize,
@@ -32,12 +32,12 @@ pub(crate) struct Args {
     lr: f64,
     /// Steps between two validations and checkpoints.
     #[arg(long, default_value_t = 500)]
-    validate_every: u64,
+    validate_every_steps: u64,
     #[command(flatten)]
     options: TrainingOptions,
 }
 
-fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
+fn parse_network(name: &str) -> Result<SceneEncoderConfig, String> {
     SceneEncoderConfig::preset(name).ok_or_else(|| "must be lean or full".to_owned())
 }
 
@@ -82,16 +82,16 @@ fn tell(bar: &TrainingBar, report: &EncoderReport) {
 
 impl Args {
     fn config(&self) -> anyhow::Result<EncoderTrainConfig> {
-        if self.validate_every == 0 {
-            return Err(bad("--validate-every must be above zero"));
+        if self.validate_every_steps == 0 {
+            return Err(bad("--validate-every-steps must be above zero"));
         }
-        check_folders(self.scenes.iter().chain(&self.validation))?;
+        check_folders(self.dataset.iter().chain(&self.validation))?;
         Ok(EncoderTrainConfig {
-            scenes: self.scenes.clone(),
+            scenes: self.dataset.clone(),
             validation: self.validation.clone(),
-            encoder: self.config.clone(),
+            encoder: self.network.clone(),
             run: run_config(&self.options, self.batch, self.lr)?,
-            validate_every: self.validate_every,
+            validate_every: self.validate_every_steps,
         })
     }
 }

@@ -25,9 +25,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    check_folders(&args.sweeps.scenes)?;
+    check_folders(&args.sweeps.dataset)?;
     let config = HypLiLocTrainConfig {
-        scenes: args.sweeps.scenes.clone(),
+        scenes: args.sweeps.dataset.clone(),
         scene_name: args.sweeps.scene_name.clone(),
         turn_rad: args.turns.largest_rad()?,
         run: run_config(&args.options, args.batch, args.lr)?,
@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
     card.row(
         "augmentation",
-        format_args!("turns up to {} degrees", args.turns.turn),
+        format_args!("turns up to {} degrees", args.turns.turn_deg),
     );
     if let Some((error_m, error_deg)) = latest {
         card.row(

@@ -12,7 +12,7 @@ use support::cli::BadInput;
 pub(crate) struct SceneSweeps {
     /// Folders of sweeps, all of the same scene.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
-    pub(crate) scenes: Vec<PathBuf>,
+    pub(crate) dataset: Vec<PathBuf>,
     /// Name of the scene, for messages and the model card.
     #[arg(long, default_value = "scene")]
     pub(crate) scene_name: String,
@@ -22,20 +22,20 @@ pub(crate) struct SceneSweeps {
 #[derive(Debug, clap::Args)]
 pub(crate) struct SensorTurns {
     /// Largest random turn of the sensor to either side, degrees; vehicles in lanes head as those of the training.
-    #[arg(long, value_name = "DEGREES", default_value_t = 20.0)]
-    pub(crate) turn: f64,
+    #[arg(long, value_name = "DEG", default_value_t = 20.0)]
+    pub(crate) turn_deg: f64,
 }
 
 impl SensorTurns {
     /// The largest turn, radians; an impossible one is a usage error.
     pub(crate) fn largest_rad(&self) -> anyhow::Result<f64> {
-        if !(0.0..=180.0).contains(&self.turn) {
+        if !(0.0..=180.0).contains(&self.turn_deg) {
             return Err(bad(&format!(
-                "--turn is {}, must be 0 to 180 degrees",
-                self.turn
+                "--turn-deg is {}, must be 0 to 180 degrees",
+                self.turn_deg
             )));
         }
-        Ok(self.turn.to_radians())
+        Ok(self.turn_deg.to_radians())
     }
 }
 

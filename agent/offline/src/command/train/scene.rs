@@ -21,21 +21,22 @@ pub(crate) struct Args {
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
     /// Number of sweeps of a validation.
-    #[arg(long, default_value_t = 120)]
+    #[arg(long, value_name = "N", default_value_t = 120, requires = "validation")]
     validation_sweeps: usize,
     /// Seconds between two validations and checkpoints.
     #[arg(long, default_value_t = 120)]
-    validate_every: u64,
+    validate_every_s: u64,
     /// Weights of the encoder: a scene encoder, or a detector, whose backbone then serves both.
     #[arg(long, value_name = "FILE")]
     encoder: PathBuf,
     /// Head of the same scene to start from, for example to add sweeps of another weather or season; its sizes replace
-    /// --classes, --centres, --width, --blocks and --no-refiner, its name --scene-name. Name sweeps that it knows among --scenes too.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["classes", "centres", "width", "blocks", "no_refiner", "scene_name"])]
+    /// --position-clusters, --centres, --width, --blocks and --no-refiner, its name --scene-name. Name sweeps that it
+    /// knows among --dataset too.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["position_clusters", "centres", "width", "blocks", "no_refiner", "scene_name"])]
     init: Option<PathBuf>,
     /// Clusters of sensor positions that a sweep is classified into.
     #[arg(long, default_value_t = 50)]
-    classes: i64,
+    position_clusters: i64,
     /// Clusters of world coordinates, the reference points of a cell's offset.
     #[arg(long, default_value_t = 500)]
     centres: i64,
@@ -52,8 +53,8 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 1)]
     copies: usize,
     /// Largest rotation of such copies, degrees.
-    #[arg(long, default_value_t = 10.0)]
-    turn: f64,
+    #[arg(long, value_name = "DEG", default_value_t = 10.0, requires = "copies")]
+    turn_deg: f64,
     /// Leave out a share of the sweeps in the middle of the training: those with an even loss (RSD), or random ones, its
     /// control. Trainings of fewer than some 14 passes are too short for it.
     #[arg(long, value_name = "CHOICE")]
@@ -114,23 +115,23 @@ impl Args {
         if self.copies == 0 || self.validation_sweeps == 0 {
             return Err(bad("--copies and --validation-sweeps must be above zero"));
         }
-        check_folders(self.sweeps.scenes.iter().chain(&self.validation))?;
+        check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;
         let run = run_config(&self.options, self.batch, self.lr)?;
         Ok(SceneTrainConfig {
-            scenes: self.sweeps.scenes.clone(),
+            scenes: self.sweeps.dataset.clone(),
             validation: self.validation.clone(),
             validation_sweeps: self.validation_sweeps,
             encoder: self.encoder.clone(),
             init: self.init.clone(),
             scene_name: self.sweeps.scene_name.clone(),
-            classes: self.classes,
+            classes: self.position_clusters,
             centres: self.centres,
             width: self.width,
             blocks: self.blocks,
             refiner: !self.no_refiner,
             augmentation: SweepAugmentation {
                 copies: self.copies,
-                turn_rad: self.turn.to_radians(),
+                turn_rad: self.turn_deg.to_radians(),
                 keep: 0.7,
             },
             redundancy: self.leave_out.map(|leave_out| RedundancyConfig {
@@ -139,7 +140,7 @@ impl Args {
                 ..RedundancyConfig::default()
             }),
             run,
-            validate_every: Duration::from_secs(self.validate_every),
+            validate_every: Duration::from_secs(self.validate_every_s),
         })
     }
 }

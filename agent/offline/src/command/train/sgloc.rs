@@ -26,9 +26,9 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    check_folders(&args.sweeps.scenes)?;
+    check_folders(&args.sweeps.dataset)?;
     let config = SgLocTrainConfig {
-        scenes: args.sweeps.scenes.clone(),
+        scenes: args.sweeps.dataset.clone(),
         scene_name: args.sweeps.scene_name.clone(),
         encoder: args.encoder.clone(),
         run: run_config(&args.options, args.batch, args.lr)?,

@@ -5,7 +5,7 @@ use std::fmt::Debug;
 use bus::InboxConfig;
 use dataset::Scenario;
 use fusion::Exchange;
-use link::{CapacityConfig, DelayModel, LinkConfig, LossModel};
+use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
 use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
@@ -21,9 +21,9 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
         ego,
         poses,
         compute,
-        maps_limit_gb,
+        feature_maps_limit_gb,
         scenarios,
-        ticks,
+        frames,
         ..
     } = experiment;
     let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
@@ -32,7 +32,7 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
             "name {name:?} is to name files: letters, digits, - and _"
         ));
     }
-    for (field, value) in [("scenarios", scenarios), ("ticks", ticks)] {
+    for (field, value) in [("scenarios", scenarios), ("frames", frames)] {
         if *value == Some(0) {
             return Err(format!("{field} is 0: there would be nothing to evaluate"));
         }
@@ -44,7 +44,12 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     number("compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
     number("compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
     number("compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)?;
-    number("maps_limit_gb", *maps_limit_gb, 0.0, 10_000.0)?;
+    number(
+        "feature_maps_limit_gb",
+        *feature_maps_limit_gb,
+        0.0,
+        10_000.0,
+    )?;
     axes(grid)?;
     let (link, _) = LinkConfig::open(&experiment.link).map_err(|error| format!("link: {error}"))?;
     contradictions(experiment, &link)?;
@@ -177,7 +182,9 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
         ))
     };
     if let Some(ego) = &ego.id {
-        return Err(format!("ego.id is {ego}: choose by protocol.ego instead"));
+        return Err(format!(
+            "ego.id is {ego}: choose by protocol.ego_kind instead"
+        ));
     }
     if ego.inbox != InboxConfig::default() {
         return Err(
@@ -187,8 +194,8 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if experiment.noise_mode == NoiseMode::Replayed {
         return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
     }
-    if grid.latency_ms.is_some() && link.delay != DelayModel::None {
-        return contradiction("grid.latency_ms", "delay");
+    if grid.latency_ms.is_some() && link.latency != LatencyModel::None {
+        return contradiction("grid.latency_ms", "latency");
     }
     if grid.bandwidth_mbps.is_some() && link.capacity != CapacityConfig::Unlimited {
         return contradiction("grid.bandwidth_mbps", "capacity");
@@ -262,11 +269,11 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
 }
 
 fn is_random(link: &LinkConfig) -> bool {
-    let delay = !matches!(
-        link.delay,
-        DelayModel::None | DelayModel::ConstantMs(_) | DelayModel::Trace
+    let latency = !matches!(
+        link.latency,
+        LatencyModel::None | LatencyModel::ConstantMs(_) | LatencyModel::Trace
     );
-    delay || link.loss != LossModel::None || link.reorder.is_some() || link.duplicate > 0.0
+    latency || link.loss != LossModel::None || link.reorder.is_some() || link.duplicate > 0.0
 }
 
 /// Checks each value of an axis: at least one, and no duplicates.
@@ -371,7 +378,7 @@ mod tests {
                 "poses: {cached: {file: p.csv}}\ngrid: {method: [max], pose_noise: [{position_std_m: 1, heading_std_deg: 1}]}",
                 "poses is cached",
             ),
-            ("ego: {id: '7'}\ngrid: {method: [max]}", "protocol.ego"),
+            ("ego: {id: '7'}\ngrid: {method: [max]}", "protocol.ego_kind"),
             (
                 "noise_mode: replayed\ngrid: {method: [max]}",
                 "noise_mode is replayed",
@@ -380,7 +387,7 @@ mod tests {
                 "poses: {noisy: {step_s: 0}}\ngrid: {method: [max]}",
                 "poses: noisy.step_s is 0",
             ),
-            ("ticks: 0\ngrid: {method: [max]}", "ticks is 0"),
+            ("frames: 0\ngrid: {method: [max]}", "frames is 0"),
         ] {
             let problem = problem(text);
             assert!(problem.contains(message), "{text}: {problem}");

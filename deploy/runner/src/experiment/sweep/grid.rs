@@ -7,7 +7,7 @@ use ego_fuser::config::EgoSettings;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use fusion::Method;
-use link::{CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel};
+use link::{CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use protocol::{BevGrid, CodecConfig, Dtype};
 use serde::{Deserialize, Serialize};
@@ -134,16 +134,13 @@ impl Point {
     pub fn link(&self, experiment: &Experiment) -> Result<(LinkConfig, PathBuf), LinkError> {
         let (mut link, folder) = LinkConfig::open(&experiment.link)?;
         if let Some(mean_ms) = self.latency_ms {
-            link.delay = match self.jitter_ms.unwrap_or(0.0) {
-                0.0 => DelayModel::ConstantMs(mean_ms),
-                std_ms => DelayModel::Normal { mean_ms, std_ms },
+            link.latency = match self.jitter_ms.unwrap_or(0.0) {
+                0.0 => LatencyModel::ConstantMs(mean_ms),
+                std_ms => LatencyModel::Normal { mean_ms, std_ms },
             };
         }
-        if let Some(rate_mbps) = self.bandwidth_mbps {
-            link.capacity = CapacityConfig::TokenBucket {
-                rate_mbps,
-                burst_bytes: 0,
-            };
+        if let Some(bandwidth_mbps) = self.bandwidth_mbps {
+            link.capacity = CapacityConfig::of_mbps(bandwidth_mbps);
         }
         if let Some(share) = self.loss {
             link.loss = LossModel::Bernoulli(share);
@@ -264,13 +261,13 @@ mod tests {
         let points = points(&experiment.grid);
         let (first, _) = points[0].link(&experiment).unwrap();
         assert_eq!(
-            (first.delay, first.capacity),
-            (DelayModel::ConstantMs(50.0), CapacityConfig::Unlimited)
+            (first.latency, first.capacity),
+            (LatencyModel::ConstantMs(50.0), CapacityConfig::Unlimited)
         );
         let (last, _) = points[3].link(&experiment).unwrap();
         assert_eq!(
-            last.delay,
-            DelayModel::Normal {
+            last.latency,
+            LatencyModel::Normal {
                 mean_ms: 50.0,
                 std_ms: 10.0
             }
@@ -278,7 +275,7 @@ mod tests {
         assert_eq!(
             last.capacity,
             CapacityConfig::TokenBucket {
-                rate_mbps: 6.0,
+                bandwidth_mbps: 6.0,
                 burst_bytes: 0
             }
         );

@@ -21,12 +21,13 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bus::config_file::ConfigError;
-use dataset::{LeftOut, Scenario};
+use dataset::Scenario;
 use ego_fuser_offline::evaluation::EvaluateError;
 use figures;
 use figures::FigureError;
 use fusion::Exchange;
 use link::LinkError;
+use serde::Serialize;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
 use support::output;
 use support::progress;
@@ -49,8 +50,8 @@ const PROBED_TICKS: usize = 4;
 pub struct Swept {
     /// Columns that vary between the runs, as printed on a terminal.
     pub table: String,
-    /// Data that each run left out.
-    pub left_out: Vec<LeftOut>,
+    /// The runs, in the order of the grid.
+    pub runs: Vec<Run>,
 }
 
 /// Reason why a sweep failed.
@@ -116,7 +117,7 @@ pub struct SweepOptions {
 }
 
 /// A computed run.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Run {
     /// Point of the grid.
     pub point: Point,
@@ -161,7 +162,7 @@ impl Sweep {
                 experiment.name,
                 check::product(grid),
                 points(grid).len(),
-                generate.scenarios * generate.frames,
+                generate.scenes * generate.frames,
                 experiment.dataset.display()
             ));
             return Ok(());
@@ -258,13 +259,7 @@ impl Sweep {
         if !options.keep_maps {
             remove_maps(&maps)?;
         }
-        Ok(Swept {
-            table,
-            left_out: runs
-                .into_iter()
-                .map(|run| run.cell.metrics.left_out)
-                .collect(),
-        })
+        Ok(Swept { table, runs })
     }
 
     /// Prints the number of runs and the estimated time.
@@ -301,9 +296,16 @@ impl Sweep {
         let mut options = point_options::options(&self.experiment, point, &self.maps())?;
         options.maps = None;
         options.part.scenarios = Some(1);
-        options.frames = Some(PROBED_TICKS);
+        options.part.frames = Some(
+            self.experiment
+                .frames
+                .unwrap_or(PROBED_TICKS)
+                .min(PROBED_TICKS),
+        );
+        let data = options.part.open(&options.dataset, &options.protocol);
+        let data = data.map_err(Box::new)?;
         let began = Instant::now();
-        let probed = evaluate(&options, &self.data, point.method, &mut || {}).map_err(Box::new)?;
+        let probed = evaluate(&options, &data, point.method, &mut || {}).map_err(Box::new)?;
         Ok(began.elapsed().as_secs_f64() / probed.metrics.frames.max(1) as f64)
     }
 
@@ -485,8 +487,8 @@ fn generator(experiment: &Experiment) -> Option<SynthOptions> {
     let generate = experiment.generate.as_ref()?;
     Some(SynthOptions {
         frames: generate.frames,
-        scenes: generate.scenarios,
-        agents: generate.agents(),
+        scenes: generate.scenes,
+        agents: generate.vehicles(),
         threads: std::thread::available_parallelism().map_or(1, usize::from),
         ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
     })
@@ -511,7 +513,7 @@ fn generate(experiment: &Experiment) -> Result<(), SweepError> {
         options.scenes,
         experiment.dataset.display()
     ));
-    let bar = progress::percent_bar(options.scenarios());
+    let bar = progress::percent_bar(options.scenes);
     let generated =
         generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();

@@ -51,7 +51,7 @@ pub(super) fn options(
 
 /// Feature maps are cached losslessly, so that the cache changes no result.
 pub(super) fn kept_maps(experiment: &Experiment, folder: &Path) -> KeptMaps {
-    let limit_bytes = (experiment.maps_limit_gb * 1e9) as u64;
+    let limit_bytes = (experiment.feature_maps_limit_gb * 1e9) as u64;
     KeptMaps {
         folder: folder.to_owned(),
         dtype: Dtype::F32,

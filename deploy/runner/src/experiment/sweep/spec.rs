@@ -35,9 +35,9 @@ pub struct Experiment {
     /// Number of scenarios, evenly spread; absent: all.
     #[serde(default)]
     pub scenarios: Option<usize>,
-    /// Number of ticks from the start of each scenario; absent: all.
+    /// Largest number of frames of each scenario; absent: all.
     #[serde(default)]
-    pub ticks: Option<usize>,
+    pub frames: Option<usize>,
     /// Participating vehicles, counted annotations and objects.
     #[serde(default)]
     pub protocol: ProtocolConfig,
@@ -52,7 +52,7 @@ pub struct Experiment {
     /// Correlation of the errors of successive frames, if the grid has pose noise.
     #[serde(default)]
     pub noise_mode: NoiseMode,
-    /// Deadline, age and trust of the ego; `protocol.ego` selects the vehicle.
+    /// Deadline, age and trust of the ego; `protocol.ego_kind` selects the vehicle.
     #[serde(default)]
     pub ego: EgoSettings,
     /// Compute times of the stages.
@@ -63,7 +63,7 @@ pub struct Experiment {
     pub link: String,
     /// Largest cache of feature maps per encoder, gigabytes, so that sweeps are encoded once for all runs.
     #[serde(default = "gigabytes")]
-    pub maps_limit_gb: f64,
+    pub feature_maps_limit_gb: f64,
     /// Axes that vary.
     pub grid: Grid,
 }
@@ -75,18 +75,18 @@ pub struct Generate {
     /// Seed of routes and traffic; 1000 and above are for measuring.
     pub seed: u64,
     /// Number of scenarios.
-    pub scenarios: usize,
+    pub scenes: usize,
     /// Number of frames of each.
     pub frames: usize,
     /// Smallest and largest number of vehicles of a scenario.
-    pub agents: [usize; 2],
+    pub vehicles: [usize; 2],
 }
 
 impl Generate {
     /// Smallest to largest number of vehicles.
     #[must_use]
-    pub fn agents(&self) -> RangeInclusive<usize> {
-        self.agents[0]..=self.agents[1]
+    pub fn vehicles(&self) -> RangeInclusive<usize> {
+        self.vehicles[0]..=self.vehicles[1]
     }
 }
 
@@ -203,6 +203,8 @@ impl Experiment {
         if !is_preset {
             experiment.link = folder.join(&experiment.link).to_string_lossy().into_owned();
         }
+        let poses = std::mem::take(&mut experiment.poses).with_networks();
+        experiment.poses = poses.map_err(|error| spec(format!("poses: {error}")))?;
         check::check(&experiment).map_err(spec)?;
         Ok(experiment)
     }
@@ -212,7 +214,7 @@ impl Experiment {
     pub fn part(&self) -> crate::experiment::evaluation::Part {
         crate::experiment::evaluation::Part {
             scenarios: self.scenarios,
-            ticks: self.ticks,
+            frames: self.frames,
             ..Default::default()
         }
     }

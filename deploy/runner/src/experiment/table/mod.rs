@@ -104,9 +104,11 @@ pub fn run(
         path: cells.clone(),
         source,
     })?;
-    let data = Part::default()
-        .open(&spec.dataset, &spec.protocol)
-        .map_err(Box::new)?;
+    let part = Part {
+        frames: spec.frames,
+        ..Part::default()
+    };
+    let data = part.open(&spec.dataset, &spec.protocol).map_err(Box::new)?;
     let run = Run { spec, cells, data };
     let mut filled = Vec::with_capacity(spec.tables.len());
     for table in &spec.tables {
@@ -203,15 +205,15 @@ impl Run<'_> {
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
             attack: column.attack,
             trust: column.trust.then(MisbehaviourConfig::default),
-            maps: self.spec.maps.as_ref().map(|folder| KeptMaps {
+            maps: self.spec.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: self.spec.dtype,
-                limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
+                limit_bytes: (self.spec.feature_maps_limit_gb.max(0.0) * 1e9) as u64,
                 intensity_scale: IntensityScale::AUTO,
             }),
-            frames: self.spec.frames,
             part: Part {
                 scenarios: table.scenarios,
+                frames: self.spec.frames,
                 ..Part::default()
             },
             protocol: self.spec.protocol.clone(),

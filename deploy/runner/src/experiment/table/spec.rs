@@ -33,15 +33,15 @@ pub struct TableSpec {
     /// Number format of transmitted feature values.
     #[serde(default = "half")]
     pub dtype: Dtype,
-    /// Largest number of frames to evaluate, over all scenarios.
+    /// Largest number of frames of each scenario.
     #[serde(default)]
     pub frames: Option<usize>,
     /// Folder of cached feature maps; absent: they are computed for every cell.
     #[serde(default)]
-    pub maps: Option<PathBuf>,
+    pub feature_maps: Option<PathBuf>,
     /// Largest cache of feature maps per encoder, gigabytes.
     #[serde(default = "gigabytes")]
-    pub maps_limit_gb: f64,
+    pub feature_maps_limit_gb: f64,
     /// The tables.
     pub tables: Vec<Table>,
 }
@@ -112,12 +112,25 @@ impl TableSpec {
     /// # Errors
     /// [`TableError`] names the file and the error.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        let spec: Self = config_file::read(path)?;
-        spec.check().map_err(|problem| TableError::Spec {
+        let mut spec: Self = config_file::read(path)?;
+        let checked = spec.check().and_then(|()| spec.find_networks());
+        checked.map_err(|problem| TableError::Spec {
             path: path.to_owned(),
             problem,
         })?;
         Ok(spec)
+    }
+
+    fn find_networks(&mut self) -> Result<(), String> {
+        for Table { rows, columns, .. } in &mut self.tables {
+            let of_rows = rows.iter_mut().filter_map(|row| row.poses.as_mut());
+            let of_columns = columns.iter_mut().map(|column| &mut column.poses);
+            for poses in of_rows.chain(of_columns) {
+                let found = std::mem::take(poses).with_networks();
+                *poses = found.map_err(|error| format!("poses: {error}"))?;
+            }
+        }
+        Ok(())
     }
 
     fn check(&self) -> Result<(), String> {

@@ -3,9 +3,10 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use localization::pgc::{CellEncoder, SceneHead, SceneHeadConfig};
 use perception::weights::{Weights, WeightsError};
 use support::shared_files;
+
+use super::{CellEncoder, SceneHead, SceneHeadConfig};
 
 /// Ending of weights files.
 const ENDING: &str = "safetensors";
@@ -20,10 +21,10 @@ const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 #[derive(Debug, thiserror::Error)]
 pub enum HeadFileError {
     /// There is no such file, and no such released head.
-    #[error("--head {head}: no such file or released head; released are {}", released.join(", "))]
+    #[error("{}: no such file or released head; released are {}", head.display(), released.join(", "))]
     NoHead {
         /// The request.
-        head: String,
+        head: PathBuf,
         /// Names of the released heads.
         released: Vec<String>,
     },
@@ -44,16 +45,16 @@ pub enum HeadFileError {
 ///
 /// # Errors
 /// [`HeadFileError::NoHead`] with the names of the released heads.
-pub fn head_file(head: &str) -> Result<PathBuf, HeadFileError> {
-    let path = PathBuf::from(head);
-    if path.is_file() {
-        return Ok(path);
+pub fn head_file(head: &Path) -> Result<PathBuf, HeadFileError> {
+    if head.is_file() {
+        return Ok(head.to_owned());
     }
-    if path.is_dir() {
-        return Ok(path.join(TRAINED_FILE));
+    if head.is_dir() {
+        return Ok(head.join(TRAINED_FILE));
     }
     let folders = weights_folders();
-    let names = [format!("pgc-{head}.{ENDING}"), format!("{head}.{ENDING}")];
+    let name = head.display();
+    let names = [format!("pgc-{name}.{ENDING}"), format!("{name}.{ENDING}")];
     let mut files = folders
         .iter()
         .flat_map(|folder| names.iter().map(move |name| folder.join(name)));
@@ -90,6 +91,20 @@ pub fn encoder_of(head: &Path) -> Result<PathBuf, HeadFileError> {
         }),
         (Err(error), None) => Err(error),
     }
+}
+
+/// The encoder that is given, or else that of the head.
+///
+/// # Errors
+/// As [`encoder_of`].
+pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf, HeadFileError> {
+    encoder.map_or_else(|| encoder_of(head), |given| Ok(given.to_owned()))
+}
+
+/// True for a word that may name a released head: a single component without an ending.
+#[must_use]
+pub fn is_name(head: &Path) -> bool {
+    head.components().count() == 1 && head.extension().is_none()
 }
 
 /// The encoder that a head names, or its digest if no file has it.
@@ -162,11 +177,13 @@ mod tests {
         let file = folder.path().join(TRAINED_FILE);
         std::fs::write(&file, "").unwrap();
         for head in [&file, &folder.path().to_owned()] {
-            assert_eq!(head_file(head.to_str().unwrap()).unwrap(), file);
+            assert_eq!(head_file(head).unwrap(), file);
         }
-        let message = head_file("town-that-nobody-drove").unwrap_err().to_string();
+        let message = head_file(Path::new("town-that-nobody-drove"))
+            .unwrap_err()
+            .to_string();
         assert!(
-            message.contains("--head town-that-nobody-drove: no such file or released head"),
+            message.contains("town-that-nobody-drove: no such file or released head"),
             "{message}"
         );
     }

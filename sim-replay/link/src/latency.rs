@@ -1,12 +1,12 @@
 //! Propagation delay.
 
-use super::config::DelayModel;
+use super::config::LatencyModel;
 use super::loss::SentMessage;
 use super::trace::Trace;
 use support::nanos;
 use support::random::SplitMix64;
 
-impl DelayModel {
+impl LatencyModel {
     /// Delay of one message, nanoseconds.
     pub(super) fn draw(
         self,
@@ -22,15 +22,15 @@ impl DelayModel {
             Self::Lognormal { median_ms, sigma } => median_ms * (sigma * random.normal()).exp(),
             Self::BySize {
                 overhead_ms,
-                rate_mbps,
+                bandwidth_mbps,
                 fixed_ms,
             } => {
                 let bits = 8.0 * message.bytes as f64;
-                random.between(0.0, overhead_ms) + bits / (1e3 * rate_mbps) + fixed_ms
+                random.between(0.0, overhead_ms) + bits / (1e3 * bandwidth_mbps) + fixed_ms
             }
             Self::Trace => trace
                 .and_then(|trace| trace.at(message.sent_nanos))
-                .map_or(0.0, |step| step.delay_ms),
+                .map_or(0.0, |step| step.latency_ms),
         })
     }
 }
@@ -41,7 +41,7 @@ mod tests {
 
     const COUNT: u64 = 20_000;
 
-    fn draws(law: DelayModel) -> Vec<f64> {
+    fn draws(law: LatencyModel) -> Vec<f64> {
         let message = SentMessage {
             bytes: 132_500,
             distance_m: 0.0,
@@ -52,7 +52,7 @@ mod tests {
             .collect()
     }
 
-    fn check(law: DelayModel, mean: f64, std: f64) {
+    fn check(law: LatencyModel, mean: f64, std: f64) {
         let draws = draws(law);
         let found = draws.iter().sum::<f64>() / COUNT as f64;
         let deviation = 3.0 * std / (COUNT as f64).sqrt();
@@ -64,23 +64,23 @@ mod tests {
 
     #[test]
     fn every_law_has_its_mean() {
-        check(DelayModel::None, 0.0, 0.0);
-        check(DelayModel::ConstantMs(12.5), 12.5, 0.0);
+        check(LatencyModel::None, 0.0, 0.0);
+        check(LatencyModel::ConstantMs(12.5), 12.5, 0.0);
         check(
-            DelayModel::UniformMs([20.0, 100.0]),
+            LatencyModel::UniformMs([20.0, 100.0]),
             60.0,
             80.0 / 12f64.sqrt(),
         );
         // 1.06 Mbit at 27 Mbit/s take 39.26 ms.
-        let by_size = DelayModel::BySize {
+        let by_size = LatencyModel::BySize {
             overhead_ms: 100.0,
-            rate_mbps: 27.0,
+            bandwidth_mbps: 27.0,
             fixed_ms: 10.0,
         };
         check(by_size, 50.0 + 39.259_259 + 10.0, 100.0 / 12f64.sqrt());
         // Nine standard deviations from 0: no truncation.
         check(
-            DelayModel::Normal {
+            LatencyModel::Normal {
                 mean_ms: 45.0,
                 std_ms: 5.0,
             },
@@ -90,7 +90,7 @@ mod tests {
         let (median, sigma) = (10.0, 0.5f64);
         let mean = median * (0.5 * sigma * sigma).exp();
         check(
-            DelayModel::Lognormal {
+            LatencyModel::Lognormal {
                 median_ms: median,
                 sigma,
             },
@@ -102,7 +102,7 @@ mod tests {
     #[test]
     fn no_delay_is_below_zero() {
         assert!(
-            draws(DelayModel::Normal {
+            draws(LatencyModel::Normal {
                 mean_ms: 1.0,
                 std_ms: 10.0
             })

@@ -1,0 +1,89 @@
+//! Unknown field of a configuration: the similar name that was meant, or the kind of file that it belongs to.
+
+/// Similarity (Jaro-Winkler) from which on a name is taken for a slip of another.
+const SIMILAR: f64 = 0.8;
+/// A field on the top level that only files of one kind have, and that kind with its command.
+const KINDS: [(&str, &str); 5] = [
+    ("grid", "an experiment: v2vloc sweep FILE"),
+    (
+        "tables",
+        "a file of tables: v2vloc eval --table FILE --out DIR",
+    ),
+    ("models", "a scenario: v2vloc up FILE"),
+    ("capacity", "a link: v2vloc eval --link FILE"),
+    (
+        "cav",
+        "the configuration of an agent: agent run --config FILE",
+    ),
+];
+
+/// The reason of an error; where it is an unknown field, with the hint that helps. `fields` are those of the document's
+/// top level if the unknown one is among them.
+pub(crate) fn explained(reason: String, fields: &[String]) -> String {
+    let Some((unknown, expected)) = parts(&reason) else {
+        return reason;
+    };
+    let of_kind = |(field, _): &&(&str, &str)| {
+        !expected.contains(field) && fields.iter().any(|own| own == field)
+    };
+    if let Some((_, kind)) = KINDS.iter().find(of_kind) {
+        return format!("unknown field `{unknown}`: this is {kind}");
+    }
+    let likeness = |name: &&str| strsim::jaro_winkler(unknown, name);
+    let nearest = expected
+        .iter()
+        .max_by(|a, b| likeness(a).total_cmp(&likeness(b)))
+        .filter(|name| expected.len() > 1 && likeness(name) > SIMILAR);
+    match nearest {
+        Some(name) => format!(
+            "unknown field `{unknown}`, did you mean `{name}`? The fields are {}",
+            expected.join(", ")
+        ),
+        None => reason,
+    }
+}
+
+/// The unknown field and the known ones of serde's message.
+fn parts(reason: &str) -> Option<(&str, Vec<&str>)> {
+    let mut quoted = reason
+        .strip_prefix("unknown field `")?
+        .split('`')
+        .step_by(2);
+    Some((
+        quoted.next()?,
+        quoted.filter(|name| !name.is_empty()).collect(),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const REASON: &str = "unknown field `metod`, expected one of `run`, `method`, `scene`";
+
+    #[test]
+    fn a_slip_is_answered_with_the_name_that_was_meant() {
+        assert_eq!(
+            explained(REASON.into(), &[]),
+            "unknown field `metod`, did you mean `method`? The fields are run, method, scene"
+        );
+        let other = REASON.replace("metod", "velocity");
+        assert_eq!(explained(other.clone(), &["velocity".into()]), other);
+        let single = "unknown field `rat`, expected `rate`";
+        assert_eq!(explained(single.into(), &[]), single);
+        assert_eq!(
+            explained("missing field `scene`".into(), &[]),
+            "missing field `scene`"
+        );
+    }
+
+    #[test]
+    fn a_file_of_another_kind_is_named_with_its_command() {
+        let fields = ["name", "grid"].map(String::from);
+        let reason = explained(REASON.replace("metod", "name"), &fields);
+        assert_eq!(
+            reason,
+            "unknown field `name`: this is an experiment: v2vloc sweep FILE"
+        );
+    }
+}
