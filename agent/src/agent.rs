@@ -115,13 +115,23 @@ impl Agent {
         &self.detector
     }
 
+    /// Perceives an empty sweep, so that the first sweep does not wait for the tensor library's preparations.
+    ///
+    /// # Errors
+    /// See [`Self::perceive`].
+    pub(crate) fn warm_up(&mut self) -> Result<(), DetectorError> {
+        let encoded = self.detector.encode(&PointCloud::default())?;
+        self.perceive_map(&encoded.features)?;
+        Ok(())
+    }
+
     /// Step before the first: encodes the sweep if the pose is estimated from the detector's levels, so that it is
     /// encoded once. Without it the pose source encodes the sweep itself, with the same result.
     pub fn prepare(&mut self, cloud: &PointCloud) {
         let is_needed = self.shares_encoder && self.pose_source.computes_from_sweep();
         // An error comes again, and is returned, when the sweep is perceived.
         self.encoded = is_needed
-            .then(|| self.detector.encode(cloud).ok())
+            .then(|| self.detector.encode_sweep(cloud).ok())
             .flatten();
     }
 
@@ -176,12 +186,12 @@ impl Agent {
     /// Second step: feature map, confidence and own detections.
     ///
     /// # Errors
-    /// [`DetectorError`] if the tensor library fails.
+    /// [`DetectorError`] if the sweep has no point in the area, a value is not valid, or the tensor library fails.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
         let encoded = self
             .encoded
             .take()
-            .map_or_else(|| self.detector.encode(cloud), Ok)?;
+            .map_or_else(|| self.detector.encode_sweep(cloud), Ok)?;
         let Encoded {
             features,
             levels,
@@ -316,6 +326,26 @@ mod tests {
             Box::new(RecordedPose),
             Detector::from_network(pillars),
         )
+    }
+
+    #[test]
+    fn a_sweep_without_a_point_in_the_area_is_an_error_of_the_frame() {
+        let mut agent = agent();
+        let far = PointCloud {
+            xyzi: vec![[4.0e6, 5.4e5, 30.0, 0.2]; 3],
+        };
+        let nothing = PointCloud::default();
+        for (cloud, start) in [
+            (&far, "none of the 3 points"),
+            (&nothing, "none of the 0 points"),
+        ] {
+            let error = agent.perceive(cloud).unwrap_err();
+            assert!(
+                error.is_of_frame() && error.to_string().starts_with(start),
+                "{error}"
+            );
+        }
+        agent.warm_up().unwrap();
     }
 
     #[test]

@@ -48,7 +48,7 @@ enum Command {
 }
 
 impl Command {
-    fn run(self) -> anyhow::Result<()> {
+    fn run(self) -> anyhow::Result<Outcome> {
         let Self::Run(args) = self;
         malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
             .context("cannot execute this program again")?;
@@ -58,8 +58,5 @@ impl Command {
 
 /// Runs a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    exit_code(
-        cli.command.run().map(|()| Outcome::Done),
-        BusError::is_behind,
-    )
+    exit_code(cli.command.run(), BusError::is_behind)
 }

@@ -68,7 +68,7 @@ impl Default for NodeOptions {
 }
 
 /// Counters of an agent at its end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct NodeReport {
     /// Sweeps computed.
     pub sweeps: u64,
@@ -76,6 +76,8 @@ pub struct NodeReport {
     pub no_pose: u64,
     /// Sweeps that could not be computed.
     pub failed: u64,
+    /// Reason of the first of these.
+    pub failure: Option<String>,
     /// Poses that the vehicle cannot have reached from the previous ones; they are published with little confidence.
     pub pose_jumps: u64,
     /// Messages of egos whose pace is not followed, because there are too many egos.
@@ -107,8 +109,7 @@ pub fn run_filtered(
     stop: &Stop,
 ) -> Result<NodeReport, BusError> {
     let mut agent = agent;
-    // The first sweep does not wait for the tensor library's preparations.
-    if let Err(error) = agent.perceive(&PointCloud::default()) {
+    if let Err(error) = agent.warm_up() {
         tracing::warn!("the detector is not warmed up: {error}");
     }
     let mut node = Node::open(bus, agent, filter, options, stop)?;
@@ -310,14 +311,17 @@ impl<'a> Node<'a> {
                 continue;
             };
             self.bus.stats().timed("lidar transport", sweep.transport());
-            self.bus.stats().received(&self.lidar);
             let arrived_nanos = sweep.unix_nanos();
-            self.process(&AgentInput {
+            let is_used = self.process(&AgentInput {
                 capture_nanos,
                 cloud: &points,
                 measured_pose: pose.as_ref(),
                 motion: motion.unwrap_or_default(),
             });
+            match is_used {
+                true => self.bus.stats().received(&self.lidar),
+                false => self.bus.stats().dropped(&self.lidar, DropReason::NotFinite),
+            }
             // Logged after everything is submitted.
             if let Some(Err(error)) = self
                 .sweep_log
@@ -330,7 +334,8 @@ impl<'a> Node<'a> {
         }
     }
 
-    fn process(&mut self, input: &AgentInput<'_>) {
+    /// Publishes what is computed from a sweep; false if it could not be computed.
+    fn process(&mut self, input: &AgentInput<'_>) -> bool {
         let stats = self.bus.stats();
         let began = Instant::now();
         self.agent.prepare(input.cloud);
@@ -358,13 +363,17 @@ impl<'a> Node<'a> {
                 self.publishers
                     .submit(input, pose, perception, shared, stats);
                 self.observe(input);
+                true
             }
             Err(error) => {
-                self.report.failed += 1;
                 tracing::error!(
                     capture_nanos = input.capture_nanos,
                     "cannot compute a sweep: {error}"
                 );
+                self.report.failed += 1;
+                let first = &mut self.report.failure;
+                first.get_or_insert_with(|| error.to_string());
+                false
             }
         }
     }

@@ -11,7 +11,7 @@ use std::path::Path;
 use nalgebra::Isometry3;
 use perception::boxes::decode::Decoded;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
-use perception::detector::Detector;
+use perception::detector::{Detector, check_values};
 use perception::weights::{METHOD_KEY, Weights};
 use protocol::{
     CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming,
@@ -40,7 +40,7 @@ pub enum Skipped {
 }
 
 /// One frame's result.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct EgoOutput {
     /// Boxes in the ego's LiDAR frame, best first.
     pub detections: Vec<Detection>,
@@ -167,14 +167,14 @@ impl Ego {
         self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
     }
 
-    /// Detects once without any data, so that the first frame does not wait for the tensor library's preparations.
+    /// Detects once without real data, so that the first frame does not wait for the tensor library's preparations.
     ///
     /// # Errors
     /// As [`Self::detect`].
     pub fn warm_up(&mut self, cav: &CavId) -> Result<(), EgoError> {
         let content = match self.method.own_content() {
             Exchange::Boxes => Content::Boxes(Vec::new()),
-            Exchange::Points => Content::Points(PointCloud::default()),
+            Exchange::Points => Content::Points(self.one_point()),
             Exchange::Features | Exchange::Nothing => {
                 let [channels, height, width] = self.detector.sent_shape();
                 let map =
@@ -200,10 +200,21 @@ impl Ego {
         Ok(())
     }
 
+    /// A cloud with one point, in the middle of the area.
+    fn one_point(&self) -> PointCloud {
+        let [x0, y0, z0, x1, y1, z1] = self.detector.config().lidar_range_m;
+        let middle = [(x0, x1), (y0, y1), (z0, z1)].map(|(low, high)| f64::midpoint(low, high));
+        let [x, y, z] = middle.map(|value| value as f32);
+        PointCloud {
+            xyzi: vec![[x, y, z, 0.0]],
+        }
+    }
+
     /// Detects around the ego. Neighbours that cannot be used are left out; with none left the result is ego-only.
     ///
     /// # Errors
-    /// [`EgoError`] when the ego's own view does not have the content that the method needs.
+    /// [`EgoError`] when the ego's own view does not have the content that the method needs, and when values of the
+    /// frame are not valid ([`EgoError::is_of_frame`]).
     pub fn detect(&mut self, own: &View, neighbours: &[View]) -> Result<EgoOutput, EgoError> {
         let needed = self.method.own_content();
         if own.content.exchange() != needed {
@@ -351,6 +362,7 @@ impl Ego {
         let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
         let fused = f64_tensor::as_batch(&self.fusion.fuse(&on_grid)?.map)?;
+        check_values("the fused feature map", &fused)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, stages)?;
         self.keep(aligned, maps.into_iter().zip(sent), &on_grid)?;

@@ -352,10 +352,11 @@ def average_precision(
     """Average precision (area under the interpolated curve, VOC 2010), as ``v2vloc eval`` computes it.
 
     Footprints are matched as in OpenCOOD: detections of a frame by falling score, each takes the remaining object with
-    the highest overlap.
+    the highest overlap. With :meth:`Frame.ground_truth` detections with a corner beyond its range do not count, and
+    detections on objects of other classes count neither way.
 
     :param detections: of each frame: :class:`Detections`, or boxes ``[N, 7]`` and scores ``[N]``.
-    :param truth: of each frame: :class:`Objects`, or boxes ``[M, 7]`` in the same frame of reference.
+    :param truth: of each frame: :class:`Objects`, or boxes ``[M, 7]`` in the same frame of reference, which all count.
     :param iou: overlap from which a detection counts; several give a dictionary.
     :param ordering: ``global``: by score over all frames; ``frame``: frame after frame (the default of OpenCOOD).
     :raises Error: with the frame whose shape or value is wrong.

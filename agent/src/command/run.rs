@@ -11,7 +11,7 @@ use perception::detector::Detector;
 use protocol::Role;
 use support::output;
 
-use support::cli::BadInput;
+use support::cli::{BadInput, Outcome};
 
 /// Run one vehicle: subscribes to its sensors; publishes pose, feature map, boxes or points.
 ///
@@ -26,7 +26,10 @@ pub(crate) struct Args {
 }
 
 /// Loads the models, joins the run and works until the replay ends.
-pub(crate) fn run(args: Args) -> anyhow::Result<()> {
+///
+/// # Errors
+/// Those of the configuration, the models and the bus.
+pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated().map_err(BadInput::of)?;
     config.models.threads.apply();
@@ -47,12 +50,16 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     if args.json {
         output::line(serde_json::to_string(&report)?)?;
     } else {
+        let reason = report.failure.as_ref();
         output::line(format_args!(
-            "{} sweeps, {} without a pose, {} failed",
-            report.sweeps, report.no_pose, report.failed
+            "{} sweeps, {} without a pose, {} failed{}",
+            report.sweeps,
+            report.no_pose,
+            report.failed,
+            reason.map_or(String::new(), |reason| format!(", the first: {reason}"))
         ))?;
     }
-    Ok(())
+    Ok(Outcome::of(report.failed > 0))
 }
 
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {

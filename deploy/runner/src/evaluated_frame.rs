@@ -13,14 +13,15 @@ pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bo
         result,
         frames,
         poses,
-        objects,
+        truth,
+        failure,
     } = frame;
     let poses: Vec<_> = frames
         .iter()
         .map(|frame| frame.cav.clone())
         .zip(poses)
         .collect();
-    let truth: Vec<(CavId, _)> = frames
+    let world_from_lidar: Vec<(CavId, _)> = frames
         .iter()
         .filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?)))
         .collect();
@@ -28,10 +29,10 @@ pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bo
     board.judge_whole(
         (tick as u64, stamp.capture_nanos),
         latency_ms,
-        result,
-        objects,
+        failure.is_none().then_some(result),
+        &truth,
         &poses,
-        truth,
+        world_from_lidar,
     );
 }
 

@@ -28,12 +28,13 @@ use perception::weights::Weights;
 use protocol::{CavId, Principal, Role};
 use sim_replay::config::SceneConfig;
 use support::file_digests::FileDigests;
+use support::provenance::Provenance;
 use tch::Device;
 
 pub use self::error::FleetError;
 pub use self::processes::SessionContext;
 use crate::scenario::Scenario;
-use crate::scenario::fingerprint::{Provenance, files_of};
+use crate::scenario::fingerprint::{collect, files_of};
 use crate::scenario::weights_choice::weights_of;
 
 /// The program that runs fleets.
@@ -203,7 +204,13 @@ impl Fleet {
     /// Rule of the counted objects: those of the protocol inside the area of the model.
     #[must_use]
     pub(crate) fn ground_truth_rule(&self) -> GroundTruthRule {
-        self.protocol.rule_within(self.detector.lidar_range_m)
+        self.applied_protocol().ground_truth
+    }
+
+    /// The protocol with the ground-truth range as it is applied to the model.
+    #[must_use]
+    pub(crate) fn applied_protocol(&self) -> EvaluationProtocol {
+        self.protocol.within(self.detector.lidar_range_m)
     }
 
     /// Number of values in one feature map of the model, as transmitted.
@@ -295,7 +302,7 @@ impl Fleet {
         data.ticks.truncate(scene.frames.unwrap_or(usize::MAX));
         let digests = FileDigests::default();
         let data_sha256 = dataset::content_sha256([&data], scene.variant.as_deref(), &digests);
-        Provenance::collect(&Self::programs(programs), data_sha256, files, &digests)
+        collect(&Self::programs(programs), data_sha256, files, &digests)
     }
 
     /// Executables of a fleet.

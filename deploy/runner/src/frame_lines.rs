@@ -42,27 +42,19 @@ impl FrameLines {
     /// Adds a frame, with the name of its scenario where there are several; false after an error.
     pub(crate) fn add(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> bool {
         if self.written.is_ok() {
-            let report =
-                DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
-            let truth = truth_line(&frame.result.ego, frame);
-            let written = line(
-                &mut self.detections,
-                &OfScenario {
-                    scenario,
-                    line: report,
-                },
-            );
-            self.written = written.and_then(|()| {
-                line(
-                    &mut self.truth,
-                    &OfScenario {
-                        scenario,
-                        line: truth,
-                    },
-                )
-            });
+            self.written = self.write(scenario, frame);
         }
         self.written.is_ok()
+    }
+
+    fn write(&mut self, scenario: Option<&str>, frame: &EvaluatedFrame) -> io::Result<()> {
+        if frame.failure.is_none() {
+            let line =
+                DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+            write_line(&mut self.detections, &OfScenario { scenario, line })?;
+        }
+        let line = truth_line(&frame.result.ego, frame);
+        write_line(&mut self.truth, &OfScenario { scenario, line })
     }
 
     /// Writes what is left.
@@ -76,7 +68,7 @@ impl FrameLines {
     }
 }
 
-fn line(out: &mut impl Write, value: &impl Serialize) -> io::Result<()> {
+fn write_line(out: &mut impl Write, value: &impl Serialize) -> io::Result<()> {
     serde_json::to_writer(&mut *out, value)?;
     out.write_all(b"\n")
 }
@@ -90,6 +82,6 @@ fn truth_line(ego: &CavId, frame: &EvaluatedFrame) -> TruthLine {
         publish_nanos: frame.stamp.capture_nanos,
         ego: ego.clone(),
         world_from_ego: own.and_then(|recorded| recorded.world_from_lidar),
-        boxes: frame.objects.clone(),
+        truth: frame.truth.clone(),
     }
 }

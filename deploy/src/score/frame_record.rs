@@ -18,7 +18,7 @@ pub struct FrameRecord {
     pub latency_ms: Option<f64>,
     /// Time at which the frame passed each stage; all `None` without a result.
     pub stamps: StageStamps,
-    /// Number of detected boxes.
+    /// Number of detected boxes that count.
     pub detected: usize,
     /// Number of true boxes.
     pub truth: usize,
@@ -52,7 +52,7 @@ pub struct StreamedResult {
     pub tick: u64,
     /// Time from that tick to this one, milliseconds.
     pub age_ms: f64,
-    /// Number of its boxes that are still in the area, moved by the ego's true motion.
+    /// Number of its boxes that still count, moved by the ego's true motion.
     pub detected: usize,
     /// Number of these that overlap a true box by at least 0.5.
     pub found: usize,

@@ -3,18 +3,20 @@
 use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer};
-use dataset::ground_truth::GroundTruthRule;
-use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
+use dataset::ground_truth::{GroundTruth, GroundTruthRule};
+use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
 use super::live_precision::{Answer, LivePrecision, TickTruth};
 use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTicks, Part, Tick};
-use super::precision::{by_iou, found_by_last, precision_recall_csv};
+use super::precision::{FrameCounts, by_iou, by_part, precision_recall_csv};
 use super::stage_stamps::StageStamps;
-use super::true_boxes::true_boxes;
+use super::true_boxes::ground_truth;
 use super::truth_line::TruthLine;
-use crate::score::metrics::{ByIou, Communication, Latencies, Percentiles, PoseErrors};
+use crate::score::metrics::{
+    ByIou, Communication, Latencies, PartPrecision, Percentiles, PoseErrors,
+};
 
 /// Gap between two frames beyond which they belong to two scenarios, nanoseconds.
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
@@ -46,7 +48,7 @@ impl FrameScores {
             rule,
             nominal_values,
             open: OpenTicks::default(),
-            scorer: Scorer::default(),
+            scorer: Scorer::default().with_breakdowns(),
             live: LivePrecision::default(),
             records: Vec::new(),
             pose_errors: Vec::new(),
@@ -74,7 +76,7 @@ impl FrameScores {
             publish_nanos: stamp.publish_nanos,
             ego: self.ego.clone(),
             world_from_ego: Some(ego.world_from_lidar),
-            boxes: true_boxes(truth, &self.ego, &self.rule),
+            truth: ground_truth(truth, &self.ego, &self.rule),
         })
     }
 
@@ -132,6 +134,12 @@ impl FrameScores {
             by_iou(&self.scorer, Ordering::Global),
             by_iou(&self.scorer, Ordering::Frame),
         )
+    }
+
+    /// Average precision over the answered ticks by distance and by class, ordered by score over all frames.
+    #[must_use]
+    pub fn average_precision_by_part(&self) -> [BTreeMap<String, PartPrecision>; 2] {
+        by_part(&self.scorer)
     }
 
     /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
@@ -232,70 +240,70 @@ impl FrameScores {
             // The ego takes no part at this tick, so no result is missing.
             return;
         }
-        let boxes = true_boxes(&truth, &self.ego, &self.rule);
-        let answer = tick.result.as_ref().map(|(done_nanos, result)| Answer {
-            published_nanos: Some(*done_nanos),
-            detections: &result.detections,
-        });
-        let streamed =
-            self.judge_live((truth.tick, began_nanos), &world_from_lidar, &boxes, answer);
+        let objects = ground_truth(&truth, &self.ego, &self.rule);
+        let at = (truth.tick, capture_nanos, began_nanos);
         let Some((done_nanos, result)) = tick.result else {
-            let (tick, truth) = (truth.tick, boxes.len());
-            return self.records.push(FrameRecord::unanswered(
-                tick,
-                capture_nanos,
-                began_nanos,
-                truth,
-                streamed,
-            ));
+            return self.judge_unanswered(at, &objects, &world_from_lidar);
         };
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
-        self.judge_result(
-            (truth.tick, capture_nanos),
-            (stamps, streamed),
+        self.judge_answered(
+            at,
+            (stamps, Some(done_nanos)),
             result,
-            boxes,
+            &objects,
             world_from_lidar,
         );
     }
 
-    /// Scores a frame whose truth is known already, at once; `poses` are the estimates of all vehicles. The same frame
-    /// must not be given to [`Self::truth`], [`Self::result`] and [`Self::pose`].
+    /// Scores a frame whose truth is known already, at once; `result` is `None` if the ego has none, `poses` are the
+    /// estimates of all vehicles. The same frame must not be given to [`Self::truth`], [`Self::result`] and
+    /// [`Self::pose`].
     pub fn judge_whole(
         &mut self,
         (tick, capture_nanos): (u64, u64),
         latency_ms: Option<f64>,
-        result: Detections,
-        boxes: Vec<Box3d>,
+        result: Option<Detections>,
+        objects: &GroundTruth,
         poses: &[(CavId, PoseEstimate)],
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
+        let at = (tick, capture_nanos, capture_nanos);
+        let Some(result) = result else {
+            return self.judge_unanswered(at, objects, &world_from_lidar);
+        };
         let stamps = StageStamps {
             detected_ms: latency_ms,
             ..StageStamps::default()
         };
         let published_nanos =
             latency_ms.map(|latency_ms| capture_nanos.saturating_add((latency_ms * 1e6) as u64));
-        let answer = Answer {
-            published_nanos,
-            detections: &result.detections,
-        };
-        let streamed = self.judge_live(
-            (tick, capture_nanos),
-            &world_from_lidar,
-            &boxes,
-            Some(answer),
-        );
-        self.judge_result(
-            (tick, capture_nanos),
-            (stamps, streamed),
+        self.judge_answered(
+            at,
+            (stamps, published_nanos),
             result,
-            boxes,
+            objects,
             world_from_lidar,
         );
+    }
+
+    /// Scores a tick, of a number, capture time and time of publication, without a result.
+    fn judge_unanswered(
+        &mut self,
+        (tick, capture_nanos, began_nanos): (u64, u64, u64),
+        objects: &GroundTruth,
+        world_from_lidar: &[(CavId, Pose)],
+    ) {
+        let streamed = self.judge_live((tick, began_nanos), world_from_lidar, objects, None);
+        self.records.push(FrameRecord::unanswered(
+            tick,
+            capture_nanos,
+            began_nanos,
+            objects.objects.len(),
+            streamed,
+        ));
     }
 
     /// Scores a tick with or without a result; returns the result that was the newest at its publication.
@@ -303,33 +311,41 @@ impl FrameScores {
         &mut self,
         (tick, began_nanos): (u64, u64),
         world_from_lidar: &[(CavId, Pose)],
-        boxes: &[Box3d],
+        truth: &GroundTruth,
         answer: Option<Answer<'_>>,
     ) -> Option<StreamedResult> {
         let world_from_ego = true_pose(world_from_lidar, &self.ego).copied();
-        let ([x_low, x_high], [y_low, y_high]) = (self.rule.x_m, self.rule.y_m);
-        let area_m = [x_low, y_low, x_high, y_high];
         self.live.add(
             &TickTruth {
                 tick,
                 began_nanos,
                 world_from_ego,
-                boxes,
-                area_m,
+                truth,
             },
             answer,
         )
     }
 
-    fn judge_result(
+    fn judge_answered(
         &mut self,
-        (tick, capture_nanos): (u64, u64),
-        (stamps, streamed): (StageStamps, Option<StreamedResult>),
+        (tick, capture_nanos, began_nanos): (u64, u64, u64),
+        (stamps, published_nanos): (StageStamps, Option<u64>),
         result: Detections,
-        boxes: Vec<Box3d>,
+        objects: &GroundTruth,
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
-        let found = self.score(&result, &boxes);
+        let answer = Answer {
+            published_nanos,
+            detections: &result.detections,
+        };
+        let streamed = self.judge_live(
+            (tick, began_nanos),
+            &world_from_lidar,
+            objects,
+            Some(answer),
+        );
+        let verdicts = self.scorer.add(&result.detections, objects);
+        let FrameCounts { detected, found } = FrameCounts::of(&self.scorer, &verdicts);
         let bytes: Vec<(u64, u64)> = result
             .fused
             .iter()
@@ -350,8 +366,8 @@ impl FrameScores {
             capture_nanos,
             latency_ms: stamps.detected_ms,
             stamps,
-            detected: result.detections.len(),
-            truth: boxes.len(),
+            detected,
+            truth: objects.objects.len(),
             found,
             fused: result.fused.len(),
             skipped: result.skipped.len(),
@@ -370,13 +386,7 @@ impl FrameScores {
         neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);
         self.ages_ms.extend(ages_ms);
-        self.keep_showpiece(tick, result, boxes, world_from_lidar);
-    }
-
-    /// Adds a frame to the scores; returns the number of detections that count as found.
-    fn score(&mut self, result: &Detections, boxes: &[Box3d]) -> usize {
-        self.scorer.add(&result.detections, boxes);
-        found_by_last(&self.scorer, result.detections.len())
+        self.keep_showpiece(tick, result, objects, world_from_lidar);
     }
 
     fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {
@@ -396,19 +406,18 @@ impl FrameScores {
         &mut self,
         tick: u64,
         result: Detections,
-        boxes: Vec<Box3d>,
+        objects: &GroundTruth,
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
-        let worth = |fused: usize, boxes: usize| (fused, boxes);
         let better = self.best.as_ref().is_none_or(|best| {
-            worth(result.fused.len(), boxes.len())
-                > worth(best.result.fused.len(), best.truth.len())
+            (result.fused.len(), objects.objects.len())
+                > (best.result.fused.len(), best.truth.len())
         });
         if better {
             self.best = Some(JudgedFrame {
                 tick,
                 result,
-                truth: boxes,
+                truth: objects.boxes().collect(),
                 world_from_lidar,
             });
         }

@@ -3,10 +3,11 @@
 use std::collections::VecDeque;
 
 use dataset::average_precision::{Ordering, Scorer};
-use protocol::{Box3d, Detection, Pose, corners_within};
+use dataset::ground_truth::GroundTruth;
+use protocol::{Detection, Pose};
 
 use super::frame_record::StreamedResult;
-use super::precision::{by_iou, found_by_last};
+use super::precision::{FrameCounts, by_iou};
 use crate::score::metrics::ByIou;
 
 /// Largest number of detections that were published after the ticks scored so far: more than any run has in flight.
@@ -41,10 +42,8 @@ pub(super) struct TickTruth<'a> {
     pub(super) began_nanos: u64,
     /// True pose of the ego's LiDAR.
     pub(super) world_from_ego: Option<Pose>,
-    /// True boxes in the ego's LiDAR frame.
-    pub(super) boxes: &'a [Box3d],
-    /// Area of the scored boxes: x, y of the lower, then of the upper corner, metres in that frame.
-    pub(super) area_m: [f64; 4],
+    /// Objects in the ego's LiDAR frame.
+    pub(super) truth: &'a GroundTruth,
 }
 
 /// Detections of a tick.
@@ -67,7 +66,7 @@ impl LivePrecision {
         self.answered += u64::from(answer.is_some());
         self.all_ticks.add(
             answer.as_ref().map_or(&[], |answer| answer.detections),
-            truth.boxes,
+            truth.truth,
         );
         let streamed = self.stream(truth);
         match answer {
@@ -126,10 +125,10 @@ impl LivePrecision {
     fn stream(&mut self, truth: &TickTruth<'_>) -> Option<StreamedResult> {
         let known = self.newest(truth);
         let detections = known.as_ref().map_or(&[][..], |(_, detections)| detections);
-        self.streaming.add(detections, truth.boxes);
-        let found = found_by_last(&self.streaming, detections.len());
-        known.map(|(of, detections)| StreamedResult {
-            detected: detections.len(),
+        let verdicts = self.streaming.add(detections, truth.truth);
+        let FrameCounts { detected, found } = FrameCounts::of(&self.streaming, &verdicts);
+        known.map(|(of, _)| StreamedResult {
+            detected,
             found,
             ..of
         })
@@ -161,9 +160,6 @@ impl LivePrecision {
                 ..found.clone()
             }
         });
-        let within = moved
-            .filter(|found| corners_within(&found.box3d.corners(), truth.area_m))
-            .collect();
         let age_ms = (truth.began_nanos.saturating_sub(*began_nanos)) as f64 * 1e-6;
         Some((
             StreamedResult {
@@ -172,16 +168,24 @@ impl LivePrecision {
                 detected: 0,
                 found: 0,
             },
-            within,
+            moved.collect(),
         ))
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use protocol::Box3d;
+
     use super::*;
 
-    const AREA_M: [f64; 4] = [-50.0, -40.0, 50.0, 40.0];
+    /// A car at `x` metres, in an area of 50 by 40 m.
+    fn truth_at(x: f64) -> GroundTruth {
+        GroundTruth {
+            area_m: [-50.0, -40.0, 50.0, 40.0],
+            ..GroundTruth::of_boxes([car(x)])
+        }
+    }
 
     fn car(x: f64) -> Box3d {
         Box3d {
@@ -203,10 +207,10 @@ mod tests {
         let streamed = (0..ticks).map(|tick| {
             let began_nanos = 1_000_000_000 + tick * 100_000_000;
             let ego_x = tick as f64;
-            let boxes = [car(20.0 + speed_m * tick as f64 - ego_x)];
+            let truth = truth_at(20.0 + speed_m * tick as f64 - ego_x);
             let world_from_ego = Some(Pose::from_xyz_yaw([ego_x, 0.0, 0.0], 0.0));
             let found = [Detection {
-                box3d: boxes[0],
+                box3d: truth.objects[0].box3d,
                 score: 0.9,
                 source: None,
             }];
@@ -220,8 +224,7 @@ mod tests {
                     tick,
                     began_nanos,
                     world_from_ego,
-                    boxes: &boxes,
-                    area_m: AREA_M,
+                    truth: &truth,
                 },
                 answer,
             )
@@ -286,7 +289,7 @@ mod tests {
             score: 0.9,
             source: None,
         }];
-        for (tick, boxes) in (0..).zip(&[vec![car(-48.0)], vec![car(10.0)]]) {
+        for (tick, truth) in (0..).zip(&[truth_at(-48.0), truth_at(10.0)]) {
             let began_nanos = 1_000 * tick;
             let world_from_ego = Some(Pose::from_xyz_yaw([5.0 * tick as f64, 0.0, 0.0], 0.0));
             let answer = (tick == 0).then_some(Answer {
@@ -298,8 +301,7 @@ mod tests {
                     tick,
                     began_nanos,
                     world_from_ego,
-                    boxes,
-                    area_m: AREA_M,
+                    truth,
                 },
                 answer,
             );
@@ -317,20 +319,17 @@ mod tests {
     #[test]
     fn results_without_a_time_have_no_streaming_precision() {
         let mut live = LivePrecision::default();
-        let (boxes, found) = (
-            [car(10.0)],
-            [Detection {
-                box3d: car(10.0),
-                score: 0.9,
-                source: None,
-            }],
-        );
+        let truth = truth_at(10.0);
+        let found = [Detection {
+            box3d: car(10.0),
+            score: 0.9,
+            source: None,
+        }];
         let truth = TickTruth {
             tick: 0,
             began_nanos: 0,
             world_from_ego: None,
-            boxes: &boxes,
-            area_m: AREA_M,
+            truth: &truth,
         };
         live.add(
             &truth,

@@ -8,6 +8,7 @@ use dataset::LeftOut;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{CavId, Counts, DropReason, Ledger, PoseError};
 use serde::{Deserialize, Serialize};
+use support::provenance::Provenance;
 use support::statistics::{quantile, sorted};
 
 use crate::score::{FrameScores, NeighbourRecord};
@@ -55,6 +56,12 @@ pub struct Metrics {
     /// the truth at that tick. Latency and missing results both lower it. `null` if results have no time of publication.
     #[serde(default)]
     pub ap_streaming: Option<ByIou>,
+    /// `ap_answered` by the distance of the objects from the ego's LiDAR, metres in the plane: bins that have objects.
+    #[serde(default)]
+    pub ap_by_distance: BTreeMap<String, PartPrecision>,
+    /// `ap_answered` by the class of the objects: classes that have objects.
+    #[serde(default)]
+    pub ap_by_class: BTreeMap<String, PartPrecision>,
     /// Errors of the poses that fusion used.
     pub pose: PoseErrors,
     /// Latencies.
@@ -76,9 +83,13 @@ pub struct Metrics {
     /// The evaluation protocol, with the ground-truth range as it was applied.
     #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
-    /// Data of the scene that could not be used.
+    /// Data of the scene that could not be used, and frames that could not be computed. On the wall clock frames that
+    /// failed are unanswered, and `messages` counts theirs as dropped.
     #[serde(default)]
     pub left_out: LeftOut,
+    /// Command, programs, and the digests of everything that the result was made from.
+    #[serde(default)]
+    pub provenance: Option<Provenance>,
 }
 
 impl Metrics {
@@ -94,6 +105,7 @@ impl Metrics {
     ) -> Self {
         let fused = board.records().iter().map(|record| record.fused).sum();
         let (ap_global, ap_frame_order) = board.average_precision();
+        let [ap_by_distance, ap_by_class] = board.average_precision_by_part();
         let (ticks, answered) = board.ticks();
         Self {
             frames: answered,
@@ -108,6 +120,8 @@ impl Metrics {
             ap_answered: ap_global,
             ap_unanswered_empty: board.unanswered_empty(),
             ap_streaming: board.streaming(),
+            ap_by_distance,
+            ap_by_class,
             pose: board.pose_errors(),
             latency_ms: board.latencies(),
             age_ms: board.ages(),
@@ -117,6 +131,7 @@ impl Metrics {
             messages: Messages::of(&ledger.total()),
             protocol: None,
             left_out: LeftOut::default(),
+            provenance: None,
         }
     }
 }
@@ -133,6 +148,16 @@ pub struct ByIou {
     /// At IoU 0.7.
     #[serde(rename = "0.7")]
     pub at_70: Option<f64>,
+}
+
+/// Average precision of a part of the objects. Detections on objects of other parts count neither way.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct PartPrecision {
+    /// Number of the objects.
+    pub objects: usize,
+    /// Average precision, ordered by score over all frames.
+    #[serde(flatten)]
+    pub ap: ByIou,
 }
 
 /// Errors of the poses, over all vehicles and frames.

@@ -20,5 +20,5 @@ pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
 pub use node::{ProcessStats, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;
-pub(crate) use true_boxes::true_objects;
+pub(crate) use true_boxes::ground_truth;
 pub use truth_line::TruthLine;

@@ -1,24 +1,50 @@
 //! Average precision and hits of a scorer.
 
-use dataset::average_precision::{Ordering, Scorer};
+use std::collections::BTreeMap;
+
+use dataset::average_precision::{Breakdown, Ordering, Scorer, Tally, Verdict};
 use support::csv_file::CsvText;
 
-use crate::score::metrics::ByIou;
+use crate::score::metrics::{ByIou, PartPrecision};
 
 /// IoU from which a detection counts as found in `frames.csv`.
 const FOUND_IOU: f64 = 0.5;
 
 /// AP at the three IoU thresholds; `None` without a true object.
 pub(super) fn by_iou(scorer: &Scorer, ordering: Ordering) -> ByIou {
-    let objects = scorer.tallies().first().map_or(0, |tally| tally.objects);
-    match scorer.average_precisions(ordering)[..] {
-        [at_30, at_50, at_70] if objects > 0 => ByIou {
-            at_30: Some(at_30),
-            at_50: Some(at_50),
-            at_70: Some(at_70),
-        },
-        _ => ByIou::default(),
+    of_tallies(scorer.tallies(), ordering)
+}
+
+fn of_tallies(tallies: &[Tally], ordering: Ordering) -> ByIou {
+    let at = |index: usize| {
+        let tally = tallies.get(index).filter(|tally| tally.objects > 0);
+        tally.map(|tally| tally.curve(ordering).average_precision)
+    };
+    ByIou {
+        at_30: at(0),
+        at_50: at(1),
+        at_70: at(2),
     }
+}
+
+/// AP of the parts that have objects, ordered by score: of bins of distance, and of classes.
+pub(super) fn by_part(scorer: &Scorer) -> [BTreeMap<String, PartPrecision>; 2] {
+    let mut by_part = [BTreeMap::new(), BTreeMap::new()];
+    let [distances, classes] = &mut by_part;
+    for (part, tallies) in scorer.parts() {
+        let objects = tallies.first().map_or(0, |tally| tally.objects);
+        if objects > 0 {
+            let precision = PartPrecision {
+                objects,
+                ap: of_tallies(tallies, Ordering::Global),
+            };
+            match part {
+                Breakdown::Distance(_) => distances.insert(part.to_string(), precision),
+                Breakdown::Class(_) => classes.insert(part.to_string(), precision),
+            };
+        }
+    }
+    by_part
 }
 
 /// Precision over recall, ordered by score: a row per detection.
@@ -39,17 +65,25 @@ pub(super) fn precision_recall_csv(scorer: &Scorer) -> String {
     text.finish()
 }
 
-/// Number of the last `detected` detections of a scorer that overlap a true box by at least [`FOUND_IOU`].
-pub(super) fn found_by_last(scorer: &Scorer, detected: usize) -> usize {
-    scorer
-        .tallies()
-        .iter()
-        .find(|tally| tally.iou_threshold == FOUND_IOU)
-        .map_or(0, |tally| {
-            let first = tally.matched.len().saturating_sub(detected);
-            tally.matched[first..]
-                .iter()
-                .filter(|matched| matched.is_true)
-                .count()
-        })
+/// Detections of a frame at an IoU of 0.5.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct FrameCounts {
+    /// Detections that count.
+    pub(super) detected: usize,
+    /// Of these, those that match a true object.
+    pub(super) found: usize,
+}
+
+impl FrameCounts {
+    /// Counts of a frame that has just been added to `scorer`, with its verdicts.
+    pub(super) fn of(scorer: &Scorer, verdicts: &[Vec<Verdict>]) -> Self {
+        let mut counts = Self::default();
+        let all = scorer.tallies().iter().zip(verdicts);
+        let at_iou = all.filter(|(tally, _)| tally.iou_threshold == FOUND_IOU);
+        for verdict in at_iou.flat_map(|(_, verdicts)| verdicts) {
+            counts.detected += usize::from(*verdict != Verdict::Ignored);
+            counts.found += usize::from(matches!(verdict, Verdict::Match(_)));
+        }
+        counts
+    }
 }

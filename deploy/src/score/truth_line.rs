@@ -1,6 +1,7 @@
 //! `truth.jsonl`: the ground truth of every tick as it was scored, so that all precisions can be computed anew.
 
-use protocol::{Box3d, CavId, Pose};
+use dataset::ground_truth::GroundTruth;
+use protocol::{CavId, Pose};
 use serde::Serialize;
 
 /// One line: the ground truth of a tick for one ego.
@@ -16,8 +17,9 @@ pub struct TruthLine {
     pub ego: CavId,
     /// True pose of its LiDAR.
     pub world_from_ego: Option<Pose>,
-    /// True boxes that count, in its LiDAR frame.
-    pub boxes: Vec<Box3d>,
+    /// Objects that count, objects of other classes, and the range in which detections count, in its LiDAR frame.
+    #[serde(flatten)]
+    pub truth: GroundTruth,
 }
 
 impl TruthLine {

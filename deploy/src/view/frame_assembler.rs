@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use dataset::average_precision::Verdict;
 use protocol::{
     Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload,
     Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
@@ -290,6 +291,15 @@ impl FrameAssembler {
     }
 }
 
+/// True for a true positive, false for a false one; `None` if the detection counts neither way.
+fn is_hit(verdict: Verdict) -> Option<bool> {
+    match verdict {
+        Verdict::Match(_) => Some(true),
+        Verdict::FalsePositive => Some(false),
+        Verdict::Ignored => None,
+    }
+}
+
 fn decode<M: Payload>(seen: &ReceivedMessage<'_>) -> Option<M> {
     wire::decode([seen.payload?], &Limits::DEFAULT)
         .map(|(_, message)| message)
@@ -466,8 +476,8 @@ impl OpenFrame {
         let mut shown = self.placed(&result.ego, &result.pose, &result.detections, None);
         shown
             .iter_mut()
-            .zip(&judgement.hits)
-            .for_each(|(shown, is_hit)| shown.is_hit = Some(*is_hit));
+            .zip(&judgement.verdicts)
+            .for_each(|(shown, verdict)| shown.is_hit = is_hit(*verdict));
         shown
     }
 

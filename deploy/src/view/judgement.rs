@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use dataset::average_precision::{Ordering, Scorer, matches};
+use dataset::average_precision::{Ordering, Scorer, Verdict};
 use dataset::ground_truth::GroundTruthRule;
 use protocol::{BevGrid, Detections, Truth};
 use serde::Serialize;
 
-use crate::score::true_objects;
+use crate::score::ground_truth;
 
 /// IoU from which a detection is a true positive.
 const IOU: f64 = 0.5;
@@ -34,8 +34,8 @@ impl From<&BevGrid> for DetectionArea {
 /// Judgement of one frame.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct Judgement {
-    /// For each detection whether it is a true positive.
-    pub(super) hits: Vec<bool>,
+    /// For each detection.
+    pub(super) verdicts: Vec<Verdict>,
     /// For each object that counts, by id, the score of the detection that found it.
     pub(super) found: BTreeMap<i64, Option<f32>>,
 }
@@ -43,17 +43,17 @@ pub(super) struct Judgement {
 impl Judgement {
     /// True and false positives from a score on, and missed objects.
     pub(super) fn counts(&self, result: &Detections, least_score: f32) -> [usize; 3] {
-        let shown = result
-            .detections
-            .iter()
-            .zip(&self.hits)
-            .filter(|(detection, _)| detection.score >= least_score);
-        let (hits, false_positives): (Vec<_>, Vec<_>) = shown.partition(|(_, is_hit)| **is_hit);
+        let shown = || {
+            let all = result.detections.iter().zip(&self.verdicts);
+            all.filter(|(detection, _)| detection.score >= least_score)
+        };
+        let matches = shown().filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
+        let wrong = shown().filter(|(_, verdict)| **verdict == Verdict::FalsePositive);
         let missed = self
             .found
             .values()
             .filter(|score| score.is_none_or(|score| score < least_score));
-        [hits.len(), false_positives.len(), missed.count()]
+        [matches.count(), wrong.count(), missed.count()]
     }
 }
 
@@ -83,21 +83,23 @@ impl Judge {
             y_m: area.y_m,
             ..GroundTruthRule::OPV2V
         };
-        let objects = true_objects(truth, &result.ego, &rule);
-        let boxes: Vec<_> = objects.iter().map(|(_, box3d)| *box3d).collect();
-        self.scorer.add(&result.detections, &boxes);
-        let matched = matches(&result.detections, &boxes, IOU);
-        let mut found: BTreeMap<i64, Option<f32>> =
-            objects.iter().map(|(id, _)| (*id, None)).collect();
-        for (detection, object) in result.detections.iter().zip(&matched) {
-            if let Some((id, _)) = object.and_then(|object| objects.get(object)) {
-                found.insert(*id, Some(detection.score));
+        let objects = ground_truth(truth, &result.ego, &rule);
+        // The scorer has one threshold.
+        let verdicts = self.scorer.add(&result.detections, &objects);
+        let verdicts = verdicts.into_iter().next().unwrap_or_default();
+        let mut found: BTreeMap<i64, Option<f32>> = objects
+            .objects
+            .iter()
+            .map(|object| (object.id, None))
+            .collect();
+        for (detection, verdict) in result.detections.iter().zip(&verdicts) {
+            if let Verdict::Match(index) = verdict
+                && let Some(object) = objects.objects.get(*index)
+            {
+                found.insert(object.id, Some(detection.score));
             }
         }
-        Judgement {
-            hits: matched.iter().map(Option::is_some).collect(),
-            found,
-        }
+        Judgement { verdicts, found }
     }
 
     /// Average precision of the frames so far; `None` without an object.
@@ -114,16 +116,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn positives_and_missed_objects_are_counted_by_score_within_the_area() {
+    fn positives_and_missed_objects_are_counted_by_score_within_area_and_classes() {
         let ego = CavId::new("7").unwrap();
-        let object = |id: i64, x_m: f64| TrueObject {
+        let object = |id: i64, class: &str, x_m: f64| TrueObject {
             id,
-            class: "car".into(),
+            class: class.into(),
             world_from_object: Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0),
             size_m: [4.0, 2.0, 1.5],
             speed_mps: None,
         };
-        let objects = vec![object(1, 10.0), object(2, 20.0), object(3, 80.0)];
+        let objects = vec![
+            object(1, "car", 10.0),
+            object(2, "car", 20.0),
+            object(3, "car", 80.0),
+            object(4, "other", 30.0),
+        ];
         let agent = AgentTruth {
             cav: ego.clone(),
             world_from_lidar: Pose::IDENTITY,
@@ -151,6 +158,8 @@ mod tests {
                 detection(10.2, 0.9),
                 detection(40.0, 0.6),
                 detection(20.0, 0.3),
+                detection(50.0, 0.3),
+                detection(30.0, 0.3),
             ],
             fused: vec![],
             skipped: vec![],
@@ -167,7 +176,17 @@ mod tests {
         let mut judge = Judge::default();
         assert_eq!(judge.average_precision(), None);
         let judgement = judge.judge(&result, &truth, &DetectionArea::from(&grid));
-        assert_eq!(judgement.hits, [true, false, true]);
+        let ignored = Verdict::Ignored;
+        assert_eq!(
+            judgement.verdicts,
+            [
+                Verdict::Match(0),
+                Verdict::FalsePositive,
+                Verdict::Match(1),
+                ignored,
+                ignored
+            ]
+        );
         assert_eq!(
             judgement.found,
             BTreeMap::from([(1, Some(0.9)), (2, Some(0.3))])

@@ -120,7 +120,7 @@ pub struct ShownBox {
     pub is_counted: bool,
     /// Score of the detection that found a true object.
     pub found_score: Option<f32>,
-    /// True if a detection is a true positive; `None` if that is not known.
+    /// True if a detection is a true positive; `None` if that is not known, or if it counts neither way.
     pub is_hit: Option<bool>,
 }
 

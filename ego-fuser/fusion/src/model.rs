@@ -9,6 +9,7 @@ use nalgebra::Isometry3;
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::{DecodeError, decode};
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::detector::DetectorError;
 use perception::layers::head::HeadOutput;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::pillars::batch::PillarBatch;
@@ -46,6 +47,9 @@ pub enum ModelError {
     /// Feature maps do not fit the BEV grid.
     #[error(transparent)]
     Warp(#[from] WarpError),
+    /// A frame cannot be computed.
+    #[error(transparent)]
+    Detector(#[from] DetectorError),
     /// The tensor library reported an error.
     #[error("model: {0}")]
     Torch(#[from] TchError),
@@ -60,6 +64,14 @@ pub enum ModelError {
         /// Metadata entries over all samples.
         described: usize,
     },
+}
+
+impl ModelError {
+    /// True if one frame cannot be computed, and others may be, see [`DetectorError::is_of_frame`].
+    #[must_use]
+    pub fn is_of_frame(&self) -> bool {
+        matches!(self, Self::Detector(error) if error.is_of_frame())
+    }
 }
 
 /// Output of a model for a batch.
@@ -357,7 +369,7 @@ impl CooperativeModel {
 }
 
 /// The values of one sample of a map, row-major.
-pub fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
+fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
     Vec::try_from(
         map.f_get(sample)?
             .f_to_device(Device::Cpu)?

@@ -22,7 +22,7 @@ use agent::rate::RateConfig;
 use dataset::class_set::ClassSet;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame::Frame;
-use dataset::ground_truth::{self, GroundTruthRule};
+use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use dataset::{LeftOut, LoadOptions, Scenario};
 use localization::pose_source::PoseSourceConfig;
 use perception::detector::Detector;
@@ -31,7 +31,7 @@ use perception::int8::InferencePrecision;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
-use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
+use protocol::{CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
 use tch::Device;
 
 use ego_fuser::ego::{Ego, EgoOutput, Skipped, View};
@@ -78,14 +78,16 @@ pub struct EvaluatedFrame {
     pub tick: usize,
     /// Sender and capture time of the result.
     pub stamp: Stamp,
-    /// Detections that the ego would have published.
+    /// Detections that the ego would have published; without boxes if it has failed.
     pub result: Detections,
+    /// Reason why the ego has no result; counted in [`Evaluator::left_out`].
+    pub failure: Option<String>,
     /// The frames of all vehicles that take part, the ego first: true poses and annotations.
     pub frames: Vec<Frame>,
     /// Reported pose of each of them.
     pub poses: Vec<PoseEstimate>,
-    /// The objects that count, in the ego's LiDAR frame.
-    pub objects: Vec<Box3d>,
+    /// Objects in the ego's LiDAR frame, and the range of those that count.
+    pub truth: GroundTruth,
 }
 
 /// Messages of all neighbours at one tick; empty where none takes part.
@@ -199,11 +201,8 @@ impl Evaluator {
     /// The protocol with the ground-truth rule that applies to this network; absent where none was configured.
     #[must_use]
     pub fn protocol(&self) -> Option<EvaluationProtocol> {
-        let protocol = self.config.protocol.clone()?;
-        Some(EvaluationProtocol {
-            ground_truth: self.rule,
-            ..protocol
-        })
+        let protocol = self.config.protocol.as_ref()?;
+        Some(protocol.within(self.ego.detector().config().lidar_range_m))
     }
 
     /// Rule for the objects that count.
@@ -213,7 +212,8 @@ impl Evaluator {
     }
 
     /// Runs over a scenario, its first agent being the ego; `on_frame` may end it. Frames that cannot be read are left
-    /// out and counted ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick.
+    /// out and counted ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick. So are
+    /// frames that cannot be computed, but a tick of the ego has no result then ([`EvaluatedFrame::failure`]).
     ///
     /// # Errors
     /// [`EvaluateError`] when the pipeline reports an error.
@@ -243,7 +243,7 @@ impl Evaluator {
             if sweeps.first().is_none_or(|ego| ego.place != 0) {
                 continue;
             }
-            if on_frame(self.frame(&mut participants, sweeps, tick)?).is_break() {
+            if on_frame(self.frame(scenario, &mut participants, sweeps, tick)?).is_break() {
                 return Ok(ControlFlow::Break(()));
             }
         }
@@ -304,6 +304,7 @@ impl Evaluator {
 
     fn frame(
         &mut self,
+        scenario: &Scenario,
         participants: &mut [Participant],
         sweeps: Vec<Sweep>,
         tick: usize,
@@ -316,17 +317,16 @@ impl Evaluator {
             let is_needed = place == 0 || self.ego.method().exchange() != Exchange::Nothing;
             let participant = &mut participants[place];
             participant.capture(sent.last());
-            sent.push(view(
-                participant,
-                &frame,
-                map.as_ref(),
-                is_needed.then_some(exchange),
-            )?);
+            let exchange = is_needed.then_some(exchange);
+            let of_agent = view(participant, &frame, map.as_ref(), exchange)?;
+            if let Some(reason) = &of_agent.failure {
+                self.count_failure(scenario, tick, &of_agent.cav, reason);
+            }
+            sent.push(of_agent);
             frames.push(frame);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
         let own = sent.remove(0);
-        let own = own.view().expect("the ego is needed by every method");
         self.under_way.push_back(SentAtOnce {
             capture_nanos: own.capture_nanos,
             sent,
@@ -336,27 +336,56 @@ impl Evaluator {
             .iter()
             .filter_map(Sent::received)
             .unzip();
-        let output = self.ego.detect(&own, &neighbours)?;
-        let result = self.report(tick, &own, &neighbours, &bytes, output);
-        let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.rule);
-        let objects = objects.into_iter().map(|(_, object)| object).collect();
-        let stamp = stamp(&own.cav, frames[0].capture_nanos);
+        let output = match own.view() {
+            Some(view) => self.detect(scenario, tick, &view, &neighbours)?,
+            // Every method needs the ego's own view, so it has failed.
+            None => Err(own.failure.clone().unwrap_or_default()),
+        };
+        let (output, failure) = match output {
+            Ok(output) => (output, None),
+            Err(reason) => (EgoOutput::default(), Some(reason)),
+        };
         Ok(EvaluatedFrame {
             tick,
-            stamp,
-            result,
+            stamp: stamp(&own.cav, own.capture_nanos),
+            result: self.report(
+                tick,
+                (&own.cav, own.pose, own.capture_nanos),
+                &neighbours,
+                &bytes,
+                output,
+            ),
+            failure,
+            truth: GroundTruth::of_tick(&frames.iter().collect::<Vec<_>>(), 0, &self.rule),
             frames,
             poses,
-            objects,
         })
     }
 
-    /// The result that the ego would publish as its agent's frame of that number; `bytes` are payload and wire bytes of
-    /// each neighbour's message.
+    /// The ego's output, or the reason why this frame has none, which is counted.
+    fn detect(
+        &mut self,
+        scenario: &Scenario,
+        tick: usize,
+        own: &View,
+        neighbours: &[View],
+    ) -> Result<Result<EgoOutput, String>, EvaluateError> {
+        match self.ego.detect(own, neighbours) {
+            Err(error) if error.is_of_frame() => {
+                let reason = error.to_string();
+                self.count_failure(scenario, tick, &own.cav, &reason);
+                Ok(Err(reason))
+            }
+            output => Ok(Ok(output?)),
+        }
+    }
+
+    /// The result that the ego would publish as its agent's frame of that number. `own` are its id, pose and capture
+    /// time, `bytes` payload and wire bytes of each neighbour's message.
     fn report(
         &self,
         agent_frame: usize,
-        own: &View,
+        (own, pose, capture_nanos): (&CavId, PoseEstimate, u64),
         neighbours: &[View],
         bytes: &[(u64, u64)],
         output: EgoOutput,
@@ -364,7 +393,7 @@ impl Evaluator {
         let fused = (output.fused.iter())
             .map(|&index| FusedNeighbour {
                 cav: neighbours[index].cav.clone(),
-                age_nanos: neighbours[index].age_nanos(own),
+                age_nanos: capture_nanos as i64 - neighbours[index].capture_nanos as i64,
                 confidence: neighbours[index].pose.confidence(),
                 payload_bytes: bytes[index].0,
                 wire_bytes: bytes[index].1,
@@ -381,10 +410,10 @@ impl Evaluator {
                 },
             });
         Detections {
-            ego: own.cav.clone(),
+            ego: own.clone(),
             agent_frame: agent_frame as u64,
             method: self.ego.method().name().to_owned(),
-            pose: own.pose,
+            pose,
             detections: output.detections,
             fused,
             skipped: skipped.collect(),

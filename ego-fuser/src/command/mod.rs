@@ -42,10 +42,9 @@ impl Command {
             Self::Run(arguments) => {
                 malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
                     .context("restarting with malloc settings")?;
-                arguments.run()?;
+                arguments.run()
             }
-            Self::Methods(arguments) => arguments.run()?,
+            Self::Methods(arguments) => arguments.run().map(|()| Outcome::Done),
         }
-        Ok(Outcome::Done)
     }
 }

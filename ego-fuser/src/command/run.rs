@@ -8,7 +8,7 @@ use ego_fuser::node::{self, NodeOptions};
 use protocol::Role;
 use support::output;
 
-use support::cli::BadInput;
+use support::cli::{BadInput, Outcome};
 
 /// Fuses what the ego's own agent and its neighbours send; detections out.
 #[derive(Debug, clap::Args)]
@@ -22,7 +22,7 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     /// Loads the model, joins the run and works until the own agent ends.
-    pub(crate) fn run(self) -> anyhow::Result<()> {
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         log_to_stderr();
         let config = self
             .config
@@ -63,11 +63,14 @@ impl Arguments {
                 fused,
                 at_deadline,
                 failed,
-            } = report;
+                failure,
+            } = &report;
+            let reason = { failure.as_ref() }
+                .map_or(String::new(), |reason| format!(", the first: {reason}"));
             output::line(format_args!(
-                "{frames} frames, {fused} neighbours' messages fused, {at_deadline} at the deadline, {failed} failed"
+                "{frames} frames, {fused} neighbours' messages fused, {at_deadline} at the deadline, {failed} failed{reason}"
             ))?;
         }
-        Ok(())
+        Ok(Outcome::of(report.failed > 0))
     }
 }

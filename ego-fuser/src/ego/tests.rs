@@ -11,6 +11,7 @@ use tch::nn::VarStore;
 
 use super::*;
 use dataset::average_precision::{Ordering, Scorer};
+use dataset::ground_truth::GroundTruth;
 
 /// Capture time of all sweeps unless stated otherwise.
 const NOW: u64 = 5_000_000_000;
@@ -271,8 +272,52 @@ fn leaves_one_map_as_it_is(method: Method) -> bool {
 /// AP@0.3, 0.5 and 0.7 of one frame.
 fn average_precisions(detections: &[Detection], objects: &[protocol::Box3d]) -> Vec<f64> {
     let mut scorer = Scorer::new(&[0.3, 0.5, 0.7]);
-    scorer.add(detections, objects);
+    scorer.add(detections, &GroundTruth::of_boxes(objects.iter().copied()));
     scorer.average_precisions(Ordering::Global)
+}
+
+/// Writes a TorchScript module that returns the ego's map times `factor`.
+fn write_script(file: &Path, factor: f64) {
+    let like = |shape: &[i64]| Tensor::ones(shape, (Kind::Float, Device::Cpu));
+    let inputs = [&[1, 2, 3, 4][..], &[1, 1, 3, 4], &[1, 3], &[1], &[1]].map(like);
+    let mut scaled = |inputs: &[Tensor]| {
+        let [features, mask, poses, confidence, age_s] = inputs else {
+            panic!("{} inputs", inputs.len())
+        };
+        let unused = (mask.sum(Kind::Float) + poses.sum(Kind::Float)) * 0.0;
+        let unused = unused + (confidence.sum(Kind::Float) + age_s.sum(Kind::Float)) * 0.0;
+        vec![features.get(0) * factor + unused]
+    };
+    let module =
+        tch::CModule::create_by_tracing("Fusion", "forward", &inputs, &mut scaled).unwrap();
+    module.save(file).unwrap();
+}
+
+#[test]
+fn fused_values_that_are_nan_or_absurd_are_errors_of_the_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    for (factor, holds) in [
+        (1.0, None),
+        (f64::NAN, Some("NaN")),
+        (f64::INFINITY, Some("NaN")),
+        (1e30, Some("000")),
+    ] {
+        let file = folder.path().join(format!("{factor}.pt"));
+        write_script(&file, factor);
+        let method: Method = format!("script:{}", file.display()).parse().unwrap();
+        let own = view("a", HERE, method, 0.0);
+        let found = Ego::new(detector(), method).unwrap().detect(&own, &[]);
+        match (found, holds) {
+            (Ok(output), None) => assert!(!output.detections.is_empty()),
+            (Err(error), Some(holds)) => {
+                let text = error.to_string();
+                assert!(error.is_of_frame(), "{text}");
+                assert!(text.starts_with("the fused feature map holds"), "{text}");
+                assert!(text.contains(holds), "{text}");
+            }
+            (found, _) => panic!("{factor}: {found:?}"),
+        }
+    }
 }
 
 #[test]

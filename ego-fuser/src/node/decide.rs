@@ -103,7 +103,13 @@ impl Node<'_> {
             Err(error) => {
                 tracing::error!(capture_nanos, "a frame could not be fused: {error}");
                 self.report.failed += 1;
-                self.bus.stats().dropped(&own_topic, DropReason::Shape);
+                let first = &mut self.report.failure;
+                first.get_or_insert_with(|| error.to_string());
+                let reason = match error.is_of_frame() {
+                    true => DropReason::NotFinite,
+                    false => DropReason::Shape,
+                };
+                self.bus.stats().dropped(&own_topic, reason);
                 // The neighbours' messages are valid.
                 self.take_in(&own, &(0..choice.views.len()).collect::<Vec<_>>(), &choice);
             }

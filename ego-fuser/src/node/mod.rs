@@ -94,7 +94,7 @@ impl From<&EgoConfig> for NodeOptions {
 }
 
 /// Summary of an ego's run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct NodeReport {
     /// Frames decided.
     pub frames: u64,
@@ -104,6 +104,8 @@ pub struct NodeReport {
     pub at_deadline: u64,
     /// Frames that could not be fused.
     pub failed: u64,
+    /// Reason of the first of these.
+    pub failure: Option<String>,
 }
 
 /// Runs `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.

@@ -386,6 +386,6 @@ impl MapSource {
                     .insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };
-        Ok(encoder.encode(&frame.points)?.features)
+        Ok(encoder.encode_sweep(&frame.points)?.features)
     }
 }

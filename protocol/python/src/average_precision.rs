@@ -1,6 +1,7 @@
 //! Average precision of arrays of boxes: the numbers of `v2vloc eval`.
 
 use dataset::average_precision::{Ordering, Scorer};
+use dataset::ground_truth::GroundTruth;
 use numpy::{PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use protocol::{Box3d, Detection};
 use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods};
@@ -47,9 +48,9 @@ pub(crate) fn average_precision<'py>(
     }
     let found = py.detach(|| {
         let mut scorer = Scorer::new(&thresholds);
-        frames
-            .iter()
-            .for_each(|(detections, objects)| scorer.add(detections, objects));
+        for (detections, truth) in &frames {
+            scorer.add(detections, truth);
+        }
         scorer.average_precisions(ordering)
     });
     match (single, found.first()) {
@@ -64,9 +65,9 @@ pub(crate) fn average_precision<'py>(
     }
 }
 
-type Scored = (Vec<Detection>, Vec<Box3d>);
+type Scored = (Vec<Detection>, GroundTruth);
 
-/// Detections and true boxes of each frame.
+/// Detections and ground truth of each frame.
 fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<Vec<Scored>> {
     let (detections, truth) = (entries("detections", detections)?, entries("truth", truth)?);
     if detections.len() != truth.len() {
@@ -76,7 +77,7 @@ fn frames(detections: &Bound<'_, PyAny>, truth: &Bound<'_, PyAny>) -> PyResult<V
         )));
     }
     let frame = |(index, (found, objects)): (usize, (&Bound<'_, PyAny>, &Bound<'_, PyAny>))| {
-        Ok((scored_boxes(index, found)?, true_boxes(index, objects)?))
+        Ok((scored_boxes(index, found)?, ground_truth(index, objects)?))
     };
     detections
         .iter()
@@ -130,25 +131,22 @@ fn scored_boxes(frame: usize, found: &Bound<'_, PyAny>) -> PyResult<Vec<Detectio
     Ok(boxes.into_iter().zip(scores).map(detection).collect())
 }
 
-fn true_boxes(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<Vec<Box3d>> {
+/// Ground truth of a frame; of arrays and annotations all boxes count, and all detections.
+fn ground_truth(frame: usize, objects: &Bound<'_, PyAny>) -> PyResult<GroundTruth> {
     let Ok(objects) = objects.cast::<Objects>() else {
-        return boxes_of("truth", frame, objects);
+        return Ok(GroundTruth::of_boxes(boxes_of("truth", frame, objects)?));
     };
+    if let Some(truth) = objects.get().truth() {
+        return Ok(truth.clone());
+    }
     let no_pose = || {
         error(format!(
             "truth of frame {frame}: objects without boxes, as the pose of the LiDAR is unknown"
         ))
     };
-    boxes_of(
-        "truth",
-        frame,
-        objects
-            .get()
-            .boxes()
-            .ok_or_else(no_pose)?
-            .bind(objects.py())
-            .as_any(),
-    )
+    let boxes = objects.get().boxes().ok_or_else(no_pose)?;
+    let boxes = boxes_of("truth", frame, boxes.bind(objects.py()).as_any())?;
+    Ok(GroundTruth::of_boxes(boxes))
 }
 
 /// Rows of an array `[N, 7]`; an empty list is none.

@@ -2,7 +2,7 @@
 
 use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::frame;
-use dataset::ground_truth;
+use dataset::ground_truth::{self, GroundTruth};
 use numpy::{PyArray2, PyUntypedArrayMethods};
 use protocol::{Box3d, Pose};
 use pyo3::types::{PyDict, PyDictMethods};
@@ -208,7 +208,8 @@ impl Frame {
             ground_truth::merged_objects(&frames, index, &rule)
                 .into_iter()
                 .unzip();
-        Objects::new(py, &objects, Some(&boxes))
+        let truth = GroundTruth::of_tick(&frames, index, &rule);
+        Objects::new(py, &objects, Some(&boxes), Some(truth))
     }
 
     fn __repr__(&self, py: Python<'_>) -> String {

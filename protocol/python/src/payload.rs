@@ -1,7 +1,7 @@
 //! Payloads of messages and parts of frames: pose estimate, feature map, detections, objects, image.
 
 use dataset::frame::{Frame, Object};
-use dataset::ground_truth::upright_box;
+use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
 use protocol::{BevGrid, Box3d, CameraMetadata, Codec, DecodedFeatures, Detection, Pose};
 use pyo3::types::{PyBytes, PyDict, PyDictMethods, PyList};
@@ -276,14 +276,22 @@ impl Detections {
 }
 
 /// Annotated objects.
-#[pyclass(frozen, get_all, module = "v2vloc")]
+#[pyclass(frozen, module = "v2vloc")]
 pub(crate) struct Objects {
+    #[pyo3(get)]
     ids: Py<PyArray1<i64>>,
+    #[pyo3(get)]
     classes: Py<PyList>,
+    #[pyo3(get)]
     boxes: Option<Matrix>,
+    #[pyo3(get)]
     world_from_object: Py<PyArray3<f64>>,
+    #[pyo3(get)]
     sizes_m: Matrix,
+    #[pyo3(get)]
     speeds_mps: Py<PyArray1<f64>>,
+    /// The same objects as ground truth, with the range and the objects that do not count; `None` for an annotation.
+    truth: Option<GroundTruth>,
 }
 
 impl Objects {
@@ -297,14 +305,16 @@ impl Objects {
                 .map(|object| upright_box(object, &lidar_from_world))
                 .collect::<Vec<_>>()
         });
-        Self::new(py, &objects, boxes.as_deref())
+        Self::new(py, &objects, boxes.as_deref(), None)
     }
 
-    /// Objects with their boxes in the frame of a LiDAR, if its true pose is known.
+    /// Objects with their boxes in the frame of a LiDAR, if its true pose is known; `truth` if they are the ground truth
+    /// of an ego.
     pub(crate) fn new(
         py: Python<'_>,
         objects: &[&Object],
         boxes: Option<&[Box3d]>,
+        truth: Option<GroundTruth>,
     ) -> PyResult<Py<Self>> {
         let boxes = boxes.map(|boxes| arrays::boxes(py, boxes.iter()));
         let poses: Vec<Pose> = objects
@@ -322,8 +332,14 @@ impl Objects {
             world_from_object: arrays::poses(py, &poses)?,
             sizes_m: arrays::rows(py, objects.iter().map(|object| object.size_m).collect())?,
             speeds_mps: PyArray1::from_vec(py, speeds).unbind(),
+            truth,
         };
         Py::new(py, made)
+    }
+
+    /// The ground truth, if the objects are that of an ego.
+    pub(crate) fn truth(&self) -> Option<&GroundTruth> {
+        self.truth.as_ref()
     }
 
     /// The boxes in the frame of a LiDAR, if its pose is known.

@@ -33,6 +33,17 @@ def test_a_run_has_the_numbers_of_eval_and_of_its_metrics(run):
             assert found[iou] == evaluated[name][str(iou)], (name, iou, found, evaluated[name])
 
 
+def test_detections_beyond_the_range_of_the_ground_truth_do_not_count(run):
+    frame = run.recording[0]
+    truth = frame.ground_truth(area_m=(-30, -30, -3, 30, 30, 1))
+    assert 0 < len(truth) < len(frame.ground_truth(area_m=AREA_M))
+    beyond = np.array([[31.0, 0.0, -1.0, 4.5, 1.9, 1.6, 0.0]])
+    scores = np.concatenate([np.full(len(truth), 0.5), [0.9]])
+    found = (np.concatenate([truth.boxes, beyond]), scores)
+    assert v2vloc.average_precision([found], [truth]) == 1.0
+    assert v2vloc.average_precision([found], [truth.boxes]) < 1.0
+
+
 def test_wrong_arrays_are_named(run):
     cases = [
         (([(CAR, [0.9])], []), {}, "detections of 1 frames, truth of 0"),

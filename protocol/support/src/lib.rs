@@ -6,6 +6,7 @@
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size, atomic writes,
 //!   CSV, SHA-256 of whole files.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
+//! - [`provenance`]: the command, programs and digests that a result was made from.
 //! - [`rounding`]: floats to integers.
 //! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
@@ -41,6 +42,7 @@ mod list_values;
 pub mod nanos;
 pub mod output;
 pub mod progress;
+pub mod provenance;
 pub mod random;
 pub mod rounding;
 pub mod shared_files;

@@ -6,12 +6,13 @@ use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use dataset::average_precision::{Ordering, Scorer};
+use dataset::ground_truth::GroundTruth;
 use protocol::{Box3d, Detection};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// 25 objects and 40 detections, 20 of them on objects: a crowded frame.
-fn frame(rng: &mut impl Rng) -> (Vec<Detection>, Vec<Box3d>) {
+fn frame(rng: &mut impl Rng) -> (Vec<Detection>, GroundTruth) {
     let objects: Vec<Box3d> = (0..25)
         .map(|_| Box3d {
             center_m: [
@@ -35,7 +36,7 @@ fn frame(rng: &mut impl Rng) -> (Vec<Detection>, Vec<Box3d>) {
             }
         })
         .collect();
-    (detections, objects)
+    (detections, GroundTruth::of_boxes(objects))
 }
 
 fn average_precision(criterion: &mut Criterion) {
@@ -44,9 +45,9 @@ fn average_precision(criterion: &mut Criterion) {
     criterion.bench_function("average_precision/50_frames/40x25", |bencher| {
         bencher.iter(|| {
             let mut scorer = Scorer::default();
-            frames
-                .iter()
-                .for_each(|(detections, objects)| scorer.add(detections, objects));
+            for (detections, truth) in &frames {
+                scorer.add(detections, truth);
+            }
             let found = [Ordering::Global, Ordering::Frame]
                 .map(|ordering| scorer.average_precisions(ordering));
             assert!(found.iter().flatten().all(|ap| (0.0..=1.0).contains(ap)));

@@ -105,6 +105,15 @@ impl EvaluationProtocol {
         }
     }
 
+    /// The protocol with the ground-truth rule for a network that covers `area_m`, see [`Self::rule_within`].
+    #[must_use]
+    pub fn within(&self, area_m: [f64; 6]) -> Self {
+        Self {
+            ground_truth: self.rule_within(area_m),
+            ..self.clone()
+        }
+    }
+
     /// The scenario with the agents that take part, the ego first; none if no agent is of the requested kind.
     #[must_use]
     pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {

@@ -15,7 +15,80 @@ use protocol::Box3d;
 use serde::{Deserialize, Serialize};
 
 use crate::class_set::ClassSet;
-use crate::frame::{Frame, Object};
+use crate::frame::{Frame, Object, ObjectClass};
+
+/// An annotated object in the LiDAR frame of an ego.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TrueBox {
+    /// Id of the object, see [`Object::id`].
+    pub id: i64,
+    /// Class of the object.
+    pub class: ObjectClass,
+    /// The object as an upright box.
+    #[serde(flatten)]
+    pub box3d: Box3d,
+}
+
+/// Ground truth of one frame: what detections are compared with, and which of them count.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct GroundTruth {
+    /// Objects that an ego is expected to find.
+    #[serde(rename = "boxes")]
+    pub objects: Vec<TrueBox>,
+    /// Objects of classes that do not count. A detection on one of them is neither right nor wrong.
+    pub ignored: Vec<TrueBox>,
+    /// Range of the objects: x, y of the lower, then of the upper corner, metres. Detections with a corner beyond it do
+    /// not count.
+    pub area_m: [f64; 4],
+}
+
+impl GroundTruth {
+    /// The ground truth of a tick for an ego, see [`merge`].
+    #[must_use]
+    pub fn of_tick(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule) -> Self {
+        let ([x_low, x_high], [y_low, y_high]) = (rule.x_m, rule.y_m);
+        let ignored = select(
+            frames_of_tick,
+            (ego_index, rule.comm_range_m),
+            |class| !rule.classes.contains(class),
+            |_| true,
+        );
+        Self {
+            objects: true_boxes(&merged_objects(frames_of_tick, ego_index, rule)),
+            ignored: true_boxes(&ignored),
+            area_m: [x_low, y_low, x_high, y_high],
+        }
+    }
+
+    /// Boxes of unknown class in an unlimited area: all detections count.
+    #[must_use]
+    pub fn of_boxes(boxes: impl IntoIterator<Item = Box3d>) -> Self {
+        let of_box = |(box3d, id)| TrueBox {
+            id,
+            class: ObjectClass::Other,
+            box3d,
+        };
+        Self {
+            objects: boxes.into_iter().zip(0..).map(of_box).collect(),
+            ignored: Vec::new(),
+            area_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX],
+        }
+    }
+
+    /// The boxes of the objects that count.
+    pub fn boxes(&self) -> impl Iterator<Item = Box3d> {
+        self.objects.iter().map(|object| object.box3d)
+    }
+}
+
+fn true_boxes(objects: &[(&Object, Box3d)]) -> Vec<TrueBox> {
+    let of_object = |(object, box3d): &(&Object, Box3d)| TrueBox {
+        id: object.id,
+        class: object.class,
+        box3d: *box3d,
+    };
+    objects.iter().map(of_object).collect()
+}
 
 /// Range, classes and agents whose annotations count.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -94,10 +167,25 @@ pub fn merged_objects<'a>(
     ego_index: usize,
     rule: &GroundTruthRule,
 ) -> Vec<(&'a Object, Box3d)> {
-    let Some(ego) = frames_of_tick.get(ego_index) else {
-        return Vec::new();
-    };
-    let Some(world_from_ego) = ego.world_from_lidar else {
+    select(
+        frames_of_tick,
+        (ego_index, rule.comm_range_m),
+        |class| rule.classes.contains(class),
+        |box3d| rule.keeps(box3d),
+    )
+}
+
+/// The objects of some classes that agents in range annotate, with the boxes that are kept; the first of each id.
+fn select<'a>(
+    frames_of_tick: &[&'a Frame],
+    (ego_index, comm_range_m): (usize, f64),
+    is_of_class: impl Fn(ObjectClass) -> bool,
+    is_kept: impl Fn(&Box3d) -> bool,
+) -> Vec<(&'a Object, Box3d)> {
+    let world_from_ego = frames_of_tick
+        .get(ego_index)
+        .and_then(|ego| ego.world_from_lidar);
+    let Some(world_from_ego) = world_from_ego else {
         return Vec::new();
     };
     let ego_from_world = world_from_ego.isometry().inverse();
@@ -108,18 +196,15 @@ pub fn merged_objects<'a>(
     {
         // The list belongs to the tick, regardless of the agents in range.
         Some(holder) => vec![holder],
-        None => contributors(frames_of_tick, ego_index, rule.comm_range_m),
+        None => contributors(frames_of_tick, ego_index, comm_range_m),
     };
     let mut seen = HashSet::new();
     let mut merged = Vec::new();
     for index in contributors {
         let listed = annotations.get(index).copied().unwrap_or_default();
-        for object in listed
-            .iter()
-            .filter(|object| rule.classes.contains(object.class))
-        {
+        for object in listed.iter().filter(|object| is_of_class(object.class)) {
             let box3d = upright_box(object, &ego_from_world);
-            if rule.keeps(&box3d) && seen.insert(object.id) {
+            if is_kept(&box3d) && seen.insert(object.id) {
                 merged.push((object, box3d));
             }
         }
@@ -194,149 +279,4 @@ pub fn upright_box(object: &Object, target_from_world: &Isometry3<f64>) -> Box3d
 }
 
 #[cfg(test)]
-mod tests {
-    use protocol::{CavId, Handedness, Pose};
-
-    use super::*;
-    use crate::frame::ObjectClass;
-
-    fn frame(cav: &str, x: f64, objects: Vec<Object>) -> Frame {
-        Frame {
-            world_from_lidar: Some(Pose::from_xyz_yaw([x, 0.0, 2.0], 0.0)),
-            objects,
-            ..Frame::empty(CavId::new(cav).unwrap(), 0, Handedness::Right)
-        }
-    }
-
-    fn car(id: i64, x: f64, y: f64) -> Object {
-        Object {
-            id,
-            class: ObjectClass::Car,
-            world_from_object: Pose::from_xyz_yaw([x, y, 1.0], 0.0),
-            size_m: [4.0, 2.0, 1.5],
-            speed_mps: None,
-        }
-    }
-
-    fn ids(frames: &[Frame], ego: usize, rule: &GroundTruthRule) -> Vec<i64> {
-        merge(&frames.iter().collect::<Vec<_>>(), ego, rule)
-            .into_iter()
-            .map(|(id, _)| id)
-            .collect()
-    }
-
-    #[test]
-    fn annotations_merge_by_id_and_the_ego_stays() {
-        let frames = [
-            frame("1", 0.0, vec![car(7, 20.0, 0.0)]),
-            frame("2", 50.0, vec![car(7, 20.0, 0.0), car(1, 0.0, 0.0)]),
-        ];
-        assert_eq!(ids(&frames, 0, &GroundTruthRule::OPV2V), [7, 1]);
-        assert_eq!(ids(&frames[..1], 0, &GroundTruthRule::OPV2V), [7]);
-        let seen_by_two = merge(&[&frames[0], &frames[1]], 1, &GroundTruthRule::OPV2V);
-        assert_eq!(seen_by_two[0].1.center_m, [-30.0, 0.0, -1.0]);
-    }
-
-    #[test]
-    fn a_cooperative_annotation_takes_the_place_of_all_others() {
-        let mut frames = [
-            frame("1", 0.0, vec![car(7, 20.0, 0.0)]),
-            frame("2", 90.0, vec![car(8, 30.0, 0.0)]),
-        ];
-        frames[0].cooperative_objects = Some(vec![car(0, 20.0, 1.0), car(1, 30.0, 1.0)]);
-        assert_eq!(ids(&frames, 0, &GroundTruthRule::OPV2V), [0, 1]);
-        assert_eq!(
-            ids(&frames, 1, &GroundTruthRule::OPV2V),
-            [0, 1],
-            "out of range, but the truth of the tick"
-        );
-        assert_eq!(ids(&frames[1..], 0, &GroundTruthRule::OPV2V), [8]);
-        let [with_list, other] = annotations(&frames.each_ref())[..] else {
-            panic!("one per frame")
-        };
-        assert_eq!((with_list.len(), other.len()), (2, 0));
-    }
-
-    #[test]
-    fn agents_out_of_range_do_not_contribute() {
-        let frames = [
-            frame("1", 0.0, vec![]),
-            frame("2", 70.0, vec![car(3, 5.0, 0.0)]),
-            frame("3", 70.1, vec![car(4, 5.0, 0.0)]),
-        ];
-        assert_eq!(ids(&frames, 0, &GroundTruthRule::OPV2V), [3]);
-    }
-
-    #[test]
-    fn every_corner_must_lie_in_range_border_included() {
-        let inside = |x, y| {
-            !ids(
-                &[frame("1", 0.0, vec![car(1, x, y)])],
-                0,
-                &GroundTruthRule::OPV2V,
-            )
-            .is_empty()
-        };
-        assert!(inside(138.0, 39.0) && inside(-138.0, -39.0));
-        assert!(!inside(138.1, 0.0) && !inside(0.0, 39.1));
-        let mut high = car(1, 0.0, 0.0);
-        high.size_m[2] = 4.5;
-        assert!(
-            ids(&[frame("1", 0.0, vec![high])], 0, &GroundTruthRule::OPV2V).is_empty(),
-            "z counts as well"
-        );
-    }
-
-    #[test]
-    fn two_corners_do_for_v2v4real_but_x_and_y_need_all() {
-        let rule = GroundTruthRule {
-            z_m: [-1.0, 3.0],
-            ..GroundTruthRule::V2V4REAL
-        };
-        assert_eq!(
-            ids(&[frame("1", 0.0, vec![car(1, 10.0, 0.0)])], 0, &rule),
-            [1],
-            "the top face is above -1 m"
-        );
-        assert!(ids(&[frame("1", 0.0, vec![car(1, 99.0, 0.0)])], 0, &rule).is_empty());
-    }
-
-    #[test]
-    fn pedestrians_are_no_targets() {
-        let walker = Object {
-            class: ObjectClass::Pedestrian,
-            ..car(1, 5.0, 0.0)
-        };
-        assert!(ids(&[frame("1", 0.0, vec![walker])], 0, &GroundTruthRule::OPV2V).is_empty());
-    }
-
-    #[test]
-    fn heading_is_right_at_half_a_turn() {
-        for yaw in [std::f64::consts::PI, -std::f64::consts::PI, 3.0, -3.0] {
-            let object = Object {
-                world_from_object: Pose::from_xyz_yaw([0.0; 3], yaw),
-                ..car(1, 0.0, 0.0)
-            };
-            let heading = upright_box(&object, &Isometry3::identity()).heading_rad;
-            assert!(
-                ((heading - yaw) / 2.0).sin().abs() < 1e-9,
-                "{heading} {yaw}"
-            );
-        }
-    }
-
-    #[test]
-    fn a_tilt_shortens_the_box_in_the_plane() {
-        let tilt = Isometry3::rotation(Vector3::y() * 0.5);
-        let object = Object {
-            world_from_object: tilt.into(),
-            ..car(1, 0.0, 0.0)
-        };
-        let [l, w, h] = upright_box(&object, &Isometry3::identity()).size_m;
-        assert!(
-            (l - 4.0 * 0.5f64.cos()).abs() < 1e-12
-                && (w - 2.0).abs() < 1e-12
-                && (h - 1.5 * 0.5f64.cos()).abs() < 1e-12
-        );
-    }
-}
+mod tests;

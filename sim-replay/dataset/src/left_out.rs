@@ -25,6 +25,9 @@ pub struct LeftOut {
     /// Frames of other agents that do not exist at the ego's ticks, because they joined later or have left. Not a
     /// fault.
     pub absent_frames: u64,
+    /// Frames that were read but could not be computed, of the ego or of other agents.
+    #[serde(default)]
+    pub failed: u64,
     /// Unused files and folders of the data set, found when it was opened.
     pub files: u64,
     problems: BTreeSet<Problem>,
@@ -62,6 +65,17 @@ impl LeftOut {
         self.keep(problem);
     }
 
+    /// Adds a frame, named by scenario, tick and agent, that could not be computed.
+    pub fn add_failed(&mut self, frame: &str, reason: &str) {
+        self.failed += 1;
+        self.keep(Problem {
+            path: String::new(),
+            line: None,
+            field: None,
+            message: format!("{frame}: {reason}"),
+        });
+    }
+
     /// Adds the parts left out of a frame.
     pub(crate) fn add_parts(&mut self, frame: &Frame) {
         self.parts += frame.problems.len() as u64;
@@ -77,6 +91,7 @@ impl LeftOut {
         self.frames += other.frames;
         self.parts += other.parts;
         self.absent_frames += other.absent_frames;
+        self.failed += other.failed;
         self.files += other.files;
         other
             .problems
@@ -87,7 +102,7 @@ impl LeftOut {
     /// True if nothing was lost. Absent agents are no loss.
     #[must_use]
     pub fn is_nothing(&self) -> bool {
-        self.ticks + self.frames + self.parts + self.files == 0
+        self.ticks + self.frames + self.parts + self.failed + self.files == 0
     }
 
     /// The findings without duplicates, at most 1,000.
@@ -116,6 +131,7 @@ impl fmt::Display for LeftOut {
             (self.ticks, "ticks (the ego's frame cannot be read)"),
             (self.frames, "frames of other agents that cannot be read"),
             (self.parts, "objects or other parts of frames"),
+            (self.failed, "frames that could not be computed"),
             (self.files, "files or folders"),
         ];
         let left_out: Vec<String> = counts

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use dataset::average_precision::{Ordering, Scorer};
-use protocol::{Box3d, Detection};
+use dataset::ground_truth::GroundTruth;
+use protocol::Detection;
 use serde_json::Value;
 use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::{Up, programs, results, write_scenario};
@@ -98,7 +99,7 @@ fn a_script_gives_the_precision_of_the_built_in_method_and_the_files_hold_the_fr
             (&wanted["tick"], &wanted["scenario"])
         );
         let found: Vec<Detection> = serde_json::from_value(found["detections"].clone()).unwrap();
-        let wanted: Vec<Box3d> = serde_json::from_value(wanted["boxes"].clone()).unwrap();
+        let wanted: GroundTruth = serde_json::from_value(wanted.clone()).unwrap();
         scorer.add(&found, &wanted);
     }
     for (computed, iou) in scorer

@@ -113,8 +113,8 @@ fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
         assert!(!offline.result.detections.is_empty());
         assert_eq!(offline.result.detections, stepped.result.detections);
         assert_eq!(
-            (&offline.result.fused, &offline.objects),
-            (&stepped.result.fused, &stepped.objects)
+            (&offline.result.fused, &offline.truth),
+            (&stepped.result.fused, &stepped.truth)
         );
     }
     assert!(
@@ -297,7 +297,7 @@ fn fewer_vehicles_leave_the_truth_as_it_is() {
     assert!(
         all.iter()
             .zip(&two)
-            .all(|(all, two)| all.objects == two.objects)
+            .all(|(all, two)| all.truth == two.truth)
     );
     assert!(all.iter().all(|frame| frame.result.fused.len() == 2));
     assert!(two.iter().all(|frame| frame.result.fused.len() == 1));

@@ -49,6 +49,23 @@ impl BackboneLevel {
         self.quantisation.is_some()
     }
 
+    /// True if most of its values above zero are the largest that 8 bits hold: a scale of its network is far too small.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub(super) fn is_saturated(&self) -> Result<bool, TchError> {
+        if !self.is_quantised() {
+            return Ok(false);
+        }
+        let largest = self.values.f_eq(i64::from(u8::MAX))?;
+        let largest = largest.f_sum(Kind::Int64)?.f_int64_value(&[])?;
+        let above_zero = self
+            .values
+            .f_count_nonzero(None::<i64>)?
+            .f_int64_value(&[])?;
+        Ok(2 * largest > above_zero)
+    }
+
     /// `[N, C]` `f32`: the features of some cells `[N]`, numbered row by row, `y * W + x`.
     ///
     /// # Errors
@@ -90,6 +107,17 @@ mod tests {
 
     use super::*;
     use crate::int8::Scale;
+
+    #[test]
+    fn a_level_of_which_most_values_are_clamped_is_saturated() {
+        let map = Tensor::arange(32, (Kind::Float, Device::Cpu)).view([1, 2, 4, 4]);
+        for (exponent, is_saturated) in [(-3, false), (-4, false), (-5, true), (-12, true)] {
+            let quantisation = Quantisation::unsigned(Scale::of_exponent(exponent));
+            let values = quantisation.quantise(&map).unwrap();
+            let level = BackboneLevel::in_integers(values, quantisation);
+            assert_eq!(level.is_saturated().unwrap(), is_saturated, "{exponent}");
+        }
+    }
 
     #[test]
     fn cells_have_the_features_of_their_place_in_both_formats() {

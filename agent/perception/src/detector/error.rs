@@ -26,10 +26,49 @@ pub enum DetectorError {
         /// The shape of this detector's.
         expected: [i64; 3],
     },
+    /// A sweep has no point that the detector could use: a blind sensor, or coordinates of another frame or unit.
+    #[error(
+        "none of the {points} points of the sweep lies in the area of the detector, {area_m:?} m (x, y, z low, then high)"
+    )]
+    NoPoints {
+        /// Number of points of the sweep.
+        points: usize,
+        /// Area of the detector, metres in the frame of the LiDAR.
+        area_m: [f64; 6],
+    },
+    /// A feature map or an output of the head is NaN, infinite or absurdly large.
+    #[error("{what} holds {value}, valid are absolute values up to {limit}")]
+    Values {
+        /// Name of the tensor.
+        what: &'static str,
+        /// Value that is not valid.
+        value: f64,
+        /// Largest valid absolute value.
+        limit: f64,
+    },
+    /// Most values of a level of the backbone are the largest that 8 bits hold.
+    #[error(
+        "most values of level {level} of the backbone exceed 8 bits: the scales of its activations are too small"
+    )]
+    Saturated {
+        /// Number of the level, from 0.
+        level: usize,
+    },
     /// The output of the head does not fit the anchors.
     #[error(transparent)]
     Decode(#[from] DecodeError),
     /// The tensor library failed.
     #[error("tensor library: {}", first_line(.0))]
     Tensor(#[from] TchError),
+}
+
+impl DetectorError {
+    /// True if one frame cannot be computed, and others may be: its data or values are not usable.
+    #[must_use]
+    pub fn is_of_frame(&self) -> bool {
+        matches!(
+            self,
+            Self::NoPoints { .. } | Self::Values { .. } | Self::Saturated { .. }
+        )
+    }
 }

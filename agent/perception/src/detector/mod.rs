@@ -16,7 +16,7 @@ use tch::{Device, Kind, Tensor};
 
 pub use backbone_level::BackboneLevel;
 pub use error::DetectorError;
-pub use output::{Encoded, Heads};
+pub use output::{Encoded, Heads, check_values};
 
 use encoder::BevEncoder;
 use output::flat;
@@ -216,10 +216,40 @@ impl Detector {
     /// sweep's own body must have been removed in its own frame, see [`Crop::without_own_body`].
     ///
     /// # Errors
-    /// Those of the tensor library.
+    /// As [`Self::encode_sweep`].
     pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
         let crop = self.crop.range_only();
-        self.encode_within(&crop, cloud)
+        let encoded = self.encode_within(&crop, cloud)?;
+        self.checked_sweep(encoded, cloud)
+    }
+
+    /// [`Self::encode`] of a sweep that is evaluated: it must have points in the area, and its map valid values.
+    ///
+    /// # Errors
+    /// [`DetectorError::NoPoints`], [`DetectorError::Values`], [`DetectorError::Saturated`]; those of the tensor library.
+    pub fn encode_sweep(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let encoded = self.encode(cloud)?;
+        self.checked_sweep(encoded, cloud)
+    }
+
+    fn checked_sweep(
+        &self,
+        encoded: Encoded,
+        cloud: &PointCloud,
+    ) -> Result<Encoded, DetectorError> {
+        if encoded.points == 0 {
+            return Err(DetectorError::NoPoints {
+                points: cloud.len(),
+                area_m: self.config.lidar_range_m,
+            });
+        }
+        check_values("the feature map of the sweep", &encoded.features)?;
+        for (level, values) in encoded.levels.iter().enumerate() {
+            if values.is_saturated()? {
+                return Err(DetectorError::Saturated { level });
+            }
+        }
+        Ok(encoded)
     }
 
     /// Crop of its input.
@@ -356,7 +386,8 @@ impl Detector {
     /// Scores, offsets and confidence of a feature map `[1, C, H, W]` or `[C, H, W]`, own or fused.
     ///
     /// # Errors
-    /// [`DetectorError::Shape`] if the feature map is not of this detector.
+    /// [`DetectorError::Shape`] if the feature map is not of this detector; [`DetectorError::Values`] if an output is
+    /// not valid.
     pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
         let map = checked(features, self.map_shape())?;
         tch::no_grad(|| Heads::new(&self.head.forward_one(&map)?))

@@ -1,6 +1,6 @@
 //! Output of a detector.
 
-use protocol::StageTiming;
+use protocol::{Limits, StageTiming};
 use tch::{TchError, Tensor};
 
 use super::backbone_level::BackboneLevel;
@@ -38,8 +38,10 @@ impl Heads {
     /// Copies the output for one feature map to plain values.
     ///
     /// # Errors
-    /// Those of the tensor library.
+    /// [`DetectorError::Values`] for values that are not valid; those of the tensor library.
     pub fn new(output: &HeadOutput) -> Result<Self, DetectorError> {
+        check_values("the output of the head (scores)", &output.scores)?;
+        check_values("the output of the head (offsets of boxes)", &output.offsets)?;
         Ok(Self {
             scores: flat(&output.scores)?,
             offsets: flat(&output.offsets)?,
@@ -51,4 +53,19 @@ impl Heads {
 /// The values of a tensor on any device, in row-major order.
 pub(super) fn flat(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(&tensor.f_contiguous()?.f_view([-1])?)
+}
+
+/// Checks that all values of a tensor are finite and as small as in a message.
+///
+/// # Errors
+/// [`DetectorError::Values`] with `what` and the value.
+pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorError> {
+    let limit = f64::from(Limits::DEFAULT.max_abs_value);
+    // The maximum of a tensor with NaN is NaN.
+    let value = tensor.f_abs()?.f_max()?.f_double_value(&[])?;
+    if value <= limit {
+        Ok(())
+    } else {
+        Err(DetectorError::Values { what, value, limit })
+    }
 }

@@ -112,6 +112,18 @@ pub enum WeightsError {
         /// Value at the index.
         value: f32,
     },
+    /// A variance of a normalisation layer is negative.
+    #[error("{}: tensor {name:?} holds {value} at index {index}; a variance is at least 0", path.display())]
+    Variance {
+        /// Path of the file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+        /// Index in row-major order.
+        index: usize,
+        /// Value at the index.
+        value: f32,
+    },
     /// The tensor library failed.
     #[error("{}: tensor {name:?}: {}", path.display(), first_line(source))]
     Tensor {

@@ -35,6 +35,8 @@ pub const METHOD_KEY: &str = "method";
 
 /// Kind of a detector.
 const DETECTOR_KIND: &str = "detector";
+/// End of the names of variances of normalisation layers.
+const VARIANCE_NAME: &str = "running_var";
 
 /// One file of parameters, read and checked.
 #[derive(Debug)]
@@ -331,7 +333,23 @@ fn read_values(
         }
     };
     check_finite(path, name, &values)?;
+    if name.ends_with(VARIANCE_NAME) {
+        check_variance(path, name, &values)?;
+    }
     Ok(Some(values))
+}
+
+/// Refuses negative variances of a normalisation layer: their square root is NaN.
+fn check_variance(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsError> {
+    let Some(index) = values.iter().position(|value| *value < 0.0) else {
+        return Ok(());
+    };
+    Err(WeightsError::Variance {
+        path: path.to_owned(),
+        name: name.to_owned(),
+        index,
+        value: values[index],
+    })
 }
 
 fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsError> {
@@ -520,6 +538,19 @@ mod tests {
                 "{message}"
             );
         }
+    }
+
+    #[test]
+    fn a_negative_variance_is_refused_with_the_name_of_its_tensor() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("variance.safetensors");
+        let network = network(&small());
+        let name = "backbone.blocks.0.2.running_var";
+        let _ = tch::no_grad(|| network.variables()[name].get(3).fill_(-0.25));
+        save(&path, &network, &metadata(&small()), Precision::Single).unwrap();
+        let message = Weights::load(&path).unwrap_err().to_string();
+        let expected = format!("tensor {name:?} holds -0.25 at index 3");
+        assert!(message.contains(&expected), "{message}");
     }
 
     #[test]

@@ -75,8 +75,8 @@ pub(crate) struct Arguments {
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
     #[arg(long, value_name = "FILE", conflicts_with_all = OF_ONE_TABLE, requires = "out")]
     table: Option<PathBuf>,
-    /// Folder for detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with --table, of the
-    /// tables [default: nothing is written].
+    /// Folder for metrics.json, detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with
+    /// --table, of the tables [default: nothing is written].
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten, next_help_heading = "Pose")]
@@ -152,6 +152,9 @@ pub(crate) struct Arguments {
     threads: Option<Threads>,
     #[command(flatten)]
     protocol: ProtocolConfig,
+    /// Print AP by distance and by class of the objects too; JSON has both in any case.
+    #[arg(long, conflicts_with_all = ["json", "table"])]
+    breakdown: bool,
     /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
     #[arg(long)]
     json: bool,
@@ -185,9 +188,9 @@ impl Arguments {
             (true, several) => output::line(serde_json::to_string_pretty(several)?)?,
             (false, several) => {
                 output::text(report::table(several))?;
-                if let Some(protocol) = several.iter().find_map(|metrics| metrics.protocol.as_ref())
-                {
-                    output::line(protocol)?;
+                if self.breakdown {
+                    output::line("")?;
+                    output::text(report::breakdown(several))?;
                 }
             }
         }

@@ -9,8 +9,7 @@ use fusion::Method;
 use protocol::{Counts, DropReason};
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
-
-use crate::scenario::fingerprint::Provenance;
+use support::provenance::Provenance;
 
 /// Digits of the key in the name of a file.
 const NAME_DIGITS: usize = 24;

@@ -23,12 +23,13 @@ use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 use protocol::{CavId, CodecConfig, Counts, Stream, Topic};
 use support::file_digests::FileDigests;
+use support::provenance::Provenance;
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{CellKey, MessageCounts};
-use crate::experiment::frame_files::{FrameFiles, FrameFilesError};
-use crate::scenario::fingerprint::{Provenance, files_of};
+use crate::experiment::frame_files::{self, FrameFiles, FrameFilesError};
+use crate::scenario::fingerprint::{collect, files_of};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Settings of an evaluation.
@@ -81,8 +82,17 @@ pub struct OpenedData {
 }
 
 impl OpenedData {
-    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.
-    fn sha256(&self, part: &Part, variant: Option<&str>) -> String {
+    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once; of its
+    /// first `ticks` only, if given.
+    fn sha256(&self, part: &Part, variant: Option<&str>, ticks: Option<usize>) -> String {
+        if let Some(mut left) = ticks {
+            let mut first: Vec<Scenario> = part.chosen(&self.scenarios).cloned().collect();
+            for scenario in &mut first {
+                scenario.ticks.truncate(left);
+                left -= scenario.ticks.len();
+            }
+            return dataset::content_sha256(&first, variant, &self.digests);
+        }
         let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
         let place = (part.scenarios, variant.map(str::to_owned));
         let sha256 = parts.entry(place).or_insert_with(|| {
@@ -200,16 +210,7 @@ impl EvaluationOptions {
     /// # Errors
     /// [`EvaluationError`] names the file that cannot be read.
     pub fn key(&self, data: &OpenedData, method: Method) -> Result<CellKey, EvaluationError> {
-        let stepped = self.stepped.as_ref();
-        let link = stepped.map(|stepped| (&stepped.link, stepped.link_folder.as_path()));
-        let variant = stepped.and_then(|stepped| stepped.lidar_variant.as_deref());
-        let vehicles = stepped.into_iter().flat_map(|stepped| &stepped.vehicles);
-        let poses =
-            std::iter::once(&self.pose_source).chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
-        let files = files_of(method, weights_of(&self.weights, method)?, poses, link);
-        let data_sha256 = data.sha256(&self.part, variant);
-        let provenance = Provenance::collect(&[], data_sha256, files, &data.digests)
-            .map_err(EvaluationError::Digest)?;
+        let provenance = self.provenance(data, method, None)?;
         // The contents of data and weights count, their places do not; kept maps change no result.
         let settings = Self {
             dataset: PathBuf::new(),
@@ -223,6 +224,24 @@ impl EvaluationOptions {
             sha256: provenance.key(&format!("{method} {settings:?}")),
             provenance,
         })
+    }
+
+    /// Digests of all that these settings are applied to; of the data up to a number of ticks, if there is one.
+    fn provenance(
+        &self,
+        data: &OpenedData,
+        method: Method,
+        ticks: Option<usize>,
+    ) -> Result<Provenance, EvaluationError> {
+        let stepped = self.stepped.as_ref();
+        let link = stepped.map(|stepped| (&stepped.link, stepped.link_folder.as_path()));
+        let variant = stepped.and_then(|stepped| stepped.lidar_variant.as_deref());
+        let vehicles = stepped.into_iter().flat_map(|stepped| &stepped.vehicles);
+        let poses =
+            std::iter::once(&self.pose_source).chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
+        let files = files_of(method, weights_of(&self.weights, method)?, poses, link);
+        let data_sha256 = data.sha256(&self.part, variant, ticks);
+        collect(&[], data_sha256, files, &data.digests).map_err(EvaluationError::Digest)
     }
 }
 
@@ -256,6 +275,18 @@ pub fn evaluate(
     };
     let poses = options.pose_source.name();
     let metrics = metrics(&board, &evaluator, clock, poses, seconds);
+    // Ticks that were left out are no frames, but were read.
+    let ticks = options
+        .frames
+        .map(|frames| frames.saturating_add(left_out_ticks(&metrics)));
+    let provenance = options.provenance(data, method, ticks)?.with_command();
+    let metrics = Metrics {
+        provenance: Some(provenance),
+        ..metrics
+    };
+    if let Some(out) = &options.out {
+        frame_files::write_metrics(out, method, &metrics)?;
+    }
     let used = board.records().iter().map(|record| record.fused as u64);
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
@@ -274,6 +305,10 @@ pub fn evaluate(
         used: used.sum(),
         messages: messages.into(),
     })
+}
+
+fn left_out_ticks(metrics: &Metrics) -> usize {
+    usize::try_from(metrics.left_out.ticks).unwrap_or(usize::MAX)
 }
 
 /// Scores of all frames, and the evaluator with its accounts.

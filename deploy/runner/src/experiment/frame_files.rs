@@ -7,14 +7,15 @@ use std::path::{Path, PathBuf};
 
 use deploy::operate::run_folder::frames_csv;
 use deploy::score::FrameScores;
+use deploy::score::metrics::{self, Metrics};
 use ego_fuser_offline::evaluation::EvaluatedFrame;
 use fusion::Method;
 
 use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
 
-/// Files of one method in a folder of its own: `detections.jsonl`, `truth.jsonl`, `frames.csv` and
-/// `precision_recall.csv`. The first two are those of a run, with the name of the scenario.
+/// Files of one method in a folder of its own: `detections.jsonl`, `truth.jsonl`, `frames.csv`, `precision_recall.csv`
+/// and, at the end, `metrics.json`. The first two are those of a run, with the name of the scenario.
 pub(crate) struct FrameFiles {
     folder: PathBuf,
     lines: FrameLines,
@@ -84,4 +85,19 @@ impl FrameFiles {
             source,
         })
     }
+}
+
+/// Writes `metrics.json` into the folder of a method in `out`.
+///
+/// # Errors
+/// [`FrameFilesError`] with the error of the operating system.
+pub(crate) fn write_metrics(
+    out: &Path,
+    method: Method,
+    metrics: &Metrics,
+) -> Result<(), FrameFilesError> {
+    let folder = out.join(file_name(method));
+    // Numbers and names have a spelling in JSON.
+    let text = serde_json::to_string_pretty(metrics).unwrap_or_default();
+    fs::write(folder.join(metrics::FILE), text).map_err(|source| FrameFilesError { folder, source })
 }

@@ -1,10 +1,11 @@
 //! Results as tables for a terminal.
 
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::path::Path;
 
 use deploy::operate::progress::bytes;
-use deploy::score::metrics::{ByIou, Contribution, Metrics, Percentiles};
+use deploy::score::metrics::{ByIou, Contribution, Metrics, PartPrecision, Percentiles};
 use fusion::Exchange;
 use fusion::Method;
 use localization::pgc::wrong_place::wrong_place_hint;
@@ -32,7 +33,8 @@ pub fn run_report(result: &RunResult) -> String {
     )
 }
 
-/// Prints the reasons for exit code 3 to standard error, `with_method` under the method of the run.
+/// Prints what was left out and the reasons for exit code 3 to standard error, `with_method` under the method of the
+/// run.
 pub fn print_loss(result: &RunResult, with_method: bool) {
     result.metrics.left_out.print();
     if let Some(sentence) = loss::sentence(result) {
@@ -163,6 +165,30 @@ pub fn table(all: &[Metrics]) -> String {
     lines(&columns, all.len()) + &comparison(all)
 }
 
+/// AP by distance and by class, a line for each part of each method.
+#[must_use]
+pub fn breakdown(all: &[Metrics]) -> String {
+    let names = ["method", "part", "objects", "AP@0.3", "AP@0.5", "AP@0.7"];
+    let side = |index: usize| if index < 2 { Side::Left } else { Side::Right };
+    let mut table =
+        TextTable::new({ names.iter().enumerate() }.map(|(index, name)| (*name, side(index))));
+    for metrics in all {
+        let parts = [(" m", &metrics.ap_by_distance), ("", &metrics.ap_by_class)];
+        for (unit, parts) in parts {
+            for (part, PartPrecision { objects, ap }) in parts {
+                let values = BY_IOU.map(|(_, of)| number(of(ap), 3));
+                let head = [
+                    metrics.method.clone(),
+                    format!("{part}{unit}"),
+                    objects.to_string(),
+                ];
+                table.row(head.into_iter().chain(values));
+            }
+        }
+    }
+    table.to_string()
+}
+
 /// Name of an IoU threshold, and its AP.
 type AtOverlap = (&'static str, fn(&ByIou) -> Option<f64>);
 const BY_IOU: [AtOverlap; 3] = [
@@ -171,9 +197,15 @@ const BY_IOU: [AtOverlap; 3] = [
     ("0.7", |ap| ap.at_70),
 ];
 
-/// Notes for a comparison: differences between runs, and messages that did not reach an ego.
+/// Notes for a comparison: the protocols, differences between runs, and messages that did not reach an ego.
 fn comparison(all: &[Metrics]) -> String {
     let mut text = String::new();
+    let protocols: BTreeSet<String> = { all.iter() }
+        .filter_map(|metrics| Some(metrics.protocol.as_ref()?.to_string()))
+        .collect();
+    for protocol in protocols {
+        let _ = writeln!(text, "{protocol}");
+    }
     if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
         let compare = match all.iter().any(|metrics| metrics.ap_streaming.is_some()) {
             true => {

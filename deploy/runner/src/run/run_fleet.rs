@@ -22,13 +22,13 @@ use deploy::score::offline_intervals;
 use deploy::score::{FrameScores, Progress, Scored, ScorerNode};
 use protocol::{Ledger, Reconciliation, RunId};
 use support::output;
+use support::provenance::Provenance;
 
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::RunError;
 use crate::run::capacity::{estimate_apart, remedies};
 use crate::run::ledger_report::LedgerReport;
 use crate::run::loss;
-use crate::scenario::fingerprint::Provenance;
 use crate::scenario::{Clock, Scenario};
 
 /// Update interval of the display.
@@ -395,9 +395,18 @@ fn write(
     let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.offline, account));
     let balance = sum.balance();
     let missed = missed(fleet, &board, &watched.ending);
+    let provenance = match fingerprint.join() {
+        Ok(Ok(provenance)) => Some(provenance),
+        Ok(Err(error)) => {
+            tracing::warn!("no hashes of what the run read: {error}");
+            None
+        }
+        Err(_) => None,
+    };
     let metrics = metrics(fleet, &board, &progress, &sum);
     let metrics = Metrics {
         ticks: metrics.answered + missed,
+        provenance: provenance.clone().map(Provenance::with_command),
         ..metrics
     };
     note(folder.write_json(deploy::score::metrics::FILE, &metrics));
@@ -408,14 +417,6 @@ fn write(
     let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
         .with_refused(refused);
     note(folder.write_json("ledger.json", &report));
-    let provenance = match fingerprint.join() {
-        Ok(Ok(provenance)) => Some(provenance),
-        Ok(Err(error)) => {
-            tracing::warn!("no hashes in scenario.yaml: {error}");
-            None
-        }
-        Err(_) => None,
-    };
     let resolved = Scenario {
         run: Some(run.clone()),
         provenance,
@@ -456,5 +457,8 @@ fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger
         last.duration_since(first).as_secs_f64()
     });
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
-    Metrics::of(board, "wall", names, seconds, sum, None)
+    Metrics {
+        protocol: Some(fleet.applied_protocol()),
+        ..Metrics::of(board, "wall", names, seconds, sum, None)
+    }
 }

@@ -10,11 +10,13 @@ use std::path::PathBuf;
 use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
+use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use link::LinkConfig;
 use protocol::RunId;
 use support::progress;
+use support::provenance::Provenance;
 
 use crate::evaluated_frame::{judge, metrics};
 use crate::fleet::{Fleet, FleetError};
@@ -185,6 +187,14 @@ fn write(
         fleet.pose_source(),
         board.seconds(),
     );
+    let provenance = fleet.provenance(&options.programs);
+    let provenance = provenance
+        .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
+        .ok();
+    let metrics = Metrics {
+        provenance: provenance.clone().map(Provenance::with_command),
+        ..metrics
+    };
     folder.write_json(deploy::score::metrics::FILE, &metrics)?;
     let report = RunReport::new(run, &metrics, board.records(), &[], None);
     folder.write_json(report::FILE, &report)?;
@@ -193,10 +203,6 @@ fn write(
         "ledger.json",
         &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)),
     )?;
-    let provenance = fleet.provenance(&options.programs);
-    let provenance = provenance
-        .inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}"))
-        .ok();
     let resolved = Scenario {
         provenance,
         ..fleet.scenario.clone()
@@ -207,7 +213,7 @@ fn write(
         folder,
         metrics,
         balance,
-        missed: 0,
+        missed: board.missed(),
         interrupted: false,
         killed: Vec::new(),
         unwritten: Vec::new(),

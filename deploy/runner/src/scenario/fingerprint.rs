@@ -1,6 +1,5 @@
-//! Provenance of a result: digests of the programs, of the data, and of every other file that it was made of.
+//! Provenance of results: collects the digests of programs, data and all other files.
 
-use std::collections::BTreeMap;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -8,68 +7,35 @@ use fusion::Method;
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
 use protocol::text::hex;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
+use support::provenance::Provenance;
 
-/// Everything that a result was made of besides its settings.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Provenance {
-    /// Version of the programs.
-    pub version: String,
-    /// Commit of the checkout that they were built in; `unknown` outside one.
-    pub commit: String,
-    /// SHA-256 of the program, or over all programs of a run.
-    pub program_sha256: String,
-    /// SHA-256 over names, capture times and whole files of the evaluated sweeps and their annotations.
-    pub data_sha256: String,
-    /// SHA-256 of every other file by its path: weights, TorchScript module, encoders and heads of the localization,
-    /// tables of poses and errors, traces of the link.
-    pub files_sha256: BTreeMap<PathBuf, String>,
-}
-
-impl Provenance {
-    /// Hashes programs and files, besides the data of that hash; without `programs`, the one that runs.
-    ///
-    /// # Errors
-    /// The first file that cannot be read, by name.
-    pub fn collect(
-        programs: &[PathBuf],
-        data_sha256: String,
-        files: impl IntoIterator<Item = PathBuf>,
-        digests: &FileDigests,
-    ) -> io::Result<Self> {
-        let files_sha256 = files
-            .into_iter()
-            .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
-            .collect::<io::Result<_>>()?;
-        Ok(Self {
-            version: env!("CARGO_PKG_VERSION").into(),
-            commit: env!("V2VLOC_COMMIT").into(),
-            program_sha256: match programs {
-                [] => digests.program_sha256()?,
-                programs => hash_programs(programs, digests)?,
-            },
-            data_sha256,
-            files_sha256,
-        })
-    }
-
-    /// SHA-256 of the settings, written as text, and of all that they were applied to.
-    #[must_use]
-    pub fn key(&self, settings: &str) -> String {
-        let mut hash = Sha256::new();
-        for part in [&self.program_sha256, &self.data_sha256] {
-            hash.update(part);
-        }
-        self.files_sha256
-            .values()
-            .for_each(|sha256| hash.update(sha256));
-        hash.update(settings);
-        hex(&hash.finalize())
-    }
+/// Hashes programs and files, besides the data of that hash; without `programs`, the one that runs.
+///
+/// # Errors
+/// The first file that cannot be read, by name.
+pub(crate) fn collect(
+    programs: &[PathBuf],
+    data_sha256: String,
+    files: impl IntoIterator<Item = PathBuf>,
+    digests: &FileDigests,
+) -> io::Result<Provenance> {
+    let files_sha256 = files
+        .into_iter()
+        .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
+        .collect::<io::Result<_>>()?;
+    Ok(Provenance {
+        command: Vec::new(),
+        version: env!("CARGO_PKG_VERSION").into(),
+        commit: env!("V2VLOC_COMMIT").into(),
+        program_sha256: match programs {
+            [] => digests.program_sha256()?,
+            programs => hash_programs(programs, digests)?,
+        },
+        data_sha256,
+        files_sha256,
+    })
 }
 
 /// Files that a method reads beside the data: its weights, its TorchScript module, those of the pose sources, and the
@@ -170,7 +136,7 @@ mod tests {
                 Some((&link, folder)),
             );
             let digests = FileDigests::default();
-            let provenance = Provenance::collect(&[], "data".into(), files, &digests).unwrap();
+            let provenance = collect(&[], "data".into(), files, &digests).unwrap();
             assert_eq!(provenance.files_sha256.len(), names.len());
             provenance.key("settings")
         };
@@ -190,7 +156,7 @@ mod tests {
     fn a_missing_file_is_named() {
         let digests = FileDigests::default();
         let missing = [PathBuf::from("/nowhere/w")];
-        let error = Provenance::collect(&[], String::new(), missing, &digests).unwrap_err();
+        let error = collect(&[], String::new(), missing, &digests).unwrap_err();
         assert!(error.to_string().starts_with("/nowhere/w"), "{error}");
     }
 }

@@ -32,7 +32,7 @@ pub use error::ScenarioError;
 pub use field_override::FieldOverride;
 pub use overrides::AgentOverrides;
 
-use crate::scenario::fingerprint::Provenance;
+use support::provenance::Provenance;
 
 /// A deployment: its scene, vehicles, method and network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]

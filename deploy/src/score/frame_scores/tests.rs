@@ -1,4 +1,5 @@
 use dataset::class_set::ClassSet;
+use protocol::Box3d;
 use protocol::{
     AgentTruth, Detection, FusedNeighbour, MisbehaviourReason, NeighbourState, SkippedNeighbour,
     TrueObject,

@@ -104,7 +104,8 @@ function judged() {
   if (!known) return null;
   const hits = found.filter((box) => box.is_hit).length;
   const missed = of.truth.filter((box) => box.is_counted && !(box.found_score >= view.score)).length;
-  return { hits, wrong: found.length - hits, missed };
+  const wrong = found.filter((box) => box.is_hit === false).length;
+  return { hits, wrong, missed };
 }
 
 function refresh() {

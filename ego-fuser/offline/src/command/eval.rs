@@ -1,5 +1,6 @@
 //! `ego-fuser eval`: AP of a method on recorded scenes.
 
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -7,18 +8,20 @@ use anyhow::Result;
 use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
-use dataset::ground_truth;
+use dataset::ground_truth::GroundTruth;
 use dataset::{self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, Scenario};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
 use perception::int8::InferencePrecision;
 use perception::weights::{KIND_KEY, Weights};
-use serde_json::json;
+use serde_json::{Value, json};
 use support::cli::BadInput;
 use support::cli::Outcome;
+use support::file_digests::FileDigests;
 use support::output;
 use support::progress;
+use support::provenance::Provenance;
 
 /// A data set with its evaluation protocol.
 struct Data {
@@ -90,9 +93,7 @@ impl Arguments {
             left_out.merge(&lost);
             rows.push(row);
         }
-        if self.json {
-            output::line(serde_json::to_string_pretty(&rows)?)?;
-        }
+        self.print_json(rows, &data, &protocols(&data, &self.weights)?)?;
         Ok(print_left_out(&left_out))
     }
 }
@@ -145,9 +146,12 @@ impl Arguments {
             );
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
-        let rule = detector.rule();
         let mut tally = Tally::default();
-        for scenario in data.iter().flat_map(|data| &data.scenarios) {
+        let all = data
+            .iter()
+            .flat_map(|data| data.scenarios.iter().map(move |scenario| (data, scenario)));
+        for (data, scenario) in all {
+            let rule = data.protocol.rule_within(detector.config().lidar_range_m);
             for tick in 0..scenario.ticks.len() {
                 let loaded =
                     scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
@@ -157,22 +161,81 @@ impl Arguments {
                 }
                 let frames: Vec<Frame> =
                     loaded.frames.into_iter().map(|(_, frame)| frame).collect();
-                let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
-                let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
+                let truth = GroundTruth::of_tick(&frames.iter().collect::<Vec<_>>(), 0, &rule);
+                let (detections, sent_bytes) = match detector.detect(&frames) {
+                    Err(error) if error.is_of_frame() => {
+                        let stem = &scenario.ticks[tick].stem;
+                        let frame = format!("scenario {}, tick {stem}", scenario.name);
+                        left_out.add_failed(&frame, &error.to_string());
+                        continue;
+                    }
+                    detected => detected?,
+                };
                 tally.frames += 1;
-                let (detections, sent_bytes) = detector.detect(&frames)?;
-                tally.scorer.add(&detections, &objects);
+                tally.scorer.add(&detections, &truth);
                 tally.payload_bytes.extend(sent_bytes);
             }
         }
         let row = tally.row("multi_scale");
-        if self.json {
-            output::line(serde_json::to_string_pretty(&[row])?)?;
-        } else {
+        if !self.json {
             print_row(&row)?;
         }
+        let area_m = detector.config().lidar_range_m;
+        let protocols: Vec<_> = data
+            .iter()
+            .map(|data| data.protocol.within(area_m))
+            .collect();
+        self.print_json(vec![row], data, &protocols)
+    }
+
+    /// Command, and digests of the program, the weights, the scripts and the evaluated data.
+    fn provenance(&self, data: &[Data]) -> Result<Provenance> {
+        let digests = FileDigests::default();
+        let scripts = self.method.iter().filter_map(|method| method.script_file());
+        let mut files_sha256 = BTreeMap::new();
+        for file in scripts.chain([self.weights.as_path()]) {
+            files_sha256.insert(file.to_owned(), digests.sha256(file)?);
+        }
+        let scenarios = data.iter().flat_map(|data| &data.scenarios);
+        let provenance = Provenance {
+            version: env!("CARGO_PKG_VERSION").into(),
+            commit: "unknown".into(),
+            program_sha256: digests.program_sha256()?,
+            data_sha256: dataset::content_sha256(scenarios, None, &digests),
+            files_sha256,
+            ..Provenance::default()
+        };
+        Ok(provenance.with_command())
+    }
+
+    /// Prints rows with the protocol of each data set and the provenance, if JSON is asked for.
+    fn print_json(
+        &self,
+        mut rows: Vec<Value>,
+        data: &[Data],
+        protocols: &[EvaluationProtocol],
+    ) -> Result<()> {
+        if !self.json {
+            return Ok(());
+        }
+        let provenance = self.provenance(data)?;
+        for row in &mut rows {
+            row["protocols"] = json!(protocols);
+            row["provenance"] = json!(provenance);
+        }
+        output::line(serde_json::to_string_pretty(&rows)?)?;
         Ok(())
     }
+}
+
+/// The protocol of each data set, as it applies to the area of the network.
+fn protocols(data: &[Data], weights: &Path) -> Result<Vec<EvaluationProtocol>> {
+    let weights = Weights::load(weights).map_err(BadInput::of)?;
+    let area_m = weights.detector_config()?.lidar_range_m;
+    Ok(data
+        .iter()
+        .map(|data| data.protocol.within(area_m))
+        .collect())
 }
 
 /// Kind of network in a weights file's metadata, if it has one.
@@ -186,7 +249,7 @@ fn evaluate(
     config: &dyn Fn(&Data) -> EvaluateConfig,
     data: &[Data],
     json: bool,
-) -> Result<(serde_json::Value, LeftOut)> {
+) -> Result<(Value, LeftOut)> {
     let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
     for data in data {
         let mut evaluator = Evaluator::new(config(data)).map_err(BadInput::of)?;
@@ -214,7 +277,7 @@ fn evaluate(
     Ok((row, left_out))
 }
 
-fn print_row(row: &serde_json::Value) -> std::io::Result<()> {
+fn print_row(row: &Value) -> std::io::Result<()> {
     let ap = |name: &str| {
         THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)))
     };
@@ -236,9 +299,13 @@ struct Tally {
 }
 
 impl Tally {
+    /// Adds a frame; one that failed has no result to add.
     fn add(&mut self, frame: &EvaluatedFrame) {
+        if frame.failure.is_some() {
+            return;
+        }
         self.frames += 1;
-        self.scorer.add(&frame.result.detections, &frame.objects);
+        self.scorer.add(&frame.result.detections, &frame.truth);
         self.payload_bytes.extend(
             frame
                 .result
@@ -248,7 +315,7 @@ impl Tally {
         );
     }
 
-    fn row(&self, method: &str) -> serde_json::Value {
+    fn row(&self, method: &str) -> Value {
         let by_iou = |ordering| {
             let found = self.scorer.average_precisions(ordering);
             THRESHOLDS

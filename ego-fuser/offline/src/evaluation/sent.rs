@@ -25,6 +25,8 @@ pub(super) struct Sent {
     pub(super) wire_bytes: u64,
     /// Of these, the bytes of the pose message.
     pub(super) pose_bytes: u64,
+    /// Reason why there is no content of a sweep that could not be computed.
+    pub(super) failure: Option<String>,
     /// Decision of the rate control, where a map had to keep within a limit.
     pub(super) rate: Option<RateChoice>,
 }
@@ -82,10 +84,11 @@ impl Sent {
     }
 }
 
-/// Messages of a vehicle for a frame: its pose and, with `exchange`, its perception.
+/// Messages of a vehicle for a frame: its pose and, with `exchange`, its perception. A sweep that cannot be computed
+/// gives no content.
 ///
 /// # Errors
-/// [`EvaluateError`] when it cannot perceive, encode or decode its own message.
+/// [`EvaluateError`] when it cannot perceive any sweep, or encode or decode its own message.
 pub(super) fn view(
     participant: &mut Participant,
     frame: &Frame,
@@ -103,43 +106,64 @@ pub(super) fn view(
     participant.observe(&input);
     let stamp = stamp(participant.cav(), frame.capture_nanos);
     let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
-    let sent = |content, payload_bytes, wire_bytes| Sent {
+    let sent = Sent {
         cav: frame.cav.clone(),
         capture_nanos: frame.capture_nanos,
         pose,
-        content,
-        payload_bytes,
-        wire_bytes,
+        content: None,
+        payload_bytes: 0,
+        wire_bytes: 0,
         pose_bytes,
+        failure: None,
         rate: None,
     };
-    let (content, bytes) = match exchange {
-        None => return Ok(sent(None, 0, 0)),
-        Some(Exchange::Points) => {
+    let Some(exchange) = exchange else {
+        return Ok(sent);
+    };
+    match perceived(participant, frame, map, exchange, (&stamp, pose)) {
+        Ok((content, rate, bytes)) => Ok(Sent {
+            content: Some(content),
+            payload_bytes: bytes - HEADER_LEN as u64,
+            wire_bytes: bytes + pose_bytes,
+            rate,
+            ..sent
+        }),
+        Err(error) if error.is_of_frame() => Ok(Sent {
+            failure: Some(error.to_string()),
+            ..sent
+        }),
+        Err(error) => Err(error),
+    }
+}
+
+/// Content of a vehicle's message as received, the decision of the rate control, and the bytes of the message.
+fn perceived(
+    participant: &mut Participant,
+    frame: &Frame,
+    map: Option<&Tensor>,
+    exchange: Exchange,
+    (stamp, pose): (&Stamp, PoseEstimate),
+) -> Result<(Content, Option<RateChoice>, u64), EvaluateError> {
+    match exchange {
+        Exchange::Points => {
             let points = participant.points(&frame.points);
-            let (message, bytes) = through_the_wire(&stamp, Points { pose, points })?;
-            (Content::Points(message.points), bytes)
+            let (message, bytes) = through_the_wire(stamp, Points { pose, points })?;
+            Ok((Content::Points(message.points), None, bytes))
         }
-        Some(Exchange::Boxes) => {
+        Exchange::Boxes => {
             let detections = participant.perceive(frame, map)?.detections;
-            let (message, bytes) = through_the_wire(&stamp, Boxes { pose, detections })?;
-            (Content::Boxes(message.detections), bytes)
+            let (message, bytes) = through_the_wire(stamp, Boxes { pose, detections })?;
+            Ok((Content::Boxes(message.detections), None, bytes))
         }
-        Some(Exchange::Features | Exchange::Nothing) => {
+        Exchange::Features | Exchange::Nothing => {
             let perception = participant.perceive(frame, map)?;
             let features = participant.write_map(perception, frame.capture_nanos)?;
-            let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
+            let (message, bytes) = through_the_wire(stamp, Bev { pose, features })?;
             let rate = message.features.rate;
             let content = Content::Features(message.features.decode(&Limits::default())?);
-            let sent = sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes);
-            return Ok(Sent { rate, ..sent });
+            Ok((content, rate, bytes))
         }
-    };
-    Ok(sent(
-        Some(content),
-        bytes - HEADER_LEN as u64,
-        bytes + pose_bytes,
-    ))
+    }
 }
 
 /// Encodes and decodes a message; returns its size on the wire too.

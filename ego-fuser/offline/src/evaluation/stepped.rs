@@ -15,10 +15,12 @@ use std::path::PathBuf;
 
 use agent::config::AgentSettings;
 use dataset::frame::Frame;
-use dataset::ground_truth;
+use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
 use link::{LinkConfig, LinkEmulator};
-use protocol::{CavId, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
+use protocol::{
+    CavId, Detections, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
+};
 use support::random::derive_seed;
 
 pub use compute::ComputeTimes;
@@ -29,7 +31,7 @@ use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
-use ego_fuser::ego::{Skipped, View};
+use ego_fuser::ego::{EgoOutput, Skipped, View};
 use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
 use ego_fuser::silence::Silence;
 use fusion::method::Exchange;
@@ -108,8 +110,8 @@ enum Pipeline {
 
 /// A tick whose sweeps are computed.
 struct Computed {
-    /// Absent where the ego's sweep cannot be read.
-    own: Option<View>,
+    /// The ego's view, or the reason why its sweep cannot be computed.
+    own: Result<View, String>,
     /// Of all vehicles that take part, the ego first.
     frames: Vec<Frame>,
     poses: Vec<PoseEstimate>,
@@ -126,7 +128,8 @@ struct Run<'a> {
     /// The next tick to compute, and the end of the range.
     next: usize,
     end: usize,
-    computed: VecDeque<Computed>,
+    /// `None` for ticks at which the ego's sweep cannot be read.
+    computed: VecDeque<Option<Computed>>,
     delivery: DelayedDelivery,
     /// Messages that arrive after the last decision, in order of time.
     arriving: VecDeque<Arrived>,
@@ -216,20 +219,20 @@ impl<'a> Run<'a> {
             .evaluator
             .sweeps(self.scenario, tick, &places, &load, with_maps)?;
         if sweeps.first().map(|ego| ego.place) != ego_place {
-            self.computed.push_back(Computed {
-                own: None,
-                frames: vec![],
-                poses: vec![],
-            });
+            self.computed.push_back(None);
             return Ok(());
         }
         let all = self.perceive(&sweeps)?;
         let mut frames: Vec<Frame> = sweeps.into_iter().map(|sweep| sweep.frame).collect();
-        let (mut poses, mut own) = (Vec::with_capacity(all.len()), None);
+        let (mut poses, mut own) = (Vec::with_capacity(all.len()), Err(String::new()));
         for (place, sent) in all.into_iter().enumerate() {
             poses.push(sent.pose);
+            if let Some(reason) = &sent.failure {
+                self.evaluator
+                    .count_failure(self.scenario, tick, &sent.cav, reason);
+            }
             if place == 0 {
-                own = sent.view();
+                own = sent.view().ok_or(sent.failure.unwrap_or_default());
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 enqueue(
@@ -250,7 +253,8 @@ impl<'a> Run<'a> {
             .load_tick(tick, self.observers.iter().copied(), &blind);
         self.evaluator.left_out.add_tick(&observers);
         frames.extend(observers.frames.into_iter().map(|(_, frame)| frame));
-        self.computed.push_back(Computed { own, frames, poses });
+        self.computed
+            .push_back(Some(Computed { own, frames, poses }));
         Ok(())
     }
 
@@ -297,20 +301,51 @@ impl<'a> Run<'a> {
         while self.next <= tick {
             self.compute()?;
         }
-        let Some(Computed {
-            own: Some(own),
-            frames,
-            poses,
-        }) = self.computed.pop_front()
-        else {
+        let Some(Computed { own, frames, poses }) = self.computed.pop_front().flatten() else {
             return Ok(None);
         };
         // Arrival of the own map.
         let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
-        let decided_nanos = self.wait(capture_nanos, ready_nanos)?;
+        let (decided_nanos, fused) = match own {
+            Ok(own) => {
+                let decided_nanos = self.wait(capture_nanos, ready_nanos)?;
+                self.ego_free_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
+                (decided_nanos, self.fuse(tick, &own)?)
+            }
+            // The ego gets no map to begin with.
+            Err(reason) => (ready_nanos, Err(reason)),
+        };
+        Ok(Some(self.evaluated(
+            tick,
+            decided_nanos,
+            (frames, poses),
+            fused,
+        )))
+    }
+
+    /// The frame of a tick that was decided at that time.
+    fn evaluated(
+        &self,
+        tick: usize,
+        decided_nanos: u64,
+        (frames, poses): (Vec<Frame>, Vec<PoseEstimate>),
+        fused: Result<Detections, String>,
+    ) -> EvaluatedFrame {
+        let compute = self.config.compute;
+        let capture_nanos = self.scenario.ticks[tick].capture_nanos;
+        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
         let done_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
-        self.ego_free_nanos = done_nanos;
-        let mut result = self.fuse(tick, &own)?;
+        let (ego, pose) = (&frames[0].cav, poses[0]);
+        let (mut result, failure) = match fused {
+            Ok(result) => (result, None),
+            Err(reason) => {
+                let number = tick - self.config.ticks.start;
+                let own = (ego, pose, capture_nanos);
+                let empty = EgoOutput::default();
+                let empty = self.evaluator.report(number, own, &[], &[], empty);
+                (empty, Some(reason))
+            }
+        };
         // Measured times would differ in every run.
         let stage = |name: &str, nanos| StageTiming {
             stage: name.into(),
@@ -322,21 +357,19 @@ impl<'a> Run<'a> {
             stage("wait", decided_nanos - ready_nanos),
             stage("fuse", done_nanos - decided_nanos),
         ];
-        let objects =
-            ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
-        let objects = objects.into_iter().map(|(_, object)| object).collect();
-        let stamp = protocol::Stamp {
-            publish_nanos: done_nanos,
-            ..stamp(&own.cav, capture_nanos)
-        };
-        Ok(Some(EvaluatedFrame {
+        let views: Vec<&Frame> = frames.iter().collect();
+        EvaluatedFrame {
             tick,
-            stamp,
+            stamp: protocol::Stamp {
+                publish_nanos: done_nanos,
+                ..stamp(ego, capture_nanos)
+            },
             result,
+            failure,
+            truth: GroundTruth::of_tick(&views, 0, &self.evaluator.rule),
             frames,
             poses,
-            objects,
-        }))
+        }
     }
 
     /// Takes in messages until the ego decides on the frame; returns the time at which it does.
@@ -347,7 +380,8 @@ impl<'a> Run<'a> {
         let mut closes_nanos = begins_nanos.max(deadline_nanos);
         loop {
             // A frame that is followed by a newer one waits no longer.
-            if let Some(next) = self.computed.iter().find_map(|next| next.own.as_ref()) {
+            let computed = self.computed.iter().flatten();
+            if let Some(next) = { computed }.find_map(|next| next.own.as_ref().ok()) {
                 let arrives_nanos = next
                     .capture_nanos
                     .saturating_add(self.config.compute.agent_nanos());
@@ -412,7 +446,12 @@ impl<'a> Run<'a> {
         neighbours.map(|member| &member.cav)
     }
 
-    fn fuse(&mut self, tick: usize, own: &View) -> Result<protocol::Detections, EvaluateError> {
+    /// The result of a tick, or the reason why it cannot be computed.
+    fn fuse(
+        &mut self,
+        tick: usize,
+        own: &View,
+    ) -> Result<Result<Detections, String>, EvaluateError> {
         let (paired, dropped) = self.pairing.pair(own.capture_nanos);
         let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
         for Paired {
@@ -426,7 +465,7 @@ impl<'a> Run<'a> {
             bytes.push((message.payload_bytes, message.wire_bytes));
             first_uses.push(is_first_use);
         }
-        let output = self.evaluator.ego.detect(own, &views)?;
+        let output = self.evaluator.detect(self.scenario, tick, own, &views)?;
         for lost in &dropped {
             self.delivery.dropped(&lost.cav, lost.reason);
         }
@@ -435,27 +474,33 @@ impl<'a> Run<'a> {
             .enumerate()
             .filter(|(index, _)| first_uses[*index])
         {
-            let left_out = output.skipped.iter().find(|(skipped, _)| *skipped == index);
+            // The messages of a frame that failed are valid.
+            let skipped = output.as_ref().map_or(&[][..], |output| &output.skipped);
+            let left_out = skipped.iter().find(|(skipped, _)| *skipped == index);
             match left_out {
                 Some((_, Skipped::Unusable(reason))) => self.delivery.dropped(&view.cav, *reason),
                 Some((_, Skipped::NotNeeded)) | None => self.delivery.received(&view.cav),
             }
         }
-        let mut result =
-            self.evaluator
-                .report(tick - self.config.ticks.start, own, &views, &bytes, output);
         let silent: Vec<CavId> = self
             .neighbours()
             .filter(|cav| views.iter().all(|view| view.cav != **cav))
             .cloned()
             .collect();
+        let mut skipped = Vec::with_capacity(silent.len());
         for cav in silent {
             self.silence.missed(&cav);
             let lost = dropped.iter().rev().find(|lost| lost.cav == cav);
             let reason = lost.map(|lost| lost.reason);
-            result.skipped.push(SkippedNeighbour { cav, reason });
+            skipped.push(SkippedNeighbour { cav, reason });
         }
-        Ok(result)
+        let number = tick - self.config.ticks.start;
+        let own = (&own.cav, own.pose, own.capture_nanos);
+        Ok(output.map(|output| {
+            let mut result = self.evaluator.report(number, own, &views, &bytes, output);
+            result.skipped.extend(skipped);
+            result
+        }))
     }
 
     /// Closes the accounting: messages still on the link or queued for a tick that will not come are in flight.

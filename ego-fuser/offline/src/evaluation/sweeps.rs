@@ -2,6 +2,7 @@
 
 use dataset::frame::Frame;
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use protocol::CavId;
 use tch::Tensor;
 
 use super::{EvaluateError, Evaluator};
@@ -40,6 +41,14 @@ impl Evaluator {
         for (place, frame) in loaded.frames {
             match self.map_of(scenario, place, tick, with_maps(place)) {
                 Ok(map) => sweeps.push(Sweep { place, frame, map }),
+                // It fails again where the vehicle perceives it, and is counted there.
+                Err(FeatureStoreError::Detector(error)) if error.is_of_frame() => {
+                    sweeps.push(Sweep {
+                        place,
+                        frame,
+                        map: None,
+                    })
+                }
                 Err(FeatureStoreError::Read(error)) => {
                     let rank = rank(place).unwrap_or(usize::MAX);
                     self.left_out.add_unreadable(rank, Problem::from(&error));
@@ -53,6 +62,19 @@ impl Evaluator {
     /// Adds the problems found when the data set was opened to the data that were left out.
     pub fn add_left_out_files(&mut self, problems: &[ReadError]) {
         self.left_out.add_files(problems);
+    }
+
+    /// Counts a frame of an agent that could not be computed, with its reason.
+    pub(super) fn count_failure(
+        &mut self,
+        scenario: &Scenario,
+        tick: usize,
+        cav: &CavId,
+        reason: &str,
+    ) {
+        let stem = scenario.ticks.get(tick).map_or("", |tick| &tick.stem);
+        let frame = format!("scenario {}, tick {stem}, agent {cav}", scenario.name);
+        self.left_out.add_failed(&frame, reason);
     }
 
     /// Data that were left out so far.

@@ -3,22 +3,21 @@
 use std::path::Path;
 
 use dataset::frame::Frame;
-use dataset::ground_truth::GroundTruthRule;
 use nalgebra::Isometry3;
 use perception::boxes::anchors::Anchors;
 use perception::boxes::decode::decode;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::crop::Crop;
-use perception::model_config::YAxis;
+use perception::detector::Heads;
+use perception::model_config::{DetectorConfig, YAxis};
 use perception::pillars::batch::PillarBatch;
 use perception::pillars::voxels::{Pillars, Voxeliser};
 use protocol::{Detection, PointCloud, Pose};
 use tch::{Device, no_grad};
 
 use super::{MultiScaleNetwork, MultiScaleOutput, Placement};
-use crate::evaluation::rule_for;
 use ego_fuser::ego::Ego;
-use fusion::model::{ModelError, flat};
+use fusion::model::ModelError;
 use fusion::points::merge_points;
 
 /// Detects in the recorded sweeps of several vehicles, by their recorded poses.
@@ -54,10 +53,10 @@ impl OfflineDetector {
         &self.network
     }
 
-    /// The objects that count over its area.
+    /// Configuration of its encoder and head.
     #[must_use]
-    pub fn rule(&self) -> GroundTruthRule {
-        rule_for(&self.network.network().config)
+    pub fn config(&self) -> &DetectorConfig {
+        &self.network.network().config
     }
 
     /// Detections in the frame of the first vehicle, and the bytes that each of the others that took part had to send:
@@ -125,10 +124,10 @@ impl OfflineDetector {
         let MultiScaleOutput {
             heads, sent_bytes, ..
         } = no_grad(|| self.network.forward(&batch, &[placement]))?;
-        let (scores, offsets) = (flat(&heads.scores, 0)?, flat(&heads.offsets, 0)?);
+        let heads = Heads::new(&heads)?;
         let mut boxes = decode(
-            &scores,
-            &offsets,
+            &heads.scores,
+            &heads.offsets,
             &self.anchors,
             self.limits.score_threshold,
         )?;

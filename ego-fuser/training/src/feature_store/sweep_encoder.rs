@@ -48,8 +48,8 @@ impl Clone for SweepEncoder {
 }
 
 impl SweepEncoder {
-    /// The message of a sweep: by agent, then by tick within its scenario. Empty for a sweep that is absent or cannot
-    /// be read, and beyond the last.
+    /// The message of a sweep: by agent, then by tick within its scenario. Empty for a sweep that is absent, or that
+    /// cannot be read or computed, and beyond the last.
     ///
     /// # Errors
     /// Those of the network and of the wire format.
@@ -71,7 +71,12 @@ impl SweepEncoder {
                     .insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
             }
         };
-        let map = detector.encode(&frame.points)?.features;
+        let map = match detector.encode_sweep(&frame.points) {
+            Ok(encoded) => encoded.features,
+            // The error comes again where the map is needed.
+            Err(error) if error.is_of_frame() => return Ok(Vec::new()),
+            Err(error) => return Err(error.into()),
+        };
         let kept = detector.to_kept(&map)?;
         self.packed(kept)
     }

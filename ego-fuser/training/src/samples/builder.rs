@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use dataset::class_set::ClassSet;
 use dataset::frame::Frame;
-use dataset::ground_truth::{self, GroundTruthRule};
+use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use perception::crop::Crop;
 use perception::model_config::DetectorConfig;
 use perception::pillars::voxels::{Pillars, Voxeliser};
@@ -98,7 +98,7 @@ pub struct Sample {
     /// Error that was added to each view's pose.
     pub offsets: Vec<Offset>,
     /// True boxes in the ego frame with their centre on the BEV grid.
-    pub objects: Vec<Box3d>,
+    pub truth: GroundTruth,
     /// Targets of those boxes.
     pub labels: Labels,
 }
@@ -193,7 +193,8 @@ impl SampleBuilder {
         let entries = self.entries(tick, if single { &agents[..1] } else { &agents[..] }, rng)?;
         let scene = self.config.augmentation.scene(rng);
         let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
-        let objects = self.objects(&frames, annotators, &changes[0]);
+        let truth = self.truth(&frames, annotators, &changes[0]);
+        let objects: Vec<Box3d> = truth.boxes().collect();
         let (mut facts, offsets) = metadata(&entries, &changes);
         // Exactly, not up to rounding: the warp recognises the identity.
         facts[0].ego_from_cav = Pose::IDENTITY;
@@ -214,7 +215,7 @@ impl SampleBuilder {
             facts,
             offsets,
             labels: self.assigner.assign(&objects),
-            objects,
+            truth,
         })
     }
 
@@ -393,13 +394,13 @@ impl SampleBuilder {
         })
     }
 
-    /// Objects annotated by `annotators`, the ego first, in the changed ego frame, on the BEV grid.
-    fn objects(
+    /// Objects annotated by `annotators`, the ego first, in the changed ego frame; those that count are on the BEV grid.
+    fn truth(
         &self,
         frames: &[Option<Frame>],
         annotators: &[usize],
         ego_view: &ViewAugment,
-    ) -> Vec<Box3d> {
+    ) -> GroundTruth {
         let range = self.detector.lidar_range_m;
         let rule = GroundTruthRule {
             x_m: ANYWHERE_M,
@@ -413,15 +414,16 @@ impl SampleBuilder {
             .iter()
             .filter_map(|&agent| frames[agent].as_ref())
             .collect();
-        let on_lattice = |object: &Box3d| {
-            (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]))
-        };
-        let merged = ground_truth::merge(&views, 0, &rule);
-        merged
-            .iter()
-            .map(|(_, object)| ego_view.box3d(object))
-            .filter(on_lattice)
-            .collect()
+        let mut truth = GroundTruth::of_tick(&views, 0, &rule);
+        for object in truth.objects.iter_mut().chain(&mut truth.ignored) {
+            object.box3d = ego_view.box3d(&object.box3d);
+        }
+        truth.objects.retain(|object| {
+            let center = object.box3d.center_m;
+            (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&center[axis]))
+        });
+        truth.area_m = [range[0], range[1], range[3], range[4]];
+        truth
     }
 }
 

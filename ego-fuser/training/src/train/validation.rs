@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use dataset::average_precision::{Ordering, Scorer};
 use fusion::model::CooperativeModel;
-use protocol::{Box3d, corners_within};
+use protocol::corners_within;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tch::no_grad;
@@ -79,18 +79,15 @@ impl Validator {
             let mut rng = ChaCha8Rng::seed_from_u64(number as u64);
             let sample = self.builder.build(tick, &mut rng)?;
             // The ground truth has the same limits as the detections.
-            let inside = |object: &&Box3d| {
-                let corners = object.corners();
-                corners_within(&corners, limits.keep_range_m)
-                    && corners.iter().all(|corner| {
-                        (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2])
-                    })
-            };
-            let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
+            let mut truth = sample.truth.clone();
+            let area_m = truth.area_m;
+            truth
+                .objects
+                .retain(|object| corners_within(&object.box3d.corners(), area_m));
             let batch = Batch::collate(vec![sample], model.network().pillar_grid())?;
             let output = no_grad(|| batch.output(model, false))?;
             for detections in model.detections(&output.head, &limits)? {
-                scorer.add(&detections, &objects);
+                scorer.add(&detections, &truth);
             }
         }
         let three = |values: Vec<f64>| std::array::from_fn(|index| values[index]);

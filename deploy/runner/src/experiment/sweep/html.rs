@@ -3,11 +3,12 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+use support::provenance::Provenance;
+
 use super::Run;
 use super::spec::Experiment;
 use super::table::{NOTES, rows};
 use super::varying::VaryingTable;
-use crate::scenario::fingerprint::Provenance;
 
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
     color:#282c34;overflow-wrap:anywhere}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{flex:1 1 20rem;min-width:0;height:auto}figure{margin:1rem 0;display:flex;flex-wrap:wrap}\
@@ -122,6 +123,7 @@ fn provenance(runs: &[Run]) -> Vec<String> {
             program_sha256,
             data_sha256,
             files_sha256,
+            command: _,
         } = &run.cell.key.provenance;
         lines.insert(format!(
             "program {version}, commit {commit}, SHA-256 {program_sha256}"

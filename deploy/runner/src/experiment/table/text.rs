@@ -5,10 +5,10 @@ use std::fmt::Write as _;
 
 use deploy::score::metrics::ByIou;
 use support::csv_file::CsvText;
+use support::provenance::Provenance;
 
 use super::{FilledRow, FilledTable};
 use crate::experiment::cell::Cell;
-use crate::scenario::fingerprint::Provenance;
 
 /// Markdown table: AP@0.3/0.5/0.7 in per cent. A single column of conditions is expanded into both orderings and bytes;
 /// several show the global ordering only. The provenance follows below.
@@ -71,6 +71,7 @@ fn provenance(table: &FilledTable) -> String {
             program_sha256,
             data_sha256,
             files_sha256,
+            command: _,
         } = &cell.key.provenance;
         frames.insert(cell.metrics.frames.to_string());
         programs.insert(format!(

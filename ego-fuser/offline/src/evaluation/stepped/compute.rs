@@ -208,8 +208,12 @@ impl Evaluator {
             let copies: Vec<View> = copies.into_iter().flatten().collect();
             sent.extend(copies);
             let began = Instant::now();
-            if let [own, neighbours @ ..] = &sent[..] {
-                self.ego.detect(own, neighbours)?;
+            // A frame that fails takes its time too; it is counted when it is evaluated.
+            if let [own, neighbours @ ..] = &sent[..]
+                && let Err(error) = self.ego.detect(own, neighbours)
+                && !error.is_of_frame()
+            {
+                return Err(error.into());
             }
             fuse.push(ms(began.elapsed()));
         }

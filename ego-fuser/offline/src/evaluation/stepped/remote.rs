@@ -256,6 +256,7 @@ impl Answer {
             payload_bytes: bytes - HEADER_LEN as u64,
             wire_bytes: bytes + pose_bytes,
             pose_bytes,
+            failure: None,
             rate,
         })
     }

@@ -1,0 +1,118 @@
+//! Overlaps of a frame: its detections within the ground-truth range against its objects, and the verdicts at a
+//! threshold.
+
+use protocol::rotated_iou::Polygon;
+use protocol::{Box3d, Detection, corners_within};
+
+use super::Verdict;
+use super::breakdown::Selection;
+use crate::ground_truth::{GroundTruth, TrueBox};
+
+/// Detections that may count, by falling score, with their overlaps.
+pub(super) struct FrameOverlaps {
+    /// Number of detections, those beyond the range included.
+    detections: usize,
+    pub(super) by_score: Vec<Candidate>,
+}
+
+/// A detection within the range.
+pub(super) struct Candidate {
+    /// Index among the detections of the frame.
+    pub(super) index: usize,
+    pub(super) score: f32,
+    /// Overlap with each object that counts, single precision as in the reference.
+    overlaps: Vec<f32>,
+    /// Largest overlap with an object of a class that does not count.
+    ignored_overlap: f32,
+}
+
+impl FrameOverlaps {
+    /// Overlaps of the detections whose corners all lie in the range.
+    pub(super) fn new(detections: &[Detection], truth: &GroundTruth) -> Self {
+        let within = detections
+            .iter()
+            .enumerate()
+            .filter(|(_, found)| corners_within(&found.box3d.corners(), truth.area_m));
+        let found = within.map(|(index, found)| (index, found.score, footprint(&found.box3d)));
+        let (objects, ignored) = (footprints(&truth.objects), footprints(&truth.ignored));
+        Self {
+            detections: detections.len(),
+            by_score: candidates(found, &objects, &ignored),
+        }
+    }
+
+    /// Overlaps of footprints that all count.
+    pub(super) fn of_footprints(detections: &[(Polygon, f32)], objects: &[Polygon]) -> Self {
+        let found = detections
+            .iter()
+            .enumerate()
+            .map(|(index, (found, score))| (index, *score, found.clone()));
+        Self {
+            detections: detections.len(),
+            by_score: candidates(found, objects, &[]),
+        }
+    }
+
+    /// Verdicts on all detections, in their order, for a part of the objects.
+    pub(super) fn judge(&self, part: &Selection, iou_threshold: f64) -> Vec<Verdict> {
+        let threshold = iou_threshold as f32;
+        let mut verdicts = vec![Verdict::Ignored; self.detections];
+        let mut taken: Vec<bool> = part.objects.iter().map(|is_in| !is_in).collect();
+        for candidate in &self.by_score {
+            let overlaps = candidate.overlaps.iter().zip(&part.objects);
+            let is_on_other = candidate.ignored_overlap >= threshold || { overlaps }
+                .any(|(overlap, is_in)| !is_in && *overlap >= threshold);
+            verdicts[candidate.index] = match take_best(&candidate.overlaps, &mut taken, threshold)
+            {
+                Some(object) => Verdict::Match(object),
+                None if is_on_other || !part.detections[candidate.index] => Verdict::Ignored,
+                None => Verdict::FalsePositive,
+            };
+        }
+        verdicts
+    }
+}
+
+/// By falling score. The sort is stable: equal scores stay in the order of the detector.
+fn candidates(
+    found: impl Iterator<Item = (usize, f32, Polygon)>,
+    objects: &[Polygon],
+    ignored: &[Polygon],
+) -> Vec<Candidate> {
+    let mut candidates: Vec<Candidate> = found
+        .map(|(index, score, found)| Candidate {
+            index,
+            score,
+            overlaps: overlaps(&found, objects).collect(),
+            ignored_overlap: overlaps(&found, ignored).fold(0.0, f32::max),
+        })
+        .collect();
+    candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+    candidates
+}
+
+fn overlaps(found: &Polygon, objects: &[Polygon]) -> impl Iterator<Item = f32> {
+    objects.iter().map(|object| found.iou(object) as f32)
+}
+
+fn footprints(objects: &[TrueBox]) -> Vec<Polygon> {
+    let boxes = objects.iter().map(|object| &object.box3d);
+    boxes.map(footprint).collect()
+}
+
+fn footprint(box3d: &Box3d) -> Polygon {
+    Polygon::footprint(&box3d.corners())
+}
+
+/// Takes the free object with the highest overlap, the first of equals, if it reaches the threshold.
+fn take_best(overlaps: &[f32], taken: &mut [bool], threshold: f32) -> Option<usize> {
+    let mut best = None;
+    for (index, &overlap) in overlaps.iter().enumerate() {
+        if !taken[index] && best.is_none_or(|(_, highest)| overlap > highest) {
+            best = Some((index, overlap));
+        }
+    }
+    let (index, _) = best.filter(|(_, overlap)| *overlap >= threshold)?;
+    taken[index] = true;
+    Some(index)
+}
