@@ -98,7 +98,7 @@ fn digest(mut file: File) -> io::Result<[u8; 32]> {
     loop {
         match file.read(&mut chunk)? {
             0 => return Ok(hash.finalize().into()),
-            count => hash.update(&chunk[..count]),
+            count => hash.update(chunk.get(..count).unwrap_or_default()),
         }
     }
 }
