@@ -204,18 +204,17 @@ pub(crate) fn read(
         ..LoadOptions::default()
     };
     let protocol = |layout: Layout| ProtocolConfig::default().resolve(layout).map_err(error);
-    let opened: Result<_, PyErr> = py.detach(|| match dataset::recording_of(&path) {
-        Some(file) => {
-            let protocol = protocol(Layout::RECORDING)?;
-            let recording =
-                RecordingFrames::open(&file, &options, protocol.clone()).map_err(error)?;
-            Ok((Source::Recording(Box::new(recording)), protocol))
+    let opened: Result<_, PyErr> = py.detach(|| {
+        let of_recording = protocol(Layout::RECORDING)?;
+        let recording = dataset::recording_of(&path)
+            .map(|file| RecordingFrames::open(&file, &options, of_recording.clone()));
+        if let Some(Ok(recording)) = recording {
+            return Ok((Source::Recording(Box::new(recording)), of_recording));
         }
-        None => {
-            let dataset = dataset::open(&path).map_err(error)?;
-            let protocol = protocol(dataset.layout)?;
-            Ok((Source::Folder(dataset), protocol))
-        }
+        // A recording that cannot be read gives the same error here.
+        let dataset = dataset::open(&path).map_err(error)?;
+        let protocol = protocol(dataset.layout)?;
+        Ok((Source::Folder(dataset), protocol))
     });
     let (source, protocol) = opened?;
     Ok(DataSet {

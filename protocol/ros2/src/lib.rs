@@ -2,7 +2,7 @@
 //!
 //! This crate links no network. The recorder writes what [`Translator`] makes of a message into bags, `v2vloc ros2`
 //! publishes the same on a ROS 2 network, and reads sweeps of LiDARs with [`read_point_cloud`], odometry and gyroscopes
-//! with [`MotionType::read`].
+//! with [`MotionType::read`], poses and transforms with [`PoseType::read`].
 //!
 //! | topic | type | from | quality of service |
 //! | --- | --- | --- | --- |
@@ -43,6 +43,7 @@ mod qos;
 mod read;
 mod ros_type;
 mod topic;
+mod transforms;
 mod translator;
 mod type_hash;
 
@@ -54,5 +55,6 @@ pub use qos::Qos;
 pub use read::ReadError;
 pub use ros_type::RosType;
 pub use topic::{RosTopic, VehicleTopic};
+pub use transforms::{PoseType, Transform, read_header};
 pub use translator::{RosMessage, Translator};
 pub use type_hash::Distribution;

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use protocol::PointCloud;
 
 use super::points::{SweepStorage, Sweeps};
-use super::{OpenOptions, ReadError, Scenario, files, single_vehicle_id};
+use super::{Layout, OpenOptions, ReadError, Scenario, files, rosbag, single_vehicle_id};
 use crate::pcd::PcdCloud;
 
 /// Endings of files of points.
@@ -89,10 +89,11 @@ enum Listed {
 
 fn listed(path: &Path) -> Result<Vec<Listed>, ReadError> {
     let about = std::fs::metadata(path).map_err(|error| ReadError::io(path, error))?;
-    if !about.is_dir() {
-        return Ok(vec![Listed::File(path.to_owned())]);
-    }
-    let clouds = clouds_in(path)?;
+    let clouds = match about.is_dir() {
+        true => clouds_in(path)?,
+        false if rosbag::is_bag(path) => Vec::new(),
+        false => vec![path.to_owned()],
+    };
     if !clouds.is_empty() {
         return Ok(clouds.into_iter().map(Listed::File).collect());
     }
@@ -118,6 +119,10 @@ fn frames_of(scenario: Scenario) -> Vec<CloudFile> {
         .flat_map(|agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick)));
     let file = |(agent, tick)| {
         let path = scenario.points_path(agent, tick, None).ok()?;
+        // Bags and recordings hold many sweeps in a file: the stem tells them apart.
+        let has_many = [Layout::ROSBAG, Layout::RECORDING].contains(&scenario.layout);
+        let stem = &scenario.ticks.get(tick)?.stem;
+        let path = if has_many { path.join(stem) } else { path };
         Some(CloudFile {
             path,
             source: Source::Frame {

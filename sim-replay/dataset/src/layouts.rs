@@ -9,7 +9,7 @@ use serde::{Serialize, Serializer};
 
 use crate::{
     Dataset, OpenOptions, ReadError, Scenario, cloud_sequence, dair, kitti_object, kitti_odometry,
-    localization, nuscenes, opv2v_family, recorded,
+    localization, nuscenes, opv2v_family, recorded, rosbag,
 };
 
 /// A layout of files on disk: its row of the table.
@@ -48,7 +48,7 @@ pub(crate) enum Reader {
 }
 
 /// All layouts, in the order in which they are tried on a folder: data sets before sequences.
-pub static LAYOUTS: [&LayoutRow; 14] = [
+pub static LAYOUTS: [&LayoutRow; 15] = [
     &recorded::RECORDING,
     &dair::DAIR,
     &dair::V2XSEQ,
@@ -63,6 +63,7 @@ pub static LAYOUTS: [&LayoutRow; 14] = [
     &localization::NCLT,
     &localization::OXFORD,
     &cloud_sequence::CLOUDS,
+    &rosbag::ROSBAG,
 ];
 
 impl Layout {
@@ -92,6 +93,8 @@ impl Layout {
     pub const KITTI_OBJECT: Self = Self(&kitti_object::KITTI_OBJECT);
     /// A recording of a live run ([`recording`]).
     pub const RECORDING: Self = Self(&recorded::RECORDING);
+    /// A bag of ROS 2.
+    pub const ROSBAG: Self = Self(&rosbag::ROSBAG);
 
     /// Its name in messages and tables.
     #[must_use]

@@ -67,7 +67,9 @@ mod presence;
 mod problem;
 mod recorded;
 mod roots;
+mod rosbag;
 mod scalar;
+mod trajectory;
 mod unfinished;
 mod v2v4real;
 mod written_pose;
@@ -147,6 +149,8 @@ pub struct Scenario {
     pub layout: Layout,
     /// Handedness of the axes of the recording.
     pub source_handedness: Handedness,
+    /// Lists of files that were joined, and by which property: clouds with poses, scans with times.
+    pub joins: Vec<String>,
     absences: Absences,
     source: Arc<dyn FrameSource>,
 }
@@ -365,6 +369,7 @@ fn single_vehicle(
         cameras: Vec::new(),
         layout,
         source_handedness: Handedness::Right,
+        joins: Vec::new(),
         absences: Absences::default(),
         source,
     }

@@ -10,6 +10,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use protocol::text::excerpt;
 
 use super::faults::Faults;
+use super::trajectory::Trajectory;
 use super::{ReadError, files};
 use support::csv_file;
 use support::rounding;
@@ -24,8 +25,8 @@ const COLUMNS: [&str; 7] = ["utime", "x", "y", "z", "roll", "pitch", "heading"];
 /// The poses of one day, in the axes of the file.
 #[derive(Debug)]
 pub(super) struct GroundTruth {
-    /// `world_from_body` by microseconds, in order.
-    poses: Vec<(u64, Isometry3<f64>)>,
+    /// `world_from_body` by microseconds.
+    poses: Trajectory,
 }
 
 /// The file that belongs to a sequence: `groundtruth_<day>.csv` in its folder or the one above, or in a folder
@@ -56,66 +57,25 @@ impl GroundTruth {
             let row = faults.take(row(path, number, &record)).flatten();
             rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
         }
-        let times: Vec<u64> = rows.iter().map(|(_, micros, _)| *micros).collect();
-        let in_order = longest_increasing(&times);
-        let mut poses = Vec::with_capacity(in_order.len());
-        let mut in_order = in_order.into_iter().peekable();
-        for (index, (number, micros, pose)) in rows.into_iter().enumerate() {
-            if in_order.next_if_eq(&index).is_some() {
-                poses.push((micros, pose));
-            } else {
-                faults.push(wrong(
-                    path,
-                    number,
-                    0,
-                    format!("{micros} is not between the times around it"),
-                ));
+        let timed = rows
+            .iter()
+            .map(|(_, micros, pose)| (*micros, *pose))
+            .collect();
+        let (poses, out_of_order) = Trajectory::new(timed, MAX_GAP_MICROS);
+        for index in out_of_order {
+            if let Some((number, micros, _)) = rows.get(index) {
+                let reason = format!("{micros} is not between the times around it");
+                faults.push(wrong(path, *number, 0, reason));
             }
         }
         faults.report("row", problems);
         Self { poses }
     }
 
-    /// The pose at a time, interpolated between the rows around it; `None` before the first, after the last and in
-    /// gaps.
+    /// The pose at a time; `None` before the first, after the last and in gaps.
     pub(super) fn at(&self, micros: u64) -> Option<Isometry3<f64>> {
-        let after = self.poses.partition_point(|(time, _)| *time < micros);
-        let (next_time, next) = self.poses.get(after)?;
-        if *next_time == micros {
-            return Some(*next);
-        }
-        let (last_time, last) = self.poses.get(after.checked_sub(1)?)?;
-        let gap = next_time - last_time;
-        let share = (micros - last_time) as f64 / gap as f64;
-        // Half a turn within a gap cannot be interpolated.
-        (gap <= MAX_GAP_MICROS)
-            .then(|| last.try_lerp_slerp(next, share, 1e-9))
-            .flatten()
+        self.poses.at(micros).ok()
     }
-}
-
-/// Indices of the longest selection of values that increase.
-#[expect(
-    clippy::indexing_slicing,
-    reason = "all indices are of `values`, and `length` is at most that of `ends`"
-)]
-fn longest_increasing(values: &[u64]) -> Vec<usize> {
-    // Of the selections of each length, the index of the smallest last value; and the predecessor of each value.
-    let mut ends: Vec<usize> = Vec::new();
-    let mut before: Vec<Option<usize>> = Vec::with_capacity(values.len());
-    for (index, value) in values.iter().enumerate() {
-        let length = ends.partition_point(|&end| values[end] < *value);
-        before.push(length.checked_sub(1).map(|shorter| ends[shorter]));
-        if length == ends.len() {
-            ends.push(index);
-        } else if *value < values[ends[length]] {
-            ends[length] = index;
-        }
-    }
-    let mut selection: Vec<usize> =
-        std::iter::successors(ends.last().copied(), |&index| before[index]).collect();
-    selection.reverse();
-    selection
 }
 
 /// Time and pose of a row; `None` if it holds no pose.
@@ -280,12 +240,5 @@ mod tests {
         let expected = "groundtruth_2012-01-15.csv:1: 1 columns, expected 7: 2 rows are left out, this is the first";
         assert_eq!(problems, [expected]);
         assert!(sound("").at(0).is_none());
-    }
-
-    #[test]
-    fn the_longest_increasing_selection_is_found() {
-        assert_eq!(longest_increasing(&[]), Vec::<usize>::new());
-        assert_eq!(longest_increasing(&[5, 1, 2, 9, 3, 3, 4]), [1, 2, 4, 6]);
-        assert_eq!(longest_increasing(&[3, 2, 1]), [2]);
     }
 }

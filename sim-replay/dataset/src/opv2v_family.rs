@@ -127,6 +127,7 @@ fn agent_folder_scenario(
         },
         layout,
         source_handedness,
+        joins: Vec::new(),
         source: if layout == Layout::V2V4REAL {
             Arc::new(V2v4Real { folder, sweeps }) as Arc<dyn FrameSource>
         } else {

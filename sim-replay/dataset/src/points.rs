@@ -132,18 +132,12 @@ impl AgentSweeps {
     /// Divisor of intensities whose type does not determine their scale.
     fn divisor(&self, storage: SweepStorage) -> f32 {
         *self.divisor.get_or_init(|| {
-            let clouds = self.files.iter().filter_map(|path| self.read_stored(storage, path).ok());
-            let clouds = clouds.filter(|cloud| !cloud.points.is_empty()).take(SAMPLES);
-            let largest = clouds.flat_map(|cloud| cloud.points.xyzi).map(|point| point[3]).fold(0.0, f32::max);
-            let divisor = intensity::divisor_of_range(largest);
-            if divisor > intensity::BYTE {
-                let file = self.files.first().map(|path| path.display().to_string()).unwrap_or_default();
-                tracing::warn!(
-                    "{file} and those after it: intensities reach {largest}, neither 0 to 1 nor 0 to 255: divided by \
-                     {divisor}; --intensity-scale states another number"
-                );
-            }
-            divisor
+            let clouds = self
+                .files
+                .iter()
+                .filter_map(|path| self.read_stored(storage, path).ok());
+            let first = self.files.first().map(PathBuf::as_path);
+            divisor_of_first(clouds, first.unwrap_or(Path::new("")))
         })
     }
 
@@ -186,6 +180,26 @@ fn read_floats(path: &Path, form: FloatForm) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     check_whole_points(path, bytes.len(), 4 * form.numbers())?;
     Ok(form.points(&bytes))
+}
+
+/// Divisor of intensities by the range of the first clouds that hold points; `path` is that of the first, for messages.
+pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Path) -> f32 {
+    let clouds = clouds
+        .filter(|cloud| !cloud.points.is_empty())
+        .take(SAMPLES);
+    let largest = clouds
+        .flat_map(|cloud| cloud.points.xyzi)
+        .map(|point| point[3])
+        .fold(0.0, f32::max);
+    let divisor = intensity::divisor_of_range(largest);
+    if divisor > intensity::BYTE {
+        let path = path.display();
+        tracing::warn!(
+            "{path} and those after it: intensities reach {largest}, neither 0 to 1 nor 0 to 255: divided by {divisor}; \
+             --intensity-scale states another number"
+        );
+    }
+    divisor
 }
 
 /// Format of a file, by the ending of its name.

@@ -32,7 +32,7 @@ pub(crate) static RECORDING: LayoutRow = LayoutRow {
 /// Name of the recording in a run folder.
 const IN_RUN_FOLDER: &str = "recording.mcap";
 
-/// The recording that `path` names: the file itself, or that of a run folder.
+/// The recording that `path` names: the file itself, or that of a run folder. A file of another program looks alike.
 #[must_use]
 pub fn recording_of(path: &Path) -> Option<PathBuf> {
     let is_recording =
@@ -44,12 +44,19 @@ pub fn recording_of(path: &Path) -> Option<PathBuf> {
 
 /// Opens the recording that a path names.
 fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
-    recording_of(path).map(|file| open(&file)).transpose()
+    let Some(file) = recording_of(path) else {
+        return Ok(None);
+    };
+    match Recording::open(&file) {
+        Ok(recording) => open(&file, recording).map(Some),
+        // A bag of ROS 2, perhaps.
+        Err(RecordingError::Foreign { .. }) => Ok(None),
+        Err(error) => Err(as_read_error(error)),
+    }
 }
 
 /// Opens a recording as a data set of one scenario. A truncated end is reported in [`Dataset::problems`].
-fn open(file: &Path) -> Result<Dataset, ReadError> {
-    let recording = Recording::open(file).map_err(as_read_error)?;
+fn open(file: &Path, recording: Recording) -> Result<Dataset, ReadError> {
     let mut problems = Vec::new();
     for damage in recording.damage() {
         problems.push(ReadError::malformed(file, damage.to_string()));
@@ -79,6 +86,7 @@ fn open(file: &Path) -> Result<Dataset, ReadError> {
         lidar_variants: Vec::new(),
         layout: Layout::RECORDING,
         source_handedness: Handedness::Right,
+        joins: Vec::new(),
         source: Arc::new(source),
     };
     Ok(Dataset {
@@ -317,8 +325,9 @@ fn message<M: Payload>(recording: &Recording, entry: &Entry) -> Result<M, ReadEr
         .map_err(|error| ReadError::malformed(recording.path(), format!("{}: {error}", entry.key)))
 }
 
-fn as_read_error(error: RecordingError) -> ReadError {
+pub(super) fn as_read_error(error: RecordingError) -> ReadError {
     match error {
+        RecordingError::Foreign { ref path, .. } => ReadError::malformed(path, error.to_string()),
         RecordingError::Io { path, source } => ReadError::Io { path, source },
         RecordingError::NotOurs { path, reason } | RecordingError::Ended { path, reason } => {
             ReadError::Layout { path, reason }

@@ -11,6 +11,7 @@ use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{Channel, MAGIC, McapError, McapResult, Message, parse_record};
 
+use super::is_own;
 use super::lengths::{self, RECORD_HEAD};
 use super::records::MAX_RECORD_BYTES;
 
@@ -46,6 +47,14 @@ impl Channels {
             channels.has_chunks = Some(has_chunks);
         }
         Ok(channels)
+    }
+
+    /// True if the summary names channels, and none of this program.
+    pub(super) fn are_foreign(&self) -> bool {
+        let mut named = (0..=u16::MAX)
+            .filter_map(|id| self.repeated.get(id))
+            .peekable();
+        named.peek().is_some() && named.all(|channel| !is_own(&channel.message_encoding))
     }
 
     pub(super) fn get(&self, id: u16) -> Option<Arc<Channel<'static>>> {

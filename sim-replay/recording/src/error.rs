@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use super::OWN_ENCODING;
+
 /// Reasons why a recording cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
@@ -13,7 +15,18 @@ pub enum RecordingError {
         /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file is no MCAP file, or not a recording of this program.
+    /// The file is an MCAP file of another program.
+    #[error(
+        "{}: no recording of v2vloc: it has no channel of encoding {OWN_ENCODING:?}{what}; sweeps and poses of a bag of \
+         ROS 2 are read wherever a data set is", path.display()
+    )]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+        /// Its first damage, if any.
+        what: String,
+    },
+    /// The file is no MCAP file, or none of its messages can be read.
     #[error("{}: {reason}", path.display())]
     NotOurs {
         /// The file.
@@ -46,6 +59,20 @@ impl RecordingError {
         Self::Io {
             path: path.into(),
             source,
+        }
+    }
+
+    pub(super) fn foreign(path: &Path, what: String) -> Self {
+        Self::Foreign {
+            path: path.into(),
+            what,
+        }
+    }
+
+    pub(super) fn not_ours(path: &Path, reason: impl Into<String>) -> Self {
+        Self::NotOurs {
+            path: path.into(),
+            reason: reason.into(),
         }
     }
 

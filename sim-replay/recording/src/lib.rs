@@ -58,6 +58,7 @@ mod damage;
 mod error;
 mod export;
 mod lengths;
+mod mcap_file;
 mod reader;
 mod records;
 mod recover;
@@ -67,6 +68,7 @@ mod writer;
 pub use damage::Damage;
 pub use error::RecordingError;
 pub use export::{ExportReport, ExportTimes, export_ros2};
+pub use mcap_file::{McapFile, Place};
 pub use reader::{Entry, Recording};
 pub use recover::{RecoverReport, recover};
 pub use sink::Store;
@@ -74,6 +76,11 @@ pub use writer::{Contents, RecordingOptions, RecordingWriter};
 
 /// Encoding of the channels that hold messages as transmitted.
 pub(crate) const OWN_ENCODING: &str = "v2vloc";
+
+/// True for channels that hold messages as transmitted.
+pub(crate) fn is_own(encoding: &str) -> bool {
+    encoding == OWN_ENCODING
+}
 
 #[cfg(test)]
 mod tests;

@@ -1,26 +1,12 @@
-//! Reader of recordings: complete, truncated, or with damaged parts.
+//! Reader of recordings.
 
-use std::collections::VecDeque;
-use std::fs::File;
-use std::ops::ControlFlow;
-use std::os::unix::fs::FileExt;
-use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::path::Path;
 
-use mcap::Message;
-use mcap::records::op;
 use protocol::{Header, Key, wire};
 
-use super::chunk::{Channels, in_words, unpack};
 use super::damage::Damage;
-use super::lengths::{self, RECORD_HEAD};
-use super::records::{RawRecord, Records};
-use super::{OWN_ENCODING, RecordingError};
-
-/// Unpacked chunks in the cache: neighbours in time are neighbours in the file.
-const KEPT_CHUNKS: usize = 4;
-/// Reading stops after more damaged parts than this.
-const MAX_DAMAGED: usize = 1000;
+use super::mcap_file::{McapFile, Messages, Place, is_foreign};
+use super::{RecordingError, is_own};
 
 /// A message of a recording: its position and its header.
 #[derive(Debug, Clone)]
@@ -31,99 +17,66 @@ pub struct Entry {
     pub header: Header,
     /// Time of arrival at the recorder, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
-    /// Index of the record that holds it.
-    holder: usize,
-    /// Index of the message in that record.
-    place: usize,
-}
-
-/// A record that holds messages: a chunk, or a message outside of chunks.
-#[derive(Debug, Clone, Copy)]
-struct Holder {
-    begin: u64,
-    /// Length of its body.
-    len: usize,
-    is_chunk: bool,
-}
-
-type Messages = Arc<Vec<Message<'static>>>;
-
-/// All channels, and a cache of the messages read last.
-#[derive(Debug)]
-struct Unpacked {
-    channels: Channels,
-    kept: VecDeque<(usize, Messages)>,
+    place: Place,
 }
 
 /// A recording whose messages can be read in any order.
 #[derive(Debug)]
 pub struct Recording {
-    path: PathBuf,
-    file: File,
-    holders: Vec<Holder>,
+    file: McapFile,
     entries: Vec<Entry>,
-    damage: Vec<Damage>,
-    unpacked: Mutex<Unpacked>,
 }
 
 impl Recording {
-    /// Opens a recording and scans all of it once; the checksum of every chunk is verified. Truncated or damaged parts
-    /// are left out, see [`Self::damage`].
+    /// Opens a recording, as [`McapFile::open`].
     ///
     /// # Errors
     /// [`RecordingError`] if the file cannot be read or is no recording of this program.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
-        let io = |source| RecordingError::io(path, source);
-        let not_ours = |reason| RecordingError::NotOurs {
-            path: path.into(),
-            reason,
-        };
-        let file = File::open(path).map_err(io)?;
-        let size = file.metadata().map_err(io)?.len();
-        let mut records = Records::open(&file, size)
-            .map_err(io)?
-            .ok_or_else(|| not_ours("not an MCAP file".into()))?;
-        let mut contents = Contents {
-            channels: Channels::of_summary(&file, size).map_err(io)?,
-            ..Contents::default()
-        };
-        contents.look_through(&mut records, size).map_err(io)?;
-        let damage = contents.damage();
-        let Contents {
-            channels,
-            has_any,
-            has_own,
-            holders,
-            entries,
-            ..
-        } = contents;
+        if is_foreign(path)? {
+            return Err(RecordingError::foreign(path, String::new()));
+        }
+        let (mut has_any, mut has_own) = (false, false);
+        let mut entries = Vec::new();
+        let file = McapFile::open(path, &mut |message, place| {
+            has_any = true;
+            if !is_own(&message.channel.message_encoding) {
+                return false;
+            }
+            has_own = true;
+            // A payload that was no valid message when it was recorded is skipped.
+            let header = wire::decode_header([message.data.as_ref()]).ok();
+            let entry = message.channel.topic.parse().ok().zip(header);
+            let entry = entry.map(|(key, header)| Entry {
+                key,
+                header,
+                arrived_nanos: message.log_time,
+                place,
+            });
+            let is_kept = entry.is_some();
+            entries.extend(entry);
+            is_kept
+        })?;
         if !has_own {
-            let what = damage
+            let what = file
+                .damage()
                 .first()
                 .map_or(String::new(), |damage| format!("; {damage}"));
-            return Err(not_ours(match has_any || damage.is_empty() {
-                true => format!("no channel of encoding {OWN_ENCODING:?} in it{what}"),
-                false => format!("none of its messages can be read{what}"),
-            }));
+            return Err(match has_any || file.damage().is_empty() {
+                true => RecordingError::foreign(path, what),
+                false => {
+                    let reason = format!("none of its messages can be read{what}");
+                    RecordingError::not_ours(path, reason)
+                }
+            });
         }
-        let unpacked = Mutex::new(Unpacked {
-            channels,
-            kept: VecDeque::new(),
-        });
-        Ok(Self {
-            path: path.into(),
-            file,
-            holders,
-            entries,
-            damage,
-            unpacked,
-        })
+        Ok(Self { file, entries })
     }
 
     /// The file.
     #[must_use]
     pub fn path(&self) -> &Path {
-        &self.path
+        self.file.path()
     }
 
     /// The messages, in the order in which they were recorded.
@@ -135,256 +88,19 @@ impl Recording {
     /// The parts of the file that could not be read, in its order.
     #[must_use]
     pub fn damage(&self) -> &[Damage] {
-        &self.damage
+        self.file.damage()
     }
 
     /// The bytes of a message, as transmitted.
     ///
     /// # Errors
-    /// [`RecordingError`] if the file has changed since it was opened.
+    /// As [`McapFile::read`].
     pub fn read(&self, entry: &Entry) -> Result<Vec<u8>, RecordingError> {
-        let messages = self.messages(entry.holder)?;
-        let message = messages
-            .get(entry.place)
-            .ok_or_else(|| self.changed(entry.holder, "the file has changed"))?;
-        Ok(message.data.to_vec())
+        self.file.read(entry.place)
     }
 
     /// The messages of all channels, in the order of the file. For [`super::recover`].
     pub(super) fn all(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
-        (0..self.holders.len()).map(|holder| self.messages(holder))
+        self.file.all()
     }
-
-    fn changed(&self, holder: usize, reason: impl Into<String>) -> RecordingError {
-        RecordingError::malformed(
-            &self.path,
-            self.holders.get(holder).map_or(0, |holder| holder.begin),
-            reason,
-        )
-    }
-
-    fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
-        let mut unpacked = self.unpacked.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
-            return Ok(Arc::clone(messages));
-        }
-        let Some(&Holder {
-            begin,
-            len,
-            is_chunk,
-        }) = self.holders.get(holder)
-        else {
-            return Err(self.changed(holder, "there is no such chunk"));
-        };
-        let mut body = vec![0; len];
-        let read = self
-            .file
-            .read_exact_at(&mut body, begin + RECORD_HEAD as u64);
-        read.map_err(|source| RecordingError::io(&self.path, source))?;
-        let messages = match is_chunk {
-            true => unpack(&body, &mut unpacked.channels).map(|(messages, _)| messages),
-            false => unpacked
-                .channels
-                .message(&body)
-                .map(|message| message.into_iter().collect()),
-        };
-        let messages = Arc::new(messages.map_err(|error| self.changed(holder, in_words(error)))?);
-        unpacked.kept.truncate(KEPT_CHUNKS - 1);
-        unpacked.kept.push_front((holder, Arc::clone(&messages)));
-        Ok(messages)
-    }
-}
-
-/// A part of the file that is skipped.
-#[derive(Debug)]
-struct Lost {
-    begin: u64,
-    end: u64,
-    /// Number of messages of this program before it.
-    before: usize,
-    reason: String,
-}
-
-/// Result of scanning a file.
-#[derive(Default)]
-struct Contents {
-    channels: Channels,
-    /// True if there are messages at all, and true if some are of this program.
-    has_any: bool,
-    has_own: bool,
-    holders: Vec<Holder>,
-    entries: Vec<Entry>,
-    lost: Vec<Lost>,
-}
-
-impl Contents {
-    /// Reads all records of a file of `size` bytes, except damaged ones.
-    fn look_through(&mut self, records: &mut Records<'_>, size: u64) -> std::io::Result<()> {
-        loop {
-            let begin = records.at();
-            let taken = match records.next()? {
-                Ok(Some(record)) => self.take(&record),
-                Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
-                Ok(None) => {
-                    self.lose((begin, begin), "the file ends without an index".into());
-                    return Ok(());
-                }
-                Err(reason) => Err(reason),
-            };
-            match taken {
-                Ok(ControlFlow::Continue(())) => {}
-                Ok(ControlFlow::Break(stated_crc)) => {
-                    self.check_whole(begin, stated_crc, records.crc());
-                    return Ok(());
-                }
-                Err(reason) if self.lost.len() >= MAX_DAMAGED => {
-                    self.lose((begin, size), format!("too many damaged parts; {reason}"));
-                    return Ok(());
-                }
-                Err(reason) => {
-                    let has_chunks = self.has_chunks();
-                    let is_own = |id| {
-                        self.channels
-                            .get(id)
-                            .is_some_and(|channel| is_own(&channel.message_encoding))
-                    };
-                    records.seek(begin + 1, |id| !has_chunks && is_own(id))?;
-                    self.lose((begin, records.at()), reason);
-                }
-            }
-        }
-    }
-
-    /// True if messages are in chunks: then those of a damaged chunk are not read one by one.
-    fn has_chunks(&self) -> bool {
-        let first = self.holders.first().map(|holder| holder.is_chunk);
-        self.channels.has_chunks.or(first).unwrap_or(false)
-    }
-
-    /// Processes the next record of the file; ends with the checksum of the data section.
-    fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
-        let RawRecord {
-            begin,
-            opcode,
-            body,
-        } = *record;
-        let added = match opcode {
-            op::DATA_END => {
-                let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
-                return Ok(ControlFlow::Break(crc));
-            }
-            op::CHUNK => {
-                let (messages, orphans) = unpack(body, &mut self.channels).map_err(in_words)?;
-                self.add(
-                    Holder {
-                        begin,
-                        len: body.len(),
-                        is_chunk: true,
-                    },
-                    &messages,
-                );
-                if orphans > 0 {
-                    let what = format!("{orphans} messages of channels that are described nowhere");
-                    self.lose((begin, begin), what);
-                }
-                Ok(())
-            }
-            op::MESSAGE => self.take_message(begin, body)?,
-            _ => self.channels.add(opcode, body),
-        };
-        added.map(|()| ControlFlow::Continue(())).map_err(in_words)
-    }
-
-    /// A message outside of chunks has no checksum but its own.
-    fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
-        let message = self.channels.message(body).map_err(in_words)?;
-        let message = message.ok_or("a message of a channel that is described nowhere")?;
-        if is_own(&message.channel.message_encoding)
-            && lengths::own_message(&message.data) != Some(message.data.len() as u64)
-        {
-            return Err("a message whose length differs from the one in its header".into());
-        }
-        self.add(
-            Holder {
-                begin,
-                len: body.len(),
-                is_chunk: false,
-            },
-            &[message],
-        );
-        Ok(Ok(()))
-    }
-
-    fn add(&mut self, holder: Holder, messages: &[Message<'static>]) {
-        self.has_any |= !messages.is_empty();
-        for (place, message) in messages.iter().enumerate() {
-            if !is_own(&message.channel.message_encoding) {
-                continue;
-            }
-            self.has_own = true;
-            // A payload that was no valid message when it was recorded is skipped.
-            let header = wire::decode_header([message.data.as_ref()]).ok();
-            if let Some((key, header)) = message.channel.topic.parse().ok().zip(header) {
-                let holder = self.holders.len();
-                self.entries.push(Entry {
-                    key,
-                    header,
-                    arrived_nanos: message.log_time,
-                    holder,
-                    place,
-                });
-            }
-        }
-        self.holders.push(holder);
-    }
-
-    /// Records a skipped part; one that continues the last one is merged with it.
-    fn lose(&mut self, (begin, end): (u64, u64), reason: String) {
-        match self.lost.last_mut() {
-            Some(last) if last.end == begin && end > begin && last.end > last.begin => {
-                last.end = end
-            }
-            _ => self.lost.push(Lost {
-                begin,
-                end,
-                before: self.entries.len(),
-                reason,
-            }),
-        }
-    }
-
-    /// Verifies the checksum of all data, for files without checksums of chunks.
-    fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
-        if stated != 0
-            && stated != found
-            && self.lost.is_empty()
-            && self.holders.iter().all(|holder| !holder.is_chunk)
-        {
-            self.lose(
-                (end, end),
-                "the checksum of the data does not agree with them".into(),
-            );
-        }
-    }
-
-    fn damage(&self) -> Vec<Damage> {
-        let first = self.entries.first().map_or(0, |entry| entry.arrived_nanos);
-        let seconds = |entry: &Entry| (entry.arrived_nanos as f64 - first as f64) * 1e-9;
-        let damage = |lost: &Lost| Damage {
-            begin_bytes: lost.begin,
-            lost_bytes: lost.end - lost.begin,
-            from_s: self
-                .entries
-                .get(..lost.before)
-                .and_then(<[Entry]>::last)
-                .map(seconds),
-            to_s: self.entries.get(lost.before).map(seconds),
-            reason: lost.reason.clone(),
-        };
-        self.lost.iter().map(damage).collect()
-    }
-}
-
-fn is_own(encoding: &str) -> bool {
-    encoding == OWN_ENCODING
 }

@@ -197,6 +197,7 @@ fn scenario(
         cameras: Vec::new(),
         layout: sides.kind.layout(),
         source_handedness: Handedness::Right,
+        joins: Vec::new(),
         source: Arc::new(Source {
             sides,
             pairs: kept,

@@ -259,6 +259,7 @@ impl Builder<'_> {
             cameras: Vec::new(),
             layout: self.layout,
             source_handedness: Handedness::Right,
+            joins: Vec::new(),
             source: Arc::new(Source {
                 root: self.root.to_owned(),
                 version: self.version.to_owned(),

@@ -80,7 +80,7 @@ impl IntensityScale {
     pub const AUTO: Self = Self { divisor: None };
 
     /// Divides the stored values. `by_range` gives the divisor of numbers whose type does not determine their scale.
-    pub(super) fn apply(self, cloud: &mut PcdCloud, by_range: impl FnOnce() -> f32) {
+    pub(crate) fn apply(self, cloud: &mut PcdCloud, by_range: impl FnOnce() -> f32) {
         let Some(origin) = &mut cloud.intensity else {
             return;
         };

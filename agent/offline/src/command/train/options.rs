@@ -55,12 +55,12 @@ pub(crate) fn run_config(
         .map_err(BadInput::of)?)
 }
 
-/// Rejects missing folders before anything is computed.
+/// Rejects missing folders and files before anything is computed.
 pub(crate) fn check_folders<'a>(
     folders: impl IntoIterator<Item = &'a PathBuf>,
 ) -> anyhow::Result<()> {
     for folder in folders {
-        std::fs::read_dir(folder)
+        std::fs::metadata(folder)
             .with_context(|| folder.display().to_string())
             .map_err(BadInput::of)?;
     }

@@ -1,0 +1,194 @@
+//! Reader of poses: where one frame is in another, from the messages of odometry, localization and transforms.
+
+use protocol::Pose;
+use re_cdr::{ByteOrder, CdrReader};
+
+use crate::read::{Body, ReadError, Reader};
+
+/// More transforms than any robot publishes in one message.
+const MAX_TRANSFORMS: u32 = 10_000;
+
+/// A message that poses can be read from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum PoseType {
+    /// `nav_msgs/Odometry`: the child frame in the frame of the header.
+    Odometry,
+    /// `geometry_msgs/PoseStamped`: a frame that is not named in the frame of the header.
+    PoseStamped,
+    /// `geometry_msgs/PoseWithCovarianceStamped`: as [`Self::PoseStamped`].
+    PoseWithCovarianceStamped,
+    /// `tf2_msgs/TFMessage`: any number of child frames, each in the frame of its own header.
+    TfMessage,
+}
+
+/// A frame in another one, at one time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Transform {
+    /// Stamp of the header, nanoseconds; 0 where the publisher sets none.
+    pub nanos: u64,
+    /// Frame of the header.
+    pub parent: String,
+    /// Child frame; `None` where the message names none.
+    pub child: Option<String>,
+    /// `parent_from_child` as published, metres; rotations of any length. See [`Pose::validate`].
+    pub parent_from_child: Pose,
+}
+
+impl PoseType {
+    /// The type of this name, `nav_msgs/msg/Odometry` for example.
+    #[must_use]
+    pub fn of_name(name: &str) -> Option<Self> {
+        match name {
+            "nav_msgs/msg/Odometry" => Some(Self::Odometry),
+            "geometry_msgs/msg/PoseStamped" => Some(Self::PoseStamped),
+            "geometry_msgs/msg/PoseWithCovarianceStamped" => Some(Self::PoseWithCovarianceStamped),
+            "tf2_msgs/msg/TFMessage" => Some(Self::TfMessage),
+            _ => None,
+        }
+    }
+
+    /// Reads a message in CDR, with its encapsulation header. Leading slashes of frames, as ROS 1 has them, are left out.
+    ///
+    /// # Errors
+    /// [`ReadError`] names the field.
+    pub fn read(self, bytes: &[u8]) -> Result<Vec<Transform>, ReadError> {
+        match Body::of(bytes)? {
+            Body::BigEndian(message) => self.read_body(message),
+            Body::LittleEndian(message) => self.read_body(message),
+        }
+    }
+
+    fn read_body<BO: ByteOrder>(
+        self,
+        mut message: Reader<'_, BO>,
+    ) -> Result<Vec<Transform>, ReadError> {
+        let count = match self {
+            Self::TfMessage => message.u32("length of transforms")?.min(MAX_TRANSFORMS),
+            _ => 1,
+        };
+        // A count that is too large ends with the message: nothing is allocated for it.
+        (0..count).map(|_| self.read_one(&mut message)).collect()
+    }
+
+    fn read_one<BO: ByteOrder>(self, message: &mut Reader<'_, BO>) -> Result<Transform, ReadError> {
+        let header = message.header()?;
+        let child = match self {
+            Self::Odometry | Self::TfMessage => {
+                let child = frame(message.read("child_frame_id", CdrReader::read_str)?);
+                Some(child).filter(|child| !child.is_empty())
+            }
+            Self::PoseStamped | Self::PoseWithCovarianceStamped => None,
+        };
+        let [x, y, z, qx, qy, qz, qw] = message.f64s(match self {
+            Self::TfMessage => "transform",
+            _ => "pose",
+        })?;
+        Ok(Transform {
+            nanos: header.nanos,
+            parent: frame(header.frame_id),
+            child,
+            parent_from_child: Pose {
+                translation_m: [x, y, z],
+                rotation_wxyz: [qw, qx, qy, qz],
+            },
+        })
+    }
+}
+
+/// Stamp (nanoseconds) and frame of a message that begins with a `std_msgs/Header`, in CDR.
+///
+/// # Errors
+/// [`ReadError`] names the field.
+pub fn read_header(bytes: &[u8]) -> Result<(u64, String), ReadError> {
+    let header = match Body::of(bytes)? {
+        Body::BigEndian(mut message) => message.header()?,
+        Body::LittleEndian(mut message) => message.header()?,
+    };
+    Ok((header.nanos, frame(header.frame_id)))
+}
+
+fn frame(name: &str) -> String {
+    name.trim_start_matches('/').to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cdr;
+
+    const POSE: Pose = Pose {
+        translation_m: [1.0, 2.0, 3.0],
+        rotation_wxyz: [0.5, 0.1, 0.2, 0.3],
+    };
+
+    fn message(child: Option<&str>) -> Vec<u8> {
+        cdr::message(|cdr| {
+            cdr::header(cdr, 5_000_000_006, "/odom");
+            if let Some(child) = child {
+                cdr.write_string(child);
+            }
+            cdr::pose(cdr, &POSE);
+            cdr::covariance(cdr, &[[0.0; 6]; 6]);
+        })
+    }
+
+    fn expected(child: Option<&str>) -> Transform {
+        Transform {
+            nanos: 5_000_000_006,
+            parent: "odom".into(),
+            child: child.map(str::to_owned),
+            parent_from_child: POSE,
+        }
+    }
+
+    #[test]
+    fn poses_are_read_with_their_frames() {
+        let odometry = message(Some("base_link"));
+        let read = |name: &str, bytes: &[u8]| PoseType::of_name(name).unwrap().read(bytes);
+        assert_eq!(
+            read("nav_msgs/msg/Odometry", &odometry).unwrap(),
+            [expected(Some("base_link"))]
+        );
+        for name in [
+            "geometry_msgs/msg/PoseStamped",
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+        ] {
+            assert_eq!(read(name, &message(None)).unwrap(), [expected(None)]);
+        }
+        assert_eq!(
+            read("nav_msgs/msg/Odometry", &message(Some(""))).unwrap(),
+            [expected(None)]
+        );
+        assert_eq!(read_header(&odometry), Ok((5_000_000_006, "odom".into())));
+        assert_eq!(PoseType::of_name("sensor_msgs/msg/Imu"), None);
+    }
+
+    #[test]
+    fn a_message_of_transforms_has_any_number() {
+        let bytes = cdr::message(|cdr| {
+            cdr.write_sequence_length(2);
+            for child in ["a", "b"] {
+                cdr::header(cdr, 5_000_000_006, "odom");
+                cdr.write_string(child);
+                cdr::pose(cdr, &POSE);
+            }
+        });
+        let read = PoseType::TfMessage.read(&bytes).unwrap();
+        assert_eq!(read, [expected(Some("a")), expected(Some("b"))]);
+    }
+
+    #[test]
+    fn a_message_that_ends_early_is_named_by_its_field() {
+        let whole = message(Some("base_link"));
+        let error = PoseType::Odometry.read(&whole[..60]).unwrap_err();
+        assert!(error.to_string().starts_with("pose at byte"), "{error}");
+        // A wrong length allocates nothing.
+        let error = PoseType::TfMessage
+            .read(&[0, 1, 0, 0, 255, 255, 255, 255])
+            .unwrap_err();
+        assert!(
+            error.to_string().starts_with("header.stamp.sec at byte"),
+            "{error}"
+        );
+    }
+}

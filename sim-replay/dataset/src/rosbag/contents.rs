@@ -1,0 +1,220 @@
+//! Sweeps and poses of a bag: the stamps of its clouds, and its transforms, as the scan finds them.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use protocol::Pose;
+use protocol::text::excerpt;
+use ros2::{PoseType, RosType, Transform, read_header};
+
+use super::scan::{Message, Place, Scan, Topic};
+use super::transforms::is_map;
+use crate::ReadError;
+use crate::faults::Faults;
+
+/// Last part of the topic of fixed transforms.
+const FIXED_TRANSFORMS: &str = "tf_static";
+/// Largest deviation of a quaternion's length from 1: tf2's own.
+const UNIT_TOLERANCE: f64 = 0.01;
+/// Largest number of topics that an error lists.
+const LISTED: usize = 12;
+
+/// A cloud: its stamp, frame and position.
+#[derive(Debug, Clone)]
+pub(super) struct CloudStamp {
+    pub(super) recorded_nanos: u64,
+    /// Stamp of its header.
+    pub(super) nanos: u64,
+    pub(super) frame: String,
+    pub(super) bytes: usize,
+    pub(super) place: Place,
+}
+
+/// A pose of one frame in another.
+#[derive(Debug, Clone)]
+pub(super) struct PoseStamp {
+    pub(super) recorded_nanos: u64,
+    /// Stamp of its header.
+    pub(super) nanos: u64,
+    pub(super) parent: String,
+    /// `None` where the message names none.
+    pub(super) child: Option<String>,
+    pub(super) parent_from_child: Isometry3<f64>,
+}
+
+/// Everything that sweeps and poses are made of.
+#[derive(Debug, Default)]
+pub(super) struct Contents {
+    path: PathBuf,
+    topics: Vec<Topic>,
+    /// By topic, in the order in which they were recorded.
+    pub(super) clouds: BTreeMap<String, Vec<CloudStamp>>,
+    /// Odometry and poses, by topic, likewise.
+    pub(super) poses: BTreeMap<String, Vec<PoseStamp>>,
+    /// Moving transforms.
+    pub(super) moving: Vec<PoseStamp>,
+    /// Fixed transforms.
+    pub(super) fixed: Vec<PoseStamp>,
+    /// Messages that cannot be read, by topic.
+    faults: BTreeMap<String, Faults>,
+}
+
+/// Use of a topic.
+enum Use {
+    Clouds,
+    Poses(PoseType),
+}
+
+impl Use {
+    fn of(topic: &Topic) -> Option<Self> {
+        if topic.type_name == RosType::PointCloud2.name() {
+            return Some(Self::Clouds);
+        }
+        PoseType::of_name(&topic.type_name).map(Self::Poses)
+    }
+}
+
+impl Contents {
+    /// Contents of the bag at `path`, before the scan.
+    pub(super) fn of(path: &Path) -> Self {
+        Self {
+            path: path.to_owned(),
+            ..Self::default()
+        }
+    }
+
+    /// Orders everything by the time of recording, and reports messages that could not be read.
+    pub(super) fn finish(&mut self, problems: &mut Vec<ReadError>) {
+        let poses = self.poses.values_mut();
+        for poses in poses.chain([&mut self.moving, &mut self.fixed]) {
+            poses.sort_by_key(|pose| pose.recorded_nanos);
+        }
+        let clouds = self.clouds.values_mut();
+        clouds.for_each(|clouds| clouds.sort_by_key(|cloud| cloud.recorded_nanos));
+        for faults in std::mem::take(&mut self.faults).into_values() {
+            faults.report("message", problems);
+        }
+    }
+
+    /// The topics with their types, for messages.
+    pub(super) fn listing(&self) -> String {
+        let shown = self.topics.iter().take(LISTED);
+        let mut names: Vec<String> = shown
+            .map(|topic| {
+                format!(
+                    "{} ({})",
+                    excerpt(&topic.name, 60),
+                    excerpt(&topic.type_name, 60)
+                )
+            })
+            .collect();
+        let more = self.topics.len().saturating_sub(LISTED);
+        if more > 0 {
+            names.push(format!("and {more} more"));
+        }
+        match names.is_empty() {
+            true => "nothing".into(),
+            false => names.join(", "),
+        }
+    }
+
+    /// True for the frame of a map or of odometry, in which clouds are no sweeps of a LiDAR.
+    pub(super) fn is_world(&self, frame: &str) -> bool {
+        let mut poses = self.poses.values().flatten();
+        is_map(frame) || frame.contains("odom") || poses.any(|pose| pose.parent == frame)
+    }
+
+    fn fault(&mut self, topic: &str, reason: String) {
+        let fault = ReadError::malformed(&self.path, format!("{topic}: {reason}"));
+        self.faults.entry(topic.to_owned()).or_default().push(fault);
+    }
+
+    fn take_transform(&mut self, topic: &str, recorded_nanos: u64, read: Transform, is_tf: bool) {
+        let parent_from_child = match isometry(&read.parent_from_child) {
+            Ok(pose) => pose,
+            Err(reason) => {
+                let child = read.child.as_deref().unwrap_or("the pose");
+                return self.fault(topic, format!("{child} in {}: {reason}", read.parent));
+            }
+        };
+        let pose = PoseStamp {
+            recorded_nanos,
+            nanos: read.nanos,
+            parent: read.parent,
+            child: read.child,
+            parent_from_child,
+        };
+        if !is_tf {
+            self.poses.entry(topic.to_owned()).or_default().push(pose);
+        } else if topic.rsplit('/').next() == Some(FIXED_TRANSFORMS) {
+            self.fixed.push(pose);
+        } else {
+            self.moving.push(pose);
+        }
+    }
+}
+
+impl Scan for Contents {
+    fn declare(&mut self, topic: &Topic) -> bool {
+        if !self.topics.contains(topic) {
+            self.topics.push(topic.clone());
+            if Use::of(topic).is_some() && !topic.is_cdr() {
+                let reason = format!("encoding {:?}, expected cdr", excerpt(&topic.encoding, 40));
+                self.fault(&topic.name, reason);
+            }
+        }
+        topic.is_cdr() && Use::of(topic).is_some()
+    }
+
+    fn take(&mut self, message: Message<'_>) {
+        let (topic, recorded_nanos) = (&message.topic.name, message.recorded_nanos);
+        let data = match message.data {
+            Ok(data) => data,
+            Err(reason) => return self.fault(topic, reason),
+        };
+        match Use::of(message.topic) {
+            Some(Use::Clouds) => match read_header(&data) {
+                Ok((nanos, frame)) => {
+                    let cloud = CloudStamp {
+                        recorded_nanos,
+                        nanos,
+                        frame,
+                        bytes: data.len(),
+                        place: message.place,
+                    };
+                    self.clouds.entry(topic.clone()).or_default().push(cloud);
+                }
+                Err(error) => self.fault(topic, error.to_string()),
+            },
+            Some(Use::Poses(pose_type)) => match pose_type.read(&data) {
+                Ok(transforms) => {
+                    let is_tf = pose_type == PoseType::TfMessage;
+                    for transform in transforms {
+                        self.take_transform(topic, recorded_nanos, transform, is_tf);
+                    }
+                }
+                Err(error) => self.fault(topic, error.to_string()),
+            },
+            None => {}
+        }
+    }
+}
+
+/// A rigid transform of a message, whose quaternion may be rounded.
+fn isometry(pose: &Pose) -> Result<Isometry3<f64>, String> {
+    let [w, x, y, z] = pose.rotation_wxyz;
+    let stored = Quaternion::new(w, x, y, z);
+    let is_unit = (stored.norm() - 1.0).abs() < UNIT_TOLERANCE;
+    if !is_unit {
+        return Err(format!(
+            "quaternion of length {:.3}, expected 1",
+            stored.norm()
+        ));
+    }
+    let [x, y, z] = pose.translation_m;
+    let rotation = UnitQuaternion::new_normalize(stored);
+    let isometry = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
+    let checked = Pose::from(isometry).validate();
+    checked.map(|_| isometry).map_err(|error| error.to_string())
+}

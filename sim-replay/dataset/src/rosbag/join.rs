@@ -1,0 +1,270 @@
+//! Join of sweeps and poses of a bag by the stamps of their headers.
+
+use std::cmp::Reverse;
+use std::path::Path;
+
+use nalgebra::Isometry3;
+use protocol::Pose;
+
+use super::contents::Contents;
+use super::pose_source::{MAX_GAP_NANOS, PoseSource, PoseSources};
+use super::scan::Place;
+use super::sweeps::SweepTopic;
+use crate::ReadError;
+use crate::trajectory::NoPose;
+
+/// Numbers of messages of two topics of clouds count as equal up to this share: a recorder begins between them.
+const SAME_COUNT: f64 = 0.95;
+
+/// The sweeps of a bag with their poses.
+#[derive(Debug)]
+pub(super) struct Joined {
+    /// In order of their stamps.
+    pub(super) sweeps: Vec<JoinedSweep>,
+    /// Topics that were chosen, and those that were not.
+    pub(super) text: String,
+}
+
+/// A sweep.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct JoinedSweep {
+    /// Stamp of its header.
+    pub(super) nanos: u64,
+    pub(super) place: Place,
+    /// `None` in a bag without poses.
+    pub(super) world_from_lidar: Option<Pose>,
+}
+
+/// Sweeps of a topic, and the poses that a source gives them.
+struct Attempt {
+    sweeps: SweepTopic,
+    sources: PoseSources,
+    /// Index of the source, and its pose at each sweep.
+    chosen: Option<(usize, SweepPoses)>,
+}
+
+/// Pose of each sweep.
+type SweepPoses = Vec<Result<Isometry3<f64>, NoPose>>;
+
+/// Joins the sweeps of one topic and the poses of one source, both chosen by what the bag holds. Sweeps without a pose are
+/// left out and counted; if no sweep has one, all are kept without.
+///
+/// # Errors
+/// [`ReadError`] with the bag's topics if no sweep is in it.
+pub(super) fn join(
+    path: &Path,
+    contents: &Contents,
+    problems: &mut Vec<ReadError>,
+) -> Result<Joined, ReadError> {
+    let topics = topics(path, contents)?;
+    let mut attempts: Vec<Attempt> = Vec::new();
+    for sweeps in topics {
+        attempts.push(Attempt::of(path, contents, sweeps));
+        if attempts
+            .last()
+            .is_some_and(|attempt| attempt.chosen.is_some())
+        {
+            break;
+        }
+    }
+    // The first topic if none has poses.
+    let with_poses = attempts.iter().position(|attempt| attempt.chosen.is_some());
+    let attempt = attempts.swap_remove(with_poses.unwrap_or(0));
+    Ok(attempt.finish(path, contents, problems))
+}
+
+/// Topics of sweeps, those with most messages first, of equally many those with most bytes. Clouds in the world's frame
+/// are no sweeps.
+fn topics(path: &Path, contents: &Contents) -> Result<Vec<SweepTopic>, ReadError> {
+    let all = contents.clouds.iter();
+    let mut topics: Vec<SweepTopic> = all
+        .map(|(topic, clouds)| SweepTopic::new(path, topic, clouds))
+        .filter(|topic| !contents.is_world(&topic.frame) && !topic.sweeps.is_empty())
+        .collect();
+    let counts = topics.iter().map(|topic| topic.sweeps.len());
+    let most = counts.max().unwrap_or(0);
+    topics.sort_by_key(|topic| {
+        let count = topic.sweeps.len();
+        let is_most = count as f64 >= SAME_COUNT * most as f64;
+        Reverse((if is_most { most } else { count }, topic.bytes()))
+    });
+    if topics.is_empty() {
+        let reason = format!(
+            "no sweep in the bag: expected sensor_msgs/PointCloud2 with stamps, in the frame of a LiDAR; its topics: {}",
+            contents.listing()
+        );
+        return Err(ReadError::malformed(path, reason));
+    }
+    Ok(topics)
+}
+
+impl Attempt {
+    /// Chooses the source: of those that give poses to at least half as many sweeps as any other, the first by rank.
+    fn of(path: &Path, contents: &Contents, sweeps: SweepTopic) -> Self {
+        let sources = PoseSources::of(path, contents, &sweeps);
+        let poses = |source: &PoseSource| -> SweepPoses {
+            let nanos = sweeps.sweeps.iter().map(|sweep| sweep.nanos);
+            nanos
+                .map(|nanos| source.at(&sources.transforms, nanos))
+                .collect()
+        };
+        let all: Vec<SweepPoses> = sources.sources.iter().map(poses).collect();
+        let counts: Vec<usize> = all.iter().map(|poses| found(poses)).collect();
+        let most = counts.iter().copied().max().unwrap_or(0);
+        let suited = sources.sources.iter().zip(&counts).enumerate();
+        let best = suited
+            .filter(|(_, (_, count))| **count > 0 && 2 * **count >= most)
+            .max_by_key(|(_, (source, _))| source.rank());
+        let chosen = best.and_then(|(index, _)| Some((index, all.get(index)?.clone())));
+        Self {
+            sweeps,
+            sources,
+            chosen,
+        }
+    }
+
+    fn finish(self, path: &Path, contents: &Contents, problems: &mut Vec<ReadError>) -> Joined {
+        let Self {
+            sweeps,
+            sources,
+            chosen,
+        } = self;
+        let fault = |reason: String| ReadError::malformed(path, reason);
+        let source = chosen
+            .as_ref()
+            .and_then(|(index, _)| sources.sources.get(*index));
+        let text = text(contents, &sweeps, &sources, source);
+        problems.extend(sweeps.problems);
+        problems.extend(sources.problems);
+        let poses: Vec<Option<Pose>> = match (&chosen, source) {
+            (Some((_, poses)), Some(source)) => {
+                problems.extend(without_pose(poses, source, &sweeps.topic).map(fault));
+                poses.iter().map(|pose| pose.ok().map(Pose::from)).collect()
+            }
+            _ => {
+                problems.push(fault(format!("{text}: the sequence is read without poses")));
+                vec![None; sweeps.sweeps.len()]
+            }
+        };
+        let has_poses = chosen.is_some();
+        let joined = sweeps
+            .sweeps
+            .iter()
+            .zip(poses)
+            .map(|(sweep, pose)| JoinedSweep {
+                nanos: sweep.nanos,
+                place: sweep.place,
+                world_from_lidar: pose,
+            });
+        Joined {
+            sweeps: joined
+                .filter(|sweep| sweep.world_from_lidar.is_some() || !has_poses)
+                .collect(),
+            text,
+        }
+    }
+}
+
+/// What is joined and what is not.
+fn text(
+    contents: &Contents,
+    sweeps: &SweepTopic,
+    sources: &PoseSources,
+    chosen: Option<&PoseSource>,
+) -> String {
+    let span = |span: Option<(u64, u64)>| match span {
+        Some((first, last)) => format!("from {:.3} s to {:.3} s", seconds(first), seconds(last)),
+        None => "none".to_owned(),
+    };
+    let of_sweeps = format!("{} ({})", sweeps.topic, sweeps.frame);
+    let others = sources
+        .sources
+        .iter()
+        .filter(|source| chosen.is_none_or(|chosen| chosen.name != source.name))
+        .map(|source| {
+            format!(
+                "{}, {} poses {}",
+                source.name,
+                source.poses,
+                span(source.span)
+            )
+        });
+    let unused = others.chain(sources.unusable.iter().cloned());
+    let clouds = contents
+        .clouds
+        .iter()
+        .filter(|(topic, _)| **topic != sweeps.topic)
+        .map(|(topic, clouds)| format!("{topic}, {} clouds", clouds.len()));
+    let unused: Vec<String> = match chosen {
+        Some(_) => unused.chain(clouds).collect(),
+        None => unused.collect(),
+    };
+    let unused = unused.join("; ");
+    match chosen {
+        Some(chosen) => {
+            let unused = match unused.is_empty() {
+                true => String::new(),
+                false => format!("; not used: {unused}"),
+            };
+            format!(
+                "sweeps of {of_sweeps} and poses of {} by the stamps of their headers, interpolated over at most {} \
+                 s{unused}",
+                chosen.name,
+                seconds(MAX_GAP_NANOS)
+            )
+        }
+        None if unused.is_empty() => format!(
+            "no poses in the bag: expected nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped, or \
+             tf2_msgs/TFMessage; its topics: {}",
+            contents.listing()
+        ),
+        None => {
+            let (first, last) = (sweeps.sweeps.first(), sweeps.sweeps.last());
+            let of_stamps = first
+                .zip(last)
+                .map(|(first, last)| (first.nanos, last.nanos));
+            format!(
+                "no pose for any of {} sweeps of {of_sweeps} {}: {unused}",
+                sweeps.sweeps.len(),
+                span(of_stamps)
+            )
+        }
+    }
+}
+
+/// Sweeps that the chosen source gives no pose, by reason.
+fn without_pose<'a>(
+    poses: &'a SweepPoses,
+    source: &'a PoseSource,
+    topic: &'a str,
+) -> impl Iterator<Item = String> + 'a {
+    [NoPose::Outside, NoPose::Gap]
+        .into_iter()
+        .filter_map(move |reason| {
+            let count = poses.iter().filter(|pose| **pose == Err(reason)).count();
+            let place = match (reason, source.span) {
+                (NoPose::Outside, Some((first, last))) => format!(
+                    "are not within the poses of {}, {:.3} s to {:.3} s",
+                    source.name,
+                    seconds(first),
+                    seconds(last)
+                ),
+                (NoPose::Outside, None) => format!("are not within the poses of {}", source.name),
+                (NoPose::Gap, _) => format!(
+                    "are in gaps of more than {} s between the poses of {}",
+                    seconds(MAX_GAP_NANOS),
+                    source.name
+                ),
+            };
+            let all = poses.len();
+            (count > 0).then(|| format!("{topic}: {count} of {all} sweeps {place}: left out"))
+        })
+}
+
+fn found(poses: &SweepPoses) -> usize {
+    poses.iter().filter(|pose| pose.is_ok()).count()
+}
+
+fn seconds(nanos: u64) -> f64 {
+    nanos as f64 * 1e-9
+}

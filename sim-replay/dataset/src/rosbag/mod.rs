@@ -1,0 +1,156 @@
+//! Bags of ROS 2 (rosbag2) that a robot recorded: sweeps of a LiDAR with odometry, poses or transforms.
+//!
+//! A bag is a folder with `metadata.yaml` and files of MCAP or SQLite, or a single file; whole files and single messages may
+//! be compressed by zstd. Sweeps are `sensor_msgs/PointCloud2`. A pose comes from `nav_msgs/Odometry`,
+//! `geometry_msgs/PoseStamped`, `geometry_msgs/PoseWithCovarianceStamped` or `tf2_msgs/TFMessage`, interpolated to the stamp
+//! of the sweep, and is carried to the frame of the sweep by the transforms of the bag.
+
+mod clock;
+mod contents;
+mod files;
+mod join;
+mod pose_source;
+mod scan;
+mod sqlite;
+mod storage;
+mod sweeps;
+#[cfg(test)]
+mod tests;
+mod transforms;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
+
+use protocol::{CavId, Handedness};
+use ros2::{SweepLimits, read_point_cloud};
+
+use self::contents::Contents;
+use self::join::{JoinedSweep, join};
+use self::storage::Storage;
+use super::files::name_below;
+use super::layouts::{LayoutRow, Reader};
+use super::points::{IntensityScale, Sweeps, divisor_of_first};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, single_vehicle};
+use crate::frame::Frame;
+use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
+
+/// A bag of ROS 2.
+pub(crate) static ROSBAG: LayoutRow = LayoutRow {
+    key: "rosbag",
+    name: "bag of ROS 2",
+    data_sets: "drives of a robot of one's own",
+    files: "a folder with metadata.yaml of rosbag2, or a file <name>.mcap or .db3 (.zstd): sensor_msgs/PointCloud2 with \
+            nav_msgs/Odometry, tf2_msgs/TFMessage, geometry_msgs/PoseStamped or PoseWithCovarianceStamped",
+    protocol: "opv2v",
+    reader: Some(Reader::Sequence {
+        is_one: files::is_bag,
+        open,
+    }),
+};
+
+/// Limits of a sweep: those of a file.
+const LIMITS: SweepLimits = SweepLimits {
+    max_points: 1 << 26,
+    max_abs_value: f32::MAX,
+};
+
+/// Sweeps and poses of a bag.
+#[derive(Debug)]
+struct Bag {
+    storage: Storage,
+    /// By stamp.
+    sweeps: BTreeMap<u64, JoinedSweep>,
+    scale: IntensityScale,
+    divisor: OnceLock<f32>,
+}
+
+/// True for a file of a bag, and for a folder with one.
+pub(super) fn is_bag(path: &Path) -> bool {
+    files::is_bag(path)
+}
+
+fn open(
+    root: &Path,
+    path: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
+    let files = files::files_of(path, problems)?;
+    let mut contents = Contents::of(path);
+    let storage = Storage::open(&files, &mut contents, problems)?;
+    contents.finish(problems);
+    let joined = join(path, &contents, problems)?;
+    let sweeps: BTreeMap<u64, JoinedSweep> = joined
+        .sweeps
+        .into_iter()
+        .map(|sweep| (sweep.nanos, sweep))
+        .collect();
+    let ticks = sweeps.keys().map(|nanos| Tick {
+        stem: nanos.to_string(),
+        capture_nanos: *nanos,
+    });
+    let ticks = ticks.collect();
+    let source = Bag {
+        storage,
+        sweeps,
+        scale: options.intensity_scale,
+        divisor: OnceLock::new(),
+    };
+    let mut scenario = single_vehicle(
+        name_below(root, path),
+        Layout::ROSBAG,
+        ticks,
+        Arc::new(source),
+    );
+    scenario.joins = vec![joined.text];
+    Ok(scenario)
+}
+
+impl Bag {
+    fn sweep(&self, tick: &Tick) -> Result<&JoinedSweep, ReadError> {
+        let lacks = || ReadError::malformed(Path::new(""), format!("no sweep at {}", tick.stem));
+        self.sweeps.get(&tick.capture_nanos).ok_or_else(lacks)
+    }
+
+    /// A sweep with the intensities as stored.
+    fn read_stored(&self, sweep: &JoinedSweep) -> Result<PcdCloud, ReadError> {
+        let bytes = self.storage.read(sweep.place)?;
+        let read = read_point_cloud(&bytes, LIMITS).map_err(|error| {
+            let reason = format!("sweep {}: {error}", sweep.nanos);
+            ReadError::malformed(self.storage.path(sweep.place), reason)
+        })?;
+        Ok(PcdCloud {
+            points: read.points,
+            dropped: read.without_return + read.too_far,
+            intensity: Some(IntensityOrigin::stored("intensity", IntensityKind::Number)),
+            form: "PointCloud2",
+            ..PcdCloud::default()
+        })
+    }
+}
+
+impl FrameSource for Bag {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = self.sweep(tick)?.world_from_lidar;
+        Ok(frame)
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
+        let mut cloud = self.read_stored(self.sweep(tick)?)?;
+        self.scale.apply(&mut cloud, || {
+            *self.divisor.get_or_init(|| {
+                let sweeps = self.sweeps.values().take(Sweeps::MOST_TRIED);
+                let clouds = sweeps.filter_map(|sweep| self.read_stored(sweep).ok());
+                divisor_of_first(clouds, &self.points_path(agent, tick, None))
+            })
+        });
+        Ok(cloud)
+    }
+
+    fn points_path(&self, _: &CavId, tick: &Tick, _: Option<&str>) -> PathBuf {
+        let path = |sweep: &JoinedSweep| self.storage.path(sweep.place).to_owned();
+        self.sweep(tick).map(path).unwrap_or_default()
+    }
+}

@@ -1,0 +1,87 @@
+//! SQLite storage of a bag: tables `topics` and `messages`, as rosbag2 writes them.
+
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+
+use rusqlite::{Connection, OpenFlags, Result, Row};
+
+use super::files::unpacked_message;
+use super::scan::{At, Message, Place, Scan, Topic};
+use crate::ReadError;
+
+/// An open database.
+#[derive(Debug)]
+pub(super) struct SqliteFile(Mutex<Connection>);
+
+impl SqliteFile {
+    /// Opens a database, file number `file` of its bag, and scans it, topic by topic in the order of the rows. Rows after
+    /// one that cannot be read are left out, with a problem; `name` is the file in errors.
+    pub(super) fn scan(
+        (name, path): (&Path, &Path),
+        file: usize,
+        scan: &mut dyn Scan,
+        problems: &mut Vec<ReadError>,
+    ) -> std::result::Result<Self, ReadError> {
+        let fault = |error| ReadError::malformed(name, format!("SQLite: {error}"));
+        let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let connection = Connection::open_with_flags(path, flags).map_err(fault)?;
+        for (id, topic) in topics(&connection).map_err(fault)? {
+            if !scan.declare(&topic) {
+                continue;
+            }
+            if let Err(error) = messages(&connection, (id, &topic), file, scan) {
+                let rest = format!("the rows of {} after it are left out", topic.name);
+                problems.push(fault(error).with_consequence(&rest));
+            }
+        }
+        Ok(Self(Mutex::new(connection)))
+    }
+
+    /// The bytes of the message in a row.
+    pub(super) fn read(&self, row: i64) -> Result<Vec<u8>> {
+        let connection = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut statement = connection.prepare("SELECT data FROM messages WHERE id = ?1")?;
+        statement.query_row([row], |row| row.get(0))
+    }
+}
+
+/// Number and description of each topic.
+fn topics(connection: &Connection) -> Result<Vec<(i64, Topic)>> {
+    let mut statement =
+        connection.prepare("SELECT id, name, type, serialization_format FROM topics")?;
+    statement.query_map([], topic)?.collect()
+}
+
+fn topic(row: &Row<'_>) -> Result<(i64, Topic)> {
+    let topic = Topic {
+        name: row.get(1)?,
+        type_name: row.get(2)?,
+        encoding: row.get(3)?,
+    };
+    Ok((row.get(0)?, topic))
+}
+
+fn messages(
+    connection: &Connection,
+    (id, topic): (i64, &Topic),
+    file: usize,
+    scan: &mut dyn Scan,
+) -> Result<()> {
+    let mut statement = connection
+        .prepare("SELECT id, timestamp, data FROM messages WHERE topic_id = ?1 ORDER BY id")?;
+    let mut rows = statement.query([id])?;
+    while let Some(row) = rows.next()? {
+        let recorded_nanos: i64 = row.get(1)?;
+        let data = row.get_ref(2)?.as_blob()?;
+        scan.take(Message {
+            topic,
+            recorded_nanos: u64::try_from(recorded_nanos).unwrap_or(0),
+            data: unpacked_message(data).map_err(|error| error.to_string()),
+            place: Place {
+                file,
+                at: At::Row(row.get(0)?),
+            },
+        });
+    }
+    Ok(())
+}

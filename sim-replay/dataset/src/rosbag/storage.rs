@@ -1,0 +1,139 @@
+//! Storage of a bag: its files, scanned once in order, and their messages by position.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use recording::McapFile;
+
+use super::files::{Kind, Unpacked, unpacked_message};
+use super::scan::{At, Message, Place, Scan, Topic};
+use super::sqlite::SqliteFile;
+use crate::ReadError;
+use crate::recorded::as_read_error;
+
+/// The files of a bag.
+pub(super) struct Storage(Vec<BagFile>);
+
+struct BagFile {
+    path: PathBuf,
+    form: Form,
+    /// An unpacked copy is deleted with the value.
+    _unpacked: Unpacked,
+}
+
+enum Form {
+    Mcap(McapFile),
+    Sqlite(SqliteFile),
+}
+
+impl Storage {
+    /// Opens files and scans them. Files and parts of files that cannot be read are left out, with a problem.
+    ///
+    /// # Errors
+    /// [`ReadError`] of the first file if none can be read.
+    pub(super) fn open(
+        paths: &[PathBuf],
+        scan: &mut dyn Scan,
+        problems: &mut Vec<ReadError>,
+    ) -> Result<Self, ReadError> {
+        let (mut files, mut faults) = (Vec::new(), Vec::new());
+        for path in paths {
+            match BagFile::open(path, files.len(), scan, problems) {
+                Ok(file) => files.push(file),
+                Err(fault) => faults.push(fault),
+            }
+        }
+        if files.is_empty() && !faults.is_empty() {
+            return Err(faults.swap_remove(0));
+        }
+        let faults = faults.into_iter();
+        problems.extend(faults.map(|fault| fault.with_consequence("the file is left out")));
+        Ok(Self(files))
+    }
+
+    /// The file of a message.
+    pub(super) fn path(&self, place: Place) -> &Path {
+        self.0
+            .get(place.file)
+            .map_or(Path::new(""), |file| &file.path)
+    }
+
+    /// The bytes of a message in CDR.
+    pub(super) fn read(&self, place: Place) -> Result<Vec<u8>, ReadError> {
+        let fault = |reason: String| ReadError::malformed(self.path(place), reason);
+        let data = match (self.0.get(place.file).map(|file| &file.form), place.at) {
+            (Some(Form::Mcap(file)), At::Mcap(at)) => file.read(at).map_err(as_read_error)?,
+            (Some(Form::Sqlite(file)), At::Row(row)) => file
+                .read(row)
+                .map_err(|error| fault(format!("SQLite: row {row} of messages: {error}")))?,
+            _ => return Err(fault("the bag has no such message".into())),
+        };
+        let message = unpacked_message(&data).map_err(|error| fault(error.to_string()))?;
+        Ok(message.into_owned())
+    }
+}
+
+impl BagFile {
+    fn open(
+        path: &Path,
+        index: usize,
+        scan: &mut dyn Scan,
+        problems: &mut Vec<ReadError>,
+    ) -> Result<Self, ReadError> {
+        let kind = Kind::of(path);
+        if kind == Some(Kind::Ros1) {
+            let reason = "a bag of ROS 1: `rosbags-convert --src FILE.bag --dst FOLDER` makes one of ROS 2 of it";
+            return Err(ReadError::malformed(path, reason));
+        }
+        let unpacked = Unpacked::of(path)?;
+        let paths = (path, unpacked.path());
+        let form = match kind {
+            Some(Kind::Sqlite) => Form::Sqlite(SqliteFile::scan(paths, index, scan, problems)?),
+            _ => Form::Mcap(scan_mcap(paths, index, scan, problems)?),
+        };
+        Ok(Self {
+            path: path.to_owned(),
+            form,
+            _unpacked: unpacked,
+        })
+    }
+}
+
+fn scan_mcap(
+    (name, path): (&Path, &Path),
+    file: usize,
+    scan: &mut dyn Scan,
+    problems: &mut Vec<ReadError>,
+) -> Result<McapFile, ReadError> {
+    let mcap = McapFile::open(path, &mut |message, at| {
+        let channel = &message.channel;
+        let schema = channel.schema.as_ref();
+        let topic = Topic {
+            name: channel.topic.clone(),
+            type_name: schema.map_or(String::new(), |schema| schema.name.clone()),
+            encoding: channel.message_encoding.clone(),
+        };
+        let is_wanted = scan.declare(&topic);
+        if is_wanted {
+            let at = At::Mcap(at);
+            scan.take(Message {
+                topic: &topic,
+                recorded_nanos: message.log_time,
+                data: unpacked_message(&message.data).map_err(|error| error.to_string()),
+                place: Place { file, at },
+            });
+        }
+        is_wanted
+    });
+    let mcap = mcap.map_err(as_read_error)?;
+    let damage = mcap.damage().iter().map(ToString::to_string);
+    problems.extend(damage.map(|damage| ReadError::malformed(name, damage)));
+    Ok(mcap)
+}
+
+impl fmt::Debug for Storage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let paths = self.0.iter().map(|file| &file.path);
+        f.debug_list().entries(paths).finish()
+    }
+}

@@ -1,0 +1,358 @@
+//! MCAP file of any program: scanned once, then its messages in any order; complete, truncated, or with damaged parts.
+
+use std::collections::VecDeque;
+use std::fs::File;
+use std::ops::ControlFlow;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use mcap::Message;
+use mcap::records::op;
+
+use super::RecordingError;
+use super::chunk::{Channels, in_words, unpack};
+use super::damage::Damage;
+use super::is_own;
+use super::lengths::{self, RECORD_HEAD};
+use super::records::{RawRecord, Records};
+
+/// Unpacked chunks in the cache: neighbours in time are neighbours in the file.
+const KEPT_CHUNKS: usize = 4;
+/// Reading stops after more damaged parts than this.
+const MAX_DAMAGED: usize = 1000;
+
+/// Position of a message in an MCAP file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Place {
+    /// Index of the record that holds it.
+    holder: usize,
+    /// Index of the message in that record.
+    index: usize,
+}
+
+/// A record that holds messages: a chunk, or a message outside of chunks.
+#[derive(Debug, Clone, Copy)]
+struct Holder {
+    begin: u64,
+    /// Length of its body.
+    len: usize,
+    is_chunk: bool,
+}
+
+/// Messages of one record.
+pub(super) type Messages = Arc<Vec<Message<'static>>>;
+
+/// All channels, and a cache of the messages read last.
+#[derive(Debug)]
+struct Unpacked {
+    channels: Channels,
+    kept: VecDeque<(usize, Messages)>,
+}
+
+/// An MCAP file of any program, whose messages can be read in any order.
+#[derive(Debug)]
+pub struct McapFile {
+    path: PathBuf,
+    file: File,
+    holders: Vec<Holder>,
+    damage: Vec<Damage>,
+    unpacked: Mutex<Unpacked>,
+}
+
+/// True for a file of another program, as far as its summary shows: no message is read.
+pub(super) fn is_foreign(path: &Path) -> Result<bool, RecordingError> {
+    let io = |source| RecordingError::io(path, source);
+    let file = File::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
+    Ok(Channels::of_summary(&file, size).map_err(io)?.are_foreign())
+}
+
+impl McapFile {
+    /// Opens a file and scans all of it once; the checksum of every chunk is verified. Truncated or damaged parts are left
+    /// out, see [`Self::damage`]. `visit` receives each message and its position, and returns true for those between which
+    /// damage is timed.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the file cannot be read or is no MCAP file.
+    pub fn open(
+        path: &Path,
+        visit: &mut dyn FnMut(&Message<'static>, Place) -> bool,
+    ) -> Result<Self, RecordingError> {
+        let io = |source| RecordingError::io(path, source);
+        let file = File::open(path).map_err(io)?;
+        let size = file.metadata().map_err(io)?.len();
+        let mut records = Records::open(&file, size)
+            .map_err(io)?
+            .ok_or_else(|| RecordingError::not_ours(path, "not an MCAP file"))?;
+        let mut contents = Contents {
+            channels: Channels::of_summary(&file, size).map_err(io)?,
+            holders: Vec::new(),
+            arrivals: Vec::new(),
+            lost: Vec::new(),
+            visit,
+        };
+        contents.look_through(&mut records, size).map_err(io)?;
+        let damage = contents.damage();
+        let Contents {
+            channels, holders, ..
+        } = contents;
+        let unpacked = Mutex::new(Unpacked {
+            channels,
+            kept: VecDeque::new(),
+        });
+        Ok(Self {
+            path: path.into(),
+            file,
+            holders,
+            damage,
+            unpacked,
+        })
+    }
+
+    /// The file.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The parts of the file that could not be read, in its order.
+    #[must_use]
+    pub fn damage(&self) -> &[Damage] {
+        &self.damage
+    }
+
+    /// The bytes of a message.
+    ///
+    /// # Errors
+    /// [`RecordingError`] if the file has changed since it was opened.
+    pub fn read(&self, place: Place) -> Result<Vec<u8>, RecordingError> {
+        let messages = self.messages(place.holder)?;
+        let message = messages
+            .get(place.index)
+            .ok_or_else(|| self.changed(place.holder, "the file has changed"))?;
+        Ok(message.data.to_vec())
+    }
+
+    /// The messages of all channels, in the order of the file.
+    pub(super) fn all(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
+        (0..self.holders.len()).map(|holder| self.messages(holder))
+    }
+
+    fn changed(&self, holder: usize, reason: impl Into<String>) -> RecordingError {
+        RecordingError::malformed(
+            &self.path,
+            self.holders.get(holder).map_or(0, |holder| holder.begin),
+            reason,
+        )
+    }
+
+    fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
+        let mut unpacked = self.unpacked.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
+            return Ok(Arc::clone(messages));
+        }
+        let Some(&Holder {
+            begin,
+            len,
+            is_chunk,
+        }) = self.holders.get(holder)
+        else {
+            return Err(self.changed(holder, "there is no such chunk"));
+        };
+        let mut body = vec![0; len];
+        let read = self
+            .file
+            .read_exact_at(&mut body, begin + RECORD_HEAD as u64);
+        read.map_err(|source| RecordingError::io(&self.path, source))?;
+        let messages = match is_chunk {
+            true => unpack(&body, &mut unpacked.channels).map(|(messages, _)| messages),
+            false => unpacked
+                .channels
+                .message(&body)
+                .map(|message| message.into_iter().collect()),
+        };
+        let messages = Arc::new(messages.map_err(|error| self.changed(holder, in_words(error)))?);
+        unpacked.kept.truncate(KEPT_CHUNKS - 1);
+        unpacked.kept.push_front((holder, Arc::clone(&messages)));
+        Ok(messages)
+    }
+}
+
+/// A part of the file that is skipped.
+#[derive(Debug)]
+struct Lost {
+    begin: u64,
+    end: u64,
+    /// Number of timed messages before it.
+    before: usize,
+    reason: String,
+}
+
+/// Result of scanning a file.
+struct Contents<'a> {
+    channels: Channels,
+    holders: Vec<Holder>,
+    /// Times of the messages between which damage is timed.
+    arrivals: Vec<u64>,
+    lost: Vec<Lost>,
+    visit: &'a mut dyn FnMut(&Message<'static>, Place) -> bool,
+}
+
+impl Contents<'_> {
+    /// Reads all records of a file of `size` bytes, except damaged ones.
+    fn look_through(&mut self, records: &mut Records<'_>, size: u64) -> std::io::Result<()> {
+        loop {
+            let begin = records.at();
+            let taken = match records.next()? {
+                Ok(Some(record)) => self.take(&record),
+                Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
+                Ok(None) => {
+                    self.lose((begin, begin), "the file ends without an index".into());
+                    return Ok(());
+                }
+                Err(reason) => Err(reason),
+            };
+            match taken {
+                Ok(ControlFlow::Continue(())) => {}
+                Ok(ControlFlow::Break(stated_crc)) => {
+                    self.check_whole(begin, stated_crc, records.crc());
+                    return Ok(());
+                }
+                Err(reason) if self.lost.len() >= MAX_DAMAGED => {
+                    self.lose((begin, size), format!("too many damaged parts; {reason}"));
+                    return Ok(());
+                }
+                Err(reason) => {
+                    let has_chunks = self.has_chunks();
+                    let is_own = |id| {
+                        self.channels
+                            .get(id)
+                            .is_some_and(|channel| is_own(&channel.message_encoding))
+                    };
+                    records.seek(begin + 1, |id| !has_chunks && is_own(id))?;
+                    self.lose((begin, records.at()), reason);
+                }
+            }
+        }
+    }
+
+    /// True if messages are in chunks: then those of a damaged chunk are not read one by one.
+    fn has_chunks(&self) -> bool {
+        let first = self.holders.first().map(|holder| holder.is_chunk);
+        self.channels.has_chunks.or(first).unwrap_or(false)
+    }
+
+    /// Processes the next record of the file; ends with the checksum of the data section.
+    fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
+        let RawRecord {
+            begin,
+            opcode,
+            body,
+        } = *record;
+        let added = match opcode {
+            op::DATA_END => {
+                let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
+                return Ok(ControlFlow::Break(crc));
+            }
+            op::CHUNK => {
+                let (messages, orphans) = unpack(body, &mut self.channels).map_err(in_words)?;
+                self.add(
+                    Holder {
+                        begin,
+                        len: body.len(),
+                        is_chunk: true,
+                    },
+                    &messages,
+                );
+                if orphans > 0 {
+                    let what = format!("{orphans} messages of channels that are described nowhere");
+                    self.lose((begin, begin), what);
+                }
+                Ok(())
+            }
+            op::MESSAGE => self.take_message(begin, body)?,
+            _ => self.channels.add(opcode, body),
+        };
+        added.map(|()| ControlFlow::Continue(())).map_err(in_words)
+    }
+
+    /// A message outside of chunks has no checksum but its own.
+    fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
+        let message = self.channels.message(body).map_err(in_words)?;
+        let message = message.ok_or("a message of a channel that is described nowhere")?;
+        if is_own(&message.channel.message_encoding)
+            && lengths::own_message(&message.data) != Some(message.data.len() as u64)
+        {
+            return Err("a message whose length differs from the one in its header".into());
+        }
+        self.add(
+            Holder {
+                begin,
+                len: body.len(),
+                is_chunk: false,
+            },
+            &[message],
+        );
+        Ok(Ok(()))
+    }
+
+    fn add(&mut self, holder: Holder, messages: &[Message<'static>]) {
+        for (index, message) in messages.iter().enumerate() {
+            let place = Place {
+                holder: self.holders.len(),
+                index,
+            };
+            if (self.visit)(message, place) {
+                self.arrivals.push(message.log_time);
+            }
+        }
+        self.holders.push(holder);
+    }
+
+    /// Records a skipped part; one that continues the last one is merged with it.
+    fn lose(&mut self, (begin, end): (u64, u64), reason: String) {
+        match self.lost.last_mut() {
+            Some(last) if last.end == begin && end > begin && last.end > last.begin => {
+                last.end = end
+            }
+            _ => self.lost.push(Lost {
+                begin,
+                end,
+                before: self.arrivals.len(),
+                reason,
+            }),
+        }
+    }
+
+    /// Verifies the checksum of all data, for files without checksums of chunks.
+    fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
+        if stated != 0
+            && stated != found
+            && self.lost.is_empty()
+            && self.holders.iter().all(|holder| !holder.is_chunk)
+        {
+            self.lose(
+                (end, end),
+                "the checksum of the data does not agree with them".into(),
+            );
+        }
+    }
+
+    fn damage(&self) -> Vec<Damage> {
+        let first = self.arrivals.first().map_or(0, |nanos| *nanos);
+        let seconds = |nanos: &u64| (*nanos as f64 - first as f64) * 1e-9;
+        let damage = |lost: &Lost| Damage {
+            begin_bytes: lost.begin,
+            lost_bytes: lost.end - lost.begin,
+            from_s: self
+                .arrivals
+                .get(..lost.before)
+                .and_then(<[u64]>::last)
+                .map(seconds),
+            to_s: self.arrivals.get(lost.before).map(seconds),
+            reason: lost.reason.clone(),
+        };
+        self.lost.iter().map(damage).collect()
+    }
+}
