@@ -40,6 +40,10 @@ pub(super) struct ScenarioFolder {
 /// Folders of scenarios at or below `dir`. Folders below that cannot be listed are left out.
 pub(super) fn find(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<PathBuf>, ReadError> {
     let mut found = Vec::new();
+    // A bag may be a single file.
+    if dir.is_file() {
+        return Ok(found);
+    }
     find_below(dir, &files::list(dir)?, MAX_DEPTH, &mut found, problems);
     Ok(found)
 }

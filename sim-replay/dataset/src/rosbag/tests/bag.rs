@@ -90,7 +90,7 @@ impl Bag {
             for (offset, value) in [(0, x), (4, 2.0), (8, 3.0), (16, 51.0)] {
                 point[offset..offset + 4].copy_from_slice(&value.to_le_bytes());
             }
-            cdr.write_byte_sequence(&point);
+            cdr.write_bytes(&point);
             cdr.write_bool(true);
         });
         self.add(topic, "sensor_msgs/msg/PointCloud2", recorded_nanos, data);
