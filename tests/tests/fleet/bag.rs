@@ -69,13 +69,22 @@ fn poses(scenario: &Scenario) -> Vec<([f64; 3], f64)> {
         ..LoadOptions::default()
     };
     (0..scenario.ticks.len())
-        .map(|tick| scenario.load(0, tick, &blind).unwrap().world_from_lidar.unwrap())
+        .map(|tick| {
+            scenario
+                .load(0, tick, &blind)
+                .unwrap()
+                .world_from_lidar
+                .unwrap()
+        })
         .map(|pose| (pose.translation_m, pose.yaw_rad()))
         .collect()
 }
 
 fn distance_m(one: [f64; 3], other: [f64; 3]) -> f64 {
-    let squares = one.iter().zip(other).map(|(one, other)| (one - other).powi(2));
+    let squares = one
+        .iter()
+        .zip(other)
+        .map(|(one, other)| (one - other).powi(2));
     squares.sum::<f64>().sqrt()
 }
 
@@ -85,27 +94,57 @@ fn a_bag_of_a_robot_is_read_mapped_and_located() {
     let folder = tempfile::tempdir().unwrap();
     let drive = drive(folder.path(), 40);
     let truth = dataset::open(&drive).unwrap().scenarios.swap_remove(0);
-    let bags = [("mcap", "none"), ("sqlite3", "none"), ("mcap", "message"), ("sqlite3", "file")]
-        .map(|(storage, compression)| write_bag(&drive, storage, compression));
+    let bags = [
+        ("mcap", "none"),
+        ("sqlite3", "none"),
+        ("mcap", "message"),
+        ("sqlite3", "file"),
+    ]
+    .map(|(storage, compression)| write_bag(&drive, storage, compression));
     for bag in &bags {
         let opened = dataset::open(bag).unwrap();
         assert!(opened.problems.is_empty(), "{:?}", opened.problems);
         let scenario = &opened.scenarios[0];
-        assert_eq!((scenario.layout, scenario.ticks.len()), (Layout::ROSBAG, 40));
-        assert!(scenario.joins[0].contains("transforms (os_sensor in map)"), "{:?}", scenario.joins);
-        for ((found, yaw), (expected, expected_yaw)) in poses(scenario).into_iter().zip(poses(&truth)) {
+        assert_eq!(
+            (scenario.layout, scenario.ticks.len()),
+            (Layout::ROSBAG, 40)
+        );
+        assert!(
+            scenario.joins[0].contains("transforms (os_sensor in map)"),
+            "{:?}",
+            scenario.joins
+        );
+        for ((found, yaw), (expected, expected_yaw)) in
+            poses(scenario).into_iter().zip(poses(&truth))
+        {
             assert!(distance_m(found, expected) < 0.05 && (yaw - expected_yaw).sin().abs() < 0.01);
         }
         let load = |scenario: &Scenario| scenario.load_points(0, 7, None).unwrap().points.xyzi;
         let (read, written) = (load(scenario), load(&truth));
-        assert!(read.len() == written.len() && read.iter().zip(&written).all(|(one, other)| one[..3] == other[..3]));
+        assert!(
+            read.len() == written.len()
+                && read
+                    .iter()
+                    .zip(&written)
+                    .all(|(one, other)| one[..3] == other[..3])
+        );
     }
     let map = folder.path().join("place");
     let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights");
     let encoder = weights.join("pgc-encoder.safetensors");
     let [of_map, of_search] = [&bags[0], &bags[1]].map(|bag| bag.to_str().unwrap());
     let (map, encoder) = (map.to_str().unwrap(), encoder.to_str().unwrap());
-    let made = agent(&["map", of_map, "--out", map, "--encoder", encoder, "--minutes", "2", "--json"]);
+    let made = agent(&[
+        "map",
+        of_map,
+        "--out",
+        map,
+        "--encoder",
+        encoder,
+        "--minutes",
+        "2",
+        "--json",
+    ]);
     assert_eq!(made.status.code(), Some(0), "{}", errors(&made));
     let located = agent(&["locate", of_search, "--head", map, "--json"]);
     let found: Vec<Value> = String::from_utf8_lossy(&located.stdout)
@@ -124,6 +163,9 @@ fn a_bag_of_a_robot_is_read_mapped_and_located() {
     distances.sort_by(f64::total_cmp);
     let close = distances.iter().filter(|distance| **distance < 3.0).count();
     let median = distances.get(distances.len() / 2);
-    println!("{} of 40 sweeps with a pose, {close} under 3 m, median {median:?} m", distances.len());
+    println!(
+        "{} of 40 sweeps with a pose, {close} under 3 m, median {median:?} m",
+        distances.len()
+    );
     assert!(close >= 20, "{distances:?}");
 }

@@ -89,6 +89,11 @@ pub(super) fn files_of(
     }
     let found = in_folder(path);
     if !is_described(path) {
+        let folders = list(path)?.folders.len();
+        if folders > 0 {
+            let reason = format!("{folders} folders beside the file of a bag: left out");
+            problems.push(ReadError::malformed(path, reason));
+        }
         return match found.len() {
             1 => Ok(found),
             count => {

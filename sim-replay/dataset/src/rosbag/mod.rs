@@ -149,6 +149,10 @@ impl FrameSource for Bag {
         Ok(cloud)
     }
 
+    fn shared_files(&self, _: &CavId) -> Vec<PathBuf> {
+        self.storage.paths()
+    }
+
     fn points_path(&self, _: &CavId, tick: &Tick, _: Option<&str>) -> PathBuf {
         let path = |sweep: &JoinedSweep| self.storage.path(sweep.place).to_owned();
         self.sweep(tick).map(path).unwrap_or_default()

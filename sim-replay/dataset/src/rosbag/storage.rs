@@ -51,6 +51,11 @@ impl Storage {
         Ok(Self(files))
     }
 
+    /// All files.
+    pub(super) fn paths(&self) -> Vec<PathBuf> {
+        self.0.iter().map(|file| file.path.clone()).collect()
+    }
+
     /// The file of a message.
     pub(super) fn path(&self, place: Place) -> &Path {
         self.0

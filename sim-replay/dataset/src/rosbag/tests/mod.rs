@@ -102,6 +102,13 @@ fn a_bag_is_a_folder_or_a_file_of_mcap_or_sqlite_compressed_or_not() {
     fs::create_dir(&undescribed).unwrap();
     by_message.mcap(&undescribed.join("x.mcap"));
     check_drive(&undescribed);
+    let beside = crate::open(folder.path()).unwrap();
+    let text = "4 folders beside the file of a bag: left out";
+    assert_eq!(
+        (beside.scenarios.len(), problems(&beside)[0].as_str()),
+        (1, text)
+    );
+    fs::remove_file(single).unwrap();
     let all = crate::open(folder.path()).unwrap();
     assert_eq!(all.scenarios.len(), 4, "a folder of bags");
 }
