@@ -1,6 +1,5 @@
 //! Fleets: replay, agents and ego together, live and in simulation time, in one process and in several.
 
-mod bag;
 mod compressor;
 mod in_process;
 mod live_figures;
