@@ -164,7 +164,11 @@ fn the_parent_death_pipe_is_open_as_long_as_the_supervisor_runs() {
 #[test]
 fn bad_input_is_not_tried_again() {
     let (_supervisor, events, _folder) = start(
-        shell("car", RestartPolicy::Service, "echo error: bad map >&2; exit 2"),
+        shell(
+            "car",
+            RestartPolicy::Service,
+            "echo error: bad map >&2; exit 2",
+        ),
         5,
     );
     assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
