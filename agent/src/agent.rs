@@ -5,7 +5,7 @@
 use std::time::{Duration, Instant};
 
 use protocol::{
-    BevFeatures, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, PointCloud, Pose,
+    BevFeatures, CavId, CodecConfig, Detection, EgoMotion, EncodedFeatures, Gnss, PointCloud, Pose,
     PoseEstimate, StageTiming, WireError,
 };
 use support::stage_times::StageTimes;
@@ -13,6 +13,7 @@ use tch::Tensor;
 
 use crate::rate::{RateConfig, RateControl};
 use localization::pose_source::{PoseInput, PoseSource};
+use localization::tracker::PoseMeasurement;
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use perception::detector::{BackboneLevel, Detector, DetectorError, Encoded};
 
@@ -59,8 +60,7 @@ pub struct AgentOutput {
 pub struct Agent {
     cav: CavId,
     pose_source: Box<dyn PoseSource>,
-    detector: Detector,
-    postprocess: PostprocessConfig,
+    detector: Option<Detector>,
     rate: RateControl,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
@@ -74,15 +74,23 @@ impl Agent {
     /// A vehicle with its pose source and its detector.
     #[must_use]
     pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
-        let postprocess = PostprocessConfig::for_late_fusion(detector.config());
         let shares_encoder = pose_source.detector_encoder() == Some(detector.encoder_sha256());
+        Self {
+            detector: Some(detector),
+            shares_encoder,
+            ..Self::without_detector(cav, pose_source)
+        }
+    }
+
+    /// A vehicle that localizes itself and perceives nothing.
+    #[must_use]
+    pub fn without_detector(cav: CavId, pose_source: Box<dyn PoseSource>) -> Self {
         Self {
             cav,
             pose_source,
-            detector,
-            postprocess,
+            detector: None,
             rate: RateControl::default(),
-            shares_encoder,
+            shares_encoder: false,
             encoded: None,
             levels: None,
         }
@@ -97,10 +105,13 @@ impl Agent {
         }
     }
 
-    /// The points that the vehicle shares: those that are not on its own body.
+    /// The points that the vehicle shares: those that are not on its own body, whose extent its detector knows.
     #[must_use]
     pub fn share_points(&self, cloud: &PointCloud) -> PointCloud {
-        self.detector.crop().without_own_body(cloud)
+        self.detector.as_ref().map_or_else(
+            || cloud.clone(),
+            |detector| detector.crop().without_own_body(cloud),
+        )
     }
 
     /// Id of the vehicle.
@@ -109,10 +120,10 @@ impl Agent {
         &self.cav
     }
 
-    /// Detector of the vehicle.
+    /// Detector of the vehicle, if it has one.
     #[must_use]
-    pub fn detector(&self) -> &Detector {
-        &self.detector
+    pub fn detector(&self) -> Option<&Detector> {
+        self.detector.as_ref()
     }
 
     /// Perceives an empty sweep, so that the first sweep does not wait for the tensor library's preparations.
@@ -120,7 +131,8 @@ impl Agent {
     /// # Errors
     /// See [`Self::perceive`].
     pub(crate) fn warm_up(&mut self) -> Result<(), DetectorError> {
-        let encoded = self.detector.encode(&PointCloud::default())?;
+        let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
+        let encoded = detector.encode(&PointCloud::default())?;
         self.perceive_map(&encoded.features)?;
         Ok(())
     }
@@ -130,9 +142,11 @@ impl Agent {
     pub fn prepare(&mut self, cloud: &PointCloud) {
         let is_needed = self.shares_encoder && self.pose_source.computes_from_sweep();
         // An error comes again, and is returned, when the sweep is perceived.
-        self.encoded = is_needed
-            .then(|| self.detector.encode_sweep(cloud).ok())
-            .flatten();
+        self.encoded = self
+            .detector
+            .as_mut()
+            .filter(|_| is_needed)
+            .and_then(|detector| detector.encode_sweep(cloud).ok());
     }
 
     /// First step: the pose, which goes out before anything else is computed.
@@ -144,6 +158,17 @@ impl Agent {
             .map(|encoded| encoded.levels.as_slice());
         self.pose_source
             .estimate(&pose_input(&self.cav, input, levels))
+    }
+
+    /// Starts the pose source anew at a pose that a person states, with its standard deviations. False if the source
+    /// starts at none.
+    pub(crate) fn start_at(&mut self, capture_nanos: u64, stated: &Gnss) -> bool {
+        self.pose_source.start_at(&PoseMeasurement {
+            capture_nanos,
+            world_from_lidar: stated.world_from_lidar.isometry(),
+            position_std_m: stated.position_std_m,
+            yaw_std_rad: stated.heading_std_rad,
+        })
     }
 
     /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. True if the
@@ -186,12 +211,14 @@ impl Agent {
     /// Second step: feature map, confidence and own detections.
     ///
     /// # Errors
-    /// [`DetectorError`] if the sweep has no point in the area, a value is not valid, or the tensor library fails.
+    /// [`DetectorError`] if the vehicle has no detector, the sweep has no point in the area, a value is not valid, or the
+    /// tensor library fails.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
+        let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
         let encoded = self
             .encoded
             .take()
-            .map_or_else(|| self.detector.encode_sweep(cloud), Ok)?;
+            .map_or_else(|| detector.encode_sweep(cloud), Ok)?;
         let Encoded {
             features,
             levels,
@@ -211,23 +238,20 @@ impl Agent {
     /// # Errors
     /// [`DetectorError::Shape`] if it is not a feature map of this detector.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
+        let detector = self.detector.as_ref().ok_or(DetectorError::Absent)?;
+        let settings = PostprocessConfig::for_late_fusion(detector.config());
         let mut times = StageTimes::start();
-        let sent = self.detector.compressed(map)?;
-        let (map, features) = (
-            self.detector.decompressed(&sent)?,
-            self.detector.to_message(&sent)?,
-        );
+        let sent = detector.compressed(map)?;
+        let (map, features) = (detector.decompressed(&sent)?, detector.to_message(&sent)?);
         times.lap("message");
-        let heads = self.detector.heads(&map)?;
+        let heads = detector.heads(&map)?;
         times.lap("head");
-        let boxes = self
-            .detector
-            .boxes(&heads, self.postprocess.score_threshold)?;
+        let boxes = detector.boxes(&heads, settings.score_threshold)?;
         let own = AgentBoxes {
             boxes: &boxes,
             output_from_agent: nalgebra::Isometry3::identity(),
         };
-        let found = postprocess(&[own], &self.postprocess);
+        let found = postprocess(&[own], &settings);
         let detections = found
             .iter()
             .map(|candidate| candidate.detection(Some(self.cav.clone())))
@@ -377,7 +401,7 @@ mod tests {
             detections,
             times,
         } = &first.perception;
-        let [channels, height, width] = agent.detector().map_shape();
+        let [channels, height, width] = agent.detector().unwrap().map_shape();
         assert_eq!(features.values.len() as i64, channels * height * width);
         assert_eq!(confidence.len(), features.grid.cells());
         assert!(!detections.is_empty() && detections.len() <= 1000);
@@ -504,29 +528,44 @@ mod tests {
                 .map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2])
                 .collect(),
         };
-        let encoded = agent.detector.encode(&cloud).unwrap().features;
-        let shared = agent
-            .detector
-            .to_message(&agent.detector.compressed(&encoded).unwrap())
+        let detector = agent.detector.as_mut().unwrap();
+        let encoded = detector.encode(&cloud).unwrap().features;
+        let shared = detector
+            .to_message(&detector.compressed(&encoded).unwrap())
             .unwrap();
-        let received = agent
-            .detector
+        let received = detector
             .received(&DecodedFeatures {
                 features: shared.clone(),
                 sent: None,
             })
             .unwrap();
-        let heads = agent.detector.heads(&received).unwrap();
+        let heads = detector.heads(&received).unwrap();
+        let undecoded = detector.heads(&encoded).unwrap();
         let seen = agent.perceive(&cloud).unwrap();
         assert_eq!(
             (&seen.features, &seen.confidence),
             (&shared, &heads.confidence)
         );
         assert_eq!((shared.channels, shared.code_of), (16, Some(64)));
-        assert_ne!(
-            seen.confidence,
-            agent.detector.heads(&encoded).unwrap().confidence
-        );
+        assert_ne!(seen.confidence, undecoded.confidence);
+    }
+
+    #[test]
+    fn a_vehicle_without_a_detector_has_poses_and_no_perception() {
+        let mut agent = Agent::without_detector(CavId::new("7").unwrap(), Box::new(RecordedPose));
+        let pose = Pose::from_xyz_yaw([5.0, 6.0, 0.0], 0.3);
+        let input = AgentInput {
+            capture_nanos: 0,
+            cloud: &PointCloud::default(),
+            measured_pose: Some(&pose),
+            motion: EgoMotion::default(),
+        };
+        agent.prepare(input.cloud);
+        assert_eq!(agent.estimate_pose(&input).world_from_cav(), Some(&pose));
+        assert!(matches!(
+            agent.perceive(input.cloud),
+            Err(DetectorError::Absent)
+        ));
     }
 
     #[test]

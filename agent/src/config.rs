@@ -29,7 +29,7 @@ pub struct AgentConfig {
     /// The vehicle.
     #[arg(long, required_unless_present = "config", allow_hyphen_values = true)]
     pub cav: CavId,
-    /// Messages to publish beside the pose.
+    /// Messages to publish beside the pose; with none the agent needs no detector and computes poses only.
     #[arg(long, value_enum, value_delimiter = ',')]
     #[serde(default = "Publish::maps")]
     pub publish: Vec<Publish>,
@@ -43,6 +43,7 @@ pub struct AgentConfig {
     pub sweep_log: Option<PathBuf>,
     /// Detector, threads and device.
     #[command(flatten)]
+    #[serde(default)]
     pub models: ModelConfig,
     /// Pose, codec and rate control.
     #[command(flatten)]
@@ -55,11 +56,12 @@ pub struct AgentConfig {
 }
 
 /// Detector of a process, and where and with how many threads it computes.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct ModelConfig {
     /// Weights of the detector (safetensors; its configuration is inside).
-    #[arg(long, value_name = "FILE", required_unless_present = "config")]
+    #[arg(long, value_name = "FILE")]
+    #[serde(default)]
     pub weights: PathBuf,
     /// Number format in which networks are computed.
     #[arg(long, value_enum, default_value_t)]
@@ -80,8 +82,19 @@ impl ModelConfig {
     /// Checks that the processes can compute as configured.
     ///
     /// # Errors
-    /// [`FieldError`] for a number of threads out of range, or a device that is missing.
+    /// [`FieldError`] for weights that are not named, a number of threads out of range, or a device that is missing.
     pub fn validate(&self) -> Result<(), FieldError> {
+        if self.weights.as_os_str().is_empty() {
+            return Err(FieldError::new(
+                "models.weights",
+                "empty",
+                "must name a file (--weights)",
+            ));
+        }
+        self.validate_without_weights()
+    }
+
+    fn validate_without_weights(&self) -> Result<(), FieldError> {
         self.threads.validate()?;
         self.inference().map(drop)
     }
@@ -152,6 +165,8 @@ pub enum Publish {
     Boxes,
     /// Points, for the early-fusion baseline.
     Points,
+    /// Nothing: poses only.
+    None,
 }
 
 impl Publish {
@@ -160,12 +175,12 @@ impl Publish {
     }
 
     /// Stream of these messages.
-    #[must_use]
-    pub fn stream(self) -> Stream {
+    fn stream(self) -> Option<Stream> {
         match self {
-            Self::Bev => Stream::Bev,
-            Self::Boxes => Stream::Boxes,
-            Self::Points => Stream::Points,
+            Self::Bev => Some(Stream::Bev),
+            Self::Boxes => Some(Stream::Boxes),
+            Self::Points => Some(Stream::Points),
+            Self::None => None,
         }
     }
 }
@@ -250,16 +265,34 @@ impl AgentSettings {
 }
 
 impl ProcessConfig for AgentConfig {
-    const REQUIRED: &'static [&'static str] = &["run", "cav", "models.weights"];
+    const REQUIRED: &'static [&'static str] = &["run", "cav"];
 
     fn validate(&self) -> Result<(), FieldError> {
-        self.models.validate()?;
+        if self.publish.contains(&Publish::None) && self.publish.len() > 1 {
+            let rule = "must be alone: nothing is published beside the pose";
+            return Err(FieldError::new("publish", "none and others", rule));
+        }
+        let weights = self.models.weights.display();
+        match self.gives_poses_only() {
+            true if !self.models.weights.as_os_str().is_empty() => {
+                let rule = "must be left out: poses only need no detector (--publish none)";
+                return Err(FieldError::new("models.weights", weights, rule));
+            }
+            true => self.models.validate_without_weights()?,
+            false => self.models.validate()?,
+        }
         self.settings.validate()?;
         self.bus.validate()
     }
 }
 
 impl AgentConfig {
+    /// True if the agent has no detector, since nothing that needs one is published.
+    #[must_use]
+    pub fn gives_poses_only(&self) -> bool {
+        self.publish.iter().all(|publish| *publish == Publish::None)
+    }
+
     /// Options of the agent's node.
     #[must_use]
     pub fn options(&self) -> NodeOptions {
@@ -267,7 +300,7 @@ impl AgentConfig {
             publish: self
                 .publish
                 .iter()
-                .map(|publish| publish.stream())
+                .filter_map(|publish| publish.stream())
                 .collect(),
             codec: self.settings.codec,
             rate: self.settings.rate,
@@ -280,6 +313,7 @@ impl AgentConfig {
 
 #[cfg(test)]
 mod tests {
+    use bus::minimal;
     use localization::pose_source::{NoiseMode, NoisyPoseConfig, TrackedPoseConfig};
 
     use super::*;
@@ -331,5 +365,37 @@ mod tests {
             (None, Some(4000))
         );
         assert_eq!((phase(ego), phase(neighbour)), (2, 3));
+    }
+
+    fn config(publish: &[Publish]) -> AgentConfig {
+        AgentConfig {
+            publish: publish.to_vec(),
+            ..minimal(|_| "x".into()).unwrap()
+        }
+    }
+
+    #[test]
+    fn the_configuration_of_a_robot_is_one_of_poses_only() {
+        let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/ros2/agent.yaml");
+        let config: AgentConfig = bus::config_file::read(file.as_ref()).unwrap();
+        config.validate().unwrap();
+        assert!(config.gives_poses_only());
+        assert_eq!(config.settings.pose.name(), "tracked");
+    }
+
+    #[test]
+    fn an_agent_that_publishes_nothing_beside_the_pose_needs_no_weights() {
+        for publish in [&[Publish::None][..], &[]] {
+            let config = config(publish);
+            config.validate().unwrap();
+            assert!(config.gives_poses_only() && config.options().publish.is_empty());
+        }
+        let error = config(&[Publish::Bev]).validate().unwrap_err().to_string();
+        assert_eq!(
+            error,
+            "models.weights is empty: must name a file (--weights)"
+        );
+        let error = config(&[Publish::None, Publish::Bev]).validate();
+        assert!(error.unwrap_err().to_string().contains("must be alone"));
     }
 }

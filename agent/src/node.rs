@@ -12,11 +12,12 @@ use bus::shutdown::Stop;
 use bus::{
     Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription,
 };
+use perception::detector::Detector;
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{
-    CavId, DropReason, Dtype, Gnss, KeyExpr, Lidar, Limits, Pace, PointCloud, PoseEstimate, Role,
-    Stream, Topic, wire,
+    CavId, DropReason, Dtype, Gnss, GnssSource, KeyExpr, Lidar, Limits, Pace, PointCloud,
+    PoseEstimate, Role, Stream, Topic, wire,
 };
 use support::sweep_log::SweepLog;
 
@@ -36,7 +37,8 @@ const DESCRIPTOR_PERIOD: Duration = Duration::from_secs(1);
 /// Options of an agent's node.
 #[derive(Debug, Clone)]
 pub struct NodeOptions {
-    /// Streams beside the pose: any of [`Stream::Bev`], [`Stream::Boxes`] and [`Stream::Points`].
+    /// Streams beside the pose: any of [`Stream::Bev`], [`Stream::Boxes`] and [`Stream::Points`], for which the agent
+    /// needs a detector.
     pub publish: Vec<Stream>,
     /// Codec of feature maps.
     pub codec: CodecConfig,
@@ -64,6 +66,13 @@ impl Default for NodeOptions {
             limits: Limits::DEFAULT,
             sweep_log: None,
         }
+    }
+}
+
+impl NodeOptions {
+    /// True if the detector's network is computed: points are published as they are, and poses need none.
+    fn needs_network(&self) -> bool {
+        self.publish.iter().any(|stream| *stream != Stream::Points)
     }
 }
 
@@ -109,7 +118,9 @@ pub fn run_filtered(
     stop: &Stop,
 ) -> Result<NodeReport, BusError> {
     let mut agent = agent;
-    if let Err(error) = agent.warm_up() {
+    if options.needs_network()
+        && let Err(error) = agent.warm_up()
+    {
         tracing::warn!("the detector is not warmed up: {error}");
     }
     let mut node = Node::open(bus, agent, filter, options, stop)?;
@@ -253,16 +264,31 @@ impl<'a> Node<'a> {
                     ..Unused::default()
                 });
             }
-        } else if let Some(Gnss {
-            world_from_lidar, ..
-        }) = self.inbox.decode(&arrival, &self.options.limits)
-        {
-            let poses = self.pairing.add_pose(capture_nanos, world_from_lidar);
-            self.count_unused(Unused {
-                poses,
-                ..Unused::default()
-            });
+        } else if let Some(gnss) = self.inbox.decode(&arrival, &self.options.limits) {
+            self.admit_pose(capture_nanos, &gnss);
         }
+    }
+
+    /// A measured pose waits for its sweep, a stated one restarts the tracker.
+    fn admit_pose(&mut self, capture_nanos: u64, gnss: &Gnss) {
+        if gnss.source == GnssSource::Stated {
+            self.bus.stats().received(&self.gnss);
+            let is_taken = self.agent.start_at(capture_nanos, gnss);
+            let [x, y, _] = gnss.world_from_lidar.translation_m;
+            if is_taken {
+                tracing::info!("starts at the stated pose x {x:.2} y {y:.2} m");
+            } else {
+                tracing::warn!(
+                    "the pose source takes no stated pose (tracked does): x {x:.2} y {y:.2} m is ignored"
+                );
+            }
+            return;
+        }
+        let poses = self.pairing.add_pose(capture_nanos, gnss.world_from_lidar);
+        self.count_unused(Unused {
+            poses,
+            ..Unused::default()
+        });
     }
 
     /// Follows the pace of an ego; one beyond the limit of egos is counted, and the first is logged.
@@ -346,14 +372,18 @@ impl<'a> Node<'a> {
         self.time_pose_stages();
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());
         self.report.pose_jumps = self.agent.pose_jumps();
-        match self.agent.perceive(input.cloud) {
+        let perceived = self
+            .options
+            .needs_network()
+            .then(|| self.agent.perceive(input.cloud));
+        match perceived.transpose() {
             Ok(perception) => {
-                for stage in &perception.times {
+                for stage in perception.iter().flat_map(|perception| &perception.times) {
                     stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
                 }
                 stats.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
-                let perception = self.filter.perception(perception);
+                let perception = perception.map(|perception| self.filter.perception(perception));
                 let shared = self
                     .publishers
                     .points
@@ -404,13 +434,13 @@ struct Publishers {
     bev: Option<Publisher>,
     boxes: Option<Publisher>,
     points: Option<Publisher>,
-    descriptor: Publisher,
+    /// With what it publishes; none without a detector, as no ego can use the vehicle's messages.
+    descriptor: Option<(Publisher, Descriptor)>,
     codec: CodecConfig,
     /// Shared with the sending thread, which is where maps are written.
     rate: Arc<Mutex<RateControl>>,
     /// Feature maps submitted so far.
     submitted: u64,
-    description: Descriptor,
     next_descriptor: Instant,
 }
 
@@ -432,8 +462,7 @@ impl Publishers {
                 .then(|| publisher(stream, PublisherOptions::FEATURES))
                 .transpose()
         };
-        let detector = agent.detector();
-        let description = Descriptor {
+        let description = |detector: &Detector| Descriptor {
             model_hash: detector.model_hash(),
             grid: detector.grid(),
             channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
@@ -442,16 +471,19 @@ impl Publishers {
                 .chain(options.publish.iter().copied())
                 .collect(),
         };
+        let descriptor = agent.detector().map(|detector| {
+            let publisher = publisher(Stream::Descriptor, PublisherOptions::POSE)?;
+            Ok::<_, BusError>((publisher, description(detector)))
+        });
         Ok(Self {
             pose: publisher(Stream::Pose, PublisherOptions::POSE)?,
             bev: wanted(Stream::Bev)?,
             boxes: wanted(Stream::Boxes)?,
             points: wanted(Stream::Points)?,
-            descriptor: publisher(Stream::Descriptor, PublisherOptions::POSE)?,
+            descriptor: descriptor.transpose()?,
             codec: options.codec,
             rate: Arc::new(Mutex::new(RateControl::new(options.rate))),
             submitted: 0,
-            description,
             next_descriptor: Instant::now(),
         })
     }
@@ -460,7 +492,9 @@ impl Publishers {
         let now = Instant::now();
         if now >= self.next_descriptor {
             self.next_descriptor = now + DESCRIPTOR_PERIOD;
-            self.descriptor.submit(0, self.description.clone());
+            if let Some((publisher, description)) = &self.descriptor {
+                publisher.submit(0, description.clone());
+            }
         }
     }
 
@@ -468,8 +502,23 @@ impl Publishers {
         &mut self,
         input: &AgentInput<'_>,
         pose: PoseEstimate,
-        perception: Perception,
+        perception: Option<Perception>,
         shared: Option<PointCloud>,
+        stats: &MessageStats,
+    ) {
+        if let Some(perception) = perception {
+            self.submit_perception(input.capture_nanos, pose, perception, stats);
+        }
+        if let (Some(publisher), Some(points)) = (&self.points, shared) {
+            publisher.submit(input.capture_nanos, Points { pose, points });
+        }
+    }
+
+    fn submit_perception(
+        &mut self,
+        capture_nanos: u64,
+        pose: PoseEstimate,
+        perception: Perception,
         stats: &MessageStats,
     ) {
         let Perception {
@@ -485,8 +534,7 @@ impl Publishers {
                 stats.clone(),
                 bev.topic().clone(),
             );
-            let (number, submitted, capture_nanos) =
-                (self.submitted, Instant::now(), input.capture_nanos);
+            let (number, submitted) = (self.submitted, Instant::now());
             self.submitted += 1;
             // The choice of format, selection, quantisation and compression run on the sending thread, at the map's
             // turn.
@@ -506,16 +554,7 @@ impl Publishers {
             });
         }
         if let Some(boxes) = &self.boxes {
-            boxes.submit(input.capture_nanos, Boxes { pose, detections });
-        }
-        if let (Some(points), Some(shared)) = (&self.points, shared) {
-            points.submit(
-                input.capture_nanos,
-                Points {
-                    pose,
-                    points: shared,
-                },
-            );
+            boxes.submit(capture_nanos, Boxes { pose, detections });
         }
     }
 
@@ -528,7 +567,8 @@ impl Publishers {
             descriptor,
             ..
         } = self;
-        let streams = [Some(pose), bev, boxes, points, Some(descriptor)];
+        let descriptor = descriptor.map(|(publisher, _)| publisher);
+        let streams = [Some(pose), bev, boxes, points, descriptor];
         streams.into_iter().flatten().for_each(Publisher::finish);
     }
 }

@@ -9,7 +9,7 @@
 //! | `scorer` | control | the truth, detections, poses, statistics |
 //! | `recorder` | nothing | everything but previews |
 //! | `viewer` | nothing | results, descriptors, previews of sweeps, feature maps, images, statistics |
-//! | `ros2` | sweeps and motion of every vehicle | sweeps, motion, poses, detections, statistics |
+//! | `ros2` | sweeps, motion and stated poses of every vehicle | sweeps, motion, poses, detections, statistics |
 //!
 //! In addition every process declares a liveliness token and publishes its readiness and its ledger, each under its own
 //! name.
@@ -168,7 +168,7 @@ impl Principal {
                     .map(|stream| everyones(stream))
                     .chain([keys(&"stats/*")]);
                 (
-                    [Stream::Lidar, Stream::Imu]
+                    [Stream::Lidar, Stream::Imu, Stream::Gnss]
                         .iter()
                         .map(|stream| everyones(stream))
                         .collect(),

@@ -15,7 +15,7 @@ use support::cli::{BadInput, Outcome};
 
 /// Run one vehicle: subscribes to its sensors; publishes pose, feature map, boxes or points.
 ///
-/// Ends when the replay does, or on Ctrl-C or SIGTERM.
+/// Ends when the replay does, or on Ctrl-C or SIGTERM; with sensors of a ROS 2 network (v2vloc ros2 --lidar) it stays.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
@@ -35,8 +35,14 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     config.models.threads.apply();
     let agent = agent(&config).map_err(BadInput::of)?;
     let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config.bus.join(&config.run, Role::Agent, &config.cav)?;
-    tracing::info!(cav = %config.cav, weights = %config.models.weights.display(), "ready");
+    let bus = config
+        .bus
+        .join(&stop, &config.run, Role::Agent, &config.cav)?;
+    if config.gives_poses_only() {
+        tracing::info!(cav = %config.cav, "ready: poses only");
+    } else {
+        tracing::info!(cav = %config.cav, weights = %config.models.weights.display(), "ready");
+    }
     let report = node::run_filtered(
         &bus,
         agent,
@@ -64,19 +70,15 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
 
 fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
     let inference = config.models.inference()?;
+    let pose = config.settings.pose.clone().with_networks()?;
+    let pose_source = pose.build(inference)?;
+    if config.gives_poses_only() {
+        return Ok(Agent::without_detector(config.cav.clone(), pose_source));
+    }
     let weights = config.models.load(inference).context("weights")?;
     let detector = Detector::from_weights(&weights, &weights.detector_config()?, inference.device)
         .context("weights")?;
-    Ok(Agent::new(
-        config.cav.clone(),
-        config
-            .settings
-            .pose
-            .clone()
-            .with_networks()?
-            .build(inference)?,
-        detector,
-    ))
+    Ok(Agent::new(config.cav.clone(), pose_source, detector))
 }
 
 fn output_filter(config: &AgentConfig) -> Box<dyn OutputFilter> {

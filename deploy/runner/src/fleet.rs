@@ -16,7 +16,6 @@ use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
 use ego_fuser::ego::Ego;
 use fusion::Exchange;
-use fusion::Method;
 use link::{LinkConfig, LinkEmulator};
 use localization::baselines::load_baseline;
 use localization::pgc::pose_solver::PoseSolver;
@@ -25,7 +24,7 @@ use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
 use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
-use protocol::{CavId, Principal, Role};
+use protocol::{CavId, Principal, Role, Stream};
 use sim_replay::config::SceneConfig;
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
@@ -318,18 +317,14 @@ impl Fleet {
         self.agents.iter().filter(|cav| **cav != self.ego)
     }
 
-    /// Messages that every vehicle publishes in addition to its pose.
-    pub(crate) fn publish(&self) -> Publish {
-        publish(self.scenario.method)
-    }
-}
-
-/// Messages that a method needs of every vehicle; the ego's own agent sends its feature map even where no other counts.
-fn publish(method: Method) -> Publish {
-    match method.exchange() {
-        Exchange::Nothing | Exchange::Features => Publish::Bev,
-        Exchange::Boxes => Publish::Boxes,
-        Exchange::Points => Publish::Points,
+    /// Messages that every vehicle publishes in addition to its pose, those that the method needs, and their stream; the
+    /// ego's own agent sends its feature map even where no other counts.
+    pub(crate) fn publish(&self) -> (Publish, Stream) {
+        match self.scenario.method.exchange() {
+            Exchange::Nothing | Exchange::Features => (Publish::Bev, Stream::Bev),
+            Exchange::Boxes => (Publish::Boxes, Stream::Boxes),
+            Exchange::Points => (Publish::Points, Stream::Points),
+        }
     }
 }
 

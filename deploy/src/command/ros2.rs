@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open, process_id};
+use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open_unless, process_id};
 use deploy::ros::{
-    AgentTopic, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run,
+    AgentTopic, ClockMode, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run,
 };
 use protocol::{CavId, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
@@ -45,7 +45,7 @@ struct Network {
     /// Domain [default: ROS_DOMAIN_ID, or 0].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=232))]
     domain_id: Option<u32>,
-    /// Namespace of the node and of the topics of vehicles, for example /fleet.
+    /// Namespace of the node, of the topics and of the frames of vehicles, for example /fleet.
     #[arg(long, value_name = "/NAME")]
     namespace: Option<RosName>,
     /// Distribution of the other nodes: humble writes no type hashes into keys; jazzy stands for all later ones.
@@ -60,10 +60,12 @@ struct Content {
     /// Do not offer the sweeps of the vehicles.
     #[arg(long)]
     no_points: bool,
-    /// Publish /clock: the capture times, for nodes with use_sim_time [default: true without --lidar].
+    /// Publish /clock: the capture times, for nodes with use_sim_time [default: true without --lidar, unless another node
+    /// publishes it].
     #[arg(long, value_name = "true|false")]
     clock: Option<bool>,
-    /// Place of the LiDAR on its vehicle, for /tf_static: metres, and optionally its yaw in degrees.
+    /// Place of the LiDAR on its vehicle: metres, and optionally its yaw in degrees [default: 0,0,0; of a robot with
+    /// --odometry that of its tf].
     #[arg(long, value_name = "X,Y,Z[,YAW]", allow_hyphen_values = true)]
     lidar_mount: Option<Mount>,
     /// Publish the first fix of this vehicle on /initialpose, as soon as somebody subscribes to it.
@@ -82,8 +84,8 @@ struct Sensors {
     /// Largest intensity of these messages, 255 for many drivers; agents get shares of it, 0 to 1.
     #[arg(long, value_name = "VALUE", default_value_t = 1.0, requires = "lidar", value_parser = above_zero)]
     intensity_max: f32,
-    /// Pass speed and yaw rate of a topic of nav_msgs/Odometry to an agent that has a --lidar, for example /odom=1000;
-    /// repeatable.
+    /// Pass speed and yaw rate of a topic of nav_msgs/Odometry to an agent that has a --lidar, for example /odom=1000,
+    /// and publish map -> odom, the robot's odometry frame, instead of map -> cav_1000/lidar; repeatable.
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
     odometry: Vec<AgentTopic>,
     /// The same of a topic of geometry_msgs/TwistStamped, in the frame of the body.
@@ -92,6 +94,10 @@ struct Sensors {
     /// The yaw rate of a topic of sensor_msgs/Imu with its z axis up; that of --odometry and --twist is not used then.
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
     imu: Vec<AgentTopic>,
+    /// Start an agent's tracker at the poses of a topic of geometry_msgs/PoseWithCovarianceStamped, for example
+    /// /initialpose=1000, which RViz and Nav2 publish; the agent has a --lidar and pose source tracked.
+    #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
+    starting_pose: Vec<AgentTopic>,
 }
 
 /// Distributions of ROS 2 by what their rmw_zenoh writes into keys.
@@ -121,9 +127,10 @@ impl Arguments {
         let stop = Stop::new();
         stop.on_signals()?;
         stop.enforce(STOP_LIMIT);
-        let bus = self.join()?;
+        let bus = self.join(&stop)?;
         let router = self.network.ros_router.as_ref().unwrap_or(&self.connect);
-        let session = open(&BusOptions::client(router.clone())).context("the ROS 2 network")?;
+        let network = BusOptions::client(router.clone());
+        let session = open_unless(&stop, &network).context("the ROS 2 network")?;
         let session = RosSession::declare(
             session,
             domain_id,
@@ -145,6 +152,19 @@ impl Arguments {
 
     fn check(&self) -> anyhow::Result<()> {
         self.sensors.check()?;
+        let published = self.content.initialpose.as_ref();
+        if let Some(source) = self
+            .sensors
+            .starting_pose
+            .iter()
+            .find(|source| Some(&source.cav) == published)
+        {
+            return Err(BadInput::new(format!(
+                "--starting-pose {}={}: its first fix goes out by --initialpose, and would come back",
+                source.topic, source.cav
+            ))
+            .into());
+        }
         if self.network.ros_router.is_none() && self.keys.is_some() {
             return Err(BadInput::new(
                 "--ros-router: nodes of ROS 2 have no certificates; name a router for them",
@@ -154,7 +174,7 @@ impl Arguments {
         Ok(())
     }
 
-    fn join(&self) -> anyhow::Result<Bus> {
+    fn join(&self, stop: &Stop) -> anyhow::Result<Bus> {
         let cav = CavId::new("ros2")?;
         let identity = Identity {
             run: self.run.clone(),
@@ -167,7 +187,7 @@ impl Arguments {
             credentials.check_name(identity.process.as_str())?;
             options = options.with_credentials(credentials);
         }
-        Ok(Bus::join(&options, identity)?)
+        Ok(Bus::join_unless(stop, &options, identity)?)
     }
 
     fn distribution(&self) -> Distribution {
@@ -181,11 +201,17 @@ impl Arguments {
         let (content, sensors) = (&self.content, &self.sensors);
         NodeOptions {
             with_points: !content.no_points,
-            // The sweeps of a robot have the time of its clock, not of a scene.
-            with_clock: content.clock.unwrap_or(sensors.lidar.is_empty()),
-            mount: content.lidar_mount.unwrap_or_default(),
+            clock: match content.clock {
+                Some(true) => ClockMode::On,
+                Some(false) => ClockMode::Off,
+                None if sensors.lidar.is_empty() => ClockMode::Unoccupied,
+                // The sweeps of a robot have the time of its clock, not of a scene.
+                None => ClockMode::Off,
+            },
+            mount: content.lidar_mount,
             lidars: sensors.lidar.clone(),
             motions: sensors.motions(),
+            starting_poses: sensors.starting_pose.clone(),
             max_intensity: sensors.intensity_max,
             initial_pose_of: content.initialpose.clone(),
         }
@@ -200,6 +226,7 @@ impl Sensors {
             ("--lidar", "LiDAR", &self.lidar),
             ("--odometry, --twist", "speed", &speeds),
             ("--imu", "IMU", &self.imu),
+            ("--starting-pose", "starting pose", &self.starting_pose),
         ] {
             for (index, source) in sources.iter().enumerate() {
                 if let Some(other) = sources
@@ -215,15 +242,15 @@ impl Sensors {
             }
         }
         let has_lidar = |cav: &CavId| self.lidar.iter().any(|lidar| lidar.cav == *cav);
-        match self
-            .motions()
-            .into_iter()
-            .map(|motion| motion.source)
+        match speeds
+            .iter()
+            .chain(&self.imu)
+            .chain(&self.starting_pose)
             .find(|source| !has_lidar(&source.cav))
         {
             Some(AgentTopic { topic, cav }) => {
                 let message = format!(
-                    "{topic}={cav}: an agent's motion goes with its sweeps; name its --lidar too"
+                    "{topic}={cav}: an agent's motion and starting pose go with its sweeps; name its --lidar too"
                 );
                 Err(BadInput::new(message).into())
             }
@@ -300,6 +327,25 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
         output::line(format_args!(
             "{read} messages of {topic} read, {unreadable} could not be read, {out_of_order} measurements out of order"
         ))?;
+    }
+    for (count, what) in [
+        (lidar.without_stamp, "messages of LiDARs had no time"),
+        (
+            lidar.ahead_of_clock,
+            "sweeps had a time ahead of this machine's clock",
+        ),
+        (
+            lidar.back_in_time,
+            "sweeps had a time before the one before",
+        ),
+        (
+            report.unplaced_poses,
+            "poses gave no place of an odometry frame in the map",
+        ),
+    ] {
+        if count > 0 {
+            output::line(format_args!("{count} {what}"))?;
+        }
     }
     if lidar.unreadable > 0 {
         output::line(format_args!(

@@ -6,16 +6,20 @@ use std::sync::Arc;
 
 use bus::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use bus::shutdown::Stop;
-use bus::{Bus, BusError, Publisher, PublisherOptions};
+use bus::{Bus, BusError, Publisher, PublisherOptions, unix_nanos};
 use protocol::{CavId, Lidar, Limits, Stream, Topic};
 use ros2::{Qos, RosName, RosType, Sweep, SweepLimits, read_point_cloud};
 use serde::Serialize;
 use zenoh::bytes::ZBytes;
 
 use super::agent_topic::AgentTopic;
-use super::motion_input::{MotionInput, MotionReport, MotionSource};
+use super::motion_input::{MotionInput, MotionReport};
+use super::node_options::NodeOptions;
 use super::refusal_log::RefusalLog;
+use super::robot_frames::RobotFrames;
 use super::session::{RosSession, RosSubscription};
+use super::stamp_check::{NoTime, OddStamp, StampCheck};
+use super::starting_pose::StartingPose;
 
 /// Limits of a receiver of the run.
 const LIMITS: SweepLimits = SweepLimits {
@@ -32,6 +36,12 @@ pub struct LidarReport {
     pub unreadable: u64,
     /// Messages with the capture time of the one before.
     pub repeated: u64,
+    /// Messages with a capture time of 0.
+    pub without_stamp: u64,
+    /// Sweeps passed on with a capture time ahead of this machine's clock.
+    pub ahead_of_clock: u64,
+    /// Sweeps passed on with a capture time before that of the sweep before.
+    pub back_in_time: u64,
     /// Messages that came before the one before them was read.
     pub superseded: u64,
     /// Points without coordinates, in sweeps passed on.
@@ -46,16 +56,19 @@ impl LidarReport {
     /// True if no message is missing.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.unreadable == 0
+        self.unreadable + self.without_stamp == 0
     }
 }
 
 /// One LiDAR.
 struct Input {
+    cav: CavId,
     topic: RosName,
     publisher: Publisher,
     motion: Option<MotionInput>,
-    last_nanos: Option<u64>,
+    starting_pose: Option<StartingPose>,
+    frames: RobotFrames,
+    stamps: StampCheck,
     has_warned_of_intensity: bool,
     log: RefusalLog,
     _subscription: RosSubscription,
@@ -71,16 +84,15 @@ pub(super) struct LidarInputs {
 }
 
 impl LidarInputs {
-    /// Subscribes to `sources`, and to the `motions` of the same vehicles. Intensities are divided by `max_intensity`.
+    /// Subscribes to the LiDARs of `options`, and to the motions and starting poses of the same vehicles.
     pub(super) fn open(
         bus: &Bus,
         session: &RosSession,
-        (sources, motions): (&[AgentTopic], &[MotionSource]),
-        max_intensity: f32,
+        (options, frames): (&NodeOptions, &RobotFrames),
         stop: &Stop,
     ) -> Result<Self, BusError> {
         // One place: an agent computes the newest sweep.
-        let queue = Arc::new(BoundedQueue::new(1, sources.len()));
+        let queue = Arc::new(BoundedQueue::new(1, options.lidars.len()));
         let superseded = Arc::<std::sync::atomic::AtomicU64>::default();
         stop.on_request({
             let queue = Arc::clone(&queue);
@@ -91,7 +103,12 @@ impl LidarInputs {
                 cav: cav.clone(),
                 stream: Stream::Lidar,
             };
-            let publisher = bus.publisher(lidar, PublisherOptions::SENSOR)?;
+            // A robot's agent stays when this node ends, and is served by its next instance.
+            let publisher = bus.publisher(lidar, PublisherOptions::SENSOR.live())?;
+            let starting_pose = options
+                .starting_poses
+                .iter()
+                .find(|source| source.cav == *cav);
             let (queue, superseded, lane) =
                 (Arc::clone(&queue), Arc::clone(&superseded), cav.clone());
             let subscription = session.subscribe(
@@ -106,22 +123,31 @@ impl LidarInputs {
                 },
             )?;
             let input = Input {
+                cav: cav.clone(),
                 topic: topic.clone(),
                 publisher,
-                motion: MotionInput::open(bus, session, cav, motions)?,
-                last_nanos: None,
+                motion: MotionInput::open(bus, session, (cav, frames), &options.motions)?,
+                starting_pose: starting_pose
+                    .map(|source| StartingPose::open(bus, session, source))
+                    .transpose()?,
+                frames: frames.clone(),
+                stamps: StampCheck::default(),
                 has_warned_of_intensity: false,
                 log: RefusalLog::of(topic.clone(), RosType::PointCloud2),
                 _subscription: subscription,
             };
             Ok((cav.clone(), input))
         };
-        let inputs = sources.iter().map(open).collect::<Result<_, BusError>>()?;
+        let inputs = options
+            .lidars
+            .iter()
+            .map(open)
+            .collect::<Result<_, BusError>>()?;
         Ok(Self {
             inputs,
             queue,
             superseded,
-            max_intensity,
+            max_intensity: options.max_intensity,
             report: LidarReport::default(),
         })
     }
@@ -136,6 +162,10 @@ impl LidarInputs {
         let mut motions = BTreeMap::new();
         for input in self.inputs.into_values() {
             input.publisher.finish();
+            input
+                .starting_pose
+                .into_iter()
+                .for_each(StartingPose::finish);
             motions.extend(input.motion.map(MotionInput::finish).unwrap_or_default());
         }
         let superseded = self.superseded.load(std::sync::atomic::Ordering::Relaxed);
@@ -151,28 +181,57 @@ impl LidarInputs {
 
 impl Input {
     fn take(&mut self, bytes: &[u8], max_intensity: f32, report: &mut LidarReport) {
-        match read_point_cloud(bytes, LIMITS) {
-            Ok(sweep) if self.last_nanos == Some(sweep.capture_nanos) => {
-                report.repeated += 1;
-                self.log.warn(&format_args!(
-                    "header.stamp is {} ns as in the message before",
-                    sweep.capture_nanos
-                ));
-            }
-            Ok(sweep) => self.pass_on(sweep, max_intensity, report),
+        let sweep = match read_point_cloud(bytes, LIMITS) {
+            Ok(sweep) => sweep,
             Err(error) => {
                 report.unreadable += 1;
-                self.log.warn(&error);
+                return self.log.warn(&error);
+            }
+        };
+        let previous_nanos = self.stamps.last_nanos();
+        match self.stamps.take(sweep.capture_nanos, unix_nanos()) {
+            Ok(odd) => {
+                odd.into_iter().for_each(|odd| self.note(odd, report));
+                self.pass_on(sweep, previous_nanos, max_intensity, report);
+            }
+            Err(left_out) => {
+                match left_out {
+                    NoTime::Zero => report.without_stamp += 1,
+                    NoTime::Repeated(_) => report.repeated += 1,
+                }
+                self.log.warn(&left_out);
             }
         }
     }
 
-    fn pass_on(&mut self, mut sweep: Sweep, max_intensity: f32, report: &mut LidarReport) {
+    /// Counts a stamp that is used although it is odd; names it now and then.
+    fn note(&mut self, odd: OddStamp, report: &mut LidarReport) {
+        match odd {
+            OddStamp::Ahead(_) => report.ahead_of_clock += 1,
+            OddStamp::Back(_) => report.back_in_time += 1,
+        }
+        if self.stamps.is_news(odd) {
+            tracing::warn!("{}: {odd}", self.topic);
+        }
+    }
+
+    fn pass_on(
+        &mut self,
+        mut sweep: Sweep,
+        previous_nanos: Option<u64>,
+        max_intensity: f32,
+        report: &mut LidarReport,
+    ) {
         report.sweeps += 1;
         report.points_without_return += sweep.without_return as u64;
         report.points_too_far += sweep.too_far as u64;
-        let previous_nanos = self.last_nanos.replace(sweep.capture_nanos);
+        self.frames.note_lidar(&self.cav, &sweep.frame_id);
         // Before the sweep: the agent waits for nothing then.
+        if let Some(starting_pose) = &self.starting_pose {
+            starting_pose.publish(sweep.capture_nanos, || {
+                self.frames.base_from_lidar(&self.cav, sweep.capture_nanos)
+            });
+        }
         if let Some(motion) = &mut self.motion
             && !motion.publish(previous_nanos, sweep.capture_nanos)
         {

@@ -9,9 +9,10 @@ use ros2::{MotionType, Qos, RosName, TimedMotion};
 use serde::Serialize;
 
 use super::agent_topic::AgentTopic;
-use super::motion_series::MotionSeries;
 use super::refusal_log::RefusalLog;
+use super::robot_frames::RobotFrames;
 use super::session::{RosSession, RosSubscription};
+use super::time_series::TimeSeries;
 
 /// A topic with the motion of a vehicle.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -36,8 +37,8 @@ pub struct MotionReport {
 /// Measurements of one vehicle.
 #[derive(Debug, Default)]
 struct Measurements {
-    speed_mps: MotionSeries,
-    yaw_rate_rad_s: MotionSeries,
+    speed_mps: TimeSeries<f64>,
+    yaw_rate_rad_s: TimeSeries<f64>,
     reports: BTreeMap<RosName, MotionReport>,
 }
 
@@ -49,11 +50,11 @@ pub(super) struct MotionInput {
 }
 
 impl MotionInput {
-    /// Subscribes to those of `sources` that are of `cav`; `None` if there are none.
+    /// Subscribes to those of `sources` that are of `cav`; `None` if there are none. Odometry names `frames` too.
     pub(super) fn open(
         bus: &Bus,
         session: &RosSession,
-        cav: &CavId,
+        (cav, frames): (&CavId, &RobotFrames),
         sources: &[MotionSource],
     ) -> Result<Option<Self>, BusError> {
         let own: Vec<&MotionSource> = sources
@@ -79,8 +80,13 @@ impl MotionInput {
                 .insert(topic.clone(), MotionReport::default());
             let takes_yaw_rate = motion_type == MotionType::Imu || !has_imu;
             let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
+            let (cav, frames) = (cav.clone(), frames.clone());
             session.subscribe(&topic.clone(), ros_type, Qos::SENSOR_DATA, move |sample| {
-                let read = motion_type.read(&sample.payload().to_bytes());
+                let bytes = sample.payload().to_bytes();
+                if motion_type == MotionType::Odometry {
+                    frames.note_odometry(&cav, &bytes);
+                }
+                let read = motion_type.read(&bytes);
                 if let Err(error) = &read {
                     log.lock()
                         .unwrap_or_else(PoisonError::into_inner)
@@ -94,7 +100,7 @@ impl MotionInput {
             cav: cav.clone(),
             stream: Stream::Imu,
         };
-        let publisher = bus.publisher(imu, PublisherOptions::POSE)?;
+        let publisher = bus.publisher(imu, PublisherOptions::POSE.live())?;
         Ok(Some(Self {
             measurements,
             publisher,

@@ -10,14 +10,16 @@ use bus::bounded_queue::{BoundedQueue, Pop};
 use bus::shutdown::Stop;
 use bus::{Bus, BusError, LivelinessEvent, RawMessage};
 use protocol::{CavId, KeyExpr, Kind, Limits, Message, Role, Stream, Topic, wire};
-use ros2::{Mount, RosTopic, Translator, VehicleTopic};
+use ros2::{FrameNames, RosTopic, Translator, VehicleTopic};
 use serde::Serialize;
 
-use super::agent_topic::AgentTopic;
 use super::initial_pose::InitialPose;
 use super::lidar_input::{LidarInputs, LidarReport};
-use super::motion_input::{MotionReport, MotionSource};
+use super::motion_input::MotionReport;
+use super::node_options::NodeOptions;
+use super::other_nodes::{Namesakes, publishes_clock};
 use super::publisher::RosPublisher;
+use super::robot_frames::RobotFrames;
 use super::scene_clock::SceneClock;
 use super::session::RosSession;
 use super::sweeps;
@@ -28,39 +30,6 @@ const PLACES: usize = 64;
 const EVENTS: usize = 256;
 /// Period at which vehicles that have joined or left are looked at.
 const POLL_PERIOD: Duration = Duration::from_millis(50);
-
-/// Options of the node.
-#[derive(Debug, Clone, PartialEq)]
-pub struct NodeOptions {
-    /// True to offer the sweeps of the run's vehicles.
-    pub with_points: bool,
-    /// True to publish `/clock`.
-    pub with_clock: bool,
-    /// Place of the LiDARs on their vehicles.
-    pub mount: Mount,
-    /// LiDARs of the ROS 2 network that are those of agents.
-    pub lidars: Vec<AgentTopic>,
-    /// Motions of these agents in the ROS 2 network.
-    pub motions: Vec<MotionSource>,
-    /// Largest intensity that they publish; passed on are shares of it.
-    pub max_intensity: f32,
-    /// Vehicle whose first fix is published on `/initialpose`.
-    pub initial_pose_of: Option<CavId>,
-}
-
-impl Default for NodeOptions {
-    fn default() -> Self {
-        Self {
-            with_points: true,
-            with_clock: true,
-            mount: Mount::default(),
-            lidars: Vec::new(),
-            motions: Vec::new(),
-            max_intensity: 1.0,
-            initial_pose_of: None,
-        }
-    }
-}
 
 /// Summary of a node: messages published and received.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
@@ -73,6 +42,8 @@ pub struct NodeReport {
     pub lidar: LidarReport,
     /// Messages of motions, by topic.
     pub motion: BTreeMap<String, MotionReport>,
+    /// Poses of robots for which the place of their LiDAR in their odometry frame was not known.
+    pub unplaced_poses: u64,
 }
 
 impl NodeReport {
@@ -106,21 +77,16 @@ pub fn run(
         bus.watch(role, move |event| drop(members.push((), event)))
     });
     let _watched = watched.into_iter().collect::<Result<Vec<_>, _>>()?;
+    let frames = RobotFrames::of(options.robots(), options.mount);
+    let _transforms = frames.listen(session)?;
     let inputs = (!options.lidars.is_empty())
-        .then(|| {
-            LidarInputs::open(
-                bus,
-                session,
-                (&options.lidars, &options.motions),
-                options.max_intensity,
-                stop,
-            )
-        })
+        .then(|| LidarInputs::open(bus, session, (options, &frames), stop))
         .transpose()?;
+    let _namesakes = Namesakes::watch(session)?;
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
         let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
-        let followed = follow(scope, (bus, session, options), &tap, &members);
+        let followed = follow(scope, (bus, session, options), &frames, (&tap, &members));
         // After an error the threads of the LiDARs have to end too.
         stop.request();
         let (lidar, motion) = reading
@@ -129,6 +95,7 @@ pub fn run(
         followed.map(|report| NodeReport {
             lidar,
             motion,
+            unplaced_poses: frames.unplaced(),
             ..report
         })
     })?;
@@ -140,10 +107,10 @@ pub fn run(
 fn follow<'scope, 'env>(
     scope: &'scope Scope<'scope, 'env>,
     (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
-    tap: &bus::PassiveSubscriber,
-    members: &BoundedQueue<(), LivelinessEvent>,
+    frames: &RobotFrames,
+    (tap, members): (&bus::PassiveSubscriber, &BoundedQueue<(), LivelinessEvent>),
 ) -> Result<NodeReport, BusError> {
-    let mut node = Node::new(scope, bus, session, options)?;
+    let mut node = Node::new(scope, (bus, session, options), frames.clone())?;
     let followed = node.follow(tap, members);
     std::mem::take(&mut node.sweeps)
         .into_values()
@@ -169,7 +136,12 @@ struct Node<'scope, 'env> {
     session: &'env RosSession,
     options: &'env NodeOptions,
     translator: Translator,
+    frames: RobotFrames,
+    names: FrameNames,
+    /// The fixed transforms as they were published last.
+    fixed: Vec<u8>,
     clock: SceneClock,
+    publishes_clock: bool,
     initial_pose: Option<InitialPose>,
     publishers: BTreeMap<RosTopic, RosPublisher>,
     sweeps: BTreeMap<CavId, Forwarding<'scope>>,
@@ -182,21 +154,29 @@ struct Node<'scope, 'env> {
 impl<'scope, 'env> Node<'scope, 'env> {
     fn new(
         scope: &'scope Scope<'scope, 'env>,
-        bus: &'env Bus,
-        session: &'env RosSession,
-        options: &'env NodeOptions,
+        (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
+        frames: RobotFrames,
     ) -> Result<Self, BusError> {
+        let mount = options.mount.unwrap_or_default();
         let initial_pose = options
             .initial_pose_of
             .clone()
-            .map(|cav| InitialPose::of(cav, options.mount));
+            .map(|cav| InitialPose::of(cav, mount));
+        let names = FrameNames::within(session.node().namespace.as_ref());
+        let translator = Translator::new(&bus.identity().run)
+            .with_frames(names.clone(), options.robots().collect());
+        let publishes_clock = publishes_clock(session, options.clock)?;
         let mut node = Self {
             scope,
             bus,
             session,
             options,
-            translator: Translator::new(&bus.identity().run),
+            translator,
+            frames,
+            names,
+            fixed: Vec::new(),
             clock: SceneClock::default(),
+            publishes_clock,
             initial_pose,
             publishers: BTreeMap::new(),
             sweeps: BTreeMap::new(),
@@ -204,7 +184,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
             published: BTreeMap::new(),
             left_out: 0,
         };
-        let clock = options.with_clock.then_some(RosTopic::Clock);
+        let clock = publishes_clock.then_some(RosTopic::Clock);
         let initial_pose = node.initial_pose.is_some().then_some(InitialPose::TOPIC);
         let topics = [RosTopic::Tf, RosTopic::TfStatic, RosTopic::Diagnostics].into_iter();
         topics
@@ -224,6 +204,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
             while let Pop::Item((), event) = members.take(Some(Instant::now())) {
                 self.note(event)?;
             }
+            self.place_robots()?;
             match tap.take(Some(Instant::now() + POLL_PERIOD)) {
                 Pop::Item(topic, raw) => self.take(&topic, &raw)?,
                 Pop::TimedOut => {}
@@ -246,7 +227,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
                 if self.options.with_points {
                     self.forward_sweeps(&cav)?;
                 }
-                self.publish_static_transforms()
+                Ok(())
             }
             LivelinessEvent::Joined { cav, .. } => {
                 [VehicleTopic::Detections, VehicleTopic::Markers]
@@ -262,7 +243,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
                 if let Some(forwarding) = self.sweeps.remove(&cav) {
                     forwarding.end();
                 }
-                self.publish_static_transforms()
+                Ok(())
             }
             LivelinessEvent::Left { cav, .. } => {
                 self.withdraw(&cav, &[VehicleTopic::Detections, VehicleTopic::Markers]);
@@ -278,10 +259,34 @@ impl<'scope, 'env> Node<'scope, 'env> {
         }
     }
 
-    /// The frames of the vehicles' bodies: all of them in one message, as only the last is kept for late subscribers.
+    /// The transforms that robots have got since, and the fixed ones if they have changed.
+    fn place_robots(&mut self) -> Result<(), BusError> {
+        for (nanos, frame) in self.frames.odometry_in_map() {
+            self.publish(RosTopic::Tf, ros2::transforms(nanos, &[frame]))?;
+        }
+        self.publish_static_transforms()
+    }
+
+    /// The bodies of vehicles below their LiDARs, and the LiDARs of robots in the robots' own frames: all of them in one
+    /// message, as only the last is kept for late subscribers.
     fn publish_static_transforms(&mut self) -> Result<(), BusError> {
+        let mount = self.options.mount.unwrap_or_default();
+        let mut in_robots = self.frames.lidars_in_robots(&self.names);
+        let is_robot = |cav: &CavId| self.options.robots().any(|robot| robot == *cav);
+        let frames: Vec<_> = self
+            .agents
+            .iter()
+            .filter_map(|cav| match is_robot(cav) {
+                true => in_robots.remove(cav),
+                false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
+            })
+            .collect();
         // The stamp of a fixed transform has no meaning.
-        let cdr = ros2::static_transforms(0, self.agents.iter(), &self.options.mount);
+        let cdr = ros2::transforms(0, &frames);
+        if self.fixed == cdr || self.fixed.is_empty() && frames.is_empty() {
+            return Ok(());
+        }
+        self.fixed.clone_from(&cdr);
         self.publish(RosTopic::TfStatic, cdr)
     }
 
@@ -297,8 +302,9 @@ impl<'scope, 'env> Node<'scope, 'env> {
             .publisher(&RosTopic::Vehicle(cav.clone(), VehicleTopic::Points))?;
         let ending = Arc::<AtomicBool>::default();
         let (bus, vehicle, ended) = (self.bus, cav.clone(), Arc::clone(&ending));
+        let names = self.names.clone();
         let thread = self.scope.spawn(move || {
-            if let Err(error) = sweeps::forward(bus, &vehicle, &mut publisher, &ended) {
+            if let Err(error) = sweeps::forward(bus, &vehicle, (&mut publisher, names), &ended) {
                 tracing::error!("sweeps of {vehicle} are no longer published: {error}");
             }
         });
@@ -321,6 +327,10 @@ impl<'scope, 'env> Node<'scope, 'env> {
         if let Topic::Stream { cav, stream } = topic {
             self.tell_time(cav, *stream, capture_nanos)?;
             self.tell_initial_pose(cav, capture_nanos, &message)?;
+            if let Message::Pose(estimate) = &message {
+                let pose = estimate.world_from_cav().map(protocol::Pose::isometry);
+                self.frames.note_pose(cav, capture_nanos, pose);
+            }
         }
         for message in self.translator.translate(topic, capture_nanos, &message) {
             self.publish(message.topic, message.cdr)?;
@@ -338,7 +348,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
         match self
             .clock
             .advance(cav, stream, capture_nanos)
-            .filter(|_| self.options.with_clock)
+            .filter(|_| self.publishes_clock)
         {
             Some(nanos) => self.publish(RosTopic::Clock, ros2::clock(nanos)),
             None => Ok(()),

@@ -1,13 +1,15 @@
 //! Session on a ROS 2 network: a node, its publishers and its subscriptions.
 
+use std::any::Any;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use bus::BusError;
 use ros2::endpoint::{Endpoint, EndpointKind, Node, gid};
 use ros2::{Distribution, Qos, RosName, RosTopic, RosType};
 use zenoh::liveliness::LivelinessToken;
-use zenoh::sample::Sample;
+use zenoh::sample::{Locality, Sample};
 use zenoh::{Session, Wait};
+use zenoh_ext::{AdvancedSubscriberBuilderExt, HistoryConfig};
 
 use super::publisher::RosPublisher;
 
@@ -25,7 +27,8 @@ pub struct RosSession {
 
 /// A subscription; ends when dropped.
 pub(super) struct RosSubscription {
-    _subscriber: zenoh::pubsub::Subscriber<()>,
+    /// Plain, or one with history.
+    _subscriber: Box<dyn Any + Send + Sync>,
     _token: LivelinessToken,
 }
 
@@ -62,6 +65,11 @@ impl RosSession {
         &self.node
     }
 
+    /// The session.
+    pub(super) fn zenoh(&self) -> &Session {
+        &self.session
+    }
+
     /// Declares a publisher of `topic`.
     pub(super) fn publisher(&self, topic: &RosTopic) -> Result<RosPublisher, BusError> {
         let name = topic.name(self.node.namespace.as_ref());
@@ -80,13 +88,20 @@ impl RosSession {
         qos: Qos,
         receive: impl Fn(Sample) + Send + Sync + 'static,
     ) -> Result<RosSubscription, BusError> {
-        // Publishers of every distribution are heard, whatever hash they write.
+        // Publishers of every distribution are heard, whatever hash they write; but not our own.
         let keys = self.node.any_hash(topic, ros_type);
-        let subscriber = self
+        let builder = self
             .session
             .declare_subscriber(&keys)
-            .callback(receive)
-            .wait();
+            .allowed_origin(Locality::Remote)
+            .callback(receive);
+        let subscriber: zenoh::Result<Box<dyn Any + Send + Sync>> = if qos.is_latched {
+            let history = HistoryConfig::default().detect_late_publishers();
+            let builder = builder.history(history).subscriber_detection();
+            builder.wait().map(|subscriber| Box::new(subscriber) as _)
+        } else {
+            builder.wait().map(|subscriber| Box::new(subscriber) as _)
+        };
         let subscriber = subscriber
             .map_err(|cause| BusError::zenoh(format!("subscribing to {keys}"), &cause))?;
         let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);

@@ -1,5 +1,6 @@
 //! Sweeps to a ROS 2 network: of vehicles whose points somebody there subscribes to.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -8,7 +9,7 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, RawMessage};
 use protocol::{CavId, KeyExpr, Kind, Limits, Stream, Topic, wire};
-use ros2::Translator;
+use ros2::{FrameNames, Translator};
 
 use super::publisher::RosPublisher;
 
@@ -20,7 +21,7 @@ const POLL_PERIOD: Duration = Duration::from_millis(100);
 pub(super) fn forward(
     bus: &Bus,
     cav: &CavId,
-    publisher: &mut RosPublisher,
+    (publisher, names): (&mut RosPublisher, FrameNames),
     ending: &Arc<AtomicBool>,
 ) -> Result<(), BusError> {
     let topic = Topic::Stream {
@@ -28,7 +29,7 @@ pub(super) fn forward(
         stream: Stream::Lidar,
     };
     let key = KeyExpr::one(&bus.key(topic.clone()));
-    let mut translator = Translator::new(&bus.identity().run);
+    let mut translator = Translator::new(&bus.identity().run).with_frames(names, BTreeSet::new());
     let is_ending = || ending.load(Ordering::Relaxed);
     while !is_ending() {
         if !publisher.is_wanted() {

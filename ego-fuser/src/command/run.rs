@@ -49,7 +49,7 @@ impl Arguments {
             .with_comm_range(config.comm_range_m)
             .with_misbehaviour_detection(settings.trust())?;
         let stop = bus.stop().context("installing signal handlers")?;
-        let bus = bus.join(run, Role::Ego, cav)?;
+        let bus = bus.join(&stop, run, Role::Ego, cav)?;
         tracing::info!(ego = %cav, method = %ego.method(), weights = %models.weights.display(), "ready");
         let report = node::run(&bus, cav, ego, &NodeOptions::from(&config), &stop)?;
         if let Err(overdue) = bus.leave(STOP_LIMIT) {

@@ -101,7 +101,7 @@ fn view_by(
     let output = agent.process(&input).unwrap();
     let content = match method.own_content() {
         Exchange::Boxes => Content::Boxes(output.perception.detections),
-        Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&cloud)),
+        Exchange::Points => Content::Points(agent.share_points(&cloud)),
         _ => Content::Features(DecodedFeatures {
             features: output.perception.features,
             sent: None,

@@ -116,11 +116,11 @@ impl BusConfig {
         }
     }
 
-    /// Joins `run` in a role.
+    /// Joins `run` in a role; a request to stop ends the wait for the router.
     ///
     /// # Errors
     /// [`BusError`] states the endpoint and the remedy.
-    pub fn join(&self, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
+    pub fn join(&self, stop: &Stop, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
         let identity = Identity {
             run: run.clone(),
             process: process_id(role, cav),
@@ -130,7 +130,7 @@ impl BusConfig {
         if let Some(credentials) = &options.credentials {
             credentials.check_name(identity.process.as_str())?;
         }
-        let mut bus = Bus::join(&options, identity)?;
+        let mut bus = Bus::join_unless(stop, &options, identity)?;
         if let Some(address) = self.metrics {
             let address = bus.serve_metrics(address, Vec::new())?;
             tracing::info!("metrics at http://{address}/metrics");

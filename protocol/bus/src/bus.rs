@@ -17,11 +17,11 @@ use super::metrics::{MetricsPeer, MetricsServer};
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
 use super::shared_pool::SharedPool;
-use super::shutdown::{self, Overdue};
+use super::shutdown::{self, Overdue, Stop};
 use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
 use super::watchdog::Heartbeat;
-use super::{BusError, BusOptions, MessageStats, open};
+use super::{BusError, BusOptions, MessageStats, open, open_unless};
 
 /// Identity of a process in a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -52,7 +52,27 @@ impl Bus {
     /// # Errors
     /// [`BusError`], as [`open`].
     pub fn join(options: &BusOptions, identity: Identity) -> Result<Self, BusError> {
-        let mut bus = Self::over(open(options)?, identity)?;
+        Self::with_pool(open(options)?, options, identity)
+    }
+
+    /// [`Self::join`], or the end at once when `stop` is requested before the router is reached.
+    ///
+    /// # Errors
+    /// [`BusError`], as [`open_unless`].
+    pub fn join_unless(
+        stop: &Stop,
+        options: &BusOptions,
+        identity: Identity,
+    ) -> Result<Self, BusError> {
+        Self::with_pool(open_unless(stop, options)?, options, identity)
+    }
+
+    fn with_pool(
+        session: Session,
+        options: &BusOptions,
+        identity: Identity,
+    ) -> Result<Self, BusError> {
+        let mut bus = Self::over(session, identity)?;
         bus.pool = SharedPool::open(&bus.session, options.shared_memory.pool_bytes(), &bus.stats)?;
         Ok(bus)
     }

@@ -4,6 +4,7 @@ use std::io::ErrorKind;
 use std::path::PathBuf;
 
 use serde_json::Value;
+use support::cli::Interrupted;
 
 use super::endpoint::Endpoint;
 
@@ -54,6 +55,14 @@ pub enum BusError {
         endpoint: Endpoint,
         /// Seconds waited.
         waited_s: f64,
+    },
+    /// The process was asked to end while it waited for the router.
+    #[error("stopped while waiting for a router at {endpoint}")]
+    Stopped {
+        /// Endpoint of the router.
+        endpoint: Endpoint,
+        /// Gives the process the exit code of an end on request.
+        source: Interrupted,
     },
     /// The system cannot start a thread.
     #[error("no thread for {what}: {cause}")]

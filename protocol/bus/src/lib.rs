@@ -92,6 +92,6 @@ pub use process_usage::{process_cpu_s, process_usage};
 pub use publisher::{Overflow, Publisher, PublisherOptions, has_subscribers, unix_nanos};
 pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
 pub use rejection_log::{Rejection, RejectionLog};
-pub use session::{BusOptions, Role as SessionRole, SharedMemory, open};
+pub use session::{BusOptions, Role as SessionRole, SharedMemory, open, open_unless};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};
 pub use watchdog::Heartbeat;

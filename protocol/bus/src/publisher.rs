@@ -51,6 +51,8 @@ pub struct PublisherOptions {
     /// For viewers: zenoh may drop a message rather than wait, there are no probes and no end notifications, and
     /// [`Publisher::is_wanted`] is true while there are subscribers.
     pub is_for_onlookers: bool,
+    /// Tells receivers when it ends. Without it they neither end with it nor count messages lost at its very end.
+    pub announces_end: bool,
 }
 
 impl PublisherOptions {
@@ -79,6 +81,16 @@ impl PublisherOptions {
             priority,
             express,
             is_for_onlookers: false,
+            announces_end: true,
+        }
+    }
+
+    /// The same of a source that may stop and come back, as a sensor does and a replay does not: its receivers stay.
+    #[must_use]
+    pub const fn live(self) -> Self {
+        Self {
+            announces_end: false,
+            ..self
         }
     }
 
@@ -142,6 +154,7 @@ impl Publisher {
             priority,
             express,
             is_for_onlookers,
+            announces_end,
         } = options;
         let topic = key.topic.clone();
         // JSON is read by programs outside this project, which do not expect probes.
@@ -179,6 +192,7 @@ impl Publisher {
             epoch,
             sequence: 0,
             has_notifications: !is_json && !is_for_onlookers,
+            announces_end,
             queue: Arc::clone(&queue),
             stats: stats.clone(),
             pool: pool.clone(),
@@ -282,7 +296,8 @@ impl Publisher {
         }
     }
 
-    /// Sends queued messages, then a notification with the number of messages, and ends. Waits for the network.
+    /// Sends queued messages, then a notification with the number of messages if it announces its end, and ends. Waits
+    /// for the network.
     pub fn finish(mut self) {
         self.queue.close();
         if let Some(thread) = self.thread.take()
@@ -307,6 +322,7 @@ struct Sender {
     epoch: u64,
     sequence: u64,
     has_notifications: bool,
+    announces_end: bool,
     queue: Arc<BoundedQueue<(), Submission>>,
     stats: MessageStats,
     pool: SharedPool,
@@ -335,7 +351,7 @@ impl Sender {
                 Pop::Closed => break,
             }
         }
-        if self.has_notifications {
+        if self.has_notifications && self.announces_end {
             let sent = vec![TopicCount {
                 topic: self.topic.clone(),
                 messages: self.sequence,

@@ -1,9 +1,12 @@
 //! Session of zenoh: explicit endpoints, no discovery, every limit set explicitly.
 
 use std::net::{TcpListener, UdpSocket};
+use std::sync::mpsc;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+use support::cli::Interrupted;
 use zenoh::{Config, Session, Wait};
 
 use super::access_control::{self, AccessControl};
@@ -11,6 +14,7 @@ use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE
 use super::egress;
 use super::endpoint::Endpoint;
 use super::error::BusError;
+use super::shutdown::Stop;
 
 /// Timeout of one attempt to open a connection.
 const OPEN_LIMIT: Duration = Duration::from_secs(3);
@@ -312,6 +316,33 @@ pub fn open(options: &BusOptions) -> Result<Session, BusError> {
         })
 }
 
+/// [`open`], or the end at once when `stop` is requested while a client waits for its router.
+///
+/// # Errors
+/// [`BusError::Stopped`] after the request; else as [`open`].
+pub fn open_unless(stop: &Stop, options: &BusOptions) -> Result<Session, BusError> {
+    let (result, first) = mpsc::channel();
+    stop.on_request({
+        let result = result.clone();
+        // The receiver is gone where the session was opened before.
+        move || drop(result.send(None))
+    });
+    // zenoh cannot be interrupted: its thread is left behind, and ends with the process.
+    let wanted = options.clone();
+    thread::Builder::new()
+        .name("open".into())
+        .spawn(move || drop(result.send(Some(open(&wanted)))))
+        .map_err(|cause| BusError::Thread {
+            what: "opening a session".into(),
+            cause,
+        })?;
+    let stopped = BusError::Stopped {
+        endpoint: options.endpoint().clone(),
+        source: Interrupted,
+    };
+    first.recv().ok().flatten().unwrap_or(Err(stopped))
+}
+
 fn port_in_use(endpoint: &Endpoint) -> bool {
     let address = endpoint.address();
     let bound = if endpoint.is_secured() {
@@ -390,6 +421,29 @@ mod tests {
             open(&BusOptions::client(endpoint)),
             Err(BusError::NoKeys(_))
         ));
+    }
+
+    #[test]
+    fn a_request_ends_the_wait_for_a_router_at_once() {
+        let nobody = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = nobody.local_addr().unwrap().port();
+        drop(nobody);
+        let options = BusOptions {
+            connect_timeout: Duration::from_secs(60),
+            ..BusOptions::client(Endpoint::loopback(port))
+        };
+        let stop = Stop::new();
+        let waiting = thread::spawn({
+            let stop = stop.clone();
+            move || open_unless(&stop, &options).unwrap_err()
+        });
+        thread::sleep(Duration::from_millis(100));
+        assert!(!waiting.is_finished());
+        let began = Instant::now();
+        stop.request();
+        let error = waiting.join().unwrap();
+        assert!(began.elapsed() < Duration::from_secs(10));
+        assert!(matches!(error, BusError::Stopped { .. }), "{error}");
     }
 
     #[test]

@@ -40,6 +40,39 @@ pub struct Node {
     pub distribution: Distribution,
 }
 
+/// Name of any node of a network, from its liveliness token or that of one of its endpoints.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct NodeName {
+    /// Id of its session.
+    pub zid: String,
+    /// Namespace; the root is `/`.
+    pub namespace: String,
+    /// Name, without a slash.
+    pub name: String,
+}
+
+impl NodeName {
+    /// Reads a token; `None` if it is of another form.
+    #[must_use]
+    pub fn of_token(token: &str) -> Option<Self> {
+        let mut chunks = token.split('/');
+        let (root, _domain, zid) = (chunks.next()?, chunks.next()?, chunks.next()?);
+        let [_node, _endpoint, _kind, _enclave] = [(); 4].map(|()| chunks.next());
+        let (namespace, name) = (chunks.next()?, chunks.next()?);
+        (root == TOKEN_ROOT).then(|| Self {
+            zid: zid.to_owned(),
+            namespace: namespace.replace('%', "/"),
+            name: name.to_owned(),
+        })
+    }
+}
+
+impl std::fmt::Display for NodeName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}/{}", self.namespace.trim_end_matches('/'), self.name)
+    }
+}
+
 /// One publisher or subscription of a [`Node`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
@@ -65,6 +98,34 @@ impl Node {
             self.zid,
             self.identity()
         )
+    }
+
+    /// The node as others see it.
+    #[must_use]
+    pub fn name_in_network(&self) -> NodeName {
+        NodeName {
+            zid: self.zid.clone(),
+            namespace: self
+                .namespace
+                .as_ref()
+                .map_or("/", RosName::as_str)
+                .to_owned(),
+            name: self.name.clone(),
+        }
+    }
+
+    /// Selector of the tokens of all nodes of this name in the domain, its own among them.
+    #[must_use]
+    pub fn namesakes(&self) -> String {
+        let (domain, name) = (self.domain_id, mangled(&self.name));
+        format!("{TOKEN_ROOT}/{domain}/*/*/*/NN/*/*/{name}")
+    }
+
+    /// Selector of the tokens of all publishers of a topic in the domain.
+    #[must_use]
+    pub fn publishers_of(&self, topic: &RosName) -> String {
+        let (domain, topic) = (self.domain_id, mangled(topic.as_str()));
+        format!("{TOKEN_ROOT}/{domain}/*/*/*/MP/*/*/*/{topic}/**")
     }
 
     /// Liveliness token of one of its endpoints.
@@ -234,6 +295,14 @@ mod tests {
             root.any_hash(&points().topic, RosType::PointCloud2),
             format!("{key}/*")
         );
+        let other = NodeName::of_token(&fleet.endpoint_token(&points())).unwrap();
+        assert_eq!(other, fleet.name_in_network());
+        assert_eq!(other.to_string(), "/fleet/a/v2vloc");
+        assert_eq!(
+            NodeName::of_token(&root.token()),
+            Some(root.name_in_network())
+        );
+        assert_eq!(NodeName::of_token("@ros2_lv/7/a1b2/0"), None);
         let humble = Node {
             distribution: Distribution::Humble,
             ..root

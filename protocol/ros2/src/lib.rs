@@ -11,7 +11,7 @@
 //! | `/cav_<id>/points` | `sensor_msgs/PointCloud2` | sweep | best effort, 5 |
 //! | `/cav_<id>/detections` | `vision_msgs/Detection3DArray` | detections of an ego | reliable, 10 |
 //! | `/cav_<id>/markers` | `visualization_msgs/MarkerArray` | the same, for viewers | reliable, 10 |
-//! | `/tf` | `tf2_msgs/TFMessage` | `map` to `cav_<id>/lidar` | reliable, 100 |
+//! | `/tf` | `tf2_msgs/TFMessage` | `map` to `cav_<id>/lidar`, or to the odometry frame of a robot | reliable, 100 |
 //! | `/tf_static` | `tf2_msgs/TFMessage` | `cav_<id>/lidar` to `cav_<id>/base_link` | reliable, latched, 1 |
 //! | `/clock` | `rosgraph_msgs/Clock` | capture times | best effort, 1 |
 //! | `/diagnostics` | `diagnostic_msgs/DiagnosticArray` | statistics of a process | reliable, 10 |
@@ -42,18 +42,22 @@ mod point_cloud;
 mod qos;
 mod read;
 mod ros_type;
+mod stated_pose;
 mod topic;
 mod transforms;
 mod translator;
 mod type_hash;
 
-pub use encode::{Mount, MountError, clock, pose, static_transforms};
+pub use encode::{
+    FrameInParent, Mount, MountError, body_in_lidar, clock, pose, static_transforms, transforms,
+};
 pub use motion::{MotionError, MotionType, TimedMotion};
-pub use names::{NameError, RosName};
+pub use names::{FrameNames, NameError, RosName};
 pub use point_cloud::{PointCloudError, Sweep, SweepLimits, read_point_cloud};
 pub use qos::Qos;
 pub use read::ReadError;
 pub use ros_type::RosType;
+pub use stated_pose::{StatedPose, StatedPoseError};
 pub use topic::{RosTopic, VehicleTopic};
 pub use transforms::{PoseType, Transform, read_header};
 pub use translator::{RosMessage, Translator};

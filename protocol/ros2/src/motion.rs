@@ -256,7 +256,6 @@ mod tests {
 
     #[test]
     fn our_own_odometry_is_read_back_with_what_it_measures() {
-        let cav = protocol::CavId::new("1").unwrap();
         let pose = protocol::Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.5);
         for motion in [
             EgoMotion {
@@ -273,14 +272,14 @@ mod tests {
             },
         ] {
             let bytes =
-                crate::encode::odometry(1_700_000_000_000_000_001, &cav, &pose, None, motion);
+                crate::encode::odometry(1_700_000_000_000_000_001, "lidar", &pose, None, motion);
             let expected = TimedMotion {
                 capture_nanos: 1_700_000_000_000_000_001,
                 motion,
             };
             assert_eq!(MotionType::Odometry.read(&bytes), Ok(expected));
         }
-        let bytes = crate::encode::odometry(5, &cav, &pose, None, EgoMotion::default());
+        let bytes = crate::encode::odometry(5, "lidar", &pose, None, EgoMotion::default());
         let error = MotionType::Odometry.read(&bytes).unwrap_err().to_string();
         assert_eq!(error, "twist.covariance[0] is 1000000: nothing is measured");
     }

@@ -93,28 +93,52 @@ pub fn vehicle(cav: &CavId) -> String {
     name
 }
 
-/// Frame of a vehicle's LiDAR, at its estimated pose.
-#[must_use]
-pub fn lidar_frame(cav: &CavId) -> String {
-    format!("{}/lidar", vehicle(cav))
+/// Frames of the vehicles of one node: `cav_1000/lidar`, in a namespace `fleet/cav_1000/lidar`, so that two nodes in one
+/// ROS 2 network, which has one tree of frames, never name the same one.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct FrameNames {
+    /// Empty, or the namespace and a slash.
+    prefix: String,
 }
 
-/// Optical frame of a vehicle's camera: z ahead, x right, y down.
-#[must_use]
-pub fn camera_frame(cav: &CavId, number: u8) -> String {
-    format!("{}/camera_{number}", vehicle(cav))
-}
+impl FrameNames {
+    /// Frames of a node in `namespace`.
+    #[must_use]
+    pub fn within(namespace: Option<&RosName>) -> Self {
+        // Unlike topics, frames begin with no slash.
+        let prefix = namespace.map(|name| format!("{}/", &name.as_str().trim_start_matches('/')));
+        Self {
+            prefix: prefix.unwrap_or_default(),
+        }
+    }
 
-/// Frame of a vehicle's body, fixed to its LiDAR.
-#[must_use]
-pub fn base_frame(cav: &CavId) -> String {
-    format!("{}/base_link", vehicle(cav))
-}
+    /// Frame of a vehicle's LiDAR, at its estimated pose.
+    #[must_use]
+    pub fn lidar(&self, cav: &CavId) -> String {
+        self.of(cav, "lidar")
+    }
 
-/// Frame of a vehicle's LiDAR at its true pose.
-#[must_use]
-pub fn truth_frame(cav: &CavId) -> String {
-    format!("{}/truth", vehicle(cav))
+    /// Optical frame of a vehicle's camera: z ahead, x right, y down.
+    #[must_use]
+    pub fn camera(&self, cav: &CavId, number: u8) -> String {
+        self.of(cav, &format!("camera_{number}"))
+    }
+
+    /// Frame of a vehicle's body, fixed to its LiDAR.
+    #[must_use]
+    pub fn base(&self, cav: &CavId) -> String {
+        self.of(cav, "base_link")
+    }
+
+    /// Frame of a vehicle's LiDAR at its true pose.
+    #[must_use]
+    pub fn truth(&self, cav: &CavId) -> String {
+        self.of(cav, "truth")
+    }
+
+    fn of(&self, cav: &CavId, frame: &str) -> String {
+        format!("{}{}/{frame}", self.prefix, vehicle(cav))
+    }
 }
 
 #[cfg(test)]
@@ -132,6 +156,16 @@ mod tests {
         assert_eq!(vehicle_of("1000"), "cav_1000");
         assert_eq!(vehicle_of("-1"), "cav_M1");
         assert_eq!(vehicle_of("_a__b"), "cav_Ua_Ub");
+    }
+
+    #[test]
+    fn frames_are_in_the_namespace_of_their_node() {
+        let (cav, fleet) = (CavId::new("-1").unwrap(), RosName::new("/a/fleet").unwrap());
+        assert_eq!(FrameNames::default().lidar(&cav), "cav_M1/lidar");
+        assert_eq!(
+            FrameNames::within(Some(&fleet)).camera(&cav, 2),
+            "a/fleet/cav_M1/camera_2"
+        );
     }
 
     #[test]

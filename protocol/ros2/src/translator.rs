@@ -7,7 +7,7 @@ use protocol::{
 };
 
 use super::encode::{self, Level, Marked, Status};
-use super::names::{MAP_FRAME, camera_frame, lidar_frame, truth_frame};
+use super::names::{FrameNames, MAP_FRAME};
 use super::topic::{RosTopic, VehicleTopic};
 
 const DETECTION_RGB: [f32; 3] = [1.0, 0.37, 0.30];
@@ -27,6 +27,9 @@ pub struct RosMessage {
 #[derive(Debug)]
 pub struct Translator {
     run: RunId,
+    names: FrameNames,
+    /// Vehicles whose LiDARs have a place in a tree of frames that others publish.
+    placed: BTreeSet<CavId>,
     motions: BTreeMap<CavId, (u64, EgoMotion)>,
     losses: BTreeMap<ProcessId, u64>,
     /// Latest capture time so far: the stamp of messages without one.
@@ -39,9 +42,22 @@ impl Translator {
     pub fn new(run: &RunId) -> Self {
         Self {
             run: run.clone(),
+            names: FrameNames::default(),
+            placed: BTreeSet::new(),
             motions: BTreeMap::new(),
             losses: BTreeMap::new(),
             latest_nanos: 0,
+        }
+    }
+
+    /// The same with other names of frames, and without transforms from `map` to the LiDARs of `placed` vehicles, which
+    /// hang elsewhere: a frame has one parent.
+    #[must_use]
+    pub fn with_frames(self, names: FrameNames, placed: BTreeSet<CavId>) -> Self {
+        Self {
+            names,
+            placed,
+            ..self
         }
     }
 
@@ -79,7 +95,7 @@ impl Translator {
                 },
                 Message::Lidar(lidar),
             ) => {
-                let cdr = encode::point_cloud(at, &lidar_frame(cav), &lidar.points);
+                let cdr = encode::point_cloud(at, &self.names.lidar(cav), &lidar.points);
                 vec![of_vehicle(cav, VehicleTopic::Points, cdr)]
             }
             (
@@ -88,7 +104,7 @@ impl Translator {
                     stream: Stream::Camera(number),
                 },
                 Message::Camera(image),
-            ) => image_messages(cav, *number, at, image),
+            ) => self.image_messages(cav, *number, at, image),
             (
                 Topic::Stream {
                     cav,
@@ -114,7 +130,7 @@ impl Translator {
                 Message::Detections(result),
             ) => {
                 let boxes: Vec<Marked> = result.detections.iter().map(Marked::from).collect();
-                let frame = lidar_frame(cav);
+                let frame = self.names.lidar(cav);
                 let detections = encode::detections(at, &frame, &result.detections);
                 let markers = encode::markers(at, &frame, "detections", DETECTION_RGB, &boxes);
                 vec![
@@ -122,7 +138,7 @@ impl Translator {
                     of_vehicle(cav, VehicleTopic::Markers, markers),
                 ]
             }
-            (Topic::Truth, Message::Truth(truth)) => truth_messages(at, truth),
+            (Topic::Truth, Message::Truth(truth)) => self.truth_messages(at, truth),
             (Topic::Stats(_), Message::Stats(stats)) => {
                 let status = self.status(stats);
                 let cdr = encode::diagnostics(self.latest_nanos, &[status]);
@@ -142,15 +158,66 @@ impl Translator {
         let motion = self.motions.get(cav).filter(|(nanos, _)| *nanos == at);
         let motion = motion.map_or(EgoMotion::default(), |(_, motion)| *motion);
         let covariance = estimate.covariance();
-        let odometry = encode::odometry(at, cav, pose, covariance, motion);
+        let frame = self.names.lidar(cav);
+        let odometry = encode::odometry(at, &frame, pose, covariance, motion);
         // The transform first: a receiver of the others can use them at once.
+        let transform = (!self.placed.contains(cav)).then(|| RosMessage {
+            topic: RosTopic::Tf,
+            cdr: encode::transforms(at, &[(MAP_FRAME.into(), frame, *pose)]),
+        });
+        transform
+            .into_iter()
+            .chain([
+                of_vehicle(cav, VehicleTopic::Pose, encode::pose(at, pose, covariance)),
+                of_vehicle(cav, VehicleTopic::Odometry, odometry),
+            ])
+            .collect()
+    }
+
+    /// An image, and the calibration that is known of its camera: projection and place on the vehicle.
+    fn image_messages(&self, cav: &CavId, number: u8, at: u64, image: &Camera) -> Vec<RosMessage> {
+        let (frame, metadata) = (self.names.camera(cav, number), &image.metadata);
+        let place = metadata.lidar_from_camera.map(|pose| RosMessage {
+            topic: RosTopic::Tf,
+            cdr: encode::transforms(at, &[(self.names.lidar(cav), frame.clone(), pose)]),
+        });
+        let info = metadata.pinhole.map(|pinhole| {
+            let cdr = encode::camera_info(at, &frame, metadata, &pinhole);
+            of_vehicle(cav, VehicleTopic::CameraInfo(number), cdr)
+        });
+        let encoded = of_vehicle(
+            cav,
+            VehicleTopic::Image(number),
+            encode::compressed_image(at, &frame, image),
+        );
+        place.into_iter().chain(info).chain([encoded]).collect()
+    }
+
+    fn truth_messages(&self, at: u64, truth: &Truth) -> Vec<RosMessage> {
+        let mut seen = BTreeSet::new();
+        let objects = truth
+            .agents
+            .iter()
+            .flat_map(|agent| &agent.objects)
+            .filter(|object| seen.insert(object.id));
+        let boxes: Vec<Marked> = objects.map(encode::truth_marker).collect();
+        let frames: Vec<_> = truth
+            .agents
+            .iter()
+            .map(|agent| {
+                let name = self.names.truth(&agent.cav);
+                (MAP_FRAME.to_owned(), name, agent.world_from_lidar)
+            })
+            .collect();
         vec![
             RosMessage {
                 topic: RosTopic::Tf,
-                cdr: encode::transforms(at, &[(lidar_frame(cav), *pose)]),
+                cdr: encode::transforms(at, &frames),
             },
-            of_vehicle(cav, VehicleTopic::Pose, encode::pose(at, pose, covariance)),
-            of_vehicle(cav, VehicleTopic::Odometry, odometry),
+            RosMessage {
+                topic: RosTopic::Truth,
+                cdr: encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes),
+            },
         ]
     }
 
@@ -197,50 +264,6 @@ fn of_vehicle(cav: &CavId, topic: VehicleTopic, cdr: Vec<u8>) -> RosMessage {
         topic: RosTopic::Vehicle(cav.clone(), topic),
         cdr,
     }
-}
-
-/// An image, and the calibration that is known of its camera: projection and place on the vehicle.
-fn image_messages(cav: &CavId, number: u8, at: u64, image: &Camera) -> Vec<RosMessage> {
-    let (frame, metadata) = (camera_frame(cav, number), &image.metadata);
-    let place = metadata.lidar_from_camera.map(|pose| RosMessage {
-        topic: RosTopic::Tf,
-        cdr: encode::mounted(at, &lidar_frame(cav), &frame, &pose),
-    });
-    let info = metadata.pinhole.map(|pinhole| {
-        let cdr = encode::camera_info(at, &frame, metadata, &pinhole);
-        of_vehicle(cav, VehicleTopic::CameraInfo(number), cdr)
-    });
-    let encoded = of_vehicle(
-        cav,
-        VehicleTopic::Image(number),
-        encode::compressed_image(at, &frame, image),
-    );
-    place.into_iter().chain(info).chain([encoded]).collect()
-}
-
-fn truth_messages(at: u64, truth: &Truth) -> Vec<RosMessage> {
-    let mut seen = BTreeSet::new();
-    let objects = truth
-        .agents
-        .iter()
-        .flat_map(|agent| &agent.objects)
-        .filter(|object| seen.insert(object.id));
-    let boxes: Vec<Marked> = objects.map(encode::truth_marker).collect();
-    let poses: Vec<_> = truth
-        .agents
-        .iter()
-        .map(|agent| (truth_frame(&agent.cav), agent.world_from_lidar))
-        .collect();
-    vec![
-        RosMessage {
-            topic: RosTopic::Tf,
-            cdr: encode::transforms(at, &poses),
-        },
-        RosMessage {
-            topic: RosTopic::Truth,
-            cdr: encode::markers(at, MAP_FRAME, "truth", TRUTH_RGB, &boxes),
-        },
-    ]
 }
 
 #[cfg(test)]
@@ -291,6 +314,28 @@ mod tests {
             inlier_count: 3,
         });
         assert_eq!(translator.translate(&topic(Stream::Pose), 300, &none), []);
+    }
+
+    #[test]
+    fn a_lidar_has_one_parent_and_frames_are_in_the_namespace() {
+        let placed = [CavId::new("1").unwrap()].into();
+        let fleet = "/fleet".parse().unwrap();
+        let names = FrameNames::within(Some(&fleet));
+        let pose = Message::Pose(PoseEstimate::new(Pose::IDENTITY, 0.9));
+        let mut translator = translator().with_frames(names, placed);
+        let messages = translator.translate(&topic(Stream::Pose), 1, &pose);
+        let topics: Vec<_> = messages
+            .iter()
+            .map(|message| message.topic.name(None).to_string())
+            .collect();
+        assert_eq!(topics, ["/cav_1/pose", "/cav_1/odometry"]);
+        let frame = b"fleet/cav_1/lidar\0";
+        assert!(
+            messages[1]
+                .cdr
+                .windows(frame.len())
+                .any(|bytes| bytes == frame)
+        );
     }
 
     #[test]

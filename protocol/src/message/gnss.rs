@@ -1,4 +1,4 @@
-//! Poses that are not computed by the method: recorded ones, and those of a GNSS receiver.
+//! Poses that are not computed by the method: recorded ones, those of a GNSS receiver, and those that a person states.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +7,7 @@ use crate::Limits;
 use crate::Pose;
 use crate::WireError;
 
-/// A pose that came with the recording: replay to that vehicle's agent.
+/// A pose from outside, to that vehicle's agent: from the replay, or from the node of a ROS 2 network.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Gnss {
     /// Pose of the LiDAR.
@@ -28,6 +28,8 @@ pub enum GnssSource {
     Recorded,
     /// A satellite receiver, with its noise.
     Gnss,
+    /// A person: where a tracker starts anew. No measurement of the sweep of that time.
+    Stated,
 }
 
 impl Gnss {

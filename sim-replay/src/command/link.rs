@@ -85,7 +85,9 @@ fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
     let stop = config.bus.stop().context("installing signal handlers")?;
-    let bus = config.bus.join(&config.run, Role::Link, &config.ego)?;
+    let bus = config
+        .bus
+        .join(&stop, &config.run, Role::Link, &config.ego)?;
     let options = NodeOptions {
         keeps_running: config.keep_running || config.bus.supervised,
         inbox: config.inbox.limits(),

@@ -31,7 +31,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let stop = config.bus.stop().context("installing signal handlers")?;
     let bus = config
         .bus
-        .join(&config.run, Role::Recorder, &CavId::new("recorder")?)?;
+        .join(&stop, &config.run, Role::Recorder, &CavId::new("recorder")?)?;
     let options = config.options();
     // A failure is reported at once to a process that waits for the report; the last line is the final report.
     let mut on_failure = |report: &RecordReport| {

@@ -42,7 +42,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let stop = config.bus.stop().context("installing signal handlers")?;
     let bus = config
         .bus
-        .join(&config.run, Role::Replay, &CavId::new("replay")?)?;
+        .join(&stop, &config.run, Role::Replay, &CavId::new("replay")?)?;
     let replay = match Replay::prepare(&bus, &scenario, config.options(), &stop) {
         Ok(replay) => replay,
         Err(

@@ -5,4 +5,6 @@ mod link;
 mod recorder;
 mod replay;
 mod ros2;
+mod ros2_frames;
+mod ros2_robot;
 mod sessions;

@@ -354,9 +354,7 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                 let output = agent.process(&input).unwrap();
                 let content = match method.own_content() {
                     Exchange::Boxes => Content::Boxes(output.perception.detections),
-                    Exchange::Points => {
-                        Content::Points(agent.detector().crop().without_own_body(&frame.points))
-                    }
+                    Exchange::Points => Content::Points(agent.share_points(&frame.points)),
                     Exchange::Features | Exchange::Nothing => Content::Features(DecodedFeatures {
                         features: output.perception.features,
                         sent: None,

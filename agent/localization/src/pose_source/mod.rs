@@ -32,6 +32,7 @@ pub use tracked::{TrackedPose, TrackedPoseConfig};
 
 use crate::pgc::head_files::{HeadFileError, encoder_or_named, head_file, is_name};
 use crate::pgc::{LocalizerError, LocalizerInput};
+use crate::tracker::PoseMeasurement;
 
 /// Inputs of a source for one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -71,6 +72,12 @@ pub trait PoseSource: std::fmt::Debug + Send {
     /// the sweep was measured.
     fn observe(&mut self, input: &PoseInput<'_>) -> bool {
         let _ = input;
+        false
+    }
+
+    /// Starts anew at a pose that is stated, not measured. False of sources that follow no vehicle.
+    fn start_at(&mut self, stated: &PoseMeasurement) -> bool {
+        let _ = stated;
         false
     }
 

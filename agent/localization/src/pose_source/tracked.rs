@@ -256,6 +256,14 @@ impl PoseSource for TrackedPose {
         true
     }
 
+    /// Measures the next sweep near the stated pose, not in the whole scene: the place that is found there may be the
+    /// wrong one that the person corrects.
+    fn start_at(&mut self, stated: &PoseMeasurement) -> bool {
+        self.tracker.restart(stated);
+        self.global_nanos = Some(stated.capture_nanos);
+        true
+    }
+
     fn detector_encoder(&self) -> Option<&str> {
         self.localizer.detector_encoder()
     }
@@ -521,6 +529,55 @@ mod tests {
             confidence.windows(2).all(|pair| pair[1] < pair[0]),
             "{confidence:?}"
         );
+    }
+
+    #[test]
+    fn a_stated_pose_is_where_the_vehicle_is_until_its_sweeps_tell() {
+        let cloud = |sweep: usize| PointCloud {
+            xyzi: vec![[0.0; 4]; sweep],
+        };
+        let cav = CavId::new("7").unwrap();
+        let mut source = TrackedPose::new(
+            Box::new(Road {
+                blind: 0..12,
+                ..road()
+            }),
+            TrackedPoseConfig::default(),
+        );
+        let mut step = |sweep: usize, stated: Option<[f64; 2]>| {
+            let (cloud, capture_nanos) = (cloud(sweep), sweep as u64 * 100_000_000);
+            let input = PoseInput {
+                cav: &cav,
+                capture_nanos,
+                cloud: &cloud,
+                levels: None,
+                measured: None,
+                motion: EgoMotion {
+                    speed_mps: Some(10.0),
+                    yaw_rate_rad_s: Some(0.0),
+                },
+            };
+            if let Some([x, y]) = stated {
+                assert!(source.start_at(&PoseMeasurement {
+                    capture_nanos,
+                    world_from_lidar: Isometry3::translation(x, y, 2.0),
+                    position_std_m: 0.5,
+                    yaw_std_rad: 0.1,
+                }));
+            }
+            let estimate = source.estimate(&input);
+            source.observe(&input);
+            estimate
+        };
+        assert_eq!(step(9, None).world_from_cav(), None, "nothing is known");
+        let stated = step(10, Some([10.6, 0.3]));
+        assert_eq!(x_y(&stated), [10.6, 0.3]);
+        assert!(stated.confidence() < 0.7, "it is no measurement");
+        let [x, y] = x_y(&step(11, None));
+        assert!((x - 11.6).abs() < 0.1 && (y - 0.3).abs() < 0.1, "{x}, {y}");
+        let found: Vec<[f64; 2]> = (12..20).map(|sweep| x_y(&step(sweep, None))).collect();
+        let [x, y] = found[7];
+        assert!((x - 19.0).abs() < 0.2 && y.abs() < 0.1, "{found:?}");
     }
 
     #[test]

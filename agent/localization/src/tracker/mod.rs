@@ -154,6 +154,13 @@ impl PoseTracker {
         self.reject(measurement)
     }
 
+    /// Starts at a pose that is stated, not measured: what was known before is forgotten.
+    pub fn restart(&mut self, stated: &PoseMeasurement) {
+        // No speed follows from the way to a place that a person points at.
+        self.accepted = None;
+        self.start(stated);
+    }
+
     fn reject(&mut self, measurement: &PoseMeasurement) -> Correction {
         if self
             .rejected

@@ -16,6 +16,9 @@ pub enum DetectorError {
     /// The configuration does not describe a network.
     #[error(transparent)]
     Config(#[from] ConfigError),
+    /// The vehicle has no detector.
+    #[error("this vehicle has no detector: it gives poses only")]
+    Absent,
     /// A feature map does not have the shape of this detector's.
     #[error("{what} is {found:?}, this detector's is {expected:?} (channels, height, width)")]
     Shape {

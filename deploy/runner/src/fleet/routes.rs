@@ -32,7 +32,7 @@ impl Fleet {
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
-        let stream = self.publish().stream();
+        let (_, stream) = self.publish();
         routes.push(route(&self.ego, stream, &ego));
         // Ego-only: the ego subscribes to its own agent and to no other.
         if self.scenario.method.exchange() == Exchange::Nothing {

@@ -76,7 +76,7 @@ impl CrewProcesses {
                 }
             }
         });
-        let stream = fleet.publish().stream();
+        let (_, stream) = fleet.publish();
         let vehicles: Vec<_> = fleet
             .agents
             .iter()

@@ -64,6 +64,7 @@ impl Scenario {
         for place in [&mut scene.dir, &mut models.weights]
             .into_iter()
             .chain(keys)
+            .filter(|place| !place.as_os_str().is_empty())
         {
             *place = absolute(place);
         }

@@ -4,7 +4,7 @@ use protocol::{CavId, EgoMotion, PlanarCovariance, Pose};
 
 use super::Mount;
 use crate::cdr;
-use crate::names::{MAP_FRAME, base_frame, lidar_frame};
+use crate::names::{FrameNames, MAP_FRAME};
 
 /// Variance of what is not measured, square metres or square radians: so large that a filter gives it no weight. Zero
 /// would claim an exact value.
@@ -27,14 +27,14 @@ pub fn pose(nanos: u64, world_from_lidar: &Pose, covariance: Option<&PlanarCovar
 /// `nav_msgs/Odometry`: the same, with the motion in the LiDAR's frame.
 pub(crate) fn odometry(
     nanos: u64,
-    cav: &CavId,
+    lidar_frame: &str,
     world_from_lidar: &Pose,
     covariance: Option<&PlanarCovariance>,
     motion: EgoMotion,
 ) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, MAP_FRAME);
-        cdr.write_string(&lidar_frame(cav));
+        cdr.write_string(lidar_frame);
         cdr::pose(cdr, world_from_lidar);
         cdr::covariance(cdr, &pose_covariance(covariance));
         cdr::xyz(cdr, [motion.speed_mps.unwrap_or(0.0), 0.0, 0.0]);
@@ -83,50 +83,39 @@ fn diagonal(variances: [f64; 6]) -> [[f64; 6]; 6] {
     rows
 }
 
-/// `tf2_msgs/TFMessage`: frames in the world, each with `world_from_child`.
-pub(crate) fn transforms(nanos: u64, children: &[(String, Pose)]) -> Vec<u8> {
-    tf_message(
-        nanos,
-        children
-            .iter()
-            .map(|(child, pose)| (MAP_FRAME.to_owned(), child.clone(), *pose)),
-    )
+/// A frame in another one: parent, child and `parent_from_child`.
+pub type FrameInParent = (String, String, Pose);
+
+/// The body of a vehicle, fixed to its LiDAR. The LiDAR is the parent, as its pose is the one that is estimated.
+#[must_use]
+pub fn body_in_lidar(names: &FrameNames, cav: &CavId, mount: &Mount) -> FrameInParent {
+    let lidar_from_base = mount.base_from_lidar.isometry().inverse().into();
+    (names.lidar(cav), names.base(cav), lidar_from_base)
 }
 
-/// `tf2_msgs/TFMessage`: one frame mounted on another, with `parent_from_child`.
-pub(crate) fn mounted(nanos: u64, parent: &str, child: &str, parent_from_child: &Pose) -> Vec<u8> {
-    tf_message(
-        nanos,
-        [(parent.to_owned(), child.to_owned(), *parent_from_child)].into_iter(),
-    )
-}
-
-/// `tf2_msgs/TFMessage` for `/tf_static`: the bodies of vehicles, fixed to their LiDARs. The LiDAR is the parent, as its
-/// pose is the one that is estimated.
+/// `tf2_msgs/TFMessage` for `/tf_static`: the bodies of vehicles.
 #[must_use]
 pub fn static_transforms<'a>(
     nanos: u64,
-    vehicles: impl ExactSizeIterator<Item = &'a CavId>,
+    vehicles: impl Iterator<Item = &'a CavId>,
     mount: &Mount,
 ) -> Vec<u8> {
-    let lidar_from_base = Pose::from(mount.base_from_lidar.isometry().inverse());
-    tf_message(
-        nanos,
-        vehicles.map(|cav| (lidar_frame(cav), base_frame(cav), lidar_from_base)),
-    )
+    let names = FrameNames::default();
+    let bodies: Vec<_> = vehicles
+        .map(|cav| body_in_lidar(&names, cav, mount))
+        .collect();
+    transforms(nanos, &bodies)
 }
 
-/// Transforms of parent, child and `parent_from_child`.
-fn tf_message(
-    nanos: u64,
-    transforms: impl ExactSizeIterator<Item = (String, String, Pose)>,
-) -> Vec<u8> {
+/// `tf2_msgs/TFMessage`.
+#[must_use]
+pub fn transforms(nanos: u64, frames: &[FrameInParent]) -> Vec<u8> {
     cdr::message(|cdr| {
-        cdr.write_sequence_length(transforms.len());
-        for (parent, child, parent_from_child) in transforms {
-            cdr::header(cdr, nanos, &parent);
-            cdr.write_string(&child);
-            cdr::pose(cdr, &parent_from_child);
+        cdr.write_sequence_length(frames.len());
+        for (parent, child, parent_from_child) in frames {
+            cdr::header(cdr, nanos, parent);
+            cdr.write_string(child);
+            cdr::pose(cdr, parent_from_child);
         }
     })
 }
@@ -152,7 +141,11 @@ mod tests {
     fn a_transform_is_laid_out_as_ros_lays_it_out() {
         let cdr = transforms(
             1_000_000_002,
-            &[("ab".into(), Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0))],
+            &[(
+                MAP_FRAME.into(),
+                "ab".into(),
+                Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0),
+            )],
         );
         let mut expected = vec![0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0];
         expected.extend(b"\x04\0\0\0map\0\x03\0\0\0ab\0");
@@ -194,7 +187,7 @@ mod tests {
             speed_mps: Some(8.0),
             yaw_rate_rad_s: None,
         };
-        let cdr = odometry(0, &CavId::new("1").unwrap(), &Pose::IDENTITY, None, motion);
+        let cdr = odometry(0, "cav_1/lidar", &Pose::IDENTITY, None, motion);
         let twist = cdr.len() - 8 * (6 + 36);
         assert_eq!(cdr[twist..][..48], f64s(&[8.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
         assert_eq!(

@@ -1,44 +1,90 @@
-//! A measured quantity over time: its value at the capture time of a sweep, and its mean between two of them.
+//! Measured quantities over time: their values at the capture time of a sweep, and the mean between two sweeps.
 //!
-//! Odometry and gyroscopes have rates and stamps of their own, a sweep's motion has that of the sweep.
+//! Odometry, gyroscopes and transforms have rates and stamps of their own.
 
 use std::collections::VecDeque;
 
+use nalgebra::Isometry3;
+
 /// Longest time from a measurement to the next, and to a time that has none after it, nanoseconds: 0.2 s.
 const MAX_GAP_NANOS: u64 = 200_000_000;
-/// Time for which measurements are kept, nanoseconds: some sweeps.
-const KEPT_NANOS: u64 = 2_000_000_000;
+/// Longest time between two poses that are interpolated, nanoseconds: 1 s.
+const MAX_POSE_GAP_NANOS: u64 = 1_000_000_000;
+/// Time for which measurements are kept, nanoseconds: a slow localizer's pose is of a sweep some seconds ago.
+const KEPT_NANOS: u64 = 10_000_000_000;
 /// Most measurements that are kept.
 const MOST: usize = 4096;
 
 /// Measurements in the order of time.
-#[derive(Debug, Default)]
-pub(super) struct MotionSeries(VecDeque<(u64, f64)>);
+#[derive(Debug)]
+pub(super) struct TimeSeries<T>(VecDeque<(u64, T)>);
 
-impl MotionSeries {
+impl<T> Default for TimeSeries<T> {
+    fn default() -> Self {
+        Self(VecDeque::new())
+    }
+}
+
+/// Reason why there is no pose at a time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum NoPose {
+    /// It may still come: the time is later than the last pose.
+    Later,
+    /// The time is before the first pose, or in a gap.
+    Never,
+}
+
+impl<T: Copy> TimeSeries<T> {
     /// Adds a measurement. Those of the same or later times are discarded, since a bag has begun again; their number.
-    pub(super) fn add(&mut self, nanos: u64, value: f64) -> u64 {
+    pub(super) fn add(&mut self, nanos: u64, value: T) -> u64 {
         let mut discarded = 0;
         while self.0.back().is_some_and(|(last, _)| *last >= nanos) {
             self.0.pop_back();
             discarded += 1;
         }
         self.0.push_back((nanos, value));
-        let is_old = |first: &(u64, f64)| nanos - first.0 > KEPT_NANOS;
+        let is_old = |first: &(u64, T)| nanos - first.0 > KEPT_NANOS;
         while self.0.len() > MOST || self.0.front().is_some_and(is_old) {
             self.0.pop_front();
         }
         discarded
     }
 
+    /// The latest measurement.
+    pub(super) fn last(&self) -> Option<T> {
+        self.0.back().map(|(_, value)| *value)
+    }
+
+    /// The last measurement before a time, and the first that is not.
+    fn around(&self, nanos: u64) -> [Option<(u64, T)>; 2] {
+        let next = self.0.partition_point(|(time, _)| *time < nanos);
+        let before = next.checked_sub(1);
+        [before, Some(next)].map(|index| self.0.get(index?).copied())
+    }
+}
+
+impl TimeSeries<Isometry3<f64>> {
+    /// The pose at a time, interpolated between the two around it.
+    pub(super) fn at(&self, nanos: u64) -> Result<Isometry3<f64>, NoPose> {
+        let [before, after] = self.around(nanos);
+        let (to, last) = after.ok_or(NoPose::Later)?;
+        if to == nanos {
+            return Ok(last);
+        }
+        let (from, first) = before.ok_or(NoPose::Never)?;
+        let share = seconds(nanos - from) / seconds(to - from);
+        // Half a turn between two poses cannot be interpolated.
+        (to - from <= MAX_POSE_GAP_NANOS)
+            .then(|| first.try_lerp_slerp(&last, share, 1e-9))
+            .flatten()
+            .ok_or(NoPose::Never)
+    }
+}
+
+impl TimeSeries<f64> {
     /// The value at a time: between two measurements the straight line, else the nearest one that is near enough.
     pub(super) fn at(&self, nanos: u64) -> Option<f64> {
-        let next = self.0.partition_point(|(time, _)| *time < nanos);
-        let before = next
-            .checked_sub(1)
-            .and_then(|index| self.0.get(index))
-            .copied();
-        let after = self.0.get(next).copied();
+        let [before, after] = self.around(nanos);
         match (before, after) {
             (Some((from, first)), Some((to, last))) if to - from <= MAX_GAP_NANOS => {
                 Some(first + (last - first) * seconds(nanos - from) / seconds(to - from))
@@ -85,8 +131,8 @@ mod tests {
 
     const MS: u64 = 1_000_000;
 
-    fn series(values: &[(u64, f64)]) -> MotionSeries {
-        let mut series = MotionSeries::default();
+    fn series(values: &[(u64, f64)]) -> TimeSeries<f64> {
+        let mut series = TimeSeries::default();
         for (ms, value) in values {
             assert_eq!(series.add(ms * MS, *value), 0);
         }
@@ -106,7 +152,19 @@ mod tests {
             [Some(2.0), Some(4.0), Some(9.0)]
         );
         assert_eq!([at(700), at(1250), at(1701)], [None; 3]);
-        assert_eq!(MotionSeries::default().at(5), None);
+        assert_eq!(TimeSeries::<f64>::default().at(5), None);
+    }
+
+    #[test]
+    fn a_pose_is_interpolated_and_awaited_but_never_extrapolated() {
+        let mut series = TimeSeries::default();
+        for (ms, x) in [(1000, 2.0), (1100, 4.0), (3000, 9.0)] {
+            series.add(ms * MS, Isometry3::translation(x, 0.0, 0.0));
+        }
+        let at = |ms: u64| series.at(ms * MS).map(|pose| pose.translation.x);
+        assert_eq!([at(1000), at(1050)], [Ok(2.0), Ok(3.0)]);
+        assert_eq!(at(3001), Err(NoPose::Later));
+        assert_eq!([at(999), at(2000)], [Err(NoPose::Never); 2]);
     }
 
     #[test]
@@ -139,7 +197,7 @@ mod tests {
         );
         (0..10_000).for_each(|k| assert_eq!(series.add(3_000 * MS + k, 0.0), 0));
         assert_eq!(series.0.len(), MOST);
-        assert_eq!(series.add(9_000 * MS, 0.0), 0);
+        assert_eq!(series.add(90_000 * MS, 0.0), 0);
         assert_eq!(series.0.len(), 1);
     }
 }

@@ -1,0 +1,65 @@
+//! Options of the node.
+
+use protocol::CavId;
+use ros2::{MotionType, Mount};
+
+use super::agent_topic::AgentTopic;
+use super::motion_input::MotionSource;
+
+/// Options of the node.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NodeOptions {
+    /// True to offer the sweeps of the run's vehicles.
+    pub with_points: bool,
+    /// Whether `/clock` is published.
+    pub clock: ClockMode,
+    /// Place of the LiDARs on their vehicles; absent: at the origin of the body, and of robots as tf has it.
+    pub mount: Option<Mount>,
+    /// LiDARs of the ROS 2 network that are those of agents.
+    pub lidars: Vec<AgentTopic>,
+    /// Motions of these agents in the ROS 2 network.
+    pub motions: Vec<MotionSource>,
+    /// Poses in the map at which trackers of these agents start.
+    pub starting_poses: Vec<AgentTopic>,
+    /// Largest intensity that they publish; passed on are shares of it.
+    pub max_intensity: f32,
+    /// Vehicle whose first fix is published on `/initialpose`.
+    pub initial_pose_of: Option<CavId>,
+}
+
+/// Publication of `/clock`, of which a ROS 2 network has one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ClockMode {
+    /// Published.
+    On,
+    /// Published if no other node publishes it.
+    Unoccupied,
+    /// Not published.
+    Off,
+}
+
+impl NodeOptions {
+    /// Vehicles with an odometry: their frames are in a tree of their own.
+    pub(super) fn robots(&self) -> impl Iterator<Item = CavId> {
+        let odometry = self
+            .motions
+            .iter()
+            .filter(|motion| motion.motion_type == MotionType::Odometry);
+        odometry.map(|motion| motion.source.cav.clone())
+    }
+}
+
+impl Default for NodeOptions {
+    fn default() -> Self {
+        Self {
+            with_points: true,
+            clock: ClockMode::Unoccupied,
+            mount: None,
+            lidars: Vec::new(),
+            motions: Vec::new(),
+            starting_poses: Vec::new(),
+            max_intensity: 1.0,
+            initial_pose_of: None,
+        }
+    }
+}

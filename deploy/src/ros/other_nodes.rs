@@ -1,0 +1,98 @@
+//! Other nodes of the ROS 2 network whose topics or frames are those of this node.
+
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use bus::BusError;
+use ros2::endpoint::NodeName;
+use ros2::{RosName, RosTopic};
+use zenoh::Wait;
+use zenoh::sample::SampleKind;
+
+use super::node_options::ClockMode;
+use super::session::RosSession;
+
+/// Timeout of a query for tokens.
+const QUERY_TIMEOUT: Duration = Duration::from_secs(3);
+
+/// Subscription to the nodes of this program; ends when dropped.
+pub(super) struct Namesakes {
+    _subscriber: zenoh::pubsub::Subscriber<()>,
+}
+
+impl Namesakes {
+    /// Names other nodes of this program in the log, those that are there and those that come. In one namespace every
+    /// topic and frame has two publishers.
+    pub(super) fn watch(session: &RosSession) -> Result<Self, BusError> {
+        let (own, domain_id) = (session.node().name_in_network(), session.node().domain_id);
+        let selector = session.node().namesakes();
+        let subscriber = session
+            .zenoh()
+            .liveliness()
+            .declare_subscriber(&selector)
+            .history(true)
+            .callback(move |sample| {
+                let token = sample.key_expr().as_str();
+                if sample.kind() == SampleKind::Put
+                    && let Some(other) = NodeName::of_token(token)
+                    && other.zid != own.zid
+                {
+                    warn(&own, &other, domain_id);
+                }
+            });
+        let subscriber = subscriber
+            .wait()
+            .map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))?;
+        Ok(Self {
+            _subscriber: subscriber,
+        })
+    }
+}
+
+fn warn(own: &NodeName, other: &NodeName, domain_id: u32) {
+    let namespace = &other.namespace;
+    if other.namespace == own.namespace {
+        tracing::warn!(
+            "another v2vloc node is in domain {domain_id} and namespace {namespace}: topics and frames of both collide; \
+             give one of them another --namespace"
+        );
+    } else {
+        tracing::info!("another v2vloc node is in domain {domain_id}, namespace {namespace}");
+    }
+}
+
+/// True if this node publishes `/clock`. Of two clocks in one network each would set the time of all nodes.
+pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<bool, BusError> {
+    if mode == ClockMode::Off {
+        return Ok(false);
+    }
+    let others = publishers(session, &RosTopic::Clock.name(None))?;
+    let is_published = others.is_empty() || mode == ClockMode::On;
+    if !others.is_empty() {
+        let names: Vec<&str> = others.iter().map(String::as_str).collect();
+        let names = names.join(", ");
+        if is_published {
+            tracing::warn!("/clock is published by {names} too: nodes get the time of two clocks");
+        } else {
+            tracing::warn!("/clock is published by {names}: it is not by this node");
+        }
+    }
+    Ok(is_published)
+}
+
+/// Nodes that publish a topic, without this one.
+fn publishers(session: &RosSession, topic: &RosName) -> Result<BTreeSet<String>, BusError> {
+    let (own, selector) = (session.node(), session.node().publishers_of(topic));
+    let tokens = session
+        .zenoh()
+        .liveliness()
+        .get(&selector)
+        .timeout(QUERY_TIMEOUT)
+        .wait();
+    let tokens =
+        tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
+    let nodes = std::iter::from_fn(|| tokens.recv().ok())
+        .filter_map(|reply| NodeName::of_token(reply.result().ok()?.key_expr().as_str()))
+        .filter(|node| node.zid != own.zid);
+    Ok(nodes.map(|node| node.to_string()).collect())
+}
