@@ -82,17 +82,8 @@ pub struct OpenedData {
 }
 
 impl OpenedData {
-    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once; of its
-    /// first `ticks` only, if given.
-    fn sha256(&self, part: &Part, variant: Option<&str>, ticks: Option<usize>) -> String {
-        if let Some(mut left) = ticks {
-            let mut first: Vec<Scenario> = part.chosen(&self.scenarios).cloned().collect();
-            for scenario in &mut first {
-                scenario.ticks.truncate(left);
-                left -= scenario.ticks.len();
-            }
-            return dataset::content_sha256(&first, variant, &self.digests);
-        }
+    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.
+    fn sha256(&self, part: &Part, variant: Option<&str>) -> String {
         let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
         let place = (part.scenarios, variant.map(str::to_owned));
         let sha256 = parts.entry(place).or_insert_with(|| {
@@ -226,13 +217,8 @@ impl EvaluationOptions {
         })
     }
 
-    /// Digests of all that these settings are applied to; of the data up to a number of ticks, if there is one.
-    fn provenance(
-        &self,
-        data: &OpenedData,
-        method: Method,
-        ticks: Option<usize>,
-    ) -> Result<Provenance, EvaluationError> {
+    /// Digests of all that these settings are applied to.
+    fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance, EvaluationError> {
         let stepped = self.stepped.as_ref();
         let link = stepped.map(|stepped| (&stepped.link, stepped.link_folder.as_path()));
         let variant = stepped.and_then(|stepped| stepped.lidar_variant.as_deref());
@@ -240,7 +226,7 @@ impl EvaluationOptions {
         let poses =
             std::iter::once(&self.pose_source).chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
         let files = files_of(method, weights_of(&self.weights, method)?, poses, link);
-        let data_sha256 = data.sha256(&self.part, variant, ticks);
+        let data_sha256 = data.sha256(&self.part, variant);
         collect(&[], data_sha256, files, &data.digests).map_err(EvaluationError::Digest)
     }
 }
@@ -275,11 +261,7 @@ pub fn evaluate(
     };
     let poses = options.pose_source.name();
     let metrics = metrics(&board, &evaluator, clock, poses, seconds);
-    // Ticks that were left out are no frames, but were read.
-    let ticks = options
-        .frames
-        .map(|frames| frames.saturating_add(left_out_ticks(&metrics)));
-    let provenance = options.provenance(data, method, ticks)?.with_command();
+    let provenance = options.provenance(data, method)?.with_command();
     let metrics = Metrics {
         provenance: Some(provenance),
         ..metrics
@@ -305,10 +287,6 @@ pub fn evaluate(
         used: used.sum(),
         messages: messages.into(),
     })
-}
-
-fn left_out_ticks(metrics: &Metrics) -> usize {
-    usize::try_from(metrics.left_out.ticks).unwrap_or(usize::MAX)
 }
 
 /// Scores of all frames, and the evaluator with its accounts.

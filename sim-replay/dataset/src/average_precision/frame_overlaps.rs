@@ -46,7 +46,7 @@ impl FrameOverlaps {
         let found = detections
             .iter()
             .enumerate()
-            .map(|(index, (found, score))| (index, *score, found.clone()));
+            .map(|(index, (found, score))| (index, *score, *found));
         Self {
             detections: detections.len(),
             by_score: candidates(found, objects, &[]),
