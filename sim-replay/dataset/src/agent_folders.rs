@@ -180,9 +180,7 @@ impl ScenarioFolder {
         }
         let mut stems: Vec<String> = all.into_iter().cloned().collect();
         problems.extend(without_common_frame(dir, &agents, &by_agent));
-        if stems.iter().all(|stem| stem.parse::<u64>().is_ok()) {
-            stems.sort_by_key(|stem| stem.parse::<u64>().unwrap_or(u64::MAX));
-        }
+        stems.sort_by(|first, second| files::natural_order(first, second));
         let variants: BTreeSet<String> = by_agent
             .values()
             .flat_map(|agent| agent.variants.iter().cloned())

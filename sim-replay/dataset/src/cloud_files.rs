@@ -45,8 +45,8 @@ pub struct Cloud {
     pub is_of_data_set: bool,
 }
 
-/// Files at paths, each a file or a folder: of a folder its files of points in text order, or all sweeps of the data set
-/// in it.
+/// Files at paths, each a file or a folder: of a folder its files of points in natural order, or all sweeps of the data
+/// set in it.
 #[must_use]
 pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile, ReadError>> {
     let mut found = Vec::new();
@@ -63,12 +63,11 @@ pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile, ReadError>> {
         .collect()
 }
 
-/// Files of points directly in a folder, in text order.
+/// Files of points directly in a folder, in natural order.
 pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
-    let paths = files::list(dir)?
-        .files
-        .into_iter()
-        .map(|name| dir.join(name));
+    let mut names = files::list(dir)?.files;
+    names.sort_by(|first, second| files::natural_order(first, second));
+    let paths = names.into_iter().map(|name| dir.join(name));
     Ok(paths.filter(|path| is_cloud(path)).collect())
 }
 

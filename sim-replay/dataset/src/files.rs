@@ -1,5 +1,6 @@
 //! Folders and files, with the path in every error.
 
+use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
@@ -43,6 +44,28 @@ pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
     listing.folders.sort_unstable();
     listing.files.sort_unstable();
     Ok(listing)
+}
+
+/// Natural order of names: numbers in them count as numbers, so `9` comes before `10`.
+pub(super) fn natural_order(first: &str, second: &str) -> Ordering {
+    parts(first)
+        .cmp(parts(second))
+        .then_with(|| first.len().cmp(&second.len()))
+}
+
+/// Texts and numbers of a name: a number by its length without zeros in front, and its digits.
+fn parts(name: &str) -> impl Iterator<Item = (usize, &[u8])> {
+    let parts = name
+        .as_bytes()
+        .chunk_by(|a, b| a.is_ascii_digit() == b.is_ascii_digit());
+    parts.map(|part| match part.first() {
+        Some(b'0'..=b'9') => {
+            let zeros = part.iter().take_while(|&&digit| digit == b'0').count();
+            (part.len() - zeros, part.get(zeros..).unwrap_or_default())
+        }
+        // Digits come before letters in text order too.
+        _ => (usize::MAX, part),
+    })
 }
 
 /// The folders below one with their contents; one that cannot be listed is left out.
@@ -140,6 +163,13 @@ mod tests {
             (listing.files, listing.folders),
             (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into()])
         );
+    }
+
+    #[test]
+    fn numbers_in_names_are_ordered_as_numbers() {
+        let mut names = ["10", "a_10", "9", "a_9", "a", "009", "1_b", "1_a"];
+        names.sort_by(|first, second| natural_order(first, second));
+        assert_eq!(names, ["1_a", "1_b", "9", "009", "10", "a", "a_9", "a_10"]);
     }
 
     #[test]

@@ -55,7 +55,7 @@ pub(super) fn open(
     let velodyne = dir.join("velodyne");
     let mut scans = scans(&velodyne, problems)?;
     let times = or_without("times", times(dir, &scans, problems), problems);
-    let poses = or_without("poses", poses(dir, problems), problems);
+    let poses = or_without("poses", poses(dir, &scans, problems), problems);
     keep_those_with(
         &mut scans,
         &dir.join("times.txt"),
@@ -76,6 +76,14 @@ pub(super) fn open(
         stem,
         capture_nanos: capture_nanos(scan),
     };
+    let mut joins = Vec::new();
+    for (is_joined, what) in [(poses.is_some(), "poses"), (times.is_some(), "times")] {
+        let line = format!(
+            "{} {what} by number: the line is that of the scan",
+            scans.len()
+        );
+        joins.extend(is_joined.then_some(line));
+    }
     let mut ticks: Vec<Tick> = scans.into_iter().map(tick).collect();
     ticks.sort_by_key(|tick| tick.capture_nanos);
     let files = ticks
@@ -87,12 +95,11 @@ pub(super) fn open(
         world_from_lidar: poses,
         sweeps,
     };
-    Ok(single_vehicle(
-        files::name_below(root, dir),
-        Layout::KITTI_ODOMETRY,
-        ticks,
-        Arc::new(source),
-    ))
+    let name = files::name_below(root, dir);
+    Ok(Scenario {
+        joins,
+        ..single_vehicle(name, Layout::KITTI_ODOMETRY, ticks, Arc::new(source))
+    })
 }
 
 /// Number and stem of the scans. Files of other names are left out.
@@ -120,6 +127,35 @@ fn or_without<T>(
         problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
         None
     })
+}
+
+/// One value for each line of a file, whose number from 0 is that of the scan. Lines that cannot be read are reported.
+///
+/// # Errors
+/// [`ReadError`] if the file cannot be read, or has as many lines as there are scans, with other numbers.
+fn of_lines<T>(
+    path: &Path,
+    scans: &[(usize, String)],
+    problems: &mut Vec<ReadError>,
+    read: impl Fn(u64, &str) -> Result<T, ReadError>,
+) -> Result<Vec<Option<T>>, ReadError> {
+    let mut faults = Faults::default();
+    let rows = kitti_text::rows(path, &mut faults, read)?;
+    let numbers = scans.iter().map(|(scan, _)| *scan);
+    let (first, last) = (numbers.clone().min(), numbers.max());
+    if let (Some(first), Some(last)) = (first, last)
+        && rows.len() == scans.len()
+        && last >= rows.len()
+    {
+        let reason = format!(
+            "as many lines as scans, but scans are numbered {first} to {last} and lines 0 to {}: number the scans as the \
+             lines",
+            rows.len() - 1
+        );
+        return Err(ReadError::malformed(path, reason));
+    }
+    faults.report("scan", problems);
+    Ok(rows)
 }
 
 /// Leaves out the scans beyond the last row of `path`, and those whose row could not be read, which is already
@@ -204,6 +240,7 @@ fn poses_path(dir: &Path) -> Option<PathBuf> {
 
 fn poses(
     dir: &Path,
+    scans: &[(usize, String)],
     problems: &mut Vec<ReadError>,
 ) -> Result<Option<Vec<Option<Pose>>>, ReadError> {
     let Some(path) = poses_path(dir) else {
@@ -213,13 +250,11 @@ fn poses(
         .transform("Tr")?
         .isometry();
     let lidar_from_camera = camera_from_lidar.inverse();
-    let mut faults = Faults::default();
-    let poses = kitti_text::rows(&path, &mut faults, |line, text| {
+    let poses = of_lines(&path, scans, problems, |line, text| {
         let rows = kitti_text::numbers::<12>(&path, line, None, text)?;
         let world_from_camera = kitti_text::rigid(&path, line, None, &rows)?.isometry();
         Ok((lidar_from_camera * world_from_camera * camera_from_lidar).into())
     });
-    faults.report("scan", problems);
     poses.map(Some)
 }
 
@@ -233,8 +268,7 @@ fn times(
     if !path.is_file() {
         return Ok(None);
     }
-    let mut faults = Faults::default();
-    let times = kitti_text::rows(&path, &mut faults, |line, text| {
+    let times = of_lines(&path, scans, problems, |line, text| {
         let [seconds] = kitti_text::numbers(&path, line, None, text)?;
         if !(0.0..=1e9).contains(&seconds) {
             return Err(kitti_text::malformed(
@@ -246,7 +280,6 @@ fn times(
         }
         Ok(rounding::to_u64(seconds * 1e9))
     })?;
-    faults.report("scan", problems);
     let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);
     if times.len() > needed {
         let reason = format!(
@@ -382,6 +415,62 @@ mod tests {
             assert_eq!(
                 (stems(&dataset).len(), problems(&dataset)),
                 (kept, vec![expected.to_owned()])
+            );
+        }
+    }
+
+    #[test]
+    fn a_blank_line_is_a_scan_without_value() {
+        let dir = tempfile::tempdir().unwrap();
+        let pose = |x: u8| format!("1 0 0 0 0 1 0 0 0 0 1 {x}\n");
+        build(
+            dir.path(),
+            ".",
+            "poses.txt",
+            &format!("{}\n{}", pose(0), pose(2)),
+        );
+        fs::write(dir.path().join("velodyne/000002.bin"), [0; 16]).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        let scenario = &dataset.scenarios[0];
+        assert_eq!(stems(&dataset), ["000000", "000002"]);
+        let frame = scenario.load(0, 1, &LoadOptions::default()).unwrap();
+        assert_eq!(
+            frame.world_from_lidar.unwrap().translation_m,
+            [2.0, 0.0, 0.0]
+        );
+        let problem = dataset.problems[0].to_string();
+        assert!(
+            problem.ends_with("poses.txt:2: the line is blank: the scan is left out"),
+            "{problem}"
+        );
+        assert_eq!(
+            scenario.joins,
+            ["2 poses by number: the line is that of the scan"]
+        );
+    }
+
+    #[test]
+    fn lines_that_may_be_of_other_scans_are_not_used() {
+        let dir = tempfile::tempdir().unwrap();
+        let pose = "1 0 0 0 0 1 0 0 0 0 1 0\n";
+        build(dir.path(), ".", "poses.txt", &pose.repeat(2));
+        let scans = dir.path().join("velodyne");
+        fs::rename(scans.join("000000.bin"), scans.join("000002.bin")).unwrap();
+        for (poses, expected) in [
+            (
+                pose.repeat(2),
+                "scans are numbered 1 to 2 and lines 0 to 1: number the scans as the lines",
+            ),
+            (
+                format!("# poses\n{}", pose.repeat(3)),
+                "a comment, where the number of a line is that of a scan",
+            ),
+        ] {
+            fs::write(dir.path().join("poses.txt"), poses).unwrap();
+            let problem = crate::open(dir.path()).unwrap().problems[0].to_string();
+            assert!(
+                problem.contains(expected) && problem.ends_with("read without poses"),
+                "{problem}"
             );
         }
     }

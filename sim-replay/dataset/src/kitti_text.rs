@@ -21,25 +21,44 @@ pub(super) struct Calibration {
 
 /// The lines of a text file, with their numbers from 1, blank ones left out.
 pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
+    let mut lines = counted_lines(path)?;
+    lines.retain(|(_, line)| !line.trim().is_empty());
+    Ok(lines)
+}
+
+/// The lines of a text file whose values belong to lines, with their numbers from 1; blank ones at the end left out.
+pub(super) fn counted_lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
     let text = files::read_text(path, MAX_BYTES)?;
-    let numbered = (1..)
-        .zip(text.lines())
-        .filter(|(_, line)| !line.trim().is_empty());
+    let numbered = (1..).zip(text.trim_end().lines());
     Ok(numbered
         .map(|(number, line)| (number, line.to_owned()))
         .collect())
 }
 
-/// One value per line; a line that cannot be read has none and is added to `faults`.
+/// One value per line; a line that cannot be read, or is blank, has none and is added to `faults`.
+///
+/// # Errors
+/// [`ReadError`] for a comment too: lines are counted, and it is not known whether it counts.
 pub(super) fn rows<T>(
     path: &Path,
     faults: &mut Faults,
     read: impl Fn(u64, &str) -> Result<T, ReadError>,
 ) -> Result<Vec<Option<T>>, ReadError> {
-    Ok(lines(path)?
-        .into_iter()
-        .map(|(line, text)| faults.take(read(line, &text)))
-        .collect())
+    let lines = counted_lines(path)?;
+    if let Some((line, _)) = lines
+        .iter()
+        .find(|(_, text)| text.trim_start().starts_with('#'))
+    {
+        let reason = "a comment, where the number of a line is that of a scan".to_owned();
+        return Err(malformed(path, *line, None, reason));
+    }
+    let values = lines
+        .iter()
+        .map(|(line, text)| match text.trim().is_empty() {
+            true => Err(malformed(path, *line, None, "the line is blank".to_owned())),
+            false => read(*line, text),
+        });
+    Ok(values.map(|value| faults.take(value)).collect())
 }
 
 pub(super) fn malformed(path: &Path, line: u64, field: Option<&str>, reason: String) -> ReadError {

@@ -59,6 +59,7 @@ mod nuscenes;
 mod open;
 mod opv2v;
 mod opv2v_family;
+pub mod overlap;
 pub mod pcd;
 mod ply;
 mod points;
@@ -66,6 +67,7 @@ mod poses;
 mod presence;
 mod problem;
 mod recorded;
+mod recorded_motion;
 mod roots;
 mod rosbag;
 mod scalar;
@@ -75,6 +77,7 @@ mod v2v4real;
 mod written_pose;
 mod yaml;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -151,6 +154,8 @@ pub struct Scenario {
     pub source_handedness: Handedness,
     /// Lists of files that were joined, and by which property: clouds with poses, scans with times.
     pub joins: Vec<String>,
+    /// Agents whose recorded motion contradicts their recorded poses: it is not used.
+    contradicted: BTreeSet<CavId>,
     absences: Absences,
     source: Arc<dyn FrameSource>,
 }
@@ -249,6 +254,9 @@ impl Scenario {
     ) -> Result<Frame, ReadError> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         let mut frame = self.source.frame(agent, tick)?;
+        if self.contradicted.contains(agent) {
+            (frame.speed_mps, frame.yaw_rate_rad_s) = (None, None);
+        }
         if options.points {
             let cloud =
                 self.load_points(agent_index, tick_index, options.lidar_variant.as_deref())?;
@@ -370,6 +378,7 @@ fn single_vehicle(
         layout,
         source_handedness: Handedness::Right,
         joins: Vec::new(),
+        contradicted: BTreeSet::new(),
         absences: Absences::default(),
         source,
     }

@@ -162,18 +162,20 @@ pub(super) fn open(
         .iter()
         .map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
+    let joined = poses
+        .as_ref()
+        .map(|_| format!("{} poses by time", ticks.len()));
     let source = Sequence {
         points_dir,
         pose_files: pose_files(dir),
         world_from_lidar: poses.unwrap_or_default(),
         sweeps,
     };
-    Ok(single_vehicle(
-        files::name_below(root, dir),
-        layout,
-        ticks,
-        Arc::new(source),
-    ))
+    let name = files::name_below(root, dir);
+    Ok(Scenario {
+        joins: joined.into_iter().collect(),
+        ..single_vehicle(name, layout, ticks, Arc::new(source))
+    })
 }
 
 /// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.

@@ -4,7 +4,9 @@ use std::path::Path;
 
 use super::layouts::{LAYOUTS, LayoutRow, Reader};
 use super::points::IntensityScale;
-use super::{Dataset, ReadError, Scenario, agent_folders, files, layouts_text, unfinished};
+use super::{
+    Dataset, ReadError, Scenario, agent_folders, files, layouts_text, recorded_motion, unfinished,
+};
 
 /// Depth below the opened folder to which sequences of a single vehicle are searched.
 const SEQUENCE_DEPTH: usize = 2;
@@ -46,6 +48,7 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     let mut dataset = open_among(&LAYOUTS, dir, options)?;
     unfinished::report(dir, &mut dataset);
+    recorded_motion::check(&mut dataset);
     Ok(dataset)
 }
 

@@ -128,6 +128,7 @@ fn agent_folder_scenario(
         layout,
         source_handedness,
         joins: Vec::new(),
+        contradicted: BTreeSet::new(),
         source: if layout == Layout::V2V4REAL {
             Arc::new(V2v4Real { folder, sweeps }) as Arc<dyn FrameSource>
         } else {

@@ -87,6 +87,7 @@ fn open(file: &Path, recording: Recording) -> Result<Dataset, ReadError> {
         layout: Layout::RECORDING,
         source_handedness: Handedness::Right,
         joins: Vec::new(),
+        contradicted: BTreeSet::new(),
         source: Arc::new(source),
     };
     Ok(Dataset {

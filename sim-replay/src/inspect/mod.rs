@@ -63,6 +63,8 @@ pub struct ScenarioReport {
     pub cameras: Vec<u8>,
     /// Frames that some agents have and others lack.
     pub missing: Vec<MissingFrame>,
+    /// Lists of files that were joined, and by which property.
+    pub joins: Vec<String>,
 }
 
 /// An agent of a scenario.

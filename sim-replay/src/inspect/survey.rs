@@ -104,6 +104,9 @@ pub fn inspect(
         report
             .problems
             .extend(sweep_problems(scenario, &findings, open));
+        report
+            .problems
+            .extend(dataset::overlap::pose_problems(scenario));
         for tick in findings {
             report.ticks.extend(tick.merged);
             report
@@ -374,6 +377,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         has_radar: scenario.has_radar,
         cameras: scenario.cameras.clone(),
         missing: scenario.missing.clone(),
+        joins: scenario.joins.clone(),
     }
 }
 

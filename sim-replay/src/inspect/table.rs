@@ -81,6 +81,9 @@ impl Report {
             let numbers: Vec<String> = scenario.cameras.iter().map(u8::to_string).collect();
             writeln!(f, "  cameras: {}", numbers.join(", "))?;
         }
+        for join in &scenario.joins {
+            writeln!(f, "  {join}")?;
+        }
         write_missing(f, scenario)?;
         self.write_merged(f, scenario)
     }

@@ -15,7 +15,7 @@ mod labels;
 #[cfg(test)]
 mod tests;
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -198,6 +198,7 @@ fn scenario(
         layout: sides.kind.layout(),
         source_handedness: Handedness::Right,
         joins: Vec::new(),
+        contradicted: BTreeSet::new(),
         source: Arc::new(Source {
             sides,
             pairs: kept,

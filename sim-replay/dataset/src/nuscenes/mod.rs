@@ -260,6 +260,7 @@ impl Builder<'_> {
             layout: self.layout,
             source_handedness: Handedness::Right,
             joins: Vec::new(),
+            contradicted: BTreeSet::new(),
             source: Arc::new(Source {
                 root: self.root.to_owned(),
                 version: self.version.to_owned(),

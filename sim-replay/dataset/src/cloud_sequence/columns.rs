@@ -1,0 +1,364 @@
+//! Columns of a file of poses: by the names of its header, or by their number.
+
+use super::keys::Unit;
+
+/// Places of the values in a row.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Columns {
+    /// Number of columns.
+    pub(super) width: usize,
+    pub(super) pose: PoseColumns,
+    /// Name of the cloud's file.
+    pub(super) name: Option<usize>,
+    /// Number of the cloud.
+    pub(super) number: Option<usize>,
+    pub(super) time: Option<TimeColumns>,
+    /// A name, number or time: the values show which.
+    pub(super) key: Option<usize>,
+}
+
+/// Columns of `world_from_lidar`.
+#[derive(Debug, PartialEq)]
+pub(super) enum PoseColumns {
+    /// x, y, z, qx, qy, qz, qw.
+    Quaternion([usize; 7]),
+    /// The first of 12 or 16 columns, a matrix row by row.
+    Matrix(usize),
+}
+
+impl PoseColumns {
+    /// TUM's order, from a column on.
+    fn in_order(first: usize) -> Self {
+        Self::Quaternion(std::array::from_fn(|value| first + value))
+    }
+}
+
+impl Default for PoseColumns {
+    fn default() -> Self {
+        Self::Matrix(0)
+    }
+}
+
+/// Columns of the time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum TimeColumns {
+    /// In a unit, or one that its size shows.
+    One(usize, Option<Unit>),
+    /// Whole seconds, and the nanoseconds after them.
+    SecondsAndNanos(usize, usize),
+}
+
+/// Meaning of a column's name.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Role {
+    /// Value of a pose: index into [`VALUES`].
+    Value(usize),
+    Time(Option<Unit>),
+    /// `sec` of `sec, nsec`.
+    Seconds,
+    /// `nsec` of `sec, nsec`.
+    Nanos,
+    Number,
+    Name,
+    Other,
+}
+
+/// The values of a pose in the order of TUM files.
+const VALUES: [&str; 7] = ["x", "y", "z", "qx", "qy", "qz", "qw"];
+/// Words of names that are no part of the pose: velocities, biases, covariances.
+const OTHER_WORDS: [&str; 16] = [
+    "v",
+    "vel",
+    "velocity",
+    "acc",
+    "acceleration",
+    "b",
+    "bias",
+    "ba",
+    "bg",
+    "bw",
+    "cov",
+    "covariance",
+    "std",
+    "sigma",
+    "twist",
+    "imu",
+];
+/// Words of the names of quaternions.
+const QUATERNION_WORDS: [&str; 7] = [
+    "q",
+    "quat",
+    "quaternion",
+    "orientation",
+    "rotation",
+    "rot",
+    "ori",
+];
+/// Words of the names of positions.
+const POSITION_WORDS: [&str; 9] = [
+    "p",
+    "t",
+    "pos",
+    "position",
+    "trans",
+    "translation",
+    "loc",
+    "location",
+    "pose",
+];
+/// Words of the names of times.
+const TIME_WORDS: [&str; 7] = ["t", "ts", "time", "times", "stamp", "timestamp", "utime"];
+/// Words of the numbers of clouds.
+const NUMBER_WORDS: [&str; 9] = [
+    "index", "idx", "id", "frame", "num", "number", "scan", "no", "keyframe",
+];
+/// Words of the names of files.
+const NAME_WORDS: [&str; 10] = [
+    "file",
+    "filename",
+    "name",
+    "path",
+    "filepath",
+    "cloud",
+    "pcd",
+    "pointcloud",
+    "image",
+    "lidar",
+];
+
+impl Columns {
+    /// True if a value of a row says to which cloud it belongs, or when it was.
+    pub(super) fn has_key(&self) -> bool {
+        [self.name, self.number, self.key]
+            .iter()
+            .any(Option::is_some)
+            || self.time.is_some()
+    }
+
+    /// Columns of a row without header: TUM's order, or matrices; before these possibly a key, or seconds and
+    /// nanoseconds.
+    ///
+    /// # Errors
+    /// A sentence if no form has so many columns.
+    pub(super) fn of_width(width: usize) -> Result<Self, String> {
+        let (pose, key, time) = match width {
+            7 => (PoseColumns::in_order(0), None, None),
+            8 => (PoseColumns::in_order(1), Some(0), None),
+            9 => (
+                PoseColumns::in_order(2),
+                None,
+                Some(TimeColumns::SecondsAndNanos(0, 1)),
+            ),
+            12 | 16 => (PoseColumns::Matrix(0), None, None),
+            13 | 17 => (PoseColumns::Matrix(1), Some(0), None),
+            _ => return Err(format!("{width} values, expected 7, 12 or 16, or one more")),
+        };
+        Ok(Self {
+            width,
+            pose,
+            key,
+            time,
+            ..Self::default()
+        })
+    }
+
+    /// Columns by their names.
+    ///
+    /// # Errors
+    /// A sentence that names the columns which are missing or given twice.
+    pub(super) fn of_names(names: &[&str]) -> Result<Self, String> {
+        let roles: Vec<Role> = names.iter().map(|name| role(name)).collect();
+        let mut values = [0; 7];
+        for (index, (place, value)) in values.iter_mut().zip(VALUES).enumerate() {
+            let wanted = Role::Value(index);
+            *place = match roles.iter().filter(|role| **role == wanted).count() {
+                1 => place_of(&roles, wanted).unwrap_or_default(),
+                0 => return Err(format!("no column {value} {}", expected(names))),
+                _ => return Err(format!("two columns {value} {}", expected(names))),
+            };
+        }
+        Ok(Self {
+            width: names.len(),
+            pose: PoseColumns::Quaternion(values),
+            name: place_of(&roles, Role::Name),
+            number: place_of(&roles, Role::Number),
+            time: time_of(&roles),
+            key: None,
+        })
+    }
+}
+
+fn place_of(roles: &[Role], wanted: Role) -> Option<usize> {
+    roles.iter().position(|role| *role == wanted)
+}
+
+/// Seconds and nanoseconds, or the first column that is a time.
+fn time_of(roles: &[Role]) -> Option<TimeColumns> {
+    let (seconds, nanos) = (place_of(roles, Role::Seconds), place_of(roles, Role::Nanos));
+    if let (Some(seconds), Some(nanos)) = (seconds, nanos) {
+        return Some(TimeColumns::SecondsAndNanos(seconds, nanos));
+    }
+    (0..).zip(roles).find_map(|(column, role)| match role {
+        Role::Time(unit) => Some(TimeColumns::One(column, *unit)),
+        Role::Seconds => Some(TimeColumns::One(column, Some(Unit::Seconds))),
+        Role::Nanos => Some(TimeColumns::One(column, Some(Unit::Nanoseconds))),
+        _ => None,
+    })
+}
+
+fn expected(names: &[&str]) -> String {
+    let names = names.join(", ");
+    format!("in the header ({names}), expected x, y, z, qx, qy, qz, qw by name, in any order")
+}
+
+/// Values of a quaternion that names give, in their order: 0 to 3 for x, y, z, w.
+pub(super) fn quaternion_order(names: &[&str]) -> Vec<usize> {
+    names
+        .iter()
+        .filter_map(|name| match role(name) {
+            Role::Value(index) => index.checked_sub(3),
+            _ => None,
+        })
+        .collect()
+}
+
+/// Meaning of a name such as `qw`, `p_RS_R_x [m]`, `field.pose.orientation.w` or `timestamp [ns]`.
+fn role(name: &str) -> Role {
+    let lower = name.to_ascii_lowercase();
+    let (plain, bracket) = lower.split_once(['[', '(']).unwrap_or((&lower, ""));
+    let words: Vec<&str> = words(plain).collect();
+    let (Some(last), false) = (words.last(), has(&words, &OTHER_WORDS)) else {
+        return Role::Other;
+    };
+    if let Some(axis) = axis(last, &words) {
+        return axis;
+    }
+    let stated = self::words(bracket).find_map(unit);
+    match unit(last) {
+        Some(Unit::Seconds) if *last != "s" && stated.is_none() => return Role::Seconds,
+        Some(Unit::Nanoseconds) if *last != "ns" && stated.is_none() => return Role::Nanos,
+        _ => {}
+    }
+    if has(&words, &TIME_WORDS) || last.ends_with("timestamp") || unit(last).is_some() {
+        let of_name = (*last == "utime").then_some(Unit::Microseconds);
+        return Role::Time(stated.or(of_name).or_else(|| unit(last)));
+    }
+    if NUMBER_WORDS.contains(last) && !words.contains(&"header") {
+        return Role::Number;
+    }
+    match NAME_WORDS.contains(last) {
+        true => Role::Name,
+        false => Role::Other,
+    }
+}
+
+/// A component of the position or the quaternion: its letter, after a word or as the end of one.
+fn axis(last: &str, words: &[&str]) -> Option<Role> {
+    let letter = last.chars().next_back()?;
+    let index = ['x', 'y', 'z', 'w']
+        .iter()
+        .position(|axis| *axis == letter)?;
+    let fused = last.strip_suffix(letter)?;
+    let stem = [fused];
+    let stems = if fused.is_empty() { words } else { &stem };
+    if has(stems, &QUATERNION_WORDS) {
+        return Some(Role::Value(3 + index));
+    }
+    let is_plain = words == [last] && fused.is_empty();
+    (index < 3 && (is_plain || has(stems, &POSITION_WORDS))).then_some(Role::Value(index))
+}
+
+fn has(words: &[&str], known: &[&str]) -> bool {
+    words.iter().any(|word| known.contains(word))
+}
+
+fn words(text: &str) -> impl Iterator<Item = &str> {
+    text.split(|letter: char| !letter.is_alphanumeric())
+        .filter(|word| !word.is_empty())
+}
+
+fn unit(word: &str) -> Option<Unit> {
+    Some(match word {
+        "s" | "sec" | "secs" | "second" | "seconds" => Unit::Seconds,
+        "ms" | "msec" | "milliseconds" => Unit::Milliseconds,
+        "us" | "usec" | "micros" | "microseconds" => Unit::Microseconds,
+        "ns" | "nsec" | "nsecs" | "nanosec" | "nanosecs" | "nanos" | "nanoseconds" => {
+            Unit::Nanoseconds
+        }
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn quaternion(names: &str) -> Result<Columns, String> {
+        Columns::of_names(&names.split(',').map(str::trim).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn columns_are_found_by_name() {
+        let first = |names: &str| {
+            let columns = quaternion(names).unwrap();
+            let PoseColumns::Quaternion(values) = columns.pose else {
+                panic!("{names}");
+            };
+            (values, columns.time)
+        };
+        let unknown = Some(TimeColumns::One(0, None));
+        let nanos = Some(TimeColumns::One(0, Some(Unit::Nanoseconds)));
+        let w_first = [1, 2, 3, 5, 6, 7, 4];
+        for (names, values, time) in [
+            (
+                "timestamp,tx,ty,tz,qx,qy,qz,qw",
+                [1, 2, 3, 4, 5, 6, 7],
+                unknown,
+            ),
+            ("timestamp,x,y,z,qw,qx,qy,qz", w_first, unknown),
+            ("timestamp,Tx,Ty,Tz,Qw,Qx,Qy,Qz", w_first, unknown),
+            (
+                "timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],\
+                 v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1],b_w_RS_S_x [rad s^-1]",
+                w_first,
+                nanos,
+            ),
+            (
+                "%time,field.pose.pose.position.x,field.pose.pose.position.y,field.pose.pose.position.z,\
+                 field.pose.pose.orientation.w,field.pose.pose.orientation.x,field.pose.pose.orientation.y,\
+                 field.pose.pose.orientation.z,field.twist.twist.linear.x,field.pose.covariance0",
+                w_first,
+                unknown,
+            ),
+            (
+                "timestamp_ns,pos_x,pos_y,pos_z,quat_w,quat_x,quat_y,quat_z",
+                w_first,
+                nanos,
+            ),
+            (
+                "sec,nsec,x,y,z,qx,qy,qz,qw",
+                [2, 3, 4, 5, 6, 7, 8],
+                Some(TimeColumns::SecondsAndNanos(0, 1)),
+            ),
+        ] {
+            assert_eq!(first(names), (values, time), "{names}");
+        }
+        let named = quaternion("file,frame,x,y,z,qx,qy,qz,qw").unwrap();
+        assert_eq!(
+            (named.name, named.number, named.time),
+            (Some(0), Some(1), None)
+        );
+    }
+
+    #[test]
+    fn headers_that_do_not_say_all_are_refused() {
+        for (names, expected) in [
+            ("t,x,y,z,roll,pitch,yaw", "no column qx"),
+            ("t,x,y,z,q0,q1,q2,q3", "no column qx"),
+            ("t,x,y,z,x,qx,qy,qz,qw", "two columns x"),
+        ] {
+            let message = quaternion(names).unwrap_err();
+            assert!(message.starts_with(expected), "{message}");
+        }
+    }
+}

@@ -1,0 +1,356 @@
+//! Join of clouds and poses: by name, number or time, or by their order where nothing contradicts it.
+
+use std::collections::{HashMap, HashSet};
+use std::hash::Hash;
+
+use super::keys::Keys;
+use super::pose_file::PoseFile;
+
+/// Largest difference between the time of a pose and that of its cloud, nanoseconds.
+const SAME_TIME_NANOS: u64 = 1_000_000;
+
+/// The row of each cloud.
+#[derive(Debug, PartialEq)]
+pub(super) struct Join {
+    /// Index of the row; `None` for a cloud without one.
+    pub(super) rows: Vec<Option<usize>>,
+    /// The property by which they were joined.
+    pub(super) by: &'static str,
+}
+
+impl Join {
+    fn new(by: &'static str, rows: impl Iterator<Item = Option<usize>>) -> Self {
+        Self {
+            rows: rows.collect(),
+            by,
+        }
+    }
+
+    fn found(&self) -> usize {
+        self.rows.iter().flatten().count()
+    }
+
+    /// True if at least half of the clouds have a row.
+    fn is_join(&self) -> bool {
+        2 * self.found() >= self.rows.len() && self.found() > 0
+    }
+}
+
+/// Joins clouds, given by the stems of their files in natural order and the keys of these, with the rows of a file of
+/// poses.
+///
+/// # Errors
+/// A sentence with the keys of both where rows cannot be assigned to clouds.
+pub(super) fn join(stems: &[&str], clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
+    for keys in &poses.keys {
+        let joined = match (clouds, keys) {
+            (_, Keys::Names(names)) => by_name(stems, names),
+            (Keys::Numbers(clouds), Keys::Numbers(rows)) => {
+                if let Some(contradiction) = shift(clouds, rows) {
+                    return Err(contradiction);
+                }
+                by_key("number", clouds, rows)
+            }
+            (Keys::Times(clouds), Keys::Times(rows)) => by_time(clouds, rows),
+            _ => continue,
+        };
+        if joined.is_join() {
+            return Ok(joined);
+        }
+    }
+    by_order(clouds, poses)
+}
+
+/// Stems or names of files; the endings and folders of the rows' names do not count.
+fn by_name(stems: &[&str], names: &[String]) -> Join {
+    let known: HashSet<&str> = stems.iter().copied().collect();
+    let names: Vec<&str> = names
+        .iter()
+        .map(|name| {
+            let name = name.trim_matches('"');
+            let name = name.rsplit(['/', '\\']).next().unwrap_or(name);
+            match name.rsplit_once('.') {
+                Some((stem, _)) if !known.contains(name) => stem,
+                _ => name,
+            }
+        })
+        .collect();
+    by_key("name", stems, &names)
+}
+
+/// Rows of equal key; a key of two rows is none.
+fn by_key<K: Eq + Hash>(by: &'static str, clouds: &[K], rows: &[K]) -> Join {
+    let mut index: HashMap<&K, Option<usize>> = HashMap::with_capacity(rows.len());
+    for (row, key) in rows.iter().enumerate() {
+        index
+            .entry(key)
+            .and_modify(|known| *known = None)
+            .or_insert(Some(row));
+    }
+    Join::new(
+        by,
+        clouds.iter().map(|key| index.get(key).copied().flatten()),
+    )
+}
+
+/// The row nearest to each cloud in time, if it is of the same time.
+fn by_time(clouds: &[u64], rows: &[u64]) -> Join {
+    let mut sorted: Vec<(u64, usize)> = rows.iter().copied().zip(0..).collect();
+    sorted.sort_unstable();
+    Join::new("time", clouds.iter().map(|time| at(&sorted, *time)))
+}
+
+/// Index of the entry nearest to a time, if it is of the same time.
+fn at(sorted: &[(u64, usize)], time: u64) -> Option<usize> {
+    let next = sorted.partition_point(|(row, _)| *row < time);
+    let around = sorted.get(next.saturating_sub(1)..)?.iter().take(2);
+    let nearest = around.min_by_key(|(row, _)| row.abs_diff(time));
+    nearest
+        .filter(|(row, _)| row.abs_diff(time) < SAME_TIME_NANOS)
+        .map(|(_, index)| *index)
+}
+
+/// Two lists of equal length whose numbers differ by a constant: which of them is right cannot be known.
+fn shift(clouds: &[u64], rows: &[u64]) -> Option<String> {
+    let (first, row) = (clouds.first()?, rows.first()?);
+    let is_shifted = first != row
+        && clouds.len() == rows.len()
+        && clouds
+            .iter()
+            .zip(rows)
+            .all(|(cloud, number)| cloud.checked_sub(*first) == number.checked_sub(*row));
+    is_shifted.then(|| {
+        format!(
+            "as many poses as clouds, but poses are numbered from {row} and clouds from {first}: number them alike, or \
+             leave the numbers out"
+        )
+    })
+}
+
+/// One row per cloud, in order.
+fn by_order(clouds: &Keys, poses: &PoseFile) -> Result<Join, String> {
+    let (rows, count) = (poses.poses.len(), clouds.len());
+    let (cloud, row) = (clouds.shown(), poses.keys.first().map(Keys::shown));
+    let keys = match row {
+        Some(row) => format!("clouds have {cloud}, poses {row}"),
+        None => format!("clouds have {cloud}, poses no key"),
+    };
+    if let Keys::Names(_) = clouds
+        && !clouds.have_one_form()
+    {
+        return Err(format!(
+            "the order of the clouds is not known, since their names are no numbers; {keys}"
+        ));
+    }
+    if poses.keys.iter().any(|keys| matches!(keys, Keys::Names(_))) {
+        return Err(format!("no cloud has the name of a pose; {keys}"));
+    }
+    if let Some(times) = &poses.times
+        && times.windows(2).any(|pair| pair.first() > pair.last())
+    {
+        return Err(format!(
+            "the times of the poses are not in order, so rows cannot be assigned to clouds; {keys}"
+        ));
+    }
+    if let (Keys::Times(clouds), Some(times)) = (clouds, &poses.times)
+        && (clouds.len() != times.len() || !have_equal_steps(clouds, times))
+    {
+        return Err(format!("no cloud has the time of a pose; {keys}"));
+    }
+    if rows == count && is_without_gap(clouds, poses.times.as_deref()) {
+        return Ok(Join::new("order", (0..count).map(Some)));
+    }
+    if let Some(joined) = by_line(clouds, rows) {
+        return Ok(joined);
+    }
+    let numbers = match rows == count {
+        true => "the numbers of the clouds have gaps",
+        false => "their numbers differ",
+    };
+    Err(format!(
+        "{rows} poses for {count} clouds, {numbers}, and no cloud has the name, number or time of a pose: lines cannot be \
+         assigned; {keys}"
+    ))
+}
+
+/// True if no cloud is missing between two others: numbers follow one another, or have the gaps that the times of the
+/// poses have.
+fn is_without_gap(clouds: &Keys, times: Option<&[u64]>) -> bool {
+    let Keys::Numbers(numbers) = clouds else {
+        return true;
+    };
+    let (Some(first), Some(last)) = (numbers.first(), numbers.last()) else {
+        return true;
+    };
+    if last - first + 1 == numbers.len() as u64 {
+        return true;
+    }
+    let ends = times.and_then(|times| Some((times, *times.first()?, *times.last()?)));
+    ends.is_some_and(|(times, start, end)| {
+        let step = end.saturating_sub(start) as f64 / (last - first) as f64;
+        numbers.iter().zip(times).all(|(number, time)| {
+            let expected = step * (number - first) as f64;
+            (time.saturating_sub(start) as f64 - expected).abs() < 0.5 * step
+        })
+    })
+}
+
+/// Clouds that are numbered as the rows are, from 0 or 1 to the last: the number is that of the row.
+fn by_line(clouds: &Keys, rows: usize) -> Option<Join> {
+    let Keys::Numbers(numbers) = clouds else {
+        return None;
+    };
+    let (first, last) = (*numbers.first()?, *numbers.last()?);
+    let is_of_rows = first <= 1 && (last + 1).checked_sub(first) == Some(rows as u64);
+    let places = numbers.iter().map(|number| number - first);
+    is_of_rows.then(|| {
+        Join::new(
+            "number of the row",
+            places.map(|place| usize::try_from(place).ok()),
+        )
+    })
+}
+
+/// True if both lists of times have the same intervals: their clocks differ by a constant only.
+fn have_equal_steps(clouds: &[u64], rows: &[u64]) -> bool {
+    let Some((start, row_start)) = clouds.first().zip(rows.first()) else {
+        return true;
+    };
+    clouds.iter().zip(rows).all(|(cloud, row)| {
+        let since = cloud.saturating_sub(*start);
+        since.abs_diff(row.saturating_sub(*row_start)) < SAME_TIME_NANOS
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn poses(keys: Vec<Keys>, count: usize) -> PoseFile {
+        let times = keys.iter().find_map(|keys| match keys {
+            Keys::Times(times) => Some(times.clone()),
+            _ => None,
+        });
+        PoseFile {
+            poses: vec![Some(protocol::Pose::IDENTITY); count],
+            keys,
+            times,
+        }
+    }
+
+    fn joined(
+        stems: &[&str],
+        keys: Vec<Keys>,
+        count: usize,
+    ) -> Result<(Vec<usize>, &'static str), String> {
+        let Join { rows, by } = join(stems, &Keys::of_stems(stems), &poses(keys, count))?;
+        Ok((rows.into_iter().map(|row| row.unwrap_or(99)).collect(), by))
+    }
+
+    #[test]
+    fn rows_belong_to_clouds_by_key_or_by_a_proven_order() {
+        let times = |steps: &[u64]| {
+            vec![Keys::Times(
+                steps.iter().map(|step| step * 100_000_000).collect(),
+            )]
+        };
+        let cases: [(&[&str], Vec<Keys>, usize, &[usize], &str); 10] = [
+            (
+                &["1", "2"],
+                vec![Keys::Numbers(vec![2, 1])],
+                2,
+                &[1, 0],
+                "number",
+            ),
+            (
+                &["1", "3", "4"],
+                vec![Keys::Numbers(vec![4, 1])],
+                2,
+                &[1, 99, 0],
+                "number",
+            ),
+            (&["000001", "000002"], times(&[0, 1]), 2, &[0, 1], "order"),
+            (&["scan_1", "scan_2"], vec![], 2, &[0, 1], "order"),
+            (
+                &["0", "12", "20"],
+                times(&[3, 15, 23]),
+                3,
+                &[0, 1, 2],
+                "order",
+            ),
+            (&["0", "2"], vec![], 3, &[0, 2], "number of the row"),
+            (&["1", "3"], vec![], 3, &[0, 2], "number of the row"),
+            (&["7.1", "7.2"], times(&[71, 99, 72]), 3, &[0, 2], "time"),
+            (
+                &["1600000000.1", "1600000000.2"],
+                times(&[0, 1]),
+                2,
+                &[0, 1],
+                "order",
+            ),
+            (
+                &["a", "b"],
+                vec![Keys::Names(vec!["x/b.pcd".into(), "a.pcd".into()])],
+                2,
+                &[1, 0],
+                "name",
+            ),
+        ];
+        for (stems, keys, count, rows, by) in cases {
+            assert_eq!(
+                joined(stems, keys, count),
+                Ok((rows.to_vec(), by)),
+                "{stems:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn lists_that_contradict_each_other_are_refused() {
+        let times = |times: &[u64]| vec![Keys::Times(times.to_vec())];
+        let cases: [(&[&str], Vec<Keys>, usize, &str); 8] = [
+            (
+                &["1", "2"],
+                vec![Keys::Numbers(vec![0, 1])],
+                2,
+                "poses are numbered from 0 and clouds from 1",
+            ),
+            (&["1", "2"], vec![], 3, "3 poses for 2 clouds"),
+            (&["0", "2"], vec![], 5, "5 poses for 2 clouds"),
+            (
+                &["0", "2", "3"],
+                vec![],
+                3,
+                "the numbers of the clouds have gaps",
+            ),
+            (
+                &["first", "second"],
+                vec![],
+                2,
+                "the order of the clouds is not known",
+            ),
+            (
+                &["1", "2"],
+                times(&[5_000_000_000, 4_000_000_000]),
+                2,
+                "not in order",
+            ),
+            (
+                &["5.5", "6.5"],
+                times(&[1_000_000, 3_000_000]),
+                2,
+                "no cloud has the time of a pose",
+            ),
+            (
+                &["1", "2"],
+                vec![Keys::Names(vec!["a".into(), "b".into()])],
+                2,
+                "no cloud has the name of a pose",
+            ),
+        ];
+        for (stems, keys, count, expected) in cases {
+            let message = joined(stems, keys, count).unwrap_err();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+}

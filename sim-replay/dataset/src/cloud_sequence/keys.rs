@@ -1,0 +1,341 @@
+//! Keys of clouds and poses: names, numbers or times. A list as a whole decides which.
+
+use support::rounding;
+
+/// Least value of a whole number that is a time: nine digits.
+const LEAST_WHOLE_TIME: f64 = 1e8;
+/// Largest time, seconds: three hundred years.
+const MOST_SECONDS: f64 = 1e10;
+/// Largest median step of times, seconds.
+const MOST_STEP_S: f64 = 60.0;
+/// Digits of nanoseconds.
+const NANOS_DIGITS: usize = 9;
+
+/// One key per cloud or pose, in their order.
+#[derive(Debug, PartialEq)]
+pub(super) enum Keys {
+    /// Names of files, or other words.
+    Names(Vec<String>),
+    /// Numbers of clouds.
+    Numbers(Vec<u64>),
+    /// Nanoseconds.
+    Times(Vec<u64>),
+}
+
+/// Unit of a time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Unit {
+    Seconds,
+    Milliseconds,
+    Microseconds,
+    Nanoseconds,
+}
+
+impl Unit {
+    const ALL: [Self; 4] = [
+        Self::Seconds,
+        Self::Milliseconds,
+        Self::Microseconds,
+        Self::Nanoseconds,
+    ];
+
+    fn seconds(self) -> f64 {
+        match self {
+            Self::Seconds => 1.0,
+            Self::Milliseconds => 1e-3,
+            Self::Microseconds => 1e-6,
+            Self::Nanoseconds => 1e-9,
+        }
+    }
+
+    /// The first unit in which all values are times since an epoch or a start, at most a minute apart.
+    fn of(values: &[f64]) -> Option<Self> {
+        let most = values.iter().copied().fold(0.0, f64::max);
+        let mut steps: Vec<f64> = values
+            .iter()
+            .zip(values.iter().skip(1))
+            .map(|(value, next)| (next - value).abs())
+            .collect();
+        steps.sort_unstable_by(f64::total_cmp);
+        let step = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
+        Self::ALL.into_iter().find(|unit| {
+            most * unit.seconds() < MOST_SECONDS && step * unit.seconds() <= MOST_STEP_S
+        })
+    }
+
+    /// Nanoseconds of values in this unit.
+    pub(super) fn nanos(self, values: &[f64]) -> Vec<u64> {
+        let scale = self.seconds() * 1e9;
+        values
+            .iter()
+            .map(|value| rounding::to_u64(value * scale))
+            .collect()
+    }
+}
+
+impl Keys {
+    /// Keys of clouds by the stems of their files: the last number of each name, if all else in the names is equal.
+    /// It is a time if it has a fraction or at least nine digits.
+    pub(super) fn of_stems(stems: &[&str]) -> Self {
+        let numbered: Option<Vec<Numbered<'_>>> =
+            stems.iter().map(|stem| Numbered::of(stem)).collect();
+        numbered
+            .and_then(|numbered| Self::of_numbered(&numbered))
+            .unwrap_or_else(|| Self::Names(stems.iter().map(|&stem| stem.to_owned()).collect()))
+    }
+
+    /// `None` for names that differ in more than a number.
+    fn of_numbered(numbered: &[Numbered<'_>]) -> Option<Self> {
+        let around = numbered.first()?.around;
+        if numbered.iter().any(|name| name.around != around) {
+            return None;
+        }
+        if let Some(times) = numbered.iter().map(Numbered::stamp_nanos).collect() {
+            return Some(Self::Times(times));
+        }
+        let words: Vec<&str> = numbered.iter().map(|name| name.number).collect();
+        match whole_numbers(&words) {
+            Some(numbers) => Some(Self::Numbers(numbers)),
+            None => {
+                let have_fraction = words.iter().any(|word| word.contains('.'));
+                Self::of_times(&words, have_fraction.then_some(Unit::Seconds))
+            }
+        }
+    }
+
+    /// Keys of words without a statement of their meaning. `None` for whole numbers that are written with a fraction
+    /// (`0.0 1.0 2.0`): programs count poses so where they know no time.
+    pub(super) fn of_words(words: &[&str]) -> Option<Self> {
+        if let Some(numbers) = whole_numbers(words) {
+            return Some(Self::Numbers(numbers));
+        }
+        let Some(values) = numbers(words) else {
+            let names = words.iter().map(|&word| word.to_owned());
+            return Some(Self::Names(names.collect()));
+        };
+        let are_counts = values
+            .iter()
+            .all(|value| value.fract() == 0.0 && *value < LEAST_WHOLE_TIME);
+        match are_counts {
+            true => None,
+            false => Self::of_times(words, None),
+        }
+    }
+
+    pub(super) fn len(&self) -> usize {
+        match self {
+            Self::Names(names) => names.len(),
+            Self::Numbers(values) | Self::Times(values) => values.len(),
+        }
+    }
+
+    /// The number of a cloud, or its place among all.
+    pub(super) fn count(&self, index: usize) -> u64 {
+        match self {
+            Self::Numbers(numbers) => numbers.get(index).copied(),
+            Self::Names(_) | Self::Times(_) => None,
+        }
+        .unwrap_or(index as u64)
+    }
+
+    /// True if two keys are the same.
+    pub(super) fn are_equal(&self, first: usize, second: usize) -> bool {
+        match self {
+            Self::Names(names) => names.get(first) == names.get(second),
+            Self::Numbers(values) | Self::Times(values) => values.get(first) == values.get(second),
+        }
+    }
+
+    /// First and last key, for messages.
+    pub(super) fn shown(&self) -> String {
+        match self {
+            Self::Names(names) => ends("names", names),
+            Self::Numbers(numbers) => ends("numbers", numbers),
+            Self::Times(times) => {
+                let seconds: Vec<String> = times
+                    .iter()
+                    .map(|nanos| format!("{:.3} s", *nanos as f64 * 1e-9))
+                    .collect();
+                ends("times", &seconds)
+            }
+        }
+    }
+
+    /// True for names that differ in numbers only, `2021-08-21-17-30-41` and the like: their natural order is that of
+    /// the clouds.
+    pub(super) fn have_one_form(&self) -> bool {
+        match self {
+            Self::Names(names) => names
+                .iter()
+                .all(|name| is_form(name, names.first().unwrap_or(name))),
+            Self::Numbers(_) | Self::Times(_) => true,
+        }
+    }
+
+    /// Times of words in a unit, or in the one that their size shows; `None` if a word is no time.
+    pub(super) fn of_times(words: &[&str], unit: Option<Unit>) -> Option<Self> {
+        let values = numbers(words)?;
+        let unit = unit.or_else(|| Unit::of(&values))?;
+        Some(Self::Times(unit.nanos(&values)))
+    }
+}
+
+fn ends<T: std::fmt::Display>(kind: &str, keys: &[T]) -> String {
+    match (keys.first(), keys.last()) {
+        (Some(first), Some(last)) => format!("{kind} {first} to {last}"),
+        _ => format!("no {kind}"),
+    }
+}
+
+/// True if two names with numbers have the same text around these.
+fn is_form(name: &str, other: &str) -> bool {
+    name.contains(is_digit)
+        && name
+            .split(is_digit)
+            .filter(|text| !text.is_empty())
+            .eq(other.split(is_digit).filter(|text| !text.is_empty()))
+}
+
+fn is_digit(letter: char) -> bool {
+    letter.is_ascii_digit()
+}
+
+/// Whole numbers below nine digits; `None` if a word is none.
+pub(super) fn whole_numbers(words: &[&str]) -> Option<Vec<u64>> {
+    let numbers: Option<Vec<u64>> = words.iter().map(|word| word.parse().ok()).collect();
+    numbers.filter(|numbers| {
+        numbers
+            .iter()
+            .all(|number| (*number as f64) < LEAST_WHOLE_TIME)
+    })
+}
+
+/// Numbers from 0 on; `None` if a word is none.
+fn numbers(words: &[&str]) -> Option<Vec<f64>> {
+    let numbers: Option<Vec<f64>> = words.iter().map(|word| word.parse().ok()).collect();
+    numbers.filter(|numbers| {
+        numbers
+            .iter()
+            .all(|number| number.is_finite() && *number >= 0.0)
+    })
+}
+
+/// A name with a number in it.
+struct Numbered<'a> {
+    /// The text before and after the number.
+    around: (&'a str, &'a str),
+    /// The number, possibly with a fraction.
+    number: &'a str,
+    /// Seconds, where the number is the nanoseconds after them.
+    seconds: Option<&'a str>,
+}
+
+impl<'a> Numbered<'a> {
+    /// The last number of a name: `7` of `scan_7`, `10.5` of `10.5`, seconds and nanoseconds of
+    /// `cloud_1583836591_182590976`.
+    fn of(stem: &'a str) -> Option<Self> {
+        let end = stem.rfind(is_digit)? + 1;
+        let (head, after) = stem.split_at_checked(end)?;
+        let (before, number) = last_digits(head);
+        if let Some((whole, _)) = before.strip_suffix('.').map(last_digits).filter(has_digits) {
+            let number = head.strip_prefix(whole)?;
+            return Some(Self {
+                around: (whole, after),
+                number,
+                seconds: None,
+            });
+        }
+        let stamp = before
+            .strip_suffix(['_', '-'])
+            .map(last_digits)
+            .filter(|(_, seconds)| is_epoch(seconds) && number.len() <= NANOS_DIGITS);
+        Some(Self {
+            around: (stamp.map_or(before, |(before, _)| before), after),
+            number,
+            seconds: stamp.map(|(_, seconds)| seconds),
+        })
+    }
+
+    /// Nanoseconds of a name with seconds and nanoseconds.
+    fn stamp_nanos(&self) -> Option<u64> {
+        stamp_nanos(self.seconds?, self.number)
+    }
+}
+
+/// Nanoseconds of whole seconds and the nanoseconds after them.
+pub(super) fn stamp_nanos(seconds: &str, nanos: &str) -> Option<u64> {
+    let nanos: u64 = nanos.parse().ok().filter(|nanos| *nanos < 1_000_000_000)?;
+    let seconds: u64 = seconds.parse().ok()?;
+    seconds.checked_mul(1_000_000_000)?.checked_add(nanos)
+}
+
+/// A text without the digits at its end, and these.
+fn last_digits(text: &str) -> (&str, &str) {
+    text.split_at(text.trim_end_matches(is_digit).len())
+}
+
+fn has_digits((_, digits): &(&str, &str)) -> bool {
+    !digits.is_empty()
+}
+
+/// True for digits of seconds since 1970: nine or ten places without zeros in front.
+fn is_epoch(digits: &str) -> bool {
+    (NANOS_DIGITS..=NANOS_DIGITS + 1).contains(&digits.trim_start_matches('0').len())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_names_are_times_with_a_fraction_or_nine_digits() {
+        let cases = [
+            (vec!["0", "10", "2"], Keys::Numbers(vec![0, 10, 2])),
+            (vec!["scan_07", "scan_8"], Keys::Numbers(vec![7, 8])),
+            (vec!["frame-1"], Keys::Numbers(vec![1])),
+            (vec!["7_lidar"], Keys::Numbers(vec![7])),
+            (vec!["0000000123"], Keys::Numbers(vec![123])),
+            (
+                vec!["10.5", "11"],
+                Keys::Times(vec![10_500_000_000, 11_000_000_000]),
+            ),
+            (
+                vec!["1600000000000000"],
+                Keys::Times(vec![1_600_000_000_000_000_000]),
+            ),
+            (
+                vec!["cloud_1583836591_182590976", "cloud_1583836592_82590976"],
+                Keys::Times(vec![1_583_836_591_182_590_976, 1_583_836_592_082_590_976]),
+            ),
+            (
+                vec!["left_0", "right_0"],
+                Keys::Names(vec!["left_0".into(), "right_0".into()]),
+            ),
+        ];
+        for (stems, expected) in cases {
+            assert_eq!(Keys::of_stems(&stems), expected, "{stems:?}");
+        }
+    }
+
+    #[test]
+    fn a_list_of_times_has_one_unit() {
+        let times = |words: &[&str]| match Keys::of_times(words, None) {
+            Some(Keys::Times(times)) => times,
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(times(&["0", "100000000"]), [0, 100_000_000], "nanoseconds");
+        assert_eq!(
+            times(&["1000", "1001"]),
+            [1_000_000_000_000, 1_001_000_000_000]
+        );
+        assert_eq!(
+            times(&["1600000000128", "1600000000228"]),
+            [1_600_000_000_128_000_000, 1_600_000_000_228_000_000]
+        );
+        assert_eq!(Keys::of_words(&["0.0", "1.0", "2.0"]), None, "counted");
+        assert_eq!(
+            Keys::of_words(&["0.0", "0.1"]),
+            Some(Keys::Times(vec![0, 100_000_000]))
+        );
+    }
+}

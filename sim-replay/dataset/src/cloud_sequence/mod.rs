@@ -1,0 +1,409 @@
+//! Folders of point clouds with one file of poses, as LiDAR odometry and mapping programs write them.
+//!
+//! The clouds (`.pcd`, `.ply`, `.npy` or `.bin`) lie in the folder, or in `clouds`, `scans`, `lidar` or `points` below it,
+//! in the LiDAR frame, right-handed. The file of poses has a line per cloud: `world_from_lidar` as 3x4 or 4x4 matrix row
+//! by row, or as position and quaternion, in the order x y z qx qy qz qw (TUM) or by the names of a header; possibly with
+//! the cloud's name, number or time. Lines belong to clouds by that key ([`join`]), else by their order.
+
+mod columns;
+mod join;
+mod keys;
+mod pose_file;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use protocol::{CavId, Handedness, Pose};
+
+use self::join::join;
+use self::keys::Keys;
+use self::pose_file::PoseFile;
+use super::cloud_files::clouds_in;
+use super::faults::Faults;
+use super::layouts::{LayoutRow, Reader};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
+use crate::frame::Frame;
+use crate::pcd::PcdCloud;
+
+/// A folder of clouds and a file of poses.
+pub(crate) static CLOUDS: LayoutRow = LayoutRow {
+    key: "clouds",
+    name: "clouds with poses",
+    data_sets: "results of LiDAR odometry and mapping",
+    files: "<cloud>.pcd, .ply, .npy or .bin (or in clouds/, scans/, lidar/, points/), and poses.txt, poses.csv, \
+            <sequence>_poses_tum.txt or optimized_poses.txt (x y z qx qy qz qw or the columns of a header, 3x4 or 4x4 \
+            matrices; possibly with time, number or name of the cloud)",
+    protocol: "opv2v",
+    reader: Some(Reader::Sequence {
+        is_one: |dir| place_of(dir).is_some(),
+        open,
+    }),
+};
+
+/// Names of the file of poses, or their ends (KISS-ICP, SC-LIO-SAM), the first that exists.
+const POSES: [&str; 8] = [
+    "poses.txt",
+    "poses.csv",
+    "poses.tum",
+    "trajectory.txt",
+    "trajectory.csv",
+    "optimized_poses.txt",
+    "_poses_tum.txt",
+    "_poses_kitti.txt",
+];
+/// Folders of the clouds below that of the poses, whatever the case of their letters.
+const FOLDERS: [&str; 4] = ["clouds", "scans", "lidar", "points"];
+
+#[derive(Debug)]
+struct Sequence {
+    /// File of the poses.
+    poses: PathBuf,
+    /// File and pose by stem.
+    clouds: BTreeMap<String, (PathBuf, Pose)>,
+    sweeps: Sweeps,
+}
+
+/// True for a name, or one that ends in it where that begins with `_`.
+fn is_poses(name: &str, known: &str) -> bool {
+    name == known || (known.starts_with('_') && name.ends_with(known))
+}
+
+/// File of poses and clouds in natural order, if a folder has both.
+fn place_of(dir: &Path) -> Option<(PathBuf, Vec<PathBuf>)> {
+    let listing = files::list(dir).ok()?;
+    let poses = POSES
+        .iter()
+        .find_map(|known| listing.files.iter().find(|name| is_poses(name, known)))?;
+    let below = FOLDERS.iter().filter_map(|known| {
+        let mut folders = listing.folders.iter();
+        folders.find(|name| name.eq_ignore_ascii_case(known))
+    });
+    // A map that was saved beside the sweeps is none of them.
+    let folders = below
+        .map(|name| dir.join(name))
+        .chain(std::iter::once(dir.to_owned()));
+    let clouds = folders
+        .filter_map(|folder| clouds_in(&folder).ok())
+        .find(|clouds| !clouds.is_empty())?;
+    Some((dir.join(poses), clouds))
+}
+
+fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
+    let (path, mut files) =
+        place_of(dir).ok_or_else(|| ReadError::malformed(dir, "no clouds with poses"))?;
+    let mut faults = Faults::default();
+    let poses = PoseFile::read(&path, &mut faults)?;
+    if let Keys::Times(times) = Keys::of_stems(&stems_of(&files)) {
+        let mut timed: Vec<(u64, PathBuf)> = times.into_iter().zip(files).collect();
+        timed.sort();
+        files = timed.into_iter().map(|(_, file)| file).collect();
+    }
+    let stems = stems_of(&files);
+    let keys = Keys::of_stems(&stems);
+    no_two_alike(&files, &keys)?;
+    let joined =
+        join(&stems, &keys, &poses).map_err(|reason| ReadError::malformed(&path, reason))?;
+    faults.report("pose", problems);
+    let mut timed = BTreeMap::new();
+    let mut without = Faults::default();
+    for (index, ((file, stem), row)) in files.iter().zip(&stems).zip(&joined.rows).enumerate() {
+        let Some(world_from_lidar) = row.and_then(|row| poses.poses.get(row).copied().flatten())
+        else {
+            let reason = format!("no pose in {}", path.display());
+            without.push(ReadError::malformed(file, reason));
+            continue;
+        };
+        let nanos = capture_nanos(&keys, &poses, (index, *row))
+            .unwrap_or_else(|| options.period_nanos.saturating_mul(keys.count(index)));
+        let cloud = ((*stem).to_owned(), (file.clone(), world_from_lidar));
+        timed.insert((nanos, index), cloud);
+    }
+    without.report("cloud", problems);
+    Ok(scenario(
+        files::name_below(root, dir),
+        timed,
+        (path, joined.by),
+        options,
+    ))
+}
+
+/// A scenario of clouds by capture time and place, joined with the poses of a file.
+fn scenario(
+    name: String,
+    timed: BTreeMap<(u64, usize), (String, (PathBuf, Pose))>,
+    (poses, by): (PathBuf, &str),
+    options: &OpenOptions,
+) -> Scenario {
+    let ticks = timed
+        .iter()
+        .map(|((nanos, _), (stem, _))| Tick {
+            stem: stem.clone(),
+            capture_nanos: *nanos,
+        })
+        .collect();
+    let used = timed.values().map(|(_, (file, _))| file.clone());
+    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, used, options);
+    let clouds: BTreeMap<String, (PathBuf, Pose)> = timed.into_values().collect();
+    let join = format!(
+        "{} poses of {} by {by}",
+        clouds.len(),
+        poses.file_name().unwrap_or_default().display()
+    );
+    let source = Arc::new(Sequence {
+        poses,
+        clouds,
+        sweeps,
+    });
+    Scenario {
+        joins: vec![join],
+        ..single_vehicle(name, Layout(&CLOUDS), ticks, source)
+    }
+}
+
+fn stems_of(files: &[PathBuf]) -> Vec<&str> {
+    let stems = files.iter().map(|file| file.file_stem());
+    stems
+        .map(|stem| stem.and_then(|stem| stem.to_str()).unwrap_or_default())
+        .collect()
+}
+
+/// Refuses two clouds of one number, time or stem: one pose cannot be that of both.
+fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<(), ReadError> {
+    for (pair, index) in files.windows(2).zip(0..) {
+        if keys.are_equal(index, index + 1)
+            && let [first, second] = pair
+        {
+            let reason = format!(
+                "has the number, time or name of {}: a pose cannot be that of both",
+                first.display()
+            );
+            return Err(ReadError::malformed(second, reason));
+        }
+    }
+    Ok(())
+}
+
+/// Time of a cloud, by its index and row: that in its name, or of its pose.
+fn capture_nanos(
+    keys: &Keys,
+    poses: &PoseFile,
+    (index, row): (usize, Option<usize>),
+) -> Option<u64> {
+    match keys {
+        Keys::Times(times) => times.get(index).copied(),
+        Keys::Numbers(_) | Keys::Names(_) => poses.times.as_ref()?.get(row?).copied(),
+    }
+}
+
+impl FrameSource for Sequence {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = self.clouds.get(&tick.stem).map(|(_, pose)| *pose);
+        Ok(frame)
+    }
+
+    fn points(
+        &self,
+        agent: &CavId,
+        tick: &Tick,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        self.sweeps
+            .read(agent, &self.points_path(agent, tick, variant))
+    }
+
+    fn shared_files(&self, agent: &CavId) -> Vec<PathBuf> {
+        let mut files = self.sweeps.samples(agent);
+        files.push(self.poses.clone());
+        files
+    }
+
+    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        self.clouds
+            .get(&tick.stem)
+            .map(|(path, _)| path.clone())
+            .unwrap_or_default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::{Dataset, LoadOptions};
+
+    fn clouds(dir: &Path, names: &[&str]) {
+        for (index, name) in (1_u8..).zip(names) {
+            let point: Vec<u8> = [f32::from(index), 2.0, 3.0, 0.5]
+                .iter()
+                .flat_map(|value| value.to_le_bytes())
+                .collect();
+            fs::write(dir.join(name), point).unwrap();
+        }
+    }
+
+    fn poses(dataset: &Dataset) -> Vec<(String, [f64; 3], f32)> {
+        let scenario = &dataset.scenarios[0];
+        let frame = |tick: usize| scenario.load(0, tick, &LoadOptions::default()).unwrap();
+        let pose = |tick: usize| {
+            let frame = frame(tick);
+            (
+                scenario.ticks[tick].stem.clone(),
+                frame.world_from_lidar.unwrap().translation_m,
+                frame.points.xyzi[0][0],
+            )
+        };
+        (0..scenario.ticks.len()).map(pose).collect()
+    }
+
+    #[test]
+    fn poses_are_joined_by_the_number_of_the_cloud() {
+        let dir = tempfile::tempdir().unwrap();
+        let names: Vec<String> = (0..12).map(|number| format!("{number}.bin")).collect();
+        clouds(
+            dir.path(),
+            &names.iter().map(String::as_str).collect::<Vec<_>>(),
+        );
+        let rows = |row: fn(usize) -> String| (0..12).map(row).collect::<String>();
+        let matrix = |number: usize| format!("1 0 0 {number} 0 1 0 0 0 0 1 0\n");
+        let timed = |number: usize| format!("{:.6} {number} 0 0 0 0 0 1\n", 0.1 * number as f64);
+        let counted = |number: usize| format!("{number}.0 {number} 0 0 0 0 0 1\n");
+        let keyed =
+            |number: usize| format!("{} 1 0 0 {} 0 1 0 0 0 0 1 0\n", 11 - number, 11 - number);
+        for (text, by) in [
+            (rows(matrix), "order"),
+            (rows(timed), "order"),
+            (rows(counted), "order"),
+            (rows(keyed), "number"),
+        ] {
+            fs::write(dir.path().join("poses.txt"), text).unwrap();
+            let dataset = crate::open(dir.path()).unwrap();
+            let scenario = &dataset.scenarios[0];
+            assert_eq!(scenario.joins, [format!("12 poses of poses.txt by {by}")]);
+            let found = poses(&dataset);
+            for (number, (stem, position, first_x)) in found.iter().enumerate() {
+                let expected = (number.to_string(), [number as f64, 0.0, 0.0]);
+                assert_eq!((stem.clone(), *position), expected, "{by}");
+                // The first cloud has a point at 1 m.
+                assert_eq!(*first_x as usize, number + 1);
+            }
+            let times: Vec<u64> = scenario
+                .ticks
+                .iter()
+                .map(|tick| tick.capture_nanos)
+                .collect();
+            assert_eq!(
+                times,
+                (0..12).map(|tick| tick * 100_000_000).collect::<Vec<u64>>()
+            );
+        }
+    }
+
+    #[test]
+    fn files_of_odometry_programs_are_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let scans = dir.path().join("Scans");
+        fs::create_dir(&scans).unwrap();
+        clouds(&scans, &["000000.bin", "000001.bin"]);
+        fs::write(dir.path().join("GlobalMap.bin"), [0; 16]).unwrap();
+        for name in [
+            "optimized_poses.txt",
+            "07_poses_kitti.txt",
+            "07_poses_tum.txt",
+        ] {
+            let text = match name.ends_with("tum.txt") {
+                true => "0.0 1 2 3 0 0 0 1\n1.0 4 5 6 0 0 0 1\n",
+                false => "1 0 0 1 0 1 0 2 0 0 1 3\n1 0 0 4 0 1 0 5 0 0 1 6\n",
+            };
+            fs::write(dir.path().join(name), text).unwrap();
+            let dataset = crate::open(dir.path()).unwrap();
+            assert_eq!(
+                dataset.scenarios[0].joins,
+                [format!("2 poses of {name} by order")]
+            );
+            assert_eq!(poses(&dataset)[1].1, [4.0, 5.0, 6.0]);
+            fs::remove_file(dir.path().join(name)).unwrap();
+        }
+    }
+
+    #[test]
+    fn seconds_and_nanoseconds_are_a_time() {
+        let dir = tempfile::tempdir().unwrap();
+        clouds(
+            dir.path(),
+            &[
+                "cloud_1583836591_182590976.bin",
+                "cloud_1583836591_382590976.bin",
+            ],
+        );
+        let rows = "#sec,nsec,x,y,z,qx,qy,qz,qw\n1583836591,182590976,1,2,3,0,0,0,1\n\
+                    1583836591,282590976,9,9,9,0,0,0,1\n1583836591,382590976,4,5,6,0,0,0,1\n";
+        fs::write(dir.path().join("poses.csv"), rows).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        let found: Vec<[f64; 3]> = poses(&dataset).into_iter().map(|pose| pose.1).collect();
+        assert_eq!(found, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]);
+        assert_eq!(
+            dataset.scenarios[0].ticks[1].capture_nanos,
+            1_583_836_591_382_590_976
+        );
+    }
+
+    #[test]
+    fn one_pose_for_two_clouds_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        clouds(dir.path(), &["1.bin", "01.bin"]);
+        fs::write(
+            dir.path().join("poses.txt"),
+            "1 2 3 0 0 0 1\n4 5 6 0 0 0 1\n",
+        )
+        .unwrap();
+        let message = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(
+            message.contains("1.bin: has the number, time or name of"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn poses_belong_to_clouds_by_name_time_or_order() {
+        let dir = tempfile::tempdir().unwrap();
+        let below = dir.path().join("scans");
+        fs::create_dir(&below).unwrap();
+        clouds(&below, &["10.5.bin", "11.bin"]);
+        let expected = vec![
+            ("10.5".into(), [1.0, 2.0, 3.0], 1.0),
+            ("11".into(), [4.0, 5.0, 6.0], 2.0),
+        ];
+        let of = |text: &str| {
+            fs::write(dir.path().join("poses.txt"), text).unwrap();
+            crate::open(dir.path()).unwrap()
+        };
+        let by_time = of("# time x y z q\n11.0002 4 5 6 0 0 0 1\n10.5 1 2 3 0 0 1 0\n");
+        assert_eq!(
+            (by_time.layout.name(), poses(&by_time)),
+            ("clouds with poses", expected.clone())
+        );
+        let by_name = of("file,x,y,z,qx,qy,qz,qw\n11.bin,4,5,6,0,0,0,1\n10.5.bin,1,2,3,0,0,0,1\n");
+        assert_eq!(poses(&by_name), expected);
+        let by_order = of("1 0 0 1 0 1 0 2 0 0 1 3\n1 0 0 4 0 1 0 5 0 0 1 6\n");
+        assert_eq!(poses(&by_order), expected);
+        let lacking = of("10.5 1 2 3 0 0 1 0\n11 4 5 6 0 0 0 2\n");
+        assert_eq!((poses(&lacking).len(), lacking.problems.len()), (1, 2));
+        assert!(
+            lacking.problems[0]
+                .to_string()
+                .contains("quaternion of length 2.000, expected 1")
+        );
+        fs::write(dir.path().join("poses.txt"), "1 2 3 0 0 1 0\n").unwrap();
+        let message = crate::open(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("1 poses for 2 clouds"), "{message}");
+    }
+}

@@ -1,0 +1,198 @@
+//! Overlap of sweeps at their stated poses: finds poses of other sweeps, other axes and other units.
+//!
+//! Walls, poles, trees and vehicles of two sweeps shortly after one another must coincide where the poses say so. For a
+//! few pairs of each agent the overlap at the stated motion is compared with the best one around no motion.
+
+mod structure;
+
+use nalgebra::Isometry3;
+use protocol::CavId;
+
+use self::structure::{Match, Structure};
+use super::{LoadOptions, Problem, Scenario};
+
+/// Pairs of each agent whose poses are read, evenly spread.
+const CANDIDATES: usize = 24;
+/// Pairs of these whose sweeps are read, evenly spread; and those with the largest turn.
+const SPREAD: usize = 3;
+const TURNS: usize = 2;
+/// Ticks from one sweep to the next where successive ones are less than [`MOVED_M`] apart.
+const SLOW_STEP: usize = 5;
+const MOVED_M: f64 = 0.5;
+/// Longest time between two sweeps that are compared, nanoseconds.
+const SOON_NANOS: u64 = 2_000_000_000;
+/// Range around no motion in which the best overlap is searched, metres: 1.5 times the stated motion, within these.
+const SEARCH_M: [f64; 2] = [3.0, 8.0];
+/// Overlap that is better: by this share of the structure, and this ratio.
+const BETTER_BY: f32 = 0.15;
+const BETTER_RATIO: f32 = 1.4;
+/// Overlap that shows a motion at least.
+const CLEAR: f32 = 0.4;
+/// Smallest difference of two motions that counts.
+const OTHER_M: f32 = 0.4;
+const OTHER_RAD: f32 = 0.035;
+/// Sweeps up to this far apart by their poses, metres, have much of their structure in common.
+const NEAR_M: f64 = 3.0;
+/// Share of the structure that sweeps of one place have in common at least.
+const LEAST_OVERLAP: f32 = 0.2;
+
+/// Two sweeps of an agent, by their ticks.
+#[derive(Debug, Clone, Copy)]
+struct Pair {
+    ticks: [usize; 2],
+    /// Motion by the poses: `first_from_second`.
+    stated: Isometry3<f64>,
+}
+
+/// A pair whose poses the sweeps contradict.
+struct Contradiction {
+    pair: Pair,
+    /// Overlap at the stated motion.
+    overlap: f32,
+    best: Match,
+}
+
+/// One problem for each agent of a scenario whose sweeps contradict its poses. Reads ten sweeps of each agent at most.
+/// Agents that stand, sweeps without structure and unreadable frames give none.
+#[must_use]
+pub fn pose_problems(scenario: &Scenario) -> Vec<Problem> {
+    let agents = scenario.agents.iter().enumerate();
+    agents
+        .filter_map(|(index, agent)| agent_problem(scenario, index, agent))
+        .collect()
+}
+
+fn agent_problem(scenario: &Scenario, index: usize, agent: &CavId) -> Option<Problem> {
+    let judged: Vec<Option<Contradiction>> = pairs(scenario, index)
+        .into_iter()
+        .filter_map(|pair| judge(scenario, index, pair))
+        .collect();
+    let count = judged.len();
+    let wrong: Vec<Contradiction> = judged.into_iter().flatten().collect();
+    let first = wrong.first()?;
+    // One pair of several may be an object that fills the view.
+    if wrong.len() < 2 && count > 1 {
+        return None;
+    }
+    let path = scenario
+        .points_path(index, first.pair.ticks[0], None)
+        .ok()?;
+    let path = path.parent().unwrap_or(&path).display().to_string();
+    let stems = first.pair.ticks.map(|tick| {
+        scenario
+            .ticks
+            .get(tick)
+            .map_or("", |tick| tick.stem.as_str())
+    });
+    let message = format!(
+        "{path}: agent {agent}: {} of {count} pairs of sweeps contradict the poses: from {} to {} the poses have {} \
+         ({:.0} % of the structure overlap), the sweeps {} ({:.0} %): poses of other sweeps, other axes or other units",
+        wrong.len(),
+        stems[0],
+        stems[1],
+        shown(&first.pair.stated.cast()),
+        100.0 * first.overlap,
+        shown(&first.best.first_from_second),
+        100.0 * first.best.overlap,
+    );
+    Some(Problem {
+        path,
+        line: None,
+        field: Some("world_from_lidar".into()),
+        message,
+    })
+}
+
+fn shown(motion: &Isometry3<f32>) -> String {
+    let [x, y, z] = motion.translation.vector.into();
+    let degrees = motion.rotation.angle().to_degrees();
+    format!("({x:.1}, {y:.1}, {z:.1}) m and a turn by {degrees:.1} degrees")
+}
+
+/// Pairs that are spread evenly, and those that turn most.
+fn pairs(scenario: &Scenario, agent: usize) -> Vec<Pair> {
+    let ticks: Vec<usize> = (0..scenario.ticks.len())
+        .filter(|&tick| scenario.is_present(agent, tick))
+        .collect();
+    let step = ticks.len().div_ceil(CANDIDATES).max(1);
+    let mut candidates: Vec<Pair> = (0..ticks.len())
+        .step_by(step)
+        .filter_map(|first| pair(scenario, agent, &ticks, first))
+        .collect();
+    let step = candidates.len().div_ceil(SPREAD).max(1);
+    let mut chosen: Vec<Pair> = candidates
+        .iter()
+        .skip(step / 2)
+        .step_by(step)
+        .copied()
+        .collect();
+    candidates.retain(|pair| chosen.iter().all(|known| known.ticks != pair.ticks));
+    candidates.sort_by(|a, b| {
+        let [a, b] = [a, b].map(|pair| pair.stated.rotation.angle());
+        b.total_cmp(&a)
+    });
+    chosen.extend(candidates.into_iter().take(TURNS));
+    chosen
+}
+
+/// A sweep and its successor, or a later one where that is close.
+fn pair(scenario: &Scenario, agent: usize, ticks: &[usize], first: usize) -> Option<Pair> {
+    let next = pair_of(
+        scenario,
+        agent,
+        [*ticks.get(first)?, *ticks.get(first + 1)?],
+    )?;
+    if next.stated.translation.vector.norm() > MOVED_M {
+        return Some(next);
+    }
+    let later = ticks.get(first + SLOW_STEP);
+    let later = later.and_then(|later| pair_of(scenario, agent, [next.ticks[0], *later]));
+    Some(later.unwrap_or(next))
+}
+
+fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Pair> {
+    let blind = LoadOptions {
+        points: false,
+        ..LoadOptions::default()
+    };
+    let [start, end] = ticks.map(|tick| scenario.ticks.get(tick).map(|tick| tick.capture_nanos));
+    if end?.abs_diff(start?) > SOON_NANOS {
+        return None;
+    }
+    let [world_from_first, world_from_second] = ticks.map(|tick| {
+        let frame = scenario.load(agent, tick, &blind).ok()?;
+        Some(frame.world_from_lidar?.isometry())
+    });
+    Some(Pair {
+        ticks,
+        stated: world_from_first?.inv_mul(&world_from_second?),
+    })
+}
+
+/// `None` if the pair cannot be judged; `Some(None)` if the sweeps agree with the poses.
+fn judge(scenario: &Scenario, agent: usize, pair: Pair) -> Option<Option<Contradiction>> {
+    let [first, second] = pair.ticks.map(|tick| {
+        let cloud = scenario.load_points(agent, tick, None).ok()?;
+        Structure::of(&cloud.points)
+    });
+    let (first, second) = (first?, second?);
+    let overlap = first.overlap(&second, &pair.stated.cast());
+    let moved_m = pair.stated.translation.vector.norm();
+    let radius_m = (1.5 * moved_m).clamp(SEARCH_M[0], SEARCH_M[1]);
+    let best = first.best_overlap(&second, radius_m as f32);
+    let between = best.first_from_second.inv_mul(&pair.stated.cast());
+    let is_other =
+        between.translation.vector.norm() > OTHER_M || between.rotation.angle() > OTHER_RAD;
+    let is_better = best.overlap > CLEAR.max(BETTER_RATIO * overlap).max(overlap + BETTER_BY);
+    let is_elsewhere = moved_m < NEAR_M && overlap.max(best.overlap) < LEAST_OVERLAP;
+    Some(
+        ((is_better && is_other) || is_elsewhere).then_some(Contradiction {
+            pair,
+            overlap,
+            best,
+        }),
+    )
+}
+
+#[cfg(test)]
+mod tests;
