@@ -7,12 +7,13 @@ use bus::BusError;
 use bus::malloc_settings;
 use clap::{Parser, Subcommand};
 use support::cli::{Outcome, exit_code};
+use support::command_line::parse_beside;
 use support::sibling_program::Sibling;
 
 use crate::command;
 
 /// Subcommands that read data sets.
-pub(crate) const OFFLINE: Sibling = Sibling {
+const OFFLINE: Sibling = Sibling {
     program: "agent-offline",
     subcommands: &[
         (
@@ -37,7 +38,7 @@ pub(crate) const OFFLINE: Sibling = Sibling {
     after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 data could not be used and were left out, 130 \
                   a training was stopped by Ctrl-C."
 )]
-pub(crate) struct Cli {
+pub struct CommandLine {
     #[command(subcommand)]
     command: Command,
 }
@@ -56,7 +57,9 @@ impl Command {
     }
 }
 
-/// Runs a subcommand.
-pub(crate) fn run(cli: Cli) -> ExitCode {
-    exit_code(cli.command.run(), BusError::is_behind)
+/// Runs the subcommand on the command line.
+#[must_use]
+pub fn main() -> ExitCode {
+    let command_line: CommandLine = parse_beside(&OFFLINE);
+    exit_code(command_line.command.run(), BusError::is_behind)
 }

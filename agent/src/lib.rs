@@ -31,6 +31,8 @@
 
 pub mod agent;
 pub mod attack;
+mod command;
+pub mod command_line;
 pub mod config;
 pub mod node;
 pub mod output_filter;

@@ -18,6 +18,8 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+mod command;
+pub mod command_line;
 pub mod operate;
 pub mod report;
 pub mod ros;

@@ -24,6 +24,8 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+mod command;
+pub mod command_line;
 pub mod config;
 pub mod ego;
 pub mod misbehaviour;

@@ -7,6 +7,8 @@ mod command_line;
 
 use std::process::ExitCode;
 
+use support::command_line::parse_behind;
+
 fn main() -> ExitCode {
-    command_line::run(support::command_line::parse())
+    command_line::run(parse_behind::<_, agent::command_line::CommandLine>())
 }

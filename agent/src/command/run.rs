@@ -1,10 +1,10 @@
 //! `agent run`: one vehicle of a live fleet.
 
-use agent::agent::Agent;
-use agent::attack::Attack;
-use agent::config::AgentConfig;
-use agent::node;
-use agent::output_filter::{OutputFilter, Unfiltered};
+use crate::agent::Agent;
+use crate::attack::Attack;
+use crate::config::AgentConfig;
+use crate::node;
+use crate::output_filter::{OutputFilter, Unfiltered};
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
 use perception::detector::Detector;

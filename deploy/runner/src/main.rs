@@ -7,8 +7,9 @@ mod command;
 use std::process::ExitCode;
 
 use clap::Parser;
+use deploy::command_line::CommandLine as Front;
 use support::cli::exit_code;
-use support::command_line::parse;
+use support::command_line::parse_behind;
 
 /// Runs and experiments that compute networks.
 #[derive(Debug, Parser)]
@@ -26,7 +27,7 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    let command_line: CommandLine = parse();
+    let command_line = parse_behind::<CommandLine, Front>();
     bus::log_to_stderr();
     exit_code(command_line.command.run(), command::is_bad_input)
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use deploy::operate::keys::{KeyError, KeyPlan, make};
+use crate::operate::keys::{KeyError, KeyPlan, make};
 use protocol::{CavId, Principal, Role};
 use serde_json::json;
 use support::output;

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use deploy::operate::status::RunStatus;
-use deploy::report::{Comparison, RunReport};
+use crate::operate::status::RunStatus;
+use crate::report::{Comparison, RunReport};
 use support::output;
 
 use support::cli::BadInput;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open_unless, process_id};
-use deploy::ros::{
+use crate::ros::{
     AgentTopic, ClockMode, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run,
 };
 use protocol::{CavId, Role, RunId};

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use anyhow::ensure;
 use bus::Endpoint;
-use deploy::operate::remote_status::RemoteStatus;
-use deploy::operate::status::{RunStatus, StatusError};
+use crate::operate::remote_status::RemoteStatus;
+use crate::operate::status::{RunStatus, StatusError};
 use protocol::RunId;
 use support::output;
 

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bus::Endpoint;
-use deploy::operate::status::{Phase, RunStatus};
-use deploy::view::{LiveRun, serve_live, show_recorded, until_stopped};
+use crate::operate::status::{Phase, RunStatus};
+use crate::view::{LiveRun, serve_live, show_recorded, until_stopped};
 use protocol::RunId;
 use support::output;
 

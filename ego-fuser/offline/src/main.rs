@@ -7,8 +7,9 @@ mod command;
 use std::process::ExitCode;
 
 use clap::Parser;
+use ego_fuser::command_line::CommandLine as Front;
 use support::cli::exit_code;
-use support::command_line::parse;
+use support::command_line::parse_behind;
 
 /// Training and evaluation of collaborative detection.
 #[derive(Debug, Parser)]
@@ -24,5 +25,5 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    exit_code(parse::<CommandLine>().command.run(), |_| false)
+    exit_code(parse_behind::<CommandLine, Front>().command.run(), |_| false)
 }

@@ -2,9 +2,9 @@
 
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
-use ego_fuser::config::EgoConfig;
-use ego_fuser::ego::{Ego, EgoError};
-use ego_fuser::node::{self, NodeOptions};
+use crate::config::EgoConfig;
+use crate::ego::{Ego, EgoError};
+use crate::node::{self, NodeOptions};
 use protocol::Role;
 use support::output;
 

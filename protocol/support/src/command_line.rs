@@ -5,19 +5,16 @@ use std::io;
 use std::path::Path;
 use std::process;
 
-use clap::{Arg, ArgAction, Command, Parser};
+use clap::{Arg, ArgAction, ArgMatches, Command, CommandFactory, Parser};
 use clap_complete::Shell;
 
-use crate::command_tree::CommandTree;
 use crate::list_values::with_lists_joined;
 use crate::output::{self, Verbosity};
 use crate::sibling_program::Sibling;
 
 /// Variable that asks for a completion script (`bash`, `zsh`, `fish`, ...) on standard output, or for manual pages in a
 /// folder (`man:FOLDER`), instead of running.
-pub(crate) const GENERATE: &str = "V2VLOC_GENERATE";
-/// Value of the variable that asks for the subcommands and their options as JSON: what a program asks its sibling for.
-pub(crate) const DESCRIPTION: &str = "description";
+const GENERATE: &str = "V2VLOC_GENERATE";
 
 /// Place of the last option in the help, before `--help`.
 const LAST: usize = 998;
@@ -26,46 +23,73 @@ const LAST: usize = 998;
 /// [`Parser::parse`].
 #[must_use]
 pub fn parse<P: Parser>() -> P {
-    parse_with(None)
+    end_if_generated(P::command);
+    parse_arguments(P::command())
 }
 
-/// The same with the subcommands that a program beside this one carries out: where one of these is given, the process
-/// becomes that program.
+/// Parses the command line of a program with the subcommands that `sibling`, a program beside it, carries out: where one
+/// of these is given, the process becomes that program.
 #[must_use]
 pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
-    parse_with(Some(sibling))
+    if env::var_os(GENERATE).is_some() {
+        let error = sibling.exec_generator();
+        output::note(format_args!(
+            "without the options of {}: {error}",
+            sibling.program
+        ));
+    }
+    end_if_generated(|| sibling.extend(P::command()));
+    end_if_failed(sibling.exec_help(env::args_os()));
+    let matches = matches(sibling.extend(P::command()));
+    end_if_failed(sibling.exec_subcommand(&matches));
+    P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
 }
 
-fn parse_with<P: Parser>(sibling: Option<&Sibling>) -> P {
-    if let Some(wanted) = env::var_os(GENERATE) {
-        let wanted = wanted.to_string_lossy();
-        let generated = generate(P::command(), sibling, &wanted);
-        if let Err(error) = &generated {
-            output::error(format_args!("{GENERATE}={wanted}: {error}"));
-        }
-        process::exit(if generated.is_ok() { 0 } else { 2 });
-    }
-    let end = |error: io::Error| -> ! {
-        output::error(error);
-        process::exit(1)
-    };
-    sibling
-        .and_then(|sibling| sibling.exec_help(env::args_os()))
-        .map(end);
-    let own = P::command();
-    let command = sibling.map_or_else(|| own.clone(), |sibling| sibling.extend(own.clone()));
+/// Parses the command line of a sibling of the program `Front`; completions and manual pages are those of `Front` with
+/// the subcommands of both.
+#[must_use]
+pub fn parse_behind<P: Parser, Front: CommandFactory>() -> P {
+    end_if_generated(|| {
+        let own = P::command();
+        let shown = own.get_subcommands().filter(|command| !command.is_hide_set());
+        Front::command().subcommands(shown.cloned())
+    });
+    parse_arguments(P::command())
+}
+
+fn parse_arguments<P: Parser>(command: Command) -> P {
+    P::from_arg_matches(&matches(command)).unwrap_or_else(|error| error.exit())
+}
+
+/// Arguments of this process; sets the verbosity of its messages.
+fn matches(command: Command) -> ArgMatches {
     let command = with_negative_numbers(with_verbosity(command));
-    let matches = command
-        .clone()
-        .get_matches_from(with_lists_joined(&command, env::args_os()));
+    let words = with_lists_joined(&command, env::args_os());
+    let matches = command.get_matches_from(words);
     output::set_verbosity(verbosity(
         matches.get_count("verbose"),
         matches.get_flag("quiet"),
     ));
-    sibling
-        .and_then(|sibling| sibling.exec_subcommand(&matches))
-        .map(end);
-    P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
+    matches
+}
+
+fn end_if_generated(command: impl FnOnce() -> Command) {
+    let Some(wanted) = env::var_os(GENERATE) else {
+        return;
+    };
+    let wanted = wanted.to_string_lossy();
+    let generated = generate(with_verbosity(command()), &wanted);
+    if let Err(error) = &generated {
+        output::error(format_args!("{GENERATE}={wanted}: {error}"));
+    }
+    process::exit(if generated.is_ok() { 0 } else { 2 });
+}
+
+fn end_if_failed(error: Option<io::Error>) {
+    if let Some(error) = error {
+        output::error(error);
+        process::exit(1)
+    }
 }
 
 /// The command with negative numbers as values of its options: those that are out of bounds are named, not taken for
@@ -117,13 +141,7 @@ fn verbosity(verbose: u8, quiet: bool) -> Verbosity {
     }
 }
 
-fn generate(command: Command, sibling: Option<&Sibling>, wanted: &str) -> io::Result<()> {
-    if wanted == DESCRIPTION {
-        return output::line(serde_json::to_string(&CommandTree::of(&command))?);
-    }
-    let mut command = with_verbosity(
-        sibling.map_or_else(|| command.clone(), |sibling| complete(&command, sibling)),
-    );
+fn generate(mut command: Command, wanted: &str) -> io::Result<()> {
     if let Some(folder) = wanted.strip_prefix("man:") {
         return clap_mangen::generate_to(command, Path::new(folder));
     }
@@ -136,22 +154,9 @@ fn generate(command: Command, sibling: Option<&Sibling>, wanted: &str) -> io::Re
     output::text(String::from_utf8_lossy(&script))
 }
 
-/// The command with the subcommands of a sibling; without their options where the sibling is not installed.
-fn complete(command: &Command, sibling: &Sibling) -> Command {
-    sibling
-        .extend_described(command.clone())
-        .unwrap_or_else(|error| {
-            output::note(format_args!(
-                "without the options of {}: {error}",
-                sibling.program
-            ));
-            sibling.extend(command.clone())
-        })
-}
-
 #[cfg(test)]
 mod tests {
-    use clap::{CommandFactory, FromArgMatches};
+    use clap::FromArgMatches;
 
     use super::*;
 
@@ -197,7 +202,6 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         generate(
             Cli::command(),
-            None,
             &format!("man:{}", folder.path().display()),
         )
         .unwrap();
@@ -212,6 +216,6 @@ mod tests {
             pages.contains(&"program.1".into()) && pages.contains(&"program-act.1".into()),
             "{pages:?}"
         );
-        assert!(generate(Cli::command(), None, "tcsh").is_err());
+        assert!(generate(Cli::command(), "tcsh").is_err());
     }
 }

@@ -35,7 +35,6 @@ pub mod atomic_file;
 pub mod bounded_file;
 pub mod cli;
 pub mod command_line;
-mod command_tree;
 pub mod csv_file;
 pub mod file_digests;
 mod list_values;

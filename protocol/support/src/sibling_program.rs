@@ -12,8 +12,6 @@ use std::process;
 
 use clap::{Arg, ArgAction, ArgMatches, Command};
 
-use crate::command_line::{DESCRIPTION, GENERATE};
-use crate::command_tree::CommandTree;
 use crate::output::{Verbosity, verbosity};
 
 /// Argument of the subcommands: everything behind their name, `--help` included.
@@ -31,51 +29,19 @@ pub struct Sibling {
 impl Sibling {
     /// Adds the subcommands to `command`. Their options are known to the program only.
     pub(crate) fn extend(&self, command: Command) -> Command {
-        let rest = || {
-            Arg::new(REST)
-                .action(ArgAction::Append)
-                .value_parser(clap::value_parser!(OsString))
-                .num_args(0..)
-        };
-        let rest = || {
-            rest()
-                .trailing_var_arg(true)
-                .allow_hyphen_values(true)
-                .hide(true)
-        };
-        let stub = |(name, about): &(&'static str, &'static str)| {
+        let rest = Arg::new(REST)
+            .action(ArgAction::Append)
+            .value_parser(clap::value_parser!(OsString))
+            .num_args(0..)
+            .trailing_var_arg(true)
+            .allow_hyphen_values(true)
+            .hide(true);
+        command.subcommands(self.subcommands.iter().map(|(name, about)| {
             Command::new(*name)
                 .about(*about)
                 .disable_help_flag(true)
-                .arg(rest())
-        };
-        command.subcommands(self.subcommands.iter().map(stub))
-    }
-
-    /// Adds the subcommands to `command` with their options, as the program describes them.
-    ///
-    /// # Errors
-    /// The system's if the program cannot be executed; also when it does not describe its subcommands.
-    pub(crate) fn extend_described(&self, command: Command) -> io::Result<Command> {
-        let output = process::Command::new(self.path())
-            .env(GENERATE, DESCRIPTION)
-            .output()?;
-        let described: CommandTree = serde_json::from_slice(&output.stdout)?;
-        let subcommand = |(name, _): &(&'static str, &'static str)| {
-            let known = described
-                .subcommands
-                .iter()
-                .find(|known| known.name == *name);
-            known
-                .map(CommandTree::command)
-                .ok_or_else(|| io::Error::other(format!("it has no subcommand {name}")))
-        };
-        let subcommands = self
-            .subcommands
-            .iter()
-            .map(subcommand)
-            .collect::<io::Result<Vec<_>>>()?;
-        Ok(command.subcommands(subcommands))
+                .arg(rest.clone())
+        }))
     }
 
     /// Replaces this process by the program if the arguments ask for the help of one of the subcommands. Returns only
@@ -91,6 +57,11 @@ impl Sibling {
             .to_str()
             .filter(|name| help == "help" && self.has(name))?;
         Some(self.exec(name, [&help].into_iter().chain(&rest)))
+    }
+
+    /// Replaces this process by the program, which writes completions and manual pages of both. Returns only on failure.
+    pub(crate) fn exec_generator(&self) -> io::Error {
+        process::Command::new(self.path()).exec()
     }
 
     /// Replaces this process by the program if the command line names one of the subcommands. Returns only otherwise
