@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use localization::baselines::{DescribedSweep, SweepDatabase};
-use localization::pgc::{Localizer, LocalizerError, LocalizerTimes};
+use localization::pgc::{Localizer, LocalizerError, stopwatch};
 
 /// Error of building a database of sweeps.
 #[derive(Debug, thiserror::Error)]
@@ -86,7 +86,7 @@ fn described(
         let path = scenario.points_path(agent, tick, None)?;
         return Err(ReadError::malformed(&path, "there is no pose for this sweep").into());
     };
-    let features = localizer.sweep_features(&frame.points, &mut LocalizerTimes::default())?;
+    let features = localizer.sweep_features(&frame.points, &mut stopwatch())?;
     Ok(features.map(|descriptor| DescribedSweep {
         descriptor,
         world_from_sensor: pose.isometry(),

@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
-use bus::shutdown::Stop;
-use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open_unless, process_id};
 use crate::ros::{
     AgentTopic, ClockMode, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run,
 };
+use anyhow::Context;
+use bus::shutdown::Stop;
+use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open_unless, process_id};
 use protocol::{CavId, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};

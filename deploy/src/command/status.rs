@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use anyhow::ensure;
-use bus::Endpoint;
 use crate::operate::remote_status::RemoteStatus;
 use crate::operate::status::{RunStatus, StatusError};
+use anyhow::ensure;
+use bus::Endpoint;
 use protocol::RunId;
 use support::output;
 

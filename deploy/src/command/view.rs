@@ -4,9 +4,9 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bus::Endpoint;
 use crate::operate::status::{Phase, RunStatus};
 use crate::view::{LiveRun, serve_live, show_recorded, until_stopped};
+use bus::Endpoint;
 use protocol::RunId;
 use support::output;
 

@@ -25,5 +25,7 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    exit_code(parse_behind::<CommandLine, Front>().command.run(), |_| false)
+    exit_code(parse_behind::<CommandLine, Front>().command.run(), |_| {
+        false
+    })
 }

@@ -1,10 +1,10 @@
 //! `ego-fuser run`: the fusing vehicle of a live fleet.
 
-use anyhow::Context;
-use bus::{Configured, STOP_LIMIT, log_to_stderr};
 use crate::config::EgoConfig;
 use crate::ego::{Ego, EgoError};
 use crate::node::{self, NodeOptions};
+use anyhow::Context;
+use bus::{Configured, STOP_LIMIT, log_to_stderr};
 use protocol::Role;
 use support::output;
 

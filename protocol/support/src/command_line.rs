@@ -51,7 +51,9 @@ pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
 pub fn parse_behind<P: Parser, Front: CommandFactory>() -> P {
     end_if_generated(|| {
         let own = P::command();
-        let shown = own.get_subcommands().filter(|command| !command.is_hide_set());
+        let shown = own
+            .get_subcommands()
+            .filter(|command| !command.is_hide_set());
         Front::command().subcommands(shown.cloned())
     });
     parse_arguments(P::command())
@@ -200,11 +202,7 @@ mod tests {
     #[test]
     fn manual_pages_are_written_and_an_unknown_shell_is_named() {
         let folder = tempfile::tempdir().unwrap();
-        generate(
-            Cli::command(),
-            &format!("man:{}", folder.path().display()),
-        )
-        .unwrap();
+        generate(Cli::command(), &format!("man:{}", folder.path().display())).unwrap();
         let mut pages: Vec<_> = folder
             .path()
             .read_dir()

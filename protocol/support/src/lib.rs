@@ -7,7 +7,7 @@
 //!   CSV, SHA-256 of whole files.
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`provenance`]: the command, programs and digests that a result was made from.
-//! - [`rounding`]: floats to integers.
+//! - [`rounding`]: floats to integers; [`sampling`]: parts of lists.
 //! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
 //!
@@ -44,6 +44,7 @@ pub mod progress;
 pub mod provenance;
 pub mod random;
 pub mod rounding;
+pub mod sampling;
 pub mod shared_files;
 pub mod sibling_program;
 pub mod stage_times;

@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use protocol::StageTiming;
 
-/// Durations of consecutive stages.
-#[derive(Debug, Clone)]
+/// Durations of consecutive stages; a stage that recurs has the sum of its times.
+#[derive(Debug, Clone, PartialEq)]
 pub struct StageTimes {
     last: Instant,
     timings: Vec<StageTiming>,
@@ -15,25 +15,48 @@ impl StageTimes {
     /// Starts the first stage now.
     #[must_use]
     pub fn start() -> Self {
+        Self::of(&[])
+    }
+
+    /// Starts the first stage now; `stages` are reported in this order, also those that take no time.
+    #[must_use]
+    pub fn of(stages: &[&str]) -> Self {
+        let nothing = |stage: &&str| StageTiming::new(stage, Duration::ZERO);
         Self {
             last: Instant::now(),
-            timings: Vec::new(),
+            timings: stages.iter().map(nothing).collect(),
         }
     }
 
-    /// Ends a stage and starts the next one; returns its duration.
+    /// Ends a stage and starts the next one; returns the time since the last end.
     pub fn lap(&mut self, stage: &str) -> Duration {
         let now = Instant::now();
         let took = now - self.last;
-        self.timings.push(StageTiming::new(stage, took));
         self.last = now;
+        let timing = StageTiming::new(stage, took);
+        match self.timings.iter_mut().find(|known| known.stage == stage) {
+            Some(known) => known.nanos = known.nanos.saturating_add(timing.nanos),
+            None => self.timings.push(timing),
+        }
         took
+    }
+
+    /// All stages so far.
+    #[must_use]
+    pub fn timings(&self) -> &[StageTiming] {
+        &self.timings
     }
 
     /// All stages so far.
     #[must_use]
     pub fn into_timings(self) -> Vec<StageTiming> {
         self.timings
+    }
+
+    /// Sum of all stages.
+    #[must_use]
+    pub fn total(&self) -> Duration {
+        Duration::from_nanos(self.timings.iter().map(|timing| timing.nanos).sum())
     }
 }
 
@@ -49,13 +72,25 @@ mod tests {
         let first = times.lap("first");
         let second = times.lap("second");
         assert!(first >= Duration::from_millis(2) && first + second <= began.elapsed());
-        let timings = times.into_timings();
+        let again = times.lap("first");
+        assert_eq!(times.total(), first + second + again);
         assert_eq!(
-            timings,
+            times.into_timings(),
             [
-                StageTiming::new("first", first),
+                StageTiming::new("first", first + again),
                 StageTiming::new("second", second)
             ]
+        );
+    }
+
+    #[test]
+    fn stages_that_take_no_time_are_reported() {
+        let mut times = StageTimes::of(&["first", "second"]);
+        let second = times.lap("second");
+        let expected = [("first", Duration::ZERO), ("second", second)];
+        assert_eq!(
+            times.timings(),
+            expected.map(|(stage, took)| StageTiming::new(stage, took))
         );
     }
 }

@@ -8,7 +8,7 @@ use dataset::frame::{Frame, Object, ObjectClass};
 use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::pcd;
 use dataset::{self, Dataset, Layout, LoadOptions, OpenOptions};
-use localization::pgc::{Localizer, LocalizerInput};
+use localization::pgc::{Localize, Localizer, LocalizerInput};
 use perception::inference::Inference;
 use sim_replay::inspect::{TickReport, inspect};
 use tests::fixtures::data;
@@ -411,7 +411,7 @@ fn a_real_sweep_passes_through_the_shipped_networks_and_is_placed_nowhere() {
     let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights");
     let [encoder, head] =
         ["pgc-encoder", "pgc-town1"].map(|name| weights.join(format!("{name}.safetensors")));
-    let localizer = Localizer::load(&encoder, &head, Inference::default()).unwrap();
+    let mut localizer = Localizer::load(&encoder, &head, Inference::default()).unwrap();
     let frame = dataset.scenarios[0]
         .load(0, 0, &LoadOptions::default())
         .unwrap();
@@ -432,6 +432,9 @@ fn a_real_sweep_passes_through_the_shipped_networks_and_is_placed_nowhere() {
             .all(|number| number.is_finite())
     );
     // Recorded in another town than that of the head.
-    let estimate = localizer.localize(&frame.points).unwrap().estimate;
+    let estimate = localizer
+        .localize(LocalizerInput::of(&frame.points))
+        .unwrap()
+        .estimate;
     assert!(estimate.confidence() < 0.1, "{estimate:?}");
 }

@@ -13,7 +13,7 @@ use localization::baselines::diffloc::{DiffLocConfig, RangeImageConfig};
 use localization::baselines::load_baseline;
 use localization::baselines::sgloc::SgLocConfig;
 use localization::pgc::pose_solver::PoseSolver;
-use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
+use localization::pgc::{Localize, Localizer, LocalizerError, LocalizerInput, SceneEncoder};
 use perception::inference::Inference;
 use perception::train::{Length, RunConfig, TrainingError};
 use perception::weights::Weights;
@@ -129,7 +129,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
         summary.accuracy
     );
 
-    let localizer =
+    let mut localizer =
         Localizer::load(&encoder, &summary.trained.weights, Inference::default()).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
     let mut found = 0;
@@ -137,7 +137,9 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
         let frame = dataset.scenarios[0]
             .load(0, 2 * tick, &LoadOptions::default())
             .unwrap();
-        let answer = localizer.localize(&frame.points).unwrap();
+        let answer = localizer
+            .localize(LocalizerInput::of(&frame.points))
+            .unwrap();
         let Some(pose) = answer.estimate.world_from_cav() else {
             continue;
         };
@@ -151,7 +153,10 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
         found += usize::from(off.norm() < 3.0);
         assert!((0.0..=1.0).contains(&answer.estimate.confidence()));
         assert_eq!(
-            localizer.localize(&frame.points).unwrap().estimate,
+            localizer
+                .localize(LocalizerInput::of(&frame.points))
+                .unwrap()
+                .estimate,
             answer.estimate,
             "same sweep, same answer"
         );
@@ -166,7 +171,10 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
         xyzi: (0..10).map(|k| [k as f32, 3.0, 0.5, 0.1]).collect(),
     };
     for cloud in [PointCloud::default(), nan, few] {
-        let estimate = localizer.localize(&cloud).unwrap().estimate;
+        let estimate = localizer
+            .localize(LocalizerInput::of(&cloud))
+            .unwrap()
+            .estimate;
         assert_eq!(
             estimate,
             PoseEstimate::NoPose {
@@ -312,9 +320,15 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
     let frame = dataset.scenarios[0]
         .load(0, 3, &LoadOptions::default())
         .unwrap();
-    let first = localizer.localize(&frame.points).unwrap().estimate;
+    let first = localizer
+        .localize(LocalizerInput::of(&frame.points))
+        .unwrap()
+        .estimate;
     assert_eq!(
-        localizer.localize(&frame.points).unwrap().estimate,
+        localizer
+            .localize(LocalizerInput::of(&frame.points))
+            .unwrap()
+            .estimate,
         first,
         "same sweep, same answer"
     );
@@ -325,7 +339,13 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
         reason: NoPoseReason::TooFewPoints,
         inlier_count: 0,
     };
-    assert_eq!(localizer.localize(&nan).unwrap().estimate, none);
+    assert_eq!(
+        localizer
+            .localize(LocalizerInput::of(&nan))
+            .unwrap()
+            .estimate,
+        none
+    );
 
     let mut resumed = config(203);
     resumed.run.resume = true;

@@ -1,8 +1,7 @@
 //! LightLoc (Li et al. 2025): classification and regression of scene coordinates without the predicted error, the
 //! refinement and the confidence that PGC adds.
 
-use std::time::Instant;
-
+use crate::pgc::localization::SOLVE;
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
 
@@ -25,15 +24,11 @@ impl LightLoc {
 }
 
 impl Localize for LightLoc {
-    fn localize_sweep(
-        &mut self,
-        sweep: LocalizerInput<'_>,
-    ) -> Result<Localization, LocalizerError> {
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let (mut coordinates, mut times) = self.localizer.scene_coordinates(sweep)?;
         coordinates.epsilon_m.fill(0.0);
-        let start = Instant::now();
         let solved = self.solver.solve(&coordinates);
-        times.solve = start.elapsed();
+        times.lap(SOLVE);
         Ok(Localization::new(&solved, times))
     }
 

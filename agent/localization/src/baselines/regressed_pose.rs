@@ -2,13 +2,19 @@
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use protocol::{NoPoseReason, PoseEstimate};
+use support::stage_times::StageTimes;
 
-use crate::pgc::{Localization, LocalizerTimes};
+use crate::pgc::Localization;
 
-/// Confidence of a pose that is regressed directly: such a network predicts no error.
-pub(super) const FULL_CONFIDENCE: f32 = 1.0;
+/// The pose with full confidence, since such a network predicts no error; none if it is not finite or has no heading.
+pub(super) fn localization(pose: Option<Isometry3<f64>>, times: StageTimes) -> Localization {
+    match pose {
+        Some(pose) => Localization::from_estimate(PoseEstimate::new(pose.into(), 1.0), times),
+        None => no_pose(NoPoseReason::Failed, times),
+    }
+}
 
-pub(super) fn no_pose(reason: NoPoseReason, times: LocalizerTimes) -> Localization {
+pub(super) fn no_pose(reason: NoPoseReason, times: StageTimes) -> Localization {
     Localization::from_estimate(
         PoseEstimate::NoPose {
             reason,

@@ -2,14 +2,12 @@
 //!
 //! A regression that does not beat it has learnt less than the poses of its training sweeps (Sattler et al. 2019).
 
-use std::time::Instant;
-
 use nalgebra::Isometry3;
-use protocol::{NoPoseReason, PoseEstimate};
+use protocol::NoPoseReason;
 
-use crate::pgc::{
-    Localization, Localize, Localizer, LocalizerError, LocalizerInput, LocalizerTimes,
-};
+use super::regressed_pose::{localization, no_pose};
+use crate::pgc::localization::SOLVE;
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput, stopwatch};
 
 /// Smallest deviation of a channel: constant ones are scaled as if they had this one.
 const LEAST_DEVIATION: f32 = 1e-4;
@@ -120,26 +118,15 @@ impl Retrieval {
 
 impl Localize for Retrieval {
     /// Every pose has full confidence: nothing tells a good one from a bad one.
-    fn localize_sweep(
-        &mut self,
-        sweep: LocalizerInput<'_>,
-    ) -> Result<Localization, LocalizerError> {
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
-        let mut times = LocalizerTimes::default();
+        let mut times = stopwatch();
         let Some(descriptor) = self.localizer.sweep_features(cloud, &mut times)? else {
-            let none = PoseEstimate::NoPose {
-                reason: NoPoseReason::TooFewPoints,
-                inlier_count: 0,
-            };
-            return Ok(Localization::from_estimate(none, times));
+            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
         };
-        let start = Instant::now();
         let pose = self.database.nearest(&descriptor);
-        times.solve = start.elapsed();
-        Ok(Localization::from_estimate(
-            PoseEstimate::new(pose.into(), 1.0),
-            times,
-        ))
+        times.lap(SOLVE);
+        Ok(localization(Some(pose), times))
     }
 }
 

@@ -1,26 +1,24 @@
 //! Localization of one sweep: its pose or the reason why there is none, with evidence and time per stage.
 
-use std::time::Duration;
-
-use protocol::{PoseEstimate, StageTiming};
+use protocol::PoseEstimate;
+use support::stage_times::StageTimes;
 
 use super::pose_evidence::PoseEvidence;
 use super::pose_solver::{self, FoundPose, Solved};
 use super::pose_std::PoseStd;
 
-/// Time per stage.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct LocalizerTimes {
-    /// Voxels and rulebooks from points.
-    pub voxelise: Duration,
-    /// Scene encoder.
-    pub encode: Duration,
-    /// Scene head.
-    pub regress: Duration,
-    /// Pose solver.
-    pub solve: Duration,
-    /// Pose refinement, its fits included.
-    pub refine: Duration,
+/// Stages of a localization.
+pub(crate) const VOXELISE: &str = "pose voxelise";
+pub(crate) const ENCODE: &str = "pose encode";
+pub(crate) const REGRESS: &str = "pose regress";
+pub(crate) const SOLVE: &str = "pose solve";
+/// Pose refinement, its fits included.
+pub(crate) const REFINE: &str = "pose refine";
+
+/// Stopwatch of a localization.
+#[must_use]
+pub fn stopwatch() -> StageTimes {
+    StageTimes::of(&[VOXELISE, ENCODE, REGRESS, SOLVE, REFINE])
 }
 
 /// Result of one sweep.
@@ -35,13 +33,13 @@ pub struct Localization {
     /// Inliers as a share of all regressed cells, 0..=1.
     pub inlier_ratio: f64,
     /// Time per stage.
-    pub times: LocalizerTimes,
+    pub times: StageTimes,
 }
 
 impl Localization {
     /// Result of a solver.
     #[must_use]
-    pub fn new(solved: &Solved, times: LocalizerTimes) -> Self {
+    pub fn new(solved: &Solved, times: StageTimes) -> Self {
         let found = solved.as_ref().ok().copied();
         let inliers = match solved {
             Ok(found) => found.evidence.inliers,
@@ -58,26 +56,21 @@ impl Localization {
 
     /// Result of a method without cells: its estimate is the only evidence.
     #[must_use]
-    pub fn from_estimate(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
+    pub fn from_estimate(estimate: PoseEstimate, times: StageTimes) -> Self {
         let (found, inlier_count) = match estimate {
             PoseEstimate::Pose {
                 world_from_cav,
                 confidence,
                 ..
             } => {
-                let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
-                let (evidence, cell_covariance) =
-                    (PoseEvidence::none(), PoseStd::UNBOUNDED.covariance);
-                (
-                    Some(FoundPose {
-                        world_from_sensor,
-                        evidence,
-                        cell_covariance,
-                        sigma,
-                        is_rejected: false,
-                    }),
-                    0,
-                )
+                let found = FoundPose {
+                    world_from_sensor: world_from_cav.isometry(),
+                    evidence: PoseEvidence::none(),
+                    cell_covariance: PoseStd::UNBOUNDED.covariance,
+                    sigma: f64::from(confidence),
+                    is_rejected: false,
+                };
+                (Some(found), 0)
             }
             PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
         };
@@ -88,34 +81,5 @@ impl Localization {
             inlier_ratio: 0.0,
             times,
         }
-    }
-}
-
-impl LocalizerTimes {
-    /// Stages by name, in their order.
-    #[must_use]
-    pub fn stages(&self) -> Vec<StageTiming> {
-        let Self {
-            voxelise,
-            encode,
-            regress,
-            solve,
-            refine,
-        } = *self;
-        [
-            ("pose voxelise", voxelise),
-            ("pose encode", encode),
-            ("pose regress", regress),
-            ("pose solve", solve),
-            ("pose refine", refine),
-        ]
-        .map(|(stage, time)| StageTiming::new(stage, time))
-        .into()
-    }
-
-    /// Sum of all stages.
-    #[must_use]
-    pub fn total(&self) -> Duration {
-        self.voxelise + self.encode + self.regress + self.solve + self.refine
     }
 }

@@ -3,9 +3,9 @@
 use nalgebra::Isometry3;
 use serde::{Deserialize, Serialize};
 
-use super::localize::{SceneCoordinates, sigma};
 use super::pose_refinement::RefinedPose;
 use super::pose_std::PoseStd;
+use super::scene_coordinates::{SceneCoordinates, sigma};
 use crate::registration::Registration;
 
 /// Statistics of the cells that a pose was estimated from.

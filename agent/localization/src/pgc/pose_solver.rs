@@ -4,9 +4,9 @@ use nalgebra::{Isometry3, Vector3};
 use protocol::{NoPoseReason, PoseEstimate};
 
 use super::confidence::Confidence;
-use super::localize::SceneCoordinates;
 use super::pose_evidence::{PoseEvidence, std_of};
 use super::pose_refinement::RefinedPose;
+use super::scene_coordinates::SceneCoordinates;
 use crate::registration::ransac::{self, RansacConfig};
 use crate::registration::sc2pcr::{self, Sc2PcrConfig};
 use crate::registration::{NoRegistration, Registration};

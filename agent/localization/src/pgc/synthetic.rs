@@ -6,9 +6,10 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
 
 use super::error::LocalizerError;
-use super::localization::{Localization, LocalizerTimes};
-use super::localize::{Localize, LocalizerInput, SceneCoordinates};
+use super::localization::{Localization, stopwatch};
+use super::localize::{Localize, LocalizerInput};
 use super::pose_solver::PoseSolver;
+use super::scene_coordinates::SceneCoordinates;
 
 /// Origin of the scene in the world: far away, as in maps in UTM coordinates, metres.
 const ORIGIN_M: [f64; 3] = [500_000.0, 5_700_000.0, 100.0];
@@ -87,10 +88,10 @@ impl SyntheticScene {
 }
 
 impl Localize for SyntheticScene {
-    fn localize_sweep(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+    fn localize(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         self.next_seed += 1;
         let solved = PoseSolver::default().solve(&self.coordinates(self.next_seed - 1));
-        Ok(Localization::new(&solved, LocalizerTimes::default()))
+        Ok(Localization::new(&solved, stopwatch()))
     }
 }
 

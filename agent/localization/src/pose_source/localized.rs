@@ -83,7 +83,7 @@ impl LocalizedPose {
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 
-    /// The same with another localizer.
+    /// The pose of another localizer, behind a motion gate.
     #[must_use]
     pub fn new(localizer: Box<dyn Localize>, motion_gate: MotionGateConfig) -> Self {
         Self {
@@ -98,9 +98,9 @@ impl PoseSource for LocalizedPose {
     /// Ignores the measured pose.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
-        let estimate = match self.localizer.localize_sweep(input.sweep()) {
+        let estimate = match self.localizer.localize(input.sweep()) {
             Ok(localization) => {
-                self.times = localization.times.stages();
+                self.times = localization.times.into_timings();
                 localization.estimate
             }
             Err(error) => {
@@ -152,7 +152,7 @@ mod tests {
 
     use super::*;
     use crate::pgc::synthetic::SyntheticScene;
-    use crate::pgc::{Localization, LocalizerInput, LocalizerTimes};
+    use crate::pgc::{Localization, LocalizerInput, stopwatch};
 
     fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
         let cav = CavId::new("7").unwrap();
@@ -193,10 +193,7 @@ mod tests {
     struct Broken;
 
     impl Localize for Broken {
-        fn localize_sweep(
-            &mut self,
-            _: LocalizerInput<'_>,
-        ) -> Result<Localization, LocalizerError> {
+        fn localize(&mut self, _: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
             Err(LocalizerError::Config("broken".into()))
         }
     }
@@ -214,7 +211,7 @@ mod tests {
             ),
             [none]
         );
-        assert_eq!(LocalizerTimes::default().stages().len(), 5);
+        assert_eq!(stopwatch().timings().len(), 5);
     }
 
     #[test]

@@ -59,6 +59,7 @@ impl<'a> PoseInput<'a> {
         LocalizerInput {
             cloud: self.cloud,
             levels: self.levels,
+            predicted: None,
         }
     }
 }

@@ -136,7 +136,7 @@ impl TrackedPose {
         Ok(Self::new(Box::new(localizer), config.clone()))
     }
 
-    /// The same with another localizer.
+    /// Follows a vehicle with another localizer.
     #[must_use]
     pub fn new(localizer: Box<dyn Localize>, config: TrackedPoseConfig) -> Self {
         let limits = TrackerLimits {
@@ -163,18 +163,16 @@ impl TrackedPose {
         predicted: Option<&TrackedState>,
     ) -> Option<Localization> {
         self.measured_nanos = Some(input.capture_nanos);
-        let measured = match predicted {
-            Some(state) => self
-                .localizer
-                .localize_near(input.sweep(), &state.world_from_lidar),
-            None => {
-                self.global_nanos = Some(input.capture_nanos);
-                self.localizer.localize_sweep(input.sweep())
-            }
+        if predicted.is_none() {
+            self.global_nanos = Some(input.capture_nanos);
+        }
+        let sweep = LocalizerInput {
+            predicted: predicted.map(|state| state.world_from_lidar),
+            ..input.sweep()
         };
-        match measured {
+        match self.localizer.localize(sweep) {
             Ok(localization) => {
-                self.times = localization.times.stages();
+                self.times = localization.times.timings().to_vec();
                 Some(localization)
             }
             Err(error) => {
@@ -297,11 +295,10 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU64, Ordering};
 
-    use nalgebra::Isometry3;
     use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;
-    use crate::pgc::{LocalizerInput, LocalizerTimes};
+    use crate::pgc::stopwatch;
 
     /// A vehicle that drives at 10 m/s along x; every sweep holds its number of points.
     #[derive(Debug, Default)]
@@ -328,25 +325,17 @@ mod tests {
             } else {
                 PoseEstimate::new(pose, 0.99)
             };
-            Localization::from_estimate(estimate, LocalizerTimes::default())
+            Localization::from_estimate(estimate, stopwatch())
         }
     }
 
     impl Localize for Road {
-        fn localize_sweep(
-            &mut self,
-            sweep: LocalizerInput<'_>,
-        ) -> Result<Localization, LocalizerError> {
-            self.globals.fetch_add(1, Ordering::Relaxed);
-            Ok(self.result(sweep.cloud))
-        }
-
-        fn localize_near(
-            &mut self,
-            sweep: LocalizerInput<'_>,
-            _: &Isometry3<f64>,
-        ) -> Result<Localization, LocalizerError> {
-            self.nears.fetch_add(1, Ordering::Relaxed);
+        fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
+            let count = match sweep.predicted {
+                Some(_) => &self.nears,
+                None => &self.globals,
+            };
+            count.fetch_add(1, Ordering::Relaxed);
             Ok(self.result(sweep.cloud))
         }
     }

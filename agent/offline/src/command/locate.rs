@@ -6,7 +6,7 @@ use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
 use localization::pgc::head_files::{encoder_or_named, head_file};
 use localization::pgc::pose_solver::FoundPose;
 use localization::pgc::wrong_place::other_lidar_hint;
-use localization::pgc::{Localization, Localizer};
+use localization::pgc::{Localization, Localize, Localizer, LocalizerInput};
 use localization::pose_covariance::pose_covariance;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
@@ -111,11 +111,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         precision: args.precision,
         ..Inference::default()
     };
-    let localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
+    let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
     let mut points = Vec::new();
     for file in clouds_at(&args.clouds) {
-        let located = args.locate(&localizer, file)?;
+        let located = args.locate(&mut localizer, file)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
             (None, Some(_)) => found += 1,
@@ -155,7 +155,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn locate(
         &self,
-        localizer: &Localizer,
+        localizer: &mut Localizer,
         file: Result<CloudFile, dataset::ReadError>,
     ) -> anyhow::Result<Located> {
         let map = localizer.head_config().scene_name.clone();
@@ -195,11 +195,11 @@ impl Args {
         if y_axis == YAxis::Right {
             mirror(&mut points);
         }
-        let mut localization = localizer.localize(&points)?;
+        let mut localization = localizer.localize(LocalizerInput::of(&points))?;
         let mut is_mirrored = y_axis == YAxis::Right;
         if y_axis == YAxis::Auto && published(&localization).is_none() {
             mirror(&mut points);
-            let other = localizer.localize(&points)?;
+            let other = localizer.localize(LocalizerInput::of(&points))?;
             if published(&other).is_some() {
                 (localization, is_mirrored) = (other, true);
             }

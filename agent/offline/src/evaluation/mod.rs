@@ -17,8 +17,9 @@ pub use table::{write_csv, write_error_table};
 
 use localization::pgc::LocalizerError;
 use localization::pgc::confidence::{Confidence, Labelled};
-use localization::pgc::{Localization, Localize, LocalizerTimes};
+use localization::pgc::{Localization, Localize, LocalizerInput, stopwatch};
 use localization::pose_source::{PoseInput, PoseSource};
+use support::sampling::evenly_spread;
 
 /// Selection of sweeps.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -123,6 +124,7 @@ pub struct Evaluated {
 }
 
 /// A sweep of a scenario.
+#[derive(Clone, Copy)]
 struct Sweep<'a> {
     scenario: &'a Scenario,
     agent: usize,
@@ -140,7 +142,7 @@ pub fn evaluate(
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, EvaluationError> {
     evaluate_with(
-        &mut |frame| localizer.localize(&frame.points),
+        &mut |frame| localizer.localize(LocalizerInput::of(&frame.points)),
         options,
         on_sweep,
     )
@@ -163,7 +165,7 @@ pub fn evaluate_source(
             points,
             ..
         } = frame;
-        let start = Instant::now();
+        let mut times = stopwatch();
         let (capture_nanos, motion) = (*capture_nanos, frame.motion());
         let input = PoseInput {
             cav,
@@ -175,10 +177,7 @@ pub fn evaluate_source(
         };
         let estimate = source.estimate(&input);
         source.observe(&input);
-        let times = LocalizerTimes {
-            solve: start.elapsed(),
-            ..LocalizerTimes::default()
-        };
+        times.lap("pose solve");
         Ok(Localization::from_estimate(estimate, times))
     };
     evaluate_with(&mut ask, options, on_sweep)
@@ -198,8 +197,8 @@ fn evaluate_with(
     let all: Vec<Sweep<'_>> = scenarios
         .flat_map(|scenario| sweeps_of(scenario, options.every))
         .collect();
-    let count = options.sweeps.map_or(all.len(), |most| most.min(all.len()));
-    if count == 0 {
+    let chosen = evenly_spread(&all, options.sweeps.unwrap_or(usize::MAX));
+    if chosen.is_empty() {
         return Err(EvaluationError::Empty(options.scenes.clone()));
     }
     let load = LoadOptions {
@@ -207,19 +206,22 @@ fn evaluate_with(
         ..LoadOptions::default()
     };
     let mut evaluated = Evaluated {
-        sweeps: Vec::with_capacity(count),
+        sweeps: Vec::with_capacity(chosen.len()),
         left_out: LeftOut::default(),
     };
     datasets
         .iter()
         .for_each(|dataset| evaluated.left_out.add_files(&dataset.problems));
-    for place in 0..count {
-        let Sweep {
+    for (
+        place,
+        &Sweep {
             scenario,
             agent,
             tick,
-        } = all[place * all.len() / count];
-        on_sweep(place + 1, count);
+        },
+    ) in chosen.iter().enumerate()
+    {
+        on_sweep(place + 1, chosen.len());
         let frame = match scenario.load(agent, tick, &load) {
             Ok(frame) => frame,
             Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
@@ -311,7 +313,9 @@ pub(super) mod tests {
                     cav: CavId::new("7").unwrap(),
                     stem: format!("{seed:06}"),
                     truth: scene.world_from_sensor(seed).into(),
-                    localization: scene.localize(&PointCloud::default()).unwrap(),
+                    localization: scene
+                        .localize(LocalizerInput::of(&PointCloud::default()))
+                        .unwrap(),
                 }
             })
             .collect()

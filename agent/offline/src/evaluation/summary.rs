@@ -260,9 +260,9 @@ fn integrity(sweeps: &[EvaluatedSweep]) -> Option<IntegritySummary> {
 fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
     let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for sweep in sweeps {
-        let stages = sweep.localization.times;
+        let stages = &sweep.localization.times;
         let mut add = |stage: &str, ms: f64| times.entry(stage.to_owned()).or_default().push(ms);
-        for timing in stages.stages() {
+        for timing in stages.timings() {
             add(
                 timing.stage.trim_start_matches("pose "),
                 timing.nanos as f64 * 1e-6,

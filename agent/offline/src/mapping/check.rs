@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use crate::evaluation::EvaluatedSweep;
 use crate::training::{SweepList, yaw};
 use localization::pgc::confidence::{BAD_M, Labelled};
-use localization::pgc::{Localizer, LocalizerError};
+use localization::pgc::{Localize, Localizer, LocalizerError, LocalizerInput};
 
 /// Fewest examples of either kind; of fewer sweeps there are rotated and subsampled copies.
 pub(super) const LEAST_CHECKED: usize = 45;
@@ -36,7 +36,7 @@ pub(super) struct Check {
 /// # Errors
 /// [`LocalizerError`] when the tensor library fails. Sweeps that cannot be read are left out and counted in `list`.
 pub(super) fn check(
-    localizer: &Localizer,
+    localizer: &mut Localizer,
     list: &SweepList,
     seed: u64,
     deadline: Instant,
@@ -61,7 +61,7 @@ pub(super) fn check(
             0 => (frame.points, truth),
             _ => turned(&frame.points, &truth, &mut rng),
         };
-        let localization = localizer.localize(&cloud)?;
+        let localization = localizer.localize(LocalizerInput::of(&cloud))?;
         let sweep = EvaluatedSweep {
             scenario,
             cav: frame.cav,
@@ -71,7 +71,7 @@ pub(super) fn check(
         };
         check.labelled.extend(sweep.labelled());
         let mirrored = EvaluatedSweep {
-            localization: localizer.localize(&mirrored(&cloud))?,
+            localization: localizer.localize(LocalizerInput::of(&mirrored(&cloud)))?,
             ..sweep.clone()
         };
         // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.

@@ -29,6 +29,7 @@ use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
 use perception::train::{Length, RunConfig, TrainingError};
 use perception::weights::{WeightsError, annotate};
+use support::sampling::evenly_spread;
 
 /// Sweeps that are encoded to measure their time.
 const PROBES: usize = 8;
@@ -150,10 +151,12 @@ pub fn make_map(
     let training = Arc::new(
         sweeps
             .list
-            .subset(&thinned(&sweeps.training, plan.training)),
+            .subset(&evenly_spread(&sweeps.training, plan.training)),
     );
-    let held_out = sweeps.list.subset(&thinned(&sweeps.held_out, plan.checked));
-    let coverage = sweeps.coverage(&thinned(&sweeps.training, plan.training));
+    let held_out = sweeps
+        .list
+        .subset(&evenly_spread(&sweeps.held_out, plan.checked));
+    let coverage = sweeps.coverage(&evenly_spread(&sweeps.training, plan.training));
     let (summary, run) = map.train(&training, &plan)?;
     map.copy_encoder()?;
     let weights = summary.trained.weights.clone();
@@ -186,14 +189,6 @@ pub fn make_map(
         trained: summary.trained,
         run,
     })
-}
-
-/// `count` of some indices, evenly spread.
-fn thinned(indices: &[usize], count: usize) -> Vec<usize> {
-    let count = count.min(indices.len());
-    (0..count)
-        .map(|place| indices[place * indices.len() / count])
-        .collect()
 }
 
 /// Sweeps with poses.
@@ -323,7 +318,7 @@ impl Map<'_> {
             .most_sweeps
             .unwrap_or(usize::MAX)
             .min(sweeps.training.len());
-        let probes = Arc::new(sweeps.list.subset(&thinned(&sweeps.training, PROBES)));
+        let probes = Arc::new(sweeps.list.subset(&evenly_spread(&sweeps.training, PROBES)));
         let unchanged = SweepAugmentation {
             copies: 1,
             turn_rad: 0.0,
@@ -500,7 +495,7 @@ impl Map<'_> {
             Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
         let mut search = ScaleSearch::default();
         let all: Vec<usize> = (0..training.len()).collect();
-        for index in thinned(&all, sweeps) {
+        for index in evenly_spread(&all, sweeps) {
             if let Some((frame, ..)) = training.frame(index) {
                 localizer.observe(&frame.points, &mut search)?;
             }
@@ -514,7 +509,7 @@ impl Map<'_> {
     }
 
     fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, MapError> {
-        let localizer = Localizer::load_without_confidence(
+        let mut localizer = Localizer::load_without_confidence(
             &self.config.encoder,
             weights,
             Inference::default(),
@@ -527,7 +522,7 @@ impl Map<'_> {
         };
         let deadline = started + self.config.time;
         Ok(check::check(
-            &localizer,
+            &mut localizer,
             held_out,
             self.config.run.seed,
             deadline,
@@ -563,17 +558,5 @@ impl Map<'_> {
 impl From<TrainingError> for MapError {
     fn from(error: TrainingError) -> Self {
         Self::Training(error.into())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_thinned_list_is_even_and_never_longer() {
-        assert_eq!(thinned(&[2, 3, 5, 7, 11, 13], 3), [2, 5, 11]);
-        assert_eq!(thinned(&[2, 3], 9), [2, 3]);
-        assert_eq!(thinned(&[], 3), Vec::<usize>::new());
     }
 }

@@ -7,10 +7,11 @@ use tch::{Kind, Tensor, no_grad};
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use localization::pgc::SceneCoordinates;
-use localization::pgc::SceneHead;
+use localization::pgc::extensions::wider_search;
 use localization::pgc::pose_refinement::SweepCells;
-use localization::pgc::pose_search::{PoseSearch, SearchTimes};
+use localization::pgc::pose_search::PoseSearch;
 use localization::pgc::pose_solver::PoseSolver;
+use localization::pgc::{SceneHead, stopwatch};
 use protocol::PoseError;
 
 /// Errors on sweeps that were not trained on.
@@ -57,11 +58,6 @@ pub(super) fn validate(
     let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
     let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
     let solver = PoseSolver::default();
-    let search = PoseSearch {
-        head,
-        solver: &solver,
-        kind,
-    };
     let mut translations = Vec::new();
     let mut rotations = Vec::new();
     let mut first = 0;
@@ -83,10 +79,14 @@ pub(super) fn validate(
             features,
             sensor_m: coordinates.sensor_m.clone(),
         };
-        let found = search
-            .run(&coordinates, &refinement_cells, &mut SearchTimes::default())?
-            .into_solved();
-        let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
+        let search = PoseSearch {
+            head,
+            solver: &solver,
+            refinement_cells: &refinement_cells,
+            kind,
+        };
+        let found = wider_search::search(&search, &coordinates, &mut stopwatch())?;
+        let (metres, degrees) = found.solved.map_or((f64::INFINITY, 180.0), |found| {
             let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
             (error.distance_m, error.angle_deg)
         });

@@ -24,6 +24,7 @@ use perception::weights::Weights;
 use protocol::{CavId, CodecConfig, Counts, Stream, Topic};
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
+use support::sampling::evenly_spread;
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
@@ -145,10 +146,8 @@ impl Part {
         &self,
         scenarios: &'a [Scenario],
     ) -> impl Iterator<Item = &'a Scenario> + use<'a> {
-        let count = self
-            .scenarios
-            .map_or(scenarios.len(), |most| most.min(scenarios.len()));
-        (0..count).map(move |index| &scenarios[index * scenarios.len() / count])
+        let all: Vec<&Scenario> = scenarios.iter().collect();
+        evenly_spread(&all, self.scenarios.unwrap_or(usize::MAX)).into_iter()
     }
 }
 

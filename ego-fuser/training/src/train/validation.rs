@@ -7,6 +7,7 @@ use fusion::model::CooperativeModel;
 use protocol::corners_within;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use support::sampling::evenly_spread;
 use tch::no_grad;
 
 use super::accuracy::Accuracy;
@@ -37,10 +38,7 @@ impl Validator {
     ) -> Result<Self, TrainError> {
         let scenes = Arc::new(scenes);
         let all = scenes.ticks();
-        let frames = frames.clamp(1, all.len());
-        let ticks = (0..frames)
-            .map(|frame| all[frame * all.len() / frames])
-            .collect();
+        let ticks = evenly_spread(all, frames.max(1));
         let samples = SampleConfig {
             augmentation: Augmentation::OFF,
             drop_neighbour: 0.0,

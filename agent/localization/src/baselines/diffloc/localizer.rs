@@ -1,9 +1,8 @@
 //! Localization by DiffLoc: from a sweep to a pose.
 
 use std::path::Path;
-use std::time::Instant;
 
-use protocol::{NoPoseReason, PoseEstimate};
+use protocol::NoPoseReason;
 use tch::nn::VarStore;
 use tch::{Device, Tensor, no_grad};
 
@@ -11,9 +10,10 @@ use super::config::DiffLocConfig;
 use super::denoiser::Windows;
 use super::network::DiffLoc;
 use super::range_image::CHANNELS;
-use crate::baselines::regressed_pose::{FULL_CONFIDENCE, no_pose, upright};
+use crate::baselines::regressed_pose::{localization, no_pose, upright};
+use crate::pgc::localization::{ENCODE, REGRESS, VOXELISE};
 use crate::pgc::pose_solver::MIN_CELLS;
-use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, LocalizerTimes};
+use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use perception::weights::Weights;
 
 /// A DiffLoc network of one scene, for single sweeps.
@@ -64,16 +64,12 @@ impl DiffLocLocalizer {
 }
 
 impl Localize for DiffLocLocalizer {
-    fn localize_sweep(
-        &mut self,
-        sweep: LocalizerInput<'_>,
-    ) -> Result<Localization, LocalizerError> {
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
-        let mut times = LocalizerTimes::default();
-        let start = Instant::now();
+        let mut times = stopwatch();
         let config = self.network.config();
         let values = config.image.image(&cloud.xyzi);
-        times.voxelise = start.elapsed();
+        times.lap(VOXELISE);
         if values[..config.image.pixels()]
             .iter()
             .filter(|&&range| range > 0.0)
@@ -82,7 +78,6 @@ impl Localize for DiffLocLocalizer {
         {
             return Ok(no_pose(NoPoseReason::TooFewPoints, times));
         }
-        let start = Instant::now();
         let shape = [
             1,
             CHANNELS as i64,
@@ -93,22 +88,14 @@ impl Localize for DiffLocLocalizer {
             .f_view(shape)?
             .f_to_device(self.device)?;
         let features = no_grad(|| self.network.encoder().forward(&image, false))?.features;
-        times.encode = start.elapsed();
-        let start = Instant::now();
+        times.lap(ENCODE);
         let poses = self
             .network
             .poses(&features.f_unsqueeze(1)?, Windows::Single)?;
         let answer: Vec<f32> = Vec::try_from(&poses.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
-        times.regress = start.elapsed();
-        Ok(
-            match upright(&scaled(&answer, config.scale_m), config.origin_m) {
-                Some(pose) => Localization::from_estimate(
-                    PoseEstimate::new(pose.into(), FULL_CONFIDENCE),
-                    times,
-                ),
-                None => no_pose(NoPoseReason::Failed, times),
-            },
-        )
+        times.lap(REGRESS);
+        let pose = upright(&scaled(&answer, config.scale_m), config.origin_m);
+        Ok(localization(pose, times))
     }
 }
 
@@ -201,7 +188,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = write(folder.path(), &variables, DiffLocLocalizer::KIND);
         let mut localizer = load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap();
-        let answer = localizer.localize(&sweep()).unwrap();
+        let answer = localizer.localize(LocalizerInput::of(&sweep())).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let expected = [1200.0, -1920.0, 26.0];
         assert!(
@@ -219,7 +206,13 @@ mod tests {
             reason: NoPoseReason::TooFewPoints,
             inlier_count: 0,
         };
-        assert_eq!(localizer.localize(&few).unwrap().estimate, none);
+        assert_eq!(
+            localizer
+                .localize(LocalizerInput::of(&few))
+                .unwrap()
+                .estimate,
+            none
+        );
     }
 
     #[test]

@@ -1,17 +1,17 @@
 //! Localization by HypLiLoc: from a sweep to a pose.
 
 use std::path::Path;
-use std::time::Instant;
 
-use protocol::{NoPoseReason, PoseEstimate};
+use protocol::NoPoseReason;
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::config::HypLiLocConfig;
 use super::network::HypLiLoc;
 use super::sweep_input::{InputBatch, SweepInput};
-use crate::baselines::regressed_pose::{FULL_CONFIDENCE, no_pose, upright};
-use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, LocalizerTimes};
+use crate::baselines::regressed_pose::{localization, no_pose, upright};
+use crate::pgc::localization::{REGRESS, VOXELISE};
+use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use perception::weights::Weights;
 
 /// Shortest heading that is a direction.
@@ -66,38 +66,24 @@ impl HypLiLocLocalizer {
 }
 
 impl Localize for HypLiLocLocalizer {
-    fn localize_sweep(
-        &mut self,
-        sweep: LocalizerInput<'_>,
-    ) -> Result<Localization, LocalizerError> {
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
-        let mut times = LocalizerTimes::default();
-        let start = Instant::now();
+        let mut times = stopwatch();
         let points_m: Vec<[f32; 3]> = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]).collect();
         let input = SweepInput::new(&points_m);
-        times.voxelise = start.elapsed();
+        times.lap(VOXELISE);
         let Some(input) = input else {
             return Ok(no_pose(NoPoseReason::TooFewPoints, times));
         };
-        let start = Instant::now();
         let mut answer = no_grad(|| self.regress(input))?;
-        times.regress = start.elapsed();
+        times.lap(REGRESS);
         answer
             .iter_mut()
             .zip(self.config.scale_m)
             .for_each(|(axis, scale)| *axis *= scale as f32);
-        Ok(
-            match of_length_one(&mut answer)
-                .then(|| upright(&answer, self.config.origin_m))
-                .flatten()
-            {
-                Some(pose) => Localization::from_estimate(
-                    PoseEstimate::new(pose.into(), FULL_CONFIDENCE),
-                    times,
-                ),
-                None => no_pose(NoPoseReason::Failed, times),
-            },
-        )
+        let has_heading = of_length_one(&mut answer);
+        let pose = has_heading.then(|| upright(&answer, self.config.origin_m));
+        Ok(localization(pose.flatten(), times))
     }
 }
 
@@ -182,7 +168,7 @@ mod tests {
             &config()
         );
         let mut localizer = load_baseline(&path, Device::Cpu, PoseSolver::default()).unwrap();
-        let answer = localizer.localize(&sweep()).unwrap();
+        let answer = localizer.localize(LocalizerInput::of(&sweep())).unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let expected = [1050.0, -2050.0, 32.0];
         assert!(
@@ -211,12 +197,18 @@ mod tests {
         };
         for cloud in [PointCloud::default(), nan, few] {
             assert_eq!(
-                localizer.localize(&cloud).unwrap().estimate,
+                localizer
+                    .localize(LocalizerInput::of(&cloud))
+                    .unwrap()
+                    .estimate,
                 none(NoPoseReason::TooFewPoints)
             );
         }
         assert_eq!(
-            localizer.localize(&sweep()).unwrap().estimate,
+            localizer
+                .localize(LocalizerInput::of(&sweep()))
+                .unwrap()
+                .estimate,
             none(NoPoseReason::Failed)
         );
     }

@@ -1,7 +1,6 @@
 //! Localization by SGLoc: from a sweep to a pose, through the same trait as PGC.
 
 use std::path::Path;
-use std::time::Instant;
 
 use perception::weights::Weights;
 use protocol::NoPoseReason;
@@ -11,12 +10,14 @@ use tch::{Device, Kind, Tensor, no_grad};
 use super::{SgLoc, SgLocConfig};
 use crate::baselines::regressed_pose::no_pose;
 use crate::pgc::error::LocalizerError;
-use crate::pgc::localize::{Localize, LocalizerInput, SceneCoordinates, choose_evenly};
+use crate::pgc::localization::{ENCODE, REGRESS, SOLVE, VOXELISE};
 use crate::pgc::pose_solver::{MIN_CELLS, PoseSolver};
 use crate::pgc::scene_encoder::SceneFeatures;
 use crate::pgc::voxel_batch::VoxelBatch;
 use crate::pgc::voxelise::SweepVoxels;
-use crate::pgc::{Localization, LocalizerTimes};
+use crate::pgc::{
+    Localization, Localize, LocalizerInput, SceneCoordinates, choose_evenly, stopwatch,
+};
 
 /// Largest number of cells of a sweep that are regressed. More than of PGC: their coordinates are less accurate.
 const CELLS: usize = 1024;
@@ -88,29 +89,22 @@ impl SgLocLocalizer {
 }
 
 impl Localize for SgLocLocalizer {
-    fn localize_sweep(
-        &mut self,
-        sweep: LocalizerInput<'_>,
-    ) -> Result<Localization, LocalizerError> {
+    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
         let cloud = sweep.cloud;
-        let mut times = LocalizerTimes::default();
-        let start = Instant::now();
+        let mut times = stopwatch();
         let config = self.network.encoder().config();
         let sweep = SweepVoxels::new(cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]), config);
-        times.voxelise = start.elapsed();
+        times.lap(VOXELISE);
         if sweep.cells().len() < MIN_CELLS {
             return Ok(no_pose(NoPoseReason::TooFewPoints, times));
         }
-        let start = Instant::now();
         let batch = VoxelBatch::new(&[&sweep], config, self.device)?;
         let features = self.network.encoder().encode(&batch, Kind::Float)?;
-        times.encode = start.elapsed();
-        let start = Instant::now();
+        times.lap(ENCODE);
         let coordinates = self.regress(&sweep, &features)?;
-        times.regress = start.elapsed();
-        let start = Instant::now();
+        times.lap(REGRESS);
         let solved = self.solver.solve(&coordinates);
-        times.solve = start.elapsed();
+        times.lap(SOLVE);
         Ok(Localization::new(&solved, times))
     }
 }
@@ -188,7 +182,9 @@ mod tests {
 
     #[test]
     fn cells_that_are_all_shifted_alike_give_the_pose_of_the_shift() {
-        let answer = shifting([0.1, 0.2, 0.03]).localize(&sweep()).unwrap();
+        let answer = shifting([0.1, 0.2, 0.03])
+            .localize(LocalizerInput::of(&sweep()))
+            .unwrap();
         let pose = answer.estimate.world_from_cav().unwrap();
         let off = pose.isometry().translation.vector - Vector3::new(1010.0, -1980.0, 33.0);
         assert!(off.norm() < 1e-2 && pose.yaw_rad().abs() < 1e-4, "{pose:?}");
@@ -204,12 +200,18 @@ mod tests {
         };
         let mut localizer = shifting([0.0; 3]);
         for cloud in [&PointCloud::default(), &nan, &few] {
-            assert_eq!(localizer.localize(cloud).unwrap().estimate, TOO_FEW_POINTS);
+            assert_eq!(
+                localizer
+                    .localize(LocalizerInput::of(cloud))
+                    .unwrap()
+                    .estimate,
+                TOO_FEW_POINTS
+            );
         }
         // Coordinates that overflow are those of no cell.
         assert_eq!(
             shifting([3e38, 0.0, 0.0])
-                .localize(&sweep())
+                .localize(LocalizerInput::of(&sweep()))
                 .unwrap()
                 .estimate,
             TOO_FEW_POINTS

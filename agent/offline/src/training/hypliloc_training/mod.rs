@@ -147,6 +147,7 @@ mod tests {
     use std::path::Path;
 
     use localization::baselines::load_baseline;
+    use localization::pgc::LocalizerInput;
     use localization::pgc::pose_solver::PoseSolver;
     use perception::train::Length;
     use protocol::PointCloud;

@@ -1,10 +1,14 @@
-//! Scene parts: logits that place a sweep in one part of the scene after another, the most likely first.
+//! Search in other parts of the scene, an extension: logits that place a sweep in one part after another, the most
+//! likely first.
 //!
 //! The head regresses a sweep in the part that its classifier chooses; in fog and snow the second choice is often the
-//! right one. Not in the paper.
+//! right one. Measured gain, poses under 3 m before rejection: town 1 in fog 93.5 to 98.5 %, town 4 in fog 71.0 to
+//! 92.0 %, in snow 92.5 to 98.0 %, in sunshine 99.0 to 99.5 % (`deploy/results/localization.md`).
 
 use tch::{Kind, TchError, Tensor};
 
+/// Factor on the expected error of cells in a part that the classifier does not choose.
+pub(crate) const WIDENING: f64 = 2.0;
 /// Largest number of parts that are tried.
 pub(crate) const MOST_PARTS: usize = 20;
 /// No further part is tried once those before it have more than this probability together.
@@ -16,7 +20,7 @@ const LEAD: f64 = 10.0;
 ///
 /// # Errors
 /// Those of the tensor library.
-pub(super) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>, TchError> {
+pub(crate) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>, TchError> {
     let (probabilities, order) = logits
         .f_softmax(1, Kind::Float)?
         .f_reshape([-1])?

@@ -1,0 +1,361 @@
+//! Localizer of a scene: its networks and solver, and what they compute from one sweep.
+
+use std::path::Path;
+
+use perception::inference::Inference;
+use perception::int8::ScaleSearch;
+use perception::weights::Weights;
+use protocol::PointCloud;
+use support::stage_times::StageTimes;
+use tch::nn::VarStore;
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::cell_choice::choose_evenly;
+use super::cell_encoder::{CellEncoder, PreparedSweep};
+use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
+use super::error::LocalizerError;
+use super::extensions::other_parts::MOST_PARTS;
+use super::head_config::SceneHeadConfig;
+use super::localization::{ENCODE, REGRESS, VOXELISE, stopwatch};
+use super::localize::LocalizerInput;
+use super::pose_refinement::SweepCells;
+use super::pose_solver::PoseSolver;
+use super::scene_coordinates::SceneCoordinates;
+use super::scene_encoder::SceneFeatures;
+use super::scene_regression::SceneHead;
+
+/// Largest number of regressed cells, where the head allows for more: more cells hardly improve poses, and they take
+/// time.
+pub(crate) const CELLS: usize = 256;
+/// Largest number of cells of the pose refinement: each costs little, and their errors average out.
+const REFINEMENT_CELLS: usize = 768;
+
+/// A sweep behind the encoder.
+pub(super) struct EncodedSweep {
+    sweep: PreparedSweep,
+    features: SceneFeatures,
+    /// Cells of the pose refinement.
+    pub(super) refinement_cells: SweepCells,
+}
+
+/// Encoder, scene-specific head and solver.
+#[derive(Debug)]
+pub struct Localizer {
+    pub(super) encoder: CellEncoder,
+    pub(super) head: SceneHead,
+    pub(super) solver: PoseSolver,
+    pub(super) most_parts: usize,
+    device: Device,
+    pub(super) sha256: [String; 2],
+}
+
+impl Localizer {
+    /// Reads encoder and head.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] when a file is missing, truncated or of another kind, when its confidence model is not valid,
+    /// or when the head was trained on the features of another encoder.
+    pub fn load(encoder: &Path, head: &Path, inference: Inference) -> Result<Self, LocalizerError> {
+        let (mut localizer, weights) = Self::open(encoder, head, inference)?;
+        localizer.solver.confidence = stored_confidence(&weights)?;
+        Ok(localizer)
+    }
+
+    /// Reads encoder and head without the confidence model in the head's file, to fit a new one: one of an earlier version has other
+    /// features.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_without_confidence(
+        encoder: &Path,
+        head: &Path,
+        inference: Inference,
+    ) -> Result<Self, LocalizerError> {
+        Ok(Self::open(encoder, head, inference)?.0)
+    }
+
+    fn open(
+        encoder: &Path,
+        head: &Path,
+        inference: Inference,
+    ) -> Result<(Self, Weights), LocalizerError> {
+        let Inference { device, precision } = inference;
+        let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
+        let weights = Weights::load(head)?.with_precision(precision);
+        weights.check_kind(SceneHead::KIND)?;
+        let config: SceneHeadConfig = weights.config()?;
+        if config.encoder_sha256 != encoder_sha256 {
+            return Err(LocalizerError::OtherEncoder {
+                head: head.display().to_string(),
+                expected: config.encoder_sha256,
+                encoder: encoder.display().to_string(),
+                found: encoder_sha256,
+            });
+        }
+        let mut variables = VarStore::new(device);
+        let mut scene_head = SceneHead::new(&variables.root(), &config)?;
+        weights.copy_into(&variables)?;
+        variables.freeze();
+        if let Some(scales) = weights.activation_scales()? {
+            let quantised = network
+                .quantise(&scales)
+                .and_then(|()| scene_head.quantise(&scales));
+            quantised.map_err(|error| weights.quantise_error(error))?;
+        }
+        let sha256 = [encoder_sha256, weights.sha256().to_owned()];
+        let solver = PoseSolver::default();
+        Ok((
+            Self {
+                encoder: network,
+                head: scene_head,
+                solver,
+                most_parts: MOST_PARTS,
+                device,
+                sha256,
+            },
+            weights,
+        ))
+    }
+
+    /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    pub fn observe(
+        &self,
+        cloud: &PointCloud,
+        search: &mut ScaleSearch,
+    ) -> Result<(), LocalizerError> {
+        let Some(EncodedSweep {
+            sweep, features, ..
+        }) = self.encode(LocalizerInput::of(cloud), &mut stopwatch())?
+        else {
+            return Ok(());
+        };
+        self.encoder.observe(&sweep, search)?;
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
+        let cells = self.pick(&sweep, &features, &chosen)?.features;
+        no_grad(|| {
+            let logits = self
+                .head
+                .classify(&features.sweeps, false)?
+                .f_expand([chosen.len() as i64, -1], false)?;
+            self.head
+                .observe(&self.head.normalise(&cells)?, &logits, search)
+        })?;
+        Ok(())
+    }
+
+    /// SHA-256 of encoder and head.
+    #[must_use]
+    pub fn sha256(&self) -> &[String; 2] {
+        &self.sha256
+    }
+
+    /// The head's configuration: scene, origin.
+    #[must_use]
+    pub fn head_config(&self) -> &SceneHeadConfig {
+        self.head.config()
+    }
+
+    /// First steps: voxels, features, scene coordinates.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    pub fn scene_coordinates(
+        &self,
+        sweep: LocalizerInput<'_>,
+    ) -> Result<(SceneCoordinates, StageTimes), LocalizerError> {
+        let mut times = stopwatch();
+        let coordinates = match self.encode(sweep, &mut times)? {
+            Some(encoded) => {
+                self.regress(&encoded, CELLS, &self.classify(&encoded)?, &mut times)?
+            }
+            None => SceneCoordinates::default(),
+        };
+        Ok((coordinates, times))
+    }
+
+    /// Features of a whole sweep, `[sweep_channels]`, to compare sweeps by; `None` for a sweep without cells.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library fails.
+    pub fn sweep_features(
+        &self,
+        cloud: &PointCloud,
+        times: &mut StageTimes,
+    ) -> Result<Option<Vec<f32>>, LocalizerError> {
+        let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else {
+            return Ok(None);
+        };
+        Ok(Some(Vec::try_from(
+            &encoded
+                .features
+                .sweeps
+                .f_reshape([-1])?
+                .f_to_device(Device::Cpu)?,
+        )?))
+    }
+
+    /// Cells and features; `None` for a sweep without cells.
+    pub(super) fn encode(
+        &self,
+        input: LocalizerInput<'_>,
+        times: &mut StageTimes,
+    ) -> Result<Option<EncodedSweep>, LocalizerError> {
+        let sweep = self.encoder.format().prepare(&input.cloud.xyzi);
+        times.lap(VOXELISE);
+        let refined = choose_evenly(sweep.cells(), REFINEMENT_CELLS);
+        if refined.is_empty() {
+            return Ok(None);
+        }
+        let features = self.encoder.encode_one(&sweep, input.levels)?;
+        let refinement_cells = self.pick(&sweep, &features, &refined)?;
+        times.lap(ENCODE);
+        Ok(Some(EncodedSweep {
+            sweep,
+            features,
+            refinement_cells,
+        }))
+    }
+
+    /// Logits `[1, classes]` of the parts of the scene.
+    pub(super) fn classify(&self, encoded: &EncodedSweep) -> Result<Tensor, TchError> {
+        no_grad(|| self.head.classify(&encoded.features.sweeps, false))
+    }
+
+    /// Scene coordinates of at most `count` cells in the part of the scene that the logits `[1, classes]` choose
+    /// (Eq. 4).
+    pub(super) fn regress(
+        &self,
+        encoded: &EncodedSweep,
+        count: usize,
+        logits: &Tensor,
+        times: &mut StageTimes,
+    ) -> Result<SceneCoordinates, LocalizerError> {
+        let EncodedSweep {
+            sweep, features, ..
+        } = encoded;
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
+        let SweepCells {
+            features: cells,
+            sensor_m,
+        } = self.pick(sweep, features, &chosen)?;
+        let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
+            let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
+            let regression =
+                self.head
+                    .regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
+            let world = Vec::try_from(
+                &regression
+                    .coordinates_m
+                    .f_reshape([-1])?
+                    .f_to_device(Device::Cpu)?,
+            )?;
+            Ok((
+                world,
+                Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?,
+            ))
+        })?;
+        times.lap(REGRESS);
+        let origin_m = self.head.config().origin_m;
+        Ok(SceneCoordinates {
+            sensor_m,
+            world_m: world.as_chunks().0.to_vec(),
+            epsilon_m,
+            origin_m,
+        })
+    }
+
+    fn pick(
+        &self,
+        sweep: &PreparedSweep,
+        features: &SceneFeatures,
+        chosen: &[usize],
+    ) -> Result<SweepCells, TchError> {
+        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
+        let features = no_grad(|| features.cells.f_index_select(0, &rows))?;
+        Ok(SweepCells {
+            features,
+            sensor_m: chosen
+                .iter()
+                .map(|&cell| sweep.cells()[cell].centroid_m)
+                .collect(),
+        })
+    }
+
+    /// Search and confidence.
+    #[must_use]
+    pub fn solver(&self) -> &PoseSolver {
+        &self.solver
+    }
+
+    /// Sets the largest number of parts of the scene in which a sweep is sought whose pose few cells confirm.
+    pub fn set_most_parts(&mut self, most: usize) {
+        self.most_parts = most;
+    }
+
+    /// Sets another search or confidence.
+    pub fn set_solver(&mut self, solver: PoseSolver) {
+        self.solver = solver;
+    }
+}
+
+/// The confidence model in a head's file; the plain confidence if there is none.
+fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
+    if weights.metadata(CONFIDENCE_KEY).is_none() {
+        return Ok(Confidence::Plain);
+    }
+    let model: ConfidenceModel = weights.metadata_json(CONFIDENCE_KEY)?;
+    let head = weights.path().display().to_string();
+    model
+        .check()
+        .map_err(|reason| LocalizerError::Confidence { head, reason })?;
+    Ok(Confidence::Calibrated(model))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use perception::weights::{self, Precision};
+
+    use super::*;
+
+    #[test]
+    fn a_confidence_that_would_fail_on_a_sweep_is_rejected_with_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let stored = |model: &ConfidenceModel| {
+            let path = folder.path().join("head.safetensors");
+            let metadata: BTreeMap<_, _> = [(
+                CONFIDENCE_KEY.to_owned(),
+                serde_json::to_string(model).unwrap(),
+            )]
+            .into();
+            weights::save(
+                &path,
+                &VarStore::new(Device::Cpu),
+                &metadata,
+                Precision::Single,
+            )
+            .unwrap();
+            stored_confidence(&Weights::load(&path).unwrap())
+        };
+        let model = ConfidenceModel::example();
+        assert_eq!(
+            stored(&model).unwrap(),
+            Confidence::Calibrated(model.clone())
+        );
+        let message = stored(&ConfidenceModel {
+            bias: -1e308,
+            ..model
+        })
+        .unwrap_err()
+        .to_string();
+        assert!(
+            message.contains("head.safetensors") && message.contains("bias"),
+            "{message}"
+        );
+    }
+}

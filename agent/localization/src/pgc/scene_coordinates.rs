@@ -1,0 +1,37 @@
+//! Scene coordinates: positions of the cells of a sweep in the sensor frame and, predicted, in the world.
+
+use crate::registration::Correspondence;
+
+/// Predicted world coordinates of the cells of a sweep.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SceneCoordinates {
+    /// `[N, 3]`: in the sensor frame, metres.
+    pub sensor_m: Vec<[f32; 3]>,
+    /// `[N, 3]`: in the world relative to the head's origin, metres.
+    pub world_m: Vec<[f32; 3]>,
+    /// `[N]`: predicted L1 error, metres.
+    pub epsilon_m: Vec<f32>,
+    /// The head's origin in the world, metres.
+    pub origin_m: [f64; 3],
+}
+
+impl SceneCoordinates {
+    /// Correspondences for the solver, weighted by Eq. 6.
+    #[must_use]
+    pub fn correspondences(&self) -> Vec<Correspondence> {
+        let places = self.sensor_m.iter().zip(&self.world_m).zip(&self.epsilon_m);
+        places
+            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
+                source_m,
+                target_m,
+                weight: sigma(epsilon_m),
+            })
+            .collect()
+    }
+}
+
+/// Confidence of a cell (Eq. 6): 0.5 at an expected error of 1 m.
+#[must_use]
+pub fn sigma(epsilon_m: f32) -> f32 {
+    1.0 / (1.0 + epsilon_m * epsilon_m)
+}
