@@ -12,7 +12,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{PoseInput, PoseSource};
-use crate::pgc::{Localization, Localize, Localizer, LocalizerError};
+use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
 use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits};
 
 /// Networks of PGC and settings of the tracker.
