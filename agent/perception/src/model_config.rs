@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use protocol::BevGrid;
+use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 /// Number of values that describe a box relative to its anchor: x, y, z, h, w, l, yaw.
@@ -11,16 +12,9 @@ pub const BOX_CODE: i64 = 7;
 /// Reason why a [`DetectorConfig`] is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    /// The area, the pillar size or a count is empty, negative or NaN.
-    #[error("detector configuration: {field} is {value}, must be {must}")]
-    Value {
-        /// Name of the field.
-        field: &'static str,
-        /// Value of the field.
-        value: String,
-        /// Condition on the value.
-        must: &'static str,
-    },
+    /// A setting is out of range, or contradicts another.
+    #[error("detector configuration: {0}")]
+    Value(#[from] FieldError),
     /// A module's file cannot be read.
     #[error("{}: {problem}", file.display())]
     ScriptFile {
@@ -36,16 +30,6 @@ pub enum ConfigError {
         file: PathBuf,
         /// First line of the tensor library's message.
         reason: String,
-    },
-    /// Lists that describe the same levels differ in length.
-    #[error("detector configuration: {field} has {got} entries, layer_nums has {levels}")]
-    Levels {
-        /// Name of the field.
-        field: &'static str,
-        /// Number of its entries.
-        got: usize,
-        /// Number of levels.
-        levels: usize,
     },
 }
 
@@ -280,87 +264,43 @@ impl DetectorConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.check_area()?;
         self.check_levels()?;
-        let positive = |field, value: i64| {
-            let error = ConfigError::Value {
-                field,
-                value: value.to_string(),
-                must: "1 to 4096",
-            };
-            if (1..=4096).contains(&value) {
-                Ok(())
-            } else {
-                Err(error)
-            }
-        };
-        positive(
-            "max_points_per_pillar",
-            i64::try_from(self.max_points_per_pillar).unwrap_or(0),
-        )?;
-        positive("pillar_channels", self.pillar_channels)?;
-        positive("shrink channels", self.feature_channels())?;
-        positive("number of anchor yaws", self.anchors.yaws_deg.len() as i64)?;
-        positive("compress_ratio", self.compress_ratio.unwrap_or(1))?;
+        for (field, value) in [
+            (
+                "max_points_per_pillar",
+                i64::try_from(self.max_points_per_pillar).unwrap_or(0),
+            ),
+            ("pillar_channels", self.pillar_channels),
+            ("shrink channels", self.feature_channels()),
+            ("number of anchor yaws", self.anchors.yaws_deg.len() as i64),
+            ("compress_ratio", self.compress_ratio.unwrap_or(1)),
+        ] {
+            within(field, value, 1, 4096)?;
+        }
         if let Some(ShrinkConfig::DoubleConv { stride, .. }) = self.shrink {
-            positive("shrink stride", stride)?;
+            within("shrink stride", stride, 1, 4096)?;
         }
-        if !(1..=MAX_CELLS).contains(&self.max_pillars) {
-            return Err(value_error(
-                "max_pillars",
-                self.max_pillars,
-                "1 to 16777216",
-            ));
-        }
-        if self
-            .anchors
-            .size_lwh_m
-            .iter()
-            .any(|size| !(size.is_finite() && *size > 0.0))
-        {
-            return Err(value_error(
-                "anchors.size_lwh_m",
-                self.anchors.size_lwh_m,
-                "positive",
-            ));
-        }
-        self.check_sizes()
+        within("max_pillars", self.max_pillars, 1, MAX_CELLS)?;
+        require_positive("anchors.size_lwh_m", self.anchors.size_lwh_m)?;
+        Ok(self.check_sizes()?)
     }
 
     /// Checked before anything of this size is allocated: the file with these numbers may come from anyone.
-    fn check_sizes(&self) -> Result<(), ConfigError> {
+    fn check_sizes(&self) -> Result<(), FieldError> {
         let [x, y, _] = self.pillar_grid().map(|count| count as i64);
         let canvas = x * y * self.pillar_channels;
-        if canvas > MAX_VALUES {
-            return Err(value_error(
-                "pillar grid times pillar_channels",
-                canvas,
-                "268435456 values at most",
-            ));
-        }
+        within("pillar grid times pillar_channels", canvas, 0, MAX_VALUES)?;
         let step = self.layer_strides[0] / self.upsample_strides[0];
         let layers = [
             self.backbone_channels(),
             self.feature_channels(),
             self.head_channels(),
         ];
-        let widest = self
-            .num_filters
-            .iter()
-            .chain(&layers)
-            .copied()
-            .max()
-            .unwrap_or(0);
-        let map = (x / step) * (y / step) * widest;
-        if map > MAX_VALUES {
-            let field = "cells of a feature map times the largest of num_filters, num_upsample_filters, shrink and anchors";
-            return Err(value_error(field, map, "268435456 values at most"));
-        }
-        let parameters = self.parameters();
-        if parameters > MAX_PARAMETERS {
-            let field =
-                "layer_nums, num_filters, upsample_strides and shrink: number of parameters";
-            return Err(value_error(field, parameters, "256000000 at most"));
-        }
-        Ok(())
+        let widest = self.num_filters.iter().chain(&layers).max();
+        let map = (x / step) * (y / step) * widest.copied().unwrap_or(0);
+        let field = "cells of a feature map times the largest of num_filters, num_upsample_filters, shrink and anchors";
+        within(field, map, 0, MAX_VALUES)?;
+        let field = "layer_nums, num_filters, upsample_strides and shrink: number of parameters";
+        within(field, self.parameters(), 0, MAX_PARAMETERS)
     }
 
     /// Channels of the head's output.
@@ -398,53 +338,33 @@ impl DetectorConfig {
         count + channels * self.head_channels()
     }
 
-    fn check_area(&self) -> Result<(), ConfigError> {
+    fn check_area(&self) -> Result<(), FieldError> {
         let range = self.lidar_range_m;
-        if range.iter().any(|edge| !edge.is_finite())
-            || (0..3).any(|axis| range[axis] >= range[axis + 3])
-        {
-            return Err(value_error(
-                "lidar_range_m",
-                range,
-                "finite, lower below upper",
-            ));
-        }
-        if self
-            .voxel_size_m
-            .iter()
-            .any(|size| !(size.is_finite() && *size > 0.0))
-        {
-            return Err(value_error("voxel_size_m", self.voxel_size_m, "positive"));
-        }
-        if (self.voxel_size_m[0] - self.voxel_size_m[1]).abs() > 1e-9 {
-            return Err(value_error(
-                "voxel_size_m",
-                self.voxel_size_m,
-                "equal along x and y",
-            ));
-        }
-        if self.y_axis == YAxis::Right && (range[1] + range[4]).abs() > 1e-9 {
-            return Err(value_error(
-                "lidar_range_m",
-                range,
-                "as wide to the left as to the right if y_axis is right",
-            ));
-        }
+        let is_area = range.iter().all(|edge| edge.is_finite())
+            && (0..3).all(|axis| range[axis] < range[axis + 3]);
+        let rule = "must be finite, lower below upper";
+        require(is_area, "lidar_range_m", range, rule)?;
+        let voxel_m = self.voxel_size_m;
+        require_positive("voxel_size_m", voxel_m)?;
+        let is_square = (voxel_m[0] - voxel_m[1]).abs() <= 1e-9;
+        let rule = "must be equal along x and y";
+        require(is_square, "voxel_size_m", voxel_m, rule)?;
+        let is_even = self.y_axis == YAxis::Left || (range[1] + range[4]).abs() <= 1e-9;
+        let rule = "must be as wide to the left as to the right if y_axis is right";
+        require(is_even, "lidar_range_m", range, rule)?;
         let [x, y, z] = self.pillar_grid();
-        if z != 1 {
-            return Err(value_error("pillar layers along z", z, "1"));
-        }
-        if !(1..=MAX_CELLS).contains(&x.saturating_mul(y)) {
-            return Err(value_error("pillar grid", [x, y], "1 to 16777216 cells"));
-        }
-        Ok(())
+        within("pillar layers along z", z, 1, 1)?;
+        within(
+            "cells of the pillar grid",
+            x.saturating_mul(y),
+            1,
+            MAX_CELLS,
+        )
     }
 
-    fn check_levels(&self) -> Result<(), ConfigError> {
+    fn check_levels(&self) -> Result<(), FieldError> {
         let levels = self.layer_nums.len();
-        if !(1..=8).contains(&levels) {
-            return Err(value_error("layer_nums", &self.layer_nums, "1 to 8 blocks"));
-        }
+        within("number of layer_nums", levels, 1, 8)?;
         let lists: [(&'static str, &[i64]); 4] = [
             ("layer_strides", &self.layer_strides),
             ("num_filters", &self.num_filters),
@@ -452,60 +372,40 @@ impl DetectorConfig {
             ("num_upsample_filters", &self.num_upsample_filters),
         ];
         for (field, list) in lists {
-            if list.len() != levels {
-                return Err(ConfigError::Levels {
-                    field,
-                    got: list.len(),
-                    levels,
-                });
-            }
-            if list.iter().any(|value| !(1..=4096).contains(value)) {
-                return Err(value_error(field, list, "1 to 4096 each"));
-            }
+            let fits = list.len() == levels && list.iter().all(|value| (1..=4096).contains(value));
+            let rule = format!("must be {levels} numbers, as layer_nums is, of 1 to 4096");
+            require(fits, field, list, rule)?;
         }
-        let fewest = if self.blocks == BlockKind::Residual {
-            1
-        } else {
-            0
-        };
-        if self
-            .layer_nums
-            .iter()
-            .any(|layers| !(fewest..=64).contains(layers))
-        {
-            return Err(value_error(
-                "layer_nums",
-                &self.layer_nums,
-                "at most 64 each, residual blocks at least 1",
-            ));
-        }
+        let fewest = usize::from(self.blocks == BlockKind::Residual);
+        let layers = &self.layer_nums;
+        let fits = layers.iter().all(|layers| (fewest..=64).contains(layers));
+        let rule = "must be at most 64 each, residual blocks at least 1";
+        require(fits, "layer_nums", layers, rule)?;
         self.check_strides()
     }
 
     /// Every level must be up-sampled to the same BEV grid, without a remainder.
-    fn check_strides(&self) -> Result<(), ConfigError> {
+    fn check_strides(&self) -> Result<(), FieldError> {
         let mut down = 1;
         for (stride, up) in self.layer_strides.iter().zip(&self.upsample_strides) {
             down *= stride;
-            if down % up != 0 || down / up != self.layer_strides[0] / self.upsample_strides[0] {
-                return Err(value_error(
-                    "upsample_strides",
-                    &self.upsample_strides,
-                    "bring all levels to one BEV grid",
-                ));
-            }
+            let fits =
+                down % up == 0 && down / up == self.layer_strides[0] / self.upsample_strides[0];
+            let rule = "must bring all levels to one BEV grid";
+            require(fits, "upsample_strides", &self.upsample_strides, rule)?;
         }
         let [x, y, _] = self.pillar_grid();
         let down = usize::try_from(down).unwrap_or(usize::MAX);
-        if x % down != 0 || y % down != 0 {
-            return Err(value_error(
-                "pillar grid",
-                [x, y],
-                "a multiple of the product of layer_strides",
-            ));
-        }
-        Ok(())
+        let fits = x % down == 0 && y % down == 0;
+        let rule = "must be a multiple of the product of layer_strides";
+        require(fits, "pillar grid", [x, y], rule)
     }
+}
+
+/// Refuses sizes that are not all finite and above zero.
+fn require_positive(field: &str, sizes: [f64; 3]) -> Result<(), FieldError> {
+    let is_size = sizes.iter().all(|size| size.is_finite() && *size > 0.0);
+    require(is_size, field, sizes, "must be positive")
 }
 
 /// Box of the car under the LiDAR, as in OpenCOOD: x and y of the lower and the upper corner, metres.
@@ -517,18 +417,6 @@ const MAX_CELLS: usize = 1 << 24;
 const MAX_VALUES: i64 = 1 << 28;
 /// Largest number of parameters of a network, for the same reason: nearly 1 GiB.
 const MAX_PARAMETERS: i64 = 256_000_000;
-
-fn value_error(
-    field: &'static str,
-    value: impl std::fmt::Debug,
-    must: &'static str,
-) -> ConfigError {
-    ConfigError::Value {
-        field,
-        value: format!("{value:?}"),
-        must,
-    }
-}
 
 #[cfg(test)]
 mod tests {
@@ -654,13 +542,10 @@ mod tests {
             "{message}"
         );
         config.upsample_strides.pop();
-        assert_eq!(
-            config.validate(),
-            Err(ConfigError::Levels {
-                field: "upsample_strides",
-                got: 2,
-                levels: 3
-            })
+        let message = config.validate().unwrap_err().to_string();
+        assert!(
+            message.contains("upsample_strides is [1, 2]: must be 3"),
+            "{message}"
         );
         let mut config = DetectorConfig::lean();
         config.lidar_range_m[3] = f64::NAN;

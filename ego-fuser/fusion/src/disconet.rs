@@ -5,11 +5,11 @@
 
 use perception::layers::convolution::Norm;
 use perception::model_config::{ConfigError, DetectorConfig};
+use protocol::config::within;
 use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{TchError, Tensor};
 
-use super::bounds::within;
 use super::conv_gru::Conv;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
@@ -57,10 +57,11 @@ impl DiscoNetConfig {
     /// # Errors
     /// [`ConfigError`] names the field.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        within("fusion channels", self.channels, 1..=4096)?;
+        within("fusion channels", self.channels, 1, 4096)?;
         self.hidden
             .iter()
-            .try_for_each(|&hidden| within("fusion hidden channels", hidden, 1..=4096))
+            .try_for_each(|&hidden| within("fusion hidden channels", hidden, 1, 4096))?;
+        Ok(())
     }
 }
 

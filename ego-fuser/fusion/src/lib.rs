@@ -25,7 +25,6 @@
 
 pub mod attention;
 mod block_order;
-mod bounds;
 pub(crate) mod channel_mixing;
 pub(crate) mod classes;
 pub mod coalign;

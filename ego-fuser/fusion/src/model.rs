@@ -16,6 +16,7 @@ use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
 use perception::train::ComputePrecision;
 use perception::weights::{CONFIG_KEY, METHOD_KEY, Weights, WeightsError};
+use protocol::config::require;
 use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
@@ -118,16 +119,10 @@ impl CooperativeModel {
         fusion: &FusionConfig,
         device: Device,
     ) -> Result<Self, ModelError> {
-        if config.y_axis == YAxis::Right {
-            // Samples and targets are right-handed; a mirrored network cannot be trained.
-            let (field, value) = ("y_axis", "right".to_owned());
-            return Err(ConfigError::Value {
-                field,
-                value,
-                must: "left to train",
-            }
-            .into());
-        }
+        // Samples and targets are right-handed; a mirrored network cannot be trained.
+        let is_left = config.y_axis == YAxis::Left;
+        let rule = "must be left to train";
+        require(is_left, "y_axis", config.y_axis, rule).map_err(ConfigError::from)?;
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), config)?;
         let fusion = FusionStage::new(&variables.root(), fusion, method, config)?;

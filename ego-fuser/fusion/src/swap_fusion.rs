@@ -5,6 +5,7 @@
 //! are those of all agents; a bias table over the offset between agents, rows and columns is added to the scores.
 
 use perception::model_config::ConfigError;
+use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
 use tch::nn::{self, Init};
 use tch::{Device, Kind, TchError, Tensor};
@@ -78,33 +79,15 @@ impl SwapFusionConfig {
             ("fusion.head_channels", self.head_channels, 4096),
             ("fusion.hidden", self.hidden, 4096),
         ];
-        if let Some((field, size, _)) = sizes
-            .into_iter()
-            .find(|(_, size, most)| !(1..=*most).contains(size))
-        {
-            return Err(ConfigError::Value {
-                field,
-                value: size.to_string(),
-                must: "at least 1 and plausible",
-            });
+        for (field, size, most) in sizes {
+            within(field, size, 1, most)?;
         }
-        if self.channels % self.head_channels != 0 {
-            let value = self.head_channels.to_string();
-            return Err(ConfigError::Value {
-                field: "fusion.head_channels",
-                value,
-                must: "a divisor of the channels",
-            });
-        }
-        if !(0.0..1.0).contains(&self.dropout) {
-            let value = self.dropout.to_string();
-            return Err(ConfigError::Value {
-                field: "fusion.dropout",
-                value,
-                must: "a share below 1",
-            });
-        }
-        Ok(())
+        let (field, size) = ("fusion.head_channels", self.head_channels);
+        let rule = "must be a divisor of the channels";
+        require(self.channels % size == 0, field, size, rule)?;
+        let is_share = (0.0..1.0).contains(&self.dropout);
+        let rule = "must be a share below 1";
+        Ok(require(is_share, "fusion.dropout", self.dropout, rule)?)
     }
 }
 

@@ -7,12 +7,12 @@
 //! neither multiplied here nor trained.
 
 use perception::model_config::{ConfigError, DetectorConfig};
+use protocol::config::{require, within};
 use protocol::{BevGrid, Pose};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::bounds::within;
 use super::conv_gru::{Conv, ConvGru};
 use super::interface::{Fusion, FusionOutput};
 use super::maps::{AlignedMaps, MapMetadata, present};
@@ -84,14 +84,17 @@ impl V2vNetConfig {
     /// # Errors
     /// [`ConfigError`] names the field.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        within("fusion channels", self.channels, 1..=4096)?;
-        within("fusion rounds", self.rounds as i64, 1..=16)?;
-        within("fusion gru_layers", self.gru_layers as i64, 0..=8)?;
-        within(
-            "odd fusion kernel",
-            if self.kernel % 2 == 1 { self.kernel } else { 0 },
-            1..=15,
-        )
+        within("fusion channels", self.channels, 1, 4096)?;
+        within("fusion rounds", self.rounds as i64, 1, 16)?;
+        within("fusion gru_layers", self.gru_layers as i64, 0, 8)?;
+        within("fusion kernel", self.kernel, 1, 15)?;
+        let is_odd = self.kernel % 2 == 1;
+        Ok(require(
+            is_odd,
+            "fusion kernel",
+            self.kernel,
+            "must be odd",
+        )?)
     }
 }
 

@@ -7,13 +7,13 @@
 //! The published networks fuse at several levels of the backbone; that is `multi_scale`, for imported weights.
 
 use perception::model_config::{ConfigError, DetectorConfig};
+use protocol::config::{require, within};
 use protocol::{ConfidenceGate, Smoothing};
 use serde::{Deserialize, Serialize};
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
 use super::attention::attended;
-use super::bounds::within;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
 use super::max::maximum;
@@ -160,11 +160,9 @@ impl Communication {
     pub fn new(path: &nn::Path<'_>, config: &CommunicationConfig) -> Result<Self, ConfigError> {
         let window = config.smoothing.map(|Smoothing { kernel, .. }| {
             let kernel = i64::from(kernel);
-            within(
-                "odd kernel of the smoothing",
-                if kernel % 2 == 1 { kernel } else { 0 },
-                1..=63,
-            )?;
+            within("kernel of the smoothing", kernel, 1, 63)?;
+            let is_odd = kernel % 2 == 1;
+            require(is_odd, "kernel of the smoothing", kernel, "must be odd")?;
             let path = path / "gaussian_filter";
             let weight = path
                 .var("weight", &[1, 1, kernel, kernel], Init::Const(0.0))

@@ -3,5 +3,5 @@
 mod field;
 mod options;
 
-pub use field::{FieldError, above_zero, within};
+pub use field::{FieldError, above_zero, require, within};
 pub use options::{Section, document, options_of};

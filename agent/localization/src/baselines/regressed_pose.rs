@@ -1,6 +1,7 @@
 //! Pose that a network regresses directly.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use protocol::config::{FieldError, require};
 use protocol::{NoPoseReason, PoseEstimate};
 use support::stage_times::StageTimes;
 
@@ -37,4 +38,12 @@ pub(super) fn upright(answer: &[f32], origin_m: [f64; 3]) -> Option<Isometry3<f6
         let heading = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), sine.atan2(cosine));
         Isometry3::from_parts(Translation3::from(position), heading)
     })
+}
+
+/// Refuses positions without a finite origin or a scale above 0.
+pub(super) fn require_scale(origin_m: [f64; 3], scale_m: [f64; 3]) -> Result<(), FieldError> {
+    let is_place = origin_m.iter().all(|axis| axis.is_finite());
+    require(is_place, "origin_m", origin_m, "must be finite")?;
+    let is_scale = scale_m.iter().all(|axis| axis.is_finite() && *axis > 0.0);
+    require(is_scale, "scale_m", scale_m, "must be above 0")
 }

@@ -1,5 +1,6 @@
 //! Configuration of a scene encoder.
 
+use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 use super::head_config::MAX_PARAMETERS;
@@ -161,64 +162,29 @@ impl SceneEncoderConfig {
     /// Checks that a network can be built.
     ///
     /// # Errors
-    /// Field and value that are wrong.
-    pub fn validate(&self) -> Result<(), String> {
-        let positive = |name: &str, value: f64| {
-            (value.is_finite() && value > 0.0)
-                .then_some(())
-                .ok_or_else(|| format!("{name} is {value}, must be above 0"))
-        };
-        positive("voxel_m", self.voxel_m)?;
-        positive("range_m", self.range_m)?;
-        self.context_m
-            .iter()
-            .try_for_each(|&edge| positive("context_m", edge))?;
-        if self.height_m.iter().any(|height| !height.is_finite())
-            || self.height_m[0] >= self.height_m[1]
-        {
-            return Err(format!("height_m is {:?}, must rise", self.height_m));
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        let lengths = [("voxel_m", self.voxel_m), ("range_m", self.range_m)];
+        let windows = self.context_m.iter().map(|&edge| ("context_m", edge));
+        for (field, metres) in lengths.into_iter().chain(windows) {
+            let is_length = metres.is_finite() && metres > 0.0;
+            require(is_length, field, metres, "must be above 0")?;
         }
-        if !(2..=6).contains(&self.levels()) {
-            return Err(format!(
-                "widths has {} entries, must have 2 to 6",
-                self.levels()
-            ));
+        let [low, high] = self.height_m;
+        let rises = low.is_finite() && high.is_finite() && low < high;
+        require(rises, "height_m", self.height_m, "must rise")?;
+        within("number of widths", self.levels(), 2, 6)?;
+        let groups = self.residual_widths.len();
+        within("number of residual_widths", groups, 0, MAX_ENTRIES)?;
+        within("number of context_m", self.context_m.len(), 0, MAX_ENTRIES)?;
+        for &channels in self.widths.iter().chain(&self.residual_widths) {
+            within("widths and residual_widths", channels, 1, 4096)?;
         }
-        for (name, entries) in [
-            ("residual_widths", self.residual_widths.len()),
-            ("context_m", self.context_m.len()),
-        ] {
-            if entries > MAX_ENTRIES {
-                return Err(format!(
-                    "{name} has {entries} entries, must have {MAX_ENTRIES} at most"
-                ));
-            }
-        }
-        let channels = self.widths.iter().chain(&self.residual_widths);
-        match channels
-            .copied()
-            .find(|channels| !(1..=4096).contains(channels))
-        {
-            Some(channels) => Err(format!(
-                "a layer has {channels} channels, must have 1 to 4096"
-            )),
-            None if self.range_m / self.voxel_m > 10_000.0
-                || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS =>
-            {
-                Err(format!(
-                    "range_m is {} with voxel_m {}: too many voxels",
-                    self.range_m, self.voxel_m
-                ))
-            }
-            // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
-            None if self.parameters() > MAX_PARAMETERS => Err(format!(
-                "widths are {:?} and residual_widths {:?}: {} parameters, must be {MAX_PARAMETERS} at most",
-                self.widths,
-                self.residual_widths,
-                self.parameters()
-            )),
-            None => Ok(()),
-        }
+        let most_m = (self.voxel_m * 10_000.0).min(self.coarse_cell_m() * MAX_PLANE_CELLS);
+        within("range_m", self.range_m, 0.0, most_m)?;
+        // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
+        let field = "parameters by widths and residual_widths";
+        within(field, self.parameters(), 0, MAX_PARAMETERS)
     }
 
     /// Parameters of the 3x3x3 convolutions, nearly all there are.
@@ -266,7 +232,7 @@ mod tests {
     #[test]
     fn absurd_configurations_are_rejected_by_name() {
         let refused = |config: SceneEncoderConfig, field: &str| {
-            config.validate().unwrap_err().contains(field)
+            config.validate().unwrap_err().to_string().contains(field)
         };
         assert!(refused(
             SceneEncoderConfig {
@@ -280,7 +246,7 @@ mod tests {
                 voxel_m: 1e-6,
                 ..SceneEncoderConfig::lean()
             },
-            "too many"
+            "range_m"
         ));
         assert!(refused(
             SceneEncoderConfig {

@@ -1,5 +1,6 @@
 //! Errors of a localizer.
 
+use protocol::config::FieldError;
 use tch::TchError;
 
 use perception::detector::DetectorError;
@@ -12,7 +13,10 @@ pub enum LocalizerError {
     /// The weights are not readable or made for another model.
     #[error(transparent)]
     Weights(#[from] WeightsError),
-    /// The configuration does not describe a network.
+    /// A setting does not describe a network.
+    #[error("localizer: {0}")]
+    Setting(#[from] FieldError),
+    /// The parts of a localizer do not fit together.
     #[error("localizer: {0}")]
     Config(String),
     /// The confidence model in a head's file is not valid.
@@ -21,7 +25,7 @@ pub enum LocalizerError {
         /// Path of the head.
         head: String,
         /// Field and value that are wrong.
-        reason: String,
+        reason: FieldError,
     },
     /// The head was trained on the features of another encoder.
     #[error("{head}: trained on encoder {expected}, but {encoder} is {found} (SHA-256)")]

@@ -1,5 +1,6 @@
 //! Configuration of a scene head.
 
+use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 /// Largest number of values of a key grid.
@@ -104,48 +105,25 @@ impl RefinerConfig {
     /// Checks that a network can be built.
     ///
     /// # Errors
-    /// Field and value that are wrong.
-    pub fn validate(&self) -> Result<(), String> {
-        let sizes = [
-            ("local_channels", self.local_channels),
-            ("keys", self.keys),
-            ("width", self.width),
-        ];
-        if let Some((name, size)) = sizes
-            .into_iter()
-            .find(|(_, size)| !(1..=4096).contains(size))
-        {
-            return Err(format!("refiner: {name} is {size}, must be 1 to 4096"));
-        }
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        within("refiner.local_channels", self.local_channels, 1, 4096)?;
+        within("refiner.keys", self.keys, 1, 4096)?;
+        within("refiner.width", self.width, 1, 4096)?;
         // The size of the neighbourhood of every cell grows with its square.
-        if !(1..=MAX_REACH).contains(&self.reach) {
-            return Err(format!(
-                "refiner: reach is {}, must be 1 to {MAX_REACH}",
-                self.reach
-            ));
+        within("refiner.reach", self.reach, 1, MAX_REACH)?;
+        for axis in 0..2 {
+            let edge_m = self.high_m[axis] - self.low_m[axis];
+            let is_edge = edge_m > 0.0 && edge_m < 1e5;
+            let rule = "must be above low_m, less than 100 km away";
+            require(is_edge, "refiner.high_m", self.high_m, rule)?;
         }
-        let mut edges = (0..2).map(|axis| self.high_m[axis] - self.low_m[axis]);
-        if edges.any(|edge| !(edge > 0.0 && edge < 1e5)) {
-            return Err(format!(
-                "refiner: from {:?} to {:?} is no area",
-                self.low_m, self.high_m
-            ));
-        }
-        if !(0.1..=100.0).contains(&self.spacing_m) {
-            return Err(format!(
-                "refiner: spacing_m is {}, must be 0.1 to 100",
-                self.spacing_m
-            ));
-        }
+        within("refiner.spacing_m", self.spacing_m, 0.1, 100.0)?;
         let [columns, rows] = self.corners();
         // Checked before anything of this size is allocated: the file with these numbers may come from anyone.
-        match columns.saturating_mul(rows).saturating_mul(self.keys) {
-            values if values > MAX_KEY_GRID => Err(format!(
-                "refiner: {columns} x {rows} corners of {} keys are {values} values, must be {MAX_KEY_GRID} at most",
-                self.keys
-            )),
-            _ => Ok(()),
-        }
+        let values = columns.saturating_mul(rows).saturating_mul(self.keys);
+        let field = format!("refiner: {columns} x {rows} corners of {} keys", self.keys);
+        within(&field, values, 1, MAX_KEY_GRID)
     }
 }
 
@@ -153,9 +131,9 @@ impl SceneHeadConfig {
     /// Checks that a network can be built.
     ///
     /// # Errors
-    /// Field and value that are wrong.
-    pub fn validate(&self) -> Result<(), String> {
-        let sizes = [
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        for (field, size) in [
             ("cell_channels", self.cell_channels),
             ("sweep_channels", self.sweep_channels),
             ("classes", self.classes),
@@ -163,23 +141,16 @@ impl SceneHeadConfig {
             ("width", self.width),
             ("blocks", self.blocks as i64),
             ("max_cells", self.max_cells as i64),
-        ];
-        match sizes
-            .into_iter()
-            .find(|(_, size)| !(1..=16_384).contains(size))
-        {
-            Some((name, size)) => Err(format!("{name} is {size}, must be 1 to 16384")),
-            None if self.origin_m.iter().any(|axis| !axis.is_finite()) => {
-                Err(format!("origin_m is {:?}, must be finite", self.origin_m))
-            }
-            None if self.parameters() > MAX_PARAMETERS => Err(format!(
-                "width is {} with {} blocks: {} parameters, must be {MAX_PARAMETERS} at most",
-                self.width,
-                self.blocks,
-                self.parameters()
-            )),
-            None => Ok(()),
+        ] {
+            within(field, size, 1, 16_384)?;
         }
+        let is_place = self.origin_m.iter().all(|axis| axis.is_finite());
+        require(is_place, "origin_m", self.origin_m, "must be finite")?;
+        let field = format!(
+            "width {} with {} blocks: parameters",
+            self.width, self.blocks
+        );
+        within(&field, self.parameters(), 0, MAX_PARAMETERS)
     }
 
     /// Parameters of the regressing layers; those of the classifier are few in any case.
@@ -204,7 +175,7 @@ mod tests {
             keys: 4096,
             width: 8,
         };
-        let message = huge.validate().unwrap_err();
+        let message = huge.validate().unwrap_err().to_string();
         assert!(
             message.contains("33335 x 33335") && message.contains("4096 keys"),
             "{message}"
@@ -216,8 +187,8 @@ mod tests {
             ..huge
         };
         assert_eq!(
-            far.validate(),
-            Err("refiner: reach is 4096, must be 1 to 16".to_owned())
+            far.validate().unwrap_err().to_string(),
+            "refiner.reach is 4096: must be 1 to 16"
         );
     }
 
@@ -244,9 +215,10 @@ mod tests {
             ..head
         }
         .validate()
-        .unwrap_err();
+        .unwrap_err()
+        .to_string();
         assert!(
-            message.contains("width is 16384") && message.contains("256000000"),
+            message.contains("width 16384") && message.contains("256000000"),
             "{message}"
         );
     }

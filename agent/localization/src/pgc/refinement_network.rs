@@ -37,7 +37,7 @@ impl Refiner {
     /// # Errors
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &RefinerConfig) -> Result<Self, LocalizerError> {
-        config.validate().map_err(LocalizerError::Config)?;
+        config.validate()?;
         let [columns, rows] = config.corners();
         let corners = columns * rows;
         let RefinerConfig {

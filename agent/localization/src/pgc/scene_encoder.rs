@@ -52,7 +52,7 @@ impl SceneEncoder {
     /// # Errors
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &SceneEncoderConfig) -> Result<Self, LocalizerError> {
-        config.validate().map_err(LocalizerError::Config)?;
+        config.validate()?;
         let widths = &config.widths;
         let level = |level: usize| path / "levels" / level;
         let first = SparseConv::new(&level(0), config.input.channels(), widths[0]);

@@ -62,7 +62,7 @@ impl SceneHead {
     /// # Errors
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &SceneHeadConfig) -> Result<Self, LocalizerError> {
-        config.validate().map_err(LocalizerError::Config)?;
+        config.validate()?;
         let SceneHeadConfig {
             cell_channels,
             sweep_channels,

@@ -22,6 +22,7 @@ mod global_attention;
 mod sampling;
 
 use perception::model_config::{ConfigError, DetectorConfig};
+use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{TchError, Tensor};
@@ -29,7 +30,6 @@ use tch::{TchError, Tensor};
 use self::consensus::Consensus;
 use self::global_attention::{GlobalHalf, REDUCTION};
 use self::sampling::Sampler;
-use super::bounds::within;
 use super::cobevt::nearest_first;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
@@ -91,25 +91,16 @@ impl ErmvpConfig {
     /// [`ConfigError`] names the field, its value and what it must be.
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.layers.validate()?;
-        within("fusion.compared", self.compared, 1..=4096)?;
-        within("fusion.search", self.search, 1..=16)?;
-        if self.layers.count_missing {
-            let must = "false: only present agents are fused";
-            return Err(ConfigError::Value {
-                field: "fusion.layers.count_missing",
-                value: "true".into(),
-                must,
-            });
-        }
-        if !(self.kept > 0.0 && self.kept <= 1.0) {
-            let value = self.kept.to_string();
-            return Err(ConfigError::Value {
-                field: "fusion.kept",
-                value,
-                must: "a share above 0 and up to 1",
-            });
-        }
-        Ok(())
+        within("fusion.compared", self.compared, 1, 4096)?;
+        within("fusion.search", self.search, 1, 16)?;
+        let (field, rule) = (
+            "fusion.layers.count_missing",
+            "must be false: only present agents are fused",
+        );
+        require(!self.layers.count_missing, field, true, rule)?;
+        let is_share = self.kept > 0.0 && self.kept <= 1.0;
+        let rule = "must be a share above 0 and up to 1";
+        Ok(require(is_share, "fusion.kept", self.kept, rule)?)
     }
 }
 

@@ -1,6 +1,7 @@
 //! Ablation of PASTAT: settings without some of its parts.
 
 use perception::model_config::ConfigError;
+use protocol::config::FieldError;
 
 use super::config::PastatConfig;
 use crate::FusionConfig;
@@ -32,11 +33,8 @@ pub fn ablated(
             return Ok(fusion.clone());
         }
         let value = format!("without {without:?}, {frames:?} frames");
-        return Err(ConfigError::Value {
-            field: "fusion",
-            value,
-            must: "unchanged for methods other than pastat",
-        });
+        let rule = "must be unchanged for methods other than pastat";
+        return Err(FieldError::new("fusion", value, rule).into());
     };
     let mut config = without
         .iter()

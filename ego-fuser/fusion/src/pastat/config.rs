@@ -1,6 +1,7 @@
 //! Sizes and switches of PASTAT.
 
 use perception::model_config::ConfigError;
+use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 use super::spatial_alignment::correlation::PARTS;
@@ -201,133 +202,68 @@ impl PastatConfig {
     /// # Errors
     /// [`ConfigError`] names the field, its value and what it must be.
     pub(crate) fn validate(&self) -> Result<(), ConfigError> {
-        let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
         for (field, value, most) in [
             ("pastat channels", self.channels, 4096),
             ("pastat patch", self.patch, 16),
             ("pastat dim", self.dim, 1024),
             ("pastat heads", self.heads, 64),
             ("pastat mlp_ratio", self.mlp_ratio, 16),
-            (
-                "pastat depth",
-                i64::try_from(self.depth).unwrap_or(i64::MAX),
-                32,
-            ),
+            ("pastat depth", self.depth as i64, 32),
             ("pastat refine", self.map_refinement.unwrap_or(1), 4096),
-            (
-                "pastat temporal memory hidden",
-                self.temporal_memory.map_or(1, |memory| memory.hidden),
-                4096,
-            ),
-            (
-                "pastat frames",
-                i64::try_from(self.frames).unwrap_or(i64::MAX),
-                16,
-            ),
+            ("pastat frames", self.frames as i64, 16),
         ] {
-            if !(1..=most).contains(&value) {
-                return error(
-                    field,
-                    value.to_string(),
-                    "above zero and of a sensible size",
-                );
-            }
+            within(field, value, 1, most)?;
         }
-        if self.earlier_cells < 1 || self.patch % self.earlier_cells != 0 {
-            return error(
-                "pastat earlier_cells",
-                self.earlier_cells.to_string(),
-                "a divisor of the patch",
-            );
+        let cells = self.earlier_cells;
+        let is_divisor = cells >= 1 && self.patch % cells == 0;
+        let rule = "must be a divisor of the patch";
+        require(is_divisor, "pastat earlier_cells", cells, rule)?;
+        let is_multiple = self.dim % (2 * self.heads) == 0;
+        let rule = "must be a multiple of twice the heads";
+        require(is_multiple, "pastat dim", self.dim, rule)?;
+        let sizes = self.windows.len() as i64;
+        let are_windows = sizes > 0
+            && self.heads % sizes == 0
+            && self.windows.iter().all(|size| (1..=32).contains(size));
+        let rule = "must be 1 to 32 tokens each, sharing the heads";
+        require(are_windows, "pastat windows", &self.windows, rule)?;
+        within("pastat frame_secs", self.frame_secs, 1e-3, 10.0)?;
+        if let Some(memory) = self.temporal_memory {
+            let rule = "must be 2 or more, as earlier maps are blended in";
+            require(self.frames >= 2, "pastat frames", self.frames, rule)?;
+            memory.validate()?;
         }
-        if self.dim % (2 * self.heads) != 0 {
-            return error(
-                "pastat dim",
-                self.dim.to_string(),
-                "a multiple of twice the heads",
-            );
+        let Some(fsa) = &self.fsa else { return Ok(()) };
+        fsa.validate()?;
+        if let Some(search) = fsa.alignment_search {
+            let is_multiple = search.cells % self.earlier_cells == 0;
+            let rule = "must be a multiple of earlier_cells";
+            require(is_multiple, "pastat fsa search cells", search.cells, rule)?;
         }
-        let sizes = i64::try_from(self.windows.len()).unwrap_or(i64::MAX);
-        let are_sizes = self.windows.iter().all(|size| (1..=32).contains(size));
-        if sizes == 0 || self.heads % sizes != 0 || !are_sizes {
-            return error(
-                "pastat windows",
-                format!("{:?}", self.windows),
-                "1 to 32 tokens each, sharing the heads",
-            );
-        }
-        if !(1e-3..=10.0).contains(&self.frame_secs) {
-            return error(
-                "pastat frame_secs",
-                self.frame_secs.to_string(),
-                "0.001 to 10 s",
-            );
-        }
-        if let Some(cells) = self
-            .fsa
-            .as_ref()
-            .and_then(|fsa| fsa.alignment_search)
-            .map(|search| search.cells)
-            && cells % self.earlier_cells != 0
-        {
-            return error(
-                "pastat fsa search cells",
-                cells.to_string(),
-                "a multiple of earlier_cells",
-            );
-        }
-        if let Some(MemoryConfig { share, .. }) = self.temporal_memory
-            && !(share > 0.0 && share <= 1.0)
-        {
-            return error(
-                "pastat temporal memory share",
-                share.to_string(),
-                "above 0, up to 1",
-            );
-        }
-        if self.temporal_memory.is_some() && self.frames < 2 {
-            return error(
-                "pastat frames",
-                self.frames.to_string(),
-                "2 or more, as earlier maps are blended in",
-            );
-        }
-        self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
+        Ok(())
+    }
+}
+
+impl MemoryConfig {
+    fn validate(&self) -> Result<(), FieldError> {
+        within("pastat temporal memory hidden", self.hidden, 1, 4096)?;
+        let is_share = self.share > 0.0 && self.share <= 1.0;
+        let rule = "must be above 0, up to 1";
+        require(is_share, "pastat temporal memory share", self.share, rule)
     }
 }
 
 impl FsaConfig {
-    fn validate(&self) -> Result<(), ConfigError> {
-        let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
-        if !(1..=256).contains(&self.matching) || !(1..=4096).contains(&self.hidden) {
-            return error(
-                "pastat fsa channels",
-                format!("{}, {}", self.matching, self.hidden),
-                "1 to 256 and 1 to 4096",
-            );
-        }
-        if !(0..=8).contains(&self.radius) {
-            return error("pastat fsa radius", self.radius.to_string(), "0 to 8 cells");
-        }
-        if !(0.0..=50.0).contains(&self.max_shift_m) || !(0.0..=1.6).contains(&self.max_turn_rad) {
-            let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
-            return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
-        }
-        if let Some(SearchConfig {
-            cells,
-            radius,
-            margin,
-        }) = self.alignment_search
-            && !((1..=16).contains(&cells)
-                && (1..=32).contains(&radius)
-                && (0.0..=2.0).contains(&margin))
-        {
-            let value = format!("{cells}, {radius}, {margin}");
-            return error(
-                "pastat fsa search",
-                value,
-                "1 to 16 cells, 1 to 32 of them away, a margin of 0 to 2",
-            );
+    fn validate(&self) -> Result<(), FieldError> {
+        within("pastat fsa matching", self.matching, 1, 256)?;
+        within("pastat fsa hidden", self.hidden, 1, 4096)?;
+        within("pastat fsa radius", self.radius, 0, 8)?;
+        within("pastat fsa max_shift_m", self.max_shift_m, 0.0, 50.0)?;
+        within("pastat fsa max_turn_rad", self.max_turn_rad, 0.0, 1.6)?;
+        if let Some(search) = self.alignment_search {
+            within("pastat fsa search cells", search.cells, 1, 16)?;
+            within("pastat fsa search radius", search.radius, 1, 32)?;
+            within("pastat fsa search margin", search.margin, 0.0, 2.0)?;
         }
         Ok(())
     }

@@ -1,9 +1,8 @@
 //! Sizes of TraF-Align.
 
 use perception::model_config::ConfigError;
+use protocol::config::{require, within};
 use serde::{Deserialize, Serialize};
-
-use crate::bounds::within;
 
 /// Sizes of [`TrafAlign`](super::TrafAlign).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -65,26 +64,17 @@ impl TrafAlignConfig {
     /// # Errors
     /// [`ConfigError`] names the field.
     pub(crate) fn validate(&self) -> Result<(), ConfigError> {
-        within("fusion channels", self.channels, 1..=4096)?;
-        within("fusion patch", self.patch, 1..=8)?;
-        within("fusion dim", self.dim, 2..=4096)?;
-        within(
-            "fusion heads",
-            if self.dim % self.heads.max(1) == 0 {
-                self.heads
-            } else {
-                0
-            },
-            1..=64,
-        )?;
-        within("fusion kernel", self.kernel, 1..=9)?;
-        within("fusion layers", self.layers as i64, 1..=16)?;
-        within("fusion field", self.field, 1..=64)?;
-        within("fusion frames", self.frames as i64, 1..=16)?;
-        within(
-            "fusion frame_secs in ms",
-            (self.frame_secs * 1e3) as i64,
-            1..=60_000,
-        )
+        within("fusion channels", self.channels, 1, 4096)?;
+        within("fusion patch", self.patch, 1, 8)?;
+        within("fusion dim", self.dim, 2, 4096)?;
+        within("fusion heads", self.heads, 1, 64)?;
+        let is_divisor = self.dim % self.heads == 0;
+        require(is_divisor, "fusion heads", self.heads, "must divide dim")?;
+        within("fusion kernel", self.kernel, 1, 9)?;
+        within("fusion layers", self.layers as i64, 1, 16)?;
+        within("fusion field", self.field, 1, 64)?;
+        within("fusion frames", self.frames as i64, 1, 16)?;
+        within("fusion frame_secs", self.frame_secs, 1e-3, 60.0)?;
+        Ok(())
     }
 }

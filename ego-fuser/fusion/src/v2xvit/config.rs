@@ -1,6 +1,7 @@
 //! Configuration of a V2X-ViT encoder.
 
 use perception::model_config::ConfigError;
+use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 use crate::block_order::BlockOrder;
@@ -101,10 +102,9 @@ impl V2xVitConfig {
     /// [`ConfigError`] when the edges do not divide one another.
     pub fn order(&self) -> Result<BlockOrder, ConfigError> {
         let edges: Vec<i64> = self.windows.iter().map(|window| window.edge).collect();
-        BlockOrder::new(&edges).ok_or_else(|| ConfigError::Value {
-            field: "fusion.windows.edge",
-            value: format!("{edges:?}"),
-            must: "edges of which each divides the next larger one",
+        BlockOrder::new(&edges).ok_or_else(|| {
+            let rule = "must be edges of which each divides the next larger one";
+            FieldError::new("fusion.windows.edge", format_args!("{edges:?}"), rule).into()
         })
     }
 
@@ -125,33 +125,13 @@ impl V2xVitConfig {
             sizes.push(("fusion.windows.heads", window.heads));
             sizes.push(("fusion.windows.head_channels", window.head_channels));
         }
-        if let Some((field, size)) = sizes
-            .into_iter()
-            .find(|(_, size)| !(1..=4096).contains(size))
-        {
-            return Err(ConfigError::Value {
-                field,
-                value: size.to_string(),
-                must: "1 to 4096",
-            });
+        for (field, size) in sizes {
+            within(field, size, 1, 4096)?;
         }
-        if self.order()?.largest() > 64 {
-            let value = self.order()?.largest().to_string();
-            return Err(ConfigError::Value {
-                field: "fusion.windows.edge",
-                value,
-                must: "at most 64",
-            });
-        }
-        if !(0.0..1.0).contains(&self.dropout) {
-            let value = self.dropout.to_string();
-            return Err(ConfigError::Value {
-                field: "fusion.dropout",
-                value,
-                must: "a share below 1",
-            });
-        }
-        Ok(())
+        within("fusion.windows.edge", self.order()?.largest(), 1, 64)?;
+        let is_share = (0.0..1.0).contains(&self.dropout);
+        let rule = "must be a share below 1";
+        Ok(require(is_share, "fusion.dropout", self.dropout, rule)?)
     }
 }
 

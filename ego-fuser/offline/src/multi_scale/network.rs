@@ -7,6 +7,7 @@ use perception::model_config::{ConfigError, DetectorConfig};
 use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
 use perception::weights::Weights;
+use protocol::config::require;
 use serde::{Deserialize, Serialize};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
@@ -81,14 +82,9 @@ impl MultiScaleNetwork {
         config: &MultiScaleConfig,
         device: Device,
     ) -> Result<Self, ConfigError> {
-        if detector.compress_ratio.is_some() {
-            let (field, value) = ("compress_ratio", format!("{:?}", detector.compress_ratio));
-            return Err(ConfigError::Value {
-                field,
-                value,
-                must: "absent where levels are fused",
-            });
-        }
+        let ratio = detector.compress_ratio;
+        let rule = "must be absent where levels are fused";
+        require(ratio.is_none(), "compress_ratio", ratio, rule)?;
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), detector)?;
         let path = variables.root() / "fusion_net" / "naive_communication";

@@ -1,9 +1,10 @@
 //! Configuration of a DiffLoc network: sizes, and the scene that it was trained on.
 
+use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
 
 use super::range_image::RangeImageConfig;
-use crate::pgc::LocalizerError;
+use crate::baselines::regressed_pose::require_scale;
 
 /// Sizes of the network, and the normalisation of poses.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -68,72 +69,42 @@ impl DiffLocConfig {
     /// Checks sizes that come from a file.
     ///
     /// # Errors
-    /// [`LocalizerError::Config`] names the field that is wrong.
-    pub fn validate(&self) -> Result<(), LocalizerError> {
-        let wrong = |text: String| Err(LocalizerError::Config(format!("DiffLoc: {text}")));
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn validate(&self) -> Result<(), FieldError> {
         let RangeImageConfig {
             rows,
             columns,
-            elevations_deg: [low, high],
+            elevations_deg,
             ..
         } = self.image;
-        let side = 1..=4096;
-        if !side.contains(&rows) || !side.contains(&columns) {
-            return wrong(format!(
-                "image of {rows} x {columns}, expected 1 to 4096 rows and columns"
-            ));
-        }
-        if !(-90.0..=90.0).contains(&low) || !(-90.0..=90.0).contains(&high) || low >= high {
-            return wrong(format!("elevations_deg from {low} to {high}"));
-        }
+        within("image.rows", rows, 1, 4096)?;
+        within("image.columns", columns, 1, 4096)?;
+        let [low, high] = elevations_deg;
+        let rises = -90.0 <= low && low < high && high <= 90.0;
+        let rule = "must rise, from -90 to 90";
+        require(rises, "image.elevations_deg", elevations_deg, rule)?;
         let [height, width] = self.patch;
-        if height < 1 || width < 1 || rows as i64 % height != 0 || columns as i64 % width != 0 {
-            return wrong(format!(
-                "patch {height} x {width} does not divide an image of {rows} x {columns}"
-            ));
-        }
-        for (name, width) in [
+        let divides =
+            height >= 1 && width >= 1 && rows as i64 % height == 0 && columns as i64 % width == 0;
+        require(divides, "patch", self.patch, "must divide the image")?;
+        let widths = [
             ("width", self.width),
             ("denoiser_width", self.denoiser_width),
-        ] {
-            if self.heads < 1 || !(1..=4096).contains(&width) || width % self.heads != 0 {
-                return wrong(format!("{name} {width} for {} heads", self.heads));
-            }
+        ];
+        for (field, width) in widths {
+            within(field, width, 1, 4096)?;
+            let is_shared = self.heads >= 1 && width % self.heads == 0;
+            let rule = format!("must be a multiple of the {} heads", self.heads);
+            require(is_shared, field, width, rule)?;
         }
-        if self
-            .stem
-            .iter()
-            .any(|channels| !(1..=1024).contains(channels))
-        {
-            return wrong(format!(
-                "stem of {:?} channels, expected 1 to 1024",
-                self.stem
-            ));
+        for &channels in &self.stem {
+            within("stem", channels, 1, 1024)?;
         }
-        if self.layers > 64 || self.denoiser_layers > 64 || !(1..=16).contains(&self.frames) {
-            let Self {
-                layers,
-                denoiser_layers,
-                frames,
-                ..
-            } = self;
-            return wrong(format!(
-                "{layers} and {denoiser_layers} layers for {frames} frames"
-            ));
-        }
-        if !(0.0..1.0).contains(&self.drop_path) {
-            return wrong(format!("drop_path {}, expected 0 to 1", self.drop_path));
-        }
-        let scaled = self
-            .scale_m
-            .iter()
-            .all(|axis| axis.is_finite() && *axis > 0.0);
-        if !scaled || !self.origin_m.iter().all(|axis| axis.is_finite()) {
-            return wrong(format!(
-                "origin_m {:?}, scale_m {:?}",
-                self.origin_m, self.scale_m
-            ));
-        }
-        Ok(())
+        within("layers", self.layers, 0, 64)?;
+        within("denoiser_layers", self.denoiser_layers, 0, 64)?;
+        within("frames", self.frames, 1, 16)?;
+        let is_share = (0.0..1.0).contains(&self.drop_path);
+        require(is_share, "drop_path", self.drop_path, "must be 0 to 1")?;
+        require_scale(self.origin_m, self.scale_m)
     }
 }

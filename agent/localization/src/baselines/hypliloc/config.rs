@@ -1,8 +1,9 @@
 //! Configuration of a trained network: its scene and the scale of its positions.
 
+use protocol::config::FieldError;
 use serde::{Deserialize, Serialize};
 
-use crate::pgc::LocalizerError;
+use crate::baselines::regressed_pose::require_scale;
 
 /// Configuration of a network of one scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,20 +21,9 @@ impl HypLiLocConfig {
     /// Checks the numbers.
     ///
     /// # Errors
-    /// [`LocalizerError::Config`] names the field and its value.
-    pub fn validate(&self) -> Result<(), LocalizerError> {
-        let error = |text: String| Err(LocalizerError::Config(text));
-        if !self.origin_m.iter().all(|axis| axis.is_finite()) {
-            return error(format!("origin_m is {:?}, must be finite", self.origin_m));
-        }
-        if !self
-            .scale_m
-            .iter()
-            .all(|axis| axis.is_finite() && *axis > 0.0)
-        {
-            return error(format!("scale_m is {:?}, must be above 0", self.scale_m));
-        }
-        Ok(())
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        require_scale(self.origin_m, self.scale_m)
     }
 }
 

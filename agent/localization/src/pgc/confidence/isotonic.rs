@@ -1,5 +1,6 @@
 //! Decreasing functions from data: isotonic regression by pooling adjacent violators (Barlow et al. 1972).
 
+use protocol::config::{FieldError, require};
 use serde::{Deserialize, Serialize};
 
 /// Relative tolerance of the order of knots that are equal up to rounding.
@@ -57,27 +58,19 @@ impl MonotoneMap {
     /// Checks that x increases and values decrease from knot to knot, as in a fit up to rounding.
     ///
     /// # Errors
-    /// The knots that are wrong.
-    pub(super) fn check(&self) -> Result<(), String> {
-        if let Some((x, y)) = self
-            .knots
-            .iter()
-            .find(|(x, y)| !x.is_finite() || !(0.0..=1.0).contains(y))
-        {
-            return Err(format!(
-                "sigma has a knot [{x}, {y}], its value must be 0 to 1"
-            ));
+    /// [`FieldError`] with the knots that are wrong.
+    pub(super) fn check(&self) -> Result<(), FieldError> {
+        for knot @ (x, y) in &self.knots {
+            let is_knot = x.is_finite() && (0.0..=1.0).contains(y);
+            require(is_knot, "a knot of sigma", knot, "must have 0 to 1")?;
         }
-        let is_in_order = |pair: &&[(f64, f64)]| {
+        for pair in self.knots.windows(2) {
             let ((x0, y0), (x1, y1)) = (pair[0], pair[1]);
-            x1 >= x0 - ROUNDING * (1.0 + x0.abs()) && y1 <= y0 + ROUNDING
-        };
-        match self.knots.windows(2).find(|pair| !is_in_order(pair)) {
-            Some(pair) => Err(format!(
-                "sigma has the knots {pair:?} one after the other, x must rise and values fall"
-            )),
-            None => Ok(()),
+            let is_in_order = x1 >= x0 - ROUNDING * (1.0 + x0.abs()) && y1 <= y0 + ROUNDING;
+            let rule = "x must rise and values fall";
+            require(is_in_order, "two knots of sigma", pair, rule)?;
         }
+        Ok(())
     }
 
     /// Value at `x`; 0.5 for a function without knots, 0 if `x` is NaN.

@@ -7,6 +7,7 @@
 mod fit;
 mod isotonic;
 
+use protocol::config::{FieldError, within};
 use serde::{Deserialize, Serialize};
 
 pub use fit::{BAD_M, FitError, FitReport, Labelled, check_good_loss, observed};
@@ -73,24 +74,13 @@ impl ConfidenceModel {
     /// Checks values from a file against the bounds of a fit.
     ///
     /// # Errors
-    /// Field and value that are wrong.
-    pub fn check(&self) -> Result<(), String> {
-        if self.bias.is_nan() || self.bias.abs() > MAX_WEIGHT {
-            return Err(format!("bias is {:?}, must be -1e9 to 1e9", self.bias));
+    /// [`FieldError`] of the first field that is wrong.
+    pub fn check(&self) -> Result<(), FieldError> {
+        within("bias", self.bias, -MAX_WEIGHT, MAX_WEIGHT)?;
+        for &weight in &self.weights {
+            within("a weight", weight, 0.0, MAX_WEIGHT)?;
         }
-        if let Some(weight) = self
-            .weights
-            .iter()
-            .find(|weight| !(0.0..=MAX_WEIGHT).contains(*weight))
-        {
-            return Err(format!("a weight is {weight:?}, must be 0 to 1e9"));
-        }
-        if !(0.0..=1.0).contains(&self.reject_below) {
-            return Err(format!(
-                "reject_below is {}, must be 0 to 1",
-                self.reject_below
-            ));
-        }
+        within("reject_below", self.reject_below, 0.0, 1.0)?;
         self.sigma.check()
     }
 
@@ -195,8 +185,9 @@ mod tests {
     fn values_that_no_fit_has_are_rejected_by_name() {
         let example = ConfidenceModel::example;
         assert_eq!(example().check(), Ok(()));
-        let refused =
-            |model: ConfidenceModel, field: &str| model.check().unwrap_err().contains(field);
+        let refused = |model: ConfidenceModel, field: &str| {
+            model.check().unwrap_err().to_string().contains(field)
+        };
         let mut weights = [0.3; FEATURES];
         weights[3] = 1e308;
         assert!(refused(
