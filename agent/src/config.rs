@@ -17,7 +17,7 @@ use localization::pose_source::PoseSourceConfig;
 use perception::compute_device::{ComputeDevice, NoCuda};
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
-use perception::weights::{Weights, WeightsError};
+use perception::weights::{FileError, Weights};
 
 /// Configuration of `agent run`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -102,8 +102,8 @@ impl ModelConfig {
     /// Reads the weights, to compute with as [`Self::inference`] says.
     ///
     /// # Errors
-    /// [`WeightsError`] names the file.
-    pub fn load(&self, inference: Inference) -> Result<Weights, WeightsError> {
+    /// [`FileError`] names the file.
+    pub fn load(&self, inference: Inference) -> Result<Weights, FileError> {
         Ok(Weights::load(&self.weights)?.with_precision(inference.precision))
     }
 

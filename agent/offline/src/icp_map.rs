@@ -3,6 +3,7 @@
 //! The baseline of pose generators: accurate if the start is near enough, but the point-cloud map has to be stored in
 //! the vehicle and a receiver has to give the start.
 
+use crate::Error;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -55,26 +56,15 @@ fn no_pose(reason: NoPoseReason) -> PoseEstimate {
     }
 }
 
-/// Error of building a point-cloud map.
-#[derive(Debug, thiserror::Error)]
-pub enum MapError {
-    /// A scene is not readable.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// None of the sweeps has a pose.
-    #[error("{}: no sweep has a true pose to put it on the map with", .0.display())]
-    NoPoses(PathBuf),
-}
-
 /// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path.
 ///
 /// # Errors
-/// [`MapError`] names the file.
+/// [`Error`] names the file.
 pub fn read_map(
     folders: &[impl AsRef<Path>],
     spacing_m: f64,
     config: &IcpConfig,
-) -> Result<IcpTarget, MapError> {
+) -> Result<IcpTarget, Error> {
     let mut map = IcpTarget::new(config);
     for folder in folders {
         let mut sweeps = 0;
@@ -113,7 +103,10 @@ pub fn read_map(
             }
         }
         if sweeps == 0 {
-            return Err(MapError::NoPoses(folder.as_ref().to_owned()));
+            let folder = folder.as_ref().display();
+            return Err(Error::Input(format!(
+                "{folder}: no sweep has a true pose to put it on the map with"
+            )));
         }
     }
     map.fit();

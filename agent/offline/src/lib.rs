@@ -26,8 +26,11 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+mod error;
 pub mod evaluation;
 pub mod icp_map;
 pub mod mapping;
 pub mod sweep_database;
 pub mod training;
+
+pub use error::Error;

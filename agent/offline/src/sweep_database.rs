@@ -1,36 +1,23 @@
 //! Database of sweeps for retrieval, from drives with true poses.
 
+use crate::Error;
 use std::path::{Path, PathBuf};
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use localization::baselines::{DescribedSweep, SweepDatabase};
 use localization::pgc::{Localizer, LocalizerError, stopwatch};
 
-/// Error of building a database of sweeps.
-#[derive(Debug, thiserror::Error)]
-pub enum DatabaseError {
-    /// A scene is not readable.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// The encoder failed.
-    #[error(transparent)]
-    Localizer(#[from] LocalizerError),
-    /// None of the sweeps has a pose and cells.
-    #[error("{0:?}: no sweep with a true pose to retrieve")]
-    NoSweeps(Vec<PathBuf>),
-}
-
 /// Describes every sweep of the drives; `progress` gets the number of sweeps done and of all. Sweeps that cannot be
 /// read or have no pose are left out and counted in `left_out`.
 ///
 /// # Errors
-/// [`DatabaseError`] names the file.
+/// [`Error`] names the file.
 pub fn read_database(
     folders: &[impl AsRef<Path>],
     localizer: &Localizer,
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
-) -> Result<SweepDatabase, DatabaseError> {
+) -> Result<SweepDatabase, Error> {
     let datasets = folders
         .iter()
         .map(|folder| dataset::open(folder.as_ref()))
@@ -57,7 +44,7 @@ pub fn read_database(
                 }
                 match described(scenario, agent, tick, localizer) {
                     Ok(sweep) => sweeps.extend(sweep),
-                    Err(DatabaseError::Read(error)) => {
+                    Err(Error::Read(error)) => {
                         left_out.add_unreadable(agent, Problem::from(&error))
                     }
                     Err(error) => return Err(error),
@@ -71,7 +58,7 @@ pub fn read_database(
             .map(|folder| folder.as_ref().to_owned())
             .collect()
     };
-    SweepDatabase::new(&sweeps).ok_or_else(|| DatabaseError::NoSweeps(folders()))
+    SweepDatabase::new(&sweeps).ok_or_else(|| Error::NoSweeps(folders()))
 }
 
 /// Features and pose of a sweep; `None` for a sweep without cells.
@@ -80,7 +67,7 @@ fn described(
     agent: usize,
     tick: usize,
     localizer: &Localizer,
-) -> Result<Option<DescribedSweep>, DatabaseError> {
+) -> Result<Option<DescribedSweep>, Error> {
     let frame = scenario.load(agent, tick, &LoadOptions::default())?;
     let Some(pose) = frame.world_from_lidar else {
         let path = scenario.points_path(agent, tick, None)?;

@@ -15,7 +15,7 @@ use perception::model_config::{ConfigError, DetectorConfig, YAxis};
 use perception::pillars::batch::PillarBatch;
 use perception::pillars::point_pillars::PointPillars;
 use perception::train::ComputePrecision;
-use perception::weights::{CONFIG_KEY, METHOD_KEY, Weights, WeightsError};
+use perception::weights::{CONFIG_KEY, FileError, METHOD_KEY, Weights};
 use protocol::config::require;
 use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
@@ -41,7 +41,7 @@ pub enum ModelError {
     Config(#[from] ConfigError),
     /// The weights do not fit.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The weights name a method that is not known.
     #[error(transparent)]
     Method(#[from] UnknownMethod),

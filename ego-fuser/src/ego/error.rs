@@ -1,7 +1,7 @@
 //! Errors of the ego's pipeline.
 
 use perception::detector::DetectorError;
-use perception::weights::WeightsError;
+use perception::weights::FileError;
 use protocol::BevGrid;
 use tch::TchError;
 
@@ -14,7 +14,7 @@ use fusion::warp::WarpError;
 pub enum EgoError {
     /// The weights are not readable.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),

@@ -16,7 +16,7 @@ use std::sync::Arc;
 use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario};
 use perception::detector::{Detector, DetectorError};
 use perception::train::{Prefetch, TrainingError};
-use perception::weights::{Weights, WeightsError};
+use perception::weights::{FileError, Weights};
 use protocol::message::Bev;
 use protocol::text::hex;
 use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
@@ -53,7 +53,7 @@ pub enum FeatureStoreError {
     Read(#[from] ReadError),
     /// The encoder's weights cannot be used.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The encoder reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),

@@ -4,7 +4,7 @@
 //!   that come with the programs.
 //! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size, atomic writes,
-//!   CSV, SHA-256 of whole files.
+//!   CSV, SHA-256 of whole files; errors name the file ([`file_error`]).
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`provenance`]: the command, programs and digests that a result was made from.
 //! - [`rounding`]: floats to integers; [`sampling`]: parts of lists.
@@ -37,6 +37,7 @@ pub mod cli;
 pub mod command_line;
 pub mod csv_file;
 pub mod file_digests;
+pub mod file_error;
 mod list_values;
 pub mod nanos;
 pub mod output;

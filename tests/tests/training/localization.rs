@@ -3,10 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use agent_offline::Error;
 use agent_offline::training::{
-    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderTrainConfig, LocalizerTrainError,
-    RedundancyConfig, SceneReport, SceneTrainConfig, SgLocReport, SgLocTrainConfig,
-    SweepAugmentation, train_diffloc, train_encoder, train_scene, train_sgloc,
+    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderTrainConfig, RedundancyConfig,
+    SceneReport, SceneTrainConfig, SgLocReport, SgLocTrainConfig, SweepAugmentation, train_diffloc,
+    train_encoder, train_scene, train_sgloc,
 };
 use dataset::{self, LoadOptions};
 use localization::baselines::diffloc::{DiffLocConfig, RangeImageConfig};
@@ -390,7 +391,7 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     assert!(
         matches!(
             error,
-            LocalizerTrainError::Training(TrainingError::OtherTraining { field: "seed", .. })
+            Error::Training(TrainingError::OtherTraining { field: "seed", .. })
         ),
         "{error}"
     );

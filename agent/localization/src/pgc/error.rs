@@ -5,14 +5,14 @@ use tch::TchError;
 
 use perception::detector::DetectorError;
 use perception::torch_error::first_line;
-use perception::weights::WeightsError;
+use perception::weights::FileError;
 
 /// Error of loading a localizer or of localizing a sweep.
 #[derive(Debug, thiserror::Error)]
 pub enum LocalizerError {
     /// The weights are not readable or made for another model.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// A setting does not describe a network.
     #[error("localizer: {0}")]
     Setting(#[from] FieldError),

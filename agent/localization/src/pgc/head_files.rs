@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use perception::weights::{Weights, WeightsError};
+use perception::weights::{FileError, Weights};
 use support::shared_files;
 
 use super::{CellEncoder, SceneHead, SceneHeadConfig};
@@ -17,35 +17,11 @@ const TRAINED_FILE: &str = "weights.safetensors";
 /// Folders of released weights from the working directory.
 const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 
-/// Reasons why no file is chosen.
-#[derive(Debug, thiserror::Error)]
-pub enum HeadFileError {
-    /// There is no such file, and no such released head.
-    #[error("{}: no such file or released head; released are {}", head.display(), released.join(", "))]
-    NoHead {
-        /// The request.
-        head: PathBuf,
-        /// Names of the released heads.
-        released: Vec<String>,
-    },
-    /// No encoder belongs to the head.
-    #[error("{}: its encoder (SHA-256 {sha256}) is neither beside it nor among the released weights: --encoder FILE", head.display())]
-    NoEncoder {
-        /// The head.
-        head: PathBuf,
-        /// Digest in the head's metadata.
-        sha256: String,
-    },
-    /// A file cannot be read.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-}
-
 /// The file of a head: a path, the folder of a training, or the name of a released one (`town1` or `pgc-town1`).
 ///
 /// # Errors
-/// [`HeadFileError::NoHead`] with the names of the released heads.
-pub fn head_file(head: &Path) -> Result<PathBuf, HeadFileError> {
+/// [`FileError`] with the names of the released heads.
+pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
     if head.is_file() {
         return Ok(head.to_owned());
     }
@@ -68,9 +44,11 @@ pub fn head_file(head: &Path) -> Result<PathBuf, HeadFileError> {
     };
     files
         .find(|file| file.is_file())
-        .ok_or_else(|| HeadFileError::NoHead {
-            head: head.to_owned(),
-            released: released(),
+        .ok_or_else(|| {
+            let released: Vec<String> = released();
+            let released = released.join(", ");
+            let problem = format_args!("no such file or released head; released are {released}");
+            FileError::new(head, problem)
         })
 }
 
@@ -78,17 +56,19 @@ pub fn head_file(head: &Path) -> Result<PathBuf, HeadFileError> {
 /// released; without one `pgc-encoder.safetensors` beside it.
 ///
 /// # Errors
-/// [`HeadFileError`] when there is none, or the head cannot be read.
-pub fn encoder_of(head: &Path) -> Result<PathBuf, HeadFileError> {
+/// [`FileError`] when there is none, or the head cannot be read.
+pub fn encoder_of(head: &Path) -> Result<PathBuf, FileError> {
     let beside = Some(head.with_file_name(ENCODER_FILE)).filter(|file| file.is_file());
     match (named_encoder(head), beside) {
         (Ok(Ok(found)), _) => Ok(found),
         // The digests are compared, and an unreadable head is reported, when both are opened.
         (_, Some(beside)) => Ok(beside),
-        (Ok(Err(sha256)), None) => Err(HeadFileError::NoEncoder {
-            head: head.to_owned(),
-            sha256,
-        }),
+        (Ok(Err(sha256)), None) => {
+            let problem = format_args!(
+                "its encoder (SHA-256 {sha256}) is neither beside it nor among the released weights: --encoder FILE"
+            );
+            Err(FileError::new(head, problem))
+        }
         (Err(error), None) => Err(error),
     }
 }
@@ -97,7 +77,7 @@ pub fn encoder_of(head: &Path) -> Result<PathBuf, HeadFileError> {
 ///
 /// # Errors
 /// As [`encoder_of`].
-pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf, HeadFileError> {
+pub fn encoder_or_named(encoder: Option<&Path>, head: &Path) -> Result<PathBuf, FileError> {
     encoder.map_or_else(|| encoder_of(head), |given| Ok(given.to_owned()))
 }
 
@@ -108,7 +88,7 @@ pub fn is_name(head: &Path) -> bool {
 }
 
 /// The encoder that a head names, or its digest if no file has it.
-fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, HeadFileError> {
+fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, FileError> {
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
     let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;

@@ -30,7 +30,7 @@ pub(crate) use pose_table::CachedPose;
 pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
-use crate::pgc::head_files::{HeadFileError, encoder_or_named, head_file, is_name};
+use crate::pgc::head_files::{encoder_or_named, head_file, is_name};
 use crate::pgc::{LocalizerError, LocalizerInput};
 use crate::tracker::PoseMeasurement;
 
@@ -358,8 +358,8 @@ impl PoseSourceConfig {
     /// names where it has none.
     ///
     /// # Errors
-    /// [`HeadFileError`] when there is no such head, or no file is its encoder.
-    pub fn with_networks(mut self) -> Result<Self, HeadFileError> {
+    /// [`FileError`] when there is no such head, or no file is its encoder.
+    pub fn with_networks(mut self) -> Result<Self, FileError> {
         let networks = match &mut self {
             Self::Pgc(pgc) => Some((&mut pgc.encoder, &mut pgc.head)),
             Self::Tracked(tracked) => Some((&mut tracked.encoder, &mut tracked.head)),

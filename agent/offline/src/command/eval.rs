@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use agent_offline::Error;
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, IntegritySummary,
-    LocalizationSummary, evaluate, evaluate_source, reliability_charts, write_csv,
-    write_error_table,
+    Evaluated, EvaluatedSweep, EvaluationOptions, IntegritySummary, LocalizationSummary, evaluate,
+    evaluate_source, reliability_charts, write_csv, write_error_table,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use agent_offline::sweep_database::read_database;
@@ -358,7 +358,7 @@ impl Args {
         bar.finish_and_clear();
         match evaluated {
             Ok(evaluated) => Ok(evaluated),
-            Err(error @ EvaluationError::Localizer(_)) => Err(error.into()),
+            Err(error @ Error::Localizer(_)) => Err(error.into()),
             Err(error) => Err(BadInput::of(error).into()),
         }
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use agent_offline::mapping::{MapConfig, MapError, MapProgress, MapReport, make_map};
+use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
 use localization::pgc::head_files::{ENCODER_FILE, released_encoder};
@@ -217,7 +217,7 @@ fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
         report.coverage.cell_m,
         report.coverage.picture()
     ));
-    card.write(&config.run.out).map_err(MapError::from)?;
+    card.write(&config.run.out)?;
     let path = config.run.out.join(REPORT_FILE);
     let json = serde_json::to_string_pretty(report)? + "\n";
     support::atomic_file::write(&path, json.as_bytes()).with_context(|| path.display().to_string())

@@ -3,6 +3,7 @@
 mod summary;
 mod table;
 
+use crate::Error;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -32,32 +33,6 @@ pub struct EvaluationOptions {
     pub every: usize,
     /// Largest number of sweeps, evenly over all there are.
     pub sweeps: Option<usize>,
-}
-
-/// Error that ends an evaluation early.
-#[derive(Debug, thiserror::Error)]
-pub enum EvaluationError {
-    /// A dataset or a frame cannot be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// There is no sweep.
-    #[error("no sweep in {0:?}")]
-    Empty(Vec<PathBuf>),
-    /// A sweep has no pose to compare with.
-    #[error(
-        "{scenario}: {cav} at {stem}: there is no true pose to compare with (agent localize finds poses without)"
-    )]
-    NoTruth {
-        /// Name of the scenario.
-        scenario: String,
-        /// Vehicle.
-        cav: CavId,
-        /// Name of the frame.
-        stem: String,
-    },
-    /// The localizer failed.
-    #[error(transparent)]
-    Localizer(#[from] LocalizerError),
 }
 
 /// Result of one sweep.
@@ -134,13 +109,13 @@ struct Sweep<'a> {
 /// Localizes every sweep of the scenes in turn; `on_sweep` gets the number done and the number of all.
 ///
 /// # Errors
-/// [`EvaluationError`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot
+/// [`Error`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot
 /// be read are left out and counted.
 pub fn evaluate(
     localizer: &mut dyn Localize,
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
-) -> Result<Evaluated, EvaluationError> {
+) -> Result<Evaluated, Error> {
     evaluate_with(
         &mut |frame| localizer.localize(LocalizerInput::of(&frame.points)),
         options,
@@ -156,7 +131,7 @@ pub fn evaluate_source(
     source: &mut dyn PoseSource,
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
-) -> Result<Evaluated, EvaluationError> {
+) -> Result<Evaluated, Error> {
     let mut ask = |frame: &Frame| {
         let measured = frame.gnss_world_from_lidar();
         let Frame {
@@ -187,7 +162,7 @@ fn evaluate_with(
     localize: &mut dyn FnMut(&Frame) -> Result<Localization, LocalizerError>,
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
-) -> Result<Evaluated, EvaluationError> {
+) -> Result<Evaluated, Error> {
     let datasets = options
         .scenes
         .iter()
@@ -199,7 +174,7 @@ fn evaluate_with(
         .collect();
     let chosen = evenly_spread(&all, options.sweeps.unwrap_or(usize::MAX));
     if chosen.is_empty() {
-        return Err(EvaluationError::Empty(options.scenes.clone()));
+        return Err(Error::Input(format!("no sweep in {:?}", options.scenes)));
     }
     let load = LoadOptions {
         lidar_variant: options.variant.clone(),
@@ -234,11 +209,10 @@ fn evaluate_with(
         };
         let stem = scenario.ticks[tick].stem.clone();
         let Some(truth) = frame.world_from_lidar else {
-            return Err(EvaluationError::NoTruth {
-                scenario: scenario.name.clone(),
-                cav: frame.cav,
-                stem,
-            });
+            return Err(Error::Input(format!(
+                "{}: {} at {stem}: there is no true pose to compare with (agent localize finds poses without)",
+                scenario.name, frame.cav
+            )));
         };
         let localization = localize(&frame)?;
         let scenario = scenario.name.clone();
@@ -251,7 +225,7 @@ fn evaluate_with(
         });
     }
     if evaluated.sweeps.is_empty() {
-        return Err(EvaluationError::Empty(options.scenes.clone()));
+        return Err(Error::Input(format!("no sweep in {:?}", options.scenes)));
     }
     Ok(evaluated)
 }

@@ -17,18 +17,20 @@ pub use report::{HeldOutAccuracy, MapReport};
 
 use self::check::Check;
 use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
+use crate::Error;
 use crate::evaluation::LocalizationSummary;
 use crate::training::{
-    CELLS, FeatureCache, LocalizerTrainError, SceneReport, SceneSummary, SceneSweeps,
-    SceneTrainConfig, SweepAugmentation, SweepList, train_scene_on,
+    CELLS, FeatureCache, SceneReport, SceneSummary, SceneSweeps, SceneTrainConfig,
+    SweepAugmentation, SweepList, train_scene_on,
 };
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
 use localization::pgc::head_files::ENCODER_FILE;
-use localization::pgc::{CellEncoder, Localizer, LocalizerError};
+use localization::pgc::{CellEncoder, Localizer};
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
-use perception::train::{Length, RunConfig, TrainingError};
-use perception::weights::{WeightsError, annotate};
+use perception::train::{Length, RunConfig};
+use perception::weights::annotate;
+use support::file_error::AtFile;
 use support::sampling::evenly_spread;
 
 /// Sweeps that are encoded to measure their time.
@@ -68,79 +70,14 @@ pub enum MapProgress {
     At(f64, String),
 }
 
-/// Error that ends a map early.
-#[derive(Debug, thiserror::Error)]
-pub enum MapError {
-    /// No sweep has a pose.
-    #[error("{folders:?}: none of {sweeps} sweeps has a pose{}", first.as_ref().map(|first| format!("; first fault: {first}")).unwrap_or_default())]
-    NoPoses {
-        /// The drives.
-        folders: Vec<PathBuf>,
-        /// Number of sweeps.
-        sweeps: usize,
-        /// The first fault of a sweep.
-        first: Option<String>,
-    },
-    /// The features do not fit into the memory.
-    #[error("features of {sweeps} sweeps take {} MB, {} MB are free: --sweeps N uses fewer", needed >> 20, free >> 20)]
-    Memory {
-        /// Number of sweeps, copies included.
-        sweeps: usize,
-        /// Bytes needed.
-        needed: u64,
-        /// Bytes available.
-        free: u64,
-    },
-    /// The folder of the results holds no stopped map of these drives.
-    #[error("--resume: {}: {reason}", path.display())]
-    Resume {
-        /// The file.
-        path: PathBuf,
-        /// Description of the problem.
-        reason: String,
-    },
-    /// A training failed, or data cannot be read.
-    #[error(transparent)]
-    Training(#[from] LocalizerTrainError),
-    /// The head cannot be loaded or run.
-    #[error(transparent)]
-    Localizer(#[from] LocalizerError),
-    /// The head's file cannot be completed.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// The encoder cannot be copied beside the head.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
-}
-
-impl MapError {
-    /// True if the input is at fault.
-    #[must_use]
-    pub fn is_bad_input(&self) -> bool {
-        match self {
-            Self::NoPoses { .. } | Self::Memory { .. } | Self::Resume { .. } => true,
-            Self::Training(error) => matches!(
-                error,
-                LocalizerTrainError::Read(_) | LocalizerTrainError::NoSweeps(_)
-            ),
-            Self::Localizer(_) | Self::Weights(_) | Self::Io { .. } => false,
-        }
-    }
-}
-
 /// Trains and checks a head; writes weights, encoder, checkpoint and curve into `config.run.out`.
 ///
 /// # Errors
-/// [`MapError`]; a checkpoint may stay.
+/// [`Error`]; a checkpoint may stay.
 pub fn make_map(
     config: &MapConfig,
     observe: &mut dyn FnMut(MapProgress),
-) -> Result<MapReport, MapError> {
+) -> Result<MapReport, Error> {
     let mut map = Map {
         config,
         started: Instant::now(),
@@ -240,17 +177,19 @@ impl Map<'_> {
         (self.observe)(MapProgress::At(seconds, text));
     }
 
-    fn no_poses(&self, list: &SweepList) -> MapError {
+    fn no_poses(&self, list: &SweepList) -> Error {
         let first = list.data().problems.into_iter().next();
-        MapError::NoPoses {
-            folders: self.config.drives.clone(),
-            sweeps: list.len(),
-            first,
-        }
+        let first = first.map(|first| format!("; first fault: {first}"));
+        Error::Input(format!(
+            "{:?}: none of {} sweeps has a pose{}",
+            self.config.drives,
+            list.len(),
+            first.unwrap_or_default()
+        ))
     }
 
     /// Reads the poses and holds sweeps out.
-    fn survey(&mut self) -> Result<Sweeps, MapError> {
+    fn survey(&mut self) -> Result<Sweeps, Error> {
         let list = SweepList::open(&self.config.drives)?;
         self.at(format!("reading the poses of {} sweeps", list.len()));
         let positions: Vec<(usize, Option<Vector3<f64>>)> = list
@@ -295,7 +234,7 @@ impl Map<'_> {
     }
 
     /// Measures the time of a sweep, plans and announces; or takes the plan of the map that is resumed.
-    fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan, MapError> {
+    fn plan(&mut self, sweeps: &Sweeps) -> Result<Plan, Error> {
         let run = &self.config.run;
         let with_pose = sweeps.training.len() + sweeps.held_out.len();
         if run.resume {
@@ -335,8 +274,8 @@ impl Map<'_> {
         };
         FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress).map_err(|error| {
             match error {
-                LocalizerTrainError::NoSweeps(_) => self.no_poses(&probes),
-                error => error.into(),
+                Error::NoSweeps(_) => self.no_poses(&probes),
+                error => error,
             }
         })?;
         let all_s = began.elapsed().as_secs_f64();
@@ -349,11 +288,11 @@ impl Map<'_> {
         let encoded = plan.training * plan.copies;
         let needed = feature_bytes(encoded, encoder.format().cell_channels());
         if let Some(free) = too_little_memory(needed) {
-            return Err(MapError::Memory {
-                sweeps: encoded,
-                needed,
-                free,
-            });
+            return Err(Error::Input(format!(
+                "features of {encoded} sweeps take {} MB, {} MB are free: --sweeps N uses fewer",
+                needed >> 20,
+                free >> 20
+            )));
         }
         self.announce(sweeps, &plan, wanted);
         StoredPlan {
@@ -400,7 +339,7 @@ impl Map<'_> {
         &mut self,
         training: &Arc<SweepList>,
         plan: &Plan,
-    ) -> Result<(SceneSummary, RunConfig), MapError> {
+    ) -> Result<(SceneSummary, RunConfig), Error> {
         let left_s =
             (self.config.time.as_secs_f64() - self.seconds() - plan.after_training_s()).max(1.0);
         let run = RunConfig {
@@ -470,7 +409,7 @@ impl Map<'_> {
     }
 
     /// Copies the encoder beside the head, so that the folder is all that is needed.
-    fn copy_encoder(&self) -> Result<(), MapError> {
+    fn copy_encoder(&self) -> Result<(), Error> {
         let path = self.config.run.out.join(ENCODER_FILE);
         let is_there = path.canonicalize().ok() == self.config.encoder.canonicalize().ok();
         let copied = if is_there {
@@ -478,9 +417,8 @@ impl Map<'_> {
         } else {
             std::fs::copy(&self.config.encoder, &path)
         };
-        copied
-            .map(|_| ())
-            .map_err(|source| MapError::Io { path, source })
+        copied.at(&path)?;
+        Ok(())
     }
 
     /// Searches the scales of activations; their number.
@@ -489,7 +427,7 @@ impl Map<'_> {
         weights: &Path,
         training: &SweepList,
         sweeps: usize,
-    ) -> Result<usize, MapError> {
+    ) -> Result<usize, Error> {
         self.at("scales for 8-bit inference".to_owned());
         let localizer =
             Localizer::load_without_confidence(&self.config.encoder, weights, Inference::FLOAT)?;
@@ -508,7 +446,7 @@ impl Map<'_> {
         Ok(scales.len())
     }
 
-    fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, MapError> {
+    fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, Error> {
         let mut localizer = Localizer::load_without_confidence(
             &self.config.encoder,
             weights,
@@ -535,7 +473,7 @@ impl Map<'_> {
         &mut self,
         weights: &Path,
         checked: &mut Check,
-    ) -> Result<(Option<FitReport>, Option<String>), MapError> {
+    ) -> Result<(Option<FitReport>, Option<String>), Error> {
         match ConfidenceModel::fit(&checked.labelled, GOOD_LOSS) {
             Ok((model, report)) => {
                 let text = serde_json::to_string(&model).expect("a model is numbers");
@@ -552,11 +490,5 @@ impl Map<'_> {
                 Ok((None, None))
             }
         }
-    }
-}
-
-impl From<TrainingError> for MapError {
-    fn from(error: TrainingError) -> Self {
-        Self::Training(error.into())
     }
 }

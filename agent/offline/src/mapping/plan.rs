@@ -6,9 +6,10 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 
-use super::MapError;
 use super::check::LEAST_CHECKED;
+use crate::Error;
 use crate::training::CELLS;
+use support::file_error::AtFile;
 
 /// Largest share of the time before the check that is spent on encoding.
 const ENCODING_SHARE: f64 = 0.5;
@@ -105,30 +106,34 @@ impl StoredPlan {
     /// Name of the file.
     const FILE: &str = "plan.json";
 
-    pub(super) fn write(&self, out: &Path) -> Result<(), MapError> {
+    pub(super) fn write(&self, out: &Path) -> Result<(), Error> {
         let path = out.join(Self::FILE);
         let text = serde_json::to_string(self).expect("a plan is numbers");
         let written =
             fs::create_dir_all(out).and_then(|()| atomic_file::write(&path, text.as_bytes()));
-        written.map_err(|source| MapError::Io { path, source })
+        Ok(written.at(&path)?)
     }
 
     /// The plan of a stopped map of `sweeps` sweeps.
-    pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, MapError> {
+    pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, Error> {
         let path = out.join(Self::FILE);
-        let wrong = |reason: String| MapError::Resume {
-            path: path.clone(),
-            reason,
-        };
-        let text = fs::read_to_string(&path).map_err(|error| wrong(error.to_string()))?;
-        let stored: Self = serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?;
-        if stored.sweeps != sweeps {
-            return Err(wrong(format!(
-                "the stopped map was of {} sweeps, the drives have {sweeps}",
-                stored.sweeps
-            )));
+        let text = fs::read_to_string(&path).map_err(|error| error.to_string());
+        let stored = text.and_then(|text| {
+            serde_json::from_str::<Self>(&text).map_err(|error| error.to_string())
+        });
+        let stored = stored.and_then(|stored| match stored.sweeps {
+            before if before == sweeps => Ok(stored),
+            before => Err(format!(
+                "the stopped map was of {before} sweeps, the drives have {sweeps}"
+            )),
+        });
+        match stored {
+            Ok(stored) => Ok(stored.plan),
+            Err(reason) => Err(Error::Input(format!(
+                "--resume: {}: {reason}",
+                path.display()
+            ))),
         }
-        Ok(stored.plan)
     }
 }
 

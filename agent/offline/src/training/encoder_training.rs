@@ -11,9 +11,9 @@ use tch::nn::VarStore;
 use tch::{Device, no_grad};
 
 use super::contrast::{Contrast, ContrastLoss};
-use super::error::LocalizerTrainError;
 use super::pairs::{Pair, PairMaker};
 use super::sweep_store::SweepStore;
+use crate::Error;
 use localization::pgc::{SceneEncoder, SceneEncoderConfig};
 use perception::train::{Curve, DataListing, Prefetch, RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
@@ -83,11 +83,11 @@ pub struct EncoderSummary {
 /// Trains an encoder; writes checkpoint, curve and weights into `config.run.out`.
 ///
 /// # Errors
-/// [`LocalizerTrainError`]; the last checkpoint stays.
+/// [`Error`]; the last checkpoint stays.
 pub fn train_encoder(
     config: &EncoderTrainConfig,
     observe: &mut dyn FnMut(&EncoderReport),
-) -> Result<EncoderSummary, LocalizerTrainError> {
+) -> Result<EncoderSummary, Error> {
     let mut training = Training::prepare(config, observe)?;
     let maker = training.maker.clone();
     let batch = config.run.batch as u64;
@@ -135,7 +135,7 @@ impl<'a> Training<'a> {
     fn prepare(
         config: &'a EncoderTrainConfig,
         observe: &mut dyn FnMut(&EncoderReport),
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let run = &config.run;
         run.start()?;
         let variables = VarStore::new(run.device);
@@ -147,7 +147,7 @@ impl<'a> Training<'a> {
         let mut maker = |folders: &[PathBuf], seed| {
             let store = Arc::new(SweepStore::read(folders, config.encoder.range_m)?);
             observe(&EncoderReport::Read(store.data.clone()));
-            Ok::<_, LocalizerTrainError>((
+            Ok::<_, Error>((
                 PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?,
                 store,
             ))
@@ -186,7 +186,7 @@ impl<'a> Training<'a> {
             .loss(&self.encoder, pairs, precision.kind(), device)
     }
 
-    fn step(&mut self, pairs: &[Pair], window: &mut Window) -> Result<(), LocalizerTrainError> {
+    fn step(&mut self, pairs: &[Pair], window: &mut Window) -> Result<(), Error> {
         let loss = self.loss(pairs)?;
         if self.trainer.step(&loss.total, self.share_done())? {
             window.add(&loss)?;
@@ -195,7 +195,7 @@ impl<'a> Training<'a> {
     }
 
     /// Report of the steps of `window`, also appended to the curve.
-    fn report(&mut self, window: Window) -> Result<EncoderReport, LocalizerTrainError> {
+    fn report(&mut self, window: Window) -> Result<EncoderReport, Error> {
         let (loss, accuracy) = window.means();
         let (step, seconds) = (self.trainer.steps(), self.trainer.seconds());
         self.curve
@@ -210,7 +210,7 @@ impl<'a> Training<'a> {
         })
     }
 
-    fn validate(&mut self) -> Result<Option<EncoderAccuracy>, LocalizerTrainError> {
+    fn validate(&mut self) -> Result<Option<EncoderAccuracy>, Error> {
         let Some(maker) = &self.validation else {
             return Ok(None);
         };
@@ -224,7 +224,7 @@ impl<'a> Training<'a> {
         Ok(self.accuracy)
     }
 
-    fn finish(self) -> Result<EncoderSummary, LocalizerTrainError> {
+    fn finish(self) -> Result<EncoderSummary, Error> {
         // Only the encoder is saved, under the names it is loaded by.
         let encoder = VarStore::new(Device::Cpu);
         SceneEncoder::new(&encoder.root(), &self.config.encoder)?;

@@ -8,9 +8,9 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
-use super::error::LocalizerTrainError;
 use super::sweep_store::{SweepList, yaw};
 use super::turned_sweep::{CELLS, TurnedSweep};
+use crate::Error;
 use localization::pgc::{Cell, CellEncoder, PreparedSweep};
 use perception::train::{Prefetch, RunConfig};
 
@@ -54,14 +54,14 @@ impl FeatureCache {
     /// number of sweeps done and of all.
     ///
     /// # Errors
-    /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.
+    /// [`Error`] when a sweep cannot be read or encoded, or none has a pose.
     pub(crate) fn build(
         list: &Arc<SweepList>,
         encoder: &CellEncoder,
         augmentation: SweepAugmentation,
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let RunConfig {
             seed,
             loader_threads,
@@ -167,7 +167,7 @@ impl Builder {
         encoder: &CellEncoder,
         kind: Kind,
         device: Device,
-    ) -> Result<(), LocalizerTrainError> {
+    ) -> Result<(), Error> {
         let sweeps: Vec<&PreparedSweep> = batch.iter().map(|turned| &turned.sweep).collect();
         let encoded = encoder.encode(&sweeps, kind)?;
         let mut rows = Vec::new();
@@ -191,9 +191,9 @@ impl Builder {
         Ok(())
     }
 
-    fn finish(self, device: Device) -> Result<FeatureCache, LocalizerTrainError> {
+    fn finish(self, device: Device) -> Result<FeatureCache, Error> {
         if self.poses.is_empty() || self.places.is_empty() {
-            return Err(LocalizerTrainError::NoSweeps(Vec::new()));
+            return Err(Error::NoSweeps(Vec::new()));
         }
         let count = self.poses.len() as f64;
         let origin_m: [f64; 3] = std::array::from_fn(|axis| {

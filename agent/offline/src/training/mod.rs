@@ -4,7 +4,6 @@
 mod contrast;
 mod diffloc_training;
 mod encoder_training;
-mod error;
 mod feature_cache;
 mod hypliloc_training;
 mod kmeans;
@@ -23,7 +22,6 @@ pub use diffloc_training::{
 pub use encoder_training::{
     EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder,
 };
-pub use error::LocalizerTrainError;
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
 pub use hypliloc_training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};

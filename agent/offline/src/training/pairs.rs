@@ -9,8 +9,8 @@ use rand::seq::{IndexedRandom, SliceRandom};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::error::LocalizerTrainError;
 use super::sweep_store::{SweepStore, heading_rad, yaw};
+use crate::Error;
 use localization::pgc::{Cell, SceneEncoderConfig, SweepVoxels};
 
 /// Largest distance of the sensors of a pair in the plane, metres.
@@ -69,12 +69,12 @@ impl PairMaker {
     /// Finds the overlapping sweeps of each sweep.
     ///
     /// # Errors
-    /// [`LocalizerTrainError::NoPairs`] when no two sweeps overlap.
+    /// [`Error::NoPairs`] when no two sweeps overlap.
     pub(crate) fn new(
         store: Arc<SweepStore>,
         config: SceneEncoderConfig,
         seed: u64,
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let partners = partners(&store);
         let anchors: Vec<u32> = (0..)
             .zip(&partners)
@@ -82,7 +82,9 @@ impl PairMaker {
             .map(|(index, _)| index)
             .collect();
         if anchors.is_empty() {
-            return Err(LocalizerTrainError::NoPairs(PAIR_RANGE_M));
+            return Err(Error::Input(format!(
+                "no two sweeps of one world within {PAIR_RANGE_M} m of each other"
+            )));
         }
         Ok(Self {
             store,
@@ -102,9 +104,9 @@ impl PairMaker {
     /// Pair `number`.
     ///
     /// # Errors
-    /// [`LocalizerTrainError::NoMatches`] when neighbouring sweeps have no matching cells, for example because they are
+    /// [`Error::NoMatches`] when neighbouring sweeps have no matching cells, for example because they are
     /// empty.
-    pub(crate) fn pair(&self, number: u64) -> Result<Pair, LocalizerTrainError> {
+    pub(crate) fn pair(&self, number: u64) -> Result<Pair, Error> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(number);
         for _ in 0..TRIES {
@@ -120,7 +122,9 @@ impl PairMaker {
                 return Ok(pair);
             }
         }
-        Err(LocalizerTrainError::NoMatches(TRIES))
+        Err(Error::Input(format!(
+            "{TRIES} pairs of sweeps side by side have no cell at the same spot: are the sweeps empty?"
+        )))
     }
 
     fn build(&self, anchor: usize, partner: usize, rng: &mut ChaCha8Rng) -> Pair {

@@ -4,8 +4,8 @@ use serde::Serialize;
 use support::statistics;
 use tch::{Kind, Tensor, no_grad};
 
-use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
+use crate::Error;
 use localization::pgc::SceneCoordinates;
 use localization::pgc::extensions::wider_search;
 use localization::pgc::pose_refinement::SweepCells;
@@ -37,7 +37,7 @@ pub(super) fn validate(
     head: &SceneHead,
     cache: &FeatureCache,
     kind: Kind,
-) -> Result<SceneAccuracy, LocalizerTrainError> {
+) -> Result<SceneAccuracy, Error> {
     let regression = no_grad(|| {
         let logits = head
             .classify(&cache.sweeps, false)?

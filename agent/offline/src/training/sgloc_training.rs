@@ -10,8 +10,8 @@ use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
-use super::error::LocalizerTrainError;
 use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
+use crate::Error;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
 use perception::train::{RunConfig, Trained, Trainer};
@@ -58,11 +58,11 @@ pub enum SgLocReport {
 /// Trains a head; writes checkpoint and weights into `config.run.out`.
 ///
 /// # Errors
-/// [`LocalizerTrainError`].
+/// [`Error`].
 pub fn train_sgloc(
     config: &SgLocTrainConfig,
     observe: &mut dyn FnMut(&SgLocReport),
-) -> Result<Trained, LocalizerTrainError> {
+) -> Result<Trained, Error> {
     let started = Instant::now();
     let run = &config.run;
     run.start()?;
@@ -173,7 +173,7 @@ fn adopt_encoder(
     variables: &VarStore,
     path: &Path,
     config: &SceneEncoderConfig,
-) -> Result<(), LocalizerTrainError> {
+) -> Result<(), Error> {
     let stored = VarStore::new(variables.device());
     SceneEncoder::new(&stored.root(), config)?;
     Weights::load(path)

@@ -9,7 +9,7 @@ use dataset::{self, LoadOptions, ReadError, Scenario};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
 
-use super::error::LocalizerTrainError;
+use crate::Error;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 use perception::train::{DataListing, Prefetch};
 use support::file_digests::FileDigests;
@@ -125,8 +125,8 @@ impl SweepList {
     /// Lists every sweep of every agent.
     ///
     /// # Errors
-    /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep.
-    pub(crate) fn open(folders: &[PathBuf]) -> Result<Self, LocalizerTrainError> {
+    /// [`Error`] when a folder cannot be read or holds no sweep.
+    pub(crate) fn open(folders: &[PathBuf]) -> Result<Self, Error> {
         let (mut places, mut scenarios, mut problems) = (Vec::new(), Vec::new(), Vec::new());
         let mut drive = 0;
         for (world, folder) in folders.iter().enumerate() {
@@ -150,7 +150,7 @@ impl SweepList {
             }
         }
         if places.is_empty() {
-            return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
+            return Err(Error::NoSweeps(folders.to_vec()));
         }
         let sha256 = dataset::content_sha256(
             scenarios.iter().map(AsRef::as_ref),
@@ -332,8 +332,8 @@ impl SweepStore {
     /// Reads every sweep that has a pose.
     ///
     /// # Errors
-    /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep with a pose.
-    pub(crate) fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, LocalizerTrainError> {
+    /// [`Error`] when a folder cannot be read or holds no sweep with a pose.
+    pub(crate) fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, Error> {
         let list = Arc::new(SweepList::open(folders)?);
         let count = list.len();
         let source = Arc::clone(&list);
@@ -348,7 +348,7 @@ impl SweepStore {
             sweeps.extend(reader.next_batch()?);
         }
         match sweeps.is_empty() {
-            true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),
+            true => Err(Error::NoSweeps(folders.to_vec())),
             false => Ok(Self {
                 sweeps,
                 data: list.data(),
@@ -396,6 +396,6 @@ mod tests {
         assert_eq!((alone.sweeps.len(), alone.data.left_out()), (2, None));
         assert_ne!(alone.data.sha256, store.data.sha256);
         let error = SweepStore::read(&[unknown], 50.0).unwrap_err();
-        assert!(matches!(error, LocalizerTrainError::NoSweeps(_)), "{error}");
+        assert!(matches!(error, Error::NoSweeps(_)), "{error}");
     }
 }

@@ -5,14 +5,14 @@ use tch::TchError;
 use crate::boxes::decode::DecodeError;
 use crate::model_config::ConfigError;
 use crate::torch_error::first_line;
-use crate::weights::WeightsError;
+use crate::weights::FileError;
 
 /// Error of loading a detector or of running it.
 #[derive(Debug, thiserror::Error)]
 pub enum DetectorError {
     /// The weights are not readable or made for another model.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The configuration does not describe a network.
     #[error(transparent)]
     Config(#[from] ConfigError),

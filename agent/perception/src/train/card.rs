@@ -4,8 +4,8 @@ use std::fmt::{Display, Write};
 use std::path::Path;
 
 use serde::Serialize;
+use support::file_error::{AtFile, FileError};
 
-use super::error::TrainingError;
 use super::run_config::RunConfig;
 use super::trainer::Trained;
 
@@ -69,9 +69,9 @@ impl ModelCard {
     /// Writes it into the folder of the weights.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when the file cannot be written.
-    pub fn write(&self, out: &Path) -> Result<(), TrainingError> {
+    /// [`FileError`] when the file cannot be written.
+    pub fn write(&self, out: &Path) -> Result<(), FileError> {
         let path = out.join("model-card.md");
-        std::fs::write(&path, &self.text).map_err(|source| TrainingError::Io { path, source })
+        std::fs::write(&path, &self.text).at(&path)
     }
 }

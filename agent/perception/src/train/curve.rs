@@ -5,8 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use support::atomic_file;
-
-use super::error::TrainingError;
+use support::file_error::{AtFile, FileError};
 
 /// Appends rows that begin with the step; every row is on disk when the call returns.
 #[derive(Debug)]
@@ -20,18 +19,14 @@ impl Curve {
     /// be repeated.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when the file cannot be read or written.
-    pub fn open(path: &Path, header: &str, checkpoint: Option<u64>) -> Result<Self, TrainingError> {
-        let io = |source| TrainingError::Io {
-            path: path.to_owned(),
-            source,
-        };
+    /// [`FileError`] when the file cannot be read or written.
+    pub fn open(path: &Path, header: &str, checkpoint: Option<u64>) -> Result<Self, FileError> {
         let kept = match checkpoint {
-            Some(step) if path.exists() => rows_until(&fs::read_to_string(path).map_err(io)?, step),
+            Some(step) if path.exists() => rows_until(&fs::read_to_string(path).at(path)?, step),
             _ => format!("{header}\n"),
         };
-        atomic_file::write(path, kept).map_err(io)?;
-        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
+        atomic_file::write(path, kept).at(path)?;
+        let file = OpenOptions::new().append(true).open(path).at(path)?;
         Ok(Self {
             path: path.to_owned(),
             file,
@@ -47,19 +42,16 @@ impl Curve {
     /// Appends a row of formatted cells.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when the file cannot be written.
-    pub fn row(&mut self, row: &str) -> Result<(), TrainingError> {
-        writeln!(self.file, "{row}").map_err(|source| TrainingError::Io {
-            path: self.path.clone(),
-            source,
-        })
+    /// [`FileError`] when the file cannot be written.
+    pub fn row(&mut self, row: &str) -> Result<(), FileError> {
+        writeln!(self.file, "{row}").at(&self.path)
     }
 
     /// Appends a row of numbers.
     ///
     /// # Errors
     /// As [`Self::row`].
-    pub fn numbers(&mut self, values: &[f64]) -> Result<(), TrainingError> {
+    pub fn numbers(&mut self, values: &[f64]) -> Result<(), FileError> {
         let cells: Vec<String> = values.iter().map(|value| format!("{value:.5}")).collect();
         self.row(&cells.join(","))
     }

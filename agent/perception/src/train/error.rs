@@ -1,14 +1,10 @@
 //! Errors that end any training early.
 
-use std::io;
-use std::path::PathBuf;
-
 use support::cli::Interrupted;
+use support::file_error::FileError;
 use tch::TchError;
 
-use super::checkpoint::CheckpointError;
 use crate::torch_error::first_line;
-use crate::weights::WeightsError;
 
 /// Error that ends a training early.
 #[derive(Debug, thiserror::Error)]
@@ -16,9 +12,9 @@ pub enum TrainingError {
     /// Ended on request after so many steps; the checkpoint is written.
     #[error("stopped at step {0}; --resume goes on")]
     Interrupted(u64, #[source] Interrupted),
-    /// The checkpoint cannot be written or restored.
+    /// A file cannot be read, written or used.
     #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
+    File(#[from] FileError),
     /// The checkpoint is of another training.
     #[error("the checkpoint was made with {field} {found}, not {asked}")]
     OtherTraining {
@@ -35,17 +31,6 @@ pub enum TrainingError {
     /// A thread that prepares batches has ended.
     #[error("a thread that prepares batches has ended early")]
     LoaderGone,
-    /// Weights cannot be written.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// A file cannot be read or written.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
     /// The tensor library failed.
     #[error("training: {}", first_line(.0))]
     Tensor(#[from] TchError),

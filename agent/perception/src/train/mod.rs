@@ -18,7 +18,6 @@ mod trainer;
 pub use adamw::{AdamW, AdamWConfig, Step};
 pub use bar::TrainingBar;
 pub use card::ModelCard;
-pub use checkpoint::CheckpointError;
 pub use curve::Curve;
 pub use data_listing::DataListing;
 pub use error::TrainingError;

@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use support::file_error::{AtFile, FileError};
 use tch::{Device, Kind};
 
 use super::adamw::AdamWConfig;
 use super::checkpoint::CHECKPOINT_FILE;
-use super::error::TrainingError;
 use super::interruption::Interruption;
 
 /// Configuration of a training run, for any network.
@@ -63,22 +63,17 @@ impl RunConfig {
     /// the checkpoint of an earlier training there, unless it is resumed.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when the folder cannot be created, or the checkpoint not removed.
-    pub fn start(&self) -> Result<(), TrainingError> {
+    /// [`FileError`] when the folder cannot be created, or the checkpoint not removed.
+    pub fn start(&self) -> Result<(), FileError> {
         tch::manual_seed(self.seed as i64);
-        std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io {
-            path: self.out.clone(),
-            source,
-        })?;
+        std::fs::create_dir_all(&self.out).at(&self.out)?;
         if self.resume {
             return Ok(());
         }
         // Of a training that is overwritten: --resume would go on with it if this one ended before its first checkpoint.
         let path = self.out.join(CHECKPOINT_FILE);
         match std::fs::remove_file(&path) {
-            Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
-                Err(TrainingError::Io { path, source })
-            }
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error).at(&path),
             _ => Ok(()),
         }
     }

@@ -7,6 +7,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use support::cli::Interrupted;
+use support::file_error::FileError;
 use tch::Tensor;
 use tch::nn::VarStore;
 
@@ -133,8 +134,8 @@ impl Trainer {
     /// Training curve, in `curve.csv` of the folder of the results.
     ///
     /// # Errors
-    /// [`TrainingError::Io`] when the file cannot be written.
-    pub fn curve(&self, header: &str) -> Result<Curve, TrainingError> {
+    /// [`FileError`] when the file cannot be written.
+    pub fn curve(&self, header: &str) -> Result<Curve, FileError> {
         let checkpoint = self.run.resume.then_some(self.progress.step);
         Curve::open(&self.run.out.join("curve.csv"), header, checkpoint)
     }
@@ -199,21 +200,21 @@ impl Trainer {
     /// Writes a checkpoint of `variables` with the state that is needed to resume.
     ///
     /// # Errors
-    /// [`TrainingError::Checkpoint`] when the file cannot be written.
-    pub fn checkpoint(&mut self, variables: &VarStore) -> Result<(), TrainingError> {
+    /// [`FileError`] when the file cannot be written.
+    pub fn checkpoint(&mut self, variables: &VarStore) -> Result<(), FileError> {
         self.progress.seconds = self.seconds();
-        Ok(checkpoint::save(
+        checkpoint::save(
             &checkpoint_path(&self.run),
             variables,
             &self.optimizer,
             &self.progress,
-        )?)
+        )
     }
 
     /// Ends the training if that was requested; writes a checkpoint before. To be called after each step.
     ///
     /// # Errors
-    /// [`TrainingError::Interrupted`], or [`TrainingError::Checkpoint`].
+    /// [`TrainingError::Interrupted`], or [`FileError`].
     pub fn check_interruption(&mut self, variables: &VarStore) -> Result<(), TrainingError> {
         if !self.steps.is_interrupted() {
             return Ok(());
@@ -225,13 +226,13 @@ impl Trainer {
     /// Writes the weights; their header contains `about`, their kind and training.
     ///
     /// # Errors
-    /// [`TrainingError::Weights`] when a parameter is not finite or the file cannot be written.
+    /// [`FileError`] when a parameter is not finite or the file cannot be written.
     pub fn save_weights(
         &self,
         variables: &VarStore,
         mut about: BTreeMap<String, String>,
         data: DataListing,
-    ) -> Result<Trained, TrainingError> {
+    ) -> Result<Trained, FileError> {
         about.insert("seed".to_owned(), self.run.seed.to_string());
         about.insert("steps".to_owned(), self.steps().to_string());
         about.insert("data_sha256".to_owned(), data.sha256.clone());

@@ -9,8 +9,9 @@ use safetensors::tensor::SafeTensors;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use support::atomic_file;
+use support::file_error::{AtFile, FileError};
 
-use super::error::WeightsError;
+use super::incomplete;
 
 /// Key of the header that contains the metadata.
 const METADATA: &str = "__metadata__";
@@ -19,25 +20,13 @@ const METADATA: &str = "__metadata__";
 /// SHA-256.
 ///
 /// # Errors
-/// [`WeightsError`] when the file is missing, not a complete safetensors file or not writable.
-pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, WeightsError> {
-    let io = |source| WeightsError::Io {
-        path: path.to_owned(),
-        source,
-    };
-    let old = fs::read(path).map_err(io)?;
-    let format = |source| WeightsError::Format {
-        path: path.to_owned(),
-        size: old.len(),
-        source,
-    };
-    SafeTensors::deserialize(&old).map_err(format)?;
-    let new = annotated(&old, key, text).map_err(|source| WeightsError::Metadata {
-        path: path.to_owned(),
-        key: key.to_owned(),
-        source,
-    })?;
-    atomic_file::write(path, &new).map_err(io)?;
+/// [`FileError`] when the file is missing, not a complete safetensors file or not writable.
+pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, FileError> {
+    let old = fs::read(path).at(path)?;
+    SafeTensors::deserialize(&old).map_err(|error| incomplete(path, old.len(), error))?;
+    let new = annotated(&old, key, text)
+        .map_err(|error| FileError::new(path, format_args!("metadata {key:?}: {error}")))?;
+    atomic_file::write(path, &new).at(path)?;
     Ok(hex(&Sha256::digest(&new)))
 }
 

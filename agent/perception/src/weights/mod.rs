@@ -4,27 +4,29 @@
 //! built from. Names of the tensors are those of the reference's state dictionary.
 
 mod annotate;
-mod error;
 mod save;
 
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use half::{bf16, f16};
 use protocol::text::hex;
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use support::bounded_file;
+use support::file_error::AtFile;
 use tch::Tensor;
 use tch::nn::VarStore;
 
 use crate::int8::{ActivationScales, InferencePrecision, QuantiseError, SCALES_KEY};
 use crate::model_config::DetectorConfig;
+use crate::torch_error::first_line;
 
 pub use annotate::annotate;
-pub use error::WeightsError;
 pub use save::{Precision, save};
+pub use support::file_error::FileError;
 
 /// Metadata key of the configuration.
 pub const CONFIG_KEY: &str = "config";
@@ -62,20 +64,13 @@ impl Weights {
     /// Integer tensors, which only count batches in the reference, are ignored.
     ///
     /// # Errors
-    /// [`WeightsError`] when the file is missing, truncated, or holds values that are no parameters.
-    pub fn load(path: &Path) -> Result<Self, WeightsError> {
-        let io = |source| WeightsError::Io {
-            path: path.to_owned(),
-            source,
-        };
-        let bytes = bounded_file::read(path, MAX_BYTES).map_err(io)?;
-        let format = |source| WeightsError::Format {
-            path: path.to_owned(),
-            size: bytes.len(),
-            source,
-        };
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
-        let file = SafeTensors::deserialize(&bytes).map_err(format)?;
+    /// [`FileError`] when the file is missing, truncated, or holds values that are no parameters.
+    pub fn load(path: &Path) -> Result<Self, FileError> {
+        let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
+        let (_, header) = SafeTensors::read_metadata(&bytes)
+            .map_err(|error| incomplete(path, bytes.len(), error))?;
+        let file = SafeTensors::deserialize(&bytes)
+            .map_err(|error| incomplete(path, bytes.len(), error))?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.iter() {
             if let Some(values) = read_values(path, name, &view)? {
@@ -152,15 +147,13 @@ impl Weights {
     /// Checks the kind of the network, if the file contains it.
     ///
     /// # Errors
-    /// [`WeightsError::Kind`] when it is another one.
-    pub fn check_kind(&self, expected: &'static str) -> Result<(), WeightsError> {
+    /// [`FileError`] when it is another one.
+    pub fn check_kind(&self, expected: &'static str) -> Result<(), FileError> {
         let detector = || self.metadata(METHOD_KEY).map(|_| DETECTOR_KIND);
         match self.metadata(KIND_KEY).or_else(detector) {
-            Some(found) if found != expected => Err(WeightsError::Kind {
-                path: self.path.clone(),
-                found: found.to_owned(),
-                expected,
-            }),
+            Some(found) if found != expected => Err(self.error(format_args!(
+                "weights of kind {found:?}, needed are those of kind {expected:?}"
+            ))),
             _ => Ok(()),
         }
     }
@@ -169,15 +162,15 @@ impl Weights {
     ///
     /// # Errors
     /// See [`Self::metadata_json`].
-    pub fn config<T: DeserializeOwned>(&self) -> Result<T, WeightsError> {
+    pub fn config<T: DeserializeOwned>(&self) -> Result<T, FileError> {
         self.metadata_json(CONFIG_KEY)
     }
 
     /// Configuration of a detector.
     ///
     /// # Errors
-    /// [`WeightsError::Kind`] when the file names another kind of network; see [`Self::metadata_json`].
-    pub fn detector_config(&self) -> Result<DetectorConfig, WeightsError> {
+    /// [`FileError`] when the file names another kind of network; see [`Self::metadata_json`].
+    pub fn detector_config(&self) -> Result<DetectorConfig, FileError> {
         self.check_kind(DETECTOR_KIND)?;
         self.config()
     }
@@ -185,28 +178,23 @@ impl Weights {
     /// The JSON under a metadata key.
     ///
     /// # Errors
-    /// [`WeightsError::NoMetadata`] when the key is missing, [`WeightsError::Metadata`] when its JSON has another form.
-    pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, WeightsError> {
-        let text = self
-            .metadata
-            .get(key)
-            .ok_or_else(|| WeightsError::NoMetadata {
-                path: self.path.clone(),
-                key: key.to_owned(),
-                found: self.metadata.keys().cloned().collect(),
-            })?;
-        serde_json::from_str(text).map_err(|source| WeightsError::Metadata {
-            path: self.path.clone(),
-            key: key.to_owned(),
-            source,
-        })
+    /// [`FileError`] when the key is missing, or its JSON has another form.
+    pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, FileError> {
+        let Some(text) = self.metadata.get(key) else {
+            let found: Vec<&String> = self.metadata.keys().collect();
+            return Err(self.error(format_args!(
+                "metadata has no key {key:?}; it has {found:?}"
+            )));
+        };
+        serde_json::from_str(text)
+            .map_err(|error| self.error(format_args!("metadata {key:?}: {error}")))
     }
 
     /// Scales of the activations for 8-bit inference; `None` if the file has none, or if it is for floating point.
     ///
     /// # Errors
-    /// [`WeightsError::Metadata`] when the JSON has another form.
-    pub fn activation_scales(&self) -> Result<Option<ActivationScales>, WeightsError> {
+    /// [`FileError`] when the JSON has another form.
+    pub fn activation_scales(&self) -> Result<Option<ActivationScales>, FileError> {
         self.metadata
             .contains_key(SCALES_KEY)
             .then(|| self.metadata_json(SCALES_KEY))
@@ -223,19 +211,20 @@ impl Weights {
     }
 
     /// The error of quantising these weights.
-    pub fn quantise_error(&self, source: impl Into<QuantiseError>) -> WeightsError {
-        WeightsError::Quantise {
-            path: self.path.clone(),
-            source: source.into(),
-        }
+    pub fn quantise_error(&self, error: impl Into<QuantiseError>) -> FileError {
+        self.error(format_args!("int8: {}", error.into()))
+    }
+
+    fn error(&self, problem: impl Display) -> FileError {
+        FileError::new(&self.path, problem)
     }
 
     /// Copies the parameters into a network; tensors that the network does not have are ignored.
     ///
     /// # Errors
-    /// [`WeightsError::MissingTensor`] or [`WeightsError::Shape`] name the tensor that does not fit; nothing is copied
+    /// [`FileError`] names the tensor that does not fit; nothing is copied
     /// then.
-    pub fn copy_into(&self, network: &VarStore) -> Result<(), WeightsError> {
+    pub fn copy_into(&self, network: &VarStore) -> Result<(), FileError> {
         self.copy_some_into(network, |_| true)
     }
 
@@ -247,7 +236,7 @@ impl Weights {
         &self,
         network: &VarStore,
         wanted: impl Fn(&str) -> bool,
-    ) -> Result<(), WeightsError> {
+    ) -> Result<(), FileError> {
         let variables: BTreeMap<String, Tensor> = network
             .variables()
             .into_iter()
@@ -263,32 +252,30 @@ impl Weights {
                     Tensor::f_from_slice(&source.values)?.f_view(source.shape.as_slice())?;
                 variable.f_copy_(&values)
             });
-            copied.map_err(|source| WeightsError::Tensor {
-                path: self.path.clone(),
-                name,
-                source,
+            copied.map_err(|error| {
+                self.error(format_args!("tensor {name:?}: {}", first_line(&error)))
             })?;
         }
         Ok(())
     }
 
-    fn checked(&self, name: &str, expected: Vec<i64>) -> Result<&Values, WeightsError> {
-        let missing = || WeightsError::MissingTensor {
-            path: self.path.clone(),
-            name: name.to_owned(),
-            expected: expected.clone(),
-        };
-        let tensor = self.tensors.get(name).ok_or_else(missing)?;
-        if tensor.shape == expected {
-            return Ok(tensor);
+    fn checked(&self, name: &str, expected: Vec<i64>) -> Result<&Values, FileError> {
+        match self.tensors.get(name) {
+            Some(tensor) if tensor.shape == expected => Ok(tensor),
+            Some(Values { shape, .. }) => Err(self.error(format_args!(
+                "tensor {name:?} has shape {shape:?}, the network expects {expected:?}"
+            ))),
+            None => Err(self.error(format_args!(
+                "tensor {name:?} is missing (the network expects shape {expected:?})"
+            ))),
         }
-        Err(WeightsError::Shape {
-            path: self.path.clone(),
-            name: name.to_owned(),
-            found: tensor.shape.clone(),
-            expected,
-        })
     }
+}
+
+/// The error of a file of `size` bytes that is truncated or no safetensors file.
+fn incomplete(path: &Path, size: usize, error: SafeTensorError) -> FileError {
+    let problem = format_args!("not a complete safetensors file ({size} bytes): {error}");
+    FileError::new(path, problem)
 }
 
 /// The values of one tensor as `f32`; `None` for integers.
@@ -296,7 +283,7 @@ fn read_values(
     path: &Path,
     name: &str,
     view: &TensorView<'_>,
-) -> Result<Option<Vec<f32>>, WeightsError> {
+) -> Result<Option<Vec<f32>>, FileError> {
     let data = view.data();
     let values: Vec<f32> = match view.dtype() {
         Dtype::F16 => data
@@ -325,11 +312,10 @@ fn read_values(
             .collect(),
         Dtype::I64 | Dtype::I32 => return Ok(None),
         dtype => {
-            return Err(WeightsError::Dtype {
-                path: path.to_owned(),
-                name: name.to_owned(),
-                dtype,
-            });
+            let problem = format_args!(
+                "tensor {name:?} is of type {dtype:?}; parameters are F16, BF16, F32 or F64"
+            );
+            return Err(FileError::new(path, problem));
         }
     };
     check_finite(path, name, &values)?;
@@ -340,29 +326,24 @@ fn read_values(
 }
 
 /// Refuses negative variances of a normalisation layer: their square root is NaN.
-fn check_variance(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsError> {
+fn check_variance(path: &Path, name: &str, values: &[f32]) -> Result<(), FileError> {
     let Some(index) = values.iter().position(|value| *value < 0.0) else {
         return Ok(());
     };
-    Err(WeightsError::Variance {
-        path: path.to_owned(),
-        name: name.to_owned(),
-        index,
-        value: values[index],
-    })
+    let value = values[index];
+    let problem = format_args!(
+        "tensor {name:?} holds {value} at index {index}: a variance must not be negative"
+    );
+    Err(FileError::new(path, problem))
 }
 
-fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsError> {
+fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), FileError> {
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(()),
         Some(index) => {
             let value = values[index];
-            Err(WeightsError::NotFinite {
-                path: path.to_owned(),
-                name: name.to_owned(),
-                index,
-                value,
-            })
+            let problem = format_args!("tensor {name:?} holds {value} at index {index}");
+            Err(FileError::new(path, problem))
         }
     }
 }
@@ -521,7 +502,7 @@ mod tests {
     fn missing_and_truncated_files_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cut.safetensors");
-        assert!(matches!(Weights::load(&path), Err(WeightsError::Io { .. })));
+        assert_eq!(Weights::load(&path).unwrap_err().path, path);
         save(
             &path,
             &network(&small()),

@@ -5,14 +5,15 @@ use std::path::Path;
 
 use half::f16;
 use protocol::text::hex;
-use safetensors::tensor::{Dtype, TensorView};
+use safetensors::tensor::{Dtype, SafeTensorError, TensorView};
 use sha2::{Digest, Sha256};
 use support::atomic_file;
+use support::file_error::{AtFile, FileError};
 use tch::nn::VarStore;
 use tch::{Kind, Tensor};
 
 use super::check_finite;
-use super::error::WeightsError;
+use crate::torch_error::first_line;
 
 /// Number format of parameters on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,24 +32,18 @@ pub enum Precision {
 /// Returns the SHA-256 of the file.
 ///
 /// # Errors
-/// [`WeightsError`] when a parameter is not finite or the file cannot be written.
+/// [`FileError`] when a parameter is not finite or the file cannot be written.
 pub fn save(
     path: &Path,
     network: &VarStore,
     metadata: &BTreeMap<String, String>,
     precision: Precision,
-) -> Result<String, WeightsError> {
+) -> Result<String, FileError> {
     let mut stored = Vec::new();
     for (name, variable) in network.variables() {
         stored.push(store(path, name, &variable, precision)?);
     }
-    let size = stored.iter().map(|tensor| tensor.bytes.len()).sum();
-    let format = |source| WeightsError::Format {
-        path: path.to_owned(),
-        size,
-        source,
-    };
-    let views: Result<Vec<_>, _> = (stored.iter())
+    let views: Result<Vec<_>, SafeTensorError> = (stored.iter())
         .map(|tensor| {
             Ok((
                 &tensor.name,
@@ -57,14 +52,9 @@ pub fn save(
         })
         .collect();
     let header: HashMap<_, _> = metadata.clone().into_iter().collect();
-    let bytes = with_sorted_header(
-        safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?,
-    );
-    let io = |source| WeightsError::Io {
-        path: path.to_owned(),
-        source,
-    };
-    atomic_file::write(path, &bytes).map_err(io)?;
+    let bytes = safetensors::serialize(views.at(path)?, Some(header)).at(path)?;
+    let bytes = with_sorted_header(bytes);
+    atomic_file::write(path, &bytes).at(path)?;
     Ok(hex(&Sha256::digest(&bytes)))
 }
 
@@ -109,7 +99,7 @@ fn store(
     name: String,
     variable: &Tensor,
     precision: Precision,
-) -> Result<Stored, WeightsError> {
+) -> Result<Stored, FileError> {
     let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
     let flat = tch::no_grad(|| {
         variable
@@ -117,16 +107,12 @@ fn store(
             .and_then(|values| values.f_reshape([-1]))
     });
     let values = flat.and_then(|flat| Vec::<f32>::try_from(&flat));
-    let values = match values {
-        Ok(values) => values,
-        Err(source) => {
-            return Err(WeightsError::Tensor {
-                path: path.to_owned(),
-                name,
-                source,
-            });
-        }
-    };
+    let values = values.map_err(|error| {
+        FileError::new(
+            path,
+            format_args!("tensor {name:?}: {}", first_line(&error)),
+        )
+    })?;
     check_finite(path, &name, &values)?;
     let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
     let (dtype, bytes) = if precision == Precision::Half && shape.len() > 1 && fits {

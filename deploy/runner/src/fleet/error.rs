@@ -6,7 +6,7 @@ use dataset::ReadError;
 use ego_fuser::ego::EgoError;
 use link::LinkError;
 use localization::pgc::LocalizerError;
-use perception::weights::WeightsError;
+use perception::weights::FileError;
 use protocol::CavId;
 
 use crate::scenario::weights_choice::WeightsChoiceError;
@@ -80,7 +80,7 @@ pub enum FleetError {
     },
     /// The weights cannot be used.
     #[error("weights: {0}")]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The ego cannot fuse with the weights.
     #[error("weights: {0}")]
     Ego(#[from] EgoError),

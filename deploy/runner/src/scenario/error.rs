@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use bus::config_file::ConfigError;
-use localization::pgc::head_files::HeadFileError;
+use perception::weights::FileError;
 
 /// Reason why a scenario cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -17,7 +17,7 @@ pub enum ScenarioError {
         /// Path of the scenario file.
         path: PathBuf,
         /// The head, or the encoder that is missing.
-        source: HeadFileError,
+        source: FileError,
     },
     /// A path does not exist.
     #[error("{}: {field}: {} does not exist", path.display(), missing.display())]

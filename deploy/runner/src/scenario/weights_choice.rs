@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use fusion::Method;
-use perception::weights::{METHOD_KEY, Weights, WeightsError};
+use perception::weights::{FileError, METHOD_KEY, Weights};
 
 /// File name of the weights of a training.
 const TRAINED_FILE: &str = "weights.safetensors";
@@ -48,7 +48,7 @@ pub enum WeightsChoiceError {
     },
     /// The weights of a training cannot be read.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
 }
 
 /// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or

@@ -6,7 +6,7 @@ use std::cell::RefCell;
 
 use perception::int8::ScaleSearch;
 use perception::model_config::{ConfigError, DetectorConfig, YAxis};
-use perception::weights::{METHOD_KEY, Weights, WeightsError};
+use perception::weights::{FileError, METHOD_KEY, Weights};
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
 use tch::{Device, TchError, Tensor};
@@ -34,7 +34,7 @@ pub enum StageError {
     Config(#[from] ConfigError),
     /// The weights do not fit.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The weights of another method do not fit.
     #[error("{source}; the file was trained for method {trained}, not {method}")]
     OtherMethod {
@@ -43,7 +43,7 @@ pub enum StageError {
         /// Required method.
         method: &'static str,
         /// Tensor that does not fit.
-        source: Box<WeightsError>,
+        source: Box<FileError>,
     },
 }
 
@@ -428,7 +428,7 @@ fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
 }
 
 /// Names the method of the weights beside an error, if it is another one.
-fn of_method(error: WeightsError, weights: &Weights, method: Method) -> StageError {
+fn of_method(error: FileError, weights: &Weights, method: Method) -> StageError {
     match weights.metadata(METHOD_KEY) {
         Some(trained) if trained != method.name() => StageError::OtherMethod {
             trained: trained.to_owned(),
@@ -444,7 +444,7 @@ pub(crate) fn stored_config(
     weights: &Weights,
     method: Method,
     detector: &DetectorConfig,
-) -> Result<FusionConfig, WeightsError> {
+) -> Result<FusionConfig, FileError> {
     let usual = method.default_fusion(detector);
     if weights.metadata(FUSION_KEY).is_none() {
         return Ok(usual);

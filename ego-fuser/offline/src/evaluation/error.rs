@@ -4,7 +4,7 @@ use dataset::ReadError;
 use link::LinkError;
 use localization::pose_source::PoseSourceError;
 use perception::detector::DetectorError;
-use perception::weights::WeightsError;
+use perception::weights::FileError;
 use protocol::WireError;
 
 use super::stepped::RemoteError;
@@ -16,7 +16,7 @@ use training::feature_store::FeatureStoreError;
 pub enum EvaluateError {
     /// The weights are not readable.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
+    Weights(#[from] FileError),
     /// The detector reported an error.
     #[error(transparent)]
     Detector(#[from] DetectorError),

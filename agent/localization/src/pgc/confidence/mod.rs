@@ -195,7 +195,7 @@ mod tests {
                 weights,
                 ..example()
             },
-            "a weight is 1e308"
+            "a weight is 1000000"
         ));
         weights[3] = -0.1;
         assert!(refused(
@@ -229,7 +229,7 @@ mod tests {
                     sigma: MonotoneMap::falling(knots),
                     ..example()
                 },
-                "sigma has"
+                "of sigma"
             ));
         }
     }

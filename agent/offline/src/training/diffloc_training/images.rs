@@ -7,8 +7,9 @@ use dataset::frame::{Frame, Object};
 use nalgebra::{Isometry3, Point3, Vector3};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use crate::Error;
+use crate::training::SweepList;
 use crate::training::sweep_store::heading_rad;
-use crate::training::{LocalizerTrainError, SweepList};
 use localization::baselines::diffloc::{CHANNELS, RangeImageConfig, UNITS};
 use perception::train::{Prefetch, RunConfig};
 
@@ -58,14 +59,14 @@ impl SweepImages {
     /// deviation. `progress` gets the number of sweeps done and of all.
     ///
     /// # Errors
-    /// [`LocalizerTrainError`] when no sweep has a pose.
+    /// [`Error`] when no sweep has a pose.
     pub(super) fn read(
         list: &Arc<SweepList>,
         config: RangeImageConfig,
         normalisation: Option<Normalisation>,
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let total = list.len();
         let source = Arc::clone(list);
         let mut loader = Prefetch::start(run.loader_threads, 0, move |number| {
@@ -99,7 +100,7 @@ impl SweepImages {
             progress(done, total);
         }
         if poses.is_empty() {
-            return Err(LocalizerTrainError::NoSweeps(Vec::new()));
+            return Err(Error::NoSweeps(Vec::new()));
         }
         let normalisation = normalisation.unwrap_or_else(|| Normalisation::of(&poses));
         Ok(Self {

@@ -13,9 +13,9 @@ use std::time::Instant;
 use tch::nn::VarStore;
 use tch::{Cuda, Device, Kind, Tensor};
 
-use super::error::LocalizerTrainError;
 use super::place_classes::PlaceClasses;
 use super::sweep_store::SweepList;
+use crate::Error;
 use localization::baselines::diffloc::{DiffLoc, DiffLocConfig, DiffLocLocalizer};
 use perception::train::{RunConfig, Trained, Trainer};
 use perception::weights::{CONFIG_KEY, KIND_KEY};
@@ -91,11 +91,11 @@ pub struct DiffLocSummary {
 /// Trains DiffLoc; writes checkpoint, curve and weights into `config.run.out`.
 ///
 /// # Errors
-/// [`LocalizerTrainError`].
+/// [`Error`].
 pub fn train_diffloc(
     config: &DiffLocTrainConfig,
     observe: &mut dyn FnMut(&DiffLocReport),
-) -> Result<DiffLocSummary, LocalizerTrainError> {
+) -> Result<DiffLocSummary, Error> {
     let started = Instant::now();
     let run = &config.run;
     run.start()?;
@@ -178,7 +178,7 @@ struct Training<'a> {
 }
 
 impl Training<'_> {
-    fn run(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), LocalizerTrainError> {
+    fn run(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), Error> {
         let mut curve = self.trainer.curve(CURVE)?;
         let mut means = Vec::new();
         while self.share_done() < 1.0 {
@@ -233,7 +233,7 @@ impl Training<'_> {
     }
 
     /// Order, augmentation and noise follow from seed and step, so a resumed training is the uninterrupted one.
-    fn step(&mut self) -> Result<StepLosses, LocalizerTrainError> {
+    fn step(&mut self) -> Result<StepLosses, Error> {
         let Self {
             config,
             network,
@@ -262,10 +262,7 @@ impl Training<'_> {
         })
     }
 
-    fn validate(
-        &mut self,
-        observe: &mut dyn FnMut(&DiffLocReport),
-    ) -> Result<(), LocalizerTrainError> {
+    fn validate(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), Error> {
         if let Some(images) = &self.validation {
             let accuracy = validate(&self.network, images, self.config.run.precision.kind())?;
             observe(&DiffLocReport::Validated(self.trainer.seconds(), accuracy));

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Vector3};
 use tch::{Kind, TchError, Tensor};
 
-use crate::training::LocalizerTrainError;
+use crate::Error;
 use crate::training::sweep_store::{SweepList, heading_rad};
 use localization::baselines::hypliloc::{InputBatch, RANGE_M, SweepInput};
 use perception::train::{DataListing, Prefetch, RunConfig};
@@ -44,7 +44,7 @@ impl Examples {
         scenes: &[PathBuf],
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let list = Arc::new(SweepList::open(scenes)?);
         let total = list.len();
         let source = Arc::clone(&list);
@@ -75,7 +75,7 @@ impl Examples {
             progress((first + CHUNK).min(total), total);
         }
         if poses.is_empty() {
-            return Err(LocalizerTrainError::NoSweeps(scenes.to_vec()));
+            return Err(Error::NoSweeps(scenes.to_vec()));
         }
         let mut data = list.data();
         if too_empty > 0 {

@@ -11,8 +11,8 @@ use std::time::Instant;
 use tch::nn::VarStore;
 use tch::{Cuda, Kind, Tensor};
 
-use super::error::LocalizerTrainError;
 use super::place_classes::PlaceClasses;
+use crate::Error;
 use localization::baselines::HypLiLocLocalizer;
 use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig, WIDTH};
 use perception::train::{RunConfig, Trained, Trainer};
@@ -67,11 +67,11 @@ pub enum HypLiLocReport {
 /// Trains a network; writes checkpoint and weights into `config.run.out`.
 ///
 /// # Errors
-/// [`LocalizerTrainError`].
+/// [`Error`].
 pub fn train_hypliloc(
     config: &HypLiLocTrainConfig,
     observe: &mut dyn FnMut(&HypLiLocReport),
-) -> Result<Trained, LocalizerTrainError> {
+) -> Result<Trained, Error> {
     let run = &config.run;
     run.start()?;
     let examples = Examples::read(&config.scenes, run, &mut |done, all| {

@@ -5,7 +5,8 @@ use std::path::Path;
 use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::training::{FeatureCache, LocalizerTrainError};
+use crate::Error;
+use crate::training::FeatureCache;
 use localization::pgc::{LocalizerError, SceneHead, SceneHeadConfig};
 use perception::weights::Weights;
 
@@ -52,7 +53,7 @@ impl StoredHead {
 pub(super) fn classes_of_sweeps(
     head: &SceneHead,
     cache: &FeatureCache,
-) -> Result<Vec<usize>, LocalizerTrainError> {
+) -> Result<Vec<usize>, Error> {
     let (classes, errors_m) = no_grad(|| classify(head, cache))?;
     let positions: Vec<[f64; 3]> = cache
         .world_from_sensor
@@ -76,9 +77,10 @@ pub(super) fn classes_of_sweeps(
         .map(|(class, sum)| (class, std::array::from_fn(|axis| sum[axis] / sum[3])))
         .collect();
     if middles.is_empty() {
-        return Err(LocalizerTrainError::OtherScene(
-            head.config().scene_name.clone(),
-        ));
+        return Err(Error::Input(format!(
+            "the head of {:?} recognises none of the sweeps: are they of another scene?",
+            head.config().scene_name
+        )));
     }
     Ok(positions
         .iter()

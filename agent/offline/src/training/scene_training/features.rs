@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use super::config::{SceneReport, SceneTrainConfig};
-use crate::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
+use crate::Error;
+use crate::training::{FeatureCache, SweepAugmentation, SweepList};
 use localization::pgc::{CellEncoder, SweepFormat};
 use perception::train::DataListing;
 
@@ -31,14 +32,14 @@ impl Features {
         config: &SceneTrainConfig,
         sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
             let cache =
                 FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
             observe(&SceneReport::Encoded(list.data()));
-            Ok::<_, LocalizerTrainError>(cache)
+            Ok::<_, Error>(cache)
         };
         let training = encode(&sweeps.training, config.augmentation)?;
         let unchanged = SweepAugmentation {

@@ -25,12 +25,12 @@ use self::continued::StoredHead;
 use self::features::Features;
 pub(crate) use self::features::SceneSweeps;
 use self::losses::{centre_loss, weighted_loss};
-use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use super::kmeans::kmeans;
 use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
+use crate::Error;
 use localization::pgc::SceneHead;
 use localization::pgc::SceneHeadConfig;
 use perception::train::{Curve, DataListing, Length, RunConfig, Trainer};
@@ -50,11 +50,11 @@ const MAX_CELLS: usize = 1024;
 /// Trains a head; writes checkpoint, curve and weights into `config.run.out`.
 ///
 /// # Errors
-/// [`LocalizerTrainError`]; the last checkpoint stays.
+/// [`Error`]; the last checkpoint stays.
 pub fn train_scene(
     config: &SceneTrainConfig,
     observe: &mut dyn FnMut(&SceneReport),
-) -> Result<SceneSummary, LocalizerTrainError> {
+) -> Result<SceneSummary, Error> {
     let training = Arc::new(SweepList::open(&config.scenes)?);
     let validation = match config.validation.as_slice() {
         [] => None,
@@ -82,7 +82,7 @@ pub(crate) fn train_scene_on(
     config: &SceneTrainConfig,
     sweeps: &SceneSweeps,
     observe: &mut dyn FnMut(&SceneReport),
-) -> Result<SceneSummary, LocalizerTrainError> {
+) -> Result<SceneSummary, Error> {
     let mut training = Training::prepare(config, sweeps, observe)?;
     let mut last_validation = Instant::now();
     while training.share_done() < 1.0 {
@@ -127,7 +127,7 @@ impl<'a> Training<'a> {
         config: &'a SceneTrainConfig,
         sweeps: &SceneSweeps,
         observe: &mut dyn FnMut(&SceneReport),
-    ) -> Result<Self, LocalizerTrainError> {
+    ) -> Result<Self, Error> {
         let started = Instant::now();
         let run = &config.run;
         run.start()?;
@@ -223,7 +223,7 @@ impl<'a> Training<'a> {
     }
 
     /// Eq. 4 and 5.
-    fn step(&mut self) -> Result<(), LocalizerTrainError> {
+    fn step(&mut self) -> Result<(), Error> {
         let share_done = self.share_done();
         let rows = self.order.next_batch(share_done)?;
         let sweeps = self.cache.sweep_of_cell.f_index_select(0, &rows)?;
@@ -280,10 +280,7 @@ impl<'a> Training<'a> {
     }
 
     /// Validates and writes a checkpoint.
-    fn validate_and_save(
-        &mut self,
-        observe: &mut dyn FnMut(&SceneReport),
-    ) -> Result<(), LocalizerTrainError> {
+    fn validate_and_save(&mut self, observe: &mut dyn FnMut(&SceneReport)) -> Result<(), Error> {
         let report = self.report();
         let SceneReport::Stepped {
             error_m, epsilon_m, ..
@@ -309,7 +306,7 @@ impl<'a> Training<'a> {
         Ok(self.trainer.checkpoint(&self.variables)?)
     }
 
-    fn finish(mut self) -> Result<SceneSummary, LocalizerTrainError> {
+    fn finish(mut self) -> Result<SceneSummary, Error> {
         let variables = match self.config.init {
             // Cropped already, to the sweeps of its first training, which may have been elsewhere in the scene.
             Some(_) => self.variables,
@@ -344,10 +341,7 @@ fn classifier_time(run: &RunConfig) -> Option<Duration> {
 }
 
 /// The configuration of the head for these features.
-fn head_config(
-    config: &SceneTrainConfig,
-    features: &Features,
-) -> Result<SceneHeadConfig, LocalizerTrainError> {
+fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig, Error> {
     let Features {
         training,
         format,

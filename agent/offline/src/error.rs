@@ -1,0 +1,44 @@
+//! Error of training, evaluating or mapping.
+
+use std::path::PathBuf;
+
+use dataset::ReadError;
+use localization::pgc::LocalizerError;
+use perception::torch_error::first_line;
+use perception::train::TrainingError;
+use perception::weights::FileError;
+use tch::TchError;
+
+/// Error that ends a training, an evaluation or a map early.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A scene cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// A file cannot be read, written or used.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// No folder holds a sweep with a known pose.
+    #[error("no sweep with a pose in {0:?}")]
+    NoSweeps(Vec<PathBuf>),
+    /// The input cannot be used; the text names it, and what is needed.
+    #[error("{0}")]
+    Input(String),
+    /// A network cannot be built, loaded or run.
+    #[error(transparent)]
+    Localizer(#[from] LocalizerError),
+    /// The training itself failed.
+    #[error(transparent)]
+    Training(#[from] TrainingError),
+    /// The tensor library failed.
+    #[error("training: {}", first_line(.0))]
+    Tensor(#[from] TchError),
+}
+
+impl Error {
+    /// True if the input is at fault.
+    #[must_use]
+    pub fn is_bad_input(&self) -> bool {
+        matches!(self, Self::Read(_) | Self::NoSweeps(_) | Self::Input(_))
+    }
+}

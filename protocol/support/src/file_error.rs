@@ -1,0 +1,50 @@
+//! File error: the path of a file and what is wrong with it.
+
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+/// A file that cannot be read, written or used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}: {problem}", path.display())]
+pub struct FileError {
+    /// Path of the file.
+    pub path: PathBuf,
+    /// Entry that is wrong, the value found and the values allowed; or the error of the system.
+    pub problem: String,
+}
+
+impl FileError {
+    /// An error about the file at `path`.
+    pub fn new(path: impl Into<PathBuf>, problem: impl Display) -> Self {
+        Self {
+            path: path.into(),
+            problem: problem.to_string(),
+        }
+    }
+}
+
+/// Results whose error gets the path of its file.
+pub trait AtFile<T> {
+    /// The result with an error that names the file.
+    ///
+    /// # Errors
+    /// [`FileError`] in place of the error there was.
+    fn at(self, path: &Path) -> Result<T, FileError>;
+}
+
+impl<T, E: Display> AtFile<T> for Result<T, E> {
+    fn at(self, path: &Path) -> Result<T, FileError> {
+        self.map_err(|error| FileError::new(path, error))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_begins_with_its_file() {
+        let error = "x".parse::<u8>().at(Path::new("a/b.csv")).unwrap_err();
+        assert_eq!(error.to_string(), "a/b.csv: invalid digit found in string");
+    }
+}
