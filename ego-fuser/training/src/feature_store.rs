@@ -7,63 +7,29 @@
 
 mod sweep_encoder;
 
+use crate::Error;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario};
-use perception::detector::{Detector, DetectorError};
-use perception::train::{Prefetch, TrainingError};
-use perception::weights::{FileError, Weights};
+use dataset::{self, IntensityScale, LoadOptions, Scenario};
+use perception::detector::Detector;
+use perception::train::Prefetch;
+use perception::weights::Weights;
 use protocol::message::Bev;
 use protocol::text::hex;
 use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
-use tch::{Device, TchError, Tensor};
+use support::file_error::AtFile;
+use tch::{Device, Tensor};
 
 use sweep_encoder::SweepEncoder;
 
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;
-
-/// Error of storing or reading maps.
-#[derive(Debug, thiserror::Error)]
-pub enum FeatureStoreError {
-    /// The operating system reported an error.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
-    /// A map cannot be packed or unpacked.
-    #[error("{}: {source}", path.display())]
-    Wire {
-        /// The file.
-        path: PathBuf,
-        /// Cause.
-        source: WireError,
-    },
-    /// A sweep cannot be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// The encoder's weights cannot be used.
-    #[error(transparent)]
-    Weights(#[from] FileError),
-    /// The encoder reported an error.
-    #[error(transparent)]
-    Detector(#[from] DetectorError),
-    /// A thread that encodes has ended.
-    #[error(transparent)]
-    Thread(#[from] TrainingError),
-    /// The tensor library reported an error.
-    #[error("kept maps: {0}")]
-    Torch(#[from] TchError),
-}
 
 /// Folder, numeric type and largest size of stored maps.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -142,7 +108,7 @@ impl FeatureStore {
     /// `on_sweep` gets the number of stored sweeps and of all. An interrupted run is continued.
     ///
     /// # Errors
-    /// [`FeatureStoreError`] names the file.
+    /// [`Error`] names the file.
     pub fn open(
         kept: &KeptMaps,
         weights: &Arc<Weights>,
@@ -150,26 +116,22 @@ impl FeatureStore {
         digests: &FileDigests,
         threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
-    ) -> Result<Self, FeatureStoreError> {
+    ) -> Result<Self, Error> {
         let path = kept
             .folder
             .join(file_name(kept, weights, scenarios, digests)?);
-        let io = |source| FeatureStoreError::Io {
-            path: path.clone(),
-            source,
-        };
-        fs::create_dir_all(&kept.folder).map_err(io)?;
+        fs::create_dir_all(&kept.folder).at(&path)?;
         let file = OpenOptions::new()
             .create(true)
             .read(true)
             .append(true)
             .open(&path)
-            .map_err(io)?;
+            .at(&path)?;
         // Of two trainings that start together one encodes, the other waits for it.
-        file.lock().map_err(io)?;
-        let starts = starts(&file).map_err(io)?;
+        file.lock().at(&path)?;
+        let starts = starts(&file).at(&path)?;
         // A truncated message is encoded again.
-        file.set_len(starts[starts.len() - 1]).map_err(io)?;
+        file.set_len(starts[starts.len() - 1]).at(&path)?;
         let mut first = vec![0];
         for scenario in scenarios {
             first.push(first[first.len() - 1] + scenario.agents.len() * scenario.ticks.len());
@@ -199,7 +161,7 @@ impl FeatureStore {
             starts,
         };
         store.fill(encoder, kept.limit_bytes, threads, on_sweep)?;
-        store.file.unlock().map_err(|source| store.io(source))?;
+        store.file.unlock().at(&store.path)?;
         Ok(store)
     }
 
@@ -209,7 +171,7 @@ impl FeatureStore {
         limit_bytes: u64,
         threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
-    ) -> Result<(), FeatureStoreError> {
+    ) -> Result<(), Error> {
         let (stored, all) = self.sweeps();
         if stored == all || self.bytes() >= limit_bytes {
             return Ok(());
@@ -222,11 +184,10 @@ impl FeatureStore {
         while self.sweeps().0 < all && self.bytes() < limit_bytes {
             let message = messages.next_batch()??;
             let length = u32::try_from(message.len())
-                .map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
+                .map_err(|_| io::Error::from(io::ErrorKind::FileTooLarge))
+                .at(&self.path)?;
             let record = [&length.to_le_bytes()[..], &message].concat();
-            self.file
-                .write_all(&record)
-                .map_err(|source| self.io(source))?;
+            self.file.write_all(&record).at(&self.path)?;
             self.starts.push(self.bytes() + record.len() as u64);
             on_sweep(self.sweeps().0, all);
         }
@@ -237,13 +198,8 @@ impl FeatureStore {
     /// not be read.
     ///
     /// # Errors
-    /// [`FeatureStoreError`] when the file cannot be read or was changed.
-    pub fn map(
-        &self,
-        scenario: usize,
-        agent: usize,
-        tick: usize,
-    ) -> Result<Option<Tensor>, FeatureStoreError> {
+    /// [`Error`] when the file cannot be read or was changed.
+    pub fn map(&self, scenario: usize, agent: usize, tick: usize) -> Result<Option<Tensor>, Error> {
         let place = self.first[scenario] + agent * self.ticks[scenario] + tick;
         let Some(&[start, end]) = self.starts.get(place..place + 2) else {
             return Ok(None);
@@ -253,19 +209,12 @@ impl FeatureStore {
             return Ok(None);
         }
         let mut bytes = vec![0; (end - start) as usize];
-        self.file
-            .read_exact_at(&mut bytes, start)
-            .map_err(|source| self.io(source))?;
+        self.file.read_exact_at(&mut bytes, start).at(&self.path)?;
         let decode = || -> Result<_, WireError> {
             let (_, message): (Header, Bev) = wire::decode([bytes.as_slice()], &Limits::default())?;
             message.features.decode(&Limits::default())
         };
-        let features = decode()
-            .map_err(|source| FeatureStoreError::Wire {
-                path: self.path.clone(),
-                source,
-            })?
-            .features;
+        let features = decode().at(&self.path)?.features;
         let size = [
             1,
             i64::from(features.channels),
@@ -295,13 +244,6 @@ impl FeatureStore {
 
     fn bytes(&self) -> u64 {
         self.starts[self.starts.len() - 1]
-    }
-
-    fn io(&self, source: io::Error) -> FeatureStoreError {
-        FeatureStoreError::Io {
-            path: self.path.clone(),
-            source,
-        }
     }
 }
 
@@ -366,14 +308,14 @@ impl MapSource {
     /// The map of a sweep, `[1, C, H, W]`; `scenario` is the one of that index.
     ///
     /// # Errors
-    /// [`FeatureStoreError`] when it cannot be read.
+    /// [`Error`] when it cannot be read.
     pub fn map(
         &mut self,
         index: usize,
         scenario: &Scenario,
         agent: usize,
         tick: usize,
-    ) -> Result<Tensor, FeatureStoreError> {
+    ) -> Result<Tensor, Error> {
         if let Some(map) = self.store.map(index, agent, tick)? {
             return Ok(map);
         }

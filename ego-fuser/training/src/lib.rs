@@ -6,7 +6,10 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+mod error;
 pub mod feature_store;
 pub mod loss;
 pub mod samples;
 pub mod train;
+
+pub use error::Error;

@@ -4,7 +4,8 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::MutexGuard;
 
-use ::training::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig, TrainError};
+use ::training::Error;
+use ::training::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
 use perception::train::{Length, RunConfig};
@@ -167,7 +168,7 @@ fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
         ..none
     };
     assert!(
-        matches!(train::run(&late, &mut Ear::default()), Err(TrainError::NotTrained(method)) if method == Method::LATE)
+        matches!(train::run(&late, &mut Ear::default()), Err(Error::NotTrained(method)) if method == Method::LATE)
     );
 }
 

@@ -332,7 +332,7 @@ fn check_variance(path: &Path, name: &str, values: &[f32]) -> Result<(), FileErr
     };
     let value = values[index];
     let problem = format_args!(
-        "tensor {name:?} holds {value} at index {index}: a variance must not be negative"
+        "tensor {name:?} holds {value} at index {index}; a variance is at least 0"
     );
     Err(FileError::new(path, problem))
 }

@@ -17,10 +17,11 @@ use perception::model_config::DetectorConfig;
 use perception::train::{AdamWConfig, DataListing, RunConfig, TrainingBar, TrainingOptions};
 use perception::weights::Weights;
 use protocol::Dtype;
+use training::Error;
 use training::feature_store::KeptMaps;
 use training::loss::{LossConfig, Unassigned};
 use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
-use training::train::{self, Accuracy, Observer, StepReport, TrainConfig, TrainError};
+use training::train::{self, Accuracy, Observer, StepReport, TrainConfig};
 
 use support::cli::BadInput;
 
@@ -320,14 +321,12 @@ impl Arguments {
 }
 
 /// Cause of an early end of a training: the input, if the initial model could not be built.
-fn blamed(error: TrainError) -> anyhow::Error {
+fn blamed(error: Error) -> anyhow::Error {
     match error {
-        TrainError::Model(
-            ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_),
-        )
-        | TrainError::NotTrained(_)
-        | TrainError::NothingToFreeze
-        | TrainError::NothingToKeep(_) => BadInput::of(error).into(),
+        Error::Model(ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_))
+        | Error::NotTrained(_)
+        | Error::NothingToFreeze
+        | Error::NothingToKeep(_) => BadInput::of(error).into(),
         error => error.into(),
     }
 }
@@ -392,11 +391,11 @@ mod tests {
     #[test]
     fn weights_that_are_not_there_are_bad_input_and_a_training_that_diverges_is_not() {
         let missing = Weights::load(Path::new("no/such.safetensors")).unwrap_err();
-        let blame = blamed(TrainError::Model(missing.into()));
+        let blame = blamed(Error::Model(missing.into()));
         assert!(
             blame.is::<BadInput>() && blame.to_string().contains("no/such.safetensors"),
             "{blame}"
         );
-        assert!(!blamed(TrainError::Training(TrainingError::Diverged(9))).is::<BadInput>());
+        assert!(!blamed(Error::Training(TrainingError::Diverged(9))).is::<BadInput>());
     }
 }

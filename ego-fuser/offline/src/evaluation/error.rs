@@ -9,7 +9,6 @@ use protocol::WireError;
 
 use super::stepped::RemoteError;
 use ego_fuser::ego::EgoError;
-use training::feature_store::FeatureStoreError;
 
 /// Reason why an evaluation ended early.
 #[derive(Debug, thiserror::Error)]
@@ -34,7 +33,7 @@ pub enum EvaluateError {
     Wire(#[from] WireError),
     /// Kept maps cannot be read.
     #[error(transparent)]
-    Maps(#[from] Box<FeatureStoreError>),
+    Maps(#[from] Box<training::Error>),
     /// The link emulation cannot be built.
     #[error(transparent)]
     Link(#[from] LinkError),

@@ -6,7 +6,7 @@ use protocol::CavId;
 use tch::Tensor;
 
 use super::{EvaluateError, Evaluator};
-use training::feature_store::FeatureStoreError;
+use training::Error;
 
 /// The sweep of one agent.
 #[derive(Debug)]
@@ -42,14 +42,14 @@ impl Evaluator {
             match self.map_of(scenario, place, tick, with_maps(place)) {
                 Ok(map) => sweeps.push(Sweep { place, frame, map }),
                 // It fails again where the vehicle perceives it, and is counted there.
-                Err(FeatureStoreError::Detector(error)) if error.is_of_frame() => {
+                Err(Error::Detector(error)) if error.is_of_frame() => {
                     sweeps.push(Sweep {
                         place,
                         frame,
                         map: None,
                     })
                 }
-                Err(FeatureStoreError::Read(error)) => {
+                Err(Error::Read(error)) => {
                     let rank = rank(place).unwrap_or(usize::MAX);
                     self.left_out.add_unreadable(rank, Problem::from(&error));
                 }
@@ -90,7 +90,7 @@ impl Evaluator {
         agent: usize,
         tick: usize,
         is_needed: bool,
-    ) -> Result<Option<Tensor>, FeatureStoreError> {
+    ) -> Result<Option<Tensor>, Error> {
         let Some(maps) = self.maps.as_mut().filter(|_| is_needed) else {
             return Ok(None);
         };

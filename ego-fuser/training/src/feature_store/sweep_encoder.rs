@@ -14,7 +14,8 @@ use protocol::{
 };
 use tch::Device;
 
-use super::FeatureStoreError;
+use crate::Error;
+use support::file_error::AtFile;
 
 /// zstd level of a message: more costs time and saves nothing.
 const ZSTD_LEVEL: i32 = 1;
@@ -53,7 +54,7 @@ impl SweepEncoder {
     ///
     /// # Errors
     /// Those of the network and of the wire format.
-    pub(super) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, FeatureStoreError> {
+    pub(super) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, Error> {
         let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
         let Some(of) = self.scenarios.get(scenario) else {
             return Ok(Vec::new());
@@ -83,18 +84,14 @@ impl SweepEncoder {
 }
 
 impl SweepEncoder {
-    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
+    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, Error> {
         let codec = CodecConfig {
             dtype: self.dtype,
             zstd_level: Some(ZSTD_LEVEL),
             ..CodecConfig::default()
         };
         // Sender and time of a map follow from its index.
-        let invalid = |_| FeatureStoreError::Io {
-            path: self.path.clone(),
-            source: io::ErrorKind::InvalidInput.into(),
-        };
-        let cav = CavId::new("0").map_err(invalid)?;
+        let cav = CavId::new("0").at(&self.path)?;
         let stamp = Stamp {
             cav,
             epoch: 0,
@@ -110,9 +107,6 @@ impl SweepEncoder {
             let features = encode_features(features, &codec, None)?;
             Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
         };
-        encode().map_err(|source| FeatureStoreError::Wire {
-            path: self.path.clone(),
-            source,
-        })
+        Ok(encode().at(&self.path)?)
     }
 }

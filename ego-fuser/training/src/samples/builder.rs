@@ -13,10 +13,10 @@ use rand::Rng;
 use tch::Tensor;
 
 use super::augment::{Augmentation, ViewAugment};
-use super::error::SampleError;
 use super::moments::Moments;
 use super::poses::{DrawnError, Offset, SamplePoses};
 use super::scenes::{SceneSet, TickRef};
+use crate::Error;
 use crate::feature_store::MapSource;
 use fusion::MapMetadata;
 use fusion::points::merge_points;
@@ -169,14 +169,14 @@ impl SampleBuilder {
     /// The sample of a tick, seen from a random vehicle.
     ///
     /// # Errors
-    /// [`SampleError`] when a file is missing or malformed, or a vehicle has no pose.
-    pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, SampleError> {
+    /// [`Error`] when a file is missing or malformed, or a vehicle has no pose.
+    pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, Error> {
         let frames = self.scenes.annotations(tick);
         let present: Vec<usize> = (0..frames.len())
             .filter(|&agent| frames[agent].is_some())
             .collect();
         if present.is_empty() {
-            return Err(SampleError::Empty(format!(
+            return Err(Error::Data(format!(
                 "no readable frame at tick {} of scenario {}",
                 tick.tick,
                 self.scenes.scenario(tick).name
@@ -226,7 +226,7 @@ impl SampleBuilder {
         now: TickRef,
         agents: &[usize],
         rng: &mut impl Rng,
-    ) -> Result<Vec<Entry>, SampleError> {
+    ) -> Result<Vec<Entry>, Error> {
         let ticks = &self.scenes.scenario(now).ticks;
         let gap = self.config.moments.draw_gap(rng);
         let error = self.config.poses.draw(rng)?;
@@ -306,7 +306,7 @@ impl SampleBuilder {
         agent: usize,
         place: [usize; 2],
         error: &DrawnError,
-    ) -> Result<[PoseEstimate; 2], SampleError> {
+    ) -> Result<[PoseEstimate; 2], Error> {
         let frames = self.scenes.annotations(tick);
         let Some(frame) = &frames[agent] else {
             let absent = PoseEstimate::NoPose {
@@ -332,7 +332,7 @@ impl SampleBuilder {
         entries: &[Entry],
         changes: &[ViewAugment],
         facts: &mut Vec<MapMetadata>,
-    ) -> Result<Vec<Pillars>, SampleError> {
+    ) -> Result<Vec<Pillars>, Error> {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
             let points = self.scenes.points(
@@ -365,7 +365,7 @@ impl SampleBuilder {
         frames: &[Option<Frame>],
         ego: usize,
         rng: &mut impl Rng,
-    ) -> Result<Vec<usize>, SampleError> {
+    ) -> Result<Vec<usize>, Error> {
         let mut agents = vec![ego];
         let Some(ego_frame) = &frames[ego] else {
             return Ok(agents);
@@ -386,12 +386,11 @@ impl SampleBuilder {
         Ok(agents)
     }
 
-    fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose, SampleError> {
-        frame.world_from_lidar.ok_or_else(|| SampleError::NoPose {
-            scenario: self.scenes.scenario(tick).name.clone(),
-            capture_nanos: frame.capture_nanos,
-            cav: frame.cav.to_string(),
-        })
+    fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose, Error> {
+        let scenario = &self.scenes.scenario(tick).name;
+        frame
+            .world_from_lidar
+            .ok_or_else(|| without_pose(scenario, frame))
     }
 
     /// Objects annotated by `annotators`, the ego first, in the changed ego frame; those that count are on the BEV grid.

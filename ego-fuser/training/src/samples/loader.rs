@@ -8,9 +8,9 @@ use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
 use super::builder::{Sample, SampleBuilder, SampleViews};
-use super::error::SampleError;
 use super::poses::Offset;
 use super::scenes::TickRef;
+use crate::Error;
 use fusion::MapMetadata;
 use fusion::model::{CooperativeModel, CooperativeOutput, ModelError};
 use fusion::targets::Labels;
@@ -41,11 +41,8 @@ impl Batch {
     /// Collates samples, all of pillars or all of maps.
     ///
     /// # Errors
-    /// [`SampleError::Torch`] when maps are of different shapes.
-    pub(crate) fn collate(
-        samples: Vec<Sample>,
-        pillar_grid: &PillarGrid,
-    ) -> Result<Self, SampleError> {
+    /// [`Error::Torch`] when maps are of different shapes.
+    pub(crate) fn collate(samples: Vec<Sample>, pillar_grid: &PillarGrid) -> Result<Self, Error> {
         let (mut pillars, mut maps) = (Vec::new(), Vec::new());
         for sample in &samples {
             match &sample.views {
@@ -104,7 +101,7 @@ pub fn batches(
     pillar_grid: PillarGrid,
     run: &RunConfig,
     first: u64,
-) -> Prefetch<Result<Batch, SampleError>> {
+) -> Prefetch<Result<Batch, Error>> {
     let mut order = Order::new(builder.scenes().ticks().to_vec(), run.seed);
     let mut builder = builder.clone();
     let size = run.batch as u64;

@@ -5,7 +5,6 @@
 
 mod augment;
 mod builder;
-mod error;
 mod loader;
 mod moments;
 mod poses;
@@ -13,7 +12,6 @@ mod scenes;
 
 pub use augment::{Augmentation, SceneAugment, ViewAugment};
 pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews};
-pub use error::SampleError;
 pub use loader::{Batch, BatchViews, batches};
 pub use moments::Moments;
 pub use poses::{Offset, SamplePoses};

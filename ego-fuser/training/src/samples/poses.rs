@@ -9,7 +9,7 @@ use protocol::config::within;
 use protocol::{CavId, Pose, PoseEstimate};
 use rand::Rng;
 
-use super::error::SampleError;
+use crate::Error;
 
 /// Poses of samples: the recording's, or those of a pose generator; some samples with an added error.
 #[derive(Debug, Clone, Default)]
@@ -55,7 +55,7 @@ impl SamplePoses {
     }
 
     /// Draws the error of one sample.
-    pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
+    pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, Error> {
         // One draw fewer where the share is all or nothing: earlier samples stay the same.
         let lost =
             (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
@@ -80,12 +80,8 @@ impl SamplePoses {
     }
 
     /// Pose of a vehicle without the added error.
-    pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, SampleError> {
-        let missing = || SampleError::NoPose {
-            scenario: scenario.to_owned(),
-            capture_nanos: frame.capture_nanos,
-            cav: frame.cav.to_string(),
-        };
+    pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, Error> {
+        let missing = || without_pose(scenario, frame);
         if self.tables.is_empty() {
             return Ok(PoseEstimate::new(
                 frame.world_from_lidar.ok_or_else(missing)?,
@@ -216,6 +212,16 @@ impl DrawnError {
             none @ PoseEstimate::NoPose { .. } => none,
         }
     }
+}
+
+/// The error of a frame without a pose, whose view cannot be aligned.
+pub(super) fn without_pose(scenario: &str, frame: &Frame) -> Error {
+    let Frame {
+        cav, capture_nanos, ..
+    } = frame;
+    Error::Data(format!(
+        "scenario {scenario}, {capture_nanos} ns: agent {cav} has no pose"
+    ))
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use perception::train::DataListing;
 use protocol::PointCloud;
 use support::file_digests::FileDigests;
 
-use super::error::SampleError;
+use crate::Error;
 
 /// A tick of a [`SceneSet`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -43,19 +43,19 @@ impl SceneSet {
     /// Opens datasets, splits or scenarios, with all agents of the protocol.
     ///
     /// # Errors
-    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts
-    /// itself, [`SampleError::Empty`] when there is no tick in any of them.
+    /// [`Error::Read`] when a folder cannot be read, [`Error::Data`] when the protocol contradicts itself, or there is no
+    /// tick in any of them.
     pub fn open(
         folders: &[PathBuf],
         options: &OpenOptions,
         protocol: &ProtocolConfig,
-    ) -> Result<Self, SampleError> {
+    ) -> Result<Self, Error> {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
             let dataset = dataset::open_with(folder, options)?;
             let protocol = protocol
                 .resolve(dataset.layout)
-                .map_err(SampleError::Protocol)?;
+                .map_err(|error| Error::Data(format!("evaluation protocol: {error}")))?;
             let protocol = EvaluationProtocol {
                 max_agents: usize::MAX,
                 ..protocol
@@ -73,7 +73,7 @@ impl SceneSet {
             ..Self::new(scenarios)
         };
         if set.ticks.is_empty() {
-            return Err(SampleError::Empty(format!(
+            return Err(Error::Data(format!(
                 "no tick of any scenario in {folders:?}"
             )));
         }
@@ -151,8 +151,8 @@ impl SceneSet {
     /// The sweep of one agent.
     ///
     /// # Errors
-    /// [`SampleError::Read`] when a file is missing or malformed.
-    pub fn points(&self, tick: TickRef, agent: usize) -> Result<PointCloud, SampleError> {
+    /// [`Error::Read`] when a file is missing or malformed.
+    pub fn points(&self, tick: TickRef, agent: usize) -> Result<PointCloud, Error> {
         Ok(self
             .scenario(tick)
             .load(agent, tick.tick, &LoadOptions::default())?

@@ -2,12 +2,14 @@
 
 use csv::StringRecord;
 use figures::{self, Axis, Chart, Mark, Series};
-use perception::train::{Curve, Trainer, TrainingError};
+use perception::train::{Curve, Trainer};
+use perception::weights::FileError;
 use support::csv_file;
+use support::file_error::AtFile;
 
 use super::accuracy::Accuracy;
-use super::error::TrainError;
 use super::observer::StepReport;
+use crate::Error;
 
 const HEADER: &str = "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";
 /// Points of a line in the picture: losses of single batches are noisy and are averaged to about this number.
@@ -18,11 +20,11 @@ const SMOOTH_POINTS: usize = 150;
 pub(super) struct DetectorCurve(Curve);
 
 impl DetectorCurve {
-    pub(super) fn open(trainer: &Trainer) -> Result<Self, TrainingError> {
+    pub(super) fn open(trainer: &Trainer) -> Result<Self, FileError> {
         Ok(Self(trainer.curve(HEADER)?))
     }
 
-    pub(super) fn step(&mut self, report: &StepReport) -> Result<(), TrainingError> {
+    pub(super) fn step(&mut self, report: &StepReport) -> Result<(), FileError> {
         let StepReport {
             step,
             epoch,
@@ -45,7 +47,7 @@ impl DetectorCurve {
         step: u64,
         seconds: f64,
         accuracy: &Accuracy,
-    ) -> Result<(), TrainingError> {
+    ) -> Result<(), FileError> {
         let [ap_30, ap_50, ap_70] = accuracy.ap_global;
         self.0.row(&format!(
             "{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"
@@ -53,12 +55,9 @@ impl DetectorCurve {
     }
 
     /// Draws the curve so far, including rows of an interrupted training, into a PNG file beside it.
-    pub(super) fn draw(&self, title: &str) -> Result<(), TrainError> {
+    pub(super) fn draw(&self, title: &str) -> Result<(), Error> {
         let path = self.0.path();
-        let text = std::fs::read_to_string(path).map_err(|source| TrainingError::Io {
-            path: path.to_owned(),
-            source,
-        })?;
+        let text = std::fs::read_to_string(path).at(path)?;
         Ok(figures::save_png(
             &charts(title, &text),
             &path.with_extension("png"),

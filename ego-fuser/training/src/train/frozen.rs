@@ -6,10 +6,10 @@ use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 
 use super::config::TrainConfig;
-use super::error::TrainError;
 use super::observer::Observer;
-use crate::feature_store::{FeatureStore, FeatureStoreError, KeptMaps, MapSource, is_encoder};
-use crate::samples::{Augmentation, SampleConfig, SampleError, SceneSet};
+use crate::Error;
+use crate::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
+use crate::samples::{Augmentation, SampleConfig, SceneSet};
 use fusion::model::{CooperativeModel, ModelError};
 use support::file_digests::FileDigests;
 
@@ -25,11 +25,11 @@ impl<'a> FrozenEncoder<'a> {
     pub(super) fn of(
         config: &'a TrainConfig,
         model: &CooperativeModel,
-    ) -> Result<Option<Self>, TrainError> {
+    ) -> Result<Option<Self>, Error> {
         let Some(kept) = &config.frozen_encoder else {
             return Ok(None);
         };
-        let init = config.init.as_ref().ok_or(TrainError::NothingToFreeze)?;
+        let init = config.init.as_ref().ok_or(Error::NothingToFreeze)?;
         for (name, variable) in model.variables.variables() {
             if is_encoder(&name) {
                 let _ = variable.f_set_requires_grad(false)?;
@@ -50,17 +50,16 @@ impl<'a> FrozenEncoder<'a> {
         &self,
         scenes: &SceneSet,
         observer: &mut dyn Observer,
-    ) -> Result<MapSource, TrainError> {
+    ) -> Result<MapSource, Error> {
         let on_sweep = &mut |done, all| observer.encoded(done, all);
-        let open = FeatureStore::open(
+        let store = FeatureStore::open(
             self.kept,
             &self.weights,
             scenes.scenarios(),
             &FileDigests::default(),
             self.threads,
             on_sweep,
-        );
-        let store = open.map_err(|error: FeatureStoreError| SampleError::from(error))?;
+        )?;
         Ok(MapSource::new(Arc::new(store), Arc::clone(&self.weights)))
     }
 }

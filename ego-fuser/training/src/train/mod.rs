@@ -6,7 +6,6 @@ mod accuracy;
 mod card;
 mod config;
 mod curve;
-mod error;
 mod frozen;
 mod observer;
 mod validation;
@@ -19,15 +18,13 @@ use perception::weights::Weights;
 
 pub use accuracy::Accuracy;
 pub use config::TrainConfig;
-pub use error::TrainError;
 pub use observer::{Observer, StepReport, Summary};
 pub(crate) use validation::Validator;
 
 use self::curve::DetectorCurve;
+use crate::Error;
 use crate::loss::{LabelTensors, alignment_loss, detection_loss};
-use crate::samples::{
-    Batch, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet, batches,
-};
+use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleKind, SceneSet, batches};
 use fusion::method::{Exchange, Method};
 use fusion::model::{CooperativeModel, ModelError};
 
@@ -36,29 +33,25 @@ const READ_EVERY: u64 = 10;
 /// Trains a method and writes checkpoint, curve (CSV and PNG), weights and model card into `config.run.out`.
 ///
 /// # Errors
-/// [`TrainError`]; the last checkpoint stays.
-pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
+/// [`Error`]; the last checkpoint stays.
+pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary, Error> {
     Training::prepare(config, observer)?.run(observer)
 }
 
 /// The views that a method is trained on; `is_frozen`: its encoder is frozen, `is_ego_only`: ego-only training.
-fn sample_kind(
-    method: Method,
-    is_frozen: bool,
-    is_ego_only: bool,
-) -> Result<SampleKind, TrainError> {
+fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<SampleKind, Error> {
     match method.exchange() {
         Exchange::Nothing => Ok(SampleKind::Single),
-        Exchange::Points if is_frozen => Err(TrainError::NothingToKeep(method)),
+        Exchange::Points if is_frozen => Err(Error::NothingToKeep(method)),
         Exchange::Points | Exchange::Features if is_ego_only => Ok(SampleKind::Single),
         Exchange::Points => Ok(SampleKind::Merged),
         Exchange::Features => Ok(SampleKind::Cooperative),
-        Exchange::Boxes => Err(TrainError::NotTrained(method)),
+        Exchange::Boxes => Err(Error::NotTrained(method)),
     }
 }
 
 /// The initial model of a training.
-fn first_model(config: &TrainConfig) -> Result<CooperativeModel, TrainError> {
+fn first_model(config: &TrainConfig) -> Result<CooperativeModel, Error> {
     let TrainConfig {
         method,
         run,
@@ -89,7 +82,7 @@ struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, TrainError> {
+    fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, Error> {
         let kind = sample_kind(
             config.method,
             config.frozen_encoder.is_some(),
@@ -103,14 +96,14 @@ impl<'a> Training<'a> {
             kind,
             ..frozen::sample_config(config, &model)
         };
-        samples.poses.validate().map_err(SampleError::from)?;
+        samples.poses.validate()?;
         model.set_precision(run.precision);
         let scenes = Arc::new(SceneSet::open(
             &config.data,
             &config.open,
             &config.protocol,
         )?);
-        let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
+        let assigner = Arc::new(model.assigner()?);
         let mut builder = SampleBuilder::new(
             Arc::clone(&scenes),
             samples.clone(),
@@ -154,7 +147,7 @@ impl<'a> Training<'a> {
         })
     }
 
-    fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
+    fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, Error> {
         observer.opened(&self.scenes.data());
         let pillar_grid = *self.model.network().pillar_grid();
         let mut loader = batches(
@@ -194,7 +187,7 @@ impl<'a> Training<'a> {
     }
 
     /// One step; its losses, or `None` when the gradient was not finite.
-    fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, TrainError> {
+    fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, Error> {
         let device = self.config.run.device;
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
         let output = batch.output(&self.model, true)?;
@@ -248,7 +241,7 @@ impl<'a> Training<'a> {
     }
 
     /// Validation and checkpoint.
-    fn look_back(&mut self, observer: &mut dyn Observer) -> Result<(), TrainError> {
+    fn look_back(&mut self, observer: &mut dyn Observer) -> Result<(), Error> {
         if let Some(validator) = &mut self.validator {
             self.model.set_precision(ComputePrecision::F32);
             let accuracy = validator.measure(&self.model);
@@ -263,7 +256,7 @@ impl<'a> Training<'a> {
         Ok(self.trainer.checkpoint(&self.model.variables)?)
     }
 
-    fn draw_curve(&self) -> Result<(), TrainError> {
+    fn draw_curve(&self) -> Result<(), Error> {
         let TrainConfig { method, run, .. } = self.config;
         self.curve.draw(&format!(
             "{method}, {} samples a step, seed {}",
@@ -271,7 +264,7 @@ impl<'a> Training<'a> {
         ))
     }
 
-    fn finish(self) -> Result<Summary, TrainError> {
+    fn finish(self) -> Result<Summary, Error> {
         self.draw_curve()?;
         let Self {
             config,
@@ -335,7 +328,7 @@ mod tests {
     #[test]
     fn merged_points_are_not_learnt_from_behind_a_frozen_encoder() {
         assert!(
-            matches!(sample_kind(Method::EARLY, true, false), Err(TrainError::NothingToKeep(method)) if method == Method::EARLY)
+            matches!(sample_kind(Method::EARLY, true, false), Err(Error::NothingToKeep(method)) if method == Method::EARLY)
         );
         assert_eq!(
             sample_kind(Method::EARLY, false, false).unwrap(),
@@ -357,7 +350,7 @@ mod tests {
             );
         }
         assert!(
-            matches!(sample_kind(Method::LATE, false, true), Err(TrainError::NotTrained(method)) if method == Method::LATE)
+            matches!(sample_kind(Method::LATE, false, true), Err(Error::NotTrained(method)) if method == Method::LATE)
         );
     }
 }

@@ -11,10 +11,10 @@ use support::sampling::evenly_spread;
 use tch::no_grad;
 
 use super::accuracy::Accuracy;
-use super::error::TrainError;
+use crate::Error;
 use crate::feature_store::MapSource;
 use crate::samples::{
-    Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef,
+    Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SceneSet, TickRef,
 };
 
 /// Measures AP on a fixed choice of frames, each from a fixed vehicle, with no agent missing or late and no added pose
@@ -29,13 +29,13 @@ impl Validator {
     /// Chooses `frames` ticks of `scenes`, evenly spread.
     ///
     /// # Errors
-    /// [`TrainError::Sample`] when a folder cannot be read.
+    /// [`Error::Sample`] when a folder cannot be read.
     pub(crate) fn open(
         scenes: SceneSet,
         samples: &SampleConfig,
         model: &CooperativeModel,
         frames: usize,
-    ) -> Result<Self, TrainError> {
+    ) -> Result<Self, Error> {
         let scenes = Arc::new(scenes);
         let all = scenes.ticks();
         let ticks = evenly_spread(all, frames.max(1));
@@ -51,7 +51,7 @@ impl Validator {
             merged_truth: true,
             ..samples.clone()
         };
-        let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
+        let assigner = Arc::new(model.assigner()?);
         let builder = SampleBuilder::new(scenes, samples, model.config().clone(), assigner);
         Ok(Self { builder, ticks })
     }
@@ -69,8 +69,8 @@ impl Validator {
     /// AP of `model` now.
     ///
     /// # Errors
-    /// [`TrainError`] when a frame cannot be read or does not fit the model.
-    pub(crate) fn measure(&mut self, model: &CooperativeModel) -> Result<Accuracy, TrainError> {
+    /// [`Error`] when a frame cannot be read or does not fit the model.
+    pub(crate) fn measure(&mut self, model: &CooperativeModel) -> Result<Accuracy, Error> {
         let mut scorer = Scorer::default();
         let limits = model.limits();
         for (number, &tick) in self.ticks.iter().enumerate() {
