@@ -13,7 +13,7 @@ use tch::{TchError, Tensor};
 use super::conv_gru::Conv;
 use super::interface::{Fusion, FusionOutput};
 use super::maps::AlignedMaps;
-use super::settings::{FusionSettings, of_size};
+use super::settings::FusionSettings;
 use super::spec::{Exchange, FusionSpec, MethodSpec};
 
 /// DiscoNet.
@@ -46,12 +46,6 @@ impl DiscoNetConfig {
         }
     }
 
-    /// The same: the weighting network is the cheapest part of any network.
-    #[must_use]
-    pub fn lean(channels: i64) -> Self {
-        Self::full(channels)
-    }
-
     /// Checks that a network can be built.
     ///
     /// # Errors
@@ -69,7 +63,7 @@ impl FusionSettings for DiscoNetConfig {
     const KIND: &'static str = "disconet";
 
     fn for_detector(detector: &DetectorConfig) -> Self {
-        of_size(detector, Self::lean, Self::full)
+        Self::full(detector.feature_channels())
     }
 
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
@@ -154,7 +148,7 @@ mod tests {
         tch::set_num_threads(1);
         tch::manual_seed(4);
         let variables = VarStore::new(Device::Cpu);
-        let network = DiscoNet::new(&variables.root(), &DiscoNetConfig::lean(8)).unwrap();
+        let network = DiscoNet::new(&variables.root(), &DiscoNetConfig::full(8)).unwrap();
         let features = Tensor::rand([3, 8, 6, 10], (Kind::Float, Device::Cpu));
         let mask = Tensor::ones([3, 1, 6, 10], (Kind::Float, Device::Cpu));
         let grid = BevGrid {

@@ -9,11 +9,9 @@ use super::spatial_alignment::correlation::PARTS;
 /// Tokens that are queries in the attention over agents and time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Rows {
-    /// Those of the ego's newest map only: only they are used in the end. Maps of others are unchanged.
+pub(crate) enum Rows {
+    /// Those of the ego's newest map: only they are used in the end. Maps of others are unchanged.
     Ego,
-    /// All in every block but the last: maps of others attend to each other too.
-    All,
 }
 
 /// Wavelengths of the temporal encoding as a function of the channel.
@@ -22,8 +20,6 @@ pub enum Rows {
 pub(crate) enum Wavelengths {
     /// `2k / D` for the sine (Eq. 11) and `(2k + 1) / D` for the cosine (Eq. 12), as the paper prints them.
     Printed,
-    /// `2k / D` for both, as is usual.
-    Usual,
 }
 
 /// Feature Spatial Alignment.
@@ -169,7 +165,6 @@ impl PastatConfig {
             heads: 8,
             depth: 3,
             windows: vec![4, 8],
-            rows: Rows::All,
             map_refinement: Some(channels),
             temporal_memory: None,
             earlier_cells: 1,

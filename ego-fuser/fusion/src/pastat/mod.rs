@@ -21,7 +21,6 @@ use tch::{TchError, Tensor, nn};
 
 pub use ablation::{Part, ablated};
 pub(crate) use config::PastatConfig;
-pub use config::Rows;
 
 use self::coarse_alignment::CoarseAlignment;
 use self::confidence_embedding::ConfidenceEmbedding;

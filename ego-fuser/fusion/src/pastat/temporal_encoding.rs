@@ -3,7 +3,7 @@
 use tch::{Device, Kind, TchError, Tensor, nn};
 
 use super::confidence_embedding::Confidences;
-use super::config::{PastatConfig, Wavelengths};
+use super::config::PastatConfig;
 use super::spatial_alignment::AlignedTokens;
 
 /// Ages are clamped to this, seconds.
@@ -58,12 +58,12 @@ impl TemporalEncoding {
     /// `[N, D]`: `E_t` of each map; zeros without the encoding, for the ablation.
     fn of_ages(&self, age_secs: &[f64]) -> Result<Tensor, TchError> {
         let size = [age_secs.len() as i64, self.config.dim];
-        let Some(wavelengths) = self.config.te else {
+        if self.config.te.is_none() {
             return Tensor::f_zeros(size, (Kind::Float, self.device));
-        };
+        }
         let values: Vec<f32> = age_secs
             .iter()
-            .flat_map(|&age| encoding(age, &self.config, wavelengths))
+            .flat_map(|&age| encoding(age, &self.config))
             .collect();
         Tensor::f_from_slice(&values)?
             .f_view(size)?
@@ -75,18 +75,13 @@ impl TemporalEncoding {
 ///
 /// The paper counts time steps from 1, the oldest, to T, the newest. A map between two steps lies between them: `t` is
 /// not a slot but T less the age in steps, so a late message is not encoded as a fresh one.
-fn encoding(age_secs: f64, config: &PastatConfig, wavelengths: Wavelengths) -> Vec<f32> {
+fn encoding(age_secs: f64, config: &PastatConfig) -> Vec<f32> {
     let t = config.frames as f64 - age_secs.clamp(-MAX_AGE_SECS, MAX_AGE_SECS) / config.frame_secs;
     let dim = config.dim as f64;
     (0..config.dim)
         .map(|channel| {
-            let is_cosine = channel % 2 == 1;
-            let numerator = match wavelengths {
-                Wavelengths::Usual if is_cosine => channel - 1,
-                Wavelengths::Usual | Wavelengths::Printed => channel,
-            };
-            let angle = t / 10_000_f64.powf(numerator as f64 / dim);
-            (if is_cosine { angle.cos() } else { angle.sin() }) as f32
+            let angle = t / 10_000_f64.powf(channel as f64 / dim);
+            (if channel % 2 == 1 { angle.cos() } else { angle.sin() }) as f32
         })
         .collect()
 }
@@ -106,7 +101,7 @@ mod tests {
 
     #[test]
     fn the_newest_of_three_frames_is_step_three_as_printed() {
-        let found = encoding(0.0, &config(), Wavelengths::Printed);
+        let found = encoding(0.0, &config());
         for (channel, value) in found.iter().enumerate() {
             let angle = 3.0 / 10_000_f64.powf(channel as f64 / 8.0);
             let expected = if channel % 2 == 0 {
@@ -119,22 +114,19 @@ mod tests {
                 "channel {channel}"
             );
         }
-        let usual = encoding(0.0, &config(), Wavelengths::Usual);
-        assert_eq!(usual[0], found[0]);
-        assert!((f64::from(usual[1]) - 3.0_f64.cos()).abs() < 1e-6);
     }
 
     #[test]
     fn the_oldest_is_step_one_and_a_late_map_lies_between_steps() {
-        let at = |age| encoding(age, &config(), Wavelengths::Printed)[0];
+        let at = |age| encoding(age, &config())[0];
         assert!((at(0.2) - 1.0_f32.sin()).abs() < 1e-6);
         assert!((at(0.05) - 2.5_f32.sin()).abs() < 1e-6);
         assert_ne!(
-            encoding(0.0, &config(), Wavelengths::Printed),
-            encoding(0.5, &config(), Wavelengths::Printed)
+            encoding(0.0, &config()),
+            encoding(0.5, &config())
         );
         assert!(
-            encoding(f64::INFINITY, &config(), Wavelengths::Printed)
+            encoding(f64::INFINITY, &config())
                 .iter()
                 .all(|value| value.is_finite())
         );

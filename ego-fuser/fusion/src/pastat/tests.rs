@@ -136,7 +136,6 @@ fn untrained_it_is_the_maximum_of_the_newest_maps() {
     for config in [
         small(),
         PastatConfig {
-            rows: Rows::All,
             patch: 1,
             earlier_cells: 1,
             ..small()
@@ -161,28 +160,25 @@ fn untrained_it_is_the_maximum_of_the_newest_maps() {
 
 #[test]
 fn masked_entries_change_nothing_also_after_training() {
-    for rows in [Rows::Ego, Rows::All] {
-        let (_store, pastat) = trained(&PastatConfig {
-            rows,
-            fsa: None,
-            ..small()
-        });
-        let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
-        for entry in [1, 3] {
-            let _ = scene.mask.get(entry).fill_(0.0);
-        }
-        let fused = scene.fused(&pastat);
-        for entry in [1, 3] {
-            let _ = scene.features.get(entry).fill_(5.0);
-        }
-        assert!(distance(&scene.fused(&pastat), &fused) < 1e-4);
-        assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-4);
-        // A map with some cells counts only there.
-        let _ = scene.mask.get(1).narrow(2, 0, 4).fill_(1.0);
-        let near = scene.fused(&pastat);
-        let _ = scene.features.get(1).narrow(2, 8, 12).fill_(-5.0);
-        assert!(distance(&scene.fused(&pastat), &near) < 1e-4);
+    let (_store, pastat) = trained(&PastatConfig {
+        fsa: None,
+        ..small()
+    });
+    let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
+    for entry in [1, 3] {
+        let _ = scene.mask.get(entry).fill_(0.0);
     }
+    let fused = scene.fused(&pastat);
+    for entry in [1, 3] {
+        let _ = scene.features.get(entry).fill_(5.0);
+    }
+    assert!(distance(&scene.fused(&pastat), &fused) < 1e-4);
+    assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-4);
+    // A map with some cells counts only there.
+    let _ = scene.mask.get(1).narrow(2, 0, 4).fill_(1.0);
+    let near = scene.fused(&pastat);
+    let _ = scene.features.get(1).narrow(2, 8, 12).fill_(-5.0);
+    assert!(distance(&scene.fused(&pastat), &near) < 1e-4);
 }
 
 #[test]
@@ -236,21 +232,19 @@ fn each_switch_decides_whether_its_input_matters() {
 
 #[test]
 fn every_parameter_gets_a_gradient() {
-    for rows in [Rows::Ego, Rows::All] {
-        let (store, pastat) = trained(&PastatConfig { rows, ..small() });
-        let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
-        (scene.fused(&pastat) * (uniform(8, &[4, 12, 20]) - 0.5))
-            .sum(Kind::Float)
-            .backward();
-        for (name, variable) in store.variables() {
-            let gradient = variable.grad();
-            assert!(gradient.defined(), "{name} has no gradient");
-            let is_finite = gradient.isfinite().all().int64_value(&[]) == 1;
-            assert!(
-                is_finite && gradient.abs().max().double_value(&[]) > 0.0,
-                "{name}"
-            );
-        }
+    let (store, pastat) = trained(&small());
+    let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
+    (scene.fused(&pastat) * (uniform(8, &[4, 12, 20]) - 0.5))
+        .sum(Kind::Float)
+        .backward();
+    for (name, variable) in store.variables() {
+        let gradient = variable.grad();
+        assert!(gradient.defined(), "{name} has no gradient");
+        let is_finite = gradient.isfinite().all().int64_value(&[]) == 1;
+        assert!(
+            is_finite && gradient.abs().max().double_value(&[]) > 0.0,
+            "{name}"
+        );
     }
 }
 

@@ -1,5 +1,5 @@
 //! Ego queries, an extension: only the tokens of the ego's newest map are queries in the attention over agents and time
-//! (`rows: ego`; `all`: off), since only they are used in the end.
+//! (`rows: ego`), since only they are used in the end.
 //!
 //! Attention is then one pass over the tokens, where tensor operations pass over all of them a dozen times. Plain
 //! floats: on the CPU, without gradients. Measured gain: not measured separately; every training in the tables has it.

@@ -1,11 +1,11 @@
-//! Extensions of PASTAT: steps that are not in the paper. Each can be switched off in the configuration, and each file
-//! states the gain where it was measured.
+//! Extensions of PASTAT: steps that are not in the paper. Each but the ego's queries can be switched off in the
+//! configuration, and each file states the gain where it was measured.
 //!
 //! | step | setting | off |
 //! | --- | --- | --- |
 //! | [`alignment_search`] | `fsa.search` | absent |
 //! | [`pooled_history`] | `earlier_cells` | 1 |
-//! | [`ego_queries`] | `rows` | `all` |
+//! | [`ego_queries`] | `rows` | never |
 //! | [`temporal_memory`] | `recall` | absent, `--without temporal-memory` |
 //! | [`map_refinement`] | `refine` | absent |
 

@@ -42,46 +42,30 @@ impl AgentAttention {
         }
     }
 
-    /// Attention of the first `rows` entries to all, at each cell.
+    /// Attention of the ego's newest to all, at each cell: sums over few entries are cheaper than products of small
+    /// matrices.
     ///
     /// # Shapes
-    /// - `tokens`: `[N, h, w, D]`
+    /// - `tokens`: `[N, h, w, D]`, the ego's newest first
     /// - `valid`: `[N, h, w]`, 1 for valid tokens
-    /// - returns: `[rows, h, w, D]`
-    pub(super) fn forward(
-        &self,
-        tokens: &Tensor,
-        valid: &Tensor,
-        rows: i64,
-    ) -> Result<Tensor, TchError> {
+    /// - returns: `[1, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
         let (entries, height, width, dim) = tokens.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
-        let query = self.query.forward(&tokens.f_narrow(0, 0, rows)?) / (each as f64).sqrt();
-        let (key, value) = (self.key.forward(tokens), self.value.forward(tokens));
+        let query = self.query.forward(&tokens.f_narrow(0, 0, 1)?) / (each as f64).sqrt();
+        let [query, key, value] = [query, self.key.forward(tokens), self.value.forward(tokens)]
+            .map(|tensor| tensor.f_view([-1, cells, dim]));
         let hidden = valid.f_eq(0.0)?.f_view([entries, cells, 1])?;
-        let mixed = if rows == 1 {
-            let by_cell = |tensor: &Tensor| tensor.f_view([-1, cells, dim]);
-            self.one_row(
-                &by_cell(&query)?,
-                &by_cell(&key)?,
-                &by_cell(&value)?,
-                &hidden,
-            )?
-        } else {
-            let by_head = |tensor: &Tensor| tensor.f_view([-1, cells, self.heads, each]);
-            all_rows(
-                &by_head(&query)?,
-                &by_head(&key)?,
-                &by_head(&value)?,
-                &hidden,
-            )?
-        };
+        let scores = (query? * key?).f_matmul(&self.members)?;
+        let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(0, None)?;
+        let mixed = (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value?)
+            .f_sum_dim_intlist([0_i64].as_slice(), true, None)?;
         Ok(self
             .out
-            .forward(&mixed.f_reshape([rows, height, width, dim])?))
+            .forward(&mixed.f_reshape([1, height, width, dim])?))
     }
 
-    /// Attention of the ego to all, from tokens that are not normalised yet: the same as `forward` of one row.
+    /// Attention of the ego to all, from tokens that are not normalised yet: the result of `forward`.
     ///
     /// A head's score of a token is the product of its query, led back through the weights of keys and norm, with the
     /// token; the constant term of the norm changes no weight. So neither keys nor values are computed.
@@ -120,37 +104,6 @@ impl AgentAttention {
                 .f_reshape([1, height, width, dim])?,
         ))
     }
-
-    /// One query row, the ego's: sums over few entries are cheaper than products of small matrices.
-    fn one_row(
-        &self,
-        query: &Tensor,
-        key: &Tensor,
-        value: &Tensor,
-        hidden: &Tensor,
-    ) -> Result<Tensor, TchError> {
-        let scores = (query * key).f_matmul(&self.members)?;
-        let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
-        (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value).f_sum_dim_intlist(
-            [0_i64].as_slice(),
-            true,
-            None,
-        )
-    }
-}
-
-fn all_rows(
-    query: &Tensor,
-    key: &Tensor,
-    value: &Tensor,
-    hidden: &Tensor,
-) -> Result<Tensor, TchError> {
-    // [N, cells, heads, d] to [cells, heads, N, d]
-    let by_cell = |tensor: &Tensor| tensor.f_permute([1, 2, 0, 3])?.f_contiguous();
-    let scores = by_cell(query)?.f_matmul(&by_cell(key)?.f_transpose(2, 3)?)?;
-    let hidden = hidden.f_permute([1, 2, 0])?.f_unsqueeze(2)?;
-    let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(3, None)?;
-    weights.f_matmul(&by_cell(value)?)?.f_permute([2, 0, 1, 3])
 }
 
 /// Attention among the tokens of a window, with windows of several sizes, each with its share of the heads.
@@ -287,18 +240,6 @@ mod tests {
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 
     #[test]
-    fn one_row_is_the_first_of_all_rows() {
-        let variables = VarStore::new(Device::Cpu);
-        let attention = AgentAttention::new(&variables.root(), 8, 2);
-        let tokens = Tensor::randn([4, 3, 5, 8], FLOAT);
-        let valid = Tensor::rand([4, 3, 5], FLOAT).gt(0.4).to_kind(Kind::Float);
-        let _ = valid.get(0).fill_(1.0);
-        let all = attention.forward(&tokens, &valid, 4).unwrap();
-        let one = attention.forward(&tokens, &valid, 1).unwrap();
-        assert!(one.allclose(&all.narrow(0, 0, 1), 1e-4, 1e-5, false));
-    }
-
-    #[test]
     fn what_the_ego_gathers_is_what_one_row_learns() {
         let variables = VarStore::new(Device::Cpu);
         let attention = AgentAttention::new(&variables.root(), 12, 2);
@@ -313,9 +254,7 @@ mod tests {
         let valid = uniform(2, &[4, 9, 10]).gt(0.4).to_kind(Kind::Float);
         // No valid tokens here.
         let _ = valid.select(1, 0).select(1, 0).fill_(0.0);
-        let forward = attention
-            .forward(&norm.forward(&tokens), &valid, 1)
-            .unwrap();
+        let forward = attention.forward(&norm.forward(&tokens), &valid).unwrap();
         let others = Others::of(&tokens.permute([0, 3, 1, 2]), &valid).unwrap();
         let gathered = attention
             .gather(&norm, &tokens.narrow(0, 0, 1), &others)
@@ -339,8 +278,8 @@ mod tests {
         let _ = changed.get(1).fill_(7.0);
         let same = |found: Tensor, again: Tensor| found.allclose(&again, 1e-5, 1e-6, false);
         assert!(same(
-            agents.forward(&tokens, &valid, 1).unwrap(),
-            agents.forward(&changed, &valid, 1).unwrap()
+            agents.forward(&tokens, &valid).unwrap(),
+            agents.forward(&changed, &valid).unwrap()
         ));
         let _ = valid.get(0).get(1).get(3).fill_(0.0);
         let _ = changed.get(0).get(1).get(3).fill_(9.0);

@@ -39,27 +39,19 @@ impl Block {
         }
     }
 
-    /// The first `rows` entries after this block.
+    /// The ego's newest after this block.
     ///
     /// # Shapes
-    /// - `tokens`: `[N, h, w, D]`
+    /// - `tokens`: `[N, h, w, D]`, the ego's newest first
     /// - `valid`: `[N, h, w]`
-    /// - returns: `[rows, h, w, D]`
-    pub(super) fn forward(
-        &self,
-        tokens: &Tensor,
-        valid: &Tensor,
-        rows: i64,
-    ) -> Result<Tensor, TchError> {
-        let kept = tokens.f_narrow(0, 0, rows)?;
-        let kept = self
-            .agents
-            .forward(&self.norms[0].forward(tokens), valid, rows)?
-            + kept;
-        self.across(&kept, &valid.f_narrow(0, 0, rows)?)
+    /// - returns: `[1, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+        let attended = self.agents.forward(&self.norms[0].forward(tokens), valid)?;
+        let kept = attended + tokens.f_narrow(0, 0, 1)?;
+        self.across(&kept, &valid.f_narrow(0, 0, 1)?)
     }
 
-    /// The ego's newest `[1, h, w, D]` after this block, in plain floats: the same as the first row of
+    /// The ego's newest `[1, h, w, D]` after this block, in plain floats: the result of
     /// [`forward`](Self::forward).
     pub(super) fn gather(
         &self,

@@ -10,7 +10,7 @@ mod block;
 use tch::{Device, TchError, Tensor, nn};
 
 use self::block::Block;
-use super::config::{PastatConfig, Rows};
+use super::config::PastatConfig;
 use super::extensions::ego_queries::Others;
 use super::patches::channels_last;
 use super::temporal_encoding::Tokens;
@@ -19,7 +19,6 @@ use super::temporal_encoding::Tokens;
 #[derive(Debug)]
 pub(super) struct Transformer {
     blocks: Vec<Block>,
-    rows: Rows,
 }
 
 impl Transformer {
@@ -28,13 +27,12 @@ impl Transformer {
         let block = |index: usize| Block::new(&(path / "blocks" / index), config);
         Self {
             blocks: (0..config.depth).map(block).collect(),
-            rows: config.rows,
         }
     }
 
     /// Context of the ego: its tokens `[1, h, w, D]` after all blocks.
     pub(super) fn forward(&self, Tokens { values, valid }: &Tokens) -> Result<Tensor, TchError> {
-        if self.rows == Rows::Ego && values.device() == Device::Cpu && !values.requires_grad() {
+        if values.device() == Device::Cpu && !values.requires_grad() {
             let (others, valid) = (Others::of(values, valid)?, valid.f_narrow(0, 0, 1)?);
             let ego = channels_last(&values.f_narrow(0, 0, 1)?)?;
             return self
@@ -42,21 +40,11 @@ impl Transformer {
                 .iter()
                 .try_fold(ego, |ego, block| block.gather(&ego, &others, &valid));
         }
-        let count = values.size()[0];
         let mut tokens = channels_last(values)?;
-        for (index, block) in self.blocks.iter().enumerate() {
-            let is_last = index + 1 == self.blocks.len();
-            let rows = if is_last || self.rows == Rows::Ego {
-                1
-            } else {
-                count
-            };
-            let kept = block.forward(&tokens, valid, rows)?;
-            tokens = if is_last || rows == count {
-                kept
-            } else {
-                Tensor::f_cat(&[kept, tokens.f_narrow(0, rows, count - rows)?], 0)?
-            };
+        let others = tokens.f_narrow(0, 1, tokens.size()[0] - 1)?;
+        for block in &self.blocks {
+            let ego = block.forward(&tokens, valid)?;
+            tokens = Tensor::f_cat(&[&ego, &others], 0)?;
         }
         tokens.f_narrow(0, 0, 1)
     }
