@@ -38,6 +38,7 @@ pub mod layers;
 pub mod model_config;
 pub mod pillars;
 pub mod sparse;
+pub mod tensor_values;
 pub mod torch_error;
 pub mod train;
 pub mod weights;

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use perception::inference::Inference;
 use perception::int8::ScaleSearch;
+use perception::tensor_values::values;
 use perception::weights::Weights;
 use protocol::PointCloud;
 use support::stage_times::StageTimes;
@@ -188,13 +189,7 @@ impl Localizer {
         let Some(encoded) = self.encode(LocalizerInput::of(cloud), times)? else {
             return Ok(None);
         };
-        Ok(Some(Vec::try_from(
-            &encoded
-                .features
-                .sweeps
-                .f_reshape([-1])?
-                .f_to_device(Device::Cpu)?,
-        )?))
+        Ok(Some(values(&encoded.features.sweeps)?))
     }
 
     /// Cells and features; `None` for a sweep without cells.
@@ -241,22 +236,15 @@ impl Localizer {
             features: cells,
             sensor_m,
         } = self.pick(sweep, features, &chosen)?;
-        let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
+        let regression = no_grad(|| {
             let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
-            let regression =
-                self.head
-                    .regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
-            let world = Vec::try_from(
-                &regression
-                    .coordinates_m
-                    .f_reshape([-1])?
-                    .f_to_device(Device::Cpu)?,
-            )?;
-            Ok((
-                world,
-                Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?,
-            ))
+            let cells = self.head.normalise(&cells)?;
+            self.head.regress(&cells, &logits, Kind::Float)
         })?;
+        let (world, epsilon_m) = (
+            values(&regression.coordinates_m)?,
+            values(&regression.epsilon_m)?,
+        );
         times.lap(REGRESS);
         let origin_m = self.head.config().origin_m;
         Ok(SceneCoordinates {

@@ -1,7 +1,8 @@
 //! Pose refinement: from a coarse pose to an accurate one, by two rounds of the refiner's predictions and a new fit.
 
 use nalgebra::{Isometry3, Point3, Vector3};
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use perception::tensor_values::values;
+use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::pose_std::PoseStd;
 use super::scene_regression::SceneHead;
@@ -88,13 +89,8 @@ pub(super) fn refine(
             .f_view([-1, 3])?
             .f_to_device(device)?;
         let seen = no_grad(|| refiner.look(&cells, &assumed, &heading, kind))?;
-        let world: Vec<f32> = Vec::try_from(
-            &seen
-                .coordinates_m
-                .f_reshape([-1])?
-                .f_to_device(Device::Cpu)?,
-        )?;
-        let epsilon_m: Vec<f32> = Vec::try_from(&seen.epsilon_m.f_to_device(Device::Cpu)?)?;
+        let world = values(&seen.coordinates_m)?;
+        let epsilon_m = values(&seen.epsilon_m)?;
         let pairs: Vec<Correspondence> = (sensor_m.iter().zip(world.as_chunks().0).zip(&epsilon_m))
             .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
                 source_m,

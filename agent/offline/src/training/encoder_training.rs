@@ -1,7 +1,6 @@
 //! First stage: the encoder, over many scenes, on correspondences between overlapping sweeps. Trained once, then
 //! frozen.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -16,7 +15,6 @@ use super::sweep_store::SweepStore;
 use crate::Error;
 use localization::pgc::{SceneEncoder, SceneEncoderConfig};
 use perception::train::{Curve, DataListing, Prefetch, RunConfig, Trained, Trainer};
-use perception::weights::{CONFIG_KEY, KIND_KEY};
 
 /// Number of pairs of a validation.
 const VALIDATION_PAIRS: u64 = 24;
@@ -232,15 +230,13 @@ impl<'a> Training<'a> {
         for (name, mut variable) in encoder.variables() {
             no_grad(|| variable.f_copy_(&trained[&format!("encoder.{name}")]))?;
         }
-        let config = serde_json::to_string(&self.config.encoder).expect("a configuration is JSON");
-        let about = BTreeMap::from([
-            (CONFIG_KEY.to_owned(), config),
-            (KIND_KEY.to_owned(), SceneEncoder::KIND.to_owned()),
-        ]);
         Ok(EncoderSummary {
-            trained: self
-                .trainer
-                .save_weights(&encoder, about, self.store.data.clone())?,
+            trained: self.trainer.save_network(
+                &encoder,
+                SceneEncoder::KIND,
+                &self.config.encoder,
+                self.store.data.clone(),
+            )?,
             sweeps: self.store.sweeps.len(),
             accuracy: self.accuracy,
         })

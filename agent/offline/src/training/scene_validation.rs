@@ -12,6 +12,7 @@ use localization::pgc::pose_refinement::SweepCells;
 use localization::pgc::pose_search::PoseSearch;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{SceneHead, stopwatch};
+use perception::tensor_values::values;
 use protocol::PoseError;
 
 /// Errors on sweeps that were not trained on.
@@ -53,9 +54,9 @@ pub(super) fn validate(
         .f_abs()?
         .f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     let cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
-    let world: Vec<f32> = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?)?;
-    let sensor: Vec<f32> = Vec::try_from(&cache.sensor_m.f_reshape([-1])?)?;
-    let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
+    let world = values(&regression.coordinates_m)?;
+    let sensor = values(&cache.sensor_m)?;
+    let epsilon = values(&regression.epsilon_m)?;
     let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
     let solver = PoseSolver::default();
     let mut translations = Vec::new();

@@ -1,6 +1,5 @@
 //! Training of SGLoc's head on the sweeps of one scene: cells drawn at random from the cached features of a frozen encoder.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -15,7 +14,7 @@ use crate::Error;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
 use perception::train::{RunConfig, Trained, Trainer};
-use perception::weights::{CONFIG_KEY, KIND_KEY, Weights};
+use perception::weights::Weights;
 
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 10;
@@ -123,14 +122,12 @@ pub fn train_sgloc(
         }
     }
     trainer.checkpoint(&variables)?;
-    let about = BTreeMap::from([
-        (
-            CONFIG_KEY.to_owned(),
-            serde_json::to_string(&network_config).expect("a configuration is JSON"),
-        ),
-        (KIND_KEY.to_owned(), SgLocLocalizer::KIND.to_owned()),
-    ]);
-    Ok(trainer.save_weights(&variables, about, list.data())?)
+    Ok(trainer.save_network(
+        &variables,
+        SgLocLocalizer::KIND,
+        &network_config,
+        list.data(),
+    )?)
 }
 
 /// Random rows of a cache.

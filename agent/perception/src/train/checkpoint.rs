@@ -14,9 +14,10 @@ use serde::de::DeserializeOwned;
 use support::atomic_file;
 use support::file_error::{AtFile, FileError};
 use tch::nn::VarStore;
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Tensor, no_grad};
 
 use super::adamw::AdamW;
+use crate::tensor_values::values;
 
 /// Name of the checkpoint in the folder of the results.
 pub(super) const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
@@ -107,10 +108,6 @@ pub(crate) fn restore<P: DeserializeOwned>(
     Ok(progress)
 }
 
-fn values(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(no_grad(|| tensor.f_to_kind(Kind::Float)?.f_reshape([-1]))?)
-}
-
 fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorError> {
     let file = SafeTensors::deserialize(bytes)?;
     let read = |(name, view): (&str, TensorView<'_>)| {
@@ -129,8 +126,8 @@ fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorErro
 
 #[cfg(test)]
 mod tests {
-    use tch::Device;
     use tch::nn::Init;
+    use tch::{Device, Kind};
 
     use super::super::adamw::AdamWConfig;
     use super::*;

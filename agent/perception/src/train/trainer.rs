@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use support::cli::Interrupted;
-use support::file_error::FileError;
+use support::file_error::{AtFile, FileError};
 use tch::Tensor;
 use tch::nn::VarStore;
 
@@ -19,7 +19,7 @@ use super::error::TrainingError;
 use super::interruption::Steps;
 use super::run_config::RunConfig;
 use super::schedule::OneCycle;
-use crate::weights;
+use crate::weights::{self, CONFIG_KEY, KIND_KEY};
 
 /// Number of gradients in a row that are not finite after which a training fails.
 const MAX_SKIPPED: u32 = 20;
@@ -221,6 +221,23 @@ impl Trainer {
         }
         self.checkpoint(variables)?;
         Err(TrainingError::Interrupted(self.steps(), Interrupted))
+    }
+
+    /// Writes the weights of a network; their header contains `kind` and `config`.
+    ///
+    /// # Errors
+    /// [`FileError`] when a parameter is not finite or the file cannot be written.
+    pub fn save_network(
+        &self,
+        variables: &VarStore,
+        kind: &str,
+        config: &impl Serialize,
+        data: DataListing,
+    ) -> Result<Trained, FileError> {
+        let config = serde_json::to_string(config).at(&self.run.out)?;
+        let about = [(CONFIG_KEY, config), (KIND_KEY, kind.to_owned())];
+        let about = about.map(|(key, text)| (key.to_owned(), text)).into();
+        self.save_weights(variables, about, data)
     }
 
     /// Writes the weights; their header contains `about`, their kind and training.

@@ -9,10 +9,11 @@ use safetensors::tensor::{Dtype, SafeTensorError, TensorView};
 use sha2::{Digest, Sha256};
 use support::atomic_file;
 use support::file_error::{AtFile, FileError};
+use tch::Tensor;
 use tch::nn::VarStore;
-use tch::{Kind, Tensor};
 
 use super::check_finite;
+use crate::tensor_values::values;
 use crate::torch_error::first_line;
 
 /// Number format of parameters on disk.
@@ -101,13 +102,7 @@ fn store(
     precision: Precision,
 ) -> Result<Stored, FileError> {
     let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
-    let flat = tch::no_grad(|| {
-        variable
-            .f_to_kind(Kind::Float)
-            .and_then(|values| values.f_reshape([-1]))
-    });
-    let values = flat.and_then(|flat| Vec::<f32>::try_from(&flat));
-    let values = values.map_err(|error| {
+    let values = values(variable).map_err(|error| {
         FileError::new(
             path,
             format_args!("tensor {name:?}: {}", first_line(&error)),

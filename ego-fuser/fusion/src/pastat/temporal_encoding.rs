@@ -81,7 +81,11 @@ fn encoding(age_secs: f64, config: &PastatConfig) -> Vec<f32> {
     (0..config.dim)
         .map(|channel| {
             let angle = t / 10_000_f64.powf(channel as f64 / dim);
-            (if channel % 2 == 1 { angle.cos() } else { angle.sin() }) as f32
+            (if channel % 2 == 1 {
+                angle.cos()
+            } else {
+                angle.sin()
+            }) as f32
         })
         .collect()
 }
@@ -121,10 +125,7 @@ mod tests {
         let at = |age| encoding(age, &config())[0];
         assert!((at(0.2) - 1.0_f32.sin()).abs() < 1e-6);
         assert!((at(0.05) - 2.5_f32.sin()).abs() < 1e-6);
-        assert_ne!(
-            encoding(0.0, &config()),
-            encoding(0.5, &config())
-        );
+        assert_ne!(encoding(0.0, &config()), encoding(0.5, &config()));
         assert!(
             encoding(f64::INFINITY, &config())
                 .iter()

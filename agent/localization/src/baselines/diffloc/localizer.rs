@@ -14,6 +14,7 @@ use crate::baselines::regressed_pose::{localization, no_pose, upright};
 use crate::pgc::localization::{ENCODE, REGRESS, VOXELISE};
 use crate::pgc::pose_solver::MIN_CELLS;
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
+use perception::tensor_values::values;
 use perception::weights::Weights;
 
 /// A DiffLoc network of one scene, for single sweeps.
@@ -68,9 +69,9 @@ impl Localize for DiffLocLocalizer {
         let cloud = sweep.cloud;
         let mut times = stopwatch();
         let config = self.network.config();
-        let values = config.image.image(&cloud.xyzi);
+        let ranges = config.image.image(&cloud.xyzi);
         times.lap(VOXELISE);
-        if values[..config.image.pixels()]
+        if ranges[..config.image.pixels()]
             .iter()
             .filter(|&&range| range > 0.0)
             .count()
@@ -84,7 +85,7 @@ impl Localize for DiffLocLocalizer {
             config.image.rows as i64,
             config.image.columns as i64,
         ];
-        let image = Tensor::f_from_slice(&values)?
+        let image = Tensor::f_from_slice(&ranges)?
             .f_view(shape)?
             .f_to_device(self.device)?;
         let features = no_grad(|| self.network.encoder().forward(&image, false))?.features;
@@ -92,7 +93,7 @@ impl Localize for DiffLocLocalizer {
         let poses = self
             .network
             .poses(&features.f_unsqueeze(1)?, Windows::Single)?;
-        let answer: Vec<f32> = Vec::try_from(&poses.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
+        let answer = values(&poses)?;
         times.lap(REGRESS);
         let pose = upright(&scaled(&answer, config.scale_m), config.origin_m);
         Ok(localization(pose, times))

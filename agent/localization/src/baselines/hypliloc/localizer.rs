@@ -12,6 +12,7 @@ use super::sweep_input::{InputBatch, SweepInput};
 use crate::baselines::regressed_pose::{localization, no_pose, upright};
 use crate::pgc::localization::{REGRESS, VOXELISE};
 use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
+use perception::tensor_values::values;
 use perception::weights::Weights;
 
 /// Shortest heading that is a direction.
@@ -61,7 +62,7 @@ impl HypLiLocLocalizer {
         let batch = InputBatch::new(&[input], self.device)?;
         let poses = self.network.forward(&batch, Kind::Float, false)?.fusion;
         let answer = Tensor::f_cat(&[poses.position, poses.heading], 1)?;
-        Vec::try_from(&answer.f_reshape([-1])?.f_to_device(Device::Cpu)?)
+        values(&answer)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use perception::tensor_values::values;
 use perception::weights::Weights;
 use protocol::NoPoseReason;
 use tch::nn::VarStore;
@@ -72,12 +73,12 @@ impl SgLocLocalizer {
         let places = Tensor::f_from_slice(sensor_m.as_flattened())?
             .f_view([-1, 3])?
             .f_to_device(self.device)?;
-        let world: Vec<f32> = no_grad(|| {
+        let world = no_grad(|| {
             let cells = features.cells.f_index_select(0, &rows)?;
             let coordinates = self
                 .network
                 .coordinates(&cells, &places, Kind::Float, false)?;
-            Vec::try_from(&coordinates.f_reshape([-1])?.f_to_device(Device::Cpu)?)
+            values(&coordinates)
         })?;
         Ok(SceneCoordinates {
             epsilon_m: vec![0.0; sensor_m.len()],

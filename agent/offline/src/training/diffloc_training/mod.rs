@@ -5,7 +5,6 @@ mod augmentation;
 mod images;
 mod loss;
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -18,7 +17,6 @@ use super::sweep_store::SweepList;
 use crate::Error;
 use localization::baselines::diffloc::{DiffLoc, DiffLocConfig, DiffLocLocalizer};
 use perception::train::{RunConfig, Trained, Trainer};
-use perception::weights::{CONFIG_KEY, KIND_KEY};
 
 pub use accuracy::DiffLocAccuracy;
 use accuracy::{accuracy, validate};
@@ -147,17 +145,13 @@ pub fn train_diffloc(
         last: None,
     };
     training.run(observe)?;
-    let about = BTreeMap::from([
-        (
-            CONFIG_KEY.to_owned(),
-            serde_json::to_string(&network_config).expect("a configuration is JSON"),
-        ),
-        (KIND_KEY.to_owned(), DiffLocLocalizer::KIND.to_owned()),
-    ]);
     Ok(DiffLocSummary {
-        trained: training
-            .trainer
-            .save_weights(&training.variables, about, list.data())?,
+        trained: training.trainer.save_network(
+            &training.variables,
+            DiffLocLocalizer::KIND,
+            &network_config,
+            list.data(),
+        )?,
         sweeps: training.images.len() as usize,
         network: network_config,
         validation: training.last,

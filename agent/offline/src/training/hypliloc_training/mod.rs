@@ -4,7 +4,6 @@ mod augmentation;
 mod criterion;
 mod examples;
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -16,7 +15,6 @@ use crate::Error;
 use localization::baselines::HypLiLocLocalizer;
 use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig, WIDTH};
 use perception::train::{RunConfig, Trained, Trainer};
-use perception::weights::{CONFIG_KEY, KIND_KEY};
 
 use augmentation::augment;
 use criterion::{Criteria, mean_errors};
@@ -131,14 +129,12 @@ pub fn train_hypliloc(
         origin_m: examples.origin_m,
         scale_m: examples.deviation_m,
     };
-    let about = BTreeMap::from([
-        (
-            CONFIG_KEY.to_owned(),
-            serde_json::to_string(&network_config).expect("a configuration is JSON"),
-        ),
-        (KIND_KEY.to_owned(), HypLiLocLocalizer::KIND.to_owned()),
-    ]);
-    Ok(trainer.save_weights(&variables, about, examples.data)?)
+    Ok(trainer.save_network(
+        &variables,
+        HypLiLocLocalizer::KIND,
+        &network_config,
+        examples.data,
+    )?)
 }
 
 #[cfg(test)]

@@ -10,7 +10,6 @@ mod key_grid;
 mod losses;
 mod statistics;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -34,7 +33,6 @@ use crate::Error;
 use localization::pgc::SceneHead;
 use localization::pgc::SceneHeadConfig;
 use perception::train::{Curve, DataListing, Length, RunConfig, Trainer};
-use perception::weights::{CONFIG_KEY, KIND_KEY};
 
 /// Weight of a unit of cross entropy over the centres, metres.
 const CENTRE_WEIGHT_M: f64 = 5.0;
@@ -312,15 +310,13 @@ impl<'a> Training<'a> {
             Some(_) => self.variables,
             None => key_grid::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?,
         };
-        let about = BTreeMap::from([
-            (
-                CONFIG_KEY.to_owned(),
-                serde_json::to_string(&self.head_config).expect("a configuration is JSON"),
-            ),
-            (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
-        ]);
         Ok(SceneSummary {
-            trained: self.trainer.save_weights(&variables, about, self.data)?,
+            trained: self.trainer.save_network(
+                &variables,
+                SceneHead::KIND,
+                &self.head_config,
+                self.data,
+            )?,
             preparing_seconds: self.preparing_seconds,
             scene_name: self.head_config.scene_name,
             sweeps: self.cache.sweep_count(),

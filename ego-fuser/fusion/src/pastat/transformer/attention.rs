@@ -60,9 +60,7 @@ impl AgentAttention {
         let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(0, None)?;
         let mixed = (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value?)
             .f_sum_dim_intlist([0_i64].as_slice(), true, None)?;
-        Ok(self
-            .out
-            .forward(&mixed.f_reshape([1, height, width, dim])?))
+        Ok(self.out.forward(&mixed.f_reshape([1, height, width, dim])?))
     }
 
     /// Attention of the ego to all, from tokens that are not normalised yet: the result of `forward`.
