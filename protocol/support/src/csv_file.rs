@@ -1,7 +1,6 @@
 //! CSV files: rows under a known header with errors that state file, line and field, and texts written row by row.
 
 use std::fmt::Display;
-use std::io;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
@@ -9,42 +8,10 @@ use csv::{ReaderBuilder, StringRecord, Terminator, Trim, Writer, WriterBuilder};
 use protocol::text::excerpt;
 
 use crate::bounded_file;
+use crate::file_error::FileError;
 
 /// Maximum number of characters of a foreign field or line in an error.
 const SHOWN_CHARS: usize = 80;
-
-/// Error of a CSV file.
-#[derive(Debug, thiserror::Error)]
-pub enum CsvError {
-    /// The file is missing or not readable.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Error of the system.
-        source: io::Error,
-    },
-    /// The first line is not the expected header.
-    #[error("{}:1: header is {found:?}, must be {expected:?}", path.display())]
-    Header {
-        /// The file.
-        path: PathBuf,
-        /// The line found.
-        found: String,
-        /// The expected line.
-        expected: &'static str,
-    },
-    /// A row is not valid.
-    #[error("{}:{line}: {problem}", path.display())]
-    Row {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: u64,
-        /// The error, with the value found and the values allowed.
-        problem: String,
-    },
-}
 
 /// A file with the expected header.
 #[derive(Debug, Clone)]
@@ -66,26 +33,23 @@ impl CsvFile {
     /// Reads a file of at most `max_bytes` whose first line is `header`, the column names separated by commas.
     ///
     /// # Errors
-    /// [`CsvError::Io`] and [`CsvError::Header`].
-    pub fn read(path: &Path, header: &'static str, max_bytes: u64) -> Result<Self, CsvError> {
+    /// [`FileError`].
+    pub fn read(path: &Path, header: &'static str, max_bytes: u64) -> Result<Self, FileError> {
         let path = path.to_owned();
         match bounded_file::read_text(&path, max_bytes) {
             Ok(text) => Self { path, header, text }.checked(),
-            Err(source) => Err(CsvError::Io { path, source }),
+            Err(error) => Err(FileError::new(path, error)),
         }
     }
 
-    fn checked(self) -> Result<Self, CsvError> {
+    fn checked(self) -> Result<Self, FileError> {
         let found = self.text.lines().next().unwrap_or_default().trim();
         if found == self.header {
             return Ok(self);
         }
         let found = excerpt(found, SHOWN_CHARS);
-        Err(CsvError::Header {
-            path: self.path,
-            found,
-            expected: self.header,
-        })
+        let problem = format_args!("header is {found:?}, must be {:?}", self.header);
+        Err(FileError::in_line(self.path, 1, problem))
     }
 
     /// The rows below the header; lines without content are skipped.
@@ -108,8 +72,8 @@ impl CsvRow<'_> {
     /// The row itself, if it has a field for every column.
     ///
     /// # Errors
-    /// [`CsvError::Row`].
-    pub fn complete(self) -> Result<Self, CsvError> {
+    /// [`FileError`].
+    pub fn complete(self) -> Result<Self, FileError> {
         let expected = self.file.header.split(',').count();
         if self.record.len() == expected {
             return Ok(self);
@@ -124,13 +88,13 @@ impl CsvRow<'_> {
     /// A field as a number within `range`; `must` describes the allowed numbers.
     ///
     /// # Errors
-    /// [`CsvError::Row`] states the field.
+    /// [`FileError`] states the field.
     pub fn number(
         &self,
         column: usize,
         range: RangeInclusive<f64>,
         must: &str,
-    ) -> Result<f64, CsvError> {
+    ) -> Result<f64, FileError> {
         let number = self
             .field(column)
             .parse()
@@ -141,7 +105,7 @@ impl CsvRow<'_> {
 
     /// The error for a field that is not valid.
     #[must_use]
-    pub fn wrong(&self, column: usize, must: impl Display) -> CsvError {
+    pub fn wrong(&self, column: usize, must: impl Display) -> FileError {
         let name = self.file.header.split(',').nth(column).unwrap_or_default();
         self.fault(format_args!(
             "{name} is {:?}, must be {must}",
@@ -151,12 +115,8 @@ impl CsvRow<'_> {
 
     /// The error for this row.
     #[must_use]
-    pub fn fault(&self, problem: impl Display) -> CsvError {
-        CsvError::Row {
-            path: self.file.path.clone(),
-            line: self.line,
-            problem: problem.to_string(),
-        }
+    pub fn fault(&self, problem: impl Display) -> FileError {
+        FileError::in_line(&self.file.path, self.line, problem)
     }
 
     fn shown(&self) -> String {
@@ -230,7 +190,7 @@ impl CsvText {
 mod tests {
     use super::*;
 
-    fn file(text: &str) -> Result<CsvFile, CsvError> {
+    fn file(text: &str) -> Result<CsvFile, FileError> {
         CsvFile {
             path: "a.csv".into(),
             header: "name,size_m",

@@ -1,12 +1,14 @@
 //! Configuration of a link.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use protocol::config::{FieldError, within};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use support::file_error::FileError;
 
 use super::device_clock::{ClockStep, DeviceClock};
-use super::trace::{Trace, TraceError};
+use super::trace::Trace;
 use super::trace_config::TraceConfig;
 
 /// Payload of one fragment where loss is drawn per fragment, bytes: what fits an 802.11p frame with its headers.
@@ -15,70 +17,20 @@ pub(super) const FRAGMENT_BYTES: u64 = 1400;
 /// Reasons why a link is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
-    /// A number is out of bounds.
-    #[error("link: {field} is {value}, must be {must}")]
-    Value {
-        /// Name of the field.
-        field: &'static str,
-        /// Found value.
-        value: f64,
-        /// Valid values.
-        must: &'static str,
-    },
-    /// No preset has this name.
-    #[error("link: unknown preset {name:?}; there are {known}")]
-    Preset {
-        /// Requested name.
-        name: String,
-        /// Available names.
-        known: String,
-    },
-    /// The delay or the loss refers to a trace, but the capacity is none.
-    #[error("link: {field} is trace, but capacity names no trace with such a column")]
-    NoTrace {
-        /// Name of the field.
-        field: &'static str,
-    },
-    /// The trace is not readable.
+    /// A value is out of bounds, or contradicts another.
+    #[error("link: {0}")]
+    Value(#[from] FieldError),
+    /// A configuration or a trace cannot be read or used.
     #[error(transparent)]
-    Trace(#[from] TraceError),
-    /// The name is neither a preset nor a readable file.
-    #[error("{}: neither a preset of a link ({known}) nor a file that can be read: {source}", path.display())]
-    File {
-        /// Given name or path.
-        path: PathBuf,
-        /// The presets.
-        known: String,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
-    /// The file holds no valid link configuration.
-    #[error("{}: {source}", path.display())]
-    Yaml {
-        /// The file.
-        path: PathBuf,
-        /// The fault, with its position.
-        source: Box<serde_saphyr::Error>,
-    },
-    /// The link in a file is invalid.
-    #[error("{}: {source}", path.display())]
-    InFile {
-        /// The file.
-        path: PathBuf,
-        /// The fault.
-        source: Box<LinkError>,
-    },
+    File(#[from] FileError),
 }
 
 impl LinkError {
-    /// The same with the path of the link's file, if it has none yet.
-    pub(super) fn in_file(name: &str, source: Self) -> Self {
-        match source {
-            in_file @ Self::InFile { .. } => in_file,
-            source => Self::InFile {
-                path: name.into(),
-                source: Box::new(source),
-            },
+    /// The error with the path of the link's file, if it names no file yet.
+    pub(super) fn in_file(self, name: &str) -> Self {
+        match self {
+            Self::File(_) => self,
+            error @ Self::Value(_) => Self::File(FileError::new(name, error)),
         }
     }
 }
@@ -310,53 +262,23 @@ impl LinkConfig {
     /// Checks every number; files are not opened.
     ///
     /// # Errors
-    /// [`LinkError`] with the first invalid field.
-    pub fn validate(&self) -> Result<(), LinkError> {
+    /// [`FieldError`] with the first invalid field.
+    pub fn validate(&self) -> Result<(), FieldError> {
         if let CapacityConfig::TokenBucket { bandwidth_mbps, .. } = self.capacity {
-            bounded(
-                "capacity.bandwidth_mbps",
-                bandwidth_mbps,
-                1e-6,
-                1e6,
-                "1e-6 to 1e6",
-            )?;
+            within("capacity.bandwidth_mbps", bandwidth_mbps, 1e-6, 1e6)?;
         }
-        bounded(
-            "clock.offset_ms",
-            self.clock.offset_ms,
-            -MAX_MS,
-            MAX_MS,
-            "-600,000 to 600,000 ms",
-        )?;
-        bounded(
-            "clock.drift_ppm",
-            self.clock.drift_ppm,
-            -1e5,
-            1e5,
-            "-100,000 to 100,000",
-        )?;
+        within("clock.offset_ms", self.clock.offset_ms, -MAX_MS, MAX_MS)?;
+        within("clock.drift_ppm", self.clock.drift_ppm, -1e5, 1e5)?;
         if let Some(ClockStep { at_s, by_ms }) = self.clock.step {
-            bounded("clock.step.at_s", at_s, 0.0, 1e9, "0 to 1e9 s")?;
-            bounded(
-                "clock.step.by_ms",
-                by_ms,
-                -MAX_MS,
-                MAX_MS,
-                "-600,000 to 600,000 ms",
-            )?;
+            within("clock.step.at_s", at_s, 0.0, 1e9)?;
+            within("clock.step.by_ms", by_ms, -MAX_MS, MAX_MS)?;
         }
         match self.latency {
             LatencyModel::None | LatencyModel::Trace => {}
             LatencyModel::ConstantMs(ms) => time("latency", ms)?,
             LatencyModel::UniformMs([low, high]) => {
                 time("latency", low)?;
-                bounded(
-                    "latency",
-                    high,
-                    low,
-                    MAX_MS,
-                    "from the lower bound to 600,000 ms",
-                )?;
+                within("latency", high, low, MAX_MS)?;
             }
             LatencyModel::Normal { mean_ms, std_ms } => {
                 time("latency.mean_ms", mean_ms)?;
@@ -368,18 +290,12 @@ impl LinkConfig {
                 fixed_ms,
             } => {
                 time("latency.overhead_ms", overhead_ms)?;
-                bounded(
-                    "latency.bandwidth_mbps",
-                    bandwidth_mbps,
-                    1e-6,
-                    1e6,
-                    "1e-6 to 1e6",
-                )?;
+                within("latency.bandwidth_mbps", bandwidth_mbps, 1e-6, 1e6)?;
                 time("latency.fixed_ms", fixed_ms)?;
             }
             LatencyModel::Lognormal { median_ms, sigma } => {
                 time("latency.median_ms", median_ms)?;
-                bounded("latency.sigma", sigma, 0.0, 5.0, "0 to 5")?;
+                within("latency.sigma", sigma, 0.0, 5.0)?;
             }
         }
         time("floor_ms", self.floor_ms)?;
@@ -400,7 +316,7 @@ impl LinkConfig {
             LossModel::Distance(points) => {
                 let mut last_m = 0.0;
                 for &[distance_m, share] in points {
-                    bounded("loss.distance", distance_m, last_m, 1e6, "rising metres")?;
+                    within("loss.distance", distance_m, last_m, 1e6)?;
                     probability("loss.distance", share)?;
                     last_m = distance_m;
                 }
@@ -416,11 +332,11 @@ impl LinkConfig {
         }
         probability("duplicate", self.duplicate)?;
         if let Some(trace) = self.capacity.trace() {
-            bounded("offset_s", trace.offset_s, 0.0, 1e9, "0 to 1e9 s")?;
+            within("offset_s", trace.offset_s, 0.0, 1e9)?;
         }
         for Outage { from_s, to_s } in &self.outages {
-            bounded("outages.from_s", *from_s, 0.0, 1e9, "0 to 1e9 s")?;
-            bounded("outages.to_s", *to_s, *from_s, 1e9, "after from_s")?;
+            within("outages.from_s", *from_s, 0.0, 1e9)?;
+            within("outages.to_s", *to_s, *from_s, 1e9)?;
         }
         Ok(())
     }
@@ -448,10 +364,10 @@ impl LinkConfig {
         };
         let has_steps = matches!(trace, Some(Trace::Steps(_)));
         if self.latency == LatencyModel::Trace && !has_steps {
-            return Err(LinkError::NoTrace { field: "latency" });
+            return Err(FieldError::new("latency", "trace", NO_COLUMN).into());
         }
         if self.loss == LossModel::Trace && !has_steps {
-            return Err(LinkError::NoTrace { field: "loss" });
+            return Err(FieldError::new("loss", "trace", NO_COLUMN).into());
         }
         Ok(trace)
     }
@@ -460,26 +376,15 @@ impl LinkConfig {
 /// Longest valid delay, milliseconds.
 const MAX_MS: f64 = 600_000.0;
 
-fn time(field: &'static str, ms: f64) -> Result<(), LinkError> {
-    bounded(field, ms, 0.0, MAX_MS, "0 to 600,000 ms")
+/// Rule of a delay or a loss from a trace.
+const NO_COLUMN: &str = "capacity must name a trace with such a column";
+
+fn time(field: &str, ms: f64) -> Result<(), FieldError> {
+    within(field, ms, 0.0, MAX_MS)
 }
 
-fn probability(field: &'static str, share: f64) -> Result<(), LinkError> {
-    bounded(field, share, 0.0, 1.0, "0 to 1")
-}
-
-fn bounded(
-    field: &'static str,
-    value: f64,
-    low: f64,
-    high: f64,
-    must: &'static str,
-) -> Result<(), LinkError> {
-    if (low..=high).contains(&value) {
-        Ok(())
-    } else {
-        Err(LinkError::Value { field, value, must })
-    }
+fn probability(field: &str, share: f64) -> Result<(), FieldError> {
+    within(field, share, 0.0, 1.0)
 }
 
 #[cfg(test)]
@@ -561,7 +466,7 @@ mod tests {
                 loss,
                 ..LinkConfig::default()
             })
-            .contains("rising")
+            .contains("loss.distance is 20: must be 50")
         );
         let config = LinkConfig {
             latency: LatencyModel::Trace,

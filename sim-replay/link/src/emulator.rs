@@ -123,7 +123,7 @@ impl LinkEmulator {
     /// [`LinkError`] with the file and its fault.
     pub fn open(name: &str, seed: u64) -> Result<Self, LinkError> {
         let (config, folder) = LinkConfig::open(name)?;
-        Self::new(config, &folder, seed).map_err(|source| LinkError::in_file(name, source))
+        Self::new(config, &folder, seed).map_err(|error| error.in_file(name))
     }
 
     /// The emulator of a configuration; paths of traces start at `folder`. The same seed gives the same results.

@@ -56,5 +56,5 @@ pub use config::{
 pub use device_clock::{ClockStep, DeviceClock};
 pub use emulator::{Delivery, LinkEmulator, Outcome, Packet};
 pub use preset::PRESETS;
-pub use trace::{Step, Trace, TraceError};
+pub use trace::{Step, Trace};
 pub use trace_config::TraceConfig;

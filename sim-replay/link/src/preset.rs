@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use super::config::{
     CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig,
 };
+use protocol::config::FieldError;
 use support::bounded_file;
+use support::file_error::{AtFile, FileError};
 
 /// Every preset with a one-line description.
 pub const PRESETS: [(&str, &str); 6] = [
@@ -46,18 +48,16 @@ impl LinkConfig {
             return Ok((Self::preset(name)?, PathBuf::from(".")));
         }
         let path = PathBuf::from(name);
-        let text = bounded_file::read_text(&path, MAX_BYTES).map_err(|source| LinkError::File {
-            path: path.clone(),
-            known: names.join(", "),
-            source,
+        let text = bounded_file::read_text(&path, MAX_BYTES).map_err(|error| {
+            let names = names.join(", ");
+            let problem = format_args!(
+                "neither a preset of a link ({names}) nor a file that can be read: {error}"
+            );
+            FileError::new(&path, problem)
         })?;
-        let config: Self = serde_saphyr::from_str(&text).map_err(|source| LinkError::Yaml {
-            path: path.clone(),
-            source: Box::new(source),
-        })?;
-        config
-            .validate()
-            .map_err(|source| LinkError::in_file(name, source))?;
+        let config: Self = serde_saphyr::from_str(&text).at(&path)?;
+        let checked = config.validate().map_err(LinkError::from);
+        checked.map_err(|error| error.in_file(name))?;
         let folder = path.parent().unwrap_or(Path::new(".")).to_path_buf();
         Ok((config, folder))
     }
@@ -72,7 +72,7 @@ impl LinkConfig {
     /// A published link model, by name.
     ///
     /// # Errors
-    /// [`LinkError::Preset`] lists the available names.
+    /// [`LinkError::Value`] lists the available names.
     pub fn preset(name: &str) -> Result<Self, LinkError> {
         let shaped = |bandwidth_mbps: f64, burst_bytes| CapacityConfig::TokenBucket {
             bandwidth_mbps,
@@ -146,10 +146,9 @@ impl LinkConfig {
             },
             _ => {
                 let known = PRESETS.map(|(name, _)| name).join(", ");
-                return Err(LinkError::Preset {
-                    name: name.chars().take(40).collect(),
-                    known,
-                });
+                let name: String = name.chars().take(40).collect();
+                let rule = format!("unknown, there are {known}");
+                return Err(FieldError::new("preset", name, rule).into());
             }
         })
     }

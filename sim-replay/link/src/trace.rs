@@ -1,11 +1,12 @@
 //! Link traces: measured rates, delays and losses over time.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use protocol::text::excerpt;
 
 use support::bounded_file;
-use support::csv_file::{CsvError, CsvFile, CsvRow};
+use support::csv_file::{CsvFile, CsvRow};
+use support::file_error::{AtFile, FileError};
 use support::rounding;
 
 /// First line of a CSV trace.
@@ -14,40 +15,7 @@ const HEADER: &str = "time_s,bandwidth_mbps,latency_ms,loss";
 pub(super) const OPPORTUNITY_BYTES: u64 = 1500;
 /// Longer files are refused, bytes.
 const MAX_FILE_BYTES: u64 = 256 << 20;
-
-/// Reasons why a trace cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum TraceError {
-    /// The file or a row of it cannot be used.
-    #[error(transparent)]
-    Csv(#[from] CsvError),
-    /// A line is invalid.
-    #[error("{}:{line}: {found:?} must be {must}", path.display())]
-    Line {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: usize,
-        /// Found text.
-        found: String,
-        /// Valid content.
-        must: &'static str,
-    },
-    /// It ends before the start of the link.
-    #[error("{}: offset_s is {offset_s}, behind the last line", path.display())]
-    Past {
-        /// The file.
-        path: PathBuf,
-        /// Start of the link in the trace, seconds.
-        offset_s: f64,
-    },
-    /// The file has no line of data.
-    #[error("{}: no line with numbers", path.display())]
-    Empty {
-        /// The file.
-        path: PathBuf,
-    },
-}
+const NO_NUMBERS: &str = "no line with numbers";
 
 /// The state of a link from a time on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -76,8 +44,8 @@ impl Trace {
     /// before. The link begins at `offset_nanos`.
     ///
     /// # Errors
-    /// [`TraceError`] with the file and the line.
-    pub fn read_csv(path: &Path, offset_nanos: u64) -> Result<Self, TraceError> {
+    /// [`FileError`] with the file and the line.
+    pub fn read_csv(path: &Path, offset_nanos: u64) -> Result<Self, FileError> {
         let mut steps: Vec<Step> = Vec::new();
         for row in CsvFile::read(path, HEADER, MAX_FILE_BYTES)?.rows() {
             let row = row.complete()?;
@@ -89,7 +57,7 @@ impl Trace {
                 });
             if !is_later {
                 let must = "later than the line before, the first at offset_s (0) or before";
-                return Err(row.wrong(0, must).into());
+                return Err(row.wrong(0, must));
             }
             steps.push(step);
         }
@@ -97,10 +65,9 @@ impl Trace {
             .last()
             .is_some_and(|last| last.from_nanos < offset_nanos);
         if is_past {
-            return Err(TraceError::Past {
-                path: path.to_owned(),
-                offset_s: offset_nanos as f64 * 1e-9,
-            });
+            let offset_s = offset_nanos as f64 * 1e-9;
+            let problem = format_args!("offset_s is {offset_s}, behind the last line");
+            return Err(FileError::new(path, problem));
         }
         let begin = steps
             .partition_point(|step| step.from_nanos <= offset_nanos)
@@ -111,19 +78,18 @@ impl Trace {
         };
         match steps.get(begin..) {
             Some(left @ [_, ..]) => Ok(Self::Steps(left.iter().map(shifted).collect())),
-            _ => Err(TraceError::Empty {
-                path: path.to_owned(),
-            }),
+            _ => Err(FileError::new(path, NO_NUMBERS)),
         }
     }
 
     /// Reads delivery opportunities in mahimahi's format: one line per packet, whole milliseconds that never decrease.
     ///
     /// # Errors
-    /// [`TraceError`] with the file and the line.
-    pub fn read_mahimahi(path: &Path) -> Result<Self, TraceError> {
+    /// [`FileError`] with the file and the line.
+    pub fn read_mahimahi(path: &Path) -> Result<Self, FileError> {
         let mut times = Vec::new();
-        for (index, line) in read(path)?
+        for (index, line) in bounded_file::read_text(path, MAX_FILE_BYTES)
+            .at(path)?
             .lines()
             .enumerate()
             .filter(|(_, line)| !line.trim().is_empty())
@@ -146,9 +112,7 @@ impl Trace {
             }
         }
         match times.last() {
-            None => Err(TraceError::Empty {
-                path: path.to_owned(),
-            }),
+            None => Err(FileError::new(path, NO_NUMBERS)),
             // The length of a trace is its last time: one that ends at 0 would deliver everything at once.
             Some(0) => Err(wrong(path, times.len() - 1, "0", "a last line above 0")),
             Some(_) => Ok(Self::Opportunities(times)),
@@ -168,7 +132,7 @@ impl Trace {
     }
 }
 
-fn step(row: &CsvRow<'_>) -> Result<Step, CsvError> {
+fn step(row: &CsvRow<'_>) -> Result<Step, FileError> {
     let time_s = row.number(0, 0.0..=1e9, "0 to 1e9 seconds")?;
     let bandwidth_mbps = row.number(1, 0.0..=1e6, "0 to 1e6 Mbit/s")?;
     Ok(Step {
@@ -179,20 +143,9 @@ fn step(row: &CsvRow<'_>) -> Result<Step, CsvError> {
     })
 }
 
-fn read(path: &Path) -> Result<String, CsvError> {
-    bounded_file::read_text(path, MAX_FILE_BYTES).map_err(|source| CsvError::Io {
-        path: path.to_owned(),
-        source,
-    })
-}
-
-fn wrong(path: &Path, index: usize, found: &str, must: &'static str) -> TraceError {
-    TraceError::Line {
-        path: path.to_owned(),
-        line: index + 1,
-        found: excerpt(found, 80),
-        must,
-    }
+fn wrong(path: &Path, index: usize, found: &str, must: &str) -> FileError {
+    let problem = format_args!("{:?} must be {must}", excerpt(found, 80));
+    FileError::in_line(path, index as u64 + 1, problem)
 }
 
 #[cfg(test)]
@@ -261,10 +214,7 @@ mod tests {
             let message = Trace::read_csv(&path, 0).unwrap_err().to_string();
             assert!(message.contains(&format!("trace.txt:{line}:")), "{message}");
         }
-        assert!(matches!(
-            Trace::read_csv(Path::new("no/such/trace.csv"), 0),
-            Err(TraceError::Csv(CsvError::Io { .. }))
-        ));
+        assert!(Trace::read_csv(Path::new("no/such/trace.csv"), 0).is_err());
         let (_folder, path) = file("time,rate\n");
         assert!(
             Trace::read_csv(&path, 0)

@@ -1,8 +1,9 @@
 //! Table of measured pose errors of a pose generator, one row per sweep.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use support::csv_file::{CsvError, CsvFile, CsvRow};
+use support::csv_file::{CsvFile, CsvRow};
+use support::file_error::FileError;
 
 use super::noise::PlanarError;
 
@@ -13,20 +14,6 @@ const HEADER: &str = "x_m,y_m,z_m,yaw_deg,confidence";
 const MAX_ERROR_M: f64 = 1e5;
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 64 << 20;
-
-/// Error of reading a table.
-#[derive(Debug, thiserror::Error)]
-pub enum ErrorTableError {
-    /// The file or a row of it cannot be used.
-    #[error(transparent)]
-    Csv(#[from] CsvError),
-    /// There is no row.
-    #[error("{}: no row below the header", path.display())]
-    Empty {
-        /// Path of the file.
-        path: PathBuf,
-    },
-}
 
 /// Result of one sweep.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,16 +41,14 @@ impl ErrorTable {
     /// Reads a table.
     ///
     /// # Errors
-    /// [`ErrorTableError`] names the file, the line and the column.
-    pub fn read(path: &Path) -> Result<Self, ErrorTableError> {
+    /// [`FileError`] names the file, the line and the column.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
         let rows = CsvFile::read(path, HEADER, MAX_BYTES)?
             .rows()
             .map(parse_row)
             .collect::<Result<Vec<_>, _>>()?;
         if rows.is_empty() {
-            Err(ErrorTableError::Empty {
-                path: path.to_owned(),
-            })
+            Err(FileError::new(path, "no row below the header"))
         } else {
             Ok(Self { rows })
         }
@@ -77,7 +62,7 @@ impl ErrorTable {
     }
 }
 
-fn parse_row(row: CsvRow<'_>) -> Result<TableRow, CsvError> {
+fn parse_row(row: CsvRow<'_>) -> Result<TableRow, FileError> {
     if row.field(0) == "no_pose" {
         return Ok(TableRow::NoPose);
     }
@@ -101,7 +86,7 @@ fn parse_row(row: CsvRow<'_>) -> Result<TableRow, CsvError> {
 mod tests {
     use super::*;
 
-    fn read(text: &str) -> Result<ErrorTable, ErrorTableError> {
+    fn read(text: &str) -> Result<ErrorTable, FileError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("errors.csv");
         std::fs::write(&path, text).unwrap();

@@ -17,17 +17,18 @@ use std::path::{Path, PathBuf};
 
 use perception::detector::BackboneLevel;
 use perception::inference::Inference;
+use perception::weights::FileError;
 use protocol::config::{FieldError, within};
 use protocol::{CavId, EgoMotion, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use error_table::{ErrorTable, ErrorTableError, TableRow};
+pub use error_table::{ErrorTable, TableRow};
 pub use localized::{BaselinePoseConfig, LocalizedPose, PgcConfig};
 pub use noise::PlanarError;
 pub use noisy::NoisyPose;
 pub(crate) use pose_table::CachedPose;
-pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
+pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable};
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
 use crate::pgc::head_files::{encoder_or_named, head_file, is_name};
@@ -256,15 +257,12 @@ pub enum PoseSourceError {
     /// A value is out of range, or a file is not named.
     #[error("pose source: {0}")]
     Value(#[from] FieldError),
-    /// The table is not readable.
+    /// A table of errors or poses is not readable.
     #[error(transparent)]
-    Table(#[from] ErrorTableError),
+    Table(#[from] FileError),
     /// The networks cannot be used.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
-    /// The table of poses is not readable.
-    #[error(transparent)]
-    PoseTable(#[from] PoseTableError),
 }
 
 impl PoseSourceConfig {

@@ -2,51 +2,20 @@
 
 use std::collections::HashMap;
 use std::fs::OpenOptions;
-use std::io::{self, Write as _};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use support::csv_file::{CsvError, CsvFile, CsvRow, CsvText};
+use support::csv_file::{CsvFile, CsvRow, CsvText};
+use support::file_error::{AtFile, FileError};
 
 /// The first line of a table.
 const HEADER: &str =
     "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
 /// Largest file that is read, bytes: two million sweeps.
 const MAX_BYTES: u64 = 256 << 20;
-
-/// Error of reading or writing a table of poses.
-#[derive(Debug, thiserror::Error)]
-pub enum PoseTableError {
-    /// The file or a row of it cannot be used.
-    #[error(transparent)]
-    Csv(#[from] CsvError),
-    /// The file cannot be written.
-    #[error("{}: {source}", path.display())]
-    Write {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
-    /// The requested scenario has no row.
-    #[error("{}: there is no pose of scenario {scenario} in it", path.display())]
-    NoScenario {
-        /// Path of the file.
-        path: PathBuf,
-        /// Name of the scenario.
-        scenario: String,
-    },
-    /// The table has several scenarios and none is selected.
-    #[error("{}: it has poses of {count} scenarios, `scenario` must name one", path.display())]
-    WhichScenario {
-        /// Path of the file.
-        path: PathBuf,
-        /// Number of scenarios.
-        count: usize,
-    },
-}
 
 /// A sweep within its scenario.
 type SweepKey = (CavId, u64);
@@ -76,8 +45,8 @@ impl PoseTable {
     /// Reads a table.
     ///
     /// # Errors
-    /// [`PoseTableError`] names the file and the line.
-    pub fn read(path: &Path) -> Result<Self, PoseTableError> {
+    /// [`FileError`] names the file and the line.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
         let mut table = Self {
             path: path.to_owned(),
             ..Self::default()
@@ -124,8 +93,8 @@ impl PoseTable {
     /// Appends the rows of a scenario to a file, which gets its header where it is new.
     ///
     /// # Errors
-    /// [`PoseTableError::Write`] when the file cannot be written.
-    pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<(), PoseTableError> {
+    /// [`FileError`] when the file cannot be written.
+    pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<(), FileError> {
         let mut text = if path.exists() {
             CsvText::headless()
         } else {
@@ -134,45 +103,30 @@ impl PoseTable {
         rows.iter()
             .for_each(|row| text.row(fields(last_part(scenario), row)));
         let text = text.finish();
-        let append = |path: &Path| {
-            OpenOptions::new()
-                .create(true)
-                .append(true)
-                .open(path)?
-                .write_all(text.as_bytes())
-        };
-        append(path).map_err(|source| PoseTableError::Write {
-            path: path.to_owned(),
-            source,
-        })
+        let file = OpenOptions::new().create(true).append(true).open(path);
+        file.and_then(|mut file| file.write_all(text.as_bytes()))
+            .at(path)
     }
 
     /// The poses of one scenario: the requested one, or the only one there is.
     ///
     /// # Errors
-    /// [`PoseTableError`] when there is none, or several and none is requested.
+    /// [`FileError`] when there is none, or several and none is requested.
     fn of_scenario(
         mut self,
         scenario: Option<&str>,
-    ) -> Result<HashMap<SweepKey, PoseEstimate>, PoseTableError> {
-        let path = self.path.clone();
-        match scenario {
-            Some(name) => {
-                self.scenarios
-                    .remove(last_part(name))
-                    .ok_or_else(|| PoseTableError::NoScenario {
-                        path,
-                        scenario: name.to_owned(),
-                    })
+    ) -> Result<HashMap<SweepKey, PoseEstimate>, FileError> {
+        let wrong = match (scenario, self.scenarios.len()) {
+            (Some(name), _) => match self.scenarios.remove(last_part(name)) {
+                Some(poses) => return Ok(poses),
+                None => format!("there is no pose of scenario {name} in it"),
+            },
+            (None, 1) => return Ok(self.scenarios.into_values().next().unwrap_or_default()),
+            (None, count) => {
+                format!("it has poses of {count} scenarios, `scenario` must name one")
             }
-            None if self.scenarios.len() == 1 => {
-                Ok(self.scenarios.into_values().next().unwrap_or_default())
-            }
-            None => Err(PoseTableError::WhichScenario {
-                path,
-                count: self.scenarios.len(),
-            }),
-        }
+        };
+        Err(FileError::new(self.path, wrong))
     }
 }
 
@@ -199,8 +153,8 @@ impl CachedPose {
     /// Reads the table.
     ///
     /// # Errors
-    /// [`PoseTableError`] names the file and what is wrong with it.
-    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
+    /// [`FileError`] names the file and what is wrong with it.
+    pub(crate) fn new(config: &CachedPoseConfig) -> Result<Self, FileError> {
         Ok(Self {
             poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())?,
         })
@@ -264,7 +218,7 @@ fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
     fields
 }
 
-fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, CsvError> {
+fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, FileError> {
     let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
     Ok((
         cav,
@@ -274,7 +228,7 @@ fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, CsvError> {
     ))
 }
 
-fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
+fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
     if row.field(11).is_empty() {
         pose(row)
     } else {
@@ -282,7 +236,7 @@ fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
     }
 }
 
-fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
+fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
     let number = |column| row.number(column, f64::MIN..=f64::MAX, "a finite number");
     let translation_m = [number(3)?, number(4)?, number(5)?];
     let rotation_wxyz = [number(6)?, number(7)?, number(8)?, number(9)?];
@@ -297,7 +251,7 @@ fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
     Ok(PoseEstimate::new(world_from_cav, confidence as f32))
 }
 
-fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
+fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate, FileError> {
     let reason: NoPoseReason =
         serde_json::from_value(serde_json::Value::String(row.field(11).to_owned()))
             .map_err(|_| row.wrong(11, "a reason for no pose"))?;
