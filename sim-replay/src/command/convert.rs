@@ -82,7 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 Outcome::DataLost
             })
         }
-        Err(error @ SynthError::Write { .. }) => Err(error.into()),
+        Err(error @ SynthError::Write(_)) => Err(error.into()),
         Err(error) => {
             output::note(format_args!("error: {error}"));
             Ok(Outcome::BadInput)

@@ -90,7 +90,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
             print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
-        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => {
+        Err(error @ (SynthError::Write(_) | SynthError::TooFewCompanions { .. })) => {
             Err(error.into())
         }
         Err(error) => {

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use simulator::map::{Finding, Map, RoadMapError, read_map};
+use simulator::map::{Finding, Map, read_map};
+use support::file_error::FileError;
 
 /// Contents of an OpenDRIVE map. Serializes to the JSON of `sim-replay inspect --json MAP.xodr`, prints as its table.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -39,8 +40,8 @@ pub struct MapReport {
 /// Reads an OpenDRIVE map.
 ///
 /// # Errors
-/// [`RoadMapError`] if the file cannot be read or is no usable map.
-pub fn inspect_map(path: &Path) -> Result<MapReport, RoadMapError> {
+/// [`FileError`] if the file cannot be read or is no usable map.
+pub fn inspect_map(path: &Path) -> Result<MapReport, FileError> {
     let Map { network, lanes } = read_map(path)?;
     let roads = &network.roads;
     let heights = || {

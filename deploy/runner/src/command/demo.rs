@@ -183,7 +183,7 @@ fn generate(options: &SynthOptions) -> anyhow::Result<()> {
     bar.finish_and_clear();
     match generated {
         Ok(_) => Ok(()),
-        Err(error @ (SynthError::Write { .. } | SynthError::TooFewCompanions { .. })) => {
+        Err(error @ (SynthError::Write(_) | SynthError::TooFewCompanions { .. })) => {
             Err(error.into())
         }
         Err(error) => Err(BadInput::of(error).into()),

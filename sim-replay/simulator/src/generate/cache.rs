@@ -12,6 +12,7 @@ use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
 use crate::map::RoadMapSource;
 use support::bounded_file;
+use support::file_error::{AtFile, FileError};
 
 /// Longer files were not written by this program, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
@@ -130,13 +131,9 @@ pub fn generate_whole(
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<Summary, SynthError> {
     let unfinished = options.out.with_added_extension("unfinished");
-    let write = |path: &Path, source| SynthError::Write {
-        path: path.to_owned(),
-        source,
-    };
     match fs::remove_dir_all(&unfinished) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            return Err(write(&unfinished, error));
+            return Err(SynthError::Write(FileError::new(unfinished, error)));
         }
         Ok(()) | Err(_) => {}
     }
@@ -147,37 +144,28 @@ pub fn generate_whole(
         },
         progress,
     )?;
-    fs::rename(&unfinished, &options.out).map_err(|source| write(&options.out, source))?;
+    fs::rename(&unfinished, &options.out)
+        .at(&options.out)
+        .map_err(SynthError::Write)?;
     Ok(summary)
 }
 
 /// Settings with which the scenarios in a folder were made; an error if a scenario has no file with its settings.
 fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
-    let at = |path: &Path, problem: String| SynthError::Read {
-        path: path.to_owned(),
-        problem,
-    };
-    let entries = fs::read_dir(folder).map_err(|error| at(folder, error.to_string()))?;
     let mut generators = Vec::new();
-    for entry in entries {
-        let scenario = entry.map_err(|error| at(folder, error.to_string()))?.path();
+    for entry in fs::read_dir(folder).at(folder)? {
+        let scenario = entry.at(folder)?.path();
         if !scenario.is_dir() {
             continue;
         }
         let file = scenario.join(FILE_NAME);
-        let text = bounded_file::read_text(&file, MAX_FILE_BYTES)
-            .map_err(|error| at(&file, error.to_string()))?;
+        let text = bounded_file::read_text(&file, MAX_FILE_BYTES).map_err(|error| {
+            let problem = format!("{error}; generated scenes record their settings in this file");
+            FileError::new(&file, problem)
+        })?;
         let made: MadeWith = serde_saphyr::from_str(&text).map_err(|error| {
-            at(
-                &file,
-                error
-                    .without_snippet()
-                    .to_string()
-                    .lines()
-                    .next()
-                    .unwrap_or_default()
-                    .into(),
-            )
+            let text = error.without_snippet().to_string();
+            FileError::new(&file, text.lines().next().unwrap_or_default())
         })?;
         generators.push(made.generator);
     }

@@ -2,14 +2,15 @@
 
 use std::path::PathBuf;
 
-use crate::map::RoadMapError;
+use protocol::config::FieldError;
+use support::file_error::FileError;
 
 /// Reasons why scenes could not be generated.
 #[derive(Debug, thiserror::Error)]
 pub enum SynthError {
-    /// The map could not be built.
+    /// A map, or the settings that are recorded with generated scenes, cannot be used.
     #[error(transparent)]
-    MapModel(#[from] RoadMapError),
+    File(#[from] FileError),
     /// The output folder is not empty.
     #[error("{} is not empty; --force writes into it anyway", .0.display())]
     NotEmpty(PathBuf),
@@ -25,22 +26,9 @@ pub enum SynthError {
         /// Requested value.
         wanted: String,
     },
-    /// The settings of the scenes in a folder cannot be read.
-    #[error("{}: {problem}; generated scenes record their settings in this file", path.display())]
-    Read {
-        /// The file with the settings.
-        path: PathBuf,
-        /// The fault.
-        problem: String,
-    },
     /// A file or folder could not be written.
-    #[error("{}: {source}", path.display())]
-    Write {
-        /// File or folder that was to be written.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Write(FileError),
     /// A layout cannot hold a scene.
     #[error("layout {layout}: {reason}")]
     Layout {
@@ -49,16 +37,9 @@ pub enum SynthError {
         /// Property of the scene that the layout cannot hold.
         reason: String,
     },
-    /// A numeric option is invalid.
-    #[error("{option} is {value}; {expected}")]
-    Option {
-        /// Its name on the command line.
-        option: &'static str,
-        /// Given value.
-        value: String,
-        /// Valid values.
-        expected: &'static str,
-    },
+    /// An option is invalid.
+    #[error(transparent)]
+    Option(#[from] FieldError),
     /// The road network has no place for a vehicle.
     #[error("map {0} has no lane long enough to start from")]
     NoRoad(String),

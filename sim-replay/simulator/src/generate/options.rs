@@ -4,9 +4,9 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use clap::ValueEnum;
+use protocol::config::{FieldError, require, within};
 
 use super::camera::ImageSize;
-use super::error::SynthError;
 use super::layout::SceneLayout;
 use super::traffic::STEP_S;
 use super::weather::Weather;
@@ -111,56 +111,35 @@ impl SynthOptions {
     /// Checks the numbers.
     ///
     /// # Errors
-    /// [`SynthError::Option`] with the first invalid option.
-    pub fn validate(&self) -> Result<(), SynthError> {
-        let check = |is_good: bool, option: &'static str, value: String, expected: &'static str| {
-            if is_good {
-                Ok(())
-            } else {
-                Err(SynthError::Option {
-                    option,
-                    value,
-                    expected,
-                })
-            }
-        };
+    /// [`FieldError`] with the first invalid option.
+    pub fn validate(&self) -> Result<(), FieldError> {
         let steps = self.period_s / STEP_S;
         let is_multiple = (1.0..=1e4).contains(&steps) && (steps - steps.round()).abs() < 1e-6;
-        check(
+        require(
             is_multiple,
             "--period-s",
-            self.period_s.to_string(),
-            "expected a multiple of 0.05 s up to 500 s",
+            self.period_s,
+            "must be a multiple of 0.05 s up to 500 s",
         )?;
-        check(
-            (1..=100_000).contains(&self.frames),
-            "--frames",
-            self.frames.to_string(),
-            "expected 1 to 100000",
-        )?;
-        check(
-            (1..=10_000).contains(&self.scenes),
-            "--scenes",
-            self.scenes.to_string(),
-            "expected 1 to 10000",
-        )?;
+        within("--frames", self.frames, 1, 100_000)?;
+        within("--scenes", self.scenes, 1, 10_000)?;
         let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
         let have_names = self
             .copies
             .iter()
             .all(|weather| weather.variant().is_some());
-        check(
+        require(
             have_names,
             "--weather-copies",
             copies.join(","),
-            "expected fog, snow or both",
+            "must be fog, snow or both",
         )?;
         let have_place = self.copies.is_empty() || self.layout == SceneLayout::Opv2v;
-        check(
+        require(
             have_place,
             "--weather-copies",
             copies.join(","),
-            "expected none, as the layout opv2v alone has copies of sweeps",
+            "must be none, as the layout opv2v alone has copies of sweeps",
         )?;
         let images = self
             .cameras
@@ -170,44 +149,43 @@ impl SynthOptions {
                 .iter()
                 .all(|edge| (16..=4096).contains(edge))
         });
-        check(
+        require(
             are_small,
             "--cameras",
-            images.clone(),
-            "expected 16 to 4096 pixels along each edge",
+            &images,
+            "must be 16 to 4096 pixels along each edge",
         )?;
         let have_place = self.cameras.is_none() || self.layout == SceneLayout::Opv2v;
-        check(
+        require(
             have_place,
             "--cameras",
             images,
-            "expected none, as images are written in the layout opv2v alone",
+            "must be none, as images are written in the layout opv2v alone",
         )?;
         let agents = format!("{}-{}", self.agents.start(), self.agents.end());
         let is_range = *self.agents.start() >= 1
             && self.agents.start() <= self.agents.end()
             && *self.agents.end() <= 7;
-        check(
+        require(
             is_range,
             "--vehicles",
-            agents.clone(),
-            "expected a number or a range within 1-7",
+            &agents,
+            "must be a number or a range within 1-7",
         )?;
         if !self.layout.needs_two_agents() {
             return Ok(());
         }
-        let subset = self.subset.name().to_owned();
-        check(
+        require(
             self.subset == Subset::V2vdet,
             "--subset",
-            subset,
-            "expected v2vdet, as the layout needs two agents",
+            self.subset.name(),
+            "must be v2vdet, as the layout needs two agents",
         )?;
-        check(
+        require(
             *self.agents.start() >= 2,
             "--vehicles",
             agents,
-            "expected 2 or more, as the layout needs two agents",
+            "must be 2 or more, as the layout needs two agents",
         )
     }
 }

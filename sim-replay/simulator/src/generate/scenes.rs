@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use support::file_error::AtFile;
 
 use protocol::CavId;
 
@@ -127,11 +128,7 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
 /// Creates the output folder, or refuses one that is not empty.
 pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), SynthError> {
     make_folder(out)?;
-    let entries = fs::read_dir(out);
-    let mut entries = entries.map_err(|source| SynthError::Write {
-        path: out.to_owned(),
-        source,
-    })?;
+    let mut entries = fs::read_dir(out).at(out).map_err(SynthError::Write)?;
     if entries.next().is_some() && !force {
         return Err(SynthError::NotEmpty(out.to_owned()));
     }

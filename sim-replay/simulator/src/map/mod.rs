@@ -42,6 +42,7 @@ use std::path::{Path, PathBuf};
 use surface::Surface;
 
 use support::bounded_file;
+use support::file_error::{AtFile, FileError};
 
 /// Longest side of a map, metres.
 const MAX_EXTENT_M: f64 = 50_000.0;
@@ -105,50 +106,11 @@ pub struct ParkingSpot {
     pub width_m: f64,
 }
 
-/// Reasons why a map cannot be built.
-#[derive(Debug, thiserror::Error)]
-pub enum RoadMapError {
-    /// The map's file could not be read.
-    #[error("{}: {source}", path.display())]
-    Read {
-        /// The map's file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
-    /// The map's file is not a usable OpenDRIVE map.
-    #[error("{}: {source}", path.display())]
-    OpenDrive {
-        /// The map's file.
-        path: PathBuf,
-        /// The fault, with its position in the file.
-        source: OpenDriveError,
-    },
-    /// The map has no lane to drive on.
-    #[error("{}: none of its {roads} roads has a driving lane", path.display())]
-    NoLanes {
-        /// The map's file.
-        path: PathBuf,
-        /// Number of roads.
-        roads: usize,
-    },
-    /// The map is larger than the limit.
-    #[error("{}: its lanes reach over {extent_m:.0} m, more than the limit of {limit_m} m", path.display())]
-    TooLarge {
-        /// The map's file.
-        path: PathBuf,
-        /// Longer side of the rectangle around its lanes, metres.
-        extent_m: f64,
-        /// Longest side of a map, metres.
-        limit_m: f64,
-    },
-}
-
 /// Builds the map of `source` and `map_seed`.
 ///
 /// # Errors
-/// [`RoadMapError`] when a map cannot be read or is no usable road network; procedural maps always build.
-pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, RoadMapError> {
+/// [`FileError`] when a map cannot be read or is no usable road network; procedural maps always build.
+pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, FileError> {
     let name = source.name();
     match source {
         RoadMapSource::Town1 => Ok(place_roadside(name, &layout::town1(map_seed), map_seed)),
@@ -169,25 +131,23 @@ pub fn build(source: &RoadMapSource, map_seed: u64) -> Result<MapModel, RoadMapE
 }
 
 /// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
-fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), RoadMapError> {
+fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), FileError> {
     let points = || graph.lanes.iter().flat_map(|lane| &lane.centerline);
     let extent = |axis: usize| {
         let values = || points().map(|point| point[axis]);
         values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
     };
     if graph.lanes.is_empty() {
-        return Err(RoadMapError::NoLanes {
-            path: path.into(),
-            roads: network.roads.len(),
-        });
+        let roads = network.roads.len();
+        let problem = format_args!("none of its {roads} roads has a driving lane");
+        return Err(FileError::new(path, problem));
     }
     let extent_m = extent(0).max(extent(1));
     if extent_m > MAX_EXTENT_M {
-        return Err(RoadMapError::TooLarge {
-            path: path.into(),
-            extent_m,
-            limit_m: MAX_EXTENT_M,
-        });
+        let problem = format_args!(
+            "its lanes reach over {extent_m:.0} m, more than the limit of {MAX_EXTENT_M} m"
+        );
+        return Err(FileError::new(path, problem));
     }
     Ok(())
 }
@@ -204,18 +164,10 @@ pub struct Map {
 /// Reads the file of an OpenDRIVE map.
 ///
 /// # Errors
-/// [`RoadMapError::Read`] and [`RoadMapError::OpenDrive`].
-pub fn read_map(path: &Path) -> Result<Map, RoadMapError> {
-    let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64);
-    let bytes = bytes.map_err(|source| RoadMapError::Read {
-        path: path.into(),
-        source,
-    })?;
-    let network = opendrive::read_bytes(&bytes);
-    let mut network = network.map_err(|source| RoadMapError::OpenDrive {
-        path: path.into(),
-        source,
-    })?;
+/// [`FileError`] if it is not readable, or no usable OpenDRIVE map.
+pub fn read_map(path: &Path) -> Result<Map, FileError> {
+    let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64).at(path)?;
+    let mut network = opendrive::read_bytes(&bytes).at(path)?;
     let (lanes, counts) = lane_builder::lane_graph(&network);
     network.findings.extend(counts.findings);
     Ok(Map { network, lanes })

@@ -6,28 +6,24 @@ use std::{fs, io};
 use super::SceneHeader;
 use crate::generate::error::SynthError;
 use dataset::UNFINISHED;
-
-fn failed(path: &Path, source: io::Error) -> SynthError {
-    SynthError::Write {
-        path: path.to_owned(),
-        source,
-    }
-}
+use support::file_error::{AtFile, FileError};
 
 /// Writes text or bytes.
 pub(crate) fn write_file(path: &Path, bytes: impl AsRef<[u8]>) -> Result<(), SynthError> {
-    fs::write(path, bytes).map_err(|source| failed(path, source))
+    fs::write(path, bytes).at(path).map_err(SynthError::Write)
 }
 
 /// Makes a folder and those above it.
 pub(crate) fn make_folder(path: &Path) -> Result<(), SynthError> {
-    fs::create_dir_all(path).map_err(|source| failed(path, source))
+    fs::create_dir_all(path).at(path).map_err(SynthError::Write)
 }
 
 /// Creates a folder; an existing one is removed with its contents.
 pub(super) fn make_fresh_folder(path: &Path) -> Result<(), SynthError> {
     match fs::remove_dir_all(path) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(failed(path, error)),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            return Err(SynthError::Write(FileError::new(path, error)));
+        }
         Ok(()) | Err(_) => {}
     }
     make_folder(path)
@@ -76,7 +72,9 @@ impl Unfinished {
 
     /// Removes the marker: all files are written.
     pub(crate) fn clear(self) -> Result<(), SynthError> {
-        fs::remove_file(&self.0).map_err(|source| failed(&self.0, source))
+        fs::remove_file(&self.0)
+            .at(&self.0)
+            .map_err(SynthError::Write)
     }
 }
 
