@@ -4,10 +4,10 @@
 //! the vehicle and a receiver has to give the start.
 
 use crate::Error;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
-use dataset::{self, LoadOptions, ReadError};
+use dataset::{self, LoadOptions};
 use nalgebra::Isometry3;
 use protocol::{NoPoseReason, PoseEstimate};
 

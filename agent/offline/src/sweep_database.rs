@@ -1,11 +1,11 @@
 //! Database of sweeps for retrieval, from drives with true poses.
 
 use crate::Error;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use localization::baselines::{DescribedSweep, SweepDatabase};
-use localization::pgc::{Localizer, LocalizerError, stopwatch};
+use localization::pgc::{Localizer, stopwatch};
 
 /// Describes every sweep of the drives; `progress` gets the number of sweeps done and of all. Sweeps that cannot be
 /// read or have no pose are left out and counted in `left_out`.

@@ -167,7 +167,7 @@ impl Communication {
             let weight = path
                 .var("weight", &[1, 1, kernel, kernel], Init::Const(0.0))
                 .set_requires_grad(false);
-            Ok((
+            Ok::<_, ConfigError>((
                 weight,
                 path.var("bias", &[1], Init::Const(0.0))
                     .set_requires_grad(false),

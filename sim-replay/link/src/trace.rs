@@ -150,6 +150,8 @@ fn wrong(path: &Path, index: usize, found: &str, must: &str) -> FileError {
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
     use super::*;
 
     fn file(text: &str) -> (tempfile::TempDir, PathBuf) {

@@ -8,7 +8,7 @@
 mod cell_choice;
 pub mod cell_encoder;
 pub mod confidence;
-mod dense;
+pub(crate) mod dense;
 mod encoder_config;
 pub(crate) mod error;
 pub mod extensions;
@@ -37,7 +37,7 @@ pub mod wrong_place;
 
 use nalgebra::{Isometry3, Vector3};
 use support::stage_times::StageTimes;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, Tensor};
 
 pub(crate) use cell_choice::choose_evenly;
 pub use cell_encoder::{CellEncoder, EncodedCells, PreparedSweep, SweepFormat};

@@ -5,7 +5,6 @@ mod table;
 
 use crate::Error;
 use std::path::PathBuf;
-use std::time::Instant;
 
 use dataset::frame::Frame;
 use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};

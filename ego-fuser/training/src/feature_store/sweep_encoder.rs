@@ -1,6 +1,5 @@
 //! Sweep encoder: stored maps of sweeps by number, each thread with a network of its own.
 
-use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
 

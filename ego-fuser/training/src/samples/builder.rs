@@ -14,7 +14,7 @@ use tch::Tensor;
 
 use super::augment::{Augmentation, ViewAugment};
 use super::moments::Moments;
-use super::poses::{DrawnError, Offset, SamplePoses};
+use super::poses::{DrawnError, Offset, SamplePoses, without_pose};
 use super::scenes::{SceneSet, TickRef};
 use crate::Error;
 use crate::feature_store::MapSource;

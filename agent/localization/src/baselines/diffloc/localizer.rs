@@ -120,7 +120,7 @@ mod tests {
     use crate::baselines::load_baseline;
     use crate::pgc::pose_solver::PoseSolver;
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
-    use protocol::PointCloud;
+    use protocol::{PointCloud, PoseEstimate};
 
     fn config() -> DiffLocConfig {
         DiffLocConfig {

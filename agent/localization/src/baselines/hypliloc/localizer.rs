@@ -109,7 +109,7 @@ mod tests {
     use crate::baselines::load_baseline;
     use crate::baselines::sgloc::SgLocLocalizer;
     use crate::pgc::pose_solver::PoseSolver;
-    use protocol::PointCloud;
+    use protocol::{PointCloud, PoseEstimate};
 
     fn config() -> HypLiLocConfig {
         HypLiLocConfig {

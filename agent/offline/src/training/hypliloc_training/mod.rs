@@ -197,9 +197,9 @@ mod tests {
             load_baseline(&trained.weights, Device::Cpu, PoseSolver::default()).unwrap();
         let wall = (0..4000).map(|k| [(k % 60) as f32 - 30.0, 9.0, (k / 60) as f32 * 0.1, 0.2]);
         let answer = localizer
-            .localize(&PointCloud {
+            .localize(LocalizerInput::of(&PointCloud {
                 xyzi: wall.collect(),
-            })
+            }))
             .unwrap();
         assert!(answer.estimate.world_from_cav().is_some(), "{answer:?}");
     }

@@ -226,7 +226,7 @@ fn agents_beyond_two_are_omitted_and_one_is_refused() {
     };
     let refused = generate(&one, &|_| {}).unwrap_err().to_string();
     assert!(
-        refused.contains("--vehicles is 1-2; expected 2 or more"),
+        refused.contains("must be 2 or more"),
         "{refused}"
     );
     assert!(!folder.path().join("one").exists());
