@@ -58,13 +58,8 @@ fn file_name(
     weights: &Weights,
     scenarios: &[Scenario],
     digests: &FileDigests,
-) -> Result<String, FeatureStoreError> {
-    let program = digests
-        .program_sha256()
-        .map_err(|source| FeatureStoreError::Io {
-            path: kept.folder.clone(),
-            source,
-        })?;
+) -> Result<String, Error> {
+    let program = digests.program_sha256().at(&kept.folder)?;
     let scales = weights
         .activation_scales()?
         .map(|scales| scales.sha256_of(is_encoder));

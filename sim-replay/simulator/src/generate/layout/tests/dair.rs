@@ -225,9 +225,6 @@ fn agents_beyond_two_are_omitted_and_one_is_refused() {
         ..options(SceneLayout::Dair, &folder.path().join("one"))
     };
     let refused = generate(&one, &|_| {}).unwrap_err().to_string();
-    assert!(
-        refused.contains("must be 2 or more"),
-        "{refused}"
-    );
+    assert!(refused.contains("must be 2 or more"), "{refused}");
     assert!(!folder.path().join("one").exists());
 }
