@@ -81,32 +81,22 @@ impl ResidualGroup {
             scales.get(&inward_activation(name))?,
             scales.get(&middle_activation(name))?,
         );
-        let hidden = |input, output: Quantisation| LayerFormat {
-            input,
-            output: Some(output.scale),
-            relu: true,
-        };
-        let last = |input| LayerFormat {
-            input,
-            output: None,
-            relu: false,
-        };
         let linear = |weight: &Tensor, bias: Option<&Tensor>, format| {
             Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
         };
         Ok(Int8ResidualGroup {
             input,
-            inward: self.inward.int8(hidden(input, inward))?,
+            inward: self.inward.int8(LayerFormat::hidden(input, inward))?,
             middle: linear(
                 &self.middle,
                 Some(&self.middle_bias),
-                hidden(inward, middle),
+                LayerFormat::hidden(inward, middle),
             )?,
-            outward: self.outward.int8(last(middle))?,
+            outward: self.outward.int8(LayerFormat::last(middle))?,
             skip: self
                 .skip
                 .as_ref()
-                .map(|skip| linear(skip, None, last(input)))
+                .map(|skip| linear(skip, None, LayerFormat::last(input)))
                 .transpose()?,
         })
     }

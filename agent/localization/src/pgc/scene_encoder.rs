@@ -175,11 +175,7 @@ impl SceneEncoder {
         let mut down = Vec::with_capacity(self.down.len());
         for (level, conv) in self.down.iter().enumerate() {
             let output = scales.get(&level_activation(level + 1))?;
-            down.push(conv.int8(LayerFormat {
-                input,
-                output: Some(output.scale),
-                relu: true,
-            })?);
+            down.push(conv.int8(LayerFormat::hidden(input, output))?);
             (before, input) = (input, output);
         }
         let fine = self

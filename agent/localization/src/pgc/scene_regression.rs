@@ -10,7 +10,7 @@ use super::head_config::SceneHeadConfig;
 use super::int8_block::Int8Block;
 use super::refinement_network::Refiner;
 use super::residual_group::OnActivation;
-use perception::int8::{ActivationScales, LayerFormat, Quantisation, QuantiseError, ScaleSearch};
+use perception::int8::{ActivationScales, LayerFormat, QuantiseError, ScaleSearch};
 use perception::layers::convolution::Norm;
 
 /// Hidden layers of the classifier of sweeps, as in LightLoc.
@@ -215,24 +215,14 @@ impl SceneHead {
     /// # Errors
     /// [`QuantiseError`] names the activation whose scale is missing.
     pub fn quantise(&mut self, scales: &ActivationScales) -> Result<(), QuantiseError> {
-        let hidden = |input, output: Quantisation| LayerFormat {
-            input,
-            output: Some(output.scale),
-            relu: true,
-        };
-        let last = |input| LayerFormat {
-            input,
-            output: None,
-            relu: false,
-        };
         let (mut before, mut blocks) = (scales.get(INWARD)?, Vec::with_capacity(self.blocks.len()));
         for (number, [first, second, third]) in self.blocks.iter().enumerate() {
             let of = |part| scales.get(&block_activation(number, part));
             let (inner, innermost, output) = (of("0")?, of("1")?, of("output")?);
             let layers = [
-                first.int8(hidden(before, inner))?,
-                second.int8(hidden(inner, innermost))?,
-                third.int8(last(innermost))?,
+                first.int8(LayerFormat::hidden(before, inner))?,
+                second.int8(LayerFormat::hidden(inner, innermost))?,
+                third.int8(LayerFormat::last(innermost))?,
             ];
             blocks.push(Int8Block {
                 input: before,

@@ -22,6 +22,28 @@ pub struct LayerFormat {
     pub relu: bool,
 }
 
+impl LayerFormat {
+    /// A layer with a ReLU, whose results are quantised for the next one.
+    #[must_use]
+    pub fn hidden(input: Quantisation, output: Quantisation) -> Self {
+        Self {
+            input,
+            output: Some(output.scale),
+            relu: true,
+        }
+    }
+
+    /// A layer without a ReLU, whose results are in floating point.
+    #[must_use]
+    pub fn last(input: Quantisation) -> Self {
+        Self {
+            input,
+            output: None,
+            relu: false,
+        }
+    }
+}
+
 /// Weight, bias and format of a layer.
 #[derive(Debug)]
 pub(super) struct Layer {

@@ -174,14 +174,7 @@ mod tests {
         let input = Quantisation::unsigned(Scale::of_exponent(-6));
         let x = Tensor::rand([sites.len() as i64, 8], (Kind::Float, Device::Cpu)) * 3.0;
         let expected = tch::no_grad(|| conv.forward(&x, &index).unwrap());
-        let int8 = tch::no_grad(|| {
-            conv.int8(LayerFormat {
-                input,
-                output: None,
-                relu: false,
-            })
-        })
-        .unwrap();
+        let int8 = tch::no_grad(|| conv.int8(LayerFormat::last(input))).unwrap();
         let found = int8.forward(&input.quantise(&x).unwrap(), &index).unwrap();
         let error = (&found - &expected)
             .square()
@@ -193,14 +186,7 @@ mod tests {
             "{error}"
         );
         let odd = SparseConv::new(&(network.root() / "odd"), 3, 4);
-        let message = odd
-            .int8(LayerFormat {
-                input,
-                output: None,
-                relu: false,
-            })
-            .unwrap_err()
-            .to_string();
+        let message = odd.int8(LayerFormat::last(input)).unwrap_err().to_string();
         assert!(message.contains("3 input channels"), "{message}");
     }
 

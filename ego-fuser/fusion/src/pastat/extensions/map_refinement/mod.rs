@@ -94,22 +94,8 @@ impl MapRefinement {
             Int8Convolution::new(&convolution.ws, convolution.bs.as_ref(), geometry, format)
         };
         let convolutions = [
-            quantised(
-                first,
-                LayerFormat {
-                    input,
-                    output: Some(hidden.scale),
-                    relu: true,
-                },
-            )?,
-            quantised(
-                second,
-                LayerFormat {
-                    input: hidden,
-                    output: None,
-                    relu: false,
-                },
-            )?,
+            quantised(first, LayerFormat::hidden(input, hidden))?,
+            quantised(second, LayerFormat::last(hidden))?,
         ];
         self.int8 = Some(Int8Refinement {
             input,
