@@ -14,7 +14,6 @@ const MAX_CORNERS: usize = 8;
 /// A footprint with precomputed bounds and area.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Polygon {
-    /// Corners, counter-clockwise.
     corners: Footprint,
     low: [f64; 2],
     high: [f64; 2],

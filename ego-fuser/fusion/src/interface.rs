@@ -16,9 +16,6 @@ pub trait Fusion: Debug + Send {
     fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError>;
 
     /// Adds the activations of one sample that [`Self::quantise`] needs scales of.
-    ///
-    /// # Errors
-    /// As [`Self::fuse`].
     fn observe(&self, _maps: &AlignedMaps, _search: &mut ScaleSearch) -> Result<(), TchError> {
         Ok(())
     }

@@ -48,9 +48,6 @@ pub(super) struct RefinedPose {
 ///
 /// With `is_wide` the error of `start` may be larger than usual. `None` if the head has no refiner or its predictions
 /// do not constrain a pose.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn refine(
     head: &SceneHead,
     cells: &SweepCells,

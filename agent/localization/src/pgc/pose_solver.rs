@@ -77,9 +77,6 @@ impl PoseSolver {
     }
 
     /// The same for cells with `factor` times the error. Inliers are counted as in [`Self::search`].
-    ///
-    /// # Errors
-    /// As [`Self::solve`].
     pub(super) fn search_wider(
         &self,
         coordinates: &SceneCoordinates,

@@ -97,9 +97,6 @@ impl SceneEncoder {
     }
 
     /// The encoder of a file already read, frozen.
-    ///
-    /// # Errors
-    /// As [`Self::load`].
     pub(super) fn from_weights(weights: &Weights, device: Device) -> Result<Self, LocalizerError> {
         weights.check_kind(Self::KIND)?;
         let config: SceneEncoderConfig = weights.config()?;

@@ -35,9 +35,6 @@ where
 }
 
 /// Re-fits a motion at one scale until it converges, at most `max_steps` times.
-///
-/// # Errors
-/// See [`reweighted`].
 pub(crate) fn converge<I>(
     pairs: &I,
     start: &Isometry3<f64>,

@@ -68,9 +68,6 @@ impl Contrast {
     }
 
     /// Encodes all sweeps of `pairs` in one pass and computes the loss.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn loss(
         &self,
         encoder: &SceneEncoder,

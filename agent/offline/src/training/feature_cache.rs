@@ -119,9 +119,6 @@ impl FeatureCache {
     }
 
     /// Lets the regression targets be relative to another origin, metres in the world.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(crate) fn move_origin(&mut self, origin_m: [f64; 3]) -> Result<(), TchError> {
         let moved: [f32; 3] =
             std::array::from_fn(|axis| (self.origin_m[axis] - origin_m[axis]) as f32);

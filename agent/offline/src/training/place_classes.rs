@@ -27,9 +27,6 @@ pub(super) struct PlaceClasses<const BRANCHES: usize> {
 impl<const BRANCHES: usize> PlaceClasses<BRANCHES> {
     /// Clusters training poses `[S, 5]` (position in units of `scale_m`, cosine and sine of the heading), and builds
     /// a layer for features of `width` channels below each of `paths`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn new(
         paths: [nn::Path<'_>; BRANCHES],
         width: i64,
@@ -64,9 +61,6 @@ impl<const BRANCHES: usize> PlaceClasses<BRANCHES> {
     }
 
     /// `[BRANCHES]`: cross entropy of each branch's features `[N, width]` of sweeps with `poses` `[N, 5]`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn losses(
         &self,
         features: [&Tensor; BRANCHES],

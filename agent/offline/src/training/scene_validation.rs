@@ -31,9 +31,6 @@ pub struct SceneAccuracy {
 }
 
 /// Regresses and solves every sweep of `cache`.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn validate(
     head: &SceneHead,
     cache: &FeatureCache,

@@ -74,9 +74,6 @@ impl Int8Backbone {
     }
 
     /// Levels of the quantised canvas `[1, C_pillar, H, W]`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn levels(&self, canvas: &Tensor) -> Result<Vec<BackboneLevel>, TchError> {
         let mut x = canvas.shallow_clone();
         let mut levels = Vec::with_capacity(self.blocks.len());
@@ -88,9 +85,6 @@ impl Int8Backbone {
     }
 
     /// Feature map `[1, C, H', W']`, `f32` and contiguous, of the levels' values.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn features(&self, levels: &[Tensor]) -> Result<Tensor, TchError> {
         let upsampled = self
             .deblocks
@@ -116,9 +110,6 @@ fn shrink_activation(position: usize) -> String {
 
 /// Adds the activations that quantising a folded backbone and its shrink layers needs, for a canvas
 /// `[1, C_pillar, H, W]`; nothing if they stay in floating point.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn observe_backbone(
     backbone: &BevBackbone,
     shrink: Option<&Shrink>,

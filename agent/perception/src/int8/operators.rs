@@ -38,9 +38,6 @@ impl Operators {
     }
 
     /// Calls a method.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn call(&self, method: &str, arguments: &[IValue]) -> Result<Tensor, TchError> {
         match self.0.method_is(method, arguments)? {
             IValue::Tensor(tensor) => Ok(tensor),

@@ -21,9 +21,6 @@ pub(super) struct QuantisedWeight {
 impl QuantisedWeight {
     /// Quantises a weight `[output channels, ...]`; of two scales per channel that with the smaller squared error is
     /// taken: the one that reaches the largest weight, and the next finer one, which clamps it.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn new(weight: &Tensor) -> Result<Self, TchError> {
         let outputs = weight.size().first().copied().unwrap_or(0);
         let rows = weight.f_to_kind(Kind::Float)?.f_reshape([outputs, -1])?;

@@ -32,9 +32,6 @@ pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchEr
 /// # Shapes
 /// - `maps`: `[sum of record_len, C, H, W]`
 /// - returns: `[B, C, H, W]`
-///
-/// # Errors
-/// Those of the tensor library, when `record_len` does not add up to the number of maps.
 pub(crate) fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
     let samples = maps.f_split_with_sizes(record_len, 0)?;
     let fused: Result<Vec<_>, _> = samples

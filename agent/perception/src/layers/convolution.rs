@@ -267,9 +267,6 @@ impl ConvLayer {
     ///
     /// A 1x1 layer is one matrix product, whose result can be written in either order at no cost, while transposing a
     /// computed map takes longer than computing it.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(crate) fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let (batch, input, height, width) = x.size4()?;
         let kernel = self.weight.size();
@@ -290,9 +287,6 @@ impl ConvLayer {
     }
 
     /// The folded layer in integers, see [`Int8Convolution`].
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(crate) fn int8(
         &self,
         input: Quantisation,
@@ -382,9 +376,6 @@ impl ConvLayer {
 
 /// A map `[1, C, H, W]` whose channels are innermost in memory, contiguous: one transposition, which the library does
 /// several times faster between two dimensions than between four.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(crate) fn contiguous_map(map: &Tensor) -> Result<Tensor, TchError> {
     let (batch, channels, height, width) = map.size4()?;
     if batch != 1 {

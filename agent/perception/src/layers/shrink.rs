@@ -50,9 +50,6 @@ impl Shrink {
     }
 
     /// [`Self::forward`] of one map in inference, contiguous.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(crate) fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self.layers.split_last() {
             Some((last, rest)) => last.forward_contiguous(&chain(rest, x, false)),

@@ -16,9 +16,6 @@ pub struct Int8SparseConv {
 
 impl Int8SparseConv {
     /// Quantises a weight `[27 * C_in, C_out]` with bias `[C_out]`.
-    ///
-    /// # Errors
-    /// Those of the tensor library; [`TchError::Shape`] unless `C_in` is a multiple of four.
     pub(super) fn new(
         weight: &Tensor,
         bias: &Tensor,

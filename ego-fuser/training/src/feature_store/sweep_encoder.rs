@@ -50,9 +50,6 @@ impl Clone for SweepEncoder {
 impl SweepEncoder {
     /// The message of a sweep: by agent, then by tick within its scenario. Empty for a sweep that is absent, or that
     /// cannot be read or computed, and beyond the last.
-    ///
-    /// # Errors
-    /// Those of the network and of the wire format.
     pub(super) fn message(&mut self, sweep: usize) -> Result<Vec<u8>, Error> {
         let scenario = self.first.partition_point(|&first| first <= sweep) - 1;
         let Some(of) = self.scenarios.get(scenario) else {

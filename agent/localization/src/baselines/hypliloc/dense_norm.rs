@@ -32,9 +32,6 @@ impl BatchNormed {
     }
 
     /// `[N, C]` to `[N, C']`, in the precision of `x`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         self.norm.forward_t(&self.dense.forward(x)?, train).f_relu()
     }
@@ -77,18 +74,12 @@ impl LayerNormed {
     }
 
     /// `[S, T, C]` in single precision.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
         self.norm.forward(&of_tokens(&self.dense, tokens)?)
     }
 }
 
 /// A dense layer of tokens `[S, T, C]`.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn of_tokens(dense: &Dense, tokens: &Tensor) -> Result<Tensor, TchError> {
     let (sweeps, count, channels) = tokens.size3()?;
     dense

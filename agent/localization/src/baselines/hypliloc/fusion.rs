@@ -26,9 +26,6 @@ impl Fusion {
 
     /// `[S, P + I + 2, WIDTH]` of tokens `[S, P, WIDTH]` of points and `[S, I, WIDTH]` of the image: in this order, then
     /// one pooled token of each.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(&self, points: &Tensor, image: &Tensor) -> Result<Tensor, TchError> {
         let pooled = |tokens: &Tensor| tokens.f_mean_dim(1_i64, true, Kind::Float);
         let tokens = [
@@ -45,9 +42,6 @@ impl Fusion {
 }
 
 /// Tokens of length 1.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn normalise(tokens: &Tensor) -> Result<Tensor, TchError> {
     let squares = tokens
         .f_square()?

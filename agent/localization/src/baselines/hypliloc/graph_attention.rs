@@ -58,9 +58,6 @@ impl GraphAttention {
     /// `[S, T, C]` in single precision.
     ///
     /// Weighted means of points of a ball lie in it, since it is convex.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
         let (sweeps, count, channels) = tokens.size3()?;
         let values = of_tokens(&self.dense, tokens)?

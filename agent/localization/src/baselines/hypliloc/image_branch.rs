@@ -53,9 +53,6 @@ impl ImageBranch {
     }
 
     /// `[S, WIDTH, 2, 23]` of ranges `[S, ROWS, COLUMNS]`, metres. Computes in `kind`, the result is single.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(
         &self,
         ranges_m: &Tensor,

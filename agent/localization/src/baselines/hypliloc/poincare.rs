@@ -10,9 +10,6 @@ const MAX_SHARE: f64 = 0.999;
 const TINY: f64 = 1e-12;
 
 /// Exponential map at the origin: tangent vectors along the last dimension to points of the ball.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn expmap0(tangent: &Tensor) -> Result<Tensor, TchError> {
     let scaled = scaled_norm(tangent)?;
     let share = scaled.f_tanh()?.f_clamp_max(MAX_SHARE)?;
@@ -20,9 +17,6 @@ pub(super) fn expmap0(tangent: &Tensor) -> Result<Tensor, TchError> {
 }
 
 /// Logarithm at the origin, the inverse of [`expmap0`].
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn logmap0(point: &Tensor) -> Result<Tensor, TchError> {
     let scaled = scaled_norm(point)?;
     let length = scaled.f_clamp_max(MAX_SHARE)?.f_atanh()?;

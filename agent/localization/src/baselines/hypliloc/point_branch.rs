@@ -34,9 +34,6 @@ impl PointBranch {
 
     /// `[S, 64, WIDTH]` tokens of points `[S, N, 3]`, metres. Layers of neighbours compute in `kind`, the result is
     /// single.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(
         &self,
         points_m: &Tensor,

@@ -45,9 +45,6 @@ impl PoseHead {
     }
 
     /// `[S, WIDTH]`: batch norm of the mean of tokens `[S, T, WIDTH]`, which is nearly the same for all sweeps.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn features(&self, tokens: &Tensor, train: bool) -> Result<Tensor, TchError> {
         Ok(self
             .norm
@@ -55,9 +52,6 @@ impl PoseHead {
     }
 
     /// Poses from features `[S, WIDTH]`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(&self, features: &Tensor) -> Result<NormalisedPoses, TchError> {
         let through = |[first, second, third]: &[Dense; 3]| {
             third.forward(

@@ -42,9 +42,6 @@ pub(super) fn range_image(points_m: &[[f32; 3]], range_m: f32) -> Vec<f32> {
 }
 
 /// `[S, 4, ROWS, COLUMNS]` x, y, z and range in units of 20 m, from ranges `[S, ROWS, COLUMNS]`, metres.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(super) fn channels(ranges_m: &Tensor) -> Result<Tensor, TchError> {
     let ranges = ranges_m.f_to_kind(Kind::Float)?.f_unsqueeze(1)? / SCALE_M;
     ranges.f_mul(&directions(ranges_m.device())?)

@@ -33,9 +33,6 @@ impl SetAbstraction {
 
     /// `[S, M, C']` features of the centres of `groups` `[S, M, K]`, from points `[S, N, 3]`, metres, and their features
     /// `[S, N, C]`. The layers compute in `kind`, the result is single.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(
         &self,
         points_m: &Tensor,

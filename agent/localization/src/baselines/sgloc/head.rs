@@ -76,9 +76,6 @@ impl SgLocHead {
     /// `[N, 3]` world coordinates relative to the origin of the network, metres, of normalised features
     /// `[N, cell_channels]` of cells at `sensor_m` `[N, 3]`, metres in the sensor frame. Computed in the precision of
     /// the features; the last layer in single precision, as its output is added to metres.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
     pub(super) fn forward(
         &self,
         cells: &Tensor,

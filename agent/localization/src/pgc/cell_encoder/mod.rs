@@ -154,9 +154,6 @@ impl CellEncoder {
 
     /// Features of one sweep, as [`Self::encode`] in single precision. A backbone uses `levels`, those of the sweep, if
     /// they are given in its number format.
-    ///
-    /// # Errors
-    /// As [`Self::encode`].
     pub(super) fn encode_one(
         &self,
         sweep: &PreparedSweep,

@@ -17,9 +17,6 @@ const SUFFICIENT_PROBABILITY: f64 = 0.95;
 const LEAD: f64 = 10.0;
 
 /// Logits `[1, classes]` of at most `most` parts in turn, given those of the classifier.
-///
-/// # Errors
-/// Those of the tensor library.
 pub(crate) fn logits_by_part(logits: &Tensor, most: usize) -> Result<Vec<Tensor>, TchError> {
     let (probabilities, order) = logits
         .f_softmax(1, Kind::Float)?

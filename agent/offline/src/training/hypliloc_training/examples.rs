@@ -108,7 +108,6 @@ impl Examples {
         self.truth.poses()
     }
 
-    /// Random sweeps.
     pub(super) fn draw(&self, count: i64) -> Result<(InputBatch, Truth), TchError> {
         let rows = Tensor::f_randint(self.len(), [count], (Kind::Int64, self.scale_m.device()))?;
         let of = |all: &Tensor| all.f_index_select(0, &rows);

@@ -73,9 +73,6 @@ pub fn train_scene(
 }
 
 /// The same on lists of sweeps in place of the folders of `config`.
-///
-/// # Errors
-/// As [`train_scene`].
 pub(crate) fn train_scene_on(
     config: &SceneTrainConfig,
     sweeps: &SceneSweeps,

@@ -247,7 +247,6 @@ impl Omissions {
         }
     }
 
-    /// All counts.
     pub(crate) fn into_counts(self) -> BTreeMap<&'static str, u64> {
         self.0
             .into_inner()

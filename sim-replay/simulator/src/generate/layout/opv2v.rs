@@ -18,7 +18,6 @@ use dataset::carla_pose::{CarlaPose, mirrored_point};
 use dataset::frame::ObjectClass;
 use dataset::pcd::{self, Encoding, IntensityField};
 
-/// The writer.
 pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }

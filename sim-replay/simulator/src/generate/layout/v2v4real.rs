@@ -51,7 +51,6 @@ const MATRIX_HEAD: &str = "!!python/object/apply:numpy.core.multiarray._reconstr
 /// Characters in a line of base64, as PyYAML breaks them.
 const BASE64_LINE: usize = 76;
 
-/// The writer.
 pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }

@@ -13,7 +13,6 @@ use super::{AgentFrame, Moment};
 use crate::generate::error::SynthError;
 use dataset::carla_pose::CarlaPose;
 
-/// The writer.
 pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }

@@ -163,7 +163,6 @@ impl Caster {
         }
     }
 
-    /// The pattern.
     #[must_use]
     pub(crate) fn pattern(&self) -> &RayPattern {
         &self.pattern
