@@ -56,7 +56,6 @@ pub enum PrincipalError {
 
 impl Principal {
     /// A process of a vehicle.
-    #[must_use]
     pub fn new(role: Role, cav: &CavId) -> Self {
         Self {
             role,
@@ -68,7 +67,6 @@ impl Principal {
     ///
     /// # Panics
     /// Never: the names of roles are identifiers.
-    #[must_use]
     pub fn of_role(role: Role) -> Self {
         Self {
             role,
@@ -80,13 +78,11 @@ impl Principal {
     ///
     /// # Panics
     /// Never: both parts are identifiers, and short enough.
-    #[must_use]
     pub fn name(&self) -> ProcessId {
         ProcessId::new(&self.to_string()).expect("two identifiers and a hyphen make one")
     }
 
     /// All permissions in `runs`.
-    #[must_use]
     pub fn rights(&self, runs: &RunScope) -> Vec<Permission> {
         let keys = |topic: &dyn fmt::Display| KeyExpr::within(runs, topic);
         let own = |stream| {
@@ -205,7 +201,6 @@ impl Principal {
 }
 
 /// Limits of message sizes, bytes, by key, in any run.
-#[must_use]
 pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
     let small = [
         Stream::Pose,

@@ -29,13 +29,11 @@ pub struct BevGrid {
 
 impl BevGrid {
     /// Number of cells.
-    #[must_use]
     pub fn cells(&self) -> usize {
         self.width as usize * self.height as usize
     }
 
     /// The same area with cells `factor` times as large; partial cells at the upper edges count as whole cells.
-    #[must_use]
     pub fn downsampled(&self, factor: u32) -> Self {
         Self {
             cell_m: self.cell_m * f64::from(factor),

@@ -32,7 +32,6 @@ pub enum Body {
 
 impl Body {
     /// The body's bytes as they are on the wire.
-    #[must_use]
     pub fn as_bytes(&self) -> &[u8] {
         match self {
             Self::Empty => &[],
@@ -43,13 +42,11 @@ impl Body {
     }
 
     /// Number of bytes.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.as_bytes().len()
     }
 
     /// True if the body has no bytes.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

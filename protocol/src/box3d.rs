@@ -18,7 +18,6 @@ pub struct Box3d {
 
 impl Box3d {
     /// Corners in metres: bottom face `(+l, -w) (+l, +w) (-l, +w) (-l, -w)`, then the top face in the same order.
-    #[must_use]
     pub fn corners(&self) -> [[f64; 3]; 8] {
         let [a, b, c, d] = [(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)];
         let (sin, cos) = self.heading_rad.sin_cos();
@@ -34,7 +33,6 @@ impl Box3d {
     }
 
     /// The same box in a world whose y axis points the other way.
-    #[must_use]
     pub fn mirrored_y(&self) -> Self {
         let [x, y, z] = self.center_m;
         Self {
@@ -45,7 +43,6 @@ impl Box3d {
     }
 
     /// The box in another frame. Roll and pitch that the transform adds are dropped, as boxes stay upright.
-    #[must_use]
     pub fn transformed(&self, target_from_source: &Isometry3<f64>) -> Self {
         let center = target_from_source * Point3::from(self.center_m);
         let (sin, cos) = self.heading_rad.sin_cos();
@@ -59,7 +56,6 @@ impl Box3d {
 }
 
 /// True if all corners lie within x, y of the lower and the upper corner of `range_m`, edges included.
-#[must_use]
 pub fn corners_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
     let [x_low, y_low, x_high, y_high] = range_m;
     corners

@@ -165,7 +165,6 @@ pub enum WireError {
 
 impl WireError {
     /// Drop reason under which the ledger counts a message lost to this error.
-    #[must_use]
     pub fn drop_reason(&self) -> DropReason {
         match self {
             Self::Truncated { .. }

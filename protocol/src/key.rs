@@ -83,7 +83,6 @@ pub struct Key {
 
 impl Key {
     /// `v2v/<run>/<cav>/<stream>`.
-    #[must_use]
     pub fn stream(run: &RunId, cav: &CavId, stream: Stream) -> Self {
         Topic::Stream {
             cav: cav.clone(),
@@ -93,7 +92,6 @@ impl Key {
     }
 
     /// `v2v/<run>/rx/<ego>/<cav>/<stream>`.
-    #[must_use]
     pub fn received(run: &RunId, ego: &CavId, cav: &CavId, stream: Stream) -> Self {
         Topic::Received {
             ego: ego.clone(),
@@ -104,31 +102,26 @@ impl Key {
     }
 
     /// `v2v/<run>/truth`.
-    #[must_use]
     pub fn truth(run: &RunId) -> Self {
         Topic::Truth.in_run(run)
     }
 
     /// `v2v/<run>/control/<verb>`.
-    #[must_use]
     pub fn control(run: &RunId, verb: Verb) -> Self {
         Topic::Control(verb).in_run(run)
     }
 
     /// `v2v/<run>/ready/<process>`.
-    #[must_use]
     pub fn ready(run: &RunId, process: &ProcessId) -> Self {
         Topic::Ready(process.clone()).in_run(run)
     }
 
     /// `v2v/<run>/stats/<process>`.
-    #[must_use]
     pub fn stats(run: &RunId, process: &ProcessId) -> Self {
         Topic::Stats(process.clone()).in_run(run)
     }
 
     /// `v2v/<run>/alive/<role>/<cav>`.
-    #[must_use]
     pub fn alive(run: &RunId, role: Role, cav: &CavId) -> Self {
         Topic::Alive {
             role,
@@ -174,7 +167,6 @@ impl KeyExpr {
 
     /// Everything of some runs, in two expressions: the wildcard of the first does not match chunks that begin with
     /// `@`.
-    #[must_use]
     pub fn all_of(runs: &RunScope) -> [Self; 2] {
         [
             Self::within(runs, &"**"),
@@ -183,85 +175,71 @@ impl KeyExpr {
     }
 
     /// Everything of a run but previews.
-    #[must_use]
     pub fn run(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/**"))
     }
 
     /// Key that no process ever declares: `v2v/<run>/undeclared`. A query on it reaches the router only.
-    #[must_use]
     pub fn none(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/{UNDECLARED}"))
     }
 
     /// One key.
-    #[must_use]
     pub fn one(key: &Key) -> Self {
         Self(key.to_string())
     }
 
     /// One stream of every vehicle, before the link.
-    #[must_use]
     pub fn stream(run: &RunId, stream: Stream) -> Self {
         Self(format!("{KEY_ROOT}/{run}/*/{stream}"))
     }
 
     /// The images of all cameras of every vehicle.
-    #[must_use]
     pub fn cameras(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/*/camera/*"))
     }
 
     /// One stream of every vehicle as it reaches `ego` over the link.
-    #[must_use]
     pub fn received(run: &RunId, ego: &CavId, stream: Stream) -> Self {
         Self(format!("{KEY_ROOT}/{run}/rx/{ego}/*/{stream}"))
     }
 
     /// One stream of every vehicle as it reaches any ego over the link.
-    #[must_use]
     pub fn received_by_anyone(run: &RunId, stream: Stream) -> Self {
         Self(format!("{KEY_ROOT}/{run}/rx/*/*/{stream}"))
     }
 
     /// The truth.
-    #[must_use]
     pub fn truth(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/truth"))
     }
 
     /// Every control message.
-    #[must_use]
     pub fn control(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/control/*"))
     }
 
     /// Readiness of every process: the routes that it has confirmed.
-    #[must_use]
     pub fn ready(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/ready/*"))
     }
 
     /// The statistics of every process.
-    #[must_use]
     pub fn stats(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/stats/*"))
     }
 
     /// The liveliness tokens of one role.
-    #[must_use]
     pub fn alive(run: &RunId, role: Role) -> Self {
         Self(format!("{KEY_ROOT}/{run}/alive/{role}/*"))
     }
 
     /// The liveliness tokens of all processes.
-    #[must_use]
     pub fn everyone_alive(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/alive/*/*"))
     }
 
     /// The key expression.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }

@@ -38,13 +38,11 @@ pub struct Account {
 
 impl Account {
     /// Account of a sender.
-    #[must_use]
     pub fn published(topic: Topic) -> Self {
         Self { topic, to: None }
     }
 
     /// Account of a receiver, or of the link on the way to it.
-    #[must_use]
     pub fn towards(topic: Topic, to: &ProcessId) -> Self {
         Self {
             topic,
@@ -79,7 +77,6 @@ pub struct Counts {
 
 impl Counts {
     /// Messages lost for any reason.
-    #[must_use]
     pub fn dropped_total(&self) -> u64 {
         self.dropped
             .values()
@@ -236,7 +233,6 @@ impl Ledger {
     }
 
     /// The counters of an account; `None` if nothing was ever counted.
-    #[must_use]
     pub fn get(&self, account: &Account) -> Option<&Counts> {
         self.accounts.get(account)
     }
@@ -247,19 +243,16 @@ impl Ledger {
     }
 
     /// Number of accounts.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.accounts.len()
     }
 
     /// True if nothing was ever counted.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.accounts.is_empty()
     }
 
     /// Sum of all accounts. A topic with two receivers counts as sent once and received twice.
-    #[must_use]
     pub fn total(&self) -> Counts {
         let mut total = Counts::default();
         self.accounts.values().for_each(|counts| total.add(counts));
@@ -268,7 +261,6 @@ impl Ledger {
 
     /// Compares sent messages with those accounted for, for each topic and receiver. To be called on the sum of the
     /// ledgers of all processes.
-    #[must_use]
     pub fn balance(&self) -> Reconciliation {
         Reconciliation::of(self)
     }

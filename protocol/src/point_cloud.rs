@@ -23,19 +23,16 @@ pub struct PointCloud {
 
 impl PointCloud {
     /// Number of points.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.xyzi.len()
     }
 
     /// True if the sweep has no point.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.xyzi.is_empty()
     }
 
     /// Every n-th point, with n such that at most `most` points remain.
-    #[must_use]
     pub fn decimate(&self, most: usize) -> Self {
         let step = self.len().div_ceil(most.max(1)).max(1);
         Self {

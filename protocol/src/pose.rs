@@ -51,7 +51,6 @@ impl Pose {
     };
 
     /// A planar pose: position, height and heading.
-    #[must_use]
     pub fn from_xyz_yaw(translation_m: [f64; 3], yaw_rad: f64) -> Self {
         let (sin, cos) = (yaw_rad / 2.0).sin_cos();
         Self {
@@ -105,14 +104,12 @@ impl Pose {
     }
 
     /// Heading: the angle from the target's x axis to the source's, seen from above, in radians.
-    #[must_use]
     pub fn yaw_rad(&self) -> f64 {
         let [w, x, y, z] = self.rotation_wxyz;
         (2.0 * (w * z + x * y)).atan2(1.0 - 2.0 * (y * y + z * z))
     }
 
     /// The transform as a `nalgebra` type.
-    #[must_use]
     pub fn isometry(&self) -> Isometry3<f64> {
         let [w, x, y, z] = self.rotation_wxyz;
         let [tx, ty, tz] = self.translation_m;
@@ -123,7 +120,6 @@ impl Pose {
     }
 
     /// The same motion in a world whose y axis points the other way.
-    #[must_use]
     pub fn mirrored_y(&self) -> Self {
         let ([x, y, z], [qw, qx, qy, qz]) = (self.translation_m, self.rotation_wxyz);
         Self {
@@ -133,7 +129,6 @@ impl Pose {
     }
 
     /// `target_from_source` from two poses in one world: `self` is `world_from_target`.
-    #[must_use]
     pub fn from_world(&self, world_from_source: &Self) -> Self {
         self.isometry()
             .inv_mul(&world_from_source.isometry())

@@ -13,7 +13,6 @@ pub struct PoseError {
 
 impl PoseError {
     /// Error of `found` against `truth`; both are poses in the same world.
-    #[must_use]
     pub fn between(found: &Pose, truth: &Pose) -> Self {
         let difference = truth.isometry().inv_mul(&found.isometry());
         Self {

@@ -45,7 +45,6 @@ pub struct UnreceivedTopic {
 
 impl Reconciliation {
     /// True if every message is accounted for.
-    #[must_use]
     pub fn is_exact(&self) -> bool {
         self.discrepancies.is_empty()
     }

@@ -22,7 +22,6 @@ pub struct Polygon {
 
 impl Polygon {
     /// A convex quadrilateral from its corners, in either direction around it.
-    #[must_use]
     pub fn new(mut corners: Footprint) -> Self {
         let mut area = signed_area(&corners);
         if area < 0.0 {
@@ -46,20 +45,17 @@ impl Polygon {
     }
 
     /// The footprint of a box: its first four corners ([`crate::Box3d::corners`]), seen from above.
-    #[must_use]
     pub fn footprint(corners: &[[f64; 3]; 8]) -> Self {
         let [a, b, c, d, ..] = corners.map(|[x, y, _]| [x, y]);
         Self::new([a, b, c, d])
     }
 
     /// Area, square metres.
-    #[must_use]
     pub fn area(&self) -> f64 {
         self.area
     }
 
     /// Area of overlap of the axis-aligned bounds, square metres: never less than that of the polygons.
-    #[must_use]
     pub(crate) fn bounds_overlap(&self, other: &Self) -> f64 {
         let side = |axis: usize| {
             self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis])
@@ -68,7 +64,6 @@ impl Polygon {
     }
 
     /// Area of the intersection, square metres.
-    #[must_use]
     pub fn intersection(&self, other: &Self) -> f64 {
         if self.bounds_overlap(other) <= 0.0 {
             return 0.0;
@@ -84,7 +79,6 @@ impl Polygon {
     }
 
     /// Intersection over union, 0..1; 0 if neither has an area.
-    #[must_use]
     pub fn iou(&self, other: &Self) -> f64 {
         let intersection = self.intersection(other);
         let union = self.area + other.area - intersection;
@@ -96,7 +90,6 @@ impl Polygon {
     }
 
     /// True if the IoU is above `threshold`; decided without clipping if bounds and areas suffice.
-    #[must_use]
     #[expect(clippy::cast_possible_truncation, reason = "compared in f32")]
     pub fn overlaps_more_than(&self, other: &Self, threshold: f64) -> bool {
         let most = self.bounds_overlap(other).min(self.area).min(other.area);

@@ -3,7 +3,6 @@
 use std::fmt::Write as _;
 
 /// Two lower-case hexadecimal digits per byte.
-#[must_use]
 pub fn hex(bytes: &[u8]) -> String {
     bytes
         .iter()
@@ -15,7 +14,6 @@ pub fn hex(bytes: &[u8]) -> String {
 }
 
 /// At most `max_chars` characters from the beginning: a hostile text inside an error must not fill the log.
-#[must_use]
 pub fn excerpt(text: &str, max_chars: usize) -> String {
     text.chars().take(max_chars).collect()
 }

@@ -106,7 +106,6 @@ impl Topic {
 
     /// True if the ledger covers it: data, but not control messages, not messages that are repeated for late joiners
     /// (their number of receptions is undefined), and not previews.
-    #[must_use]
     pub fn is_booked(&self) -> bool {
         match self {
             Self::Stream { stream, .. } | Self::Received { stream, .. } => {
@@ -118,7 +117,6 @@ impl Topic {
     }
 
     /// True if its messages are JSON, without a header.
-    #[must_use]
     pub fn is_json(&self) -> bool {
         matches!(
             self,

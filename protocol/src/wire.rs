@@ -25,19 +25,16 @@ pub struct Encoded {
 
 impl Encoded {
     /// Bytes on the wire, without the overhead of the transport.
-    #[must_use]
     pub fn wire_bytes(&self) -> usize {
         self.head.len() + self.body.len()
     }
 
     /// The two pieces, in order.
-    #[must_use]
     pub fn pieces(&self) -> [&[u8]; 2] {
         [&self.head, self.body.as_bytes()]
     }
 
     /// All in one piece; copies the body.
-    #[must_use]
     pub fn to_vec(&self) -> Vec<u8> {
         self.pieces().concat()
     }

@@ -12,7 +12,6 @@ const MAX_VARIANCE: f64 = 1e6;
 ///
 /// Residuals determine the ratios between axes; errors of neighbouring cells are correlated, so that their size is that
 /// of a [`PoseMeasurement`]: the error which the fitted confidence stands for.
-#[must_use]
 pub fn pose_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
     let PoseMeasurement {
         position_std_m,

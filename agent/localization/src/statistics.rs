@@ -4,7 +4,6 @@ use support::statistics::mean;
 
 /// Spearman's rank correlation of paired samples, equal values sharing their mean rank; `None` when one of them does
 /// not vary, or there are fewer than two pairs.
-#[must_use]
 pub fn spearman(a: &[f64], b: &[f64]) -> Option<f64> {
     pearson(&ranks(a), &ranks(b))
 }

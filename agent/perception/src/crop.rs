@@ -15,7 +15,6 @@ pub struct Crop {
 
 impl Crop {
     /// The crop of a detector.
-    #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         Self {
             low_m: std::array::from_fn(|axis| config.lidar_range_m[axis] as f32),
@@ -33,7 +32,6 @@ impl Crop {
 
     /// The sweep without the points on the vehicle's own body, at any distance: the input of early fusion at other
     /// vehicles. Points that are not finite are removed as well.
-    #[must_use]
     pub fn without_own_body(&self, cloud: &PointCloud) -> PointCloud {
         let anywhere = Self {
             low_m: [f32::NEG_INFINITY; 3],
@@ -46,7 +44,6 @@ impl Crop {
     }
 
     /// The same area, the own body included.
-    #[must_use]
     pub fn range_only(&self) -> Self {
         Self {
             own_body_m: None,

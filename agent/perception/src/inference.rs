@@ -21,7 +21,6 @@ impl Inference {
     };
 
     /// On a device, in a number format; integers are for the CPU only.
-    #[must_use]
     pub fn new(device: Device, precision: InferencePrecision) -> Self {
         match device {
             Device::Cpu => Self { device, precision },

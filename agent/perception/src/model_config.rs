@@ -143,7 +143,6 @@ pub struct DetectorConfig {
 
 impl DetectorConfig {
     /// OpenCOOD's configuration: x +-140.8 m, y +-38.4 m, a 256 x 48 x 176 feature map at 1.6 m.
-    #[must_use]
     pub fn full() -> Self {
         Self {
             name: "full".into(),
@@ -170,7 +169,6 @@ impl DetectorConfig {
     }
 
     /// For two cores and live traffic: x +-51.2 m, y +-38.4 m, a 64 x 96 x 128 feature map at 0.8 m.
-    #[must_use]
     pub fn lean() -> Self {
         Self {
             name: "lean".into(),
@@ -186,7 +184,6 @@ impl DetectorConfig {
     }
 
     /// The preset of that name: `full` or `lean`.
-    #[must_use]
     pub fn preset(name: &str) -> Option<Self> {
         match name {
             "full" => Some(Self::full()),
@@ -196,7 +193,6 @@ impl DetectorConfig {
     }
 
     /// Number of pillars along x, y, z.
-    #[must_use]
     pub fn pillar_grid(&self) -> [usize; 3] {
         std::array::from_fn(|axis| {
             let extent = self.lidar_range_m[axis + 3] - self.lidar_range_m[axis];
@@ -205,7 +201,6 @@ impl DetectorConfig {
     }
 
     /// Pillars per cell of the transmitted feature map, along one axis.
-    #[must_use]
     pub(crate) fn feature_stride(&self) -> i64 {
         let shrink = match self.shrink {
             Some(ShrinkConfig::DoubleConv { stride, .. }) => stride,
@@ -216,13 +211,11 @@ impl DetectorConfig {
     }
 
     /// Channels of the concatenated backbone levels.
-    #[must_use]
     pub fn backbone_channels(&self) -> i64 {
         self.num_upsample_filters.iter().sum()
     }
 
     /// Channels of the fused feature map and of the head's input.
-    #[must_use]
     pub fn feature_channels(&self) -> i64 {
         match self.shrink {
             Some(
@@ -233,7 +226,6 @@ impl DetectorConfig {
     }
 
     /// Channels of the transmitted feature map: of the code, if there is a compressor.
-    #[must_use]
     pub fn sent_channels(&self) -> i64 {
         self.compress_ratio
             .map_or(self.feature_channels(), |ratio| {
@@ -242,7 +234,6 @@ impl DetectorConfig {
     }
 
     /// BEV grid of the transmitted feature map.
-    #[must_use]
     pub fn feature_grid(&self) -> BevGrid {
         let [width, height, _] = self
             .pillar_grid()

@@ -3,7 +3,6 @@
 use tch::TchError;
 
 /// First line of the message of an error.
-#[must_use]
 pub fn first_line(error: &TchError) -> String {
     error
         .to_string()

@@ -16,7 +16,6 @@ pub struct BlockOrder {
 
 impl BlockOrder {
     /// The order for windows of these edges; `None` when some edge does not divide the next larger one.
-    #[must_use]
     pub fn new(edges: &[i64]) -> Option<Self> {
         let mut edges = edges.to_vec();
         edges.sort_unstable();
@@ -27,7 +26,6 @@ impl BlockOrder {
     }
 
     /// Edge of the largest window, cells.
-    #[must_use]
     pub fn largest(&self) -> i64 {
         self.edges[self.edges.len() - 1]
     }
@@ -82,7 +80,6 @@ impl BlockOrder {
     }
 
     /// Row and column of each token within a window of `edge`, in the order of tokens.
-    #[must_use]
     pub fn places(&self, edge: i64) -> Vec<[i64; 2]> {
         let mut places = vec![[0, 0]];
         let mut covered = 1;

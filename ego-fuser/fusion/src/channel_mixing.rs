@@ -27,7 +27,6 @@ pub(crate) struct ChannelMixing {
 
 impl ChannelMixing {
     /// Changes nothing before it is trained; its parameter is `steering.weight`, `[5, C, C]`, under `path`.
-    #[must_use]
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let weight =
             (path / "steering").var("weight", &[BASIS, channels, channels], Init::Const(0.0));

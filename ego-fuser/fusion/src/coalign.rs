@@ -50,7 +50,6 @@ impl Default for CoAlignConfig {
 
 impl CoAlignConfig {
     /// The fusion, which has no parameters.
-    #[must_use]
     pub(crate) fn fusion(&self) -> Where2comm {
         Where2comm::new(&Where2commConfig {
             aggregation: self.aggregation,

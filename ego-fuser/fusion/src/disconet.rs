@@ -38,7 +38,6 @@ pub struct DiscoNetConfig {
 
 impl DiscoNetConfig {
     /// The published sizes.
-    #[must_use]
     pub fn full(channels: i64) -> Self {
         Self {
             channels,

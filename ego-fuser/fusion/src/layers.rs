@@ -27,19 +27,16 @@ pub struct Linear {
 
 impl Linear {
     /// Random at the start.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool) -> Self {
         Self::with_init(path, from, to, has_bias, nn::init::DEFAULT_KAIMING_UNIFORM)
     }
 
     /// The last layer of a branch that is added to the residual path: nearly zero at the start.
-    #[must_use]
     pub fn residual(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool) -> Self {
         Self::with_init(path, from, to, has_bias, RESIDUAL)
     }
 
     /// Identity at the start; as many channels leave as enter.
-    #[must_use]
     pub fn identity(path: &nn::Path<'_>, channels: i64) -> Self {
         let linear = Self::with_init(path, channels, channels, true, Init::Const(0.0));
         let _ = tch::no_grad(|| linear.weight.shallow_clone().fill_diagonal_(1.0, false));
@@ -72,7 +69,6 @@ pub(crate) struct LayerNorm {
 
 impl LayerNorm {
     /// `weight` and `bias`, `[channels]`, below `path`.
-    #[must_use]
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let weight = path.var("weight", &[channels], Init::Const(1.0));
         Self {
@@ -106,7 +102,6 @@ pub(crate) struct FeedForward {
 
 impl FeedForward {
     /// From `channels` to `hidden` and back.
-    #[must_use]
     pub(crate) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
         let net = path / "net";
         let wide = Linear::new(&(&net / 0), channels, hidden, true);

@@ -23,7 +23,6 @@ pub struct MapMetadata {
 
 impl MapMetadata {
     /// A map without delay whose pose has full confidence.
-    #[must_use]
     pub fn fresh(agent: usize, ego_from_cav: Pose) -> Self {
         Self {
             agent,
@@ -47,7 +46,6 @@ pub struct ReceivedMaps {
 
 impl ReceivedMaps {
     /// Maps `[N, C, H, W]`, of which `sent` `[N, 1, H, W]` is 1 for cells that were sent; absent: all.
-    #[must_use]
     pub fn new(maps: Tensor, sent: Option<Tensor>) -> Self {
         Self {
             maps,
@@ -124,7 +122,6 @@ pub struct AlignedMaps {
 impl AlignedMaps {
     /// The newest maps of all agents, outside training: `features` `[N, C, H, W]` and `mask` `[N, 1, H, W]` on the
     /// ego's grid; the same tensors stand for the maps as received.
-    #[must_use]
     pub fn newest(
         features: &Tensor,
         mask: &Tensor,

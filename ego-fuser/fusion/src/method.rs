@@ -58,7 +58,6 @@ methods! {
 
 impl Method {
     /// A method that is not in the table: this process reaches it only by its handle.
-    #[must_use]
     pub const fn of(spec: &'static MethodSpec) -> Self {
         Self(spec)
     }

@@ -175,7 +175,6 @@ impl CooperativeModel {
     }
 
     /// Metadata for the header of its weights file: configuration, method and fusion.
-    #[must_use]
     pub fn about(&self) -> BTreeMap<String, String> {
         let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
         let fusion = self.fusion.config().to_json();
@@ -190,13 +189,11 @@ impl CooperativeModel {
     }
 
     /// Configuration of the detector.
-    #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.network.config
     }
 
     /// The encoder and head.
-    #[must_use]
     pub fn network(&self) -> &PointPillars {
         &self.network
     }
@@ -207,13 +204,11 @@ impl CooperativeModel {
     }
 
     /// Device of the variables.
-    #[must_use]
     pub fn device(&self) -> Device {
         self.variables.device()
     }
 
     /// The fusion stage.
-    #[must_use]
     pub fn fusion(&self) -> &FusionStage {
         &self.fusion
     }
@@ -339,7 +334,6 @@ impl CooperativeModel {
     }
 
     /// Post-processing limits of this network: boxes lie completely over its area.
-    #[must_use]
     pub fn limits(&self) -> PostprocessConfig {
         PostprocessConfig::for_detector(self.config())
     }

@@ -4,7 +4,6 @@ use nalgebra::Point3;
 use protocol::{PointCloud, Pose};
 
 /// The points of several sweeps in the frame of the ego.
-#[must_use]
 pub fn merge_points<'a>(
     clouds: impl IntoIterator<Item = &'a PointCloud>,
     ego_from_cav: &[Pose],

@@ -91,25 +91,21 @@ pub struct FusionConfig(Arc<dyn AnySettings>);
 
 impl FusionConfig {
     /// Settings of one method.
-    #[must_use]
     pub fn new(settings: impl FusionSettings) -> Self {
         Self(Arc::new(settings))
     }
 
     /// Tag in weights files.
-    #[must_use]
     pub fn kind(&self) -> &'static str {
         self.0.kind()
     }
 
     /// The settings, if they are of this type.
-    #[must_use]
     pub fn settings<S: FusionSettings>(&self) -> Option<&S> {
         self.0.as_any().downcast_ref()
     }
 
     /// See [`FusionSettings::requirements`].
-    #[must_use]
     pub fn requirements(&self) -> Requirements {
         self.0.requirements()
     }
@@ -123,13 +119,11 @@ impl FusionConfig {
     }
 
     /// JSON with the tag first, as weights files hold it.
-    #[must_use]
     pub fn to_json(&self) -> String {
         self.0.to_json(Style::Compact)
     }
 
     /// The same over several lines, for readers.
-    #[must_use]
     pub fn to_json_pretty(&self) -> String {
         self.0.to_json(Style::Pretty)
     }

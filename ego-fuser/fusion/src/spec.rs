@@ -51,7 +51,6 @@ pub struct FusionSpec {
 
 impl FusionSpec {
     /// The functions of a type of settings.
-    #[must_use]
     pub const fn of<S: FusionSettings>() -> Self {
         Self {
             kind: S::KIND,

@@ -40,7 +40,6 @@ pub struct SwapFusionConfig {
 
 impl SwapFusionConfig {
     /// The published sizes, for feature maps of `channels` (256 there).
-    #[must_use]
     pub fn full(channels: i64) -> Self {
         Self {
             channels,
@@ -56,7 +55,6 @@ impl SwapFusionConfig {
 
     /// For live traffic on two cores: two layers, heads as wide as the published ones, no dropout (drawing its mask
     /// costs as much as a layer norm and a projection).
-    #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self {
             depth: 2,
@@ -364,7 +362,6 @@ pub struct SwapFusion {
 impl SwapFusion {
     /// Variables `layers` and `mlp_head` below `path`. `config` is valid; `masked` selects which of the two networks of
     /// the reference the names belong to.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &SwapFusionConfig, masked: bool) -> Self {
         let mut halves = Vec::with_capacity(2 * config.depth);
         for layer in 0..config.depth {
@@ -402,7 +399,6 @@ impl SwapFusion {
     }
 
     /// Number of agents that its table of offsets covers.
-    #[must_use]
     pub fn slots(&self) -> i64 {
         self.slots
     }

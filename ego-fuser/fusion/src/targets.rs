@@ -143,7 +143,6 @@ impl TargetAssigner {
     }
 
     /// Targets of the objects of one frame, boxes in the frame of the anchors.
-    #[must_use]
     pub fn assign(&self, objects: &[Box3d]) -> Labels {
         const FREE: u32 = u32::MAX;
         // Per anchor: the first object it overlaps enough, and whether it may be background.
@@ -206,7 +205,6 @@ impl TargetAssigner {
 
 /// Encoding of `object` at `anchor`: offsets by the anchor's diagonal and height, logarithms of size ratios, plain
 /// difference of yaw.
-#[must_use]
 pub fn encode(object: &Box3d, anchor: &Box3d) -> [f64; BOX_CODE] {
     let [l, w, h] = object.size_m;
     let [anchor_l, anchor_w, anchor_h] = anchor.size_m;

@@ -58,7 +58,6 @@ pub struct V2vNetConfig {
 
 impl V2vNetConfig {
     /// OpenCOOD's: two rounds, the mean, one layer.
-    #[must_use]
     pub fn full(channels: i64) -> Self {
         Self {
             channels,
@@ -71,7 +70,6 @@ impl V2vNetConfig {
 
     /// One round: with N vehicles the round before the last costs N times as much as the last, for the messages between
     /// neighbours.
-    #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self {
             rounds: 1,

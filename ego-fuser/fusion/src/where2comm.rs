@@ -109,7 +109,6 @@ pub struct Where2comm(Where2commConfig);
 
 impl Where2comm {
     /// It has no parameters.
-    #[must_use]
     pub fn new(config: &Where2commConfig) -> Self {
         Self(config.clone())
     }

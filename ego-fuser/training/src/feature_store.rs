@@ -45,7 +45,6 @@ pub struct KeptMaps {
 }
 
 /// True if a parameter belongs to the encoder.
-#[must_use]
 pub fn is_encoder(name: &str) -> bool {
     ["pillar_vfe.", "backbone.", "shrink_conv."]
         .iter()
@@ -220,19 +219,16 @@ impl FeatureStore {
     }
 
     /// File of the maps.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// The index of a scenario.
-    #[must_use]
     pub fn index_of(&self, scenario: &str) -> Option<usize> {
         self.names.iter().position(|name| name == scenario)
     }
 
     /// Number of stored sweeps, and of all sweeps of the scenarios.
-    #[must_use]
     pub fn sweeps(&self) -> (usize, usize) {
         (self.starts.len() - 1, self.first[self.first.len() - 1])
     }
@@ -285,7 +281,6 @@ impl Clone for MapSource {
 
 impl MapSource {
     /// Reads from `store`, which was made with `weights`.
-    #[must_use]
     pub fn new(store: Arc<FeatureStore>, weights: Arc<Weights>) -> Self {
         Self {
             store,
@@ -295,7 +290,6 @@ impl MapSource {
     }
 
     /// The index of a scenario.
-    #[must_use]
     pub fn index_of(&self, scenario: &str) -> Option<usize> {
         self.store.index_of(scenario)
     }

@@ -90,7 +90,6 @@ pub struct LabelTensors {
 
 impl LabelTensors {
     /// Gathers the labels of a batch; every sample has the same number of anchors.
-    #[must_use]
     pub fn gather(samples: &[Labels], unassigned: Unassigned, device: Device) -> Self {
         let anchors = samples.first().map_or(0, |labels| labels.anchors);
         let mut positive = vec![0f32; anchors * samples.len()];

@@ -205,7 +205,6 @@ impl InboxConfig {
     }
 
     /// The limits in bytes.
-    #[must_use]
     pub fn limits(&self) -> InboxLimits {
         InboxLimits {
             messages_per_s: self.messages_per_s,

@@ -50,7 +50,6 @@ pub struct BoundedQueue<K, T> {
 
 impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     /// An empty queue of at most `max_lanes` lanes of `lane_capacity` items (both at least one).
-    #[must_use]
     pub fn new(lane_capacity: usize, max_lanes: usize) -> Self {
         Self {
             state: Mutex::new(State {
@@ -149,13 +148,11 @@ impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     }
 
     /// Number of items.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.lock().lanes.values().map(VecDeque::len).sum()
     }
 
     /// True if there is no item.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

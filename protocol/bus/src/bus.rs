@@ -122,19 +122,16 @@ impl Bus {
     }
 
     /// Identity of this process.
-    #[must_use]
     pub fn identity(&self) -> &Identity {
         &self.identity
     }
 
     /// Its ledger and stage timings.
-    #[must_use]
     pub fn stats(&self) -> &MessageStats {
         &self.stats
     }
 
     /// The zenoh session, for operations that this type does not offer.
-    #[must_use]
     pub fn session(&self) -> &Session {
         &self.session
     }
@@ -164,13 +161,11 @@ impl Bus {
     }
 
     /// An inbox of `places` messages for each of at most `max_topics` topics.
-    #[must_use]
     pub fn inbox(&self, places: usize, max_topics: usize) -> Arc<Inbox> {
         Inbox::new(places, max_topics, &self.stats)
     }
 
     /// An inbox with `limits` on each sender.
-    #[must_use]
     pub fn limited_inbox(
         &self,
         places: usize,
@@ -270,7 +265,6 @@ impl Bus {
     }
 
     /// The key of a topic in this run.
-    #[must_use]
     pub fn key(&self, topic: Topic) -> Key {
         topic.in_run(&self.identity.run)
     }

@@ -59,7 +59,6 @@ impl Credentials {
     }
 
     /// The common name of the certificate.
-    #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }

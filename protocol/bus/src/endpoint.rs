@@ -53,13 +53,11 @@ impl Endpoint {
     }
 
     /// The endpoint on this machine's loopback at `port`.
-    #[must_use]
     pub fn loopback(port: u16) -> Self {
         Self(format!("tcp/127.0.0.1:{port}"))
     }
 
     /// True if the address is one of the loopback.
-    #[must_use]
     pub fn is_loopback(&self) -> bool {
         let host = self.address().rsplit_once(':').map_or("", |(host, _)| host);
         let ip = host
@@ -70,19 +68,16 @@ impl Endpoint {
     }
 
     /// The same address over QUIC with keys. A process with keys never falls back to plain TCP.
-    #[must_use]
     pub fn secured(&self) -> Self {
         Self(format!("{QUIC}{}", self.address()))
     }
 
     /// True if the endpoint requires keys.
-    #[must_use]
     pub fn is_secured(&self) -> bool {
         self.0.starts_with(QUIC)
     }
 
     /// The endpoint as text.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }

@@ -103,14 +103,12 @@ pub enum BusError {
 impl BusError {
     /// True if the cause of a failure is an endpoint or keys that cannot be used: for exit codes, so that a supervisor
     /// does not restart a process that will fail again.
-    #[must_use]
     pub fn is_behind(failure: &(dyn std::error::Error + 'static)) -> bool {
         let mut chain = std::iter::successors(Some(failure), |cause| cause.source());
         chain.any(|cause| cause.downcast_ref::<Self>().is_some_and(Self::is_bad_input))
     }
 
     /// True if the input is at fault, so that a retry has no effect.
-    #[must_use]
     pub fn is_bad_input(&self) -> bool {
         if let Self::Metrics { cause, .. } = self {
             return matches!(
@@ -129,7 +127,6 @@ impl BusError {
     }
 
     /// An error of zenoh during an operation.
-    #[must_use]
     pub fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
         Self::Zenoh {
             doing: doing.into(),

@@ -42,7 +42,6 @@ impl FrameStats {
 
     /// Upper bound in seconds and number of frames of every bucket of the latency; the last is unbounded
     /// ([`f64::MAX`]).
-    #[must_use]
     pub fn latency_buckets(&self) -> Vec<(f64, u64)> {
         LATENCY_BUCKETS_S
             .into_iter()

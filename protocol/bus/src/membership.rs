@@ -42,7 +42,6 @@ impl Membership {
     }
 
     /// The next vehicle that joined (`true`) or left since the last call; `None` if there is none.
-    #[must_use]
     pub fn next(&self) -> Option<(CavId, bool)> {
         match self.events.take(Some(Instant::now())) {
             Pop::Item(cav, is_there) => Some((cav, is_there)),

@@ -116,7 +116,6 @@ struct Timings {
 
 impl MessageStats {
     /// Counters of `process`, all zero.
-    #[must_use]
     pub fn new(process: ProcessId) -> Self {
         Self {
             process,
@@ -125,7 +124,6 @@ impl MessageStats {
     }
 
     /// Process of these counters.
-    #[must_use]
     pub fn process(&self) -> &ProcessId {
         &self.process
     }
@@ -211,7 +209,6 @@ impl MessageStats {
     }
 
     /// Large messages of a process with a pool of shared memory, by their way.
-    #[must_use]
     pub fn shared_memory(&self) -> BTreeMap<SharedMemoryUse, u64> {
         self.lock().shared.clone()
     }
@@ -293,7 +290,6 @@ impl MessageStats {
     }
 
     /// State of the vehicles that have sent messages.
-    #[must_use]
     pub fn peers(&self) -> Vec<PeerSummary> {
         let summary = |(cav, peer): (&CavId, &Peer)| PeerSummary {
             cav: cav.clone(),
@@ -335,7 +331,6 @@ impl MessageStats {
     }
 
     /// Published messages and bytes so far, by topic.
-    #[must_use]
     pub fn traffic(&self) -> Vec<TopicTraffic> {
         let of = |(topic, &(messages, bytes)): (&Topic, &(u64, u64))| TopicTraffic {
             topic: topic.clone(),
@@ -357,13 +352,11 @@ impl MessageStats {
     }
 
     /// Frames so far, from end to end.
-    #[must_use]
     pub fn frames(&self) -> FrameStats {
         self.lock().frames.clone()
     }
 
     /// Current ledger. Messages submitted and not handed over, or arrived and not yet used or dropped, are in flight.
-    #[must_use]
     pub fn ledger(&self) -> Ledger {
         let state = self.lock();
         let mut ledger = state.ledger.clone();
@@ -379,7 +372,6 @@ impl MessageStats {
     }
 
     /// Summary of every stage over its most recent frames.
-    #[must_use]
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
         state
@@ -390,7 +382,6 @@ impl MessageStats {
     }
 
     /// Histogram of every stage over all its frames.
-    #[must_use]
     pub(crate) fn histograms(&self) -> Vec<StageHistogram> {
         let state = self.lock();
         let ends = || BUCKETS_S.into_iter().chain([f64::MAX]);

@@ -51,7 +51,6 @@ impl MetricsServer {
     }
 
     /// Address of the server.
-    #[must_use]
     pub(crate) fn address(&self) -> SocketAddr {
         self.0.address()
     }
@@ -60,7 +59,6 @@ impl MetricsServer {
 const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// The counters in the OpenMetrics text format.
-#[must_use]
 pub(crate) fn exposition(stats: &MessageStats) -> String {
     let process = (Cow::from("process"), Cow::from(stats.process().to_string()));
     let mut registry = Registry::with_prefix_and_labels("v2vloc", [process.clone()].into_iter());

@@ -35,25 +35,21 @@ pub struct RawMessage {
 
 impl RawMessage {
     /// The bytes, in the pieces in which they arrived.
-    #[must_use]
     pub fn pieces(&self) -> Vec<&[u8]> {
         self.payload.slices().collect()
     }
 
     /// The bytes in one piece; copied if they arrived in several.
-    #[must_use]
     pub fn bytes(&self) -> std::borrow::Cow<'_, [u8]> {
         self.payload.to_bytes()
     }
 
     /// Number of bytes.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.payload.len()
     }
 
     /// True if there are no bytes.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.payload.is_empty()
     }
@@ -118,13 +114,11 @@ impl PassiveSubscriber {
     }
 
     /// Number of messages that were replaced by newer ones of the same key, or for which there was no room.
-    #[must_use]
     pub fn overwritten(&self) -> u64 {
         self.shared.overwritten.load(Ordering::Relaxed)
     }
 
     /// Number of messages that the router has not handed on, because this subscriber took earlier ones too slowly.
-    #[must_use]
     pub fn undelivered(&self) -> u64 {
         self.shared.undelivered.load(Ordering::Relaxed)
     }

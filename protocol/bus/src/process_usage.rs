@@ -6,7 +6,6 @@ use protocol::ProcessUsage;
 use rustix::time::{ClockId, clock_gettime};
 
 /// CPU time and memory of this process so far; 0 where the system does not tell.
-#[must_use]
 pub fn process_usage() -> ProcessUsage {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     ProcessUsage {
@@ -17,7 +16,6 @@ pub fn process_usage() -> ProcessUsage {
 }
 
 /// User and system time of all threads of this process so far, seconds.
-#[must_use]
 pub fn process_cpu_s() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9

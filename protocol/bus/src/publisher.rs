@@ -219,7 +219,6 @@ impl Publisher {
     }
 
     /// True if messages should be submitted: always, except for viewer topics without subscribers.
-    #[must_use]
     pub fn is_wanted(&self) -> bool {
         self.has_subscribers
             .as_ref()
@@ -227,7 +226,6 @@ impl Publisher {
     }
 
     /// Topic of the publisher.
-    #[must_use]
     pub fn topic(&self) -> &Topic {
         &self.topic
     }
@@ -457,7 +455,6 @@ pub(super) fn payload(encoded: Encoded) -> ZBytes {
 }
 
 /// Current time on the Unix clock, nanoseconds.
-#[must_use]
 pub fn unix_nanos() -> u64 {
     let since = SystemTime::now()
         .duration_since(UNIX_EPOCH)

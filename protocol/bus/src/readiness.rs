@@ -49,7 +49,6 @@ impl fmt::Display for Route {
 
 /// The name of a process in ledgers and routes: `agent-4279`, or the role if the vehicle is only a placeholder for it
 /// (`replay`).
-#[must_use]
 pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
     Principal::new(role, cav).name()
 }
@@ -119,7 +118,6 @@ pub struct Barrier {
 
 impl Barrier {
     /// A barrier that opens when all of `expected` are confirmed; at once if there are none.
-    #[must_use]
     pub fn new(expected: impl IntoIterator<Item = Route>) -> Self {
         Self {
             missing: Mutex::new(expected.into_iter().collect()),
@@ -181,7 +179,6 @@ impl Barrier {
     }
 
     /// Routes still missing.
-    #[must_use]
     pub fn missing(&self) -> Vec<Route> {
         self.lock().iter().cloned().collect()
     }

@@ -44,7 +44,6 @@ pub struct RejectionLog {
 impl RejectionLog {
     /// Empty counts of the router of this process, which listens at `router`. If that is a QUIC endpoint, the next
     /// [`Self::update`] closes connections over plain TCP.
-    #[must_use]
     pub fn of(router: &Endpoint) -> Self {
         Self {
             seen: BTreeMap::new(),
@@ -87,7 +86,6 @@ impl RejectionLog {
     }
 
     /// Number of rejections.
-    #[must_use]
     pub fn counts(&self) -> BTreeMap<Rejection, u64> {
         let mut counts = BTreeMap::new();
         for ((rejection, _), count) in &self.seen {

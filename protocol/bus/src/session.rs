@@ -98,13 +98,11 @@ pub struct BusOptions {
 
 impl BusOptions {
     /// A router that listens at `listen`.
-    #[must_use]
     pub fn router(listen: Endpoint) -> Self {
         Self::with_role(Role::Router { listen }, LONGEST_DELIVERY)
     }
 
     /// A client of the router at `connect`.
-    #[must_use]
     pub fn client(connect: Endpoint) -> Self {
         Self::with_role(Role::Client { connect }, LONGEST_MESSAGE)
     }
@@ -144,14 +142,12 @@ impl BusOptions {
     }
 
     /// Endpoint at which this end listens or to which it connects.
-    #[must_use]
     pub fn endpoint(&self) -> &Endpoint {
         let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &self.role;
         endpoint
     }
 
     /// The same as a configuration for a separate `zenohd`.
-    #[must_use]
     pub fn for_zenohd(&self) -> Value {
         let mut whole = json!({});
         for (key, value) in self.settings() {

@@ -19,7 +19,6 @@ pub struct Stop(Arc<(Mutex<State>, Condvar)>);
 
 impl Stop {
     /// A request that has not been made.
-    #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
@@ -38,7 +37,6 @@ impl Stop {
     }
 
     /// True if the stop has been requested.
-    #[must_use]
     pub fn requested(&self) -> bool {
         self.lock().requested
     }
@@ -56,7 +54,6 @@ impl Stop {
     }
 
     /// Waits for the request, at most until `deadline`; true if it was made.
-    #[must_use]
     pub fn wait_until(&self, deadline: Instant) -> bool {
         let mut state = self.lock();
         while !state.requested {

@@ -72,20 +72,17 @@ pub struct Arrival {
 
 impl Arrival {
     /// Arrival time on the system clock, nanoseconds.
-    #[must_use]
     pub fn unix_nanos(&self) -> u64 {
         unix_nanos().saturating_sub(nanos::of(self.at.elapsed()))
     }
 
     /// Time from the publication to the arrival; what the message waits for here is no part of it.
-    #[must_use]
     pub fn transport(&self) -> Duration {
         let published = self.header.stamp.publish_nanos;
         Duration::from_nanos(self.unix_nanos().saturating_sub(published))
     }
 
     /// Bytes on the wire, without the overhead of the transport.
-    #[must_use]
     pub fn wire_bytes(&self) -> u64 {
         self.payload.len() as u64
     }
@@ -140,7 +137,6 @@ impl Inbox {
     }
 
     /// Bytes of the queued messages.
-    #[must_use]
     pub fn waiting_bytes(&self) -> usize {
         self.waiting_bytes.load(Ordering::Relaxed)
     }

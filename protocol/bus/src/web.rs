@@ -91,13 +91,11 @@ pub struct Readers {
 
 impl Readers {
     /// Number of open connections.
-    #[must_use]
     pub fn open(&self) -> usize {
         MAX_CONNECTIONS - self.places.available_permits()
     }
 
     /// Number of readers that did not read, and of connections beyond the maximum.
-    #[must_use]
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
@@ -142,13 +140,11 @@ impl WebServer {
     }
 
     /// Address of the server.
-    #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
     /// Its readers.
-    #[must_use]
     pub fn readers(&self) -> &Arc<Readers> {
         &self.readers
     }

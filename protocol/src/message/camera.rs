@@ -34,7 +34,6 @@ impl ImageFormat {
     }
 
     /// The format of a file by its first bytes.
-    #[must_use]
     pub fn of_bytes(bytes: &[u8]) -> Option<Self> {
         match bytes {
             [0x89, b'P', b'N', b'G', ..] => Some(Self::Png),
@@ -86,7 +85,6 @@ pub struct Camera {
 
 impl Pinhole {
     /// Column and row of a point of the camera's frame, pixels; `None` for a point that is not ahead of it.
-    #[must_use]
     pub fn project(&self, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
         (z > 0.0).then(|| {
             [

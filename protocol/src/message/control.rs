@@ -69,7 +69,6 @@ pub struct TopicCount {
 impl Control {
     /// The control key of this message; a probe is published on the data key that it confirms, its answer on
     /// `ready/<process>`.
-    #[must_use]
     pub fn verb(&self) -> Option<Verb> {
         Some(match self {
             Self::Start { .. } => Verb::Start,

@@ -127,7 +127,6 @@ pub struct DetectionsReport {
 
 impl DetectionsReport {
     /// The result of `stamp`'s frame, at a tick of the scene if that is known.
-    #[must_use]
     pub fn new(stamp: &Stamp, tick: Option<u64>, result: Detections) -> Self {
         let Stamp {
             cav: _,
@@ -147,7 +146,6 @@ impl DetectionsReport {
     }
 
     /// As JSON, on one line.
-    #[must_use]
     pub fn to_json(&self) -> String {
         // Serialisation fails only for maps with keys that are not strings or a failing `Serialize`; neither occurs
         // here.

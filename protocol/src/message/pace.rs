@@ -29,7 +29,6 @@ impl Pace {
     };
 
     /// Number of the interval of a capture time: the first sweep of each interval is computed. `None`: every sweep is.
-    #[must_use]
     pub fn interval_of(&self, capture_nanos: u64) -> Option<i128> {
         let since =
             i128::from(capture_nanos) + i128::from(TOLERANCE_NANOS) - i128::from(self.phase_nanos);

@@ -50,7 +50,6 @@ const CHI_SQUARE_95: f64 = 5.991;
 
 impl PlanarCovariance {
     /// Variance of the position along its worst direction, square metres: the larger eigenvalue.
-    #[must_use]
     pub fn worst_variance_m2(&self) -> f64 {
         let [xx, xy, yy] = [self.xx_m2, self.xy_m2, self.yy_m2].map(f64::from);
         let half_difference = (xx - yy) / 2.0;
@@ -58,7 +57,6 @@ impl PlanarCovariance {
     }
 
     /// Radius of the circle that holds the true position with a probability of at least 95 %, metres.
-    #[must_use]
     pub fn bound_95_m(&self) -> f64 {
         (CHI_SQUARE_95 * self.worst_variance_m2()).sqrt()
     }
@@ -96,7 +94,6 @@ pub enum NoPoseReason {
 
 impl PoseEstimate {
     /// A pose and its confidence, without a covariance.
-    #[must_use]
     pub fn new(world_from_cav: Pose, confidence: f32) -> Self {
         Self::Pose {
             world_from_cav,
@@ -106,7 +103,6 @@ impl PoseEstimate {
     }
 
     /// Covariance of the pose in the plane, if its source has one.
-    #[must_use]
     pub fn covariance(&self) -> Option<&PlanarCovariance> {
         match self {
             Self::Pose { covariance, .. } => covariance.as_ref(),
@@ -115,7 +111,6 @@ impl PoseEstimate {
     }
 
     /// The pose, if there is one.
-    #[must_use]
     pub fn world_from_cav(&self) -> Option<&Pose> {
         match self {
             Self::Pose { world_from_cav, .. } => Some(world_from_cav),
@@ -124,7 +119,6 @@ impl PoseEstimate {
     }
 
     /// Confidence of the pose, 0..=1; 0 without a pose.
-    #[must_use]
     pub fn confidence(&self) -> f32 {
         match self {
             Self::Pose { confidence, .. } => *confidence,

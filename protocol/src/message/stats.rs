@@ -77,7 +77,6 @@ pub struct StageSummary {
 
 impl StageTiming {
     /// Duration of one stage.
-    #[must_use]
     pub fn new(stage: &str, time: std::time::Duration) -> Self {
         Self {
             stage: stage.into(),

@@ -62,7 +62,6 @@ macro_rules! messages {
 
         impl Message {
             /// Kind of the message.
-            #[must_use]
             pub fn kind(&self) -> Kind {
                 match self {
                     $(Self::$variant(_) => Kind::$variant,)+

@@ -47,14 +47,12 @@ pub enum Outcome {
 
 impl Outcome {
     /// Prints an error of the input.
-    #[must_use]
     pub fn bad_input(error: &dyn Display) -> Self {
         output::error(error);
         Self::BadInput
     }
 
     /// [`Self::DataLost`] if data were lost.
-    #[must_use]
     pub fn of(lost_data: bool) -> Self {
         if lost_data {
             Self::DataLost

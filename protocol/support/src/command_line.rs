@@ -21,7 +21,6 @@ const LAST: usize = 998;
 
 /// Parses the command line of this process; sets the verbosity of its messages. Ends the process on wrong usage, as
 /// [`Parser::parse`].
-#[must_use]
 pub fn parse<P: Parser>() -> P {
     end_if_generated(P::command);
     parse_arguments(P::command())
@@ -29,7 +28,6 @@ pub fn parse<P: Parser>() -> P {
 
 /// Parses the command line of a program with the subcommands that `sibling`, a program beside it, carries out: where one
 /// of these is given, the process becomes that program.
-#[must_use]
 pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
     if env::var_os(GENERATE).is_some() {
         let error = sibling.exec_generator();
@@ -47,7 +45,6 @@ pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
 
 /// Parses the command line of a sibling of the program `Front`; completions and manual pages are those of `Front` with
 /// the subcommands of both.
-#[must_use]
 pub fn parse_behind<P: Parser, Front: CommandFactory>() -> P {
     end_if_generated(|| {
         let own = P::command();

@@ -64,7 +64,6 @@ impl CsvFile {
 
 impl CsvRow<'_> {
     /// A field by its index; empty if the row is too short.
-    #[must_use]
     pub fn field(&self, column: usize) -> &str {
         self.record.get(column).unwrap_or_default()
     }
@@ -104,7 +103,6 @@ impl CsvRow<'_> {
     }
 
     /// The error for a field that is not valid.
-    #[must_use]
     pub fn wrong(&self, column: usize, must: impl Display) -> FileError {
         let name = self.file.header.split(',').nth(column).unwrap_or_default();
         self.fault(format_args!(
@@ -114,7 +112,6 @@ impl CsvRow<'_> {
     }
 
     /// The error for this row.
-    #[must_use]
     pub fn fault(&self, problem: impl Display) -> FileError {
         FileError::in_line(&self.file.path, self.line, problem)
     }
@@ -159,7 +156,6 @@ pub struct CsvText(Writer<Vec<u8>>);
 
 impl CsvText {
     /// A text that begins with `header`, the column names separated by commas.
-    #[must_use]
     pub fn new(header: &str) -> Self {
         let mut text = Self::headless();
         text.row(header.split(',').map(str::trim));
@@ -167,7 +163,6 @@ impl CsvText {
     }
 
     /// A text without a header.
-    #[must_use]
     pub fn headless() -> Self {
         Self(WriterBuilder::new().flexible(true).from_writer(Vec::new()))
     }

@@ -5,19 +5,16 @@ use std::time::{Duration, Instant};
 use crate::rounding;
 
 /// Nanoseconds of a duration.
-#[must_use]
 pub fn of(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// Nanoseconds from `began` to `at`; 0 if `at` is earlier.
-#[must_use]
 pub fn between(began: Instant, at: Instant) -> u64 {
     of(at.saturating_duration_since(began))
 }
 
 /// Nanoseconds of milliseconds, rounded; 0 for negative values and for NaN.
-#[must_use]
 pub fn of_ms(ms: f64) -> u64 {
     rounding::to_u64(ms * 1e6)
 }

@@ -28,7 +28,6 @@ pub fn set_verbosity(verbosity: Verbosity) {
 }
 
 /// The verbosity of this process.
-#[must_use]
 pub fn verbosity() -> Verbosity {
     let set = VERBOSITY.load(Ordering::Relaxed);
     let all = [

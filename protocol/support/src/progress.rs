@@ -7,7 +7,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::output::{Verbosity, verbosity};
 
 /// A bar over `total` steps with the name `unit`, for example `frames`; its message, if any, is behind it.
-#[must_use]
 pub fn bar(total: usize, unit: &str) -> ProgressBar {
     with_template(
         total,
@@ -16,7 +15,6 @@ pub fn bar(total: usize, unit: &str) -> ProgressBar {
 }
 
 /// A bar over 1000 steps for each of `count` parts, which displays per cent.
-#[must_use]
 pub fn percent_bar(count: usize) -> ProgressBar {
     with_template(
         1000 * count,
@@ -25,7 +23,6 @@ pub fn percent_bar(count: usize) -> ProgressBar {
 }
 
 /// A counter of steps with the name `unit`, for an unknown total.
-#[must_use]
 pub fn spinner(unit: &str) -> ProgressBar {
     styled(
         ProgressBar::new_spinner(),

@@ -25,14 +25,12 @@ pub struct SplitMix64 {
 
 impl SplitMix64 {
     /// A stream with the state `seed`.
-    #[must_use]
     pub fn new(seed: u64) -> Self {
         Self { state: seed }
     }
 
     /// The stream of one `purpose` under `seed`, for example the noise of one sweep: streams of different labels do not
     /// overlap in practice, and no stream depends on the number of draws of another.
-    #[must_use]
     pub fn derived(seed: u64, purpose: &[u64]) -> Self {
         Self {
             state: derive_seed(seed, purpose),
@@ -98,7 +96,6 @@ impl RngCore for SplitMix64 {
 }
 
 /// A seed for one purpose under another seed.
-#[must_use]
 pub fn derive_seed(seed: u64, purpose: &[u64]) -> u64 {
     purpose
         .iter()

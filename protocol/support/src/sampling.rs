@@ -1,7 +1,6 @@
 //! Sampling: a part of a list, evenly spread over it.
 
 /// At most `count` of the items, evenly spread, the first of them included.
-#[must_use]
 pub fn evenly_spread<T: Clone>(items: &[T], count: usize) -> Vec<T> {
     let kept = count.min(items.len());
     (0..kept)

@@ -8,7 +8,6 @@ const FROM_PROGRAMS: [&str; 2] = ["../share/v2vloc", "../../deploy"];
 
 /// Every existing place of a file or folder, for example `weights` or `scenarios/demo.yaml`; that of an installation
 /// first.
-#[must_use]
 pub fn shared(name: &str) -> Vec<PathBuf> {
     let programs = env::current_exe()
         .ok()

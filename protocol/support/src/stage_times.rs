@@ -13,13 +13,11 @@ pub struct StageTimes {
 
 impl StageTimes {
     /// Starts the first stage now.
-    #[must_use]
     pub fn start() -> Self {
         Self::of(&[])
     }
 
     /// Starts the first stage now; `stages` are reported in this order, also those that take no time.
-    #[must_use]
     pub fn of(stages: &[&str]) -> Self {
         let nothing = |stage: &&str| StageTiming::new(stage, Duration::ZERO);
         Self {
@@ -42,7 +40,6 @@ impl StageTimes {
     }
 
     /// All stages so far.
-    #[must_use]
     pub fn timings(&self) -> &[StageTiming] {
         &self.timings
     }
@@ -54,7 +51,6 @@ impl StageTimes {
     }
 
     /// Sum of all stages.
-    #[must_use]
     pub fn total(&self) -> Duration {
         Duration::from_nanos(self.timings.iter().map(|timing| timing.nanos).sum())
     }

@@ -22,7 +22,6 @@ pub struct TextTable(Table);
 
 impl TextTable {
     /// A table with these columns.
-    #[must_use]
     pub fn new<'a>(columns: impl IntoIterator<Item = (&'a str, Side)>) -> Self {
         let (names, sides): (Vec<&str>, Vec<Side>) = columns.into_iter().unzip();
         let mut table = Table::new();
@@ -52,7 +51,6 @@ impl fmt::Display for TextTable {
 }
 
 /// A number with this many decimals; a dash if it is unknown.
-#[must_use]
 pub fn number(value: Option<f64>, digits: usize) -> String {
     value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }

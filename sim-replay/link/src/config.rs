@@ -342,7 +342,6 @@ impl LinkConfig {
     }
 
     /// The file of the capacity's trace.
-    #[must_use]
     pub fn trace_file(&self) -> Option<&Path> {
         self.capacity.trace().map(|trace| trace.path.as_path())
     }

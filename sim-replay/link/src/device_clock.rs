@@ -27,14 +27,12 @@ pub struct ClockStep {
 
 impl DeviceClock {
     /// True if it shows the scene's time.
-    #[must_use]
     pub fn is_right(&self) -> bool {
         *self == Self::default()
     }
 
     /// The time of the vehicle's clock at a time of a scene that began at `began_nanos`: at the beginning it differs by
     /// its offset. Never below 0.
-    #[must_use]
     pub fn shown_since(&self, began_nanos: u64, scene_nanos: u64) -> u64 {
         let ahead_nanos = self.ahead_nanos(scene_nanos.saturating_sub(began_nanos));
         let shown = i128::from(scene_nanos) + ahead_nanos;

@@ -149,7 +149,6 @@ impl LinkEmulator {
     }
 
     /// The clock of the senders.
-    #[must_use]
     pub fn clock(&self) -> &DeviceClock {
         &self.config.clock
     }
@@ -179,7 +178,6 @@ impl LinkEmulator {
     }
 
     /// Time of the next outcome; `None` if nothing is in flight.
-    #[must_use]
     pub fn next_nanos(&self) -> Option<u64> {
         let rules = rules(&self.config, &self.capacity);
         let sent = self

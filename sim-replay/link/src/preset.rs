@@ -63,7 +63,6 @@ impl LinkConfig {
     }
 
     /// Every field with its value, as a file for [`Self::open`].
-    #[must_use]
     pub fn to_yaml(&self) -> String {
         // Numbers, names and lists have a spelling in YAML.
         serde_saphyr::to_string(self).unwrap_or_default()

@@ -20,7 +20,6 @@ pub struct TraceConfig {
 
 impl TraceConfig {
     /// A trace from its beginning on.
-    #[must_use]
     pub fn new(path: &Path) -> Self {
         Self {
             path: path.to_owned(),

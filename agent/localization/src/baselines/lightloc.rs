@@ -17,7 +17,6 @@ pub struct LightLoc {
 
 impl LightLoc {
     /// The coordinates of `localizer`, the search of `solver`.
-    #[must_use]
     pub fn new(localizer: Localizer, solver: PoseSolver) -> Self {
         Self { localizer, solver }
     }

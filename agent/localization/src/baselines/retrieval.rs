@@ -33,7 +33,6 @@ pub struct SweepDatabase {
 
 impl SweepDatabase {
     /// A database of descriptors of equal length; `None` if there is none or they are empty.
-    #[must_use]
     pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
         let channels = sweeps
             .first()
@@ -73,7 +72,6 @@ impl SweepDatabase {
     }
 
     /// Pose of the sweep whose descriptor is nearest.
-    #[must_use]
     pub fn nearest(&self, descriptor: &[f32]) -> Isometry3<f64> {
         let wanted = self.normalise(descriptor);
         let distance = |stored: &[f32]| {
@@ -107,7 +105,6 @@ pub struct Retrieval {
 
 impl Retrieval {
     /// Retrieval from a database of descriptors of the same localizer ([`Localizer::sweep_features`]).
-    #[must_use]
     pub fn new(localizer: Localizer, database: SweepDatabase) -> Self {
         Self {
             localizer,

@@ -61,7 +61,6 @@ pub struct SceneEncoderConfig {
 
 impl SceneEncoderConfig {
     /// LightLoc's encoder, its channels times `width`: one cell per 8x8x8 voxels of 0.25 m.
-    #[must_use]
     pub fn full(width: f64) -> Self {
         let scaled = |channels: i64| ((channels as f64 * width).round() as i64).max(1);
         Self {
@@ -79,7 +78,6 @@ impl SceneEncoderConfig {
 
     /// For one core, live: half the channels, voxels of 0.5 m, cells of 2 m beside those of 4 m, and in place of the
     /// second group the mean over the surroundings.
-    #[must_use]
     pub fn lean() -> Self {
         Self {
             name: "lean".into(),
@@ -95,7 +93,6 @@ impl SceneEncoderConfig {
     }
 
     /// A configuration by its name: `lean` or `full`.
-    #[must_use]
     pub fn preset(name: &str) -> Option<Self> {
         match name {
             "lean" => Some(Self::lean()),
@@ -105,19 +102,16 @@ impl SceneEncoderConfig {
     }
 
     /// Number of levels, the voxels' own included.
-    #[must_use]
     pub fn levels(&self) -> usize {
         self.widths.len()
     }
 
     /// Edge of the coarse cells of the last level, metres.
-    #[must_use]
     pub(crate) fn coarse_cell_m(&self) -> f64 {
         self.voxel_m * f64::from(1 << (self.levels() - 1))
     }
 
     /// Edge of the cells that scene coordinates are regressed for, metres.
-    #[must_use]
     pub fn cell_m(&self) -> f64 {
         if self.fine_cells {
             0.5 * self.coarse_cell_m()
@@ -127,7 +121,6 @@ impl SceneEncoderConfig {
     }
 
     /// Channels of the last level.
-    #[must_use]
     pub(crate) fn coarse_channels(&self) -> i64 {
         self.residual_widths
             .last()
@@ -137,7 +130,6 @@ impl SceneEncoderConfig {
     }
 
     /// Channels of a cell before its surroundings are added.
-    #[must_use]
     pub fn local_channels(&self) -> i64 {
         let fine = if self.fine_cells {
             self.widths[self.levels() - 2]
@@ -148,13 +140,11 @@ impl SceneEncoderConfig {
     }
 
     /// Channels of a cell.
-    #[must_use]
     pub fn cell_channels(&self) -> i64 {
         self.local_channels() + self.context_m.len() as i64 * self.coarse_channels()
     }
 
     /// Channels of a whole sweep: mean and maximum over its cells.
-    #[must_use]
     pub fn sweep_channels(&self) -> i64 {
         2 * self.coarse_channels()
     }

@@ -65,7 +65,6 @@ pub struct RefinerConfig {
 
 impl RefinerConfig {
     /// Number of corners along x and y.
-    #[must_use]
     pub fn corners(&self) -> [i64; 2] {
         std::array::from_fn(|axis| {
             let steps = ((self.high_m[axis] - self.low_m[axis]) / self.spacing_m).ceil() as i64;
@@ -75,7 +74,6 @@ impl RefinerConfig {
 
     /// The part of the key grid between two corners (metres relative to the origin), and the rows of the full grid that
     /// its rows are.
-    #[must_use]
     pub fn cropped(&self, low_m: [f64; 2], high_m: [f64; 2]) -> (Self, Vec<i64>) {
         let whole = self.corners();
         let step = |axis: usize, place_m: f64| (place_m - self.low_m[axis]) / self.spacing_m;

@@ -16,7 +16,6 @@ pub(crate) const SOLVE: &str = "pose solve";
 pub(crate) const REFINE: &str = "pose refine";
 
 /// Stopwatch of a localization.
-#[must_use]
 pub fn stopwatch() -> StageTimes {
     StageTimes::of(&[VOXELISE, ENCODE, REGRESS, SOLVE, REFINE])
 }
@@ -38,7 +37,6 @@ pub struct Localization {
 
 impl Localization {
     /// Result of a solver.
-    #[must_use]
     pub fn new(solved: &Solved, times: StageTimes) -> Self {
         let found = solved.as_ref().ok().copied();
         let inliers = match solved {
@@ -55,7 +53,6 @@ impl Localization {
     }
 
     /// Result of a method without cells: its estimate is the only evidence.
-    #[must_use]
     pub fn from_estimate(estimate: PoseEstimate, times: StageTimes) -> Self {
         let (found, inlier_count) = match estimate {
             PoseEstimate::Pose {

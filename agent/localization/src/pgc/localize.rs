@@ -21,7 +21,6 @@ pub struct LocalizerInput<'a> {
 
 impl<'a> LocalizerInput<'a> {
     /// A sweep of which nothing is known yet.
-    #[must_use]
     pub fn of(cloud: &'a PointCloud) -> Self {
         Self {
             cloud,

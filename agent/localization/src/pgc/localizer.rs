@@ -148,13 +148,11 @@ impl Localizer {
     }
 
     /// SHA-256 of encoder and head.
-    #[must_use]
     pub fn sha256(&self) -> &[String; 2] {
         &self.sha256
     }
 
     /// The head's configuration: scene, origin.
-    #[must_use]
     pub fn head_config(&self) -> &SceneHeadConfig {
         self.head.config()
     }
@@ -274,7 +272,6 @@ impl Localizer {
     }
 
     /// Search and confidence.
-    #[must_use]
     pub fn solver(&self) -> &PoseSolver {
         &self.solver
     }

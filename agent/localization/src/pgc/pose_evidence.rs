@@ -57,7 +57,6 @@ pub struct RefinementEvidence {
 
 impl PoseEvidence {
     /// Evidence of a registration of `coordinates` and of the pose refinement that started from it.
-    #[must_use]
     pub(super) fn gather(
         coordinates: &SceneCoordinates,
         registration: &Registration,
@@ -82,7 +81,6 @@ impl PoseEvidence {
     }
 
     /// Evidence of a pose that was refined from a predicted one, relative to the head's origin.
-    #[must_use]
     pub(super) fn of_refinement(refined: &RefinedPose, start: &Isometry3<f64>) -> Self {
         let second = RefinementEvidence::gather(start, refined);
         Self {
@@ -104,7 +102,6 @@ impl PoseEvidence {
     }
 
     /// Evidence of a pose that was not estimated from cells.
-    #[must_use]
     pub(super) fn none() -> Self {
         Self {
             cells: 0,
@@ -122,7 +119,6 @@ impl PoseEvidence {
 
     /// Confidence without calibration: mean confidence of the inliers, from the last stage, times the inlier ratio of
     /// the first one.
-    #[must_use]
     pub(crate) fn plain_sigma(&self) -> f64 {
         let inlier_sigma = self
             .second

@@ -176,7 +176,6 @@ pub(super) fn confirm(
 }
 
 /// The estimate of a sweep that is published.
-#[must_use]
 pub fn estimate(solved: &Solved) -> PoseEstimate {
     let none = |reason, inliers: usize| PoseEstimate::NoPose {
         reason,

@@ -69,7 +69,6 @@ impl Refiner {
     }
 
     /// Configuration that it was built from.
-    #[must_use]
     pub fn config(&self) -> &RefinerConfig {
         &self.config
     }

@@ -17,7 +17,6 @@ pub struct SceneCoordinates {
 
 impl SceneCoordinates {
     /// Correspondences for the solver, weighted by Eq. 6.
-    #[must_use]
     pub fn correspondences(&self) -> Vec<Correspondence> {
         let places = self.sensor_m.iter().zip(&self.world_m).zip(&self.epsilon_m);
         places
@@ -31,7 +30,6 @@ impl SceneCoordinates {
 }
 
 /// Confidence of a cell (Eq. 6): 0.5 at an expected error of 1 m.
-#[must_use]
 pub fn sigma(epsilon_m: f32) -> f32 {
     1.0 / (1.0 + epsilon_m * epsilon_m)
 }

@@ -108,7 +108,6 @@ impl SceneEncoder {
     }
 
     /// Configuration that it was built from.
-    #[must_use]
     pub fn config(&self) -> &SceneEncoderConfig {
         &self.config
     }

@@ -96,13 +96,11 @@ impl SceneHead {
     }
 
     /// Configuration that it was built from.
-    #[must_use]
     pub fn config(&self) -> &SceneHeadConfig {
         &self.config
     }
 
     /// Pose refinement network, if there is one.
-    #[must_use]
     pub fn refiner(&self) -> Option<&Refiner> {
         self.refiner.as_ref()
     }

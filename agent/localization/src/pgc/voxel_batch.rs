@@ -91,13 +91,11 @@ impl VoxelBatch {
     }
 
     /// Number of sweeps.
-    #[must_use]
     pub fn sweeps(&self) -> i64 {
         self.cell_rows.len() as i64
     }
 
     /// The rows of a sweep's cells.
-    #[must_use]
     pub fn cell_rows(&self, sweep: usize) -> Range<i64> {
         self.cell_rows[sweep].clone()
     }

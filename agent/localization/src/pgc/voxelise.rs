@@ -22,7 +22,6 @@ impl Cell {
     const FLAT_M: f32 = 0.3;
 
     /// True if it is flat ground, by its height.
-    #[must_use]
     pub fn is_flat(&self) -> bool {
         self.extent_m < Self::FLAT_M
     }
@@ -51,7 +50,6 @@ pub struct SweepVoxels {
 
 impl SweepVoxels {
     /// Sorts points `[N]` of x, y, z (metres, sensor frame) into voxels; those out of range or not finite are left out.
-    #[must_use]
     pub fn new(points: impl IntoIterator<Item = [f32; 3]>, config: &SceneEncoderConfig) -> Self {
         let inside = points.into_iter().filter(|point| is_inside(point, config));
         let points: Vec<[f32; 3]> = inside.collect();
@@ -101,13 +99,11 @@ impl SweepVoxels {
     }
 
     /// The cells, in the order of the encoder's rows.
-    #[must_use]
     pub fn cells(&self) -> &[Cell] {
         &self.cells
     }
 
     /// Number of voxels.
-    #[must_use]
     pub fn voxels(&self) -> usize {
         self.first.outputs()
     }

@@ -11,7 +11,6 @@ use super::head_config::SceneHeadConfig;
 const LEAST_RATIO: f64 = 0.6;
 
 /// The hint, with the place in the head's metadata and the map of the scene, as far as they are known.
-#[must_use]
 pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> String {
     let place = Weights::load(head).and_then(|weights| weights.config::<SceneHeadConfig>());
     let place = place.ok().map(|config| config.scene_name);
@@ -25,7 +24,6 @@ pub fn wrong_place_hint(sweeps: u64, head: &Path, scene_map: Option<&str>) -> St
 
 /// The hint that sweeps are those of another LiDAR, if their median number of points is far from that of
 /// the sweeps that the head was made from ([`SceneHeadConfig::sweep_points`]).
-#[must_use]
 pub fn other_lidar_hint(head_points: Option<usize>, points: &[usize]) -> Option<String> {
     let mut points = points.to_vec();
     points.sort_unstable();

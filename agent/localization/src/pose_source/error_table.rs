@@ -55,7 +55,6 @@ impl ErrorTable {
     }
 
     /// The row of a step if the first step has row `start`; after the last row comes the first one.
-    #[must_use]
     pub fn row(&self, start: u64, step: u64) -> TableRow {
         let length = self.rows.len() as u64;
         self.rows[((start % length + step % length) % length) as usize]

@@ -84,7 +84,6 @@ impl LocalizedPose {
     }
 
     /// The pose of another localizer, behind a motion gate.
-    #[must_use]
     pub fn new(localizer: Box<dyn Localize>, motion_gate: MotionGateConfig) -> Self {
         Self {
             localizer,

@@ -55,7 +55,6 @@ pub struct PoseInput<'a> {
 
 impl<'a> PoseInput<'a> {
     /// Input of a localizer.
-    #[must_use]
     pub(crate) fn sweep(&self) -> LocalizerInput<'a> {
         LocalizerInput {
             cloud: self.cloud,
@@ -267,7 +266,6 @@ pub enum PoseSourceError {
 
 impl PoseSourceConfig {
     /// Name in files and on command lines.
-    #[must_use]
     pub fn name(&self) -> &'static str {
         match self {
             Self::Recorded => "recorded",
@@ -280,7 +278,6 @@ impl PoseSourceConfig {
     }
 
     /// The same for one scenario of many: only tables of poses differ between scenarios.
-    #[must_use]
     pub fn for_scenario(&self, name: &str) -> Self {
         match self {
             Self::Cached(config) => Self::Cached(CachedPoseConfig {
@@ -316,7 +313,6 @@ impl PoseSourceConfig {
     }
 
     /// Sweeps from one that is measured after its pose was published to the next, for a vehicle with this motion.
-    #[must_use]
     pub fn measuring_interval(&self, motion: &EgoMotion) -> u32 {
         match self {
             Self::Tracked(config) => config.interval(motion),
@@ -394,7 +390,6 @@ impl PoseSourceConfig {
     }
 
     /// Files that the source reads.
-    #[must_use]
     pub fn files(&self) -> Vec<&Path> {
         match self {
             Self::Recorded => vec![],
@@ -407,7 +402,6 @@ impl PoseSourceConfig {
     }
 
     /// True if poses are estimated from the sweep's points.
-    #[must_use]
     pub fn looks_at_sweeps(&self) -> bool {
         matches!(self, Self::Pgc(_) | Self::Tracked(_) | Self::Baseline(_))
     }

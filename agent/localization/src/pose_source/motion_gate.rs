@@ -83,7 +83,6 @@ pub(crate) struct MotionGate {
 
 impl MotionGate {
     /// Gate without any pose.
-    #[must_use]
     pub(crate) fn new(config: MotionGateConfig) -> Self {
         Self {
             config,
@@ -94,13 +93,11 @@ impl MotionGate {
     }
 
     /// Number of jumps so far.
-    #[must_use]
     pub(crate) fn jumps(&self) -> u64 {
         self.jumps
     }
 
     /// Factor on the confidence of a pose with this verdict.
-    #[must_use]
     pub(crate) fn factor(&self, verdict: Verdict) -> f64 {
         match verdict {
             Verdict::Jump => self.config.penalty,

@@ -26,7 +26,6 @@ pub struct PlanarError {
 
 impl PlanarError {
     /// The pose with this error added to its position in the world and to its yaw, as the reference does.
-    #[must_use]
     pub(crate) fn added_in_world(&self, pose: &Pose) -> Pose {
         let exact = pose.isometry();
         let rotation =
@@ -36,14 +35,12 @@ impl PlanarError {
     }
 
     /// The pose with this error in the vehicle's frame: x forward, y left.
-    #[must_use]
     pub(crate) fn added_in_vehicle(&self, pose: &Pose) -> Pose {
         let error = Isometry3::new(Vector3::from(self.position_m), Vector3::z() * self.yaw_rad);
         (pose.isometry() * error).into()
     }
 
     /// Length of the position error, metres.
-    #[must_use]
     pub fn distance_m(&self) -> f64 {
         Vector3::from(self.position_m).norm()
     }
@@ -59,7 +56,6 @@ pub(crate) struct PoseNoise {
 
 impl PoseNoise {
     /// Errors with these standard deviations, metres per axis and radians.
-    #[must_use]
     pub(crate) fn new(position_std_m: f64, yaw_std_rad: f64, seed: u64) -> Self {
         Self {
             position_std_m,
@@ -70,7 +66,6 @@ impl PoseNoise {
 
     /// The constant error of all vehicles: to the digit the draw of OpenCOOD with this seed at every call. Of six
     /// normals, three are of the position, the fifth of the heading.
-    #[must_use]
     pub(crate) fn fixed(&self) -> PlanarError {
         let mut random = NumpyNormals::new(self.seed);
         let [x, y, z, _, yaw] = std::array::from_fn(|_| random.normal());
@@ -78,7 +73,6 @@ impl PoseNoise {
     }
 
     /// The error of a vehicle at a step of time, independent of all others.
-    #[must_use]
     pub(crate) fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
         self.scaled(draw(&self.random(cav), step))
     }
@@ -87,7 +81,6 @@ impl PoseNoise {
     ///
     /// `e_k = rho e_{k-1} + sqrt(1 - rho^2) n_k`, written out as the sum of the innovations `n` back to where they have
     /// decayed: so it depends on no earlier call, and frames may be lost, repeated or started anywhere.
-    #[must_use]
     pub(crate) fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
         let random = self.random(cav);
         let depth = if rho > 0.0 {

@@ -56,7 +56,6 @@ impl NoisyPose {
     }
 
     /// The pose of a vehicle at a capture time when the true one is `pose`.
-    #[must_use]
     pub fn disturbed(&self, cav: &CavId, capture_nanos: u64, pose: &Pose) -> PoseEstimate {
         let step = (capture_nanos as f64 / self.step_nanos).round() as u64;
         let error = match &self.kind {

@@ -65,25 +65,21 @@ impl PoseTable {
     }
 
     /// True if there are poses of a scenario, by its name or the path that ends in it.
-    #[must_use]
     pub fn has(&self, scenario: &str) -> bool {
         self.scenarios.contains_key(last_part(scenario))
     }
 
     /// Number of rows.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.scenarios.values().map(HashMap::len).sum()
     }
 
     /// True if there is no row.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.scenarios.is_empty()
     }
 
     /// Estimate of a sweep.
-    #[must_use]
     pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
         self.scenarios
             .get(last_part(scenario))?

@@ -137,7 +137,6 @@ impl TrackedPose {
     }
 
     /// Follows a vehicle with another localizer.
-    #[must_use]
     pub fn new(localizer: Box<dyn Localize>, config: TrackedPoseConfig) -> Self {
         let limits = TrackerLimits {
             max_coast_s: config.max_coast_s,

@@ -42,7 +42,6 @@ impl PairMoments {
     }
 
     /// Sum of all weights.
-    #[must_use]
     pub fn weight(&self) -> f64 {
         self.weight
     }

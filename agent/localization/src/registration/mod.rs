@@ -48,7 +48,6 @@ pub struct Correspondence {
 
 impl Correspondence {
     /// True if it can be used: finite coordinates and a positive finite weight.
-    #[must_use]
     pub fn usable(&self) -> bool {
         let bounded =
             |point: &[f32; 3]| point.iter().all(|coordinate| coordinate.abs() <= MAX_ABS_M);
@@ -59,7 +58,6 @@ impl Correspondence {
     }
 
     /// Distance between the target and the transformed source, metres.
-    #[must_use]
     pub(crate) fn residual_m(&self, target_from_source: &Isometry3<f64>) -> f64 {
         let moved = target_from_source * Point3::from(self.source_m.map(f64::from));
         (Vector3::from(self.target_m.map(f64::from)) - moved.coords).norm()
@@ -81,7 +79,6 @@ pub struct Registration {
 
 impl Registration {
     /// Counts the inliers of a motion within `threshold_m`.
-    #[must_use]
     pub fn judge(
         pairs: &[Correspondence],
         target_from_source: Isometry3<f64>,
@@ -156,7 +153,6 @@ pub enum NoRegistration {
 
 impl NoRegistration {
     /// The largest number of inliers.
-    #[must_use]
     pub fn inlier_count(&self) -> usize {
         match self {
             Self::TooFewCorrespondences { .. } => 0,

@@ -79,7 +79,6 @@ impl Default for RansacConfig {
 
 impl RansacConfig {
     /// For any rotation and inliers within `inlier_threshold_m`.
-    #[must_use]
     pub fn any_rotation(inlier_threshold_m: f64) -> Self {
         Self {
             inlier_threshold_m,
@@ -93,7 +92,6 @@ impl RansacConfig {
     }
 
     /// The same for correspondences with `factor` times the error.
-    #[must_use]
     pub fn wider(&self, factor: f64) -> Self {
         Self {
             inlier_threshold_m: factor * self.inlier_threshold_m,

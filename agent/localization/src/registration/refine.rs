@@ -58,7 +58,6 @@ where
 }
 
 /// Robust kernel: factor on a pair's weight, 0..=1.
-#[must_use]
 pub(crate) fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
     let scaled = residual_m / scale_m;
     if scaled < CUTOFF_SCALES {

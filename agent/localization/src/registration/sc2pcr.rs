@@ -55,7 +55,6 @@ pub struct Refinement {
 
 impl Sc2PcrConfig {
     /// The same for correspondences with `factor` times the error.
-    #[must_use]
     pub fn wider(&self, factor: f64) -> Self {
         let refinement = self.refinement.map(|refinement| Refinement {
             threshold_m: factor * refinement.threshold_m,
@@ -193,7 +192,6 @@ pub fn consensus(
 }
 
 /// Re-fits to the inliers, weighted by `1 / (1 + (r/threshold)^2)`, until their number stays the same.
-#[must_use]
 pub fn refine(
     pairs: &[Correspondence],
     start: &Isometry3<f64>,

@@ -30,7 +30,6 @@ pub struct PoseMeasurement {
 impl PoseMeasurement {
     /// Measurement from an estimated pose. The variance is the squared error that its sigma stands for (Eq. 6), spread
     /// over two axes.
-    #[must_use]
     pub fn new(capture_nanos: u64, found: &FoundPose) -> Self {
         let error_m: f64 = (1.0 / found.sigma.clamp(1e-6, 1.0) - 1.0).sqrt();
         let [least, most] = YAW_STD_RAD;

@@ -72,7 +72,6 @@ pub struct PoseTracker {
 
 impl PoseTracker {
     /// Tracker of a vehicle whose place is not known.
-    #[must_use]
     pub fn new(limits: TrackerLimits) -> Self {
         Self {
             limits,
@@ -112,7 +111,6 @@ impl PoseTracker {
     }
 
     /// Current state, if the vehicle is not lost.
-    #[must_use]
     pub fn state(&self) -> Option<TrackedState> {
         let filter = self.filter.as_ref()?;
         let mut covariance = filter.planar_covariance();
@@ -129,7 +127,6 @@ impl PoseTracker {
     }
 
     /// True if the last measurement was rejected.
-    #[must_use]
     pub fn is_contradicted(&self) -> bool {
         !self.rejected.is_empty()
     }
@@ -190,7 +187,6 @@ impl PoseTracker {
     }
 
     /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
-    #[must_use]
     pub fn needs_measurement(&self) -> bool {
         self.is_contradicted()
             || self

@@ -39,7 +39,6 @@ pub(super) struct ContrastLoss {
 
 impl Contrast {
     /// Layers below `path`, for an encoder of `local_channels`.
-    #[must_use]
     pub(super) fn new(path: &nn::Path<'_>, local_channels: i64) -> Self {
         let last = LinearConfig {
             ws_init: Init::Randn {

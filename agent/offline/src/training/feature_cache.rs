@@ -113,7 +113,6 @@ impl FeatureCache {
     }
 
     /// Number of sweeps.
-    #[must_use]
     pub(crate) fn sweep_count(&self) -> usize {
         self.world_from_sensor.len()
     }
@@ -129,7 +128,6 @@ impl FeatureCache {
     }
 
     /// Number of cells.
-    #[must_use]
     pub(crate) fn cell_count(&self) -> i64 {
         self.sweep_of_cell.size()[0]
     }

@@ -10,7 +10,6 @@ const ROUNDS: usize = 25;
 /// Centres of up to `count` clusters and the cluster of every point. Fewer points than clusters: every point is one.
 ///
 /// Starts with points far from each other (k-means++, Arthur and Vassilvitskii 2007); same seed, same result.
-#[must_use]
 pub(crate) fn kmeans<const N: usize>(
     points: &[[f64; N]],
     count: usize,

@@ -96,7 +96,6 @@ impl PairMaker {
     }
 
     /// Number of sweeps that have a partner.
-    #[must_use]
     pub(crate) fn anchors(&self) -> usize {
         self.anchors.len()
     }

@@ -61,7 +61,6 @@ pub(crate) struct Redundancy {
 
 impl Redundancy {
     /// Nothing dropped yet.
-    #[must_use]
     pub(crate) fn new(config: RedundancyConfig, class_of_sweep: Vec<usize>) -> Self {
         let count = class_of_sweep.len();
         Self {
@@ -75,13 +74,11 @@ impl Redundancy {
     }
 
     /// Weight of each sweep; 0: not used.
-    #[must_use]
     pub(crate) fn weights(&self) -> &[f32] {
         &self.weights
     }
 
     /// True if losses are recorded when this share of the training is done.
-    #[must_use]
     pub(crate) fn watches(&self, share_done: f64) -> bool {
         self.config
             .windows
@@ -107,7 +104,6 @@ impl Redundancy {
     }
 
     /// True if sweeps that were left out are to be used again now, without waiting for the end of a pass.
-    #[must_use]
     pub(crate) fn is_time_for_all(&self, share_done: f64) -> bool {
         share_done >= self.config.all_from && self.weights.iter().any(|&weight| weight != 1.0)
     }

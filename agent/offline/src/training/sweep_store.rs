@@ -32,7 +32,6 @@ pub(crate) struct StoredSweep {
 
 impl StoredSweep {
     /// A sweep from points in metres.
-    #[must_use]
     pub(crate) fn new(
         world: usize,
         drive: usize,
@@ -85,7 +84,6 @@ pub(super) struct PosedSweep {
 }
 
 /// A rotation about the vertical.
-#[must_use]
 pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
     Isometry3::from_parts(
         Translation3::identity(),
@@ -94,7 +92,6 @@ pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
 }
 
 /// Heading of a pose, radians.
-#[must_use]
 pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
     let ahead = world_from_sensor.rotation * Vector3::x();
     ahead.y.atan2(ahead.x)
@@ -167,7 +164,6 @@ impl SweepList {
     }
 
     /// Identity of the data, and the part of it that proved unusable so far.
-    #[must_use]
     pub(crate) fn data(&self) -> DataListing {
         let without_pose = self
             .without_pose
@@ -192,7 +188,6 @@ impl SweepList {
     }
 
     /// The sweeps at some indices, as a list of their own, in the order given.
-    #[must_use]
     pub(crate) fn subset(&self, indices: &[usize]) -> Self {
         let places = indices
             .iter()
@@ -272,7 +267,6 @@ impl SweepList {
     }
 
     /// Number of sweeps.
-    #[must_use]
     pub(crate) fn len(&self) -> usize {
         self.places.len()
     }

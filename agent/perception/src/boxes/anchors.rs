@@ -21,7 +21,6 @@ pub struct Anchors {
 
 impl Anchors {
     /// The anchors of a detector.
-    #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         let stride = usize::try_from(config.feature_stride()).unwrap_or(1).max(1);
         Self::new(
@@ -38,7 +37,6 @@ impl Anchors {
     /// As in the reference they are evenly spaced from one pillar inside the lower edge to one inside the upper. For
     /// stride 2 these are the centres of the cells; for stride 4 they lie 1.6046 m apart on cells of 1.6 m. Trained
     /// weights depend on it, so it is kept.
-    #[must_use]
     pub fn new(
         lidar_range_m: [f64; 6],
         voxel_size_m: [f64; 3],
@@ -68,13 +66,11 @@ impl Anchors {
     }
 
     /// Number of anchors.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.x_m.len() * self.y_m.len() * self.yaws_rad.len()
     }
 
     /// True if there is none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -83,7 +79,6 @@ impl Anchors {
     ///
     /// # Panics
     /// When `index` is not below [`Self::len`].
-    #[must_use]
     pub fn get(&self, index: usize) -> [f64; 7] {
         let (cell, anchor) = (index / self.yaws_rad.len(), index % self.yaws_rad.len());
         let (row, column) = (cell / self.x_m.len(), cell % self.x_m.len());

@@ -87,7 +87,6 @@ pub fn decode(
 }
 
 /// One box from its offsets and its anchor, both x, y, z, h, w, l, yaw; `None` when an offset is not finite.
-#[must_use]
 pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
     if offsets.iter().any(|offset| !offset.is_finite()) {
         return None;
@@ -106,7 +105,6 @@ pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
 }
 
 /// `1 / (1 + e^-x)`.
-#[must_use]
 pub fn sigmoid(logit: f32) -> f32 {
     (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
 }

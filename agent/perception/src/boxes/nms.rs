@@ -9,7 +9,6 @@ use protocol::rotated_iou::Polygon;
 ///
 /// # Panics
 /// When the numbers of scores and boxes differ: an error of the caller, not of the data.
-#[must_use]
 pub fn rotated_nms(
     boxes: &[Polygon],
     scores: &[f32],

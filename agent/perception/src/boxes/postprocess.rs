@@ -47,7 +47,6 @@ impl Default for PostprocessConfig {
 
 impl PostprocessConfig {
     /// The default numbers with the range of a detector instead of the fixed one.
-    #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
         Self {
@@ -58,7 +57,6 @@ impl PostprocessConfig {
     }
 
     /// For boxes that another vehicle will merge: the receiver applies its own range.
-    #[must_use]
     pub fn for_late_fusion(config: &DetectorConfig) -> Self {
         Self {
             keep_range_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX],
@@ -90,7 +88,6 @@ pub struct AgentBoxes<'a> {
 /// The whole chain: projects, removes boxes of implausible size, suppresses, removes boxes out of range.
 ///
 /// Returns the detections by descending score.
-#[must_use]
 pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec<Candidate> {
     let mut candidates: Vec<Candidate> = agents
         .iter()
@@ -118,7 +115,6 @@ fn project<'a>(
 
 /// True if the size and height are plausible for a vehicle: no side over the limit, not flat, all corners between the
 /// heights.
-#[must_use]
 pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> bool {
     let [x, y, z] = bounds(corners);
     let extent = |[low, high]: [f64; 2]| high - low;
@@ -128,7 +124,6 @@ pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> 
 }
 
 /// Rotated non-maximum suppression on the footprints, by descending score.
-#[must_use]
 pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Candidate> {
     let polygons: Vec<Polygon> = candidates
         .iter()
@@ -150,7 +145,6 @@ pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Can
 ///
 /// Centre and sizes are means over the corners and the parallel edges. The heading is the direction of the sum of the
 /// four edges along the length: unlike a mean of four angles it is continuous at half a turn.
-#[must_use]
 pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
     let center_m =
         std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
@@ -178,7 +172,6 @@ pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
 
 impl Candidate {
     /// The published detection. `source` is the CAV if one alone detected it.
-    #[must_use]
     pub fn detection(&self, source: Option<CavId>) -> Detection {
         Detection {
             box3d: corners_to_box(&self.corners),

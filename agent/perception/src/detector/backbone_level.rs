@@ -37,14 +37,12 @@ impl BackboneLevel {
     }
 
     /// Channels, height and width.
-    #[must_use]
     pub fn shape(&self) -> [i64; 3] {
         let size = self.values.size();
         [size[1], size[2], size[3]]
     }
 
     /// True if it was computed in 8-bit integers.
-    #[must_use]
     pub fn is_quantised(&self) -> bool {
         self.quantisation.is_some()
     }

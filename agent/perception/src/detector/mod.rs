@@ -105,7 +105,6 @@ impl Detector {
     }
 
     /// Uses a network, trained or not, on its device; its norms are folded into the convolutions.
-    #[must_use]
     pub fn from_network(network: PointPillars) -> Self {
         tch::no_grad(|| Self {
             sha256: String::new(),
@@ -129,50 +128,42 @@ impl Detector {
     }
 
     /// Configuration that it was built from.
-    #[must_use]
     pub fn config(&self) -> &DetectorConfig {
         &self.config
     }
 
     /// Device of its feature maps.
-    #[must_use]
     pub fn device(&self) -> Device {
         self.device
     }
 
     /// True if it computes in 8-bit integers.
-    #[must_use]
     pub fn is_quantised(&self) -> bool {
         self.encoder.is_quantised()
     }
 
     /// SHA-256 of its weights file; empty if it was not read from one.
-    #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
     /// [`encoder_sha256`] of its weights file; empty if it was not read from one.
-    #[must_use]
     pub fn encoder_sha256(&self) -> &str {
         &self.encoder_sha256
     }
 
     /// Hash of the weights for the wire, where it identifies compatible feature maps; all zeros if it was not read from
     /// a file.
-    #[must_use]
     pub fn model_hash(&self) -> ModelHash {
         self.sha256.parse().unwrap_or(ModelHash([0; 32]))
     }
 
     /// BEV grid of its feature maps.
-    #[must_use]
     pub fn grid(&self) -> BevGrid {
         self.config.feature_grid()
     }
 
     /// Channels, height and width of its feature maps, as they are fused.
-    #[must_use]
     pub fn map_shape(&self) -> [i64; 3] {
         let grid = self.grid();
         [
@@ -183,7 +174,6 @@ impl Detector {
     }
 
     /// Channels, height and width as transmitted: with a compressor, of the code.
-    #[must_use]
     pub fn sent_shape(&self) -> [i64; 3] {
         let [_, height, width] = self.map_shape();
         [self.config.sent_channels(), height, width]
@@ -191,7 +181,6 @@ impl Detector {
 
     /// Channels of the feature map that the code represents, if there is a compressor: [`BevFeatures::code_of`] of its
     /// messages.
-    #[must_use]
     pub fn code_of(&self) -> Option<u32> {
         self.compressor
             .as_ref()
@@ -253,7 +242,6 @@ impl Detector {
     }
 
     /// Crop of its input.
-    #[must_use]
     pub fn crop(&self) -> &Crop {
         &self.crop
     }
@@ -448,7 +436,6 @@ impl Detector {
 }
 
 /// SHA-256 of the encoder in a detector's weights, pillars and backbone: the same for methods that share it.
-#[must_use]
 pub fn encoder_sha256(weights: &Weights) -> String {
     weights.sha256_of(|name| name.starts_with("pillar_vfe.") || name.starts_with("backbone."))
 }

@@ -44,7 +44,6 @@ impl ActivationScales {
     }
 
     /// SHA-256 over the scales of the activations whose name is `wanted`.
-    #[must_use]
     pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
         let mut hash = Sha256::new();
         for (name, Quantisation { scale, zero_point }) in
@@ -56,13 +55,11 @@ impl ActivationScales {
     }
 
     /// Number of activations.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
     /// True if there is none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

@@ -21,7 +21,6 @@ pub struct ConvGeometry {
 
 impl ConvGeometry {
     /// Keeps the size of a map, for an odd kernel.
-    #[must_use]
     pub const fn size_preserving(kernel: i64) -> Self {
         Self {
             stride: 1,

@@ -24,7 +24,6 @@ pub struct LayerFormat {
 
 impl LayerFormat {
     /// A layer with a ReLU, whose results are quantised for the next one.
-    #[must_use]
     pub fn hidden(input: Quantisation, output: Quantisation) -> Self {
         Self {
             input,
@@ -34,7 +33,6 @@ impl LayerFormat {
     }
 
     /// A layer without a ReLU, whose results are in floating point.
-    #[must_use]
     pub fn last(input: Quantisation) -> Self {
         Self {
             input,

@@ -16,13 +16,11 @@ pub struct Scale {
 
 impl Scale {
     /// The scale `2^exponent`.
-    #[must_use]
     pub const fn of_exponent(exponent: i8) -> Self {
         Self { exponent }
     }
 
     /// The smallest scale with which `levels` steps reach `magnitude`, that is positive and finite.
-    #[must_use]
     pub(super) fn reaching(magnitude: f64, levels: f64) -> Self {
         let exponent = (magnitude / levels).log2().ceil();
         Self {
@@ -61,7 +59,6 @@ fn is_zero(value: &u8) -> bool {
 
 impl Quantisation {
     /// Quantisation of values that are never negative.
-    #[must_use]
     pub const fn unsigned(scale: Scale) -> Self {
         Self {
             scale,
@@ -84,7 +81,6 @@ impl Quantisation {
     }
 
     /// The same of one value.
-    #[must_use]
     pub fn quantise_value(&self, value: f32) -> u8 {
         let steps = (value * self.scale.step().recip() as f32).round_ties_even()
             + f32::from(self.zero_point);

@@ -64,7 +64,6 @@ impl ScaleSearch {
     }
 
     /// The scales with the smallest squared errors.
-    #[must_use]
     pub fn scales(&self) -> ActivationScales {
         let best = |errors: &BTreeMap<i8, f64>| {
             let best = errors.iter().min_by(|(_, a), (_, b)| a.total_cmp(b));

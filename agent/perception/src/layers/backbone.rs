@@ -24,7 +24,6 @@ enum Block {
 impl BevBackbone {
     /// Parameters `blocks.<level>.<position>.*` (with residual blocks `resnet.layer<level>.<position>.*`) and
     /// `deblocks.<level>.<0|1>.*` under `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Self {
         let mut input = config.pillar_channels;
         let mut backbone = Self {
@@ -90,7 +89,6 @@ impl BevBackbone {
     }
 
     /// Number of levels.
-    #[must_use]
     pub fn levels(&self) -> usize {
         self.blocks.len()
     }
@@ -148,7 +146,6 @@ impl BevBackbone {
     }
 
     /// The same backbone for inference, norms folded into the convolutions.
-    #[must_use]
     pub fn folded(&self) -> Self {
         let fold = |block: &Block| match block {
             Block::Plain(layers) => Block::Plain(layers.iter().map(ConvLayer::folded).collect()),

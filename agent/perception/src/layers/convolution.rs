@@ -25,19 +25,16 @@ pub struct Norm {
 
 impl Norm {
     /// A batch norm that is the identity until it is trained; epsilon and momentum are those of PointPillars.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         Self::with_eps(path, channels, NORM_EPS, NORM_MOMENTUM)
     }
 
     /// A batch norm with the epsilon and momentum that PyTorch has by default.
-    #[must_use]
     pub fn with_defaults(path: &nn::Path<'_>, channels: i64) -> Self {
         Self::with_eps(path, channels, 1e-5, 0.1)
     }
 
     /// A batch norm with another epsilon and momentum.
-    #[must_use]
     pub fn with_eps(path: &nn::Path<'_>, channels: i64, eps: f64, momentum: f64) -> Self {
         let config = BatchNormConfig {
             eps,
@@ -111,7 +108,6 @@ pub struct ConvLayer {
 
 impl ConvLayer {
     /// `kernel x kernel` convolution with zero padding that keeps the size at stride 1. No bias: a norm must follow.
-    #[must_use]
     pub fn normed(
         conv: &nn::Path<'_>,
         norm: &nn::Path<'_>,
@@ -131,7 +127,6 @@ impl ConvLayer {
     }
 
     /// `kernel x kernel` convolution with bias and nothing after it.
-    #[must_use]
     pub fn biased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
         Self::down(
             conv,
@@ -146,7 +141,6 @@ impl ConvLayer {
     }
 
     /// `kernel x kernel` convolution without bias and with nothing after it.
-    #[must_use]
     pub(crate) fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
         Self::down(
             conv,
@@ -162,7 +156,6 @@ impl ConvLayer {
     }
 
     /// Convolution whose kernel is its stride, so that every input counts once; batch norm, ReLU.
-    #[must_use]
     pub fn patches(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], patch: i64) -> Self {
         let config = nn::ConvConfig {
             stride: patch,
@@ -176,7 +169,6 @@ impl ConvLayer {
     }
 
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
-    #[must_use]
     pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {
         let weight = conv.var(
             "weight",
@@ -346,7 +338,6 @@ impl ConvLayer {
 
     /// The same layer for inference: the norm's running statistics are folded into weight and bias, which saves one
     /// pass over the map; weights are channels-last, as the maps are.
-    #[must_use]
     pub fn folded(&self) -> Self {
         let output_dim = if self.direction == Direction::Down {
             0

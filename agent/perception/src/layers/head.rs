@@ -27,7 +27,6 @@ pub struct DetectionHead {
 
 impl DetectionHead {
     /// Parameters `cls_head.*` and `reg_head.*` under `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64, anchors: i64) -> Self {
         let init = |mean| nn::ConvConfig {
             ws_init: Init::Randn {

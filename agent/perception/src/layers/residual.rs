@@ -18,7 +18,6 @@ pub struct ResidualBlock {
 impl ResidualBlock {
     /// Chain of `blocks`, the first with `stride`; parameters `<position>.{conv1,bn1,conv2,bn2}.*` and
     /// `0.downsample.{0,1}.*` under `path`.
-    #[must_use]
     pub fn chain(
         path: &nn::Path<'_>,
         [input, filters]: [i64; 2],
@@ -57,7 +56,6 @@ impl ResidualBlock {
     }
 
     /// The same for inference, norms folded in.
-    #[must_use]
     pub(crate) fn folded(&self) -> Self {
         Self {
             first: self.first.folded(),

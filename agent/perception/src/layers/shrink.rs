@@ -13,7 +13,6 @@ pub struct Shrink {
 
 impl Shrink {
     /// Parameters `layers.0.double_conv.{0,2}.*` (OpenCOOD) or `layers.0.{0,1}.*` (pointwise) under `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, input: i64, config: &ShrinkConfig) -> Self {
         let layer = path / "layers" / 0;
         let layers = match *config {
@@ -58,7 +57,6 @@ impl Shrink {
     }
 
     /// The same for inference, norms folded in.
-    #[must_use]
     pub fn folded(&self) -> Self {
         Self {
             layers: self.layers.iter().map(ConvLayer::folded).collect(),
@@ -76,7 +74,6 @@ pub struct Compressor {
 
 impl Compressor {
     /// `channels` to `channels / ratio` and back; parameters `encoder.*` and `decoder.*` under `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64, ratio: i64) -> Self {
         let code = (channels / ratio).max(1);
         let layer = |part: &nn::Path<'_>, position: i64, io: [i64; 2]| {
@@ -104,7 +101,6 @@ impl Compressor {
     }
 
     /// The same for inference, norms folded in.
-    #[must_use]
     pub fn folded(&self) -> Self {
         Self {
             encoder: self.encoder.folded(),

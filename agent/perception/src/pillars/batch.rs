@@ -24,7 +24,6 @@ pub struct PillarGrid {
 
 impl PillarGrid {
     /// The pillar grid of a detector.
-    #[must_use]
     pub fn new(config: &DetectorConfig) -> Self {
         let [width, height, _] = config.pillar_grid();
         Self {
@@ -39,7 +38,6 @@ impl PillarGrid {
     }
 
     /// Centre x, y, z of the pillar at the cell indices z, y, x, metres.
-    #[must_use]
     pub fn center_m(&self, zyx: [i32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| {
             zyx[2 - axis] as f32 * self.size_m[axis] + self.first_center_m[axis]
@@ -47,7 +45,6 @@ impl PillarGrid {
     }
 
     /// Row-major index of a pillar's cell in `[H, W]`.
-    #[must_use]
     pub fn cell(&self, [_, y, x]: [i32; 3]) -> usize {
         y as usize * self.width + x as usize
     }
@@ -70,7 +67,6 @@ pub struct PillarBatch {
 
 impl PillarBatch {
     /// Computes the features of the points of `sweeps`, in this order.
-    #[must_use]
     pub fn new(sweeps: &[&Pillars], pillar_grid: &PillarGrid) -> Self {
         let points: usize = sweeps.iter().map(|pillars| pillars.points.len()).sum();
         let total: usize = sweeps.iter().map(|pillars| pillars.len()).sum();
@@ -96,7 +92,6 @@ impl PillarBatch {
     }
 
     /// The same tensors on another device.
-    #[must_use]
     pub fn to_device(&self, device: Device) -> Self {
         Self {
             features: self.features.to_device(device),
@@ -108,13 +103,11 @@ impl PillarBatch {
     }
 
     /// Device of the tensors.
-    #[must_use]
     pub fn device(&self) -> Device {
         self.features.device()
     }
 
     /// Number of points `P`.
-    #[must_use]
     pub fn points(&self) -> i64 {
         self.features.size()[0]
     }

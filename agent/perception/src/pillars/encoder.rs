@@ -19,7 +19,6 @@ pub struct PillarEncoder {
 
 impl PillarEncoder {
     /// Parameters `pfn_layers.0.linear.weight` and `pfn_layers.0.norm.*` under `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let layer = path / "pfn_layers" / "0";
         let shape = [channels, POINT_FEATURES as i64];
@@ -45,7 +44,6 @@ impl PillarEncoder {
     }
 
     /// Device of its parameters.
-    #[must_use]
     pub fn device(&self) -> Device {
         self.linear.device()
     }

@@ -54,13 +54,11 @@ impl PointPillars {
     }
 
     /// Device of its parameters.
-    #[must_use]
     pub fn device(&self) -> Device {
         self.encoder.device()
     }
 
     /// Grid of the pillars on the canvas.
-    #[must_use]
     pub fn pillar_grid(&self) -> &PillarGrid {
         &self.pillar_grid
     }

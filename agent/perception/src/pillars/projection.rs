@@ -32,7 +32,6 @@ impl PillarProjection {
     ///
     /// # Panics
     /// When the parameters are not `f32` on the CPU, which the encoder's constructor rules out.
-    #[must_use]
     pub fn new(encoder: &PillarEncoder) -> Self {
         let (weight, bias) = encoder.folded();
         let channels = weight.size()[0] as usize;
@@ -77,7 +76,6 @@ impl PillarProjection {
     }
 
     /// Channels per pillar `C`.
-    #[must_use]
     pub fn channels(&self) -> usize {
         self.channels
     }

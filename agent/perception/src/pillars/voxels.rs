@@ -21,13 +21,11 @@ pub struct Pillars {
 
 impl Pillars {
     /// Number of pillars `M`.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.counts.len()
     }
 
     /// True if no point was inside the area.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.counts.is_empty()
     }
@@ -48,7 +46,6 @@ impl Pillars {
     /// The reference's layout: `[M, slots, 4]` row-major, unused slots zero.
     ///
     /// `slots` below the largest count cuts points off.
-    #[must_use]
     pub fn padded(&self, slots: usize) -> Vec<f32> {
         let mut padded = Vec::with_capacity(self.len() * slots * 4);
         for (points, _) in self.iter() {
@@ -79,7 +76,6 @@ impl Voxeliser {
     /// A voxeliser for cells of `voxel_size_m` from the lower corner of `lidar_range_m` on.
     ///
     /// `grid` is the number of cells along x, y, z; the limits are per pillar and per sweep.
-    #[must_use]
     pub fn new(
         lidar_range_m: [f64; 6],
         voxel_size_m: [f64; 3],
@@ -99,7 +95,6 @@ impl Voxeliser {
     }
 
     /// The voxeliser of a detector.
-    #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         Self::new(
             config.lidar_range_m,
@@ -111,7 +106,6 @@ impl Voxeliser {
     }
 
     /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.
-    #[must_use]
     pub fn voxelise(&mut self, points: &[[f32; 4]]) -> Pillars {
         let mut pillars = self.assign(points);
         let starts = self.gather(points, &mut pillars);

@@ -18,7 +18,6 @@ pub struct SparseConv {
 
 impl SparseConv {
     /// He-initialised for the ReLU that follows; about ten of a kernel's neighbours exist on a surface.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
         let stdev = (2.0 / (10.0 * inputs as f64)).sqrt();
         let weight = path.var(

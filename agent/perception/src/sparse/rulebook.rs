@@ -22,7 +22,6 @@ pub struct Rulebook {
 
 impl Rulebook {
     /// Stride 1: output sites are the input sites.
-    #[must_use]
     pub fn submanifold(sites: &Sites) -> Self {
         let mut rows = vec![NONE; sites.len() * KERNEL_VOLUME];
         for (row, &[x, y, z]) in sites.coords().iter().enumerate() {
@@ -43,7 +42,6 @@ impl Rulebook {
     }
 
     /// Stride 2, from the sites of a level to those of the next: output `o` has the inputs `2 o + [-1, 1]^3`.
-    #[must_use]
     pub fn strided(sites: &Sites, halved: &Sites) -> Self {
         let mut rows = vec![NONE; halved.len() * KERNEL_VOLUME];
         for (row, coord) in sites.coords().iter().enumerate() {
@@ -70,19 +68,16 @@ impl Rulebook {
     }
 
     /// Number of input rows.
-    #[must_use]
     pub fn inputs(&self) -> usize {
         self.inputs
     }
 
     /// Number of output rows.
-    #[must_use]
     pub fn outputs(&self) -> usize {
         self.rows.len() / KERNEL_VOLUME
     }
 
     /// Number of pairs of input and output, of all weights together.
-    #[must_use]
     pub fn pairs(&self) -> usize {
         self.rows.iter().filter(|&&row| row != NONE).count()
     }

@@ -19,7 +19,6 @@ pub struct Sites {
 impl Sites {
     /// Sites from coordinates, and the row of each coordinate. Coordinates must be within 2^20 of zero
     /// ([`Self::holds`]).
-    #[must_use]
     pub fn collect(coords: impl IntoIterator<Item = [i32; 3]>) -> (Self, Vec<u32>) {
         let mut sites = Self::default();
         let rows = coords.into_iter().map(|coord| sites.add(coord)).collect();
@@ -38,7 +37,6 @@ impl Sites {
     }
 
     /// True if a coordinate is near enough to zero to be a site.
-    #[must_use]
     pub fn holds(coord: [i32; 3]) -> bool {
         coord
             .iter()
@@ -46,25 +44,21 @@ impl Sites {
     }
 
     /// Number of sites.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.coords.len()
     }
 
     /// True if there is none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.coords.is_empty()
     }
 
     /// `[N]` of voxel indices x, y, z.
-    #[must_use]
     pub fn coords(&self) -> &[[i32; 3]] {
         &self.coords
     }
 
     /// The row of a site.
-    #[must_use]
     pub fn row(&self, coord: [i32; 3]) -> Option<u32> {
         self.rows
             .get(&key(coord))
@@ -73,7 +67,6 @@ impl Sites {
     }
 
     /// The sites of the next level, one for every 2x2x2 voxels with a site in them, and the row in it of each site.
-    #[must_use]
     pub fn halved(&self) -> (Self, Vec<u32>) {
         Self::collect(self.coords.iter().map(|coord| coord.map(|axis| axis >> 1)))
     }

@@ -62,7 +62,6 @@ struct Entry {
 
 impl AdamW {
     /// Optimizer before its first step.
-    #[must_use]
     pub fn new(variables: &VarStore, config: AdamWConfig) -> Self {
         let named: BTreeMap<String, Tensor> = variables.variables().into_iter().collect();
         let entries = named
@@ -146,7 +145,6 @@ impl AdamW {
 
     /// The moments by name (the next step changes them), `mean.<variable>` and `square.<variable>`, and the number of
     /// steps.
-    #[must_use]
     pub fn state(&self) -> (BTreeMap<String, Tensor>, i64) {
         let both = self.entries.iter().flat_map(|entry| {
             let stored = |prefix: &str, moment: &Tensor| {

@@ -56,7 +56,6 @@ impl Default for TrainingBar {
 
 impl TrainingBar {
     /// Bar for a training of this length, which is part of the estimate if sweeps have to be encoded first.
-    #[must_use]
     pub fn of(length: Length) -> Self {
         Self {
             length: Some(length),
@@ -65,7 +64,6 @@ impl TrainingBar {
     }
 
     /// The same for a training whose time counts from the start of the encoding.
-    #[must_use]
     pub fn including_encoding(length: Length) -> Self {
         Self {
             includes_encoding: true,

@@ -17,7 +17,6 @@ pub struct ModelCard {
 
 impl ModelCard {
     /// A card with an empty table.
-    #[must_use]
     pub fn new(title: &str, about: &str) -> Self {
         Self {
             text: format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n"),

@@ -14,7 +14,6 @@ pub struct DataListing {
 
 impl DataListing {
     /// Text of the data that are left out; `None` if all can be used.
-    #[must_use]
     pub fn left_out(&self) -> Option<String> {
         let sweeps = (self.without_pose > 0)
             .then(|| format!("{} sweeps without a pose left out", self.without_pose));

@@ -176,7 +176,6 @@ pub fn check_out(out: &Path, resume: bool, force: bool) -> Result<(), OptionsErr
 
 impl ComputePrecision {
     /// The fastest number format of a device.
-    #[must_use]
     pub fn fastest_on(device: Device) -> Self {
         if device != Device::Cpu || has_bfloat16() {
             Self::Bf16

@@ -22,7 +22,6 @@ pub struct Prefetch<T> {
 
 impl<T: Send + 'static> Prefetch<T> {
     /// Starts `threads` threads; `prepare` gets the numbers of batches from `first` on.
-    #[must_use]
     pub fn start(
         threads: usize,
         first: u64,

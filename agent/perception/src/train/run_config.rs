@@ -41,7 +41,6 @@ pub struct RunConfig {
 
 impl RunConfig {
     /// One sample at a time on the CPU, in single precision, into `out`.
-    #[must_use]
     pub fn new(length: Length, out: &Path) -> Self {
         Self {
             length,

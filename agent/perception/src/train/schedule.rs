@@ -18,7 +18,6 @@ pub struct OneCycle {
 
 impl OneCycle {
     /// The learning rate when a share of the training is done, 0..1.
-    #[must_use]
     pub fn at(&self, progress: f64) -> f64 {
         let progress = progress.clamp(0.0, 1.0);
         let between =

@@ -141,31 +141,26 @@ impl Trainer {
     }
 
     /// Steps done.
-    #[must_use]
     pub fn steps(&self) -> u64 {
         self.progress.step
     }
 
     /// True after the first step, so that a user soon sees what a step costs, and after every `period` steps.
-    #[must_use]
     pub fn is_report_due(&self, period: u64) -> bool {
         self.progress.step == 1 || self.progress.step.is_multiple_of(period)
     }
 
     /// Seconds spent, in all runs together.
-    #[must_use]
     pub fn seconds(&self) -> f64 {
         self.seconds_before + self.started.elapsed().as_secs_f64()
     }
 
     /// Seconds spent on steps, in all runs together: without what came before the first step of each.
-    #[must_use]
     pub fn seconds_of_steps(&self) -> f64 {
         self.seconds() - self.progress.preparing_seconds
     }
 
     /// Share of the training that is done after `epoch` passes over the data, 0 at the start, 1 or more at the end.
-    #[must_use]
     pub fn share_done(&self, epoch: f64) -> f64 {
         self.run
             .length
@@ -173,7 +168,6 @@ impl Trainer {
     }
 
     /// The learning rate when a share is done.
-    #[must_use]
     pub fn learning_rate(&self, share_done: f64) -> f64 {
         OneCycle {
             peak: self.run.learning_rate,

@@ -93,13 +93,11 @@ impl Weights {
     }
 
     /// SHA-256 of the file, 64 hexadecimal digits: identifies the model in run records and descriptors.
-    #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
     /// SHA-256 over the tensors whose name is `wanted`: the same for files that share these and differ in others.
-    #[must_use]
     pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
         let mut hash = Sha256::new();
         for (name, Values { shape, values }) in self.tensors.iter().filter(|(name, _)| wanted(name))
@@ -113,7 +111,6 @@ impl Weights {
     }
 
     /// Path of the file.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -124,13 +121,11 @@ impl Weights {
     }
 
     /// True if there is a tensor of that name.
-    #[must_use]
     pub fn contains(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
     }
 
     /// Number of parameters.
-    #[must_use]
     pub fn parameters(&self) -> usize {
         self.tensors
             .values()
@@ -139,7 +134,6 @@ impl Weights {
     }
 
     /// The text under a metadata key.
-    #[must_use]
     pub fn metadata(&self, key: &str) -> Option<&str> {
         self.metadata.get(key).map(String::as_str)
     }

@@ -65,7 +65,6 @@ pub struct ErmvpConfig {
 
 impl ErmvpConfig {
     /// The published sizes, for feature maps of `channels` (256 there).
-    #[must_use]
     pub fn full(channels: i64) -> Self {
         Self {
             layers: SwapFusionConfig::full(channels),
@@ -76,7 +75,6 @@ impl ErmvpConfig {
     }
 
     /// For live traffic on two cores; cells are half as large, so the search range is twice as many cells.
-    #[must_use]
     pub fn lean(channels: i64) -> Self {
         Self {
             layers: SwapFusionConfig::lean(channels),

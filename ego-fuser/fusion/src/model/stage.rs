@@ -154,13 +154,11 @@ impl FusionStage {
     }
 
     /// Settings that the fusion was built from.
-    #[must_use]
     pub fn config(&self) -> &FusionConfig {
         &self.config
     }
 
     /// Inputs that the fusion needs beyond the newest map of every agent.
-    #[must_use]
     pub fn requirements(&self) -> &Requirements {
         &self.requirements
     }

@@ -134,7 +134,6 @@ pub(crate) struct PastatConfig {
 
 impl PastatConfig {
     /// Sized for one core and live traffic.
-    #[must_use]
     pub(crate) fn lean(channels: i64) -> Self {
         Self {
             channels,
@@ -157,7 +156,6 @@ impl PastatConfig {
     }
 
     /// Sized like the transformer that the paper builds on.
-    #[must_use]
     pub(crate) fn full(channels: i64) -> Self {
         Self {
             patch: 1,
@@ -178,7 +176,6 @@ impl PastatConfig {
 
     /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells fill every part of
     /// FSA.
-    #[must_use]
     pub(crate) fn padding_cells(&self) -> i64 {
         let larger = |fsa: &FsaConfig| {
             fsa.alignment_search.map_or(self.earlier_cells, |search| {

@@ -77,7 +77,6 @@ impl ObservedBox {
 ///
 /// Agents join one after another, those first that share most with the joined ones: an agent that shares nothing with
 /// the ego may still be aligned through a third.
-#[must_use]
 pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
     let seen: Vec<Vec<ObservedBox>> = agents
         .iter()

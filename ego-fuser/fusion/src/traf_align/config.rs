@@ -30,7 +30,6 @@ pub(crate) struct TrafAlignConfig {
 
 impl TrafAlignConfig {
     /// Sized for one core and live traffic.
-    #[must_use]
     pub(crate) fn lean(channels: i64) -> Self {
         let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
         Self {
@@ -47,7 +46,6 @@ impl TrafAlignConfig {
     }
 
     /// About the published sizes.
-    #[must_use]
     pub(crate) fn full(channels: i64) -> Self {
         Self {
             patch: 1,

@@ -37,7 +37,6 @@ struct Asked {
 
 impl AgentAttention {
     /// Variables `q_linears`, `k_linears`, `v_linears`, `a_linears`, `relation_att` and `relation_msg` below `path`.
-    #[must_use]
     pub fn new(
         path: &nn::Path<'_>,
         channels: i64,

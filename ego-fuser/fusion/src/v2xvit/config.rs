@@ -56,7 +56,6 @@ pub struct V2xVitConfig {
 
 impl V2xVitConfig {
     /// The published sizes, for feature maps of `channels` (256 there).
-    #[must_use]
     pub fn full(channels: i64) -> Self {
         let window = |edge, heads| WindowConfig {
             edge,
@@ -79,7 +78,6 @@ impl V2xVitConfig {
 
     /// For live traffic on two cores: two layers, heads as wide as the published ones, no dropout (drawing its mask
     /// costs as much as a layer norm and a projection).
-    #[must_use]
     pub fn lean(channels: i64) -> Self {
         let window = |edge, heads| WindowConfig {
             edge,

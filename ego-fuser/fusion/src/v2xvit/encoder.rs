@@ -81,7 +81,6 @@ pub struct Layer {
 
 impl Layer {
     /// Its pairs of attentions.
-    #[must_use]
     pub fn blocks(&self) -> &[Block] {
         &self.blocks
     }
@@ -104,7 +103,6 @@ pub struct Encoder {
 
 impl Encoder {
     /// Variables `layers` and `rte` below `path`. `config` is valid and its order is `order`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &V2xVitConfig, order: &BlockOrder) -> Self {
         let layer = |index: usize| {
             let path = path / "layers" / index;
@@ -130,13 +128,11 @@ impl Encoder {
     }
 
     /// The layers, first to last.
-    #[must_use]
     pub fn layers(&self) -> &[Layer] {
         &self.layers
     }
 
     /// Encoding of delays; absent where the configuration has none.
-    #[must_use]
     pub fn temporal(&self) -> Option<&TemporalEncoding> {
         self.temporal.as_ref()
     }

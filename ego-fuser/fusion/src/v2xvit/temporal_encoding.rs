@@ -20,7 +20,6 @@ pub struct TemporalEncoding {
 
 impl TemporalEncoding {
     /// For features of `channels`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let path = path / "emb";
         let mut table = (&path / "emb").var("weight", &[ROWS, channels], Init::Const(0.0));

@@ -109,7 +109,6 @@ pub struct WindowAttention {
 
 impl WindowAttention {
     /// Variables `pwmsa` and, for a merge by attention, `split_attn` below `path`.
-    #[must_use]
     pub fn new(
         path: &nn::Path<'_>,
         channels: i64,
@@ -141,7 +140,6 @@ impl WindowAttention {
     }
 
     /// The branches, in the order of the configuration.
-    #[must_use]
     pub fn branches(&self) -> &[WindowBranch] {
         &self.branches
     }

@@ -95,7 +95,6 @@ impl ViewAugment {
     }
 
     /// A box of that frame after the change.
-    #[must_use]
     pub fn box3d(&self, box3d: &Box3d) -> Box3d {
         let side = if self.mirrored { -1.0 } else { 1.0 };
         let center = self.turn() * Vector3::from(self.mirror(box3d.center_m)) * self.scale;
@@ -107,7 +106,6 @@ impl ViewAugment {
     }
 
     /// `ego_from_cav` between two changed frames: `self` is the ego's change, `cav` the other's.
-    #[must_use]
     pub fn pose(&self, ego_from_cav: &Pose, cav: &Self) -> Pose {
         let isometry = ego_from_cav.isometry();
         let translation =

@@ -63,7 +63,6 @@ pub struct SampleConfig {
 
 impl SampleConfig {
     /// Samples for training.
-    #[must_use]
     pub fn training(kind: SampleKind) -> Self {
         Self {
             kind,
@@ -131,7 +130,6 @@ struct Entry {
 
 impl SampleBuilder {
     /// A builder over `scenes`; `assigner` holds the anchors of `detector`.
-    #[must_use]
     pub fn new(
         scenes: Arc<SceneSet>,
         config: SampleConfig,
@@ -161,7 +159,6 @@ impl SampleBuilder {
     }
 
     /// The scenes it draws from.
-    #[must_use]
     pub fn scenes(&self) -> &SceneSet {
         &self.scenes
     }

@@ -95,7 +95,6 @@ impl Batch {
 }
 
 /// Batches from number `first` on, the same for any number of threads.
-#[must_use]
 pub fn batches(
     builder: &SampleBuilder,
     pillar_grid: PillarGrid,

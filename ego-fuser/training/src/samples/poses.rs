@@ -45,7 +45,6 @@ impl SamplePoses {
     }
 
     /// The same without an added error.
-    #[must_use]
     pub(crate) fn without_noise(&self) -> Self {
         Self {
             noise: None,
@@ -103,7 +102,6 @@ pub struct Offset(pub [f64; 3]);
 
 impl Offset {
     /// The offset between a sender's reported and true pose, both in the ego frame.
-    #[must_use]
     pub fn between(reported: &Pose, real: &Pose) -> Self {
         let along = |axis: usize| real.translation_m[axis] - reported.translation_m[axis];
         let turn_rad = real.yaw_rad() - reported.yaw_rad();

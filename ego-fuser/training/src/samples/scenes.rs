@@ -81,7 +81,6 @@ impl SceneSet {
     }
 
     /// A set of scenarios that are open already.
-    #[must_use]
     pub fn new(scenarios: Vec<Scenario>) -> Self {
         let of_scenario = |(scenario, found): (usize, &Scenario)| {
             (0..found.ticks.len())
@@ -100,26 +99,22 @@ impl SceneSet {
     }
 
     /// All ticks, scenario after scenario.
-    #[must_use]
     pub fn ticks(&self) -> &[TickRef] {
         &self.ticks
     }
 
     /// The scenario of a tick.
-    #[must_use]
     pub fn scenario(&self, tick: TickRef) -> &Scenario {
         &self.scenarios[tick.scenario]
     }
 
     /// All scenarios.
-    #[must_use]
     pub fn scenarios(&self) -> &[Scenario] {
         &self.scenarios
     }
 
     /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; `None` for
     /// those that are absent or whose file cannot be read.
-    #[must_use]
     pub fn annotations(&self, tick: TickRef) -> Arc<Vec<Option<Frame>>> {
         let known = |set: &Self| lock(&set.known).get(&tick).cloned();
         if let Some(frames) = known(self) {
@@ -160,7 +155,6 @@ impl SceneSet {
     }
 
     /// Identification of the data, and their problems.
-    #[must_use]
     pub fn data(&self) -> DataListing {
         let sha256 = self
             .sha256

@@ -31,7 +31,6 @@ const ATTENUATION_PER_M: f32 = 0.004;
 const GROUND_REFLECTIVITY: f32 = 0.25;
 
 /// The rays of one turn. The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
-#[must_use]
 pub(crate) fn lidar_pattern() -> RayPattern {
     let [low, high] = ELEVATIONS_DEG.map(f32::to_radians);
     let azimuth_step_rad = -TAU / COLUMNS as f32;
@@ -172,7 +171,6 @@ fn measure(
 }
 
 /// The point of a pose at which a sweep is given, relative to the vehicle's own origin.
-#[must_use]
 pub(crate) fn lidar_motion(vehicle: &Sweep) -> Sweep {
     vehicle.mounted(LIDAR_MOUNT_M)
 }

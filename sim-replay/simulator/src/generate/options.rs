@@ -75,7 +75,6 @@ pub struct SynthOptions {
 
 impl SynthOptions {
     /// The defaults of a subset.
-    #[must_use]
     pub fn new(subset: Subset, seed: u64, out: PathBuf) -> Self {
         Self {
             subset,
@@ -97,13 +96,11 @@ impl SynthOptions {
     }
 
     /// Default number of frames of a scenario.
-    #[must_use]
     pub fn default_frames(subset: Subset) -> usize {
         if subset == Subset::V2vdet { 60 } else { 2000 }
     }
 
     /// Steps of the simulation from one stored frame to the next.
-    #[must_use]
     pub(crate) fn steps_per_frame(&self) -> usize {
         (self.period_s / STEP_S).round() as usize
     }

@@ -115,13 +115,11 @@ fn velocity_mps(motion: &Sweep, sweep_s: f64) -> Vector3<f64> {
 }
 
 /// A radial velocity as the red channel holds it, 0..1; see [`RADAR_VELOCITY_SPAN_MPS`].
-#[must_use]
 pub(crate) fn velocity_to_red(velocity_mps: f32) -> f32 {
     (velocity_mps / (2.0 * RADAR_VELOCITY_SPAN_MPS as f32) + 0.5).clamp(0.0, 1.0)
 }
 
 /// Radial velocity in metres per second from the red channel, 0..1.
-#[must_use]
 pub fn red_to_velocity(red: f32) -> f32 {
     (red - 0.5) * 2.0 * RADAR_VELOCITY_SPAN_MPS as f32
 }

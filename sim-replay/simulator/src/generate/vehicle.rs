@@ -102,19 +102,16 @@ const STOCK: [Stock; 7] = [
 
 impl Vehicle {
     /// A random vehicle with the frequencies of moving traffic.
-    #[must_use]
     pub fn random_driving(random: &mut SplitMix64) -> Self {
         Self::random(random, |stock| stock.driving)
     }
 
     /// A random vehicle with the frequencies of parked vehicles.
-    #[must_use]
     pub(crate) fn random_parked(random: &mut SplitMix64) -> Self {
         Self::random(random, |stock| stock.parked)
     }
 
     /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
-    #[must_use]
     pub(crate) fn random_connected(random: &mut SplitMix64) -> Self {
         let low = |kind| {
             matches!(
@@ -142,7 +139,6 @@ impl Vehicle {
     }
 
     /// A vehicle of given outer sizes; proportions vary from one to the next.
-    #[must_use]
     pub fn new(kind: VehicleKind, size_m: [f64; 3], random: &mut SplitMix64) -> Self {
         let [length, width, height] = size_m.map(|size| size as f32);
         let mut vary =

@@ -78,7 +78,6 @@ impl<'t> World<'t> {
 }
 
 /// The ground of a map, without its decks, as a surface for ray casting.
-#[must_use]
 pub fn ground_surface(map_model: &MapModel) -> Box<dyn Surface + Send + Sync> {
     match &map_model.ground.terrain {
         Terrain::Plane { z_m } => Box::new(Plane(*z_m)),

@@ -29,7 +29,6 @@ pub(crate) fn outline(solid: &Solid) -> Rectangle {
 impl MapModel {
     /// Lanes and solids (by index in [`MapModel::solids`]) where the solid reaches into the lane's space up to
     /// `LANE_HEADROOM_M` over it. Empty for a valid map.
-    #[must_use]
     pub fn obstructions(&self) -> Vec<(LaneId, usize)> {
         let outlines: Vec<_> = self
             .solids

@@ -12,7 +12,6 @@ use super::lane::wrap_angle;
 /// The clothoid from `from` to `to`, beginning `s_m` along its road; a line or an arc where one fits.
 ///
 /// Meant for turns of at most about 120 degrees against the chord at either end; beyond that the curve may loop.
-#[must_use]
 pub(crate) fn between(from: Pose2, to: Pose2, s_m: f64) -> Curve {
     let distance = from.distance_m(&to);
     let chord = (to.y - from.y).atan2(to.x - from.x);

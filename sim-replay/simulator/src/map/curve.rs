@@ -69,13 +69,11 @@ pub struct Curve {
 
 impl Pose2 {
     /// A pose from its coordinates.
-    #[must_use]
     pub fn new(x: f64, y: f64, heading_rad: f64) -> Self {
         Self { x, y, heading_rad }
     }
 
     /// The pose that lies `u` ahead, `v` to the left and turned by `turn_rad`, seen from this one.
-    #[must_use]
     pub fn moved(&self, u: f64, v: f64, turn_rad: f64) -> Self {
         let (sin, cos) = self.heading_rad.sin_cos();
         Self::new(
@@ -86,13 +84,11 @@ impl Pose2 {
     }
 
     /// The pose turned round on the spot.
-    #[must_use]
     pub fn reversed(&self) -> Self {
         self.moved(0.0, 0.0, std::f64::consts::PI)
     }
 
     /// Distance in the plane, metres.
-    #[must_use]
     pub fn distance_m(&self, other: &Self) -> f64 {
         (self.x - other.x).hypot(self.y - other.y)
     }
@@ -100,7 +96,6 @@ impl Pose2 {
 
 impl Curve {
     /// Place and heading `s_m` metres after its start.
-    #[must_use]
     pub fn at(&self, s_m: f64) -> Pose2 {
         let (u, v, turn) = match self.shape {
             CurveShape::Line => (s_m, 0.0, 0.0),
@@ -122,7 +117,6 @@ impl Curve {
     }
 
     /// Place and heading of its end.
-    #[must_use]
     pub fn end(&self) -> Pose2 {
         self.at(self.length_m)
     }

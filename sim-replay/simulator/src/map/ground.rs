@@ -42,7 +42,6 @@ pub struct HeightGrid {
 
 impl Ground {
     /// Level ground without decks.
-    #[must_use]
     pub fn plane(z_m: f64) -> Self {
         Self {
             terrain: Terrain::Plane { z_m },
@@ -51,7 +50,6 @@ impl Ground {
     }
 
     /// Height of the terrain (not of decks) at `x`, `y`, metres.
-    #[must_use]
     pub fn height_m(&self, x: f64, y: f64) -> f64 {
         match &self.terrain {
             Terrain::Plane { z_m } => *z_m,
@@ -60,7 +58,6 @@ impl Ground {
     }
 
     /// The height of the terrain where it is level everywhere.
-    #[must_use]
     pub(crate) fn plane_z_m(&self) -> Option<f64> {
         match self.terrain {
             Terrain::Plane { z_m } => Some(z_m),
@@ -71,7 +68,6 @@ impl Ground {
 
 impl HeightGrid {
     /// Height of the node in `column` and `row`, clamped to the grid, metres.
-    #[must_use]
     pub(crate) fn node_m(&self, column: usize, row: usize) -> f64 {
         f64::from(
             self.heights_m[row.min(self.rows - 1) * self.columns + column.min(self.columns - 1)],
@@ -79,7 +75,6 @@ impl HeightGrid {
     }
 
     /// Height of the surface at `x`, `y`, metres.
-    #[must_use]
     pub fn height_m(&self, x: f64, y: f64) -> f64 {
         let column = ((x - self.origin_m[0]) / self.cell_m).clamp(0.0, (self.columns - 1) as f64);
         let row = ((y - self.origin_m[1]) / self.cell_m).clamp(0.0, (self.rows - 1) as f64);

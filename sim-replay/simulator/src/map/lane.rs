@@ -68,7 +68,6 @@ pub struct Lane {
 
 impl Lane {
     /// A lane of one width outside junctions, not yet linked. `centerline` holds at least two points.
-    #[must_use]
     pub fn new(id: LaneId, centerline: Vec<[f64; 3]>, width_m: f64, speed_limit_mps: f64) -> Self {
         let length_m = centerline
             .windows(2)
@@ -95,7 +94,6 @@ impl Lane {
     }
 
     /// Place on the centre line at `s_m` metres from its start (clamped to the lane), and the heading there in radians.
-    #[must_use]
     pub fn at(&self, s_m: f64) -> ([f64; 3], f64) {
         let last = self.centerline.len() - 1;
         let step = (s_m / self.length_m * last as f64).clamp(0.0, last as f64);
@@ -115,7 +113,6 @@ impl Lane {
     }
 
     /// Slope across the lane at `s_m`, radians; see [`Lane::banks_rad`].
-    #[must_use]
     pub(crate) fn bank_rad(&self, s_m: f64) -> f64 {
         let Some(last) = self.banks_rad.len().checked_sub(1).filter(|&last| last > 0) else {
             return 0.0;
@@ -127,13 +124,11 @@ impl Lane {
     }
 
     /// Heading at the start, radians.
-    #[must_use]
     pub fn start_heading_rad(&self) -> f64 {
         self.at(0.0).1
     }
 
     /// Heading at the end, radians.
-    #[must_use]
     pub fn end_heading_rad(&self) -> f64 {
         self.at(self.length_m).1
     }
@@ -146,7 +141,6 @@ impl Lane {
 
 impl LaneGraph {
     /// A graph of `lanes`, whose ids are their places.
-    #[must_use]
     pub fn new(lanes: Vec<Lane>) -> Self {
         debug_assert!(
             lanes
@@ -158,14 +152,12 @@ impl LaneGraph {
     }
 
     /// The lane of an id that belongs to this graph.
-    #[must_use]
     pub fn lane(&self, id: LaneId) -> &Lane {
         &self.lanes[id.0 as usize]
     }
 }
 
 /// Normalises an angle to (-pi, pi].
-#[must_use]
 pub(crate) fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = angle_rad.rem_euclid(2.0 * PI);
     if wrapped > PI {

@@ -32,7 +32,6 @@ pub(super) struct Origin {
 
 /// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
 /// traffic keeps right or left, road by road.
-#[must_use]
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     let mut table = LaneTable {
         first_section: Vec::new(),

@@ -30,7 +30,6 @@ pub(crate) struct LaneIndex {
 
 impl LaneIndex {
     /// Indexes every centre line of `graph`.
-    #[must_use]
     pub(crate) fn new(graph: &LaneGraph) -> Self {
         let points = || graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
         let low = points().fold([f64::INFINITY; 2], |low, p| {
@@ -75,7 +74,6 @@ impl LaneIndex {
 
     /// The lane nearest to `x`, `y` within `radius_m`; with `heading_rad`, only lanes that lead the same way within
     /// 60 degrees; with `z_m`, only where the lane is within 3 m of that height (roads pass above each other).
-    #[must_use]
     pub(crate) fn nearest(
         &self,
         graph: &LaneGraph,

@@ -32,13 +32,11 @@ pub struct CrossShape {
 
 impl LateralProfile {
     /// True if the road is level everywhere.
-    #[must_use]
     pub fn is_level(&self) -> bool {
         self.superelevation_rad.records.is_empty() && self.is_flat()
     }
 
     /// True if every cross-section is a straight line, level or not.
-    #[must_use]
     pub fn is_flat(&self) -> bool {
         self.crossfall_rad
             .iter()
@@ -48,7 +46,6 @@ impl LateralProfile {
 
     /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m`,
     /// metres.
-    #[must_use]
     pub fn at(&self, s_m: f64, t_m: f64) -> [f64; 2] {
         let fall = self.crossfall_rad[usize::from(t_m < 0.0)]
             .at(s_m)

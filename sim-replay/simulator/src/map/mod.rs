@@ -77,7 +77,6 @@ pub enum RoadMapSource {
 
 impl RoadMapSource {
     /// The name of the map made from it: its kind, or the stem of the map's file in small letters.
-    #[must_use]
     pub fn name(&self) -> String {
         let stem = |path: &Path| {
             path.file_stem()

@@ -11,7 +11,6 @@ pub struct Profile {
 
 impl Profile {
     /// The same value everywhere.
-    #[must_use]
     pub fn constant(value: f64) -> Self {
         Self {
             records: vec![(0.0, [value, 0.0, 0.0, 0.0])],
@@ -19,7 +18,6 @@ impl Profile {
     }
 
     /// The cubic that leads from one value and slope to another over `length` from `start` on.
-    #[must_use]
     pub(crate) fn hermite(
         start: f64,
         length: f64,
@@ -33,14 +31,12 @@ impl Profile {
     }
 
     /// Value at `s`; the first cubic also holds before its start, and an empty profile is 0.
-    #[must_use]
     pub fn at(&self, s: f64) -> f64 {
         self.record_at(s)
             .map_or(0.0, |(start, coefficients)| cubic(coefficients, s - start))
     }
 
     /// Slope at `s`.
-    #[must_use]
     pub(crate) fn slope_at(&self, s: f64) -> f64 {
         self.record_at(s).map_or(0.0, |(start, coefficients)| {
             cubic_slope(coefficients, s - start)

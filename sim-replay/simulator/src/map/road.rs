@@ -114,7 +114,6 @@ pub struct RoadLane {
 
 impl RoadLane {
     /// A lane without links and speed limit of its own.
-    #[must_use]
     pub fn new(kind: LaneKind, width: Profile) -> Self {
         Self {
             kind,
@@ -218,14 +217,12 @@ pub struct RoadStructure {
 
 impl LaneSection {
     /// The lane of an id, if the section has it; there is none for the centre, 0.
-    #[must_use]
     pub fn lane(&self, id: i32) -> Option<&RoadLane> {
         let side = if id > 0 { &self.left } else { &self.right };
         side.get((id.unsigned_abs() as usize).checked_sub(1)?)
     }
 
     /// True if lanes are kept level where the road is not.
-    #[must_use]
     pub(crate) fn has_level_lanes(&self) -> bool {
         self.left.iter().chain(&self.right).any(|lane| lane.level)
     }
@@ -239,7 +236,6 @@ impl LaneSection {
 
 impl Road {
     /// Place and heading of the reference line at `s_m`.
-    #[must_use]
     pub fn pose_at(&self, s_m: f64) -> Pose2 {
         let after = self.plan_view.partition_point(|curve| curve.s_m <= s_m);
         let curve = &self.plan_view[after.saturating_sub(1)];
@@ -248,7 +244,6 @@ impl Road {
     }
 
     /// Place at `s_m`, `t_m` of section `section`, on the road's surface, metres.
-    #[must_use]
     pub(crate) fn point_at(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 3] {
         let z_m = self.elevation.at(s_m);
         if self.lateral.is_level() {
@@ -262,7 +257,6 @@ impl Road {
 
     /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m` of
     /// section `section`, metres. On a level road that is `t_m` and 0.
-    #[must_use]
     pub(crate) fn aside_m(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 2] {
         if self.lateral.is_level() {
             return [t_m, 0.0];
@@ -290,7 +284,6 @@ impl Road {
 
     /// Slope across lane `id` of section `section` at `s_m` as an angle, radians; positive where the left side of the
     /// road (not of the lane's traffic) is higher.
-    #[must_use]
     pub(crate) fn bank_rad(&self, section: usize, id: i32, s_m: f64) -> f64 {
         if self.lateral.is_level() {
             return 0.0;
@@ -304,7 +297,6 @@ impl Road {
     }
 
     /// True if traffic on lane `id` of section `section` leads along the road.
-    #[must_use]
     pub(crate) fn leads_along(&self, section: usize, id: i32) -> bool {
         let reversed = self
             .sections
@@ -315,7 +307,6 @@ impl Road {
     }
 
     /// End of section `index`, metres.
-    #[must_use]
     pub(crate) fn section_end_m(&self, index: usize) -> f64 {
         self.sections
             .get(index + 1)
@@ -323,7 +314,6 @@ impl Road {
     }
 
     /// Index of the section at `s_m` in [`Road::sections`].
-    #[must_use]
     pub(crate) fn section_at(&self, s_m: f64) -> usize {
         self.sections
             .partition_point(|section| section.s_m <= s_m)
@@ -332,13 +322,11 @@ impl Road {
 
     /// Shift of the lanes' origin across the road at `s_m`, metres, clamped to the limits of a road since cubics of a
     /// map are unbounded.
-    #[must_use]
     pub(crate) fn lane_offset_m(&self, s_m: f64) -> f64 {
         self.lane_offset.at(s_m).clamp(-MAX_OFFSET_M, MAX_OFFSET_M)
     }
 
     /// Lower and upper `t` of lane `id` of section `section` at `s_m`, metres.
-    #[must_use]
     pub(crate) fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
         let side = if id > 0 {
@@ -359,7 +347,6 @@ impl Road {
     }
 
     /// Speed limit at `s_m` where the road has one, metres per second.
-    #[must_use]
     pub(crate) fn speed_limit_mps(&self, s_m: f64) -> Option<f64> {
         let after = self
             .speed_limits

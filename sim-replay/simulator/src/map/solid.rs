@@ -58,7 +58,6 @@ pub enum Shape {
 
 impl Shape {
     /// Half of the height, metres.
-    #[must_use]
     pub(crate) fn half_height_m(&self) -> f64 {
         match *self {
             Self::Box {
@@ -75,7 +74,6 @@ impl Shape {
     }
 
     /// Half lengths along the shape's own x and y of the rectangle around its outline seen from above, metres.
-    #[must_use]
     pub(crate) fn half_footprint_m(&self) -> [f64; 2] {
         match *self {
             Self::Box { half_m: [x, y, _] } | Self::Ellipsoid { radii_m: [x, y, _] } => [x, y],
@@ -101,7 +99,6 @@ pub struct Solid {
 
 impl Solid {
     /// A solid by its parts.
-    #[must_use]
     pub fn new(
         kind: SolidKind,
         shape: Shape,
@@ -119,13 +116,11 @@ impl Solid {
     }
 
     /// Height of its lowest point, metres in the world frame.
-    #[must_use]
     pub(crate) fn bottom_m(&self) -> f64 {
         self.center_m[2] - self.shape.half_height_m()
     }
 
     /// Height of its highest point, metres in the world frame.
-    #[must_use]
     pub(crate) fn top_m(&self) -> f64 {
         self.center_m[2] + self.shape.half_height_m()
     }

@@ -40,7 +40,6 @@ pub struct DiffLocConfig {
 
 impl DiffLocConfig {
     /// The small network: 16 x 256 images, 256 tokens of 128 channels.
-    #[must_use]
     pub fn small() -> Self {
         Self {
             scene_name: "scene".into(),
@@ -60,7 +59,6 @@ impl DiffLocConfig {
     }
 
     /// Number of tokens of a sweep.
-    #[must_use]
     pub fn tokens(&self) -> i64 {
         (self.image.rows as i64 / self.patch[0].max(1))
             * (self.image.columns as i64 / self.patch[1].max(1))

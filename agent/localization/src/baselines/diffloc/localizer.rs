@@ -52,13 +52,11 @@ impl DiffLocLocalizer {
     }
 
     /// SHA-256 of the weights.
-    #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
     }
 
     /// Configuration: sizes and scene.
-    #[must_use]
     pub fn config(&self) -> &DiffLocConfig {
         self.network.config()
     }

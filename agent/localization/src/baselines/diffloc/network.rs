@@ -42,25 +42,21 @@ impl DiffLoc {
     }
 
     /// Configuration that it was built from.
-    #[must_use]
     pub fn config(&self) -> &DiffLocConfig {
         &self.config
     }
 
     /// Encoder of range images.
-    #[must_use]
     pub fn encoder(&self) -> &SweepEncoder {
         &self.encoder
     }
 
     /// Denoiser of poses.
-    #[must_use]
     pub fn denoiser(&self) -> &PoseDenoiser {
         &self.denoiser
     }
 
     /// Noise schedule.
-    #[must_use]
     pub fn schedule(&self) -> &NoiseSchedule {
         &self.schedule
     }

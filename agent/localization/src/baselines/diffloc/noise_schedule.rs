@@ -41,7 +41,6 @@ impl NoiseSchedule {
     }
 
     /// Number of steps.
-    #[must_use]
     pub fn steps(&self) -> i64 {
         self.kept.len() as i64
     }

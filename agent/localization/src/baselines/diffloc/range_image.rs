@@ -38,13 +38,11 @@ impl Default for RangeImageConfig {
 
 impl RangeImageConfig {
     /// Number of pixels.
-    #[must_use]
     pub fn pixels(&self) -> usize {
         self.rows * self.columns
     }
 
     /// Index of the pixel of a point in metres in the sensor frame, and its range; `None` outside of the image.
-    #[must_use]
     pub fn pixel(&self, [x, y, z]: [f32; 3]) -> Option<(usize, f32)> {
         let range_m = (x * x + y * y + z * z).sqrt();
         if !range_m.is_finite() || range_m < LEAST_RANGE_M {
@@ -63,7 +61,6 @@ impl RangeImageConfig {
 
     /// The image `[CHANNELS, rows, columns]` of points x, y, z in metres in the sensor frame and intensity, in
     /// [`UNITS`]. The closest point of a pixel counts; points outside of the field of view are left out.
-    #[must_use]
     pub fn image(&self, xyzi: &[[f32; 4]]) -> Vec<f32> {
         let pixels = self.pixels();
         let mut closest = vec![(f32::INFINITY, 0); pixels];

@@ -35,7 +35,6 @@ pub struct EncodedSweeps {
 
 impl SweepEncoder {
     /// Builds the layers below `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Self {
         let DiffLocConfig {
             width,

@@ -52,7 +52,6 @@ impl HypLiLocLocalizer {
     }
 
     /// Configuration: scene, origin and scale of its positions.
-    #[must_use]
     pub fn config(&self) -> &HypLiLocConfig {
         &self.config
     }

@@ -44,7 +44,6 @@ pub struct HypLiLoc {
 
 impl HypLiLoc {
     /// Builds the layers below `path`.
-    #[must_use]
     pub fn new(path: &nn::Path<'_>) -> Self {
         let block = path / "point_block";
         Self {

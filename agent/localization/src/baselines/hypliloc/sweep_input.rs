@@ -24,7 +24,6 @@ pub struct SweepInput {
 
 impl SweepInput {
     /// Samples a sweep, metres in the sensor frame; `None` if it shows too little.
-    #[must_use]
     pub fn new(points_m: &[[f32; 3]]) -> Option<Self> {
         let range_m = RANGE_M as f32;
         let thinned = thin(points_m, range_m);
@@ -108,13 +107,11 @@ impl InputBatch {
     }
 
     /// Number of sweeps.
-    #[must_use]
     pub fn len(&self) -> i64 {
         self.points_m.size()[0]
     }
 
     /// True if there is no sweep.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -37,13 +37,11 @@ impl SgLoc {
     }
 
     /// Configuration that it was built from.
-    #[must_use]
     pub fn config(&self) -> &SgLocConfig {
         &self.config
     }
 
     /// Encoder.
-    #[must_use]
     pub fn encoder(&self) -> &SceneEncoder {
         &self.encoder
     }

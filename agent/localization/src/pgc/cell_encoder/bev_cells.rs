@@ -44,7 +44,6 @@ pub struct BevCells {
 
 impl BevFormat {
     /// The grids of a detector.
-    #[must_use]
     pub fn of_detector(config: &DetectorConfig) -> Self {
         let pillars = config.pillar_grid();
         let mut stride = 1;
@@ -134,7 +133,6 @@ impl LevelGrid {
 impl BevCells {
     /// Sorts points `[N]` of x, y, z (metres, sensor frame) and intensity into cells; those outside the detector's area,
     /// on the vehicle's own body or not finite are left out.
-    #[must_use]
     pub fn new(points: &[[f32; 4]], format: &BevFormat) -> Self {
         let mut cloud = PointCloud::default();
         format.crop.keep(points, &mut cloud.xyzi);
@@ -179,7 +177,6 @@ impl BevCells {
     }
 
     /// The cells, row after row.
-    #[must_use]
     pub fn cells(&self) -> &[Cell] {
         &self.cells
     }

@@ -95,7 +95,6 @@ impl CellEncoder {
     }
 
     /// SHA-256 that a head names the encoder of a file by, see [`Self::load`].
-    #[must_use]
     pub fn sha256_of(weights: &Weights) -> String {
         if BackboneEncoder::is_in(weights) {
             encoder_sha256(weights)
@@ -105,7 +104,6 @@ impl CellEncoder {
     }
 
     /// A scene encoder on its device.
-    #[must_use]
     pub fn sparse(encoder: SceneEncoder, device: Device) -> Self {
         let format = SweepFormat::Voxels(encoder.config().clone());
         Self {
@@ -116,7 +114,6 @@ impl CellEncoder {
     }
 
     /// Format of its sweeps.
-    #[must_use]
     pub fn format(&self) -> &SweepFormat {
         &self.format
     }
@@ -168,7 +165,6 @@ impl CellEncoder {
     }
 
     /// True if it takes the levels of a detector's backbone.
-    #[must_use]
     pub(super) fn takes_levels(&self) -> bool {
         matches!(self.network, Network::Backbone(_))
     }
@@ -217,7 +213,6 @@ impl CellEncoder {
 impl SweepFormat {
     /// Prepares points `[N]` of x, y, z (metres, sensor frame) and intensity; those out of range or not finite are left
     /// out.
-    #[must_use]
     pub fn prepare(&self, points: &[[f32; 4]]) -> PreparedSweep {
         match self {
             Self::Voxels(config) => PreparedSweep::Voxels(SweepVoxels::new(
@@ -229,7 +224,6 @@ impl SweepFormat {
     }
 
     /// Largest horizontal distance of a point that enters the features, metres.
-    #[must_use]
     pub fn range_m(&self) -> f64 {
         match self {
             Self::Voxels(config) => config.range_m,
@@ -238,7 +232,6 @@ impl SweepFormat {
     }
 
     /// Channels of a cell before its surroundings are added.
-    #[must_use]
     pub fn local_channels(&self) -> i64 {
         match self {
             Self::Voxels(config) => config.local_channels(),
@@ -247,7 +240,6 @@ impl SweepFormat {
     }
 
     /// Channels of a cell.
-    #[must_use]
     pub fn cell_channels(&self) -> i64 {
         match self {
             Self::Voxels(config) => config.cell_channels(),
@@ -256,7 +248,6 @@ impl SweepFormat {
     }
 
     /// Channels of a whole sweep.
-    #[must_use]
     pub fn sweep_channels(&self) -> i64 {
         match self {
             Self::Voxels(config) => config.sweep_channels(),
@@ -267,7 +258,6 @@ impl SweepFormat {
 
 impl PreparedSweep {
     /// The cells, in the order of the encoder's rows.
-    #[must_use]
     pub fn cells(&self) -> &[Cell] {
         match self {
             Self::Voxels(voxels) => voxels.cells(),

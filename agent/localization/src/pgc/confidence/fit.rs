@@ -119,7 +119,6 @@ impl ConfidenceModel {
 }
 
 /// Target sigma of an error: Eq. 6 with the true error in place of the predicted one.
-#[must_use]
 pub fn observed(error_m: f64) -> f64 {
     1.0 / (1.0 + error_m * error_m)
 }

@@ -16,14 +16,12 @@ pub struct MonotoneMap {
 
 impl MonotoneMap {
     /// Function from knots with ascending x and non-increasing values, 0..=1.
-    #[must_use]
     pub fn falling(knots: Vec<(f64, f64)>) -> Self {
         Self { knots }
     }
 
     /// Fits a decreasing function to samples of x and value, in groups of neighbours: about `groups` of them, each of
     /// at least `smallest` samples.
-    #[must_use]
     pub fn fit(mut samples: Vec<(f64, f64)>, groups: usize, smallest: usize) -> Self {
         samples.sort_by(|a, b| a.0.total_cmp(&b.0));
         let size = (samples.len() / groups.max(1)).max(smallest).max(1);
@@ -74,7 +72,6 @@ impl MonotoneMap {
     }
 
     /// Value at `x`; 0.5 for a function without knots, 0 if `x` is NaN.
-    #[must_use]
     pub fn at(&self, x: f64) -> f64 {
         if x.is_nan() {
             return 0.0;

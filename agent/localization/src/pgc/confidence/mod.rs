@@ -36,7 +36,6 @@ pub enum Confidence {
 
 impl Confidence {
     /// Sigma of a pose, 0..=1.
-    #[must_use]
     pub fn sigma(&self, evidence: &PoseEvidence) -> f64 {
         match self {
             Self::Plain => evidence.plain_sigma(),
@@ -45,7 +44,6 @@ impl Confidence {
     }
 
     /// True if a pose of this sigma is rejected.
-    #[must_use]
     pub fn rejects(&self, sigma: f64) -> bool {
         match self {
             Self::Plain => false,
@@ -85,7 +83,6 @@ impl ConfidenceModel {
     }
 
     /// Sigma of a pose, 0..=1.
-    #[must_use]
     pub fn sigma(&self, evidence: &PoseEvidence) -> f64 {
         self.sigma.at(self.log_error(evidence)).clamp(0.0, 1.0)
     }
@@ -101,7 +98,6 @@ impl ConfidenceModel {
     }
 
     /// Model with round numbers, for tests.
-    #[must_use]
     pub fn example() -> Self {
         let sigma = MonotoneMap::falling(vec![(-3.0, 0.95), (0.0, 0.5), (2.0, 0.05)]);
         Self {

@@ -86,7 +86,6 @@ pub struct IcpTarget {
 
 impl IcpTarget {
     /// Target without a point.
-    #[must_use]
     pub fn new(config: &IcpConfig) -> Self {
         let levels = config
             .levels
@@ -101,7 +100,6 @@ impl IcpTarget {
     }
 
     /// Target of one sweep, in the frame of its sensor.
-    #[must_use]
     pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
         let mut target = Self::new(config);
         target.add(xyzi, &Isometry3::identity());
@@ -126,7 +124,6 @@ impl IcpTarget {
     }
 
     /// Planes at the finest level.
-    #[must_use]
     pub fn planes(&self) -> usize {
         self.levels.last().map_or(0, Surfels::len)
     }
@@ -140,7 +137,6 @@ pub struct IcpSource {
 
 impl IcpSource {
     /// Decimates a sweep.
-    #[must_use]
     pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
         Self {
             points_m: decimate(within(xyzi, config.range_m), config.source_voxel_m),
@@ -148,7 +144,6 @@ impl IcpSource {
     }
 
     /// The points that are left `[N]`, in the frame of the sensor, metres.
-    #[must_use]
     pub fn points_m(&self) -> &[Vector3<f64>] {
         &self.points_m
     }

@@ -31,25 +31,21 @@ pub(crate) struct RayPattern {
 
 impl RayPattern {
     /// True if the columns go all the way round.
-    #[must_use]
     pub(crate) fn is_full_turn(&self) -> bool {
         self.azimuth_step_rad.abs() * self.columns as f32 > TAU - 0.5 * self.azimuth_step_rad.abs()
     }
 
     /// Azimuth of a column, radians.
-    #[must_use]
     pub(crate) fn azimuth_rad(&self, column: usize) -> f32 {
         self.first_azimuth_rad + self.azimuth_step_rad * column as f32
     }
 
     /// Elevation of a channel, radians.
-    #[must_use]
     pub(crate) fn elevation_rad(&self, channel: usize) -> f32 {
         self.first_elevation_rad + self.elevation_step_rad * channel as f32
     }
 
     /// Time at which a column is measured: 0 at the start of the sweep, 1 at its end.
-    #[must_use]
     pub(crate) fn time(&self, column: usize) -> f64 {
         if self.rolling {
             (column + 1) as f64 / self.columns as f64

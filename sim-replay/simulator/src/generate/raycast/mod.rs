@@ -43,7 +43,6 @@ impl BodyShape {
     ///
     /// # Panics
     /// If `parts` is empty: a body without extent is an error of the caller.
-    #[must_use]
     pub fn new(parts: Vec<Part>, reflectivity: f32) -> Self {
         let bounds = parts
             .iter()
@@ -120,7 +119,6 @@ pub(crate) struct SkewedColumn {
 impl SkewedColumn {
     /// The point at `range_m` along the ray of an elevation given by its cosine and sine.
     #[inline]
-    #[must_use]
     pub(crate) fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
         (self.origin_m + (self.forward * cos + self.up * sin) * range_m).into()
     }
@@ -148,7 +146,6 @@ pub(crate) struct Caster {
 
 impl Caster {
     /// A caster for sweeps of `pattern`.
-    #[must_use]
     pub(crate) fn new(pattern: RayPattern) -> Self {
         let elevations: Vec<f32> = (0..pattern.channels)
             .map(|channel| pattern.elevation_rad(channel))
@@ -163,7 +160,6 @@ impl Caster {
         }
     }
 
-    #[must_use]
     pub(crate) fn pattern(&self) -> &RayPattern {
         &self.pattern
     }
@@ -224,7 +220,6 @@ impl Caster {
     }
 
     /// The last sweep, as [`Caster::cast`] returned it.
-    #[must_use]
     pub(crate) fn image(&self) -> &RangeImage {
         &self.image
     }

@@ -46,7 +46,6 @@ pub struct Bounds {
 
 impl Bounds {
     /// A box from its centre and half sizes.
-    #[must_use]
     pub(crate) fn centered(center_m: [f32; 3], half_m: [f32; 3]) -> Self {
         Self {
             min_m: std::array::from_fn(|axis| center_m[axis] - half_m[axis]),
@@ -55,7 +54,6 @@ impl Bounds {
     }
 
     /// The smallest box around both.
-    #[must_use]
     pub fn union(&self, other: &Self) -> Self {
         Self {
             min_m: std::array::from_fn(|axis| self.min_m[axis].min(other.min_m[axis])),
@@ -64,14 +62,12 @@ impl Bounds {
     }
 
     /// Radius of the upright cylinder around the origin that holds the box.
-    #[must_use]
     pub fn radius_m(&self) -> f64 {
         let reach = |axis: usize| f64::from(self.min_m[axis].abs().max(self.max_m[axis].abs()));
         reach(0).hypot(reach(1))
     }
 
     /// The eight corners.
-    #[must_use]
     pub fn corners(&self) -> [[f32; 3]; 8] {
         std::array::from_fn(|corner| {
             std::array::from_fn(|axis| {
@@ -97,7 +93,6 @@ impl Bounds {
 
 impl Part {
     /// The box around the part.
-    #[must_use]
     pub fn bounds(&self) -> Bounds {
         match self {
             Self::Hull { bounds, .. } | Self::Box(bounds) => *bounds,

@@ -19,7 +19,6 @@ pub struct Placement {
 
 impl Placement {
     /// A level placement.
-    #[must_use]
     pub fn level(position_m: [f64; 3], yaw_rad: f64) -> Self {
         Self {
             position_m: position_m.into(),
@@ -30,7 +29,6 @@ impl Placement {
     }
 
     /// `world_from_self`, the turning part.
-    #[must_use]
     pub fn rotation(&self) -> Matrix3<f64> {
         let (sy, cy) = self.yaw_rad.sin_cos();
         let (sp, cp) = self.pitch_rad.sin_cos();
@@ -43,7 +41,6 @@ impl Placement {
     }
 
     /// `world_from_self`.
-    #[must_use]
     pub fn isometry(&self) -> Isometry3<f64> {
         let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(
             self.rotation(),
@@ -52,7 +49,6 @@ impl Placement {
     }
 
     /// The placement of something mounted at `offset_m` in this frame, with the same axes.
-    #[must_use]
     pub fn mounted(&self, offset_m: [f64; 3]) -> Self {
         Self {
             position_m: self.position_m + self.rotation() * Vector3::from(offset_m),
@@ -72,7 +68,6 @@ pub struct Sweep {
 
 impl Sweep {
     /// No motion.
-    #[must_use]
     pub fn still(placement: Placement) -> Self {
         Self {
             start: placement,
@@ -81,13 +76,11 @@ impl Sweep {
     }
 
     /// True if start and end are the same.
-    #[must_use]
     pub(crate) fn is_still(&self) -> bool {
         self.start == self.end
     }
 
     /// The placement at a time between 0 (start) and 1 (end).
-    #[must_use]
     pub fn at(&self, time: f64) -> Placement {
         let mix = |a: f64, b: f64| a + (b - a) * time;
         let turn = wrapped(self.end.yaw_rad - self.start.yaw_rad);
@@ -102,7 +95,6 @@ impl Sweep {
     }
 
     /// The motion of something mounted on this.
-    #[must_use]
     pub fn mounted(&self, offset_m: [f64; 3]) -> Self {
         Self {
             start: self.start.mounted(offset_m),
@@ -112,7 +104,6 @@ impl Sweep {
 }
 
 /// The angle on the branch from -pi to pi.
-#[must_use]
 pub fn wrapped(angle_rad: f64) -> f64 {
     let turned = (angle_rad + PI).rem_euclid(TAU) - PI;
     if turned.is_finite() { turned } else { 0.0 }
