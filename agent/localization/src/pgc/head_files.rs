@@ -42,14 +42,12 @@ pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
         let names: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
         names.into_iter().collect()
     };
-    files
-        .find(|file| file.is_file())
-        .ok_or_else(|| {
-            let released: Vec<String> = released();
-            let released = released.join(", ");
-            let problem = format_args!("no such file or released head; released are {released}");
-            FileError::new(head, problem)
-        })
+    files.find(|file| file.is_file()).ok_or_else(|| {
+        let released: Vec<String> = released();
+        let released = released.join(", ");
+        let problem = format_args!("no such file or released head; released are {released}");
+        FileError::new(head, problem)
+    })
 }
 
 /// The encoder of a head, scene encoder or detector: the file whose digest its metadata names, of those beside it or
