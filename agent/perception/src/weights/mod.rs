@@ -325,9 +325,8 @@ fn check_variance(path: &Path, name: &str, values: &[f32]) -> Result<(), FileErr
         return Ok(());
     };
     let value = values[index];
-    let problem = format_args!(
-        "tensor {name:?} holds {value} at index {index}; a variance is at least 0"
-    );
+    let problem =
+        format_args!("tensor {name:?} holds {value} at index {index}; a variance is at least 0");
     Err(FileError::new(path, problem))
 }
 

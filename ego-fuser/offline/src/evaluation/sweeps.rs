@@ -42,13 +42,11 @@ impl Evaluator {
             match self.map_of(scenario, place, tick, with_maps(place)) {
                 Ok(map) => sweeps.push(Sweep { place, frame, map }),
                 // It fails again where the vehicle perceives it, and is counted there.
-                Err(Error::Detector(error)) if error.is_of_frame() => {
-                    sweeps.push(Sweep {
-                        place,
-                        frame,
-                        map: None,
-                    })
-                }
+                Err(Error::Detector(error)) if error.is_of_frame() => sweeps.push(Sweep {
+                    place,
+                    frame,
+                    map: None,
+                }),
                 Err(Error::Read(error)) => {
                     let rank = rank(place).unwrap_or(usize::MAX);
                     self.left_out.add_unreadable(rank, Problem::from(&error));
