@@ -200,7 +200,7 @@ impl EvaluationOptions {
     /// # Errors
     /// [`EvaluationError`] names the file that cannot be read.
     pub fn key(&self, data: &OpenedData, method: Method) -> Result<CellKey, EvaluationError> {
-        let provenance = self.provenance(data, method, None)?;
+        let provenance = self.provenance(data, method)?;
         // The contents of data and weights count, their places do not; kept maps change no result.
         let settings = Self {
             dataset: PathBuf::new(),
