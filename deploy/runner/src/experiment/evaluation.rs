@@ -79,8 +79,11 @@ pub struct OpenedData {
     /// Digests of the files that were read so far.
     pub digests: FileDigests,
     /// SHA-256 of each part that was asked for, by the number of its scenarios and the variant of its sweeps.
-    parts: Mutex<BTreeMap<(Option<usize>, Option<String>), String>>,
+    parts: Mutex<BTreeMap<DataPart, String>>,
 }
+
+/// Number of scenarios, and variant of the sweeps.
+type DataPart = (Option<usize>, Option<String>);
 
 impl OpenedData {
     /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.

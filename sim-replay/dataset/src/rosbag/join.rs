@@ -109,7 +109,7 @@ impl Attempt {
                 .collect()
         };
         let all: Vec<SweepPoses> = sources.sources.iter().map(poses).collect();
-        let counts: Vec<usize> = all.iter().map(|poses| found(poses)).collect();
+        let counts: Vec<usize> = all.iter().map(found).collect();
         let most = counts.iter().copied().max().unwrap_or(0);
         let suited = sources.sources.iter().zip(&counts).enumerate();
         let best = suited
