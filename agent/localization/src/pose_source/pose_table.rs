@@ -58,7 +58,7 @@ impl PoseTable {
                 .insert(sweep_key(&row)?, estimate(&row)?)
                 .is_some()
             {
-                return Err(row.fault("duplicate row of the sweep").into());
+                return Err(row.fault("duplicate row of the sweep"));
             }
         }
         Ok(table)

@@ -294,6 +294,7 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU64, Ordering};
 
+    use nalgebra::Isometry3;
     use protocol::{CavId, EgoMotion, PointCloud, Pose};
 
     use super::*;

@@ -254,7 +254,8 @@ mod tests {
                 steps.iter().map(|step| step * 100_000_000).collect(),
             )]
         };
-        let cases: [(&[&str], Vec<Keys>, usize, &[usize], &str); 10] = [
+        type Case<'a> = (&'a [&'a str], Vec<Keys>, usize, &'a [usize], &'a str);
+        let cases: [Case<'_>; 10] = [
             (
                 &["1", "2"],
                 vec![Keys::Numbers(vec![2, 1])],

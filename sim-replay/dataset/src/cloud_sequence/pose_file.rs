@@ -180,7 +180,7 @@ impl<'a> Row<'a> {
         // Only the sign of a comment stands alone; a column may have no name.
         let is_comment = self.is_comment();
         names
-            .filter(|name| !(is_comment && name.is_empty()) && !name.starts_with('['))
+            .filter(|name| !(name.starts_with('[') || is_comment && name.is_empty()))
             .collect()
     }
 

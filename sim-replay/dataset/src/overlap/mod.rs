@@ -170,6 +170,7 @@ fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Pair>
 }
 
 /// `None` if the pair cannot be judged; `Some(None)` if the sweeps agree with the poses.
+#[expect(clippy::cast_possible_truncation, reason = "a radius of some metres")]
 fn judge(scenario: &Scenario, agent: usize, pair: Pair) -> Option<Option<Contradiction>> {
     let [first, second] = pair.ticks.map(|tick| {
         let cloud = scenario.load_points(agent, tick, None).ok()?;
