@@ -5,7 +5,7 @@ use std::fs::{File, Metadata};
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use protocol::text::hex;
 use sha2::{Digest, Sha256};
@@ -82,13 +82,16 @@ impl FileDigests {
             ));
         }
         let version = Version::of(&about);
-        let known = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(digest) = known().get(&version) {
+        if let Some(digest) = self.known().get(&version) {
             return Ok(*digest);
         }
         let digest = digest(File::open(path)?)?;
-        known().insert(version, digest);
+        self.known().insert(version, digest);
         Ok(digest)
+    }
+
+    fn known(&self) -> MutexGuard<'_, HashMap<Version, [u8; 32]>> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

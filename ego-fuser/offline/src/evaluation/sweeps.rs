@@ -32,9 +32,8 @@ impl Evaluator {
     ) -> Result<Vec<Sweep>, EvaluateError> {
         let mut loaded = scenario.load_tick(tick, places.iter().copied(), load);
         // The account takes the first as the ego, which may be any agent of the recording.
-        let rank = |agent: usize| places.iter().position(|&place| place == agent);
         for (agent, _) in &mut loaded.unreadable {
-            *agent = rank(*agent).unwrap_or(usize::MAX);
+            *agent = rank(*agent, places);
         }
         self.left_out.add_tick(&loaded);
         let mut sweeps = Vec::with_capacity(loaded.frames.len());
@@ -48,7 +47,7 @@ impl Evaluator {
                     map: None,
                 }),
                 Err(Error::Read(error)) => {
-                    let rank = rank(place).unwrap_or(usize::MAX);
+                    let rank = rank(place, places);
                     self.left_out.add_unreadable(rank, Problem::from(&error));
                 }
                 Err(other) => return Err(Box::new(other).into()),
@@ -97,4 +96,10 @@ impl Evaluator {
         };
         maps.map(index, scenario, agent, tick).map(Some)
     }
+}
+
+/// Index of an agent among those that take part.
+fn rank(agent: usize, places: &[usize]) -> usize {
+    let rank = places.iter().position(|&place| place == agent);
+    rank.unwrap_or(usize::MAX)
 }

@@ -202,17 +202,19 @@ impl Sweep {
 
     /// Identity of the run of each point.
     fn keys(&self) -> Result<Vec<CellKey>, SweepError> {
-        let key = |point: &Point| {
+        let mut keys = Vec::with_capacity(self.points.len());
+        for point in &self.points {
             let options = point_options::options(&self.experiment, point, &self.maps())?;
-            Ok(options.key(&self.data, point.method).map_err(Box::new)?)
-        };
-        self.points.iter().map(key).collect()
+            keys.push(options.key(&self.data, point.method).map_err(Box::new)?);
+        }
+        Ok(keys)
     }
 
     /// Cached runs, by place in the grid.
     fn known(&self, keys: &[CellKey]) -> Result<Vec<Option<Cell>>, SweepError> {
-        let read = |key| Ok(Cell::read(key, &self.cells())?);
-        keys.iter().map(read).collect()
+        keys.iter()
+            .map(|key| Ok(Cell::read(key, &self.cells())?))
+            .collect()
     }
 
     fn cells(&self) -> PathBuf {
