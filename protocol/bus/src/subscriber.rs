@@ -485,6 +485,22 @@ mod tests {
     }
 
     #[test]
+    fn transport_ends_at_the_arrival_and_not_where_the_message_is_used() {
+        let topic = "7/gnss".parse::<Topic>().unwrap();
+        let payload = bytes(0, gnss());
+        let mut header = header_of(&topic, &payload).unwrap();
+        header.stamp.publish_nanos = unix_nanos() - 60_000_000_000;
+        let arrival = Arrival {
+            topic,
+            header,
+            at: Instant::now() - Duration::from_secs(50),
+            payload,
+        };
+        let transport_s = arrival.transport().as_secs_f64();
+        assert!((9.9..30.0).contains(&transport_s), "{transport_s} s");
+    }
+
+    #[test]
     fn only_data_beyond_the_limit_are_counted() {
         let stats = MessageStats::new("ego-9".parse().unwrap());
         let limits = InboxLimits {

@@ -44,9 +44,7 @@ fn average_precision(scene: &Path, method: Method) -> Value {
         .part
         .open(&options.dataset, &options.protocol)
         .unwrap();
-    let metrics = evaluate(&options, &data, method, &mut || {})
-        .unwrap()
-        .metrics;
+    let metrics = evaluate(&options, &data, method, &mut || {}).unwrap();
     assert_eq!(metrics.frames, 4);
     json!([metrics.ap_global, metrics.ap_frame_order])
 }

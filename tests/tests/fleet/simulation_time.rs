@@ -156,14 +156,15 @@ fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
 }
 
 #[test]
-fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
+fn the_ego_waits_from_its_own_map_on_for_its_deadline_or_the_next_map() {
     let folder = scene();
-    for (delay_ms, compute_ms, age_ms, first_tick) in [
-        (0.0, 100.0, 0, 0),
-        (0.0, 80.0, 0, 0),
-        (30.0, 80.0, 100, 1),
-        (120.0, 80.0, 100, 1),
-        (250.0, 0.0, 200, 2),
+    // Decision after the capture: complete, or 100 ms after the own map.
+    for (delay_ms, compute_ms, age_ms, first_tick, decided_ms) in [
+        (0.0, 100.0, 0, 0, 100),
+        (0.0, 80.0, 0, 0, 80),
+        (30.0, 80.0, 0, 0, 110),
+        (120.0, 80.0, 100, 1, 180),
+        (250.0, 0.0, 200, 2, 100),
     ] {
         let link = LinkConfig {
             latency: LatencyModel::ConstantMs(delay_ms),
@@ -188,14 +189,12 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
                 vec![age_ms; 2]
             };
             assert_eq!(ages_ms(frame), expected, "delay {delay_ms} ms, tick {tick}");
-            // A complete frame is not delayed.
             let took_ms = (frame.stamp.publish_nanos - frame.stamp.capture_nanos) / MS;
-            let expected = if age_ms == 0 {
-                compute_ms as u64 + 5
-            } else {
-                105
-            };
-            assert_eq!(took_ms, expected, "delay {delay_ms} ms, tick {tick}");
+            assert_eq!(
+                took_ms,
+                decided_ms + 5,
+                "delay {delay_ms} ms, tick {tick}"
+            );
         }
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     }

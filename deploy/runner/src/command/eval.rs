@@ -180,7 +180,7 @@ impl Arguments {
         let mut all = Vec::new();
         for &method in &self.method {
             bar.set_message(method.name());
-            all.push(evaluate(&options, &data, method, &mut || bar.inc(1))?.metrics);
+            all.push(evaluate(&options, &data, method, &mut || bar.inc(1))?);
         }
         bar.finish_and_clear();
         match (self.json, &all[..]) {

@@ -1,12 +1,10 @@
 //! Cells: results of evaluations, cached on disk by everything that they were made of. Sweeps and tables print them.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
-use deploy::score::metrics::Metrics;
+use deploy::score::metrics::{Messages, Metrics};
 use fusion::Method;
-use protocol::{Counts, DropReason};
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 use support::provenance::Provenance;
@@ -35,40 +33,9 @@ pub struct Cell {
     /// Number of neighbours' messages that were fused, over all frames.
     pub used: u64,
     /// Counts of the messages that are fused: feature maps, boxes or points, without the pose messages.
-    pub messages: MessageCounts,
+    pub messages: Messages,
     /// Compute time, seconds: for estimates, never for results.
     pub wall_seconds: f64,
-}
-
-/// Message counts.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct MessageCounts {
-    /// Sent, including duplicates by the link.
-    pub sent: u64,
-    /// Used at least once.
-    pub received: u64,
-    /// In flight at the end of the scene.
-    pub in_flight: u64,
-    /// Not used, by reason.
-    pub dropped: BTreeMap<DropReason, u64>,
-}
-
-impl From<Counts> for MessageCounts {
-    fn from(counts: Counts) -> Self {
-        let Counts {
-            sent,
-            received,
-            in_flight,
-            dropped,
-            adapted: _,
-        } = counts;
-        Self {
-            sent,
-            received,
-            in_flight,
-            dropped,
-        }
-    }
 }
 
 /// Reason why a cell cannot be read or written.
@@ -157,7 +124,7 @@ mod tests {
             key: key("0a"),
             metrics: Metrics::default(),
             used: 3,
-            messages: MessageCounts::default(),
+            messages: Messages::default(),
             wall_seconds: 0.5,
         };
         cell.write(folder.path()).unwrap();

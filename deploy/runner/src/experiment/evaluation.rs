@@ -12,7 +12,7 @@ use agent::rate::RateConfig;
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 use deploy::score::FrameScores;
-use deploy::score::metrics::Metrics;
+use deploy::score::metrics::{Messages, Metrics};
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
@@ -28,7 +28,7 @@ use support::sampling::evenly_spread;
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
-use crate::experiment::cell::{CellKey, MessageCounts};
+use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::frame_files::{self, FrameFiles, FrameFilesError};
 use crate::scenario::fingerprint::{collect, files_of};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
@@ -198,6 +198,24 @@ impl EvaluationOptions {
         chosen.map(|scenario| scenario.ticks.len()).sum()
     }
 
+    fn metrics(
+        &self,
+        board: &FrameScores,
+        evaluator: &Evaluator,
+        provenance: Provenance,
+        began: Instant,
+    ) -> Metrics {
+        let (clock, seconds) = match self.stepped {
+            Some(_) => ("stepped", board.seconds()),
+            None => ("offline", began.elapsed().as_secs_f64()),
+        };
+        let metrics = metrics(board, evaluator, clock, self.pose_source.name(), seconds);
+        Metrics {
+            provenance: Some(provenance.with_command()),
+            ..metrics
+        }
+    }
+
     /// Identity of the result of a method: these settings, and the digests of all that they are applied to.
     ///
     /// # Errors
@@ -233,17 +251,6 @@ impl EvaluationOptions {
     }
 }
 
-/// Result of an evaluation.
-#[derive(Debug, Clone)]
-pub struct Evaluation {
-    /// Metrics.
-    pub metrics: Metrics,
-    /// Number of neighbours' messages that were fused, over all frames.
-    pub used: u64,
-    /// Counts of the messages that are fused, if the link is emulated.
-    pub messages: MessageCounts,
-}
-
 /// Evaluates one method over the chosen scenarios, the first vehicle of each being the ego; `on_frame` is called after
 /// every frame. Frames and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
@@ -254,24 +261,29 @@ pub fn evaluate(
     data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
-) -> Result<Evaluation, EvaluationError> {
+) -> Result<Metrics, EvaluationError> {
     let began = Instant::now();
     let (board, evaluator) = judged(options, data, method, on_frame)?;
-    let (clock, seconds) = match options.stepped {
-        Some(_) => ("stepped", board.seconds()),
-        None => ("offline", began.elapsed().as_secs_f64()),
-    };
-    let poses = options.pose_source.name();
-    let metrics = metrics(&board, &evaluator, clock, poses, seconds);
-    let provenance = options.provenance(data, method)?.with_command();
-    let metrics = Metrics {
-        provenance: Some(provenance),
-        ..metrics
-    };
+    let provenance = options.provenance(data, method)?;
+    let metrics = options.metrics(&board, &evaluator, provenance, began);
     if let Some(out) = &options.out {
         frame_files::write_metrics(out, method, &metrics)?;
     }
-    let used = board.records().iter().map(|record| record.fused as u64);
+    Ok(metrics)
+}
+
+/// [`evaluate`] for the cell of a key.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn compute(
+    options: &EvaluationOptions,
+    data: &OpenedData,
+    key: CellKey,
+    on_frame: &mut dyn FnMut(),
+) -> Result<Cell, EvaluationError> {
+    let began = Instant::now();
+    let (board, evaluator) = judged(options, data, key.method, on_frame)?;
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
         if !matches!(
@@ -284,10 +296,14 @@ pub fn evaluate(
             messages.add(counts);
         }
     }
-    Ok(Evaluation {
-        metrics,
+    let used = board.records().iter().map(|record| record.fused as u64);
+    let provenance = key.provenance.clone();
+    Ok(Cell {
+        key,
+        metrics: options.metrics(&board, &evaluator, provenance, began),
         used: used.sum(),
-        messages: messages.into(),
+        messages: Messages::of(&messages),
+        wall_seconds: began.elapsed().as_secs_f64(),
     })
 }
 

@@ -15,7 +15,7 @@ use ego_fuser::ego::{Content, View};
 use fusion::method::Exchange;
 
 /// Messages of a vehicle for one frame.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Sent {
     pub(super) cav: CavId,
     pub(super) capture_nanos: u64,
@@ -32,8 +32,13 @@ pub(super) struct Sent {
 }
 
 impl Sent {
-    /// As received by the ego; absent where nothing was sent.
+    /// A copy as received by the ego; absent where nothing was sent.
     pub(super) fn view(&self) -> Option<View> {
+        self.clone().into_view()
+    }
+
+    /// As received by the ego; absent where nothing was sent.
+    pub(super) fn into_view(self) -> Option<View> {
         let Self {
             cav,
             capture_nanos,
@@ -42,23 +47,6 @@ impl Sent {
             ..
         } = self;
         Some(View {
-            cav: cav.clone(),
-            pose: *pose,
-            capture_nanos: *capture_nanos,
-            content: content.clone()?,
-        })
-    }
-
-    /// As received by the ego; absent where nothing was sent.
-    pub(super) fn into_view(self) -> Option<ego_fuser::ego::View> {
-        let Self {
-            cav,
-            capture_nanos,
-            pose,
-            content,
-            ..
-        } = self;
-        Some(ego_fuser::ego::View {
             cav,
             pose,
             capture_nanos,

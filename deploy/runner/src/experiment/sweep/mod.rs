@@ -39,7 +39,7 @@ pub use table::csv;
 
 use self::varying::VaryingTable;
 use crate::experiment::cell::{Cell, CellError, CellKey};
-use crate::experiment::evaluation::{Evaluation, EvaluationError, OpenedData, evaluate};
+use crate::experiment::evaluation::{EvaluationError, OpenedData, compute, evaluate};
 use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Number of ticks that are timed before a sweep begins, for its estimate.
@@ -307,8 +307,8 @@ impl Sweep {
         let data = options.part.open(&options.dataset, &options.protocol);
         let data = data.map_err(Box::new)?;
         let began = Instant::now();
-        let probed = evaluate(&options, &data, point.method, &mut || {}).map_err(Box::new)?;
-        Ok(began.elapsed().as_secs_f64() / probed.metrics.frames.max(1) as f64)
+        let metrics = evaluate(&options, &data, point.method, &mut || {}).map_err(Box::new)?;
+        Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
     }
 
     /// Computes the feature maps of all sweeps, once for each encoder that is needed; returns their files.
@@ -380,21 +380,9 @@ impl Sweep {
         key: CellKey,
         on_frame: &mut dyn FnMut(),
     ) -> Result<(), SweepError> {
-        let began = Instant::now();
         let point = &self.points[index];
         let options = point_options::options(&self.experiment, point, &self.maps())?;
-        let Evaluation {
-            metrics,
-            used,
-            messages,
-        } = evaluate(&options, &self.data, point.method, on_frame).map_err(Box::new)?;
-        let cell = Cell {
-            key,
-            metrics,
-            used,
-            messages,
-            wall_seconds: began.elapsed().as_secs_f64(),
-        };
+        let cell = compute(&options, &self.data, key, on_frame).map_err(Box::new)?;
         Ok(cell.write(&self.cells())?)
     }
 

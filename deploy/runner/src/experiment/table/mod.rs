@@ -9,7 +9,6 @@ mod text;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use agent::rate::RateConfig;
 use bus::config_file::ConfigError;
@@ -20,7 +19,7 @@ pub use text::{csv, markdown};
 
 use crate::experiment::cell::{Cell, CellError};
 use crate::experiment::evaluation::{
-    Evaluation, EvaluationError, EvaluationOptions, OpenedData, Part, evaluate,
+    EvaluationError, EvaluationOptions, OpenedData, Part, compute,
 };
 use crate::scenario::weights_choice::WeightsChoiceError;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
@@ -170,20 +169,8 @@ impl Run<'_> {
         if let Some(cell) = known {
             return Ok(cell);
         }
-        let began = Instant::now();
-        let Evaluation {
-            metrics,
-            used,
-            messages,
-        } = evaluate(&options, &self.data, row.method, &mut || observer.frame())
-            .map_err(Box::new)?;
-        let cell = Cell {
-            key,
-            metrics,
-            used,
-            messages,
-            wall_seconds: began.elapsed().as_secs_f64(),
-        };
+        let on_frame = &mut || observer.frame();
+        let cell = compute(&options, &self.data, key, on_frame).map_err(Box::new)?;
         cell.write(&self.cells)?;
         Ok(cell)
     }
