@@ -30,7 +30,7 @@ fn shorten_experiment(experiment: &mut Value, scene: &Path) {
     fields.remove("generate");
     fields.insert("dataset".into(), json!(scene));
     fields.insert("weights".into(), json!(WEIGHTS));
-    fields.insert("ticks".into(), json!(1));
+    fields.insert("frames".into(), json!(1));
     if let Some(link) = fields.get_mut("link") {
         *link = json!(Path::new(EXPERIMENTS).join(link.as_str().unwrap()));
     }

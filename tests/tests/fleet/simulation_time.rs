@@ -190,11 +190,7 @@ fn the_ego_waits_from_its_own_map_on_for_its_deadline_or_the_next_map() {
             };
             assert_eq!(ages_ms(frame), expected, "delay {delay_ms} ms, tick {tick}");
             let took_ms = (frame.stamp.publish_nanos - frame.stamp.capture_nanos) / MS;
-            assert_eq!(
-                took_ms,
-                decided_ms + 5,
-                "delay {delay_ms} ms, tick {tick}"
-            );
+            assert_eq!(took_ms, decided_ms + 5, "delay {delay_ms} ms, tick {tick}");
         }
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     }

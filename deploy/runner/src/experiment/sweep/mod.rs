@@ -157,12 +157,14 @@ impl Sweep {
             && !is_generated(&experiment)?
         {
             let grid = &experiment.grid;
+            let scenes = experiment.scenes.unwrap_or(usize::MAX);
+            let frames = experiment.frames.unwrap_or(usize::MAX);
             output::note(format_args!(
                 "{}: {} = {} runs of {} frames; the data set {} is generated first",
                 experiment.name,
                 check::product(grid),
                 points(grid).len(),
-                generate.scenes * generate.frames,
+                generate.scenes.min(scenes) * generate.frames.min(frames),
                 experiment.dataset.display()
             ));
             return Ok(());
