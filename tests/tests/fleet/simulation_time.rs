@@ -473,7 +473,7 @@ fn text_of(output: &Output) -> String {
 #[test]
 fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     let folder = scene();
-    let text = "name: e\ntitle: A < B\ndataset: scene\nweights: weights.safetensors\nticks: 4\n\
+    let text = "name: e\ntitle: A < B\ndataset: scene\nweights: weights.safetensors\nframes: 4\n\
         compute: {pose_ms: 10, map_ms: 30, fuse_ms: 10}\nnoise_mode: independent\n\
         grid:\n  method: [none, late, max]\n  latency_ms: [0, 200]\n  jitter_ms: [20]\n  bandwidth_mbps: [.inf, 10]\n  \
         codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]\n  loss: [0.2]\n  pose_noise: [{position_std_m: 0.2, heading_std_deg: 0.2}]\n  agents: [2]\n  \
@@ -691,7 +691,7 @@ fn a_run_of_a_sweep_is_computed_anew_after_any_change_of_its_files() {
     fs::create_dir(folder.path().join("fusion")).unwrap();
     fs::copy(ATTENTION, &script).unwrap();
     let text = format!(
-        "name: e\ndataset: scene\nweights: weights.safetensors\nticks: 2\ngrid: {{method: [\"script:{}\"]}}\n",
+        "name: e\ndataset: scene\nweights: weights.safetensors\nframes: 2\ngrid: {{method: [\"script:{}\"]}}\n",
         script.display()
     );
     fs::write(folder.path().join("experiment.yaml"), text).unwrap();

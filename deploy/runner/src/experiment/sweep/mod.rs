@@ -157,7 +157,7 @@ impl Sweep {
             && !is_generated(&experiment)?
         {
             let grid = &experiment.grid;
-            let scenes = experiment.scenes.unwrap_or(usize::MAX);
+            let scenes = experiment.scenarios.unwrap_or(usize::MAX);
             let frames = experiment.frames.unwrap_or(usize::MAX);
             output::note(format_args!(
                 "{}: {} = {} runs of {} frames; the data set {} is generated first",
