@@ -18,9 +18,9 @@ pub enum Error {
     /// A file cannot be read, written or used.
     #[error(transparent)]
     File(#[from] FileError),
-    /// No folder holds a sweep with a known pose.
-    #[error("no sweep with a pose in {0:?}")]
-    NoSweeps(Vec<PathBuf>),
+    /// No folder holds a sweep with a known pose; the faults that were found in brackets.
+    #[error("no sweep with a pose in {0:?}{1}")]
+    NoSweeps(Vec<PathBuf>, String),
     /// The input cannot be used; the text names it, and what is needed.
     #[error("{0}")]
     Input(String),
@@ -39,6 +39,6 @@ impl Error {
     /// True if the input is at fault.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
-        matches!(self, Self::Read(_) | Self::NoSweeps(_) | Self::Input(_))
+        matches!(self, Self::Read(_) | Self::NoSweeps(..) | Self::Input(_))
     }
 }

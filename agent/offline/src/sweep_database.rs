@@ -58,7 +58,7 @@ pub fn read_database(
             .map(|folder| folder.as_ref().to_owned())
             .collect()
     };
-    SweepDatabase::new(&sweeps).ok_or_else(|| Error::NoSweeps(folders()))
+    SweepDatabase::new(&sweeps).ok_or_else(|| Error::NoSweeps(folders(), left_out.reasons()))
 }
 
 /// Features and pose of a sweep; `None` for a sweep without cells.

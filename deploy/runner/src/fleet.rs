@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use agent::config::{AgentSettings, FleetPlace, Publish};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::ground_truth::GroundTruthRule;
-use dataset::{self, OpenOptions, Scenario as Recorded};
+use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
 use deploy::operate::keys::KeyError;
 use deploy::operate::run_folder::RunFolder;
 use deploy::operate::security::RunKeys;
@@ -56,6 +56,8 @@ pub struct Fleet {
     pub detector: DetectorConfig,
     /// Evaluation protocol of the run.
     pub protocol: EvaluationProtocol,
+    /// Findings about the recorded scenario.
+    pub findings: Vec<Problem>,
 }
 
 /// Refuses options of a protocol that a live run takes from other fields.
@@ -186,6 +188,7 @@ impl Fleet {
         } else {
             Some(scene.frames.map_or(left, |frames| frames.min(left)))
         };
+        let findings = findings::sampled(std::slice::from_ref(recorded), scene.intensity_scale);
         scene.scenario = Some(name);
         scene.agents.clone_from(&agents);
         scenario.ego.id = Some(ego.clone());
@@ -197,6 +200,7 @@ impl Fleet {
             recorded: recorded.clone(),
             detector,
             protocol,
+            findings,
         })
     }
 

@@ -8,6 +8,7 @@ use crate::ros::{
 use anyhow::Context;
 use bus::shutdown::Stop;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open_unless, process_id};
+use dataset::IntensityScale;
 use protocol::{CavId, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
@@ -81,9 +82,10 @@ struct Sensors {
     /// repeatable.
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
     lidar: Vec<AgentTopic>,
-    /// Largest intensity of these messages, 255 for many drivers; agents get shares of it, 0 to 1.
-    #[arg(long, value_name = "VALUE", default_value_t = 1.0, requires = "lidar", value_parser = above_zero)]
-    intensity_max: f32,
+    /// Largest intensity of these messages; agents get shares of it, 0 to 1. `auto` is 255 for bytes and red, for other
+    /// numbers the range of each LiDAR's first sweeps, as for files.
+    #[arg(long, value_name = "auto|VALUE", default_value_t, requires = "lidar")]
+    intensity_max: IntensityScale,
     /// Pass speed and yaw rate of a topic of nav_msgs/Odometry to an agent that has a --lidar, for example /odom=1000,
     /// and publish map -> odom, the robot's odometry frame, instead of map -> cav_1000/lidar; repeatable.
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
@@ -108,15 +110,6 @@ enum Distro {
     /// With type hashes.
     #[default]
     Jazzy,
-}
-
-fn above_zero(text: &str) -> Result<f32, String> {
-    let value: f32 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if value > 0.0 && value.is_finite() {
-        Ok(value)
-    } else {
-        Err("a number above 0".to_owned())
-    }
 }
 
 impl Arguments {
@@ -212,7 +205,7 @@ impl Arguments {
             lidars: sensors.lidar.clone(),
             motions: sensors.motions(),
             starting_poses: sensors.starting_pose.clone(),
-            max_intensity: sensors.intensity_max,
+            intensity_scale: sensors.intensity_max,
             initial_pose_of: content.initialpose.clone(),
         }
     }
@@ -329,6 +322,10 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
         ))?;
     }
     for (count, what) in [
+        (
+            lidar.without_points,
+            "sweeps have no point in range and were left out",
+        ),
         (lidar.without_stamp, "messages of LiDARs had no time"),
         (
             lidar.ahead_of_clock,

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use bus::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use bus::shutdown::Stop;
 use bus::{Bus, BusError, Publisher, PublisherOptions, unix_nanos};
+use dataset::{LiveIntensities, Plausibility};
 use protocol::{CavId, Lidar, Limits, Stream, Topic};
 use ros2::{Qos, RosName, RosType, Sweep, SweepLimits, read_point_cloud};
 use serde::Serialize;
@@ -34,6 +35,8 @@ pub struct LidarReport {
     pub sweeps: u64,
     /// Messages that could not be read.
     pub unreadable: u64,
+    /// Sweeps without a point in range, which are left out.
+    pub without_points: u64,
     /// Messages with the capture time of the one before.
     pub repeated: u64,
     /// Messages with a capture time of 0.
@@ -56,7 +59,7 @@ impl LidarReport {
     /// True if no message is missing.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.unreadable + self.without_stamp == 0
+        self.unreadable + self.without_stamp + self.without_points == 0
     }
 }
 
@@ -69,7 +72,7 @@ struct Input {
     starting_pose: Option<StartingPose>,
     frames: RobotFrames,
     stamps: StampCheck,
-    has_warned_of_intensity: bool,
+    intensities: LiveIntensities,
     log: RefusalLog,
     _subscription: RosSubscription,
 }
@@ -79,7 +82,6 @@ pub(super) struct LidarInputs {
     inputs: BTreeMap<CavId, Input>,
     queue: Arc<BoundedQueue<CavId, ZBytes>>,
     superseded: Arc<std::sync::atomic::AtomicU64>,
-    max_intensity: f32,
     report: LidarReport,
 }
 
@@ -132,7 +134,7 @@ impl LidarInputs {
                     .transpose()?,
                 frames: frames.clone(),
                 stamps: StampCheck::default(),
-                has_warned_of_intensity: false,
+                intensities: LiveIntensities::new(options.intensity_scale),
                 log: RefusalLog::of(topic.clone(), RosType::PointCloud2),
                 _subscription: subscription,
             };
@@ -147,7 +149,6 @@ impl LidarInputs {
             inputs,
             queue,
             superseded,
-            max_intensity: options.max_intensity,
             report: LidarReport::default(),
         })
     }
@@ -156,7 +157,7 @@ impl LidarInputs {
     pub(super) fn run(mut self) -> (LidarReport, BTreeMap<String, MotionReport>) {
         while let Pop::Item(cav, bytes) = self.queue.take(None) {
             if let Some(input) = self.inputs.get_mut(&cav) {
-                input.take(&bytes.to_bytes(), self.max_intensity, &mut self.report);
+                input.take(&bytes.to_bytes(), &mut self.report);
             }
         }
         let mut motions = BTreeMap::new();
@@ -180,7 +181,7 @@ impl LidarInputs {
 }
 
 impl Input {
-    fn take(&mut self, bytes: &[u8], max_intensity: f32, report: &mut LidarReport) {
+    fn take(&mut self, bytes: &[u8], report: &mut LidarReport) {
         let sweep = match read_point_cloud(bytes, LIMITS) {
             Ok(sweep) => sweep,
             Err(error) => {
@@ -192,7 +193,7 @@ impl Input {
         match self.stamps.take(sweep.capture_nanos, unix_nanos()) {
             Ok(odd) => {
                 odd.into_iter().for_each(|odd| self.note(odd, report));
-                self.pass_on(sweep, previous_nanos, max_intensity, report);
+                self.pass_on(sweep, previous_nanos, report);
             }
             Err(left_out) => {
                 match left_out {
@@ -215,13 +216,12 @@ impl Input {
         }
     }
 
-    fn pass_on(
-        &mut self,
-        mut sweep: Sweep,
-        previous_nanos: Option<u64>,
-        max_intensity: f32,
-        report: &mut LidarReport,
-    ) {
+    fn pass_on(&mut self, mut sweep: Sweep, previous_nanos: Option<u64>, report: &mut LidarReport) {
+        if let Some(reason) = Plausibility::of(&sweep.points).nothing_in_range() {
+            report.without_points += 1;
+            self.log.warn(&reason);
+            return;
+        }
         report.sweeps += 1;
         report.points_without_return += sweep.without_return as u64;
         report.points_too_far += sweep.too_far as u64;
@@ -237,17 +237,8 @@ impl Input {
         {
             report.sweeps_without_motion += 1;
         }
-        let mut largest = 0.0_f32;
-        for [_, _, _, intensity] in &mut sweep.points.xyzi {
-            *intensity /= max_intensity;
-            largest = largest.max(*intensity);
-        }
-        if largest > 1.0 && !self.has_warned_of_intensity {
-            self.has_warned_of_intensity = true;
-            tracing::warn!(
-                "{}: intensity up to {largest}; networks are trained on 0 to 1: --intensity-max states the largest value",
-                self.topic
-            );
+        if let Some(finding) = self.intensities.scale(&mut sweep.points, sweep.intensity) {
+            tracing::warn!("{}: {finding}", self.topic);
         }
         self.publisher.submit(
             sweep.capture_nanos,

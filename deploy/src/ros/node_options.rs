@@ -1,5 +1,6 @@
 //! Options of the node.
 
+use dataset::IntensityScale;
 use protocol::CavId;
 use ros2::{MotionType, Mount};
 
@@ -21,8 +22,8 @@ pub struct NodeOptions {
     pub motions: Vec<MotionSource>,
     /// Poses in the map at which trackers of these agents start.
     pub starting_poses: Vec<AgentTopic>,
-    /// Largest intensity that they publish; passed on are shares of it.
-    pub max_intensity: f32,
+    /// Divisor of the intensities that they publish; passed on are 0 to 1.
+    pub intensity_scale: IntensityScale,
     /// Vehicle whose first fix is published on `/initialpose`.
     pub initial_pose_of: Option<CavId>,
 }
@@ -58,7 +59,7 @@ impl Default for NodeOptions {
             lidars: Vec::new(),
             motions: Vec::new(),
             starting_poses: Vec::new(),
-            max_intensity: 1.0,
+            intensity_scale: IntensityScale::AUTO,
             initial_pose_of: None,
         }
     }

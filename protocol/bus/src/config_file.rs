@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use protocol::config::FieldError;
 use serde::de::{DeserializeOwned, IgnoredAny};
+use support::bounded_file;
 
 use super::unknown_field;
 
@@ -61,13 +62,10 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
         path: path.into(),
         source,
     };
-    let size = std::fs::metadata(path).map_err(unreadable)?.len();
-    if size > MAX_BYTES {
-        return Err(unreadable(std::io::Error::other(format!(
-            "{size} bytes, more than {MAX_BYTES}"
-        ))));
-    }
-    parse(&std::fs::read_to_string(path).map_err(unreadable)?, path)
+    parse(
+        &bounded_file::read_text(path, MAX_BYTES).map_err(unreadable)?,
+        path,
+    )
 }
 
 /// Parses YAML; `path` is stated in errors.

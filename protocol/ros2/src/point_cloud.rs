@@ -1,10 +1,11 @@
 //! Reader of `sensor_msgs/PointCloud2`: sweeps as the drivers of LiDARs publish them.
 //!
-//! Read are `x`, `y`, `z` of 32 or 64 bits and `intensity` of any type, in any order, at any offset, of either byte order,
-//! with padding after points and rows, in one row or in many (organised). Points without coordinates, as organised clouds
+//! Read are `x`, `y`, `z` of 32 or 64 bits and an intensity of any type, by any of its usual names or as the red byte of
+//! a packed colour, in any order, at any offset, of either byte order, with padding after points and rows, in one row or
+//! in many (organised). Points without coordinates, as organised clouds
 //! have them for rays without a return, are left out.
 
-use protocol::PointCloud;
+use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS, IntensityKind, PointCloud};
 use re_cdr::{BigEndian, ByteOrder, CdrReader, LittleEndian};
 
 use crate::read::{Body, Header, ReadError, Reader};
@@ -21,6 +22,8 @@ pub struct Sweep {
     pub frame_id: String,
     /// Points in the frame of the LiDAR, metres; intensity as published, 0 where there is none.
     pub points: PointCloud,
+    /// Name of the field of the intensity and the type of its numbers; `None` if there is none.
+    pub intensity: Option<(String, IntensityKind)>,
     /// Points without coordinates (NaN or infinite), which are left out.
     pub without_return: usize,
     /// Points that are farther away than the limit, which are left out.
@@ -181,13 +184,13 @@ impl Column {
 }
 
 /// Fields of a point that are read.
-struct Columns {
+struct Columns<'a> {
     xyz: [Column; 3],
-    intensity: Option<Column>,
+    intensity: Option<(&'a str, Column, IntensityKind)>,
 }
 
-impl Columns {
-    fn find(fields: &[Field<'_>]) -> Result<Self, PointCloudError> {
+impl<'a> Columns<'a> {
+    fn find(fields: &[Field<'a>]) -> Result<Self, PointCloudError> {
         let floats = |datatype| matches!(datatype, Datatype::Float32 | Datatype::Float64);
         let coordinate = |name| {
             let found = || {
@@ -196,52 +199,72 @@ impl Columns {
                     .map(|field| field.name.chars().take(40).collect())
                     .collect()
             };
-            column(
-                fields,
-                name,
-                "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1",
-                floats,
-            )?
-            .ok_or_else(|| PointCloudError::NoField {
-                missing: name,
-                found: found(),
-            })
+            let allowed = "datatype 7 or 8 (FLOAT32, FLOAT64) and count 1";
+            column(fields, name, allowed, floats)?
+                .map(|(_, column)| column)
+                .ok_or_else(|| PointCloudError::NoField {
+                    missing: name,
+                    found: found(),
+                })
         };
         Ok(Self {
             xyz: [coordinate("x")?, coordinate("y")?, coordinate("z")?],
-            intensity: column(fields, "intensity", "datatype 1 to 8 and count 1", |_| true)?,
+            intensity: intensity(fields)?,
         })
     }
 
     fn end(&self) -> u64 {
-        self.xyz
-            .iter()
-            .chain(&self.intensity)
-            .map(|column| column.end())
-            .max()
-            .unwrap_or(0)
+        let intensity = self.intensity.iter().map(|(_, column, _)| column);
+        let columns = self.xyz.iter().chain(intensity);
+        columns.map(|column| column.end()).max().unwrap_or(0)
     }
 }
 
-/// The field `name`, if there is one.
-fn column(
-    fields: &[Field<'_>],
+/// The field of the most preferred name of an intensity, else of a packed colour.
+fn intensity<'a>(
+    fields: &[Field<'a>],
+) -> Result<Option<(&'a str, Column, IntensityKind)>, PointCloudError> {
+    for name in INTENSITY_FIELDS {
+        if let Some((name, found)) = column(fields, name, "datatype 1 to 8 and count 1", |_| true)?
+        {
+            let kind = match found.datatype {
+                Datatype::Uint8 => IntensityKind::Byte,
+                _ => IntensityKind::Number,
+            };
+            return Ok(Some((name, found, kind)));
+        }
+    }
+    // A colour of another type is no packed one.
+    let colour = (COLOUR_FIELDS.iter()).find_map(|name| {
+        column(fields, name, "", |datatype| datatype.size() == 4)
+            .ok()
+            .flatten()
+    });
+    Ok(colour.map(|(name, Column { offset, .. })| {
+        let datatype = Datatype::Uint32;
+        (name, Column { offset, datatype }, IntensityKind::RedByte)
+    }))
+}
+
+/// The field `name`, compared without case, if there is one, with its name as written.
+fn column<'a>(
+    fields: &[Field<'a>],
     name: &'static str,
     allowed: &'static str,
     is_allowed: impl Fn(Datatype) -> bool,
-) -> Result<Option<Column>, PointCloudError> {
+) -> Result<Option<(&'a str, Column)>, PointCloudError> {
     let Some(&Field {
+        name: found,
         offset,
         datatype,
         count,
-        ..
-    }) = fields.iter().find(|field| field.name == name)
+    }) = (fields.iter()).find(|field| field.name.eq_ignore_ascii_case(name))
     else {
         return Ok(None);
     };
     match Datatype::of(datatype).filter(|datatype| is_allowed(*datatype)) {
         // Some drivers leave the count at 0.
-        Some(datatype) if count <= 1 => Ok(Some(Column { offset, datatype })),
+        Some(datatype) if count <= 1 => Ok(Some((found, Column { offset, datatype }))),
         _ => Err(PointCloudError::FieldType {
             name,
             datatype,
@@ -273,7 +296,7 @@ impl Layout {
 
     fn check(
         &self,
-        columns: &Columns,
+        columns: &Columns<'_>,
         data_len: usize,
         limits: SweepLimits,
     ) -> Result<(), PointCloudError> {
@@ -338,6 +361,7 @@ fn read_sweep<BO: ByteOrder>(
         capture_nanos: nanos,
         frame_id: frame_id.into(),
         points: PointCloud::default(),
+        intensity: (columns.intensity).map(|(name, _, kind)| (name.to_owned(), kind)),
         without_return: 0,
         too_far: 0,
     };
@@ -377,7 +401,7 @@ impl Sweep {
         &mut self,
         data: &[u8],
         layout: &Layout,
-        columns: &Columns,
+        columns: &Columns<'_>,
         max_abs_value: f32,
     ) {
         let (stride, step) = (layout.stride(), layout.point_step as usize);
@@ -397,7 +421,7 @@ impl Sweep {
         }
     }
 
-    fn add<BO: ByteOrder>(&mut self, point: &[u8], columns: &Columns, max_abs_value: f32) {
+    fn add<BO: ByteOrder>(&mut self, point: &[u8], columns: &Columns<'_>, max_abs_value: f32) {
         let xyz = columns
             .xyz
             .map(|column| column.value::<BO>(point).unwrap_or(f64::NAN));
@@ -407,9 +431,14 @@ impl Sweep {
         } else if xyz.iter().any(|value| value.abs() > limit) {
             self.too_far += 1;
         } else {
-            let intensity = columns
-                .intensity
-                .and_then(|column| column.value::<BO>(point));
+            let intensity = match &columns.intensity {
+                Some((_, column, IntensityKind::RedByte)) => {
+                    let red = |colour: f64| (colour / 65_536.0).floor() % 256.0;
+                    column.value::<BO>(point).map(red)
+                }
+                Some((_, column, _)) => column.value::<BO>(point),
+                None => None,
+            };
             let intensity = intensity
                 .filter(|value| value.is_finite())
                 .unwrap_or(0.0)

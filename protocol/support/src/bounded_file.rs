@@ -1,15 +1,30 @@
-//! Whole files of a bounded size: a file of gigabytes must not fill the memory.
+//! Whole files of a bounded size: a file of gigabytes must not fill the memory, and a pipe or device not block or never
+//! end.
 
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+/// Opens a file for reading.
+///
+/// # Errors
+/// The error of the system, and [`io::ErrorKind::InvalidInput`] for a pipe, socket or device.
+pub fn open(path: &Path) -> io::Result<File> {
+    // Asked before: opening a pipe waits for its other end.
+    let kind = std::fs::metadata(path)?.file_type();
+    if !kind.is_file() && !kind.is_dir() {
+        let reason = "no regular file: pipes, sockets and devices are not read";
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
+    }
+    File::open(path)
+}
+
 /// Reads a file of at most `max_bytes`.
 ///
 /// # Errors
-/// The error of the system, and [`io::ErrorKind::FileTooLarge`] for a larger file.
+/// Those of [`open`], and [`io::ErrorKind::FileTooLarge`] for a larger file.
 pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
-    let file = File::open(path)?;
+    let file = open(path)?;
     let stated = file.metadata()?.len();
     let mut bytes = Vec::with_capacity(usize::try_from(stated.min(max_bytes)).unwrap_or(0));
     file.take(max_bytes.saturating_add(1))
@@ -33,6 +48,22 @@ pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn devices_and_pipes_are_refused_without_waiting_for_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        for path in [Path::new("/dev/zero"), &pipe] {
+            let error = read(path, u64::MAX).unwrap_err();
+            assert_eq!(error.kind(), io::ErrorKind::InvalidInput, "{error}");
+        }
+        assert_eq!(
+            read(Path::new("/dev/null"), 9).unwrap_err().kind(),
+            io::ErrorKind::InvalidInput
+        );
+    }
 
     #[test]
     fn a_file_that_is_too_large_is_refused_and_one_of_the_size_is_not() {

@@ -43,7 +43,7 @@ impl SweepLog {
 /// The system's, if the file cannot be read.
 pub fn read(path: &Path) -> io::Result<BTreeMap<u64, u64>> {
     let mut arrived = BTreeMap::new();
-    for line in BufReader::new(File::open(path)?.take(MOST_BYTES)).lines() {
+    for line in BufReader::new(crate::bounded_file::open(path)?.take(MOST_BYTES)).lines() {
         let line = line?;
         let numbers = line
             .split_once(',')

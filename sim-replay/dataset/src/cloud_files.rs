@@ -6,12 +6,13 @@ use std::sync::Arc;
 
 use protocol::PointCloud;
 
-use super::points::{SweepStorage, Sweeps};
-use super::{Layout, OpenOptions, ReadError, Scenario, files, rosbag, single_vehicle_id};
+use super::points::{FileKind, SweepStorage, Sweeps};
+use super::{
+    Layout, OpenOptions, Plausibility, ReadError, Scenario, files, rosbag, single_vehicle_id,
+};
+use crate::findings::SweepFindings;
 use crate::pcd::PcdCloud;
 
-/// Endings of files of points.
-const ENDINGS: [&str; 4] = ["pcd", "ply", "npy", "bin"];
 /// Folders of sweeps whose files are readable only with the rest of their data set: NCLT and Oxford.
 const SEQUENCE_FOLDERS: [&str; 2] = ["velodyne_sync", "velodyne_left"];
 
@@ -41,6 +42,8 @@ pub struct Cloud {
     pub points: PointCloud,
     /// Number of points that were left out: not finite, or exactly at the origin (rays without a return).
     pub left_out: usize,
+    /// Findings about the sweep as stored.
+    pub findings: SweepFindings,
     /// True if a data set states its handedness, which has been removed.
     pub is_of_data_set: bool,
 }
@@ -68,16 +71,7 @@ pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
     let mut names = files::list(dir)?.files;
     names.sort_by(|first, second| files::natural_order(first, second));
     let paths = names.into_iter().map(|name| dir.join(name));
-    Ok(paths.filter(|path| is_cloud(path)).collect())
-}
-
-fn is_cloud(path: &Path) -> bool {
-    let ending = path.extension().and_then(|ending| ending.to_str());
-    ending.is_some_and(|ending| {
-        ENDINGS
-            .iter()
-            .any(|known| ending.eq_ignore_ascii_case(known))
-    })
+    Ok(paths.filter(|path| FileKind::of(path).is_ok()).collect())
 }
 
 /// A listed file.
@@ -231,11 +225,7 @@ impl CloudFile {
     /// [`ReadError`] when the file cannot be read, is malformed or holds no points that a LiDAR measures: in this case
     /// with the exceeded limit.
     pub fn read(&self) -> Result<Cloud, ReadError> {
-        let PcdCloud {
-            mut points,
-            dropped,
-            ..
-        } = match &self.source {
+        let cloud = match &self.source {
             Source::Frame {
                 scenario,
                 agent,
@@ -243,18 +233,23 @@ impl CloudFile {
             } => scenario.load_points(*agent, *tick, None)?,
             Source::File(sweeps) => sweeps.read(&single_vehicle_id(), &self.path)?,
         };
+        let findings = SweepFindings::of(&cloud);
+        let PcdCloud {
+            mut points,
+            dropped,
+            ..
+        } = cloud;
         let before = points.len();
         points.xyzi.retain(|&[x, y, z, _]| [x, y, z] != [0.0; 3]);
         let left_out = dropped + before - points.len();
-        let mut plausibility = super::Plausibility::default();
-        plausibility.add(&points);
-        if let Some(fault) = plausibility.fault() {
+        if let Some(fault) = Plausibility::of(&points).fault() {
             let reason = format!("{fault}; a cloud is in the LiDAR frame, in metres");
             return Err(ReadError::malformed(&self.path, reason));
         }
         Ok(Cloud {
             points,
             left_out,
+            findings,
             is_of_data_set: matches!(self.source, Source::Frame { .. }),
         })
     }
@@ -346,6 +341,25 @@ mod tests {
             let file = clouds_at(&[path]).remove(0).unwrap();
             assert_eq!(xyz(&file), [[1.0, -2.0, 3.0], [4.0, 5.0, 1.5]]);
             assert!(file.read().unwrap().is_of_data_set);
+        }
+    }
+
+    #[test]
+    fn a_file_of_another_kind_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["cloud.las", "cloud.pcd.gz", "cloud.xyz", "cloud"] {
+            let path = dir.path().join(name);
+            fs::write(&path, [0; 16]).unwrap();
+            let message = clouds_at(&[path])[0]
+                .as_ref()
+                .unwrap()
+                .read()
+                .unwrap_err()
+                .to_string();
+            let ending = name.rsplit_once('.').map_or("", |(_, ending)| ending);
+            let expected =
+                format!("{ending:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin");
+            assert!(message.ends_with(&expected), "{message}");
         }
     }
 

@@ -11,7 +11,7 @@ const MAX_FRAME_BYTES: u64 = 16 << 20;
 
 /// Reads and parses the file of one frame.
 pub(super) fn read(path: &Path) -> Result<Value, ReadError> {
-    serde_json::from_slice(&files::read_limited(path, MAX_FRAME_BYTES)?).map_err(|error| {
+    parse(&files::read_limited(path, MAX_FRAME_BYTES)?).map_err(|error| {
         let line = Some(error.line() as u64).filter(|&line| line > 0);
         ReadError::Malformed {
             path: path.to_owned(),
@@ -20,6 +20,43 @@ pub(super) fn read(path: &Path) -> Result<Value, ReadError> {
             reason: format!("no sound JSON: {error}"),
         }
     })
+}
+
+/// Parses JSON in which bare words may stand that are no JSON: `NaN` and `Infinity`, as Python writes them, or numbers
+/// beyond all floats. Each is read as a text of its letters, so that only the object that needs it is lost, and named.
+pub(super) fn parse(bytes: &[u8]) -> serde_json::Result<Value> {
+    serde_json::from_slice(bytes).or_else(|error| {
+        let mended = with_quoted_words(bytes);
+        serde_json::from_slice(&mended).map_err(|_| error)
+    })
+}
+
+/// The text with quotes around each bare word that is no JSON by itself.
+pub(super) fn with_quoted_words(bytes: &[u8]) -> Vec<u8> {
+    let is_word = |byte: &u8| byte.is_ascii_alphanumeric() || b"+-._".contains(byte);
+    let mut mended = Vec::with_capacity(bytes.len() + 16);
+    let (mut rest, mut is_string) = (bytes, false);
+    while let Some((&first, behind)) = rest.split_first() {
+        let end = match is_string || !is_word(&first) {
+            // An escaped character cannot end a string.
+            true if first == b'\\' => rest.len().min(2),
+            true => 1,
+            false => rest
+                .iter()
+                .position(|byte| !is_word(byte))
+                .unwrap_or(rest.len()),
+        };
+        is_string ^= first == b'"';
+        let (token, after) = rest.split_at_checked(end).unwrap_or((&rest[..1], behind));
+        let is_bare = !is_string && is_word(&first);
+        let is_json = || serde_json::from_slice::<Value>(token).is_ok();
+        match is_bare && !is_json() {
+            true => mended.extend([b"\"", token, b"\""].concat()),
+            false => mended.extend(token),
+        }
+        rest = after;
+    }
+    mended
 }
 
 /// A value with its position in the document; readers take numbers and texts from it.
@@ -118,6 +155,15 @@ impl<'a> Field<'a> {
         number
             .filter(|number: &f64| number.is_finite())
             .ok_or_else(|| self.expected("a finite number"))
+    }
+
+    /// A time from 0, as a number or as text, in whatever unit: [`super::time_stamps`] tells it.
+    pub(super) fn time(&self) -> Result<f64, ReadError> {
+        let time = self.number()?;
+        if time < 0.0 {
+            return Err(self.expected("a time from 0"));
+        }
+        Ok(time)
     }
 
     /// A whole number from 0, as such or as text.
@@ -221,6 +267,29 @@ mod tests {
             message(root.required("d").unwrap().numbers::<1>()),
             "a.json: d.0: the text \"nan\", expected a finite number"
         );
+    }
+
+    #[test]
+    fn words_that_are_no_json_cost_the_value_alone_and_are_named() {
+        let text = br#"[{"x": NaN, "\"NaN, ": "a, NaN\\"}, {"x": -Infinity, "y": [1e999, true, null, -2.5]}]"#;
+        let value = parse(text).unwrap();
+        let list = Field::root(Path::new("a.json"), &value);
+        let messages: Vec<String> = list
+            .items()
+            .unwrap()
+            .map(|item| message(item.required("x").unwrap().number()))
+            .collect();
+        assert_eq!(
+            messages,
+            [
+                "a.json: 0.x: the text \"NaN\", expected a finite number",
+                "a.json: 1.x: the text \"-Infinity\", expected a finite number",
+            ]
+        );
+        assert_eq!(value[0]["\"NaN, "], "a, NaN\\");
+        assert_eq!(value[1]["y"], json!(["1e999", true, null, -2.5]));
+        let cut = parse(br#"[{"x": NaN, "y"#).unwrap_err().to_string();
+        assert!(cut.starts_with("expected value"), "{cut}");
     }
 
     #[test]

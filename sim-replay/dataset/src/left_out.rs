@@ -5,7 +5,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::{LoadedTick, Problem};
+use super::problem::reasons;
+use super::{LoadedTick, Problem, findings};
 use crate::frame::Frame;
 use support::cli::Outcome;
 use support::output;
@@ -31,6 +32,9 @@ pub struct LeftOut {
     /// Unused files and folders of the data set, found when it was opened.
     pub files: u64,
     problems: BTreeSet<Problem>,
+    /// Implausible properties of the data that were used. Nothing was left out for them.
+    #[serde(default)]
+    findings: BTreeSet<Problem>,
 }
 
 impl LeftOut {
@@ -40,6 +44,11 @@ impl LeftOut {
             self.files += 1;
             self.keep(Problem::from(problem));
         }
+    }
+
+    /// Adds findings about the data that are used ([`crate::findings`]).
+    pub fn add_findings(&mut self, findings: impl IntoIterator<Item = Problem>) {
+        self.findings.extend(findings);
     }
 
     /// Adds the missing and unreadable frames of a tick.
@@ -93,6 +102,7 @@ impl LeftOut {
         self.absent_frames += other.absent_frames;
         self.failed += other.failed;
         self.files += other.files;
+        self.add_findings(other.findings.iter().cloned());
         other
             .problems
             .iter()
@@ -110,8 +120,15 @@ impl LeftOut {
         self.problems.iter()
     }
 
+    /// [`reasons`] of the findings.
+    #[must_use]
+    pub fn reasons(&self) -> String {
+        reasons(&self.problems)
+    }
+
     /// Prints the findings to standard error; returns the outcome of a command that lost no other data.
     pub fn print(&self) -> Outcome {
+        findings::note(&self.findings);
         self.problems()
             .for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
         Outcome::of(!self.is_nothing())

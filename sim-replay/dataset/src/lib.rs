@@ -37,6 +37,7 @@ mod error;
 pub mod evaluation_protocol;
 mod faults;
 mod files;
+pub mod findings;
 pub mod frame;
 mod frame_files;
 mod generated_map;
@@ -71,6 +72,7 @@ mod recorded_motion;
 mod roots;
 mod rosbag;
 mod scalar;
+mod time_stamps;
 mod trajectory;
 mod unfinished;
 mod v2v4real;
@@ -90,9 +92,9 @@ pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::content_sha256;
 pub use open::{OpenOptions, open, open_with};
-pub use points::{IntensityScale, IntensityScaleError, Plausibility};
+pub use points::{IntensityScale, IntensityScaleError, LiveIntensities, Plausibility};
 pub use presence::LoadedTick;
-pub use problem::Problem;
+pub use problem::{Problem, reasons};
 pub use recorded::recording_of;
 pub use unfinished::UNFINISHED;
 
@@ -245,7 +247,8 @@ impl Scenario {
     /// Reads the frame of an agent at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     ///
     /// # Errors
-    /// [`ReadError`] if there is no such agent, tick or variant, and if a file is missing or malformed.
+    /// [`ReadError`] if there is no such agent, tick or variant, if a file is missing or malformed, and if no point of the
+    /// sweep is in range.
     pub fn load(
         &self,
         agent_index: usize,
@@ -258,8 +261,12 @@ impl Scenario {
             (frame.speed_mps, frame.yaw_rate_rad_s) = (None, None);
         }
         if options.points {
-            let cloud =
-                self.load_points(agent_index, tick_index, options.lidar_variant.as_deref())?;
+            let variant = options.lidar_variant.as_deref();
+            let cloud = self.load_points(agent_index, tick_index, variant)?;
+            if let Some(reason) = cloud.without_returns() {
+                let path = self.source.points_path(agent, tick, variant);
+                return Err(ReadError::malformed(&path, reason));
+            }
             (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
         }
         if options.radar && self.has_radar {

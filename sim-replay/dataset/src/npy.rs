@@ -3,7 +3,9 @@
 //! Columns are x, y, z and intensity; others are skipped. An organised array of rows x columns x numbers is flattened;
 //! 3 x N and 4 x N are read component by component. Points stay in the frame of the file.
 
-use crate::pcd::{INTENSITY, IntensityKind, IntensityOrigin, PcdCloud};
+use protocol::{INTENSITY_FIELDS, IntensityKind};
+
+use crate::pcd::{IntensityOrigin, PcdCloud};
 use crate::scalar::{Scalar, ScalarKind};
 
 /// Numbers of a point that are accepted.
@@ -31,11 +33,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let shape = shape_of(header)?;
     let columns = match descr.strip_prefix('[') {
         Some(fields) => named(fields, &shape)?,
-        None => numbered(
-            scalar_of(quoted(descr).unwrap_or_default())?,
-            &shape,
-            is_fortran(header),
-        )?,
+        None => numbered(number_of(descr)?, &shape, is_fortran(header))?,
     };
     let stated = shape
         .iter()
@@ -125,10 +123,23 @@ fn shape_of(header: &str) -> Result<Vec<usize>, String> {
         .collect()
 }
 
+/// The type of an array of plain numbers. Bytes without a meaning (`|V8`) are none, and may be of size 0.
+fn number_of(descr: &str) -> Result<Scalar, String> {
+    let code = quoted(descr).unwrap_or_default();
+    let scalar = scalar_of(code)?;
+    match scalar.kind {
+        ScalarKind::Padding => Err(no_number(code)),
+        _ => Ok(scalar),
+    }
+}
+
+fn no_number(code: &str) -> String {
+    format!("numbers of type {code:?}, expected integers, or floats of 4 or 8 bytes")
+}
+
 /// The number type of NumPy's code, for example `<f4`.
 fn scalar_of(code: &str) -> Result<Scalar, String> {
-    let fault =
-        || format!("numbers of type {code:?}, expected integers, or floats of 4 or 8 bytes");
+    let fault = || no_number(code);
     let (order, rest) = code.split_at_checked(1).ok_or_else(fault)?;
     let (kind, size) = rest.split_at_checked(1).ok_or_else(fault)?;
     let size = size.parse().map_err(|_| fault())?;
@@ -171,7 +182,7 @@ fn size_of_one(descr: &str) -> Result<usize, String> {
             .iter()
             .map(|(_, scalar)| scalar.size)
             .sum()),
-        None => Ok(scalar_of(quoted(descr).unwrap_or_default())?.size),
+        None => Ok(number_of(descr)?.size),
     }
 }
 
@@ -199,7 +210,7 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
             .map(|(_, place)| place)
             .ok_or_else(|| format!("no field {name}, there are {names:?}"))
     };
-    let intensity = find(&INTENSITY);
+    let intensity = find(&INTENSITY_FIELDS);
     Ok(Columns {
         places: [
             Some(coordinate("x")?),
@@ -334,6 +345,13 @@ mod tests {
         );
         assert!(message(array("|O", false, "1, 4", &[])).contains("numbers of type \"|O\""));
         assert!(message(array("<f4", false, "18446744073709551615, 4", &[])).contains("cut off"));
+        for of_no_size in ["|V0", "|V8"] {
+            let fault = message(array(of_no_size, false, "1000000000000, 3", &[]));
+            assert!(
+                fault.contains(&format!("numbers of type {of_no_size:?}")),
+                "{fault}"
+            );
+        }
         assert!(
             decode(b"\x93NUMPY\x01\x00\xff\xff")
                 .unwrap_err()

@@ -1,17 +1,19 @@
 //! Opening of data sets: detects the layout of a folder by the table of layouts.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::layouts::{LAYOUTS, LayoutRow, Reader};
 use super::points::IntensityScale;
+use super::problem::listed;
 use super::{
-    Dataset, ReadError, Scenario, agent_folders, files, layouts_text, recorded_motion, unfinished,
+    Dataset, ReadError, Scenario, agent_folders, files, layouts_text, recorded_motion, roots,
+    unfinished,
 };
 
 /// Depth below the opened folder to which sequences of a single vehicle are searched.
 const SEQUENCE_DEPTH: usize = 2;
-/// Largest number of faults listed when nothing can be opened.
-const SHOWN_PROBLEMS: usize = 5;
+/// Mount points of file systems that are not searched.
+const KERNEL_FOLDERS: [&str; 2] = ["/proc", "/sys"];
 
 /// Properties that a data set does not record itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,10 +48,23 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    check_file_system(dir)?;
     let mut dataset = open_among(&LAYOUTS, dir, options)?;
     unfinished::report(dir, &mut dataset);
     recorded_motion::check(&mut dataset);
     Ok(dataset)
+}
+
+/// Refuses the file systems of the kernel, whose folders and files have no end.
+fn check_file_system(dir: &Path) -> Result<(), ReadError> {
+    let is_kernels = |dir: PathBuf| KERNEL_FOLDERS.iter().any(|kernel| dir.starts_with(kernel));
+    match dir.canonicalize().is_ok_and(is_kernels) {
+        true => Err(ReadError::Layout {
+            path: dir.to_owned(),
+            reason: "no data set: a folder of the kernel".to_owned(),
+        }),
+        false => Ok(()),
+    }
 }
 
 /// Tries `layouts` in their order.
@@ -74,14 +89,7 @@ fn open_among(
         &mut scenarios,
         &mut problems,
     )?;
-    match scenarios.first().map(|scenario: &Scenario| scenario.layout) {
-        Some(layout) => Ok(Dataset {
-            layout,
-            scenarios,
-            problems,
-        }),
-        None => Err(nothing_opened(dir, problems)),
-    }
+    opened(dir, scenarios, problems)?.ok_or_else(|| unknown(dir))
 }
 
 /// Opens the sequences of a single vehicle, at `dir` or below.
@@ -118,33 +126,42 @@ fn open_sequences(
     Ok(())
 }
 
+/// The data set of some scenarios; `None` where there are neither these nor problems.
+///
+/// # Errors
+/// The problems, if they left no scenario.
+pub(super) fn opened(
+    dir: &Path,
+    scenarios: Vec<Scenario>,
+    problems: Vec<ReadError>,
+) -> Result<Option<Dataset>, ReadError> {
+    match scenarios.first().map(|scenario| scenario.layout) {
+        Some(layout) => Ok(Some(Dataset {
+            layout,
+            scenarios,
+            problems,
+        })),
+        None if problems.is_empty() => Ok(None),
+        None => Err(nothing_opened(dir, problems)),
+    }
+}
+
 /// The only fault, or all of them, or an unknown layout.
-pub(super) fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
+fn nothing_opened(dir: &Path, mut problems: Vec<ReadError>) -> ReadError {
     match problems.len() {
-        0 => unknown(dir),
         1 => problems.swap_remove(0),
-        count => {
-            let shown: Vec<String> = problems
-                .iter()
-                .take(SHOWN_PROBLEMS)
-                .map(ToString::to_string)
-                .collect();
-            let more = if count > SHOWN_PROBLEMS {
-                format!("; and {} more", count - SHOWN_PROBLEMS)
-            } else {
-                String::new()
-            };
-            ReadError::Layout {
-                path: dir.to_owned(),
-                reason: format!("nothing can be opened: {}{more}", shown.join("; ")),
-            }
-        }
+        _ => ReadError::Layout {
+            path: dir.to_owned(),
+            reason: format!("nothing can be opened: {}", listed(&problems)),
+        },
     }
 }
 
 fn unknown(dir: &Path) -> ReadError {
     let reason = if agent_folders::is_agent(dir) {
         "this is the folder of one agent: open the scenario above it".to_owned()
+    } else if let Some(relative) = unsupported_kitti(dir) {
+        relative.to_owned()
     } else {
         let layouts = layouts_text();
         format!(
@@ -158,10 +175,25 @@ fn unknown(dir: &Path) -> ReadError {
     }
 }
 
+/// Advice for the parts of KITTI that are not read.
+fn unsupported_kitti(dir: &Path) -> Option<&'static str> {
+    let has = |path: &'static str| !roots::find(dir, |dir| dir.join(path).exists()).is_empty();
+    if has("velodyne_points/data") {
+        return Some(
+            "this looks like KITTI raw, whose GPS poses (oxts) are not read: use KITTI's odometry sequences of the \
+             same drives, or write the poses of the LiDAR into a file poses.txt beside a folder velodyne with the \
+             clouds; agent locate reads velodyne_points/data as it is",
+        );
+    }
+    has("velodyne/0000/000000.bin").then_some(
+        "this looks like KITTI tracking, which is not read: its poses (oxts) and labels (label_02) are in one file per \
+         sequence; agent locate reads a folder velodyne/<sequence> as it is, KITTI's object data set is read with labels",
+    )
+}
+
 #[cfg(test)]
 mod tests {
     use std::fs;
-    use std::path::PathBuf;
     use std::sync::Arc;
 
     use protocol::CavId;
@@ -228,6 +260,34 @@ mod tests {
             ticks,
             Arc::new(Dummy(file)),
         ))
+    }
+
+    #[test]
+    fn folders_of_the_kernel_are_not_searched() {
+        let message = open(Path::new("/proc/self/..")).unwrap_err().to_string();
+        assert_eq!(
+            message,
+            "/proc/self/..: no data set: a folder of the kernel"
+        );
+    }
+
+    #[test]
+    fn parts_of_kitti_that_are_not_read_have_advice() {
+        let message = |cloud: &str| {
+            let dir = tempfile::tempdir().unwrap();
+            let path = dir.path().join(cloud);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, [0; 16]).unwrap();
+            open(dir.path()).unwrap_err().to_string()
+        };
+        let raw =
+            message("2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/0000000000.bin");
+        assert!(raw.contains("this looks like KITTI raw"), "{raw}");
+        let tracking = message("training/velodyne/0000/000000.bin");
+        assert!(
+            tracking.contains("this looks like KITTI tracking"),
+            "{tracking}"
+        );
     }
 
     #[test]

@@ -8,7 +8,7 @@ use protocol::{CavId, Handedness};
 
 use super::agent_folders::{self, ScenarioFolder};
 use super::layouts::{LayoutRow, Reader};
-use super::open::{OpenOptions, nothing_opened};
+use super::open::{OpenOptions, opened};
 use super::opv2v::Opv2v;
 use super::presence::Absences;
 use super::v2v4real::V2v4Real;
@@ -72,14 +72,7 @@ fn open(root: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError
             Err(error) => problems.push(error),
         }
     }
-    match scenarios.first().map(|scenario| scenario.layout) {
-        Some(layout) => Ok(Some(Dataset {
-            layout,
-            scenarios,
-            problems,
-        })),
-        None => Err(nothing_opened(root, problems)),
-    }
+    opened(root, scenarios, problems)
 }
 
 fn agent_folder_scenario(

@@ -3,7 +3,9 @@
 //! The element `vertex` holds the points: properties `x`, `y`, `z`, and an intensity by any of its usual names. Other
 //! properties and elements are skipped. Points stay in the frame of the file.
 
-use crate::pcd::{INTENSITY, IntensityKind, IntensityOrigin, PcdCloud};
+use protocol::{INTENSITY_FIELDS, IntensityKind};
+
+use crate::pcd::{IntensityOrigin, PcdCloud};
 use crate::scalar::{Scalar, ScalarKind};
 
 /// Longest header that is read, bytes.
@@ -74,7 +76,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         Some(coordinate("x")?),
         Some(coordinate("y")?),
         Some(coordinate("z")?),
-        vertex.find(&INTENSITY),
+        vertex.find(&INTENSITY_FIELDS),
     ];
     let points = match storage {
         Storage::Ascii => ascii(vertex, before, body, &columns)?,
@@ -112,15 +114,15 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     if !start.starts_with(b"ply") {
         return Err("the first line is not ply".to_owned());
     }
-    let end = start
-        .windows(END.len())
-        .position(|window| window == END)
-        .ok_or("no line end_header")?;
-    let (text, rest) = bytes.split_at(end);
-    let body = match rest.get(END.len()..).unwrap_or_default() {
-        [b'\r', b'\n', body @ ..] | [b'\n', body @ ..] => body,
-        body => body,
-    };
+    let mut len = 0;
+    let has_end = start.split_inclusive(|&byte| byte == b'\n').any(|line| {
+        len += line.len();
+        line.trim_ascii() == END
+    });
+    if !has_end {
+        return Err("no line end_header".to_owned());
+    }
+    let (text, body) = bytes.split_at_checked(len).unwrap_or_default();
     let text = String::from_utf8_lossy(text);
     let (mut storage, mut elements) = (None, Vec::<Element>::new());
     for (number, line) in (1..).zip(text.lines()) {
@@ -339,6 +341,13 @@ mod tests {
                 (1, "scalar_Intensity")
             );
         }
+    }
+
+    #[test]
+    fn the_header_ends_at_a_line_and_not_within_a_comment() {
+        let head = HEAD.replace("made by hand", "before end_header of the header");
+        let file = format!("ply\r\nformat ascii 1.0\n{head}end_header\r\n1 2 3 9 7\n4 5 6 9 8\n");
+        assert_eq!(decode(file.as_bytes()).unwrap().points.len(), 2);
     }
 
     #[test]

@@ -11,30 +11,28 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use protocol::{CavId, PointCloud};
+use protocol::{CavId, PointCloud, intensity_divisor};
 
-pub use intensity::{IntensityScale, IntensityScaleError};
+pub(crate) use intensity::NO_INTENSITY;
+pub use intensity::{IntensityScale, IntensityScaleError, LiveIntensities};
 pub use plausibility::Plausibility;
 
 use floats::FloatForm;
+use intensity::SAMPLES;
 
 use super::{OpenOptions, ReadError, files, npy, ply};
 use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
 
 /// Largest point file that is read, bytes: a sweep of a 128-channel LiDAR has some 10 MB.
 const MAX_BYTES: u64 = 1 << 30;
-/// Number of sweeps of an agent from which the missing properties are determined.
-const SAMPLES: usize = 3;
 
 /// Storage of the points of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) enum SweepStorage {
-    /// By its name: `.pcd` is PCD, `.ply` PLY, `.npy` a NumPy array, all else (`.bin`, `.pcd.bin`) little-endian `f32`, 4
-    /// or 5 per point.
+    /// By its name: `.pcd` is PCD, `.ply` PLY, `.npy` a NumPy array, `.bin` (also `.pcd.bin`) little-endian `f32`, 4 or 5
+    /// per point.
     #[default]
     ByName,
-    /// Little-endian `f32`, 5 per point: x, y, z, intensity, ring (nuScenes).
-    FiveFloats,
     /// Little-endian `f32`, component by component: all x, all y, all z, all intensities (Oxford).
     Planar,
     /// NCLT's own: `u16` x, y, z in steps of 5 mm from -100 m, `u8` intensity, `u8` laser.
@@ -117,10 +115,7 @@ impl Sweeps {
         let mut cloud = agent.read_stored(self.storage, path)?;
         if cloud.intensity.is_none() {
             agent.is_told.get_or_init(|| {
-                tracing::warn!(
-                    "{}: no intensity field (possibly in other files too): intensity is 0",
-                    path.display()
-                )
+                tracing::warn!("{} (possibly others too): {NO_INTENSITY}", path.display())
             });
         }
         self.scale.apply(&mut cloud, || agent.divisor(self.storage));
@@ -144,10 +139,8 @@ impl AgentSweeps {
     /// Number of floats per point.
     fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
         let form = self.form.get_or_init(|| {
-            let files = self
-                .files
-                .iter()
-                .filter(|path| !FileKind::of(path).is_described());
+            let is_floats = |path: &&PathBuf| matches!(FileKind::of(path), Ok(FileKind::Floats));
+            let files = self.files.iter().filter(is_floats);
             let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
             FloatForm::of(
                 &samples
@@ -163,23 +156,19 @@ impl AgentSweeps {
     /// Reads a sweep with the intensities as stored.
     fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
         match storage {
-            SweepStorage::ByName => match FileKind::of(path) {
-                FileKind::Pcd => read_pcd_stored(path),
+            SweepStorage::ByName => match FileKind::of(path)? {
+                FileKind::Pcd => read_with(path, pcd::decode_stored),
                 FileKind::Ply => read_described(path, ply::decode),
                 FileKind::Npy => read_described(path, npy::decode),
-                FileKind::Floats => read_floats(path, self.form(path)?),
+                FileKind::Floats => {
+                    let form = self.form(path)?;
+                    read_described(path, |bytes| form.decode(bytes))
+                }
             },
-            SweepStorage::FiveFloats => read_floats(path, FloatForm::Five),
-            SweepStorage::Planar => read_planar(path),
-            SweepStorage::NcltRaw => read_nclt_raw(path),
+            SweepStorage::Planar => read_described(path, planar),
+            SweepStorage::NcltRaw => read_described(path, nclt_raw),
         }
     }
-}
-
-fn read_floats(path: &Path, form: FloatForm) -> Result<PcdCloud, ReadError> {
-    let bytes = files::read_limited(path, MAX_BYTES)?;
-    check_whole_points(path, bytes.len(), 4 * form.numbers())?;
-    Ok(form.points(&bytes))
 }
 
 /// Divisor of intensities by the range of the first clouds that hold points; `path` is that of the first, for messages.
@@ -191,20 +180,16 @@ pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Pa
         .flat_map(|cloud| cloud.points.xyzi)
         .map(|point| point[3])
         .fold(0.0, f32::max);
-    let divisor = intensity::divisor_of_range(largest);
-    if divisor > intensity::BYTE {
-        let path = path.display();
-        tracing::warn!(
-            "{path} and those after it: intensities reach {largest}, neither 0 to 1 nor 0 to 255: divided by {divisor}; \
-             --intensity-scale states another number"
-        );
+    let divisor = intensity_divisor(largest);
+    if let Some(finding) = IntensityScale::AUTO.unusual(divisor, largest) {
+        tracing::warn!("{} and those after it: {finding}", path.display());
     }
     divisor
 }
 
 /// Format of a file, by the ending of its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum FileKind {
+pub(super) enum FileKind {
     Pcd,
     Ply,
     Npy,
@@ -212,28 +197,32 @@ enum FileKind {
 }
 
 impl FileKind {
-    fn of(path: &Path) -> Self {
-        let ending = path
-            .extension()
-            .and_then(|ending| ending.to_str())
+    /// The format of a file.
+    ///
+    /// # Errors
+    /// The ending, if files with it are not read.
+    pub(super) fn of(path: &Path) -> Result<Self, ReadError> {
+        let ending = (path.extension())
+            .map(|ending| ending.to_string_lossy().to_ascii_lowercase())
             .unwrap_or_default();
-        match ending.to_ascii_lowercase().as_str() {
+        Ok(match ending.as_str() {
             "pcd" => Self::Pcd,
             "ply" => Self::Ply,
             "npy" => Self::Npy,
-            _ => Self::Floats,
-        }
-    }
-
-    /// True for formats that record the type of their numbers.
-    fn is_described(self) -> bool {
-        self != Self::Floats
+            "bin" => Self::Floats,
+            _ => {
+                let reason = format!(
+                    "{ending:?} is no kind of cloud that is read: .pcd, .ply, .npy or .bin"
+                );
+                return Err(ReadError::malformed(path, reason));
+            }
+        })
     }
 }
 
 fn read_described(
     path: &Path,
-    decode: fn(&[u8]) -> Result<PcdCloud, String>,
+    decode: impl FnOnce(&[u8]) -> Result<PcdCloud, String>,
 ) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     decode(&bytes).map_err(|reason| ReadError::malformed(path, reason))
@@ -242,10 +231,6 @@ fn read_described(
 /// Reads a PCD file that is no LiDAR sweep: the fourth value is as stored, or the red byte of a colour from 0 to 1.
 pub(super) fn read_pcd(path: &Path) -> Result<PcdCloud, ReadError> {
     read_with(path, pcd::decode)
-}
-
-fn read_pcd_stored(path: &Path) -> Result<PcdCloud, ReadError> {
-    read_with(path, pcd::decode_stored)
 }
 
 fn read_with(
@@ -261,9 +246,8 @@ fn read_with(
     })
 }
 
-fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
-    let bytes = files::read_limited(path, MAX_BYTES)?;
-    check_whole_points(path, bytes.len(), 16)?;
+fn planar(bytes: &[u8]) -> Result<PcdCloud, String> {
+    check_whole_points(bytes.len(), 16)?;
     let (numbers, _) = bytes.as_chunks::<4>();
     let (xy, zi) = numbers.split_at(numbers.len() / 2);
     let ((x, y), (z, i)) = (xy.split_at(xy.len() / 2), zi.split_at(zi.len() / 2));
@@ -282,11 +266,10 @@ fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
-fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
+fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     const STEP_M: f64 = 0.005;
     const OFFSET_M: f64 = -100.0;
-    let bytes = files::read_limited(path, MAX_BYTES)?;
-    check_whole_points(path, bytes.len(), 8)?;
+    check_whole_points(bytes.len(), 8)?;
     let (points, _) = bytes.as_chunks::<8>();
     let points = points
         .iter()
@@ -314,14 +297,13 @@ pub(super) fn mirror_y(cloud: &mut PointCloud) {
     }
 }
 
-fn check_whole_points(path: &Path, len: usize, point: usize) -> Result<(), ReadError> {
+fn check_whole_points(len: usize, point: usize) -> Result<(), String> {
     if len.is_multiple_of(point) {
         return Ok(());
     }
-    let reason = format!(
+    Err(format!(
         "{len} bytes are not a whole number of points of {point} bytes: the file is cut off"
-    );
-    Err(ReadError::malformed(path, reason))
+    ))
 }
 
 #[cfg(test)]

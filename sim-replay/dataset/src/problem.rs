@@ -1,5 +1,6 @@
 //! Findings about data that was left out: place and reason, comparable and serializable.
 
+use std::fmt::{self, Display};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -17,6 +18,38 @@ pub struct Problem {
     pub field: Option<String>,
     /// The finding, with position and both values.
     pub message: String,
+}
+
+/// Largest number of faults that one error lists.
+const LISTED: usize = 5;
+
+/// The first faults as one text, and the number of the others.
+pub(crate) fn listed<P: Display>(problems: impl IntoIterator<Item = P>) -> String {
+    let mut problems = problems.into_iter();
+    let first: Vec<String> = problems
+        .by_ref()
+        .take(LISTED)
+        .map(|one| one.to_string())
+        .collect();
+    match problems.count() {
+        0 => first.join("; "),
+        more => format!("{}; and {more} more", first.join("; ")),
+    }
+}
+
+/// The first faults in brackets, for an error about data of which nothing is left; empty without any.
+#[must_use]
+pub fn reasons<P: Display>(problems: impl IntoIterator<Item = P>) -> String {
+    match listed(problems) {
+        text if text.is_empty() => text,
+        text => format!(" ({text})"),
+    }
+}
+
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
 }
 
 impl From<&ReadError> for Problem {

@@ -159,7 +159,12 @@ impl Recorded {
         };
         recorded.agents = recorded.in_order();
         if recorded.agents.is_empty() {
-            let reason = "no sweep of any vehicle in it: recorded --without lidar?";
+            let reason = match recorded.recording.entries().is_empty() {
+                true => {
+                    "none of its messages can be read: it is of another version of this program"
+                }
+                false => "no sweep of any vehicle in it: recorded --without lidar?",
+            };
             return Err(ReadError::malformed(recorded.recording.path(), reason));
         }
         Ok(recorded)

@@ -281,10 +281,18 @@ impl Contents<'_> {
     fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
         let message = self.channels.message(body).map_err(in_words)?;
         let message = message.ok_or("a message of a channel that is described nowhere")?;
-        if is_own(&message.channel.message_encoding)
-            && lengths::own_message(&message.data) != Some(message.data.len() as u64)
-        {
-            return Err("a message whose length differs from the one in its header".into());
+        if is_own(&message.channel.message_encoding) {
+            match lengths::own_message(&message.data) {
+                Some(stated) if stated == message.data.len() as u64 => {}
+                Some(_) => {
+                    return Err("a message whose length differs from the one in its header".into());
+                }
+                None => {
+                    return Err(
+                        "a damaged message, or one of another version of this program".into(),
+                    );
+                }
+            }
         }
         self.add(
             Holder {

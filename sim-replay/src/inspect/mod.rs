@@ -3,11 +3,8 @@
 //! Every frame is read. A frame that cannot be read becomes a [`Problem`] with file, line and field, and reading
 //! continues.
 
-mod boxes;
-mod cells;
 mod map;
 mod survey;
-mod sweeps;
 mod table;
 
 use protocol::{CavId, Handedness};
@@ -15,10 +12,10 @@ use serde::Serialize;
 
 pub use map::{MapReport, inspect_map};
 pub use survey::inspect;
-pub use sweeps::SweepReport;
 
 pub use dataset::Problem;
 use dataset::evaluation_protocol::EvaluationProtocol;
+pub use dataset::findings::SweepReport;
 use dataset::{Layout, MissingFrame};
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.

@@ -4,41 +4,33 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use protocol::{CavId, PointCloud, Pose};
+use protocol::CavId;
 use rayon::prelude::*;
 
-use super::boxes;
-use super::cells::Cells;
-use super::sweeps::{self, SweepFindings};
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
 use dataset::evaluation_protocol::ProtocolConfig;
-use dataset::frame::{Frame, Object};
+use dataset::findings::{self, FrameFindings, SweepReport};
+use dataset::frame::Frame;
 use dataset::ground_truth::{self, GroundTruthRule};
 use dataset::pcd::{PcdCloud, Place};
-use dataset::{self, OpenOptions, ReadError, Scenario};
+use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 
 /// Largest share of points that are not finite: with more of them a sweep is faulty, not merely sparse.
 const MOST_DROPPED: f64 = 0.9;
 
-/// Findings of one agent's frame.
+/// One agent's frame.
 #[derive(Debug, Default)]
-struct FrameFindings {
-    points: Option<usize>,
-    sweep: Option<SweepFindings>,
+struct FrameSurvey {
+    findings: FrameFindings,
     dropped: usize,
     radar_points: Option<usize>,
-    boxes: Option<usize>,
-    /// Boxes of a frame whose points were read.
-    boxes_with_sweep: usize,
-    boxes_without_points: usize,
-    world_from_lidar: Option<Pose>,
     problems: Vec<Problem>,
 }
 
 /// Findings of one tick.
 #[derive(Debug)]
 struct TickFindings {
-    agents: Vec<FrameFindings>,
+    agents: Vec<FrameSurvey>,
     /// Objects of all agents that are of the protocol's classes.
     targets: usize,
     merged: Vec<TickReport>,
@@ -98,15 +90,11 @@ pub fn inspect(
                 findings
             })
             .collect();
-        let summary = summarize(scenario, &findings);
-        report.problems.extend(box_problems(&summary, &findings));
-        report.scenarios.push(summary);
+        report.scenarios.push(summarize(scenario, &findings));
+        let scale = open.intensity_scale;
         report
             .problems
-            .extend(sweep_problems(scenario, &findings, open));
-        report
-            .problems
-            .extend(dataset::overlap::pose_problems(scenario));
+            .extend(scenario_problems(scenario, &findings, scale));
         for tick in findings {
             report.ticks.extend(tick.merged);
             report
@@ -135,23 +123,29 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
     counts.into_iter().map(with_count).collect()
 }
 
-/// Problems of the boxes of a scenario as a whole.
-fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Problem> {
-    let targets = findings.iter().map(|tick| tick.targets).sum();
-    let merged = findings
-        .iter()
-        .flat_map(|tick| &tick.merged)
-        .map(|tick| tick.merged_boxes)
-        .sum();
-    let mut problems: Vec<Problem> = boxes::without_ground_truth(&scenario.name, targets, merged)
-        .into_iter()
-        .collect();
-    for (index, agent) in scenario.agents.iter().enumerate() {
-        let boxes = findings
-            .iter()
-            .map(|tick| tick.agents[index].boxes_with_sweep)
-            .sum();
-        problems.extend(boxes::mostly_empty(&scenario.name, agent, boxes));
+/// Problems of a scenario as a whole. Without poses no ground truth is a consequence.
+fn scenario_problems(
+    scenario: &Scenario,
+    ticks: &[TickFindings],
+    scale: IntensityScale,
+) -> Vec<Problem> {
+    let of_agent = |agent: usize| {
+        let frames = ticks.iter().map(|tick| &tick.agents[agent].findings);
+        frames.enumerate().collect()
+    };
+    let agents: Vec<Vec<(usize, &FrameFindings)>> =
+        (0..scenario.agents.len()).map(of_agent).collect();
+    let mut problems = findings::of_scenario(scenario, &agents, scale);
+    let frames = agents.iter().flatten().map(|(_, frame)| frame);
+    if !frames.into_iter().any(|frame| frame.is_without_pose()) {
+        let targets = ticks.iter().map(|tick| tick.targets).sum();
+        let merged = ticks.iter().flat_map(|tick| &tick.merged);
+        let merged = merged.map(|tick| tick.merged_boxes).sum();
+        problems.extend(findings::without_ground_truth(
+            &scenario.name,
+            targets,
+            merged,
+        ));
     }
     problems
 }
@@ -161,11 +155,11 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
     let mut frames = Vec::with_capacity(scenario.agents.len());
     for agent in 0..scenario.agents.len() {
         if !scenario.is_present(agent, tick) {
-            agents.push(FrameFindings::default());
+            agents.push(FrameSurvey::default());
             continue;
         }
-        let (findings, frame) = survey_frame(scenario, agent, tick);
-        agents.push(findings);
+        let (survey, frame) = survey_frame(scenario, agent, tick);
+        agents.push(survey);
         frames.extend(frame);
     }
     let frames: Vec<&Frame> = frames.iter().collect();
@@ -181,8 +175,8 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
     }
 }
 
-fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFindings, Option<Frame>) {
-    let mut findings = FrameFindings::default();
+fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameSurvey, Option<Frame>) {
+    let mut survey = FrameSurvey::default();
     let without_points = dataset::LoadOptions {
         points: false,
         cameras: true,
@@ -190,31 +184,24 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
     };
     let frame = scenario.load(agent, tick, &without_points);
     let frame = frame
-        .map_err(|error| findings.problems.push(Problem::from(&error)))
+        .map_err(|error| survey.problems.push(Problem::from(&error)))
         .ok();
-    let plain = survey_points(scenario, agent, tick, None, &mut findings);
+    let sweep = survey_points(scenario, agent, tick, None, &mut survey.problems);
     for variant in &scenario.lidar_variants {
-        survey_points(scenario, agent, tick, Some(variant), &mut findings);
+        survey_points(scenario, agent, tick, Some(variant), &mut survey.problems);
     }
+    survey.findings = FrameFindings::of(frame.as_ref(), sweep.as_ref());
+    survey.dropped = sweep.map_or(0, |sweep| sweep.dropped);
     if let Some(frame) = &frame {
-        findings.problems.extend(frame.problems.iter().cloned());
-        findings.boxes = Some(frame.objects.len());
-        findings.world_from_lidar = frame.world_from_lidar;
-        if let Some(points) = &plain {
-            let cells = Cells::new(points);
-            let empty =
-                |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, &cells);
-            findings.boxes_with_sweep = frame.objects.len();
-            findings.boxes_without_points = frame.objects.iter().filter(empty).count();
-        }
+        survey.problems.extend(frame.problems.iter().cloned());
     }
     if scenario.has_radar {
         match scenario.load_radar(agent, tick) {
-            Ok(cloud) => findings.radar_points = Some(cloud.points.len()),
-            Err(error) => findings.problems.push(Problem::from(&error)),
+            Ok(cloud) => survey.radar_points = Some(cloud.points.len()),
+            Err(error) => survey.problems.push(Problem::from(&error)),
         }
     }
-    (findings, frame)
+    (survey, frame)
 }
 
 fn survey_points(
@@ -222,28 +209,24 @@ fn survey_points(
     agent: usize,
     tick: usize,
     variant: Option<&str>,
-    findings: &mut FrameFindings,
-) -> Option<PointCloud> {
-    let cloud = match scenario.load_points(agent, tick, variant) {
-        Ok(cloud) => cloud,
-        Err(error) => {
-            findings.problems.push(Problem::from(&error));
-            return None;
-        }
+    problems: &mut Vec<Problem>,
+) -> Option<PcdCloud> {
+    let cloud = scenario.load_points(agent, tick, variant);
+    let cloud = cloud
+        .map_err(|error| problems.push(Problem::from(&error)))
+        .ok()?;
+    let path = || {
+        scenario
+            .points_path(agent, tick, variant)
+            .unwrap_or_default()
     };
     // Organised clouds have a point for every ray, including rays without a hit.
     if cloud.dropped as f64 > MOST_DROPPED * (cloud.dropped + cloud.points.len()) as f64 {
-        let path = scenario
-            .points_path(agent, tick, variant)
-            .unwrap_or_default();
-        findings.problems.push(not_finite(&path, &cloud));
+        problems.push(not_finite(&path(), &cloud));
+    } else if let Some(reason) = cloud.without_returns() {
+        problems.push(Problem::from(&ReadError::malformed(&path(), reason)));
     }
-    if variant.is_none() {
-        findings.points = Some(cloud.points.len());
-        findings.dropped = cloud.dropped;
-        findings.sweep = Some(SweepFindings::of(&cloud));
-    }
-    Some(cloud.points)
+    Some(cloud)
 }
 
 fn not_finite(path: &Path, cloud: &PcdCloud) -> Problem {
@@ -262,51 +245,6 @@ fn not_finite(path: &Path, cloud: &PcdCloud) -> Problem {
         field: Some("x y z intensity".into()),
         message,
     }
-}
-
-fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, cells: &Cells) -> bool {
-    let Some(world_from_lidar) = world_from_lidar else {
-        return false;
-    };
-    let object_from_lidar = object
-        .world_from_object
-        .isometry()
-        .inv_mul(&world_from_lidar.isometry());
-    cells.holds_point(
-        &object_from_lidar.cast::<f32>(),
-        object.size_m.map(|size| (size / 2.0) as f32),
-    )
-}
-
-/// Problems of the sweeps of each agent as a whole.
-fn sweep_problems(
-    scenario: &Scenario,
-    findings: &[TickFindings],
-    options: &OpenOptions,
-) -> Vec<Problem> {
-    let of_agent = |agent: usize| {
-        let sweeps = sweeps_of(findings, agent);
-        let first = findings
-            .iter()
-            .position(|tick| tick.agents[agent].sweep.is_some())
-            .unwrap_or(0);
-        let path = scenario.points_path(agent, first, None).unwrap_or_default();
-        let folder = path.parent().unwrap_or(&path);
-        sweeps::problems(
-            folder,
-            &scenario.agents[agent],
-            &sweeps,
-            options.intensity_scale,
-        )
-    };
-    (0..scenario.agents.len()).flat_map(of_agent).collect()
-}
-
-fn sweeps_of(findings: &[TickFindings], agent: usize) -> Vec<&SweepFindings> {
-    findings
-        .iter()
-        .filter_map(|tick| tick.agents[agent].sweep.as_ref())
-        .collect()
 }
 
 /// One ego-only entry for every ego, and one with all agents in range, if there are any.
@@ -368,7 +306,7 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
         rate_hz: median.map(|step| 1e9 / step as f64),
         agents: (0..scenario.agents.len())
             .map(|agent| {
-                let frames: Vec<&FrameFindings> =
+                let frames: Vec<&FrameSurvey> =
                     findings.iter().map(|tick| &tick.agents[agent]).collect();
                 summarize_agent(&scenario.agents[agent], &frames)
             })
@@ -381,8 +319,8 @@ fn summarize(scenario: &Scenario, findings: &[TickFindings]) -> ScenarioReport {
     }
 }
 
-fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
-    let counts = |count: fn(&FrameFindings) -> Option<usize>| {
+fn summarize_agent(id: &CavId, frames: &[&FrameSurvey]) -> AgentReport {
+    let counts = |count: fn(&FrameSurvey) -> Option<usize>| {
         Summary::of(
             &frames
                 .iter()
@@ -390,8 +328,8 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
                 .collect::<Vec<_>>(),
         )
     };
-    let positions: Vec<[f64; 3]> = frames
-        .iter()
+    let findings = || frames.iter().map(|frame| &frame.findings);
+    let positions: Vec<[f64; 3]> = findings()
         .filter_map(|frame| Some(frame.world_from_lidar?.translation_m))
         .collect();
     let step = |pair: &[[f64; 3]]| {
@@ -400,20 +338,18 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
             .sum::<f64>()
             .sqrt()
     };
+    let sweeps: Vec<_> = findings()
+        .filter_map(|frame| frame.sweep.as_ref())
+        .collect();
     AgentReport {
         id: id.clone(),
-        points: counts(|frame| frame.points),
+        points: counts(|frame| Some(frame.findings.sweep.as_ref()?.points)),
         dropped_points: frames.iter().map(|frame| frame.dropped).sum(),
         radar_points: counts(|frame| frame.radar_points),
-        sweeps: sweeps::summarize(
-            &frames
-                .iter()
-                .filter_map(|frame| frame.sweep.as_ref())
-                .collect::<Vec<_>>(),
-        ),
-        boxes: counts(|frame| frame.boxes),
-        boxes_without_points: frames.iter().map(|frame| frame.boxes_without_points).sum(),
-        frames: frames.iter().filter(|frame| frame.points.is_some()).count(),
+        sweeps: SweepReport::of(&sweeps),
+        boxes: counts(|frame| frame.findings.boxes),
+        boxes_without_points: findings().map(|frame| frame.boxes_without_points).sum(),
+        frames: sweeps.len(),
         // An empty sum is -0.
         distance_m: (!positions.is_empty()).then(|| {
             positions
@@ -596,8 +532,8 @@ mod tests {
         assert!(message(&[&[-0.5, 0.5]]).contains("1 of 2 intensities are below 0, down to -0.5"));
         assert_eq!(
             message(&[&[1.0, 700.0]]),
-            "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255 (field intensity divided by \
-             1023): state the scale by --intensity-scale"
+            "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255: divided by 1023 unless their \
+             scale is stated"
         );
     }
 
@@ -644,6 +580,49 @@ mod tests {
                  numbers) or units of the boxes may be wrong",
                 "scene: ground truth 0 for every ego and tick, though agents list 20 objects of its classes: frames (axes, order of \
                  the pose's numbers) or units of the boxes may be wrong",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_missing_pose_is_named_and_not_its_consequences() {
+        let dir = tempfile::tempdir().unwrap();
+        let car = |id: usize| {
+            format!("  {id}: {{location: [9, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n")
+        };
+        let yaml = format!("vehicles:\n{}", (0..20).map(car).collect::<String>());
+        for stem in ["000010", "000012"] {
+            write(dir.path(), &format!("scene/1/{stem}.yaml"), yaml.as_bytes());
+            let points = sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]);
+            write(dir.path(), &format!("scene/1/{stem}.pcd"), &points);
+        }
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "/scene/1/000010.yaml: lidar_pose: missing in 2 of 2 frames of agent 1, this is the first: boxes cannot be placed"
+            ]
+        );
+    }
+
+    #[test]
+    fn a_sweep_without_a_point_in_range_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        for (stem, x) in [("000010", 10.0), ("000012", 450_000.0), ("000014", 0.0)] {
+            write(dir.path(), &format!("1/{stem}.yaml"), YAML.as_bytes());
+            let points = if x > 0.0 {
+                vec![[x, 0.0, -1.3, 0.5], [x, 1.0, 0.0, 0.4]]
+            } else {
+                vec![]
+            };
+            write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&points));
+        }
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages[messages.len() - 2..],
+            [
+                "/1/000012.pcd: none of the 2 points is a return within 300 m",
+                "/1/000014.pcd: the sweep has no point",
             ]
         );
     }

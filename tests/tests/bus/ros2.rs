@@ -483,7 +483,7 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
                 .into();
             let options = NodeOptions {
                 lidars,
-                max_intensity: 255.0,
+                intensity_scale: "255".parse().unwrap(),
                 ..NodeOptions::default()
             };
             let node = start(scope, &router, (distribution, options), &stop);

@@ -1,8 +1,10 @@
 //! `agent locate`: poses of single point clouds in the map of a scene head.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use dataset::IntensityScale;
 use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
+use dataset::findings::{self, SweepFindings};
 use localization::pgc::head_files::{encoder_or_named, head_file};
 use localization::pgc::pose_solver::FoundPose;
 use localization::pgc::wrong_place::other_lidar_hint;
@@ -113,9 +115,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
-    let mut points = Vec::new();
+    let (mut points, mut sweeps) = (Vec::new(), Vec::new());
     for file in clouds_at(&args.clouds) {
-        let located = args.locate(&mut localizer, file)?;
+        let located = args.locate(&mut localizer, file, &mut sweeps)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
             (None, Some(_)) => found += 1,
@@ -142,6 +144,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
              it? Its map is {map}"
         ));
     }
+    let folder = args
+        .clouds
+        .first()
+        .map(PathBuf::as_path)
+        .unwrap_or(Path::new(""));
+    let sweeps: Vec<&SweepFindings> = sweeps.iter().collect();
+    findings::note(&findings::of_clouds(folder, &sweeps, IntensityScale::AUTO));
     if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &points) {
         output::note(hint);
     }
@@ -157,6 +166,7 @@ impl Args {
         &self,
         localizer: &mut Localizer,
         file: Result<CloudFile, dataset::ReadError>,
+        sweeps: &mut Vec<SweepFindings>,
     ) -> anyhow::Result<Located> {
         let map = localizer.head_config().scene_name.clone();
         let name = |file: &CloudFile| file.path().display().to_string();
@@ -173,11 +183,13 @@ impl Args {
         let Cloud {
             mut points,
             left_out,
+            findings,
             is_of_data_set,
         } = match read {
             Ok(read) => read,
             Err(error) => return Ok(Located::unreadable(cloud, map, &error)),
         };
+        sweeps.push(findings);
         let (count, y_axis) = (
             points.len(),
             if is_of_data_set {

@@ -7,7 +7,9 @@ use crate::Error;
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
-use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use dataset::{
+    self, Dataset, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, Scenario, findings,
+};
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
@@ -183,9 +185,16 @@ fn evaluate_with(
         sweeps: Vec::with_capacity(chosen.len()),
         left_out: LeftOut::default(),
     };
-    datasets
-        .iter()
-        .for_each(|dataset| evaluated.left_out.add_files(&dataset.problems));
+    for Dataset {
+        scenarios,
+        problems,
+        ..
+    } in &datasets
+    {
+        evaluated.left_out.add_files(problems);
+        let findings = findings::sampled(scenarios, IntensityScale::AUTO);
+        evaluated.left_out.add_findings(findings);
+    }
     for (
         place,
         &Sweep {
@@ -224,7 +233,10 @@ fn evaluate_with(
         });
     }
     if evaluated.sweeps.is_empty() {
-        return Err(Error::Input(format!("no sweep in {:?}", options.scenes)));
+        let (scenes, reasons) = (&options.scenes, evaluated.left_out.reasons());
+        return Err(Error::Input(format!(
+            "no sweep that can be evaluated in {scenes:?}{reasons}"
+        )));
     }
     Ok(evaluated)
 }

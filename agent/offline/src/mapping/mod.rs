@@ -274,7 +274,7 @@ impl Map<'_> {
         };
         FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress).map_err(|error| {
             match error {
-                Error::NoSweeps(_) => self.no_poses(&probes),
+                Error::NoSweeps(..) => self.no_poses(&probes),
                 error => error,
             }
         })?;

@@ -188,7 +188,7 @@ impl Builder {
 
     fn finish(self, device: Device) -> Result<FeatureCache, Error> {
         if self.poses.is_empty() || self.places.is_empty() {
-            return Err(Error::NoSweeps(Vec::new()));
+            return Err(Error::NoSweeps(Vec::new(), String::new()));
         }
         let count = self.poses.len() as f64;
         let origin_m: [f64; 3] = std::array::from_fn(|axis| {

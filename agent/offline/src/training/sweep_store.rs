@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use dataset::frame::Frame;
-use dataset::{self, LoadOptions, ReadError, Scenario};
+use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario, findings, reasons};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
 
@@ -128,6 +128,7 @@ impl SweepList {
         let mut drive = 0;
         for (world, folder) in folders.iter().enumerate() {
             let dataset = dataset::open(folder)?;
+            findings::note(&findings::sampled(&dataset.scenarios, IntensityScale::AUTO));
             problems.extend(dataset.problems.iter().map(ToString::to_string));
             for scenario in dataset.scenarios.into_iter().map(Arc::new) {
                 for agent in 0..scenario.agents.len() {
@@ -147,7 +148,8 @@ impl SweepList {
             }
         }
         if places.is_empty() {
-            return Err(Error::NoSweeps(folders.to_vec()));
+            let reasons = reasons(&problems);
+            return Err(Error::NoSweeps(folders.to_vec(), reasons));
         }
         let sha256 = dataset::content_sha256(
             scenarios.iter().map(AsRef::as_ref),
@@ -342,7 +344,10 @@ impl SweepStore {
             sweeps.extend(reader.next_batch()?);
         }
         match sweeps.is_empty() {
-            true => Err(Error::NoSweeps(folders.to_vec())),
+            true => {
+                let reasons = reasons(&list.data().problems);
+                Err(Error::NoSweeps(folders.to_vec(), reasons))
+            }
             false => Ok(Self {
                 sweeps,
                 data: list.data(),
@@ -390,6 +395,6 @@ mod tests {
         assert_eq!((alone.sweeps.len(), alone.data.left_out()), (2, None));
         assert_ne!(alone.data.sha256, store.data.sha256);
         let error = SweepStore::read(&[unknown], 50.0).unwrap_err();
-        assert!(matches!(error, Error::NoSweeps(_)), "{error}");
+        assert!(matches!(error, Error::NoSweeps(..)), "{error}");
     }
 }

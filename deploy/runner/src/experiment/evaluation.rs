@@ -10,7 +10,7 @@ use std::time::Instant;
 use agent::attack::AttackConfig;
 use agent::rate::RateConfig;
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
-use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
+use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
 use deploy::score::FrameScores;
 use deploy::score::metrics::{Messages, Metrics};
 use ego_fuser::misbehaviour::MisbehaviourConfig;
@@ -174,8 +174,13 @@ pub enum EvaluationError {
     #[error("evaluation protocol: {0}")]
     Protocol(String),
     /// The data set has no frame to evaluate.
-    #[error("{}: there is no frame in it", .0.display())]
-    Empty(PathBuf),
+    #[error("{}: there is no frame in it that can be evaluated{reasons}", path.display())]
+    Empty {
+        /// The data set.
+        path: PathBuf,
+        /// Reasons of the frames that were left out.
+        reasons: String,
+    },
     /// A file cannot be hashed.
     #[error(transparent)]
     Digest(io::Error),
@@ -343,7 +348,10 @@ fn judged(
     if let Some(stepped) = &options.stepped {
         evaluator = evaluator.with_link(stepped.clone());
     }
-    evaluator.add_left_out_files(problems);
+    evaluator.add_data_set(
+        problems,
+        findings::sampled(scenarios, options.part.intensity_scale),
+    );
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().sent_channels();
     let map_values =
@@ -390,7 +398,10 @@ fn judged(
     }
     let board = board
         .filter(|board| !board.records().is_empty())
-        .ok_or(EvaluationError::Empty(options.dataset.clone()))?;
+        .ok_or_else(|| EvaluationError::Empty {
+            path: options.dataset.clone(),
+            reasons: evaluator.left_out().reasons(),
+        })?;
     files.map(|files| files.finish(&board)).transpose()?;
     Ok((board, evaluator))
 }

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
 use bus::{Endpoint, MetricsPeer, Rejection};
+use dataset::findings;
 use deploy::operate::network::{Network, RouterEndpoint};
 use deploy::operate::progress::Display;
 use deploy::operate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
@@ -101,6 +102,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
         return crate::run::stepped::run_scenario(scenario, options);
     }
     let fleet = Fleet::plan(scenario)?;
+    findings::note(&fleet.findings);
     let run = fleet
         .scenario
         .run

@@ -7,6 +7,7 @@ use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
+use dataset::findings;
 use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
@@ -33,6 +34,7 @@ use crate::scenario::{Scenario, Stepped};
 /// [`RunError`] when no fleet can be built from the scenario, or a frame cannot be read or computed.
 pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
     let mut fleet = Fleet::plan(scenario)?;
+    findings::note(&fleet.findings);
     fleet.scenario.models.threads.apply();
     let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
     let compute = match fleet

@@ -248,7 +248,7 @@ impl Arguments {
 fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let NamedSource { name, file } = source;
     let bad = |error: &dyn std::fmt::Display| BadInput::new(format!("{}: {error}", file.display()));
-    let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
+    let text = support::bounded_file::read_text(file, 1 << 20).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
     let config = config.with_networks().map_err(|error| bad(&error))?;
     // Built once without use, so that a missing file is found before the first scene.

@@ -9,7 +9,9 @@ use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
-use dataset::{self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, Scenario};
+use dataset::{
+    self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, Scenario, findings,
+};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
@@ -121,6 +123,7 @@ impl Arguments {
                 problems,
             } = dataset::open_with(folder, &options).map_err(BadInput::of)?;
             left_out.add_files(&problems);
+            left_out.add_findings(findings::sampled(&scenarios, self.intensity_scale));
             let protocol = self.protocol.resolve(layout).map_err(BadInput::new)?;
             let mut scenarios: Vec<Scenario> = scenarios
                 .iter()

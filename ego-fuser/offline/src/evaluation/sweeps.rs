@@ -56,9 +56,11 @@ impl Evaluator {
         Ok(sweeps)
     }
 
-    /// Adds the problems found when the data set was opened to the data that were left out.
-    pub fn add_left_out_files(&mut self, problems: &[ReadError]) {
+    /// Adds the problems found when the data set was opened to the data that were left out, and findings about the
+    /// rest.
+    pub fn add_data_set(&mut self, problems: &[ReadError], findings: Vec<Problem>) {
         self.left_out.add_files(problems);
+        self.left_out.add_findings(findings);
     }
 
     /// Counts a frame of an agent that could not be computed, with its reason.

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
-use dataset::{self, LoadOptions, OpenOptions, Scenario};
+use dataset::{self, LoadOptions, OpenOptions, Scenario, findings};
 use perception::train::DataListing;
 use protocol::PointCloud;
 use support::file_digests::FileDigests;
@@ -53,6 +53,10 @@ impl SceneSet {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
             let dataset = dataset::open_with(folder, options)?;
+            findings::note(&findings::sampled(
+                &dataset.scenarios,
+                options.intensity_scale,
+            ));
             let protocol = protocol
                 .resolve(dataset.layout)
                 .map_err(|error| Error::Data(format!("evaluation protocol: {error}")))?;

@@ -47,10 +47,14 @@ impl Cloud {
             let (row, column) = (index / self.width as usize, index % self.width as usize);
             let begin = row * self.row_step as usize + column * self.point_step as usize;
             for (name, offset, datatype) in &self.fields {
-                let Some(axis) = ["x", "y", "z", "intensity"]
+                let axis = ["x", "y", "z"]
                     .iter()
-                    .position(|known| known == name)
-                else {
+                    .position(|known| known.eq_ignore_ascii_case(name));
+                let is_intensity = [&INTENSITY_FIELDS[..], &COLOUR_FIELDS]
+                    .concat()
+                    .iter()
+                    .any(|known| known.eq_ignore_ascii_case(name));
+                let Some(axis) = axis.or(is_intensity.then_some(3)) else {
                     continue;
                 };
                 let value = &mut data[begin + *offset as usize..];
@@ -115,10 +119,33 @@ fn what_is_written_for_ros_is_read_back() {
         capture_nanos: 1_700_000_000_123_456_789,
         frame_id: "cav_1/lidar".into(),
         points,
+        intensity: Some(("intensity".into(), IntensityKind::Number)),
         without_return: 0,
         too_far: 0,
     };
     assert_eq!(sweep, expected);
+}
+
+#[test]
+fn intensities_are_found_by_the_names_that_files_have() {
+    let read = |name: &'static str, datatype, value: f64| {
+        let fields = vec![("X", 0, 7), ("y", 4, 7), ("z", 8, 7), (name, 12, datatype)];
+        let cloud = Cloud {
+            fields,
+            ..Cloud::plain(&[[1.0, 2.0, 3.0, value]])
+        };
+        let sweep = cloud.read().unwrap();
+        (sweep.points.xyzi[0][3], sweep.intensity)
+    };
+    for name in ["Intensity", "i", "reflectivity", "signal"] {
+        let expected = Some((name.to_owned(), IntensityKind::Number));
+        assert_eq!(read(name, 7, 255.0), (255.0, expected));
+    }
+    let byte = Some(("intensity".to_owned(), IntensityKind::Byte));
+    assert_eq!(read("intensity", 2, 7.0), (7.0, byte));
+    let red = Some(("rgb".to_owned(), IntensityKind::RedByte));
+    assert_eq!(read("rgb", 6, f64::from(0x00c2_0102)), (194.0, red));
+    assert_eq!(read("ring", 7, 9.0), (0.0, None));
 }
 
 #[test]

@@ -5,8 +5,9 @@ use std::path::Path;
 
 use super::Side;
 use super::calibration::offset_m;
+use crate::faults::Faults;
 use crate::json::Field;
-use crate::{Layout, ReadError, Tick, json_table};
+use crate::{Layout, ReadError, Tick, json_table, time_stamps};
 
 /// The pairs, below the root.
 pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
@@ -55,7 +56,8 @@ pub(super) struct Pair {
 /// Capture time and batch or sequence of a frame of the vehicle.
 #[derive(Debug)]
 struct Capture {
-    micros: u64,
+    /// `None` where the time cannot be read.
+    micros: Option<u64>,
     group: Option<String>,
 }
 
@@ -86,33 +88,30 @@ impl Index {
             ));
         }
         let captures = read_captures(root, kind, problems);
+        let has_times = captures.values().any(|capture| capture.micros.is_some());
         let mut groups: BTreeMap<String, Vec<(u64, Pair)>> = BTreeMap::new();
         for pair in pairs {
-            match captures.get(&pair.vehicle) {
-                Some(Capture { micros, group }) => {
-                    let group = group.as_ref().or(pair.sequence.as_ref());
-                    groups
-                        .entry(group_name(kind, group))
-                        .or_default()
-                        .push((*micros, pair));
-                }
+            let capture = captures.get(&pair.vehicle);
+            let group = capture.and_then(|capture| capture.group.as_ref());
+            let group = group_name(kind, group.or(pair.sequence.as_ref()));
+            let group = groups.entry(group).or_default();
+            match capture.and_then(|capture| capture.micros) {
+                Some(micros) => group.push((micros, pair)),
                 // Without any time stamp the order of the list is the best available.
-                None if captures.is_empty() => {
-                    let group = groups
-                        .entry(group_name(kind, pair.sequence.as_ref()))
-                        .or_default();
+                None if !has_times => {
                     let micros = (group.len() as u64).saturating_mul(period_nanos / 1000);
                     group.push((micros, pair));
                 }
                 None => {
                     let reason = format!(
-                        "no entry for vehicle frame {}: the pair is left out",
+                        "no time stamp of vehicle frame {}: the pair is left out",
                         pair.vehicle
                     );
                     problems.push(ReadError::malformed(&root.join(CAPTURES), reason));
                 }
             }
         }
+        groups.retain(|_, pairs| !pairs.is_empty());
         Ok(Self {
             kind,
             groups: groups
@@ -235,48 +234,53 @@ fn checked_id(field: &Field<'_>, id: &str) -> Result<String, ReadError> {
     Ok(id.to_owned())
 }
 
-/// Captures of the vehicle by frame id. Entries that cannot be read are left out, with a problem.
+/// Captures of the vehicle by frame id. Entries that cannot be read are left out, with a problem; of entries without a
+/// readable time stamp the batch or sequence is kept.
 fn read_captures(
     root: &Path,
     kind: Kind,
     problems: &mut Vec<ReadError>,
 ) -> HashMap<String, Capture> {
     let path = root.join(CAPTURES);
-    let mut captures = HashMap::new();
+    let (mut stamps, mut faults, mut groups) = (HashMap::new(), Faults::default(), Vec::new());
     let read = json_table::read(
         &path,
         MAX_BYTES,
         problems,
         |_| true,
         |entry| {
-            let (id, capture) = capture(entry, kind)?;
-            captures.insert(id, capture);
+            let (id, group) = frame_and_group(entry, kind)?;
+            let stamp = entry.required("pointcloud_timestamp");
+            if let Some(stamp) = faults.take(stamp.and_then(|stamp| stamp.time())) {
+                stamps.insert(id.clone(), stamp);
+            }
+            groups.push((id, group));
             Ok(())
         },
     );
     problems.extend(read.err());
-    if captures.is_empty() {
-        let reason = "no time stamps: frames are taken as evenly spaced, in the order of the pairs, and all in one scenario";
+    faults.report("time stamp", problems);
+    if stamps.is_empty() {
+        let reason = "no time stamps: frames are taken as evenly spaced, in the order of the pairs";
         problems.push(ReadError::malformed(&path, reason));
     }
-    captures
+    let unit = time_stamps::micros_per_unit(stamps.values().copied());
+    let capture = |(id, group): (String, Option<String>)| {
+        let micros = stamps
+            .get(&id)
+            .map(|&stamp| time_stamps::micros(stamp, unit));
+        (id, Capture { micros, group })
+    };
+    groups.into_iter().map(capture).collect()
 }
 
-fn capture(entry: &Field<'_>, kind: Kind) -> Result<(String, Capture), ReadError> {
+/// Id of a frame, and its batch or sequence where the entry states one.
+fn frame_and_group(entry: &Field<'_>, kind: Kind) -> Result<(String, Option<String>), ReadError> {
     let id = match entry.optional("frame_id")? {
         Some(id) => frame_id(&id)?,
         None => stem(&entry.required("pointcloud_path")?)?,
     };
     let (_, group_key) = kind.group();
-    let group = entry
-        .optional(group_key)?
-        .map(|group| frame_id(&group))
-        .transpose()?;
-    Ok((
-        id,
-        Capture {
-            micros: entry.required("pointcloud_timestamp")?.count()?,
-            group,
-        },
-    ))
+    let group = entry.optional(group_key)?;
+    Ok((id, group.map(|group| frame_id(&group)).transpose()?))
 }

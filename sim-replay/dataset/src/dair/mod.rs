@@ -24,6 +24,7 @@ use protocol::{CavId, Handedness};
 use self::index::{Index, Kind, Pair};
 use self::labels::{Block, Objects};
 use super::layouts::{LayoutRow, Reader};
+use super::open::opened;
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
 use super::{
@@ -76,16 +77,12 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>,
     }
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for root in &roots::find(dir, is_root) {
-        scenarios.extend(open_root(dir, root, options, &mut problems)?);
+        match open_root(dir, root, options, &mut problems) {
+            Ok(found) => scenarios.extend(found),
+            Err(error) => problems.push(error),
+        }
     }
-    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else {
-        return Ok(None);
-    };
-    Ok(Some(Dataset {
-        layout,
-        scenarios,
-        problems,
-    }))
+    opened(dir, scenarios, problems)
 }
 
 fn is_root(dir: &Path) -> bool {

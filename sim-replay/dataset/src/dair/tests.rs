@@ -570,7 +570,7 @@ fn pairs_that_cannot_be_used_are_left_out() {
             ),
             format!("{index}2: vehicle frame 000010 is in a pair already"),
             format!("{index}4.vehicle_pointcloud_path: missing"),
-            "vehicle-side/data_info.json: no entry for vehicle frame 000099: the pair is left out"
+            "vehicle-side/data_info.json: no time stamp of vehicle frame 000099: the pair is left out"
                 .into(),
         ]
     );

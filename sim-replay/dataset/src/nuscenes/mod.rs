@@ -1,5 +1,5 @@
 //! Data sets with the tables of nuScenes: V2X-Sim 2.0, Open MARS and nuScenes itself,
-//! `<root>/<version>/{scene,sample,sample_data,..}.json` and sweeps of five floats per point below the root.
+//! `<root>/<version>/{scene,sample,sample_data,..}.json` and sweeps below the root.
 //!
 //! A scene is a scenario, a key frame of the ego a tick. The channel of a LiDAR names its agent: `LIDAR_TOP_id_<agent>`
 //! (V2X-Sim; 0 is the roadside unit), `LIDAR_FRONT_CENTER_<vehicle>` (Open MARS). Annotations are those of the whole
@@ -21,6 +21,7 @@ use protocol::{CavId, Handedness};
 use self::rig::QuarterTurns;
 use self::tables::{Sample, Scene, Sweep, Tables};
 use super::layouts::{LayoutRow, Reader};
+use super::open::opened;
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
 use super::{
@@ -54,8 +55,8 @@ pub(crate) static MARS: LayoutRow = LayoutRow {
 pub(crate) static NUSCENES: LayoutRow = LayoutRow {
     key: "nu_scenes",
     name: "nuScenes",
-    data_sets: "nuScenes",
-    files: "<version>/sample.json and sample_data.json (nuScenes tables), the LiDAR LIDAR_TOP",
+    data_sets: "nuScenes, T4",
+    files: "<version>/sample.json and sample_data.json (nuScenes tables), the LiDAR LIDAR_TOP or LIDAR_CONCAT",
     protocol: "opv2v",
     reader: None,
 };
@@ -69,16 +70,12 @@ const TWO_WHEELER_WIDTH_M: f64 = 1.5;
 pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for version in &roots::find(dir, is_version) {
-        scenarios.extend(open_version(dir, version, options, &mut problems)?);
+        match open_version(dir, version, options, &mut problems) {
+            Ok(found) => scenarios.extend(found),
+            Err(error) => problems.push(error),
+        }
     }
-    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else {
-        return Ok(None);
-    };
-    Ok(Some(Dataset {
-        layout,
-        scenarios,
-        problems,
-    }))
+    opened(dir, scenarios, problems)
 }
 
 fn is_version(dir: &Path) -> bool {
@@ -138,7 +135,7 @@ fn layout(version: &Path, samples: &[Sample]) -> Result<Layout, ReadError> {
     channels.iter().find_map(|channel| Some(rig::agent_of(channel)?.0)).ok_or_else(|| {
         let reason = format!(
             "nuScenes tables without a supported LiDAR: {channels:?}, expected LIDAR_TOP_id_<agent> (V2X-Sim), \
-             LIDAR_FRONT_CENTER_<vehicle> (Open MARS) or LIDAR_TOP (nuScenes)"
+             LIDAR_FRONT_CENTER_<vehicle> (Open MARS), LIDAR_TOP (nuScenes) or LIDAR_CONCAT (T4)"
         );
         ReadError::Layout { path: version.to_owned(), reason }
     })
@@ -236,7 +233,7 @@ impl Builder<'_> {
         } = parts;
         let is_unit = |agent: &&CavId| rig::is_roadside_unit(self.layout, agent.as_str());
         let sweeps = agents.iter().fold(
-            Sweeps::new(SweepStorage::FiveFloats, options),
+            Sweeps::new(SweepStorage::ByName, options),
             |sweeps, agent| {
                 let file = |tick: &Tick| {
                     Some(
@@ -289,7 +286,10 @@ impl Builder<'_> {
                 let reason = format!("channel {channel}: {error}");
                 ReadError::malformed(&self.version.join("sensor.json"), reason)
             })?;
-            agents.push((id, channel.clone()));
+            // One cloud of all LiDARs comes before that of one.
+            if agents.iter().all(|(known, _)| *known != id) {
+                agents.push((id, channel.clone()));
+            }
         }
         let listed = |name: &str| {
             self.scene

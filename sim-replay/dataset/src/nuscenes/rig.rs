@@ -21,7 +21,10 @@ pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
             vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT),
         ));
     }
-    (channel == "LIDAR_TOP").then_some((Layout::NUSCENES, ONLY_AGENT))
+    // Data sets of T4 (Autoware) have one cloud of all LiDARs of the vehicle.
+    ["LIDAR_TOP", "LIDAR_CONCAT"]
+        .contains(&channel)
+        .then_some((Layout::NUSCENES, ONLY_AGENT))
 }
 
 /// True for roadside units: number 0 of V2X-Sim, and negative numbers as in other layouts.
@@ -81,6 +84,7 @@ mod tests {
         );
         assert_eq!(agent_of("LIDAR_FRONT_CENTER"), Some((Layout::MARS, "0")));
         assert_eq!(agent_of("LIDAR_TOP"), Some((Layout::NUSCENES, "0")));
+        assert_eq!(agent_of("LIDAR_CONCAT"), Some((Layout::NUSCENES, "0")));
         assert_eq!(agent_of("LIDAR_FRONT_LEFT"), None);
     }
 

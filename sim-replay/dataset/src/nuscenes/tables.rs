@@ -12,6 +12,7 @@ use crate::ReadError;
 use crate::frame::Object;
 use crate::json::Field;
 use crate::json_table::{self, Keys};
+use crate::time_stamps;
 
 /// The tables that are read.
 pub(super) const NAMES: [&str; 9] = [
@@ -189,7 +190,7 @@ fn read_samples(
     scenes: &Indices,
     problems: &mut Vec<ReadError>,
 ) -> Result<(Vec<Sample>, Indices), ReadError> {
-    let (mut samples, mut indices) = (Vec::new(), Indices::new());
+    let (mut samples, mut stamps, mut indices) = (Vec::new(), Vec::new(), Indices::new());
     read_rows(
         version,
         "sample.json",
@@ -197,16 +198,21 @@ fn read_samples(
         |_| true,
         |row| {
             let scene = referred(row, "scene_token", scenes)?;
-            let micros = row.required("timestamp")?.count()?;
+            let stamp = row.required("timestamp")?.time()?;
             indices.insert(row.required("token")?.id()?, samples.len());
+            stamps.push(stamp);
             samples.push(Sample {
                 scene,
-                micros,
+                micros: 0,
                 sweeps: HashMap::new(),
             });
             Ok(())
         },
     )?;
+    let unit = time_stamps::micros_per_unit(stamps.iter().copied());
+    for (sample, stamp) in samples.iter_mut().zip(stamps) {
+        sample.micros = time_stamps::micros(stamp, unit);
+    }
     Ok((samples, indices))
 }
 

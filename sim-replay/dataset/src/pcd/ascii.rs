@@ -37,7 +37,9 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
             first_dropped = Some(Place::Line(lines.line));
         }
         points.push(point);
-        labels.extend(is_labelled.then_some(label));
+        if is_labelled {
+            labels.push(label);
+        }
     }
     if points.len() != header.points {
         let reason = format!(
@@ -148,10 +150,14 @@ impl<'a> Lines<'a> {
         reason = "the low 32 bits are the colour"
     )]
     fn colour(&mut self, column: Column, field: usize) -> Result<(f32, u8), PcdError> {
-        let token = self.token();
-        if let Some(colour) = self.colours.find(token) {
+        let key = short_token(self.rest);
+        if let Some((key, len)) = key
+            && let Some(colour) = self.colours.find(key)
+        {
+            self.rest = self.rest.get(len..).unwrap_or_default();
             return Ok(colour);
         }
+        let token = self.token();
         let colour = match column {
             Column::FloatColour => unusual(token).map(|value| {
                 let (red, green) = unpack_rgb(value.to_bits());
@@ -165,7 +171,9 @@ impl<'a> Lines<'a> {
                 .map(|value: i64| unpack_rgb(value as u32)),
         };
         let colour = colour.ok_or_else(|| self.no_number(field, token))?;
-        self.colours.keep(token, colour);
+        if let Some((key, _)) = key {
+            self.colours.keep(key, colour);
+        }
         Ok(colour)
     }
 
@@ -233,6 +241,17 @@ fn columns(header: &Header) -> Vec<Column> {
     header.fields.iter().enumerate().map(column).collect()
 }
 
+/// Bytes of a token of up to 15 bytes at the start of a text as one number, and its length.
+fn short_token(text: &[u8]) -> Option<(u128, usize)> {
+    const ONES: u128 = u128::MAX / 0xff;
+    let word = u128::from_le_bytes(*text.first_chunk()?);
+    // The top bit of the first byte below 0x21, a separator, is set; bits behind it have no meaning.
+    let separators = word.wrapping_sub(ONES * 0x21) & !word & (ONES << 7);
+    let bits = (separators.trailing_zeros() / 8) * 8;
+    let token = word & !u128::MAX.checked_shl(bits).filter(|_| separators != 0)?;
+    Some((token, (bits / 8) as usize))
+}
+
 /// Cache of parsed colours, by the bytes of their tokens: a sweep has few distinct ones, and parsing is slow.
 struct Colours(Vec<(u128, (f32, u8))>);
 
@@ -244,27 +263,21 @@ impl Default for Colours {
 }
 
 impl Colours {
-    fn find(&self, token: &[u8]) -> Option<(f32, u8)> {
-        let (key, slot) = Self::place(token)?;
-        let (kept, colour) = *self.0.get(slot)?;
+    fn find(&self, key: u128) -> Option<(f32, u8)> {
+        let (kept, colour) = *self.0.get(Self::slot(key))?;
         (kept == key).then_some(colour)
     }
 
-    fn keep(&mut self, token: &[u8], colour: (f32, u8)) {
-        if let Some((key, slot)) = Self::place(token)
-            && let Some(place) = self.0.get_mut(slot)
-        {
+    fn keep(&mut self, key: u128, colour: (f32, u8)) {
+        if let Some(place) = self.0.get_mut(Self::slot(key)) {
             *place = (key, colour);
         }
     }
 
     #[expect(clippy::cast_possible_truncation, reason = "a hash of both halves")]
-    fn place(token: &[u8]) -> Option<(u128, usize)> {
-        let mut bytes = [0; 16];
-        bytes.get_mut(..token.len())?.copy_from_slice(token);
-        let key = u128::from_le_bytes(bytes);
+    fn slot(key: u128) -> usize {
         let mixed = ((key >> 64) as u64 ^ key as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        Some((key, (mixed >> 56) as usize))
+        (mixed >> 56) as usize
     }
 }
 
@@ -321,6 +334,24 @@ mod tests {
             );
             assert_eq!(decode(&file).unwrap().points.xyzi[0][3], 64.0 / 255.0);
         }
+    }
+
+    #[test]
+    fn short_tokens_end_at_any_separator() {
+        for (text, len) in [
+            ("1.5e-38 2 3 4 5 6 7 8", 7),
+            ("123456789012345\n", 15),
+            ("7\t1234567890123456", 1),
+        ] {
+            let (key, found) = super::short_token(text.as_bytes()).unwrap();
+            assert_eq!(
+                (found, &key.to_le_bytes()[..len]),
+                (len, &text.as_bytes()[..len])
+            );
+            assert!(key.to_le_bytes()[len..].iter().all(|&byte| byte == 0));
+        }
+        assert!(super::short_token(b"1234567890123456 ").is_none());
+        assert!(super::short_token(b"7 ").is_none());
     }
 
     #[test]

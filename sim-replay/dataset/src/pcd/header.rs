@@ -6,6 +6,8 @@
 
 mod points;
 
+use protocol::{COLOUR_FIELDS, INTENSITY_FIELDS};
+
 use super::{IntensityKind, PcdError};
 
 const MAX_FIELDS: usize = 64;
@@ -15,20 +17,6 @@ const MAX_LINE: usize = 8192;
 const MAX_COUNT: u64 = 65_536;
 /// Most bytes of one number.
 const MAX_SIZE: usize = 8;
-/// Names of intensity, the preferred first, compared without case.
-pub(crate) const INTENSITY: [&str; 8] = [
-    "intensity",
-    "i",
-    "scalar_intensity",
-    "reflectivity",
-    "scalar_reflectivity",
-    "reflectance",
-    "remission",
-    "signal",
-];
-/// Names of packed colours, whose red byte is an intensity.
-const COLOURS: [&str; 2] = ["rgb", "rgba"];
-
 /// Storage of the points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Data {
@@ -500,9 +488,17 @@ fn find_intensity(fields: &[Field]) -> IntensitySource {
             .iter()
             .position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name))
     };
-    let value = INTENSITY.iter().find_map(find).map(IntensitySource::Value);
+    let value = INTENSITY_FIELDS
+        .iter()
+        .find_map(find)
+        .map(IntensitySource::Value);
     value
-        .or_else(|| COLOURS.iter().find_map(find).map(IntensitySource::Red))
+        .or_else(|| {
+            COLOUR_FIELDS
+                .iter()
+                .find_map(find)
+                .map(IntensitySource::Red)
+        })
         .unwrap_or(IntensitySource::None)
 }
 

@@ -27,8 +27,8 @@ use serde::Serialize;
 
 pub use encode::{Encoding, IntensityField, encode};
 
-pub(crate) use header::INTENSITY;
 use header::{Data, Header};
+pub use protocol::IntensityKind;
 
 /// Red of full intensity.
 const RED_SCALE: f32 = 255.0;
@@ -59,18 +59,6 @@ pub struct IntensityOrigin {
     pub kind: IntensityKind,
     /// Divisor from the stored numbers to the values of [`PcdCloud::points`].
     pub divisor: f32,
-}
-
-/// Type of number that stores an intensity.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum IntensityKind {
-    /// The red byte of a packed colour, 0..255.
-    RedByte,
-    /// A byte, 0..255.
-    Byte,
-    /// A wider number, whose type does not determine its scale.
-    Number,
 }
 
 /// Position in a file.

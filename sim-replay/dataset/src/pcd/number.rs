@@ -9,6 +9,18 @@ const EXACT_POWERS: [f64; 23] = [
     1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16,
     1e17, 1e18, 1e19, 1e20, 1e21, 1e22,
 ];
+/// Powers of ten by the number of digits in a word.
+const POWERS: [u64; 9] = [
+    1,
+    10,
+    100,
+    1_000,
+    10_000,
+    100_000,
+    1_000_000,
+    10_000_000,
+    100_000_000,
+];
 /// Largest number of digits that always fits `u64`.
 const MOST_DIGITS: usize = 19;
 /// Bits of an `f64` beyond the precision of an `f32`.
@@ -22,14 +34,16 @@ pub(super) fn is_separator(byte: u8) -> bool {
 }
 
 /// The number of a token at the start of `text` and the token's length, if the number is an ordinary one.
+#[inline]
 pub(super) fn ordinary(text: &[u8]) -> Option<(f32, usize)> {
     let is_negative = text.first() == Some(&b'-');
+    let begin = usize::from(is_negative);
     let mut mantissa = Digits {
         value: 0,
-        at: usize::from(is_negative),
+        at: begin,
     };
     mantissa.read(text);
-    let mut digits = mantissa.at - usize::from(is_negative);
+    let mut digits = mantissa.at - begin;
     let mut exponent = 0;
     if text.get(mantissa.at) == Some(&b'.') {
         mantissa.at += 1;
@@ -96,15 +110,20 @@ struct Digits {
 }
 
 impl Digits {
+    #[inline]
     fn read(&mut self, text: &[u8]) {
-        while let Some(eight) = text
-            .get(self.at..)
-            .and_then(|rest| rest.first_chunk::<8>())
-            .and_then(eight_digits)
-        {
-            self.value = self.value.wrapping_mul(100_000_000).wrapping_add(eight);
-            self.at += 8;
+        while let Some(bytes) = text.get(self.at..).and_then(|rest| rest.first_chunk()) {
+            let (value, count) = leading_digits(*bytes);
+            let Some(power) = POWERS.get(count) else {
+                return;
+            };
+            self.value = self.value.wrapping_mul(*power).wrapping_add(value);
+            self.at += count;
+            if count < 8 {
+                return;
+            }
         }
+        // Fewer than eight bytes are left of the text.
         while let Some(digit) = text
             .get(self.at)
             .map(|byte| byte.wrapping_sub(b'0'))
@@ -116,21 +135,23 @@ impl Digits {
     }
 }
 
-/// Eight digits at once: neighbours are joined to numbers of two, four and eight digits within one word.
-fn eight_digits(bytes: &[u8; 8]) -> Option<u64> {
-    let word = u64::from_le_bytes(*bytes);
-    let is_digit = |word: u64| {
-        let above = word.wrapping_add(0x4646_4646_4646_4646);
-        let below = word.wrapping_sub(0x3030_3030_3030_3030);
-        (above | below) & 0x8080_8080_8080_8080 == 0
-    };
-    if !is_digit(word) {
-        return None;
-    }
-    let ones = word - 0x3030_3030_3030_3030;
-    let twos = (ones * 10 + (ones >> 8)) & 0x00ff_00ff_00ff_00ff;
+/// The number that the digits at the start make, and their count: neighbours are joined to numbers of two, four and
+/// eight digits within one word.
+#[inline]
+fn leading_digits(bytes: [u8; 8]) -> (u64, usize) {
+    const TOPS: u64 = 0x8080_8080_8080_8080;
+    // Digits become 0 to 9; the top bit of every other byte is set, at least in the first of them.
+    let word = u64::from_le_bytes(bytes) ^ 0x3030_3030_3030_3030;
+    let others = (word | word.wrapping_add(0x7676_7676_7676_7676)) & TOPS;
+    let bits = (others.trailing_zeros() / 8) * 8;
+    // Leading zeros take the place of what follows. In two steps: without any digit all 64 bits are moved out.
+    let ones = (word << ((64 - bits) / 2)) << ((64 - bits) / 2);
+    let twos = (ones.wrapping_mul(10) + (ones >> 8)) & 0x00ff_00ff_00ff_00ff;
     let fours = (twos * 100 + (twos >> 16)) & 0x0000_ffff_0000_ffff;
-    Some((fours * 10_000 + (fours >> 32)) & 0xffff_ffff)
+    (
+        (fours.wrapping_mul(10_000) + (fours >> 32)) & 0xffff_ffff,
+        (bits / 8) as usize,
+    )
 }
 
 /// The number of a token that is not ordinary: more digits, large exponents, subnormal, infinite or NaN, in the

@@ -1,25 +1,28 @@
 //! Sweeps of little-endian `f32`, point after point: `x y z intensity`, or a fifth number after these.
 //!
-//! Such a file does not record the number of floats per point. The first sweeps of an agent determine it: with the
-//! right number, neighbouring points resemble each other, and the fifth number mostly is a laser index.
+//! Such a file does not record the number of floats per point. Its columns do, in any order of the points: with the
+//! right number each column holds one quantity, with a wrong one it mixes several, and its entropy is larger.
 
 use super::plausibility::TINY;
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 
-/// Least number of points of a sample.
-const LEAST_POINTS: usize = 8;
+/// Least number of floats of a sample.
+const LEAST_NUMBERS: usize = 100;
 /// Largest number of floats of a sample that are used.
-const MOST_NUMBERS: usize = 200_000;
+const MOST_NUMBERS: usize = 20_000;
 /// Largest share of implausible numbers.
 const ABSURD_SHARE: f64 = 0.05;
 /// Largest plausible coordinate or intensity.
 const LARGEST: f32 = 1e7;
-/// Least share of whole numbers from 0 to 255 in a column of laser indices.
-const LASER_SHARE: f64 = 0.99;
 /// Unsupported numbers of floats per point that are detected.
-const OTHER_NUMBERS: [usize; 3] = [3, 6, 7];
-/// Factor by which these must reduce the difference of neighbours.
-const MUCH_LESS: f64 = 0.5;
+const OTHER_NUMBERS: [usize; 8] = [3, 6, 7, 8, 9, 10, 12, 16];
+/// Least number of points of a sample with one of them.
+const LEAST_OTHER_POINTS: usize = 20;
+/// Entropy per column, nats, by which the right number of floats per point is below a wrong one. Lasers that fire in
+/// turn make up to 0.22 between a number and its multiples; a wrong number makes 0.4 to 1.3.
+const MUCH_LESS: f64 = 0.3;
+/// Entropies that differ by less are equal: the smallest number of floats per point is the right one.
+const EQUAL: f64 = 0.15;
 
 /// Numbers per point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -46,73 +49,90 @@ impl FloatForm {
         }
     }
 
-    /// Majority vote of the samples; four if none decides.
+    /// Majority vote of the samples; without one, the form whose points fill the first sample, or four.
+    ///
+    /// # Errors
+    /// If no sample has either form, with the fault of the first.
     pub(super) fn of(samples: &[Vec<u8>]) -> Result<Self, String> {
         let votes: Vec<Result<Self, String>> = samples
             .iter()
             .filter_map(|bytes| Self::of_sample(bytes))
             .collect();
         let count = |form| votes.iter().filter(|vote| **vote == Ok(form)).count();
+        let fits = |form: &Self| {
+            (samples.first()).is_some_and(|bytes| bytes.len().is_multiple_of(4 * form.numbers()))
+        };
         match (count(Self::Four), count(Self::Five)) {
+            (0, 0) if votes.is_empty() => {
+                let fitting = [Self::Four, Self::Five].into_iter().find(fits);
+                Ok(fitting.unwrap_or(Self::Four))
+            }
             (0, 0) => votes.into_iter().next().unwrap_or(Ok(Self::Four)),
             (four, five) if five > four => Ok(Self::Five),
             _ => Ok(Self::Four),
         }
     }
 
-    /// `None` if the sample is empty or truncated, and decides nothing.
+    /// The form of one sweep by its content; `None` if it has too few numbers to tell.
     fn of_sample(bytes: &[u8]) -> Option<Result<Self, String>> {
-        let (numbers, rest) = bytes.as_chunks::<4>();
-        let fits = |form: &Self| rest.is_empty() && numbers.len().is_multiple_of(form.numbers());
-        let forms: Vec<Self> = [Self::Four, Self::Five].into_iter().filter(fits).collect();
-        let &first = forms.first().filter(|_| !numbers.is_empty())?;
-        let all = numbers.len();
-        let numbers: Vec<f32> = numbers
-            .iter()
+        let numbers: Vec<f32> = (bytes.as_chunks::<4>().0.iter())
             .take(MOST_NUMBERS)
             .map(|&bytes| f32::from_le_bytes(bytes))
             .collect();
-        if numbers.len() < LEAST_POINTS * 4 {
-            return Some(Ok(first));
+        if numbers.len() < LEAST_NUMBERS {
+            return None;
         }
         if let Some(fault) = absurd(&numbers) {
             return Some(Err(format!(
                 "no sweep of x y z intensity or x y z intensity ring as f32: {fault}"
             )));
         }
-        if forms.contains(&Self::Five) && has_lasers(&numbers) {
-            return Some(Ok(Self::Five));
-        }
-        let unlikeness_of = |form: &Self| unlikeness(&numbers, form.numbers());
-        let form = forms
-            .into_iter()
-            .min_by(|a, b| unlikeness_of(a).total_cmp(&unlikeness_of(b)))
-            .unwrap_or(first);
-        let is_better = |step: &usize| {
-            all.is_multiple_of(*step)
-                && unlikeness(&numbers, *step) < MUCH_LESS * unlikeness_of(&form)
+        let entropy_of = |form: Self| column_entropy(&numbers, form.numbers());
+        let (four, five) = (entropy_of(Self::Four), entropy_of(Self::Five));
+        let (form, entropy) = match five < four {
+            true => (Self::Five, five),
+            false => (Self::Four, four),
         };
-        Some(match OTHER_NUMBERS.into_iter().find(is_better) {
-            Some(step) => Err(format!(
+        let others: Vec<(usize, f64)> = OTHER_NUMBERS
+            .into_iter()
+            .filter(|step| numbers.len() >= LEAST_OTHER_POINTS * step)
+            .map(|step| (step, column_entropy(&numbers, step)))
+            .collect();
+        let least = (others.iter()).fold(entropy - MUCH_LESS, |least, other| least.min(other.1));
+        let right =
+            |(_, other): &&(usize, f64)| *other < entropy - MUCH_LESS && *other <= least + EQUAL;
+        Some(match others.iter().find(right) {
+            Some((step, _)) => Err(format!(
                 "it looks like {step} floats per point, expected 4 (x y z intensity) or 5 (and the laser's number)"
             )),
             None => Ok(form),
         })
     }
 
-    /// Extracts the points of a file of whole points.
-    pub(super) fn points(self, bytes: &[u8]) -> PcdCloud {
-        let (numbers, _) = bytes.as_chunks::<4>();
-        let points = numbers.chunks_exact(self.numbers());
-        let points = points
+    /// Extracts the points of a file of this form.
+    ///
+    /// # Errors
+    /// If the content has another form, or the file ends within a point.
+    pub(super) fn decode(self, bytes: &[u8]) -> Result<PcdCloud, String> {
+        let own = Self::of_sample(bytes).transpose()?;
+        if let Some(own) = own.filter(|own| *own != self) {
+            return Err(format!(
+                "it looks like {} floats per point, the first sweeps of this agent have {}",
+                own.numbers(),
+                self.numbers()
+            ));
+        }
+        super::check_whole_points(bytes.len(), 4 * self.numbers())?;
+        let points = (bytes.as_chunks::<4>().0)
+            .chunks_exact(self.numbers())
             .filter_map(|point| Some(point.first_chunk()?.map(f32::from_le_bytes)))
             .collect();
         let intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
-        PcdCloud {
+        Ok(PcdCloud {
             intensity,
             form: self.name(),
             ..PcdCloud::of_finite(points, Vec::new())
-        }
+        })
     }
 }
 
@@ -130,26 +150,27 @@ fn absurd(numbers: &[f32]) -> Option<String> {
     (share > ABSURD_SHARE).then(fault)
 }
 
-/// True if every fifth number is a laser index, and not all numbers could be.
-fn has_lasers(numbers: &[f32]) -> bool {
-    let is_laser = |number: f32| (0.0..=255.0).contains(&number) && number.fract() == 0.0;
-    let lasers = numbers
-        .as_chunks()
-        .0
-        .iter()
-        .filter(|[.., laser]: &&[f32; 5]| is_laser(*laser))
-        .count();
-    lasers as f64 >= LASER_SHARE * (numbers.len() / 5) as f64
-        && numbers.iter().any(|number| number.fract() != 0.0)
-}
-
-/// Mean difference of each number from the one `step` later. Logarithms, so that no column dominates the others.
-fn unlikeness(numbers: &[f32], step: usize) -> f64 {
-    let log = |number: f32| f64::from(number.abs().ln_1p().copysign(number));
-    let pairs = numbers.iter().zip(numbers.get(step..).unwrap_or_default());
-    let sum: f64 = pairs
-        .map(|(&a, &b)| (log(a) - log(b)).abs())
-        .filter(|difference| difference.is_finite())
-        .sum();
-    sum / (numbers.len() - step) as f64
+/// Mean entropy of the columns of points of `step` numbers, nats, by sign and octave of each number. Corrected for the
+/// size of the sample (Miller and Madow).
+fn column_entropy(numbers: &[f32], step: usize) -> f64 {
+    let points = (numbers.len() / step) as f64;
+    let of_column = |column: usize| {
+        // Sign and exponent of a float are its upper 9 bits.
+        let mut counts = [0_u32; 1 << 9];
+        for number in numbers
+            .chunks_exact(step)
+            .filter_map(|point| point.get(column))
+        {
+            let bin = (number.to_bits() >> 23) as usize;
+            counts
+                .get_mut(bin)
+                .into_iter()
+                .for_each(|count| *count += 1);
+        }
+        let shares = counts.into_iter().filter(|&count| count > 0);
+        let shares: Vec<f64> = shares.map(|count| f64::from(count) / points).collect();
+        let entropy: f64 = shares.iter().map(|share| -share * share.ln()).sum();
+        entropy + (shares.len() - 1) as f64 / (2.0 * points)
+    };
+    (0..step).map(of_column).sum::<f64>() / step as f64
 }

@@ -7,6 +7,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use protocol::{PointCloud, intensity_divisor};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -14,6 +15,11 @@ use crate::pcd::{IntensityKind, PcdCloud};
 
 /// Largest number in a byte.
 pub(super) const BYTE: f32 = 255.0;
+/// Number of sweeps of a LiDAR whose range determines the scale.
+pub(super) const SAMPLES: usize = 3;
+/// Finding about sweeps without intensities.
+pub(crate) const NO_INTENSITY: &str =
+    "no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for all points";
 
 /// Divisor of the intensities that a data set stores: [`Self::AUTO`], or a number parsed from text.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -84,39 +90,91 @@ impl IntensityScale {
         let Some(origin) = &mut cloud.intensity else {
             return;
         };
-        origin.divisor = match (self.divisor, origin.kind) {
+        origin.divisor = self.divisor(origin.kind, by_range);
+        divide(&mut cloud.points, origin.divisor);
+    }
+
+    fn divisor(self, kind: IntensityKind, by_range: impl FnOnce() -> f32) -> f32 {
+        match (self.divisor, kind) {
             (Some(divisor), _) => divisor,
             (None, IntensityKind::RedByte | IntensityKind::Byte) => BYTE,
             (None, IntensityKind::Number) => by_range(),
-        };
-        let divisor = origin.divisor;
-        #[expect(clippy::float_cmp, reason = "a division by exactly 1 changes nothing")]
-        if divisor != 1.0 {
-            cloud
-                .points
-                .xyzi
-                .iter_mut()
-                .for_each(|point| point[3] /= divisor);
         }
+    }
+
+    /// The finding that no usual scale fits intensities that were divided by `divisor`.
+    pub(crate) fn unusual(self, divisor: f32, largest_stored: f32) -> Option<String> {
+        (self == Self::AUTO && ![1.0, BYTE].contains(&divisor)).then(|| {
+            format!(
+                "intensities reach {largest_stored}, neither 0 to 1 nor 0 to 255: divided by {divisor} unless their \
+                 scale is stated"
+            )
+        })
     }
 }
 
-/// Divisor for numbers with the maximum `largest`.
-pub(super) fn divisor_of_range(largest: f32) -> f32 {
-    if largest <= 1.0 {
-        return 1.0;
+fn divide(points: &mut PointCloud, divisor: f32) {
+    #[expect(clippy::float_cmp, reason = "a division by exactly 1 changes nothing")]
+    if divisor != 1.0 {
+        points.xyzi.iter_mut().for_each(|point| point[3] /= divisor);
     }
-    // 2^9 - 1 and so on have no more than 24 bits up to 2^24 - 1, and are rounded up from there.
-    (8..=32)
-        .map(|bits| ((1_u64 << bits) - 1) as f32)
-        .find(|&limit| largest <= limit)
-        .unwrap_or(u32::MAX as f32)
+}
+
+/// Scale of the intensities of one live LiDAR: by type or by the range of its first sweeps, as for files.
+#[derive(Debug)]
+pub struct LiveIntensities {
+    scale: IntensityScale,
+    /// Number of sweeps that determined the range.
+    samples: usize,
+    largest: f32,
+    has_finding: bool,
+}
+
+impl LiveIntensities {
+    /// A LiDAR before its first sweep.
+    #[must_use]
+    pub fn new(scale: IntensityScale) -> Self {
+        Self {
+            scale,
+            samples: 0,
+            largest: 0.0,
+            has_finding: false,
+        }
+    }
+
+    /// Scales the intensities of the next sweep to 0..1; `field` has their name and type. Returns the first finding: no
+    /// field, an unusual range, or intensities above 1.
+    pub fn scale(
+        &mut self,
+        points: &mut PointCloud,
+        field: Option<(String, IntensityKind)>,
+    ) -> Option<String> {
+        let largest = (points.xyzi.iter()).fold(0.0, |largest: f32, point| largest.max(point[3]));
+        let finding = match field {
+            None => Some(NO_INTENSITY.to_owned()),
+            Some((name, kind)) => {
+                if self.samples < SAMPLES && !points.is_empty() {
+                    self.samples += 1;
+                    self.largest = self.largest.max(largest);
+                }
+                let divisor = self.scale.divisor(kind, || intensity_divisor(self.largest));
+                divide(points, divisor);
+                let above_one = || {
+                    format!(
+                        "field {name} reaches {largest}, {} divided by {divisor}: networks are trained on 0 to 1",
+                        largest / divisor
+                    )
+                };
+                (self.scale.unusual(divisor, self.largest))
+                    .or_else(|| (largest > divisor).then(above_one))
+            }
+        };
+        finding.filter(|_| !std::mem::replace(&mut self.has_finding, true))
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use protocol::PointCloud;
-
     use super::*;
     use crate::pcd::IntensityOrigin;
 
@@ -134,7 +192,7 @@ mod tests {
             intensity,
             ..PcdCloud::default()
         };
-        scale.apply(&mut cloud, || divisor_of_range(stored));
+        scale.apply(&mut cloud, || intensity_divisor(stored));
         (cloud.points.xyzi[0][3], cloud.intensity.unwrap().divisor)
     }
 
@@ -153,6 +211,41 @@ mod tests {
             scaled("100".parse().unwrap(), IntensityKind::Byte, 50.0),
             (0.5, 100.0)
         );
+    }
+
+    #[test]
+    fn live_sweeps_have_the_scale_of_files_and_findings_are_told_once() {
+        let cloud = |intensity: f32| PointCloud {
+            xyzi: vec![[1.0, 2.0, 3.0, intensity]],
+        };
+        let number = || Some(("i".to_owned(), IntensityKind::Number));
+        let mut live = LiveIntensities::new(IntensityScale::AUTO);
+        let mut scaled = |intensity: f32, field| {
+            let mut points = cloud(intensity);
+            let finding = live.scale(&mut points, field);
+            (points.xyzi[0][3], finding)
+        };
+        assert_eq!(scaled(255.0, number()), (1.0, None));
+        assert_eq!(scaled(51.0, number()), (0.2, None));
+        assert_eq!(scaled(0.0, None), (0.0, Some(NO_INTENSITY.to_owned())));
+        assert_eq!(scaled(0.0, None).1, None);
+        let mut stated = LiveIntensities::new("100".parse().unwrap());
+        let mut points = cloud(150.0);
+        let finding = stated.scale(&mut points, number()).unwrap();
+        assert!(
+            finding.starts_with("field i reaches 150, 1.5 divided by 100"),
+            "{finding}"
+        );
+        let mut unusual = LiveIntensities::new(IntensityScale::AUTO);
+        let finding = unusual.scale(&mut cloud(4000.0), number()).unwrap();
+        assert!(
+            finding.contains("neither 0 to 1 nor 0 to 255: divided by 4095"),
+            "{finding}"
+        );
+        let byte = Some(("intensity".to_owned(), IntensityKind::Byte));
+        let (mut live, mut points) = (LiveIntensities::new(IntensityScale::AUTO), cloud(1.0));
+        assert_eq!(live.scale(&mut points, byte), None);
+        assert_eq!(points.xyzi[0][3], 1.0 / 255.0);
     }
 
     #[test]

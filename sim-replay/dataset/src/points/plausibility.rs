@@ -2,6 +2,8 @@
 
 use protocol::PointCloud;
 
+use crate::pcd::PcdCloud;
+
 /// Range within which nearly all points lie, metres.
 const RANGE_M: f32 = 300.0;
 /// Least share of the points within that range.
@@ -23,6 +25,24 @@ pub struct Plausibility {
 }
 
 impl Plausibility {
+    /// Counts of one sweep.
+    #[must_use]
+    pub fn of(cloud: &PointCloud) -> Self {
+        let mut counted = Self::default();
+        counted.add(cloud);
+        counted
+    }
+
+    /// The fault that no point is a return of a sensor: there is none, or all are too far away or at the origin.
+    #[must_use]
+    pub fn nothing_in_range(&self) -> Option<String> {
+        let points = self.points;
+        (points == self.beyond_range + self.at_origin).then(|| match points {
+            0 => "the sweep has no point".to_owned(),
+            _ => format!("none of the {points} points is a return within {RANGE_M} m"),
+        })
+    }
+
     /// Counts the points of a sweep, which are finite.
     pub fn add(&mut self, cloud: &PointCloud) {
         for &[x, y, z, _] in &cloud.xyzi {
@@ -75,16 +95,42 @@ impl Plausibility {
     }
 }
 
+impl PcdCloud {
+    /// The fault that no point of a sweep is a return, with the number of points that are not finite.
+    #[must_use]
+    pub fn without_returns(&self) -> Option<String> {
+        let fault = Plausibility::of(&self.points).nothing_in_range()?;
+        Some(match self.dropped {
+            0 => fault,
+            dropped => format!("{fault}, and {dropped} points are not finite"),
+        })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn fault(points: &[[f32; 4]]) -> Option<String> {
-        let mut counted = Plausibility::default();
-        counted.add(&PointCloud {
+        let cloud = PointCloud {
             xyzi: points.to_vec(),
-        });
-        counted.fault()
+        };
+        Plausibility::of(&cloud).fault()
+    }
+
+    #[test]
+    fn one_return_in_range_is_a_sweep_and_none_is_not() {
+        let fault = |points: &[[f32; 4]]| {
+            let xyzi = points.to_vec();
+            Plausibility::of(&PointCloud { xyzi }).nothing_in_range()
+        };
+        let (far, origin) = ([450_000.0, 5_400_000.0, 110.0, 0.5], [0.0; 4]);
+        assert_eq!(fault(&[far, origin, [9.0, 0.0, 0.0, 0.5]]), None);
+        assert_eq!(
+            fault(&[far, origin]).unwrap(),
+            "none of the 2 points is a return within 300 m"
+        );
+        assert_eq!(fault(&[]).unwrap(), "the sweep has no point");
     }
 
     #[test]

@@ -33,7 +33,7 @@ use super::layouts::{LayoutRow, Reader};
 use super::points::{IntensityScale, Sweeps, divisor_of_first};
 use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, single_vehicle};
 use crate::frame::Frame;
-use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
+use crate::pcd::{IntensityOrigin, PcdCloud};
 
 /// A bag of ROS 2.
 pub(crate) static ROSBAG: LayoutRow = LayoutRow {
@@ -123,7 +123,7 @@ impl Bag {
         Ok(PcdCloud {
             points: read.points,
             dropped: read.without_return + read.too_far,
-            intensity: Some(IntensityOrigin::stored("intensity", IntensityKind::Number)),
+            intensity: (read.intensity).map(|(name, kind)| IntensityOrigin::stored(&name, kind)),
             form: "PointCloud2",
             ..PcdCloud::default()
         })

@@ -100,7 +100,7 @@ impl SweepImages {
             progress(done, total);
         }
         if poses.is_empty() {
-            return Err(Error::NoSweeps(Vec::new()));
+            return Err(Error::NoSweeps(Vec::new(), String::new()));
         }
         let normalisation = normalisation.unwrap_or_else(|| Normalisation::of(&poses));
         Ok(Self {

@@ -75,7 +75,8 @@ impl Examples {
             progress((first + CHUNK).min(total), total);
         }
         if poses.is_empty() {
-            return Err(Error::NoSweeps(scenes.to_vec()));
+            let reasons = dataset::reasons(&list.data().problems);
+            return Err(Error::NoSweeps(scenes.to_vec(), reasons));
         }
         let mut data = list.data();
         if too_empty > 0 {

@@ -2,20 +2,17 @@
 
 use std::path::Path;
 
-use protocol::CavId;
 use serde::Serialize;
 
-use super::Problem;
-use dataset::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
-use dataset::{IntensityScale, Plausibility};
+use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
+use crate::points::NO_INTENSITY;
+use crate::{IntensityScale, Plausibility, Problem};
 use support::statistics;
 
 /// Largest number of points of a sweep used for its median.
 const MEDIAN_OF: usize = 4096;
 /// Fewer points than this may all have the same intensity.
 const LEAST_POINTS: usize = 20;
-/// Divisors that need no explanation: 0 to 1, and a byte.
-const USUAL_DIVISORS: [f32; 2] = [1.0, 255.0];
 
 /// The sweeps of an agent.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -33,9 +30,10 @@ pub struct SweepReport {
 }
 
 /// Findings of one sweep.
-#[derive(Debug, Default)]
-pub(super) struct SweepFindings {
-    points: usize,
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SweepFindings {
+    /// Number of points.
+    pub points: usize,
     form: &'static str,
     intensity: Option<IntensityOrigin>,
     /// Smallest, median and largest intensity; `None` without points.
@@ -46,9 +44,9 @@ pub(super) struct SweepFindings {
 }
 
 impl SweepFindings {
-    pub(super) fn of(cloud: &PcdCloud) -> Self {
-        let mut plausibility = Plausibility::default();
-        plausibility.add(&cloud.points);
+    /// Findings of a sweep with intensities from 0 to 1.
+    #[must_use]
+    pub fn of(cloud: &PcdCloud) -> Self {
         let values = || cloud.points.xyzi.iter().map(|point| point[3]);
         let step = cloud.points.len().div_ceil(MEDIAN_OF).max(1);
         let median = median(&values().step_by(step).collect::<Vec<_>>());
@@ -66,63 +64,59 @@ impl SweepFindings {
             range,
             above_one: values().filter(|&value| value > 1.0).count(),
             below_zero: values().filter(|&value| value < 0.0).count(),
-            plausibility,
+            plausibility: Plausibility::of(&cloud.points),
         }
     }
 }
 
+#[expect(clippy::cast_possible_truncation, reason = "of f32")]
 fn median(values: &[f32]) -> Option<f32> {
     let values: Vec<f64> = values.iter().copied().map(f64::from).collect();
     statistics::median(&values).map(|median| median as f32)
 }
 
-/// The sweeps of an agent together, in order; `None` if no sweep has a point.
-pub(super) fn summarize(sweeps: &[&SweepFindings]) -> Option<SweepReport> {
-    let first = sweeps.iter().find(|sweep| sweep.range.is_some())?;
-    let ranges = || sweeps.iter().filter_map(|sweep| sweep.range);
-    Some(SweepReport {
-        form: first.form,
-        intensity: first.intensity.clone(),
-        min_intensity: ranges().map(|[min, ..]| min).fold(f32::INFINITY, f32::min),
-        median_intensity: median(&ranges().map(|[_, median, _]| median).collect::<Vec<_>>())?,
-        max_intensity: ranges()
-            .map(|[.., max]| max)
-            .fold(f32::NEG_INFINITY, f32::max),
-    })
+impl SweepReport {
+    /// The sweeps of an agent together, in order; `None` if no sweep has a point.
+    #[must_use]
+    pub fn of(sweeps: &[&SweepFindings]) -> Option<Self> {
+        let first = sweeps.iter().find(|sweep| sweep.range.is_some())?;
+        let ranges = || sweeps.iter().filter_map(|sweep| sweep.range);
+        Some(Self {
+            form: first.form,
+            intensity: first.intensity.clone(),
+            min_intensity: ranges().map(|[min, ..]| min).fold(f32::INFINITY, f32::min),
+            median_intensity: median(&ranges().map(|[_, median, _]| median).collect::<Vec<_>>())?,
+            max_intensity: ranges()
+                .map(|[.., max]| max)
+                .fold(f32::NEG_INFINITY, f32::max),
+        })
+    }
 }
 
-/// Problems of the sweeps of an agent in `folder`.
+/// Problems of `named` sweeps of a folder together, for example those `of agent 1`.
 pub(super) fn problems(
     folder: &Path,
-    agent: &CavId,
+    named: &str,
     sweeps: &[&SweepFindings],
     scale: IntensityScale,
 ) -> Vec<Problem> {
-    let Some(report) = summarize(sweeps) else {
+    let Some(report) = SweepReport::of(sweeps) else {
         return Vec::new();
     };
     let mut plausibility = Plausibility::default();
     sweeps
         .iter()
         .for_each(|sweep| plausibility.join(&sweep.plausibility));
-    let mut problems = Vec::new();
-    let mut add = |field: &str, what: String| {
-        let path = folder.display().to_string();
-        let message = format!("{path}: sweeps of agent {agent}: {what}");
-        problems.push(Problem {
-            path,
-            line: None,
-            field: Some(field.into()),
-            message,
-        });
+    let points = plausibility.fault().map(|fault| ("x y z", fault));
+    let intensity = intensity_fault(&report, sweeps, scale).map(|fault| ("intensity", fault));
+    let path = folder.display().to_string();
+    let problem = |(field, fault): (&str, String)| Problem {
+        message: format!("{path}: sweeps{named}: {fault}"),
+        path: path.clone(),
+        line: None,
+        field: Some(field.to_owned()),
     };
-    if let Some(fault) = plausibility.fault() {
-        add("x y z", fault);
-    }
-    if let Some(fault) = intensity_fault(&report, sweeps, scale) {
-        add("intensity", fault);
-    }
-    problems
+    points.into_iter().chain(intensity).map(problem).collect()
 }
 
 /// The first fault of the intensities.
@@ -132,9 +126,7 @@ fn intensity_fault(
     scale: IntensityScale,
 ) -> Option<String> {
     let Some(origin) = &report.intensity else {
-        return Some(
-            "no intensity field (intensity, reflectivity, remission, rgb, ...): it is 0 for all points".into(),
-        );
+        return Some(NO_INTENSITY.to_owned());
     };
     let SweepReport {
         min_intensity: min,
@@ -160,13 +152,7 @@ fn intensity_fault(
             "all {points} intensities are {min} ({from}), expected a sensor's, which differ"
         ));
     }
-    let is_unusual = scale == IntensityScale::AUTO && !USUAL_DIVISORS.contains(&origin.divisor);
-    is_unusual.then(|| {
-        let stored = max * origin.divisor;
-        format!(
-            "intensities reach {stored}, neither 0 to 1 nor 0 to 255 ({from}): state the scale by --intensity-scale"
-        )
-    })
+    scale.unusual(origin.divisor, max * origin.divisor)
 }
 
 impl std::fmt::Display for SweepReport {

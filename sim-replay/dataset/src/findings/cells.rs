@@ -16,6 +16,10 @@ pub(super) struct Cells {
     begins: Vec<usize>,
 }
 
+#[expect(
+    clippy::indexing_slicing,
+    reason = "columns and rows are below ACROSS, begins has one for each cell and the end, axes are 0 to 2"
+)]
 impl Cells {
     pub(super) fn new(cloud: &PointCloud) -> Self {
         let mut begins = vec![0; ACROSS * ACROSS + 1];
@@ -59,6 +63,11 @@ fn cell_of(&[x, y, ..]: &[f32; 4]) -> usize {
 }
 
 /// The column or row of a coordinate. NaN is 0.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "from 0 to ACROSS - 1"
+)]
 fn index(metres: f32) -> usize {
     let cell = (metres / CELL_M + CELLS as f32).clamp(0.0, (ACROSS - 1) as f32);
     cell as usize

@@ -1,0 +1,197 @@
+//! Findings about a data set as a whole: sweeps, boxes and poses that are valid one by one and implausible together.
+//!
+//! Inspection passes every frame; commands that report numbers print the findings of a sample ([`sampled`]).
+
+mod boxes;
+mod cells;
+mod sweeps;
+
+use std::path::{Path, PathBuf};
+
+use protocol::{CavId, Pose};
+use rayon::prelude::*;
+
+pub use boxes::without_ground_truth;
+pub use sweeps::{SweepFindings, SweepReport};
+
+use crate::frame::Frame;
+use crate::pcd::PcdCloud;
+use crate::{IntensityScale, LoadOptions, Problem, Scenario, overlap};
+use support::output;
+
+/// Largest number of scenarios of a sample.
+const MOST_SCENARIOS: usize = 4;
+/// Number of frames of a sample, over all scenarios and agents.
+const FRAMES: usize = 40;
+/// Least number of ticks of a scenario in a sample.
+const LEAST_TICKS: usize = 3;
+
+/// Findings of one frame of an agent.
+#[derive(Debug, Default)]
+pub struct FrameFindings {
+    /// Findings of its sweep, if that was read.
+    pub sweep: Option<SweepFindings>,
+    /// Annotated objects, if they were read.
+    pub boxes: Option<usize>,
+    /// Objects of a frame with a pose whose sweep was read.
+    placed_boxes: usize,
+    /// Those of them that hold none of the agent's own points.
+    pub boxes_without_points: usize,
+    /// Pose of the LiDAR.
+    pub world_from_lidar: Option<Pose>,
+}
+
+impl FrameFindings {
+    /// Findings of a frame and its plain sweep, as far as they could be read.
+    #[must_use]
+    pub fn of(frame: Option<&Frame>, sweep: Option<&PcdCloud>) -> Self {
+        let mut findings = Self {
+            sweep: sweep.map(SweepFindings::of),
+            boxes: frame.map(|frame| frame.objects.len()),
+            world_from_lidar: frame.and_then(|frame| frame.world_from_lidar),
+            ..Self::default()
+        };
+        if let Some((frame, sweep)) = frame.zip(sweep)
+            && let Some(pose) = &findings.world_from_lidar
+        {
+            findings.placed_boxes = frame.objects.len();
+            findings.boxes_without_points = boxes::without_points(frame, pose, &sweep.points);
+        }
+        findings
+    }
+
+    /// True if there are objects whose place relative to the LiDAR is unknown.
+    #[must_use]
+    pub fn is_without_pose(&self) -> bool {
+        self.boxes > Some(0) && self.world_from_lidar.is_none()
+    }
+}
+
+/// Findings of the frames of a scenario together: `frames` are those of each agent, in the order of
+/// [`Scenario::agents`], with their ticks. Intensities were divided by `scale`.
+#[must_use]
+pub fn of_scenario(
+    scenario: &Scenario,
+    frames: &[Vec<(usize, &FrameFindings)>],
+    scale: IntensityScale,
+) -> Vec<Problem> {
+    let mut problems = Vec::new();
+    for (agent, (id, frames)) in scenario.agents.iter().zip(frames).enumerate() {
+        problems.extend(without_pose(scenario, (agent, id), frames));
+        let sum =
+            |count: fn(&FrameFindings) -> usize| frames.iter().map(|(_, one)| count(one)).sum();
+        let (boxes, empty) = (
+            sum(|one| one.placed_boxes),
+            sum(|one| one.boxes_without_points),
+        );
+        problems.extend(boxes::mostly_empty(&scenario.name, id, boxes, empty));
+        let sweeps: Vec<&SweepFindings> = (frames.iter())
+            .filter_map(|(_, one)| one.sweep.as_ref())
+            .collect();
+        let folder = frames
+            .iter()
+            .find(|(_, one)| one.sweep.is_some())
+            .map(|(tick, _)| sweep_folder(scenario, agent, *tick));
+        let named = format!(" of agent {id}");
+        problems.extend(sweeps::problems(
+            &folder.unwrap_or_default(),
+            &named,
+            &sweeps,
+            scale,
+        ));
+    }
+    problems.extend(overlap::pose_problems(scenario));
+    problems
+}
+
+/// Findings of single clouds of a folder together.
+#[must_use]
+pub fn of_clouds(folder: &Path, sweeps: &[&SweepFindings], scale: IntensityScale) -> Vec<Problem> {
+    sweeps::problems(folder, "", sweeps, scale)
+}
+
+fn sweep_folder(scenario: &Scenario, agent: usize, tick: usize) -> PathBuf {
+    let path = scenario.points_path(agent, tick, None).unwrap_or_default();
+    path.parent().map(PathBuf::from).unwrap_or(path)
+}
+
+/// The finding that frames with objects have no pose.
+fn without_pose(
+    scenario: &Scenario,
+    (agent, id): (usize, &CavId),
+    frames: &[(usize, &FrameFindings)],
+) -> Option<Problem> {
+    let lacking = || frames.iter().filter(|(_, one)| one.is_without_pose());
+    let (tick, _) = lacking().next()?;
+    let stem = scenario.ticks.get(*tick)?;
+    let path = (scenario.source.frame_files(id, stem).into_iter().next())
+        .or_else(|| scenario.points_path(agent, *tick, None).ok())
+        .unwrap_or_default();
+    let path = path.display().to_string();
+    let message = format!(
+        "{path}: lidar_pose: missing in {} of {} frames of agent {id}, this is the first: boxes cannot be placed",
+        lacking().count(),
+        frames.len()
+    );
+    Some(Problem {
+        path,
+        line: None,
+        field: Some("lidar_pose".to_owned()),
+        message,
+    })
+}
+
+/// Findings of some frames, evenly spread over the scenarios. Frames that cannot be read are left out: their reader
+/// reports them.
+#[must_use]
+pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
+    let scenarios: Vec<&Scenario> = evenly(scenarios.len(), MOST_SCENARIOS)
+        .filter_map(|index| scenarios.get(index))
+        .collect();
+    let agents: usize = scenarios.iter().map(|scenario| scenario.agents.len()).sum();
+    let ticks = (FRAMES / agents.max(1)).max(LEAST_TICKS);
+    let problems = scenarios.into_iter().flat_map(|scenario| {
+        let ticks: Vec<usize> = evenly(scenario.ticks.len(), ticks).collect();
+        let places: Vec<(usize, usize)> = (0..scenario.agents.len())
+            .flat_map(|agent| ticks.iter().map(move |&tick| (agent, tick)))
+            .collect();
+        let frames: Vec<Option<FrameFindings>> = places
+            .par_iter()
+            .map(|&(agent, tick)| read(scenario, agent, tick))
+            .collect();
+        let mut of_agents = vec![Vec::new(); scenario.agents.len()];
+        for ((agent, tick), frame) in places.into_iter().zip(&frames) {
+            if let (Some(frame), Some(of_agent)) = (frame, of_agents.get_mut(agent)) {
+                of_agent.push((tick, frame));
+            }
+        }
+        of_scenario(scenario, &of_agents, scale)
+    });
+    problems.collect()
+}
+
+fn read(scenario: &Scenario, agent: usize, tick: usize) -> Option<FrameFindings> {
+    let without_points = LoadOptions {
+        points: false,
+        ..LoadOptions::default()
+    };
+    let frame = scenario.load(agent, tick, &without_points).ok();
+    let sweep = scenario.load_points(agent, tick, None).ok();
+    (frame.is_some() || sweep.is_some()).then(|| FrameFindings::of(frame.as_ref(), sweep.as_ref()))
+}
+
+/// At most `most` indices of `count`, evenly spread.
+fn evenly(count: usize, most: usize) -> impl Iterator<Item = usize> {
+    let chosen = count.min(most);
+    (0..chosen).map(move |index| index * count / chosen)
+}
+
+/// Prints findings to standard error, a line each.
+pub fn note<'a>(findings: impl IntoIterator<Item = &'a Problem>) {
+    for finding in findings {
+        output::note(format_args!("check the data: {finding}"));
+    }
+}
+
+#[cfg(test)]
+mod tests;
