@@ -145,6 +145,8 @@ fn a_robot_gets_map_to_odom_and_its_agent_stays_when_the_node_comes_and_goes() {
                 &robot.session,
                 &["%points", "%odom", "%tf", "%tf_static", "%initialpose"],
             );
+            // Of this node, not of the one before.
+            let _ = has_odometry_in_map(&tf);
             robot.sense_until("map -> odom", || has_odometry_in_map(&tf));
             if round == 0 {
                 let covariance = protocol::PlanarCovariance {
