@@ -1,4 +1,4 @@
-//! What the scan of a bag passes on: topics, and messages with their positions.
+//! Scan of a bag: topics, and messages with their positions.
 
 use std::borrow::Cow;
 
