@@ -268,11 +268,11 @@ fn ap_by_distance_and_by_class_is_that_of_a_plain_computation() {
         let on_objects = objects.iter().map(|one| {
             let x = one.box3d.center_m[0];
             found(
-                x + 0.03 * x.abs(),
+                x + 0.015 * x.abs(),
                 0.9 - 0.01 * (x.abs() as f32) + 0.003 * index as f32,
             )
         });
-        let on_nothing = (0..6).map(|k| found(-11.0 * f64::from(k) - 9.0, 0.1 + 0.13 * k as f32));
+        let on_nothing = (0..6).map(|k| found(-11.0 * f64::from(k) - 9.0, 0.85 - 0.1 * k as f32));
         let found = on_objects.chain(on_nothing).collect();
         let truth = GroundTruth {
             objects,
