@@ -329,7 +329,7 @@ mod tests {
             ),
             (
                 "scene: {dir: .}\ntimeouts: {ready_s: 1e30}",
-                "timeouts.ready_s is 1000000",
+                "timeouts.ready_s is 1e30",
             ),
             (
                 "scene: {dir: .}\nclock: stepped\nrecord: {}",
