@@ -230,13 +230,16 @@ fn camera_from_object(bottom: [f64; 3], height: f64, rotation_y: f64) -> Isometr
 mod tests {
     use std::fs;
 
+    /// Four floats of letters: one point at about 12 m.
+    const ONE_POINT: &str = "AAAAAAAAAAAAAAAA";
+
     use super::*;
     use crate::LoadOptions;
 
     fn build(label: &str) -> tempfile::TempDir {
         let dir = tempfile::tempdir().unwrap();
         for (name, text) in [
-            ("training/velodyne/000000.bin", ""),
+            ("training/velodyne/000000.bin", ONE_POINT),
             (
                 "training/calib/000000.txt",
                 "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3\n",

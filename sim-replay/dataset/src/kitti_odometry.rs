@@ -429,7 +429,7 @@ mod tests {
             "poses.txt",
             &format!("{}\n{}", pose(0), pose(2)),
         );
-        fs::write(dir.path().join("velodyne/000002.bin"), [0; 16]).unwrap();
+        fs::write(dir.path().join("velodyne/000002.bin"), b"AAAAAAAAAAAAAAAA").unwrap();
         let dataset = crate::open(dir.path()).unwrap();
         let scenario = &dataset.scenarios[0];
         assert_eq!(stems(&dataset), ["000000", "000002"]);

@@ -495,7 +495,7 @@ mod tests {
         write(
             &sequence,
             &format!("velodyne_left/{}.bin", T0 + 250_000),
-            &[],
+            &floats(&[1.0; 4]),
         );
         let frame = open(&sequence).scenarios[0]
             .load(0, 0, &LoadOptions::default())

@@ -602,7 +602,7 @@ fn relatives_of_the_format_are_understood() {
     let yaml = YAML
         .replace("vehicles:", "objects:")
         .replace("speed: 18", "speed: [10.8, 0, 14.4]");
-    write_frame(dir.path(), "1/000070", &yaml, &[]);
+    write_frame(dir.path(), "1/000070", &yaml, &[[1.0, 2.0, 3.0, 0.5]]);
     let frame = opened(dir.path())
         .load(0, 0, &LoadOptions::default())
         .unwrap();
@@ -613,7 +613,7 @@ fn relatives_of_the_format_are_understood() {
             dir.path(),
             "1/000070",
             &head.replace("vehicles:\n", empty),
-            &[],
+            &[[1.0, 2.0, 3.0, 0.5]],
         );
         assert!(
             opened(dir.path())
