@@ -367,6 +367,7 @@ mod tests {
 
     use super::*;
     use dataset::pcd::{Encoding, IntensityField, encode};
+    use protocol::PointCloud;
 
     const YAML: &str = "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n  7: {location: [10, 0, 0], center: [0, 0, 0.7], \
                         angle: [0, 0, 0], extent: [2, 1, 0.7]}\n";
