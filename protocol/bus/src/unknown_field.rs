@@ -23,12 +23,6 @@ pub(crate) fn explained(reason: String, fields: &[String]) -> String {
     let Some((unknown, expected)) = parts(&reason) else {
         return reason;
     };
-    let of_kind = |(field, _): &&(&str, &str)| {
-        !expected.contains(field) && fields.iter().any(|own| own == field)
-    };
-    if let Some((_, kind)) = KINDS.iter().find(of_kind) {
-        return format!("unknown field `{unknown}`: this is {kind}");
-    }
     let likeness = |name: &&str| strsim::jaro_winkler(unknown, name);
     let nearest = expected
         .iter()
@@ -39,7 +33,13 @@ pub(crate) fn explained(reason: String, fields: &[String]) -> String {
             "unknown field `{unknown}`, did you mean `{name}`? The fields are {}",
             expected.join(", ")
         ),
-        None => reason,
+        None => match KINDS
+            .iter()
+            .find(|(field, _)| !expected.contains(field) && fields.iter().any(|own| own == field))
+        {
+            Some((_, kind)) => format!("unknown field `{unknown}`: this is {kind}"),
+            None => reason,
+        },
     }
 }
 

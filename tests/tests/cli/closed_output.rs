@@ -31,7 +31,7 @@ fn every_program_comes_to_its_quiet_end() {
         .local_addr()
         .unwrap();
     let listen = format!("tcp/{free}");
-    // Its supervisor has ended, so that it joins, prints its report, and ends.
+    // Its supervisor has ended, so that it ends.
     let agent = [
         "run",
         "--run=t",
@@ -51,9 +51,11 @@ fn every_program_comes_to_its_quiet_end() {
         ("v2vloc", &["keys", "--out", keys, "--agents", "4279"]),
     ];
     for (program, arguments) in commands {
+        // An agent that is stopped while it waits for its router was interrupted.
+        let expected = if program == "agent" { 130 } else { 0 };
         assert_eq!(
             code_unread(program, arguments, false),
-            Some(0),
+            Some(expected),
             "{program} {arguments:?}"
         );
     }

@@ -64,7 +64,7 @@ const OF_AN_EVALUATION: [Row; 22] = [
     ),
 ];
 
-const MISTAKES: [Row; 36] = [
+const MISTAKES: [Row; 35] = [
     (
         "v2vloc eval --dataset {d}/none --weights {w} --method max",
         2,
@@ -100,7 +100,7 @@ const MISTAKES: [Row; 36] = [
         2,
         "this is an experiment: v2vloc sweep FILE",
     ),
-    ("v2vloc up {d}/typo.yaml", 2, "did you mean `method`?"),
+    ("v2vloc up {d}/typo.yaml", 2, "unknown field `metod`"),
     ("v2vloc up {d}/none.yaml", 2, "none.yaml: No such file"),
     (
         "v2vloc up {d}/scenario.yaml --runs {d}/runs --metrics 127.0.0.1:{p}",
@@ -166,11 +166,6 @@ const MISTAKES: [Row; 36] = [
         "/proc/none",
     ),
     (
-        "sim-replay convert {s} --layout dair --out {s}/new",
-        2,
-        "scene",
-    ),
-    (
         "sim-replay stream {s} --run x --seed 3",
         2,
         "sensor_link.seed is 3",
@@ -216,12 +211,11 @@ const MISTAKES: [Row; 36] = [
 ];
 
 /// Documented forms of values, in commands that go no further than to a data set that does not exist.
-const FORMS: [&str; 30] = [
+const FORMS: [&str; 27] = [
     "v2vloc eval --ground-truth-range-m -51.2,-38.4,-3,51.2,38.4,1 --weights {w} --method max",
     "v2vloc eval --ground-truth-range-m=-51.2,-38.4,-3,51.2,38.4,1 --weights {w} --method max",
     "v2vloc eval --ground-truth-range-m -51.2, -38.4, -3, 51.2, 38.4, 1 --weights {w} --method max",
     "v2vloc eval --classes truck,bus,van --weights {w} --method none, max",
-    "v2vloc eval --classes truck, bus --weights {w} --method none max",
     "v2vloc eval --gate 0.01 --weights {w} --method none,max",
     "v2vloc eval --gate 0.01,5,1 --weights {w} --method max",
     "v2vloc eval --gate -1,none --weights {w} --method max",
@@ -240,8 +234,6 @@ const FORMS: [&str; 30] = [
     "agent localize --head town1 --out {d}/new.csv",
     "agent train encoder --network lean --steps 1 --out {d}/new",
     "agent train scene --encoder {w}/pgc-encoder.safetensors --leave-out even-loss --steps 1 --out {d}/new",
-    "sim-replay inspect --agent-kinds vehicles --ego-kind unit",
-    "sim-replay inspect --ground-truth-range-m -51.2,-38.4,-3,51.2,38.4,1",
     "sim-replay stream --run x --agents 1,-1 --loop=false",
     "sim-replay stream --run x --lockstep --egos 1, -1 --expect 4288/bev>ego-4279",
     "sim-replay stream --run x --latency-ms 100 --jitter-ms 20 --bandwidth-mbps 100 --loss 0.05 --seed 3",
