@@ -495,6 +495,8 @@ fn a_lidar_of_ros_is_that_of_an_agent_and_a_wrong_message_is_counted() {
             };
             put("broken", driver_cloud(AT, 12));
             put("velodyne/points", driver_cloud(0, 16));
+            // The queue keeps the newest message only: the one without a stamp is read before the next is sent.
+            std::thread::sleep(Duration::from_millis(500));
             let mut sent = 0;
             let arrival = loop {
                 sent += 1;
