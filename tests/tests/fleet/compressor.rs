@@ -236,7 +236,11 @@ fn the_message_of_a_code_names_its_channels() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
     let mut agent = agent("10", &weights_file(folder.path(), Some(16)));
-    let seen = agent.perceive(&protocol::PointCloud::default()).unwrap();
+    let seen = agent
+        .perceive(&protocol::PointCloud {
+            xyzi: vec![[5.0, 1.0, -1.0, 0.5]],
+        })
+        .unwrap();
     let features = agent
         .write_map(seen.features, &seen.confidence, &Default::default(), 0)
         .unwrap();

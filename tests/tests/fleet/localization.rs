@@ -327,7 +327,7 @@ fn files_that_are_wrong_are_named() {
             &cut,
             ["cut.safetensors", "not a complete safetensors file"],
         ),
-        (&encoder, &missing, ["missing.safetensors", "No such file"]),
+        (&encoder, &missing, ["missing.safetensors", "no such file"]),
         (&head, &head, ["head.safetensors", "\"scene encoder\""]),
         (
             &encoder,
@@ -377,7 +377,7 @@ fn an_agent_without_its_networks_does_not_start() {
     };
     tests::fleet::write_weights(&folder.path().join("weights.safetensors"));
     let (code, output) = run(&["--pose-source", "pgc"]);
-    assert!(code == Some(2) && output.contains("--encoder"), "{output}");
+    assert!(code == Some(2) && output.contains("--head"), "{output}");
     let (code, output) = run(&[
         "--pose-source",
         "pgc",

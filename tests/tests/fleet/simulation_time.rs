@@ -377,8 +377,8 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
     let latency = &one.metrics.latency_ms.capture_to_detection;
     assert_eq!(
         (latency.p50, latency.p99),
-        (Some(120.0), Some(120.0)),
-        "the deadline, and the fusion"
+        (Some(170.0), Some(170.0)),
+        "the own map, the deadline, and the fusion"
     );
     assert!(one.metrics.age_ms.p50.unwrap() >= 100.0 && one.metrics.pose.mean_m.unwrap() > 0.05);
     let frames = fs::read_to_string(one.folder.file("frames.csv")).unwrap();
