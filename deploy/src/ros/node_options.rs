@@ -12,7 +12,7 @@ use super::motion_input::MotionSource;
 pub struct NodeOptions {
     /// True to offer the sweeps of the run's vehicles.
     pub with_points: bool,
-    /// Whether `/clock` is published.
+    /// Publication of `/clock`.
     pub clock: ClockMode,
     /// Place of the LiDARs on their vehicles; absent: at the origin of the body, and of robots as tf has it.
     pub mount: Option<Mount>,

@@ -36,7 +36,7 @@ struct State {
     unplaced: u64,
 }
 
-/// What is known of one robot.
+/// Transforms and latest estimate of one robot.
 #[derive(Debug, Default)]
 struct Robot {
     /// Odometry frame and frame of the body, as the odometry's messages name them.

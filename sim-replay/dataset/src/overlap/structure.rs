@@ -32,7 +32,7 @@ const TURN_STEP: usize = 3;
 /// Steps of the refinement: metres, and degrees.
 const REFINEMENTS: [(f32, f32); 3] = [(0.25, 1.5), (0.12, 0.75), (0.06, 0.4)];
 
-/// What stands on the ground around a sensor.
+/// Structures above the ground around a sensor.
 pub(super) struct Structure {
     /// Centres of cells with structure, in the LiDAR frame.
     samples: Vec<Point3<f32>>,

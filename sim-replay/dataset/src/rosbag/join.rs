@@ -165,7 +165,7 @@ impl Attempt {
     }
 }
 
-/// What is joined and what is not.
+/// Numbers of sweeps that are joined and left out.
 fn text(
     contents: &Contents,
     sweeps: &SweepTopic,
