@@ -36,7 +36,7 @@ pub(super) fn with_quoted_words(bytes: &[u8]) -> Vec<u8> {
     let is_word = |byte: &u8| byte.is_ascii_alphanumeric() || b"+-._".contains(byte);
     let mut mended = Vec::with_capacity(bytes.len() + 16);
     let (mut rest, mut is_string) = (bytes, false);
-    while let Some((&first, behind)) = rest.split_first() {
+    while let Some(&first) = rest.first() {
         let end = match is_string || !is_word(&first) {
             // An escaped character cannot end a string.
             true if first == b'\\' => rest.len().min(2),
@@ -47,7 +47,7 @@ pub(super) fn with_quoted_words(bytes: &[u8]) -> Vec<u8> {
                 .unwrap_or(rest.len()),
         };
         is_string ^= first == b'"';
-        let (token, after) = rest.split_at_checked(end).unwrap_or((&rest[..1], behind));
+        let (token, after) = rest.split_at_checked(end).unwrap_or((rest, &[]));
         let is_bare = !is_string && is_word(&first);
         let is_json = || serde_json::from_slice::<Value>(token).is_ok();
         match is_bare && !is_json() {
