@@ -569,7 +569,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_sweep_without_a_pose_gives_an_output_too() {
+    fn a_sweep_without_a_point_is_an_error_that_names_the_area() {
         let mut agent = agent();
         let input = AgentInput {
             capture_nanos: 0,
@@ -577,15 +577,7 @@ mod tests {
             measured_pose: None,
             motion: EgoMotion::default(),
         };
-        let output = agent.process(&input).unwrap();
-        assert!(output.pose.world_from_cav().is_none());
-        assert!(
-            output
-                .perception
-                .features
-                .values
-                .iter()
-                .all(|value| value.is_finite())
-        );
+        let error = agent.process(&input).unwrap_err().to_string();
+        assert!(error.contains("12.8"), "{error}");
     }
 }

@@ -266,35 +266,35 @@ mod tests {
                     patch: [3, 4],
                     ..config()
                 },
-                "patch 3 x 4",
+                "patch is [3, 4]",
             ),
             (
                 DiffLocConfig {
                     patch: [0, 4],
                     ..config()
                 },
-                "patch 0 x 4",
+                "patch is [0, 4]",
             ),
             (
                 DiffLocConfig {
                     heads: 3,
                     ..config()
                 },
-                "width 8 for 3 heads",
+                "width is 8: must be a multiple of the 3 heads",
             ),
             (
                 DiffLocConfig {
                     denoiser_width: 13,
                     ..config()
                 },
-                "denoiser_width 13 for 2 heads",
+                "denoiser_width is 13: must be a multiple of the 2 heads",
             ),
             (
                 DiffLocConfig {
                     scale_m: [0.0; 3],
                     ..config()
                 },
-                "scale_m [0.0",
+                "scale_m is [0.0",
             ),
             (
                 DiffLocConfig {

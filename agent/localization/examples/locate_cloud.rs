@@ -1,0 +1,41 @@
+//! Pose of one cloud: localization in the map of a released head, with the confidence of the pose.
+//!
+//! `locate_cloud CLOUD [HEAD]`; the head is a file or the name of a released one (`town1`).
+
+use std::path::PathBuf;
+
+use dataset::cloud_files::clouds_at;
+use localization::pgc::head_files::{encoder_of, head_file};
+use localization::pgc::{Localize, Localizer, LocalizerInput};
+use perception::inference::Inference;
+use protocol::PoseEstimate;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut arguments = std::env::args_os().skip(1).map(PathBuf::from);
+    let cloud = arguments.next().ok_or("which cloud?")?;
+    let head = head_file(&arguments.next().unwrap_or("town1".into()))?;
+    // The head names the encoder with which it was trained.
+    let mut localizer = Localizer::load(&encoder_of(&head)?, &head, Inference::default())?;
+    for file in clouds_at(&[cloud]) {
+        let file = file?;
+        let points = file.read()?.points;
+        let localization = localizer.localize(LocalizerInput::of(&points))?;
+        match localization.estimate {
+            PoseEstimate::Pose {
+                world_from_cav,
+                confidence,
+                ..
+            } => {
+                let [x, y, z] = world_from_cav.translation_m;
+                println!(
+                    "{}: x {x:.2} y {y:.2} z {z:.2} m, confidence {confidence:.3}",
+                    file.path().display()
+                );
+            }
+            PoseEstimate::NoPose { reason, .. } => {
+                println!("{}: no pose, {reason:?}", file.path().display());
+            }
+        }
+    }
+    Ok(())
+}
