@@ -78,8 +78,10 @@ impl<S> SweepPairing<S> {
     /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
     pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
+        // The wait goes on: with a period shorter than the time-out, none would ever be over if each sweep began anew.
+        let since = self.waiting.as_ref().map_or(now, |(_, _, since)| *since);
         self.waiting
-            .replace((capture_nanos, sweep, now))
+            .replace((capture_nanos, sweep, since))
             .map(|(_, superseded, _)| superseded)
     }
 
@@ -206,6 +208,20 @@ mod tests {
         assert_eq!(paired(&mut pairing, now), None);
         assert_eq!(pairing.add_pose(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 0)));
+    }
+
+    #[test]
+    fn sweeps_of_a_vehicle_without_gnss_are_computed_although_the_next_comes_before_the_time_out() {
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let [second, third, fourth] = [1, 2, 3].map(|period| now + period * TIMEOUT / 2);
+        assert_eq!(pairing.add_sweep(10, 'a', now), None);
+        assert_eq!(paired(&mut pairing, now), None);
+        assert_eq!(pairing.add_sweep(20, 'b', second), Some('a'));
+        assert_eq!(paired(&mut pairing, second), None);
+        assert_eq!(pairing.add_sweep(30, 'c', third), Some('b'));
+        assert_eq!(paired(&mut pairing, third), Some((30, 'c', None, 0)));
+        assert_eq!(pairing.add_sweep(40, 'd', fourth), None);
+        assert_eq!(paired(&mut pairing, fourth), Some((40, 'd', None, 0)));
     }
 
     #[test]

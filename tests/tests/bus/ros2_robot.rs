@@ -96,6 +96,15 @@ impl Robot {
     }
 }
 
+/// Requests a stop when a test ends, also by a failed assertion: no thread of the test keeps it waiting.
+struct StopAtEnd<'a>(&'a Stop);
+
+impl Drop for StopAtEnd<'_> {
+    fn drop(&mut self) {
+        self.0.request();
+    }
+}
+
 /// True if the last messages of tf have the odometry frame in the map, and nothing but it.
 fn has_odometry_in_map(tf: &Subscriber) -> bool {
     let messages: Vec<_> = tf.messages.try_iter().collect();
@@ -120,6 +129,7 @@ fn a_robot_gets_map_to_odom_and_its_agent_stays_when_the_node_comes_and_goes() {
     let stated = Arc::<Mutex<Vec<PoseMeasurement>>>::default();
     std::thread::scope(|scope| {
         let agent_stop = Stop::new();
+        let _agent_ends = StopAtEnd(&agent_stop);
         let agent = scope.spawn({
             let (router, stop, stated) = (&router, agent_stop.clone(), Arc::clone(&stated));
             move || {
@@ -140,6 +150,7 @@ fn a_robot_gets_map_to_odom_and_its_agent_stays_when_the_node_comes_and_goes() {
         let tf = Subscriber::open(&robot.session, &key("tf", TF, TF_HASH));
         for round in 0..2 {
             let stop = Stop::new();
+            let _node_ends = StopAtEnd(&stop);
             let node = start(scope, &router, (JAZZY, node_options()), &stop);
             wait_for_subscriptions(
                 &robot.session,
