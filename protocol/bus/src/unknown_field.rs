@@ -33,10 +33,11 @@ pub(crate) fn explained(reason: String, fields: &[String]) -> String {
             "unknown field `{unknown}`, did you mean `{name}`? The fields are {}",
             expected.join(", ")
         ),
-        None => match KINDS
-            .iter()
-            .find(|(field, _)| !expected.contains(field) && fields.iter().any(|own| own == field))
-        {
+        // A type with nested fields names no expected ones: only the unknown field itself tells the kind then.
+        None => match KINDS.iter().find(|(field, _)| match expected.is_empty() {
+            true => unknown == *field,
+            false => !expected.contains(field) && fields.iter().any(|own| own == field),
+        }) {
             Some((_, kind)) => format!("unknown field `{unknown}`: this is {kind}"),
             None => reason,
         },

@@ -47,7 +47,7 @@ fn shorten_tables(tables: &mut Value, scene: &Path, maps: &Path) {
     let fields = tables.as_object_mut().unwrap();
     fields.insert("dataset".into(), json!(scene));
     fields.insert("weights".into(), json!(WEIGHTS));
-    fields.insert("maps".into(), json!(maps));
+    fields.insert("feature_maps".into(), json!(maps));
     fields.insert("frames".into(), json!(1));
 }
 

@@ -217,7 +217,7 @@ fn a_bad_cloud_is_named_and_the_others_are_located() {
     let err = String::from_utf8_lossy(&none.stderr);
     assert_eq!(none.status.code(), Some(2));
     assert!(
-        err.contains("--head town-that-nobody-drove: no such file or released head"),
+        err.contains("town-that-nobody-drove: no such file or released head"),
         "{err}"
     );
 }

@@ -44,7 +44,11 @@ fn a_misspelt_field_is_named_with_file_and_line() {
 #[test]
 fn options_of_a_protocol_that_other_fields_choose_are_named() {
     let folder = tempfile::tempdir().unwrap();
-    for (option, value) in [("max_agents", "3"), ("ego", "unit"), ("agents", "vehicles")] {
+    for (option, value) in [
+        ("max_agents", "3"),
+        ("ego_kind", "unit"),
+        ("agent_kinds", "vehicles"),
+    ] {
         let scenario = write_scenario(
             folder.path(),
             1,
