@@ -479,7 +479,7 @@ fn bad_options_are_named() {
     });
     assert_eq!(
         agents,
-        "--vehicles is 4-2: must be a number or a range within 1-7"
+        "--vehicles is \"4-2\": must be a number or a range within 1-7"
     );
     let copies = message(SynthOptions {
         copies: vec![Weather::Sunny],
@@ -487,7 +487,7 @@ fn bad_options_are_named() {
     });
     assert_eq!(
         copies,
-        "--weather-copies is sunny: must be fog, snow or both"
+        "--weather-copies is \"sunny\": must be fog, snow or both"
     );
     let map = Some(RoadMapSource::OpenDrive("no/such/map.xodr".into()));
     let missing = message(SynthOptions {
