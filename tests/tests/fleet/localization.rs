@@ -386,7 +386,7 @@ fn an_agent_without_its_networks_does_not_start() {
         "--head",
         "/nowhere/h",
     ]);
-    assert!(code == Some(2) && output.contains("/nowhere/e"), "{output}");
+    assert!(code == Some(2) && output.contains("/nowhere/h"), "{output}");
     let (code, output) = run(&["--pose-source", "baseline"]);
     assert!(code == Some(2) && output.contains("--baseline"), "{output}");
     let (code, output) = run(&["--pose-source", "baseline", "--baseline", "/nowhere/w"]);

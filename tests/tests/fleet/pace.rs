@@ -68,7 +68,9 @@ impl Sweeps {
             self.lidar.submit(
                 (self.next + sweep) * PERIOD_NANOS,
                 Lidar {
-                    points: PointCloud::default(),
+                    points: PointCloud {
+                        xyzi: vec![[5.0, 0.0, 0.0, 0.5]],
+                    },
                 },
             );
             wait_for("the sweep", || {
