@@ -392,7 +392,7 @@ fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
         let file = folder.path().join("tables.yaml");
         let (data, init, maps) = (data.display(), init.display(), folder.path().join("maps"));
         let text = format!(
-            "dataset: {data}\nframes: 3\nmaps: {}\ntables:\n- name: noise\n  rows:\n  - {{method: none, weights: [{init}]}}\n{rows}\
+            "dataset: {data}\nframes: 3\nfeature_maps: {}\ntables:\n- name: noise\n  rows:\n  - {{method: none, weights: [{init}]}}\n{rows}\
              \x20 columns:\n  - name: true poses\n  - {{name: 1 m, poses: {{noisy: {{mode: independent, position_std_m: 1}}}}}}\n",
             maps.display()
         );
