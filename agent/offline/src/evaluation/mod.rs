@@ -273,7 +273,7 @@ fn outcome(estimate: &PoseEstimate) -> &'static str {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use super::*;
     use localization::pgc::synthetic::SyntheticScene;
     use protocol::PointCloud;

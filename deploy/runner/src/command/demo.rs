@@ -75,7 +75,7 @@ impl Arguments {
     /// Generates the scene, runs the methods and prints their metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let file = self.scenario()?;
-        let mut scenario = Scenario::read(&file)?;
+        let mut scenario = Scenario::read(&file).map_err(BadInput::of)?;
         scenario.scene.dir = self.scene()?;
         scenario.scene.rate = self.rate;
         let name = self.name.clone().unwrap_or_else(|| name_of_now("demo"));
@@ -86,7 +86,7 @@ impl Arguments {
             if self.view && Some(&method) == self.method.last() {
                 scenario.record.get_or_insert_default();
             }
-            scenario.check(&file)?;
+            scenario.check(&file).map_err(BadInput::of)?;
             let options = RunOptions {
                 runs: self.runs.clone(),
                 programs: programs()?,

@@ -101,7 +101,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     if scenario.clock == Clock::Stepped {
         return crate::run::stepped::run_scenario(scenario, options);
     }
-    let fleet = Fleet::plan(scenario)?;
+    let fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
     let run = fleet
         .scenario

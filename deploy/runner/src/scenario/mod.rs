@@ -5,7 +5,6 @@
 //! `deploy/scenarios/scenario.schema.json` describes them for editors.
 
 mod check;
-mod error;
 mod field_override;
 pub mod fingerprint;
 mod load;
@@ -28,7 +27,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sim_replay::config::{LinkSelection, RecordingConfig, SceneConfig};
 
-pub use error::ScenarioError;
 pub use field_override::FieldOverride;
 pub use overrides::AgentOverrides;
 

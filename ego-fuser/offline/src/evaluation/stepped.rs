@@ -17,6 +17,7 @@ use agent::config::AgentSettings;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
+use ego_fuser::config::EgoSettings;
 use link::{LinkConfig, LinkEmulator};
 use protocol::{
     CavId, Detections, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
@@ -61,7 +62,31 @@ pub struct SteppedConfig {
     pub lidar_variant: Option<String>,
 }
 
-/// Vehicles that take part.
+impl SteppedConfig {
+    /// All vehicles and ticks over a link, given with the folder of its trace, and an ego with these limits.
+    #[must_use]
+    pub fn new(
+        (link, link_folder): (LinkConfig, PathBuf),
+        seed: u64,
+        ego: &EgoSettings,
+        compute: ComputeTimes,
+    ) -> Self {
+        Self {
+            link,
+            link_folder,
+            seed,
+            deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
+            pairing: ego.pairing(),
+            compute,
+            crew: AgentPool::First(usize::MAX),
+            vehicles: BTreeMap::new(),
+            ticks: 0..usize::MAX,
+            lidar_variant: None,
+        }
+    }
+}
+
+/// Vehicles of a run in simulation time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum AgentPool {
     /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. Annotations of the
