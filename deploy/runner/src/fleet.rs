@@ -158,19 +158,16 @@ impl Fleet {
     }
 
     /// Rule of the counted objects: those of the protocol inside the area of the model.
-    #[must_use]
     pub(crate) fn ground_truth_rule(&self) -> GroundTruthRule {
         self.applied_protocol().ground_truth
     }
 
     /// The protocol with the ground-truth range as it is applied to the model.
-    #[must_use]
     pub(crate) fn applied_protocol(&self) -> EvaluationProtocol {
         self.protocol.within(self.detector.lidar_range_m)
     }
 
     /// Number of values in one feature map of the model, as transmitted.
-    #[must_use]
     pub(crate) fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
         u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
@@ -203,7 +200,6 @@ impl Fleet {
     }
 
     /// Principal of every process that the run may have, for its keys.
-    #[must_use]
     pub(crate) fn parties(&self) -> Vec<Principal> {
         let agents = self
             .agents

@@ -438,7 +438,6 @@ impl Evaluator {
 }
 
 /// The vehicles that lie completely over the area of a detector, as annotated by all agents within 70 m.
-#[must_use]
 pub(crate) fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
     GroundTruthRule {

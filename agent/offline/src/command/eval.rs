@@ -31,8 +31,7 @@ use perception::int8::InferencePrecision;
 use perception::weights::annotate;
 use protocol::config::Section;
 use serde_json::json;
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use super::scene_heads::{SceneHeadFile, by_head, with_files};
 use support::cli::{BadInput, Outcome};

@@ -12,8 +12,7 @@ use localization::pose_source::{
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use protocol::PoseEstimate;
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use super::scene_heads::{SceneHeadFile, head_of, with_files};
 use support::cli::{BadInput, Outcome};

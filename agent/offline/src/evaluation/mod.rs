@@ -17,9 +17,8 @@ pub use summary::{
 };
 pub use table::{write_csv, write_error_table};
 
-use localization::pgc::LocalizerError;
 use localization::pgc::confidence::{Confidence, Labelled};
-use localization::pgc::{Localization, Localize, LocalizerInput, stopwatch};
+use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use localization::pose_source::{PoseInput, PoseSource};
 use support::sampling::evenly_spread;
 
@@ -61,7 +60,6 @@ impl EvaluatedSweep {
     }
 
     /// Error of the pose that is published, if there is one.
-    #[must_use]
     pub(crate) fn told_error(&self) -> Option<PoseError> {
         self.localization
             .estimate

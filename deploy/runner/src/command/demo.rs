@@ -13,13 +13,10 @@ use runner::experiment::report;
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
-use support::output;
-use support::progress;
-use support::shared_files;
+use support::{output, progress, shared_files};
 
 use super::programs;
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Seeds from here on are never trained with.
 const SEED: u64 = 1000;

@@ -22,13 +22,11 @@ use protocol::config::{FieldError, Section};
 use runner::experiment::evaluation::{EvaluationOptions, Part, evaluate};
 use runner::experiment::report;
 use runner::experiment::table::{self, TableObserver, TableSpec};
-use support::output;
-use support::progress;
+use support::{output, progress};
 use training::feature_store::KeptMaps;
 
 use super::left_out;
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options that a file of tables states itself.
 const OF_ONE_TABLE: [&str; 22] = [

@@ -6,8 +6,7 @@ use std::path::Path;
 
 use deploy::operate::progress::bytes;
 use deploy::score::metrics::{ByIou, Contribution, Metrics, PartPrecision, Percentiles};
-use fusion::Exchange;
-use fusion::Method;
+use fusion::{Exchange, Method};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::PoseSourceConfig;
 use support::output;

@@ -56,7 +56,6 @@ pub(crate) struct ProcessReport {
 impl LedgerReport {
     /// Report on `ledgers`, whose sum is `sum`; processes that were offline, and the number of messages exempt for
     /// that.
-    #[must_use]
     pub(crate) fn new(
         ledgers: &[ProcessStats],
         sum: &Ledger,
@@ -81,7 +80,6 @@ impl LedgerReport {
     }
 
     /// Adds the requests that the router of the run refused.
-    #[must_use]
     pub(crate) fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
         let refused = refused.iter().map(
             |(

@@ -10,7 +10,6 @@ use crate::run::run_fleet::RunResult;
 const OVERLOAD: [DropReason; 2] = [DropReason::Superseded, DropReason::Stale];
 
 /// Reasons for exit code 3 and what would help; `None` if nothing was lost beyond the drops of the link.
-#[must_use]
 pub(crate) fn sentence(result: &RunResult) -> Option<String> {
     let reasons = reasons(result);
     let help = help(result);

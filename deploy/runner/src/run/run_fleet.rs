@@ -19,17 +19,15 @@ use deploy::operate::supervise::{ProcessSpec, Supervisor};
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
 use deploy::score::metrics::Metrics;
-use deploy::score::offline_intervals;
-use deploy::score::{FrameScores, Progress, Scored, ScorerNode};
+use deploy::score::{FrameScores, Progress, Scored, ScorerNode, offline_intervals};
 use protocol::{Ledger, Reconciliation, RunId};
 use support::output;
 use support::provenance::Provenance;
 
 use crate::fleet::{Fleet, SessionContext};
-use crate::run::RunError;
 use crate::run::capacity::{estimate_apart, remedies};
 use crate::run::ledger_report::LedgerReport;
-use crate::run::loss;
+use crate::run::{RunError, loss};
 use crate::scenario::{Clock, Scenario};
 
 /// Update interval of the display.

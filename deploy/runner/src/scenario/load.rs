@@ -23,7 +23,6 @@ impl Scenario {
     ///
     /// # Panics
     /// Never: every field has a spelling in YAML.
-    #[must_use]
     pub(crate) fn to_yaml(&self) -> String {
         serde_saphyr::to_string(self).expect("plain structs, texts and numbers")
     }

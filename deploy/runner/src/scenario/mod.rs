@@ -140,7 +140,6 @@ impl Scenario {
     }
 
     /// Settings of vehicle `cav`: `agents`, with its own entry of `vehicles` on top.
-    #[must_use]
     pub(crate) fn settings_of(&self, cav: &CavId) -> AgentSettings {
         self.vehicles
             .get(cav)

@@ -18,8 +18,7 @@ use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
 use perception::inference::Inference;
 use protocol::CavId;
-use support::output;
-use support::progress;
+use support::{output, progress};
 use tch::Device;
 
 use super::scenarios;

@@ -18,12 +18,10 @@ use fusion::Method;
 use perception::int8::InferencePrecision;
 use perception::weights::{KIND_KEY, Weights};
 use serde_json::{Value, json};
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 use support::file_digests::FileDigests;
-use support::output;
-use support::progress;
 use support::provenance::Provenance;
+use support::{output, progress};
 
 /// A data set with its evaluation protocol.
 struct Data {
