@@ -62,6 +62,13 @@ impl FeatureCache {
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, Error> {
+        let RunConfig {
+            seed,
+            loader_threads,
+            precision,
+            device,
+            ..
+        } = *run;
         let total = list.len() * augmentation.copies.max(1);
         let format = encoder.format().clone();
         let source = Arc::clone(list);
@@ -74,7 +81,7 @@ impl FeatureCache {
                     number as usize / source.len(),
                 );
                 let sweep = source.posed_sweep(index, format.range_m())?;
-                let mut rng = ChaCha8Rng::seed_from_u64(run.seed);
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 rng.set_stream(number);
                 let (turn, keep) = match copy {
                     0 => (Isometry3::identity(), 1.0),
@@ -90,19 +97,19 @@ impl FeatureCache {
             });
             prepared.flatten().collect()
         };
-        let mut loader = Prefetch::start(run.loader_threads, 0, prepare);
+        let mut loader = Prefetch::start(loader_threads, 0, prepare);
         let rows = (total * CELLS) as i64;
-        let mut builder = Builder::new(rows, encoder.format().cell_channels(), run.device)?;
+        let mut builder = Builder::new(rows, encoder.format().cell_channels(), device)?;
         let mut done = 0;
         while done < total {
             let batch = loader.next_batch()?;
             if !batch.is_empty() {
-                builder.add(&batch, encoder, run.precision.kind(), run.device)?;
+                builder.add(&batch, encoder, precision.kind(), device)?;
             }
             done = (done + BATCH as usize).min(total);
             progress(done, total);
         }
-        builder.finish(run.device)
+        builder.finish(device)
     }
 
     /// Number of sweeps.

@@ -69,22 +69,21 @@ impl DiffLocConfig {
     /// # Errors
     /// [`FieldError`] of the first field that is wrong.
     pub fn validate(&self) -> Result<(), FieldError> {
-        within("image.rows", &self.image.rows, 1, 4096)?;
-        within("image.columns", &self.image.columns, 1, 4096)?;
-        let [low, high] = &self.image.elevations_deg;
+        let RangeImageConfig {
+            rows,
+            columns,
+            elevations_deg,
+            ..
+        } = self.image;
+        within("image.rows", rows, 1, 4096)?;
+        within("image.columns", columns, 1, 4096)?;
+        let [low, high] = elevations_deg;
         let rises = -90.0 <= low && low < high && high <= 90.0;
         let rule = "must rise, from -90 to 90";
-        require(
-            rises,
-            "image.elevations_deg",
-            &self.image.elevations_deg,
-            rule,
-        )?;
+        require(rises, "image.elevations_deg", elevations_deg, rule)?;
         let [height, width] = self.patch;
-        let divides = height >= 1
-            && width >= 1
-            && &self.image.rows as i64 % height == 0
-            && &self.image.columns as i64 % width == 0;
+        let divides =
+            height >= 1 && width >= 1 && rows as i64 % height == 0 && columns as i64 % width == 0;
         require(divides, "patch", self.patch, "must divide the image")?;
         let widths = [
             ("width", self.width),

@@ -51,15 +51,15 @@ impl PoseDenoiser {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, TchError> {
+        let DiffLocConfig {
+            denoiser_width: width,
+            heads,
+            denoiser_layers,
+            ..
+        } = *config;
         let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + config.width + 1;
         let layer = |number: usize| {
-            TransformerLayer::new(
-                &(path / "layers" / number),
-                config.denoiser_width,
-                config.heads,
-                EXPANSION,
-                0.0,
-            )
+            TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, 0.0)
         };
         let half = STEP_CHANNELS / 2;
         let harmonics: Vec<f32> = (0..HARMONICS)
@@ -70,11 +70,11 @@ impl PoseDenoiser {
             .collect();
         let table = |values: &[f32]| Tensor::f_from_slice(values)?.f_to_device(path.device());
         Ok(Self {
-            inward: Dense::new(&(path / "inward"), inputs, config.denoiser_width, 0.7),
+            inward: Dense::new(&(path / "inward"), inputs, width, 0.7),
             layers: (0..denoiser_layers).map(layer).collect(),
-            norm: LayerNorm::new(&(path / "norm"), config.denoiser_width),
+            norm: LayerNorm::new(&(path / "norm"), width),
             outward: [
-                Dense::new(&(path / "outward" / 0), config.denoiser_width, LAST, 1.0),
+                Dense::new(&(path / "outward" / 0), width, LAST, 1.0),
                 Dense::new(&(path / "outward" / 1), LAST, POSE, 0.1),
             ],
             frequencies: table(&harmonics)?,

@@ -75,7 +75,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;
-    let more = serde_json::json!({"&summary.preparing_seconds": &summary.preparing_seconds, "&summary.accuracy": &summary.accuracy, "&summary.cells_shown": &summary.cells_shown});
+    let SceneSummary {
+        preparing_seconds,
+        accuracy,
+        cells_shown,
+        ..
+    } = summary;
+    let more = serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
     args.options.print(&summary.trained, &more)?;
     Ok(())
 }
