@@ -81,21 +81,12 @@ impl LedgerReport {
 
     /// Adds the requests that the router of the run refused.
     pub(crate) fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
-        let refused = refused.iter().map(
-            |(
-                Rejection {
-                    peer,
-                    message,
-                    reason,
-                },
-                count,
-            )| RefusedReport {
-                peer: peer.clone(),
-                message: message.clone(),
-                reason: reason.clone(),
-                count: *count,
-            },
-        );
+        let refused = refused.iter().map(|(of, count)| RefusedReport {
+            peer: of.peer.clone(),
+            message: of.message.clone(),
+            reason: of.reason.clone(),
+            count: *count,
+        });
         Self {
             refused: refused.collect(),
             ..self
