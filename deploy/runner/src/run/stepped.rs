@@ -43,11 +43,8 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
         None => evaluator.measure(&fleet.recorded)?,
     };
     stepped.compute = Some(compute);
-    let run = fleet
-        .scenario
-        .run
-        .clone()
-        .unwrap_or_else(|| name_of_now(options.prefix));
+    let named = fleet.scenario.run.clone();
+    let run = named.unwrap_or_else(|| name_of_now(options.prefix));
     let config = stepped_config(&fleet, compute).map_err(|error| RunError::Fleet(error.into()))?;
     let mut evaluator = evaluator.with_link(config);
     let folder = RunFolder::create(&options.runs, &run)?;
@@ -124,11 +121,8 @@ fn play(
     evaluator: &mut Evaluator,
     folder: &RunFolder,
 ) -> Result<FrameScores, RunError> {
-    let mut board = FrameScores::new(
-        fleet.ego.clone(),
-        fleet.ground_truth_rule(),
-        fleet.map_values(),
-    );
+    let (rule, map_values) = (fleet.ground_truth_rule(), fleet.map_values());
+    let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
     let unwritable = |source| RunFolderError::Write {
         path: folder.path().to_owned(),
         source,
@@ -159,13 +153,8 @@ fn write(
 ) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
-    let metrics = metrics(
-        board,
-        evaluator,
-        "stepped",
-        fleet.pose_source(),
-        board.seconds(),
-    );
+    let (poses, seconds) = (fleet.pose_source(), board.seconds());
+    let metrics = metrics(board, evaluator, "stepped", poses, seconds);
     let provenance = fleet.provenance(&options.programs);
     let provenance = provenance
         .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))
