@@ -103,16 +103,17 @@ pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
             texts.collect::<BTreeSet<_>>().len() > 1
         })
         .collect();
-    let precisions: [(&str, fn(&Metrics) -> Option<f64>); 2] = [
-        ("AP@0.5", |metrics| metrics.ap_global.at_50),
-        ("AP@0.7", |metrics| metrics.ap_global.at_70),
-    ];
     let mut figures = Vec::new();
     for &dimension in &varying {
-        let charts = precisions.iter().filter_map(|(title, precision)| {
-            chart(experiment, runs, dimension, &varying, title, *precision)
-        });
-        let (name, charts) = (dimension.name, charts.collect::<Vec<_>>());
+        let chart = |title: &str, precision: fn(&Metrics) -> Option<f64>| {
+            chart(experiment, runs, dimension, &varying, title, precision)
+        };
+        let charts = [
+            chart("AP@0.5", |metrics| metrics.ap_global.at_50),
+            chart("AP@0.7", |metrics| metrics.ap_global.at_70),
+        ];
+        let charts: Vec<Chart> = charts.into_iter().flatten().collect();
+        let name = dimension.name;
         if !charts.is_empty() {
             figures.push(Figure { name, charts });
         }
