@@ -88,7 +88,7 @@ impl Scenario {
             let files = settings.pose.files().into_iter();
             places.extend(files.map(|file| ("agents.pose", file.to_owned())));
         }
-        for (field, missing) in places.iter().filter(|(_, file)| !file.exists()) {
+        if let Some((field, missing)) = places.iter().find(|(_, file)| !file.exists()) {
             let problem = format_args!("{field}: {} does not exist", missing.display());
             return Err(FileError::new(path, problem));
         }
