@@ -181,6 +181,7 @@ mod tests {
     use super::*;
     use crate::experiment::cell::CellKey;
     use deploy::score::metrics::{Communication, Metrics};
+    use support::provenance::Provenance;
 
     fn cell(method: Method, at_50: f64) -> Cell {
         let ap = ByIou {
