@@ -19,17 +19,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::CavId;
-use crate::IdError;
-use crate::KeyExpr;
-use crate::Limits;
-use crate::ProcessId;
-use crate::Role;
-use crate::RunId;
-use crate::Stream;
-use crate::Topic;
-use crate::Verb;
 use crate::string_enum::written_as_text;
+use crate::{CavId, IdError, KeyExpr, Limits, ProcessId, Role, RunId, Stream, Topic, Verb};
 
 /// Name of a process in its certificate: `agent-4279`, `replay`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

@@ -4,8 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Limits;
-use crate::WireError;
+use crate::{Limits, WireError};
 
 /// Bound of the edges of a grid, metres: far beyond any sensor.
 const MAX_EDGE_M: f64 = 1e4;

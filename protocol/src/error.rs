@@ -1,11 +1,8 @@
 //! Errors of messages, and the drop reason under which each is counted.
 
 use crate::CavId;
-use crate::DropReason;
-use crate::IdError;
-use crate::InvalidPose;
-use crate::Kind;
 use crate::header::{HEADER_LEN, MAGIC, WIRE_VERSION};
+use crate::{DropReason, IdError, InvalidPose, Kind};
 
 /// Error of decoding or encoding a message.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

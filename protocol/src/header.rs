@@ -22,10 +22,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::CavId;
-use crate::IdError;
-use crate::Kind;
-use crate::WireError;
+use crate::{CavId, IdError, Kind, WireError};
 
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"V2VL";

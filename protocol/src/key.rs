@@ -18,16 +18,8 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::CavId;
-use crate::IdError;
-use crate::ProcessId;
-use crate::Role;
-use crate::RunId;
-use crate::RunScope;
-use crate::Stream;
-use crate::Topic;
-use crate::Verb;
 use crate::text::excerpt;
+use crate::{CavId, IdError, ProcessId, Role, RunId, RunScope, Stream, Topic, Verb};
 
 /// First chunk of every key.
 pub(crate) const KEY_ROOT: &str = "v2v";

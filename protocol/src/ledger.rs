@@ -20,12 +20,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::DropReason;
-use crate::ProcessId;
-use crate::RateReason;
-use crate::Reconciliation;
-use crate::Topic;
 use crate::reconciliation::Discrepancy;
+use crate::{DropReason, ProcessId, RateReason, Reconciliation, Topic};
 
 /// Key of a set of counters: a topic and its receiver (`None`: any receiver).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -7,10 +7,8 @@ use bincode::config::{Configuration, Limit, LittleEndian, Varint};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::Kind;
-use crate::Limits;
-use crate::WireError;
 use crate::text::excerpt;
+use crate::{Kind, Limits, WireError};
 
 const HARD_LIMIT: usize = Limits::HARD_METADATA_BYTES as usize;
 

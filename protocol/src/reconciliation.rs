@@ -5,11 +5,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Account;
-use crate::Counts;
-use crate::Ledger;
-use crate::ProcessId;
-use crate::Topic;
+use crate::{Account, Counts, Ledger, ProcessId, Topic};
 
 /// Result of [`Ledger::balance`].
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]

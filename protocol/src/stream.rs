@@ -5,9 +5,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::KeyError;
-use crate::Kind;
 use crate::string_enum::written_as_text;
+use crate::{KeyError, Kind};
 
 /// A stream of one vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -68,7 +67,6 @@ impl Stream {
 
     /// Limit of the size of a message of this stream, bytes; `None`: limited by the transport only. For processes that
     /// forward messages without reading them.
-    #[must_use]
     pub(crate) fn most_bytes(self) -> Option<usize> {
         match self {
             Self::Pose | Self::Gnss | Self::Imu | Self::Pace => Some(16 << 10),

@@ -5,15 +5,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::CavId;
-use crate::IdError;
-use crate::Key;
-use crate::KeyError;
-use crate::ProcessId;
-use crate::RunId;
-use crate::Stream;
 use crate::key::{MAX_KEY_BYTES, shown};
 use crate::string_enum::{named, written_as_text};
+use crate::{CavId, IdError, Key, KeyError, ProcessId, RunId, Stream};
 
 named! {
     /// Role of a process in a run, part of its liveliness token.

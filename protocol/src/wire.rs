@@ -6,13 +6,10 @@
 
 use crc32fast::Hasher;
 
-use crate::Body;
-use crate::Limits;
-use crate::WireError;
 use crate::body::{PayloadReader, check_body};
 use crate::header::{HEADER_LEN, Header, Stamp};
 use crate::message::{Message, MessageSource, MessageVisitor, Payload};
-use crate::metadata;
+use crate::{Body, Limits, WireError, metadata};
 
 /// A message as it is transmitted: `head`, then `body`, nothing between or after.
 #[derive(Debug, Clone, PartialEq)]

@@ -31,7 +31,7 @@ pub(crate) struct Args {
 /// Those of the configuration, the models and the bus.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let config = args.config.validated().map_err(BadInput::of)?;
+    let config = args.config.validated()?;
     config.models.threads.apply();
     let agent = agent(&config).map_err(BadInput::of)?;
     let stop = config.bus.stop().context("installing signal handlers")?;

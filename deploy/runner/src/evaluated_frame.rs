@@ -7,30 +7,18 @@ use protocol::CavId;
 
 /// Scores a frame; if compute times are emulated, its stamp is the time of publication.
 pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
-    let EvaluatedFrame {
-        tick,
-        stamp,
-        result,
-        frames,
-        poses,
-        truth,
-        failure,
-    } = frame;
-    let poses: Vec<_> = frames
-        .iter()
-        .map(|frame| frame.cav.clone())
-        .zip(poses)
-        .collect();
-    let world_from_lidar: Vec<(CavId, _)> = frames
-        .iter()
+    let (stamp, frames) = (frame.stamp, frame.frames);
+    let cavs = frames.iter().map(|frame| frame.cav.clone());
+    let poses: Vec<_> = cavs.zip(frame.poses).collect();
+    let world_from_lidar: Vec<(CavId, _)> = { frames.iter() }
         .filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?)))
         .collect();
     let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
     board.judge_whole(
-        (tick as u64, stamp.capture_nanos),
+        (frame.tick as u64, stamp.capture_nanos),
         latency_ms,
-        failure.is_none().then_some(result),
-        &truth,
+        frame.failure.is_none().then_some(frame.result),
+        &frame.truth,
         &poses,
         world_from_lidar,
     );

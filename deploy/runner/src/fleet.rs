@@ -1,6 +1,5 @@
 //! Fleet of a scenario: its vehicles, its processes, and the configuration of each.
 
-mod error;
 mod processes;
 mod routes;
 
@@ -8,6 +7,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use agent::config::{AgentSettings, FleetPlace, Publish};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::ground_truth::GroundTruthRule;
 use dataset::{self, OpenOptions, Problem, Scenario as Recorded, findings};
@@ -30,7 +30,6 @@ use support::file_digests::FileDigests;
 use support::provenance::Provenance;
 use tch::Device;
 
-pub use self::error::FleetError;
 pub use self::processes::SessionContext;
 use crate::scenario::Scenario;
 use crate::scenario::fingerprint::{collect, files_of};
@@ -61,106 +60,60 @@ pub struct Fleet {
 }
 
 /// Refuses options of a protocol that a live run takes from other fields.
-fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
-    let options = [
+fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<()> {
+    for (option, is_given) in [
         ("agent_kinds", protocol.agent_kinds.is_some()),
         ("ego_kind", protocol.ego_kind.is_some()),
         ("max_agents", protocol.max_agents.is_some()),
-    ];
-    match options.iter().find(|(_, is_given)| *is_given) {
-        Some((option, _)) => Err(FleetError::Protocol(format!(
-            "{option}: choose by scene.agents and ego.id instead"
-        ))),
-        None => Ok(()),
+    ] {
+        ensure!(
+            !is_given,
+            "protocol: {option}: choose by scene.agents and ego.id instead"
+        );
     }
+    Ok(())
 }
 
 impl Fleet {
     /// Reads scene and weights.
     ///
     /// # Errors
-    /// [`FleetError`] names what the scene or the weights lack.
-    pub fn plan(scenario: &Scenario) -> Result<Self, FleetError> {
+    /// An error that names what the scene or the weights lack.
+    pub fn plan(scenario: &Scenario) -> Result<Self> {
         let mut scenario = scenario.clone();
         scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
-        let detector = Weights::load(&scenario.models.weights)?.detector_config()?;
+        let weights = &scenario.models.weights;
+        let detector = { Weights::load(weights) }
+            .and_then(|weights| weights.detector_config())
+            .context("weights")?;
         // As the ego-fuser does: weights of another method are refused before any process starts.
-        Ego::load(&scenario.models.weights, Some(scenario.method), Device::Cpu)?;
-        scenario.poses().iter().try_for_each(load_networks)?;
+        Ego::load(weights, Some(scenario.method), Device::Cpu).context("weights")?;
+        let loaded = scenario.poses().iter().try_for_each(load_networks);
+        loaded.context("localizer")?;
         if let Some(link) = &scenario.link {
             LinkEmulator::open(&link.model, link.seed)?;
         }
         let scene = &mut scenario.scene;
-        let dataset = dataset::open_with(&scene.dir, &open_options(scene))?;
+        let options = OpenOptions {
+            intensity_scale: scene.intensity_scale,
+            ..OpenOptions::default()
+        };
+        let dataset = dataset::open_with(&scene.dir, &options).context("scene")?;
         chosen_elsewhere(&scenario.protocol)?;
-        let protocol = scenario
-            .protocol
-            .resolve(dataset.layout)
-            .map_err(FleetError::Protocol)?;
-        let recorded = match &scene.scenario {
-            None => dataset
-                .scenarios
-                .first()
-                .ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
-            Some(name) => dataset
-                .scenarios
-                .iter()
-                .find(|known| known.name == *name)
-                .ok_or_else(|| FleetError::NoScenario {
-                    dir: scene.dir.clone(),
-                    asked: name.clone(),
-                    found: dataset
-                        .scenarios
-                        .iter()
-                        .map(|known| known.name.clone())
-                        .collect(),
-                })?,
-        };
+        let protocol = scenario.protocol.resolve(dataset.layout);
+        let protocol = protocol.map_err(|error| anyhow!("protocol: {error}"))?;
+        let recorded = scenario_of(&dataset.scenarios, scene)?;
         let name = recorded.name.clone();
-        if recorded.ticks.is_empty() {
-            let agents = recorded.agents.iter().map(ToString::to_string).collect();
-            return Err(FleetError::NoFrames {
-                dir: scene.dir.clone(),
-                name,
-                agents,
-            });
-        }
-        if scene.seek >= recorded.ticks.len() {
-            return Err(FleetError::Seek {
-                seek: scene.seek,
-                name,
-                ticks: recorded.ticks.len(),
-            });
-        }
-        let known = |field, cav: &CavId| {
-            if recorded.agents.contains(cav) {
-                return Ok(());
+        let names = scene.agents.iter().map(|cav| ("scene.agents", cav));
+        let names = names.chain(scenario.ego.id.iter().map(|cav| ("ego.id", cav)));
+        let names = names.chain(scenario.vehicles.keys().map(|cav| ("vehicles", cav)));
+        let remote = scenario.remote_agents.iter();
+        for (field, cav) in names.chain(remote.map(|cav| ("remote_agents", cav))) {
+            if !recorded.agents.contains(cav) {
+                let found = texts(&recorded.agents);
+                bail!("{field} names vehicle {cav}, but scenario {name} has {found:?}");
             }
-            let found = recorded.agents.iter().map(ToString::to_string).collect();
-            Err(FleetError::NoVehicle {
-                field,
-                cav: cav.clone(),
-                name: name.clone(),
-                found,
-            })
-        };
-        scene
-            .agents
-            .iter()
-            .try_for_each(|cav| known("scene.agents", cav))?;
-        scenario
-            .ego
-            .id
-            .iter()
-            .try_for_each(|cav| known("ego.id", cav))?;
-        scenario
-            .vehicles
-            .keys()
-            .try_for_each(|cav| known("vehicles", cav))?;
-        scenario
-            .remote_agents
-            .iter()
-            .try_for_each(|cav| known("remote_agents", cav))?;
+        }
         let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
         let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
@@ -174,11 +127,11 @@ impl Fleet {
             if needs_poses
                 && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek))
             {
-                return Err(FleetError::NoPoses {
-                    cav: cav.clone(),
-                    source_name: pose.name(),
-                    name,
-                });
+                bail!(
+                    "vehicle {cav}: pose is {}, but scenario {name} has no poses of it (no lidar_pose); choose pose: pgc, \
+                     which finds them",
+                    pose.name()
+                );
             }
         }
         let scene = &mut scenario.scene;
@@ -205,19 +158,16 @@ impl Fleet {
     }
 
     /// Rule of the counted objects: those of the protocol inside the area of the model.
-    #[must_use]
     pub(crate) fn ground_truth_rule(&self) -> GroundTruthRule {
         self.applied_protocol().ground_truth
     }
 
     /// The protocol with the ground-truth range as it is applied to the model.
-    #[must_use]
     pub(crate) fn applied_protocol(&self) -> EvaluationProtocol {
         self.protocol.within(self.detector.lidar_range_m)
     }
 
     /// Number of values in one feature map of the model, as transmitted.
-    #[must_use]
     pub(crate) fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
         u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
@@ -250,7 +200,6 @@ impl Fleet {
     }
 
     /// Principal of every process that the run may have, for its keys.
-    #[must_use]
     pub(crate) fn parties(&self) -> Vec<Principal> {
         let agents = self
             .agents
@@ -332,12 +281,34 @@ impl Fleet {
     }
 }
 
-/// Options with which a scenario's data set is opened.
-fn open_options(scene: &SceneConfig) -> OpenOptions {
-    OpenOptions {
-        intensity_scale: scene.intensity_scale,
-        ..OpenOptions::default()
-    }
+/// The scenario of a data set that a scene names, or the first. Refuses one without a frame to play.
+fn scenario_of<'a>(scenarios: &'a [Recorded], scene: &SceneConfig) -> Result<&'a Recorded> {
+    let dir = scene.dir.display();
+    let recorded = match &scene.scenario {
+        None => { scenarios.first() }
+            .with_context(|| format!("scene {dir}: there is no scenario in it"))?,
+        Some(asked) => {
+            { scenarios.iter().find(|known| known.name == *asked) }.with_context(|| {
+                let found: Vec<_> = scenarios.iter().map(|known| &known.name).collect();
+                format!("scene {dir}: there is no scenario {asked:?}; it has {found:?}")
+            })?
+        }
+    };
+    let (name, seek, ticks) = (&recorded.name, scene.seek, recorded.ticks.len());
+    let agents = texts(&recorded.agents);
+    ensure!(
+        ticks > 0,
+        "scene {dir}: scenario {name} has no frame that all of {agents:?} have"
+    );
+    ensure!(
+        seek < ticks,
+        "scene.seek is {seek}, but scenario {name} has {ticks} ticks"
+    );
+    Ok(recorded)
+}
+
+fn texts(agents: &[CavId]) -> Vec<String> {
+    agents.iter().map(ToString::to_string).collect()
 }
 
 /// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.

@@ -12,7 +12,7 @@
 //! ```
 //! use runner::scenario::Scenario;
 //!
-//! # fn main() -> Result<(), runner::scenario::ScenarioError> {
+//! # fn main() -> Result<(), support::file_error::FileError> {
 //! let scenario = Scenario::read("../scenarios/demo.yaml".as_ref())?;
 //! assert_eq!(scenario.method.name(), "max");
 //! # Ok(())

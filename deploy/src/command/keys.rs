@@ -8,8 +8,7 @@ use protocol::{CavId, Principal, Role};
 use serde_json::json;
 use support::output;
 
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {

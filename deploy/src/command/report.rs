@@ -6,8 +6,7 @@ use crate::operate::status::RunStatus;
 use crate::report::{Comparison, RunReport};
 use support::output;
 
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {

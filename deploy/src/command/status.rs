@@ -11,8 +11,7 @@ use protocol::RunId;
 use support::output;
 
 use super::viewer_bus;
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Time of observation: processes report twice a second.
 const OBSERVED: Duration = Duration::from_millis(2500);

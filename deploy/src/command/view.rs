@@ -11,8 +11,7 @@ use protocol::RunId;
 use support::output;
 
 use super::viewer_bus;
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Niceness of the viewer relative to the processes of a run. Not the largest value: on a machine without spare time
 /// the page would show nothing.

@@ -91,7 +91,6 @@ pub(crate) struct Health {
 
 impl Health {
     /// No process yet. One that is silent for `hang`, or for `start` after it was started, is to be replaced.
-    #[must_use]
     pub(crate) fn new(hang: Duration, start: Duration) -> Self {
         Self {
             processes: BTreeMap::new(),
@@ -198,7 +197,6 @@ impl Health {
     }
 
     /// Status of every process.
-    #[must_use]
     pub(crate) fn statuses(&self, now: Instant) -> Vec<ProcessStatus> {
         let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
         let status = |(name, noted): (&String, &Noted)| {

@@ -4,8 +4,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use crate::score::Progress;
 

@@ -169,7 +169,6 @@ impl FrameScores {
     }
 
     /// Errors of all vehicles' poses.
-    #[must_use]
     pub(crate) fn pose_errors(&self) -> PoseErrors {
         PoseErrors::of(&self.pose_errors, self.no_pose)
     }

@@ -58,7 +58,6 @@ impl OfflineIntervals {
 
     /// Processes that were offline so far. One that does not return counts too, except the replay, which leaves when
     /// the scene is over.
-    #[must_use]
     pub(crate) fn so_far(&self) -> BTreeSet<String> {
         let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         let replay = Role::Replay.to_string();

@@ -25,7 +25,6 @@ pub struct StageStamps {
 impl StageStamps {
     /// Stamps of a tick with publication times, Unix nanoseconds: of the tick `began_nanos`, of the ego's pose
     /// `posed_nanos`, of its detections `detected_nanos`. `stages` are the durations of the ego's stages.
-    #[must_use]
     pub(crate) fn of(
         began_nanos: u64,
         posed_nanos: Option<u64>,
@@ -66,7 +65,6 @@ impl StageStamps {
     }
 
     /// Milliseconds from the publication of the tick to `nanos`.
-    #[must_use]
     pub(crate) fn since_began_ms(&self, nanos: u64) -> Option<f64> {
         self.began_nanos.map(|began| ms_between(began, nanos))
     }

@@ -252,16 +252,10 @@ impl Evaluator {
 
     /// Settings of the vehicle of an index, where it has none of its own; that of the first is the ego.
     fn settings(&self, scenario: &Scenario, index: usize) -> AgentSettings {
-        let EvaluateConfig {
-            pose_source,
-            codec,
-            rate,
-            ..
-        } = &self.config;
         let settings = AgentSettings {
-            pose: pose_source.clone(),
-            codec: *codec,
-            rate: *rate,
+            pose: self.config.pose_source.clone(),
+            codec: self.config.codec,
+            rate: self.config.rate,
             falsification: None,
         };
         settings.in_fleet(FleetPlace {
@@ -281,14 +275,10 @@ impl Evaluator {
     ) -> Result<Participant, EvaluateError> {
         let detector =
             Detector::from_weights(&self.weights, &self.weights.detector_config()?, Device::Cpu)?;
-        let place = scenario
-            .agents
-            .iter()
-            .position(|agent| agent == cav)
-            .unwrap_or(0);
+        let place = scenario.agents.iter().position(|agent| agent == cav);
         let attack = match settings.falsification {
             Some(falsification) => Some(Attack::new(falsification, cav, 0)),
-            None => self.config.attack.and_then(|attack| attack.of(place, cav)),
+            None => { self.config.attack }.and_then(|attack| attack.of(place.unwrap_or(0), cav)),
         };
         let inference = Inference::new(Device::Cpu, self.config.precision);
         let agent = Agent::new(cav.clone(), settings.pose.build(inference)?, detector);
@@ -331,11 +321,8 @@ impl Evaluator {
             capture_nanos: own.capture_nanos,
             sent,
         });
-        let (neighbours, bytes): (Vec<View>, Vec<_>) = self
-            .arrived(own.capture_nanos)
-            .iter()
-            .filter_map(Sent::received)
-            .unzip();
+        let arrived = self.arrived(own.capture_nanos).iter();
+        let (neighbours, bytes): (Vec<View>, Vec<_>) = arrived.filter_map(Sent::received).unzip();
         let output = match own.view() {
             Some(view) => self.detect(scenario, tick, &view, &neighbours)?,
             // Every method needs the ego's own view, so it has failed.
@@ -345,16 +332,11 @@ impl Evaluator {
             Ok(output) => (output, None),
             Err(reason) => (EgoOutput::default(), Some(reason)),
         };
+        let of_own = (&own.cav, own.pose, own.capture_nanos);
         Ok(EvaluatedFrame {
             tick,
             stamp: stamp(&own.cav, own.capture_nanos),
-            result: self.report(
-                tick,
-                (&own.cav, own.pose, own.capture_nanos),
-                &neighbours,
-                &bytes,
-                output,
-            ),
+            result: self.report(tick, of_own, &neighbours, &bytes, output),
             failure,
             truth: GroundTruth::of_tick(&frames.iter().collect::<Vec<_>>(), 0, &self.rule),
             frames,
@@ -438,7 +420,6 @@ impl Evaluator {
 }
 
 /// The vehicles that lie completely over the area of a detector, as annotated by all agents within 70 m.
-#[must_use]
 pub(crate) fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
     GroundTruthRule {

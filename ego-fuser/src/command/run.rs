@@ -24,10 +24,7 @@ impl Arguments {
     /// Loads the model, joins the run and works until the own agent ends.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         log_to_stderr();
-        let config = self
-            .config
-            .validated()
-            .map_err(|error| BadInput::new(error.to_string()))?;
+        let config = self.config.validated()?;
         let EgoConfig {
             run,
             models,

@@ -1,78 +1,30 @@
 //! Configuration files: YAML of a bounded size into typed values, with errors that state file, line and field.
 
 use std::collections::BTreeMap;
-use std::fmt::{self, Display};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use protocol::config::FieldError;
 use serde::de::{DeserializeOwned, IgnoredAny};
 use support::bounded_file;
+use support::file_error::{AtFile, FileError};
 
 use super::unknown_field;
 
 /// Maximum size of a file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Error of a configuration file.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The file cannot be read or written.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Error of the system.
-        source: std::io::Error,
-    },
-    /// The file is not YAML, or a field is unknown, missing or of the wrong kind.
-    #[error("{}{}: {reason}", path.display(), line.map_or(String::new(), |line| format!(":{line}")))]
-    Syntax {
-        /// The file.
-        path: PathBuf,
-        /// Line of the error, from 1.
-        line: Option<u64>,
-        /// Description of the error.
-        reason: String,
-    },
-    /// A field has a value that is not allowed. `path` is absent for values of the command line.
-    #[error("{}{error}", Origin(path.as_deref()))]
-    Value {
-        /// The file.
-        path: Option<PathBuf>,
-        /// Field, value and rule.
-        error: FieldError,
-    },
-}
-
-struct Origin<'a>(Option<&'a Path>);
-
-impl Display for Origin<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0
-            .map_or(Ok(()), |path| write!(f, "{}: ", path.display()))
-    }
-}
-
 /// Reads a YAML file of at most 1 MiB.
 ///
 /// # Errors
-/// [`ConfigError`] states the file, and the line if there is one.
-pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
-    let unreadable = |source| ConfigError::Io {
-        path: path.into(),
-        source,
-    };
-    parse(
-        &bounded_file::read_text(path, MAX_BYTES).map_err(unreadable)?,
-        path,
-    )
+/// [`FileError`] states the file, and the line if there is one.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, FileError> {
+    parse(&bounded_file::read_text(path, MAX_BYTES).at(path)?, path)
 }
 
 /// Parses YAML; `path` is stated in errors.
 ///
 /// # Errors
-/// [`ConfigError::Syntax`].
-pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, ConfigError> {
+/// [`FileError`].
+pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, FileError> {
     serde_saphyr::from_str(text).map_err(|error| {
         // A file that is no YAML may begin like one with an unknown field.
         let (error, field) = match serde_saphyr::from_str::<IgnoredAny>(text) {
@@ -84,10 +36,12 @@ pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, ConfigEr
             _ => fields_of(text),
         };
         let reason = unknown_field::explained(reason(&error), &fields);
-        ConfigError::Syntax {
-            path: path.into(),
+        FileError {
             line: error.location().map(|location| location.line()),
-            reason: field.map_or(reason.clone(), |field| format!("{field}: {reason}")),
+            ..FileError::new(
+                path,
+                field.map_or(reason.clone(), |field| format!("{field}: {reason}")),
+            )
         }
     })
 }
@@ -178,17 +132,6 @@ mod tests {
         assert!(
             unknown.contains("a.yaml:2: ") && unknown.contains("rat"),
             "{unknown}"
-        );
-        let error = FieldError::new("rate", f64::NAN, "must be 0 to 1");
-        let found = ConfigError::Value {
-            path: Some("a.yaml".into()),
-            error: error.clone(),
-        }
-        .to_string();
-        assert_eq!(found, "a.yaml: rate is NaN: must be 0 to 1");
-        assert_eq!(
-            ConfigError::Value { path: None, error }.to_string(),
-            "rate is NaN: must be 0 to 1"
         );
     }
 }

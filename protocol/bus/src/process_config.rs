@@ -11,8 +11,10 @@ use protocol::config::{FieldError, document, options_of};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
+use support::cli::BadInput;
+use support::file_error::FileError;
 
-use super::config_file::{self, ConfigError};
+use super::config_file;
 
 /// Configuration of one process.
 pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
@@ -63,13 +65,13 @@ impl<C: ProcessConfig> Configured<C> {
     /// The configuration, its values checked.
     ///
     /// # Errors
-    /// [`ConfigError::Value`] states file, field and value.
-    pub fn validated(self) -> Result<C, ConfigError> {
-        let Self { file, config } = self;
-        config
-            .validate()
-            .map_err(|error| ConfigError::Value { path: file, error })?;
-        Ok(config)
+    /// [`BadInput`] states file, field and value.
+    pub fn validated(self) -> Result<C, BadInput> {
+        match (self.config.validate(), self.file) {
+            (Ok(()), _) => Ok(self.config),
+            (Err(error), Some(file)) => Err(BadInput::of(FileError::new(file, error))),
+            (Err(error), None) => Err(BadInput::of(error)),
+        }
     }
 }
 

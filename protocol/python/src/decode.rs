@@ -1,16 +1,14 @@
 //! Messages of the wire format, one at a time.
 
 use protocol::{CavId, Header, Key, Kind, Limits, Message as WireMessage, Topic, wire};
-use pyo3::types::PyAnyMethods;
-use pyo3::types::{PyDict, PyDictMethods};
+use pyo3::types::{PyAnyMethods, PyDict, PyDictMethods};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pyfunction, pymethods};
 
-use crate::arrays;
 use crate::error::error;
 use crate::frame::Agent;
 use crate::frame_parts::{AgentParts, decode_stream};
-use crate::json;
 use crate::payload::{Bev, Camera, DecodedBev, Detections, PoseEstimate};
+use crate::{arrays, json};
 
 /// One message: header and payload.
 #[pyclass(frozen, get_all, module = "v2vloc")]

@@ -2,9 +2,8 @@
 
 use std::fmt::Display;
 
-use pyo3::PyErr;
-use pyo3::create_exception;
 use pyo3::exceptions::PyValueError;
+use pyo3::{PyErr, create_exception};
 
 create_exception!(
     v2vloc,

@@ -4,10 +4,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::BevGrid;
-use crate::WireError;
 #[cfg(feature = "config")]
 use crate::config::FieldError;
+use crate::{BevGrid, WireError};
 
 /// Widest kernel of the smoothing, cells.
 const MAX_KERNEL: u32 = 63;

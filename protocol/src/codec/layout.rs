@@ -3,9 +3,7 @@
 use std::ops::Range;
 
 use super::{Codec, Dtype, Selection};
-use crate::BevGrid;
-use crate::Limits;
-use crate::WireError;
+use crate::{BevGrid, Limits, WireError};
 
 /// Byte ranges of the parts of an unpacked body, and its number of cells.
 pub(super) struct Layout {

@@ -25,13 +25,8 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use crate::BevFeatures;
-use crate::BevGrid;
-use crate::Body;
-use crate::BodyShape;
-use crate::Limits;
-use crate::WireError;
 use crate::body::check_values;
+use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, WireError};
 
 use layout::Layout;
 

@@ -9,10 +9,8 @@ use super::{
     Codec, CodecConfig, Compression, Dtype, EncodedFeatures, Layout, Selection, encode_features,
     selection,
 };
-use crate::BevFeatures;
-use crate::Limits;
-use crate::WireError;
 use crate::string_enum::named;
+use crate::{BevFeatures, Limits, WireError};
 
 /// Bytes of a message with a feature map that are reserved for header and metadata.
 pub const HEAD_BYTES: u64 = 256;

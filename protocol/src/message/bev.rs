@@ -3,15 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Payload, PoseEstimate, private};
-use crate::BevGrid;
-use crate::Body;
-use crate::BodyShape;
-use crate::Codec;
-use crate::EncodedFeatures;
-use crate::Kind;
-use crate::Limits;
-use crate::RateChoice;
-use crate::WireError;
+use crate::{
+    BevGrid, Body, BodyShape, Codec, EncodedFeatures, Kind, Limits, RateChoice, WireError,
+};
 
 /// A BEV feature map: agent to ego, for intermediate fusion.
 ///

@@ -3,9 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{PoseEstimate, check_detections, metadata_only};
-use crate::Detection;
-use crate::Limits;
-use crate::WireError;
+use crate::{Detection, Limits, WireError};
 
 /// Detections of one agent: agent to ego, for late fusion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -3,12 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Payload, check_pose, check_within, private, wrong_body};
-use crate::Body;
-use crate::BodyShape;
-use crate::Kind;
-use crate::Limits;
-use crate::Pose;
-use crate::WireError;
+use crate::{Body, BodyShape, Kind, Limits, Pose, WireError};
 
 /// Largest edge of an image, pixels.
 const MAX_EDGE_PX: u32 = 1 << 14;

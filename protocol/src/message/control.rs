@@ -3,11 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, check_within, metadata_only};
-use crate::Limits;
-use crate::ProcessId;
-use crate::Topic;
-use crate::Verb;
-use crate::WireError;
+use crate::{Limits, ProcessId, Topic, Verb, WireError};
 
 /// One request or notification; [`Control::verb`] gives its key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -6,12 +6,8 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, metadata_only};
-use crate::BevGrid;
-use crate::Dtype;
-use crate::Limits;
-use crate::Stream;
-use crate::WireError;
 use crate::string_enum::written_as_text;
+use crate::{BevGrid, Dtype, Limits, Stream, WireError};
 
 /// Model and streams of an agent: agent to ego, once it is ready and to every late joiner.
 ///

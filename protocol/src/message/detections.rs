@@ -6,13 +6,7 @@ use super::{
     PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos,
     check_within, metadata_only,
 };
-use crate::CavId;
-use crate::Detection;
-use crate::DropReason;
-use crate::Limits;
-use crate::MisbehaviourReason;
-use crate::Stamp;
-use crate::WireError;
+use crate::{CavId, Detection, DropReason, Limits, MisbehaviourReason, Stamp, WireError};
 
 /// The result of one ego frame: ego-fuser to anyone, also as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -3,8 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_within, metadata_only};
-use crate::Limits;
-use crate::WireError;
+use crate::{Limits, WireError};
 
 /// Motion of a vehicle as its own sensors measure it at one time, wheels and IMU: replay to that vehicle's agent.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]

@@ -3,9 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_pose, check_within, metadata_only};
-use crate::Limits;
-use crate::Pose;
-use crate::WireError;
+use crate::{Limits, Pose, WireError};
 
 /// A pose from outside, to that vehicle's agent: from the replay, or from the node of a ROS 2 network.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

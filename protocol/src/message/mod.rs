@@ -21,11 +21,7 @@ mod truth;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::Body;
-use crate::BodyShape;
-use crate::Limits;
-use crate::Pose;
-use crate::WireError;
+use crate::{Body, BodyShape, Limits, Pose, WireError};
 
 pub use bev::{Bev, BevMetadata};
 pub use boxes::Boxes;

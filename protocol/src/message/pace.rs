@@ -3,8 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::metadata_only;
-use crate::Limits;
-use crate::WireError;
+use crate::{Limits, WireError};
 
 /// Pace of an ego: one sweep per interval is computed by every vehicle, the same by all. Ego to agents.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

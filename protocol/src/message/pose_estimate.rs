@@ -3,9 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_pose, check_within, metadata_only};
-use crate::Limits;
-use crate::Pose;
-use crate::WireError;
+use crate::{Limits, Pose, WireError};
 
 /// Pose estimate of an agent, or the reason why it has none: agent to ego, on its own as soon as it is known, and again
 /// in every message that needs it.

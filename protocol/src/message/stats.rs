@@ -3,11 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, check_name, check_nanos, check_within, metadata_only};
-use crate::Ledger;
-use crate::Limits;
-use crate::ProcessId;
-use crate::Topic;
-use crate::WireError;
+use crate::{Ledger, Limits, ProcessId, Topic, WireError};
 
 /// Largest CPU time of a process that a receiver accepts, seconds: a thousand cores for a year.
 const MAX_CPU_S: f64 = 3.2e10;

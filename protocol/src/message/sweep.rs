@@ -3,12 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Payload, PoseEstimate, private, wrong_body};
-use crate::Body;
-use crate::BodyShape;
-use crate::Kind;
-use crate::Limits;
-use crate::PointCloud;
-use crate::WireError;
+use crate::{Body, BodyShape, Kind, Limits, PointCloud, WireError};
 
 /// A LiDAR sweep of one vehicle: replay to that vehicle's agent.
 ///

@@ -3,11 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_box_from, check_count, check_name, check_pose, check_within, metadata_only};
-use crate::Box3d;
-use crate::CavId;
-use crate::Limits;
-use crate::Pose;
-use crate::WireError;
+use crate::{Box3d, CavId, Limits, Pose, WireError};
 
 /// Ground truth of one tick: replay to scorer, on a key of its own, so that no pipeline can use it by accident.
 ///

@@ -1,9 +1,8 @@
 //! Command line: parsing with the options of all programs, shell completions and manual pages.
 
 use std::env;
-use std::io;
 use std::path::Path;
-use std::process;
+use std::{io, process};
 
 use clap::{Arg, ArgAction, ArgMatches, Command, CommandFactory, Parser};
 use clap_complete::Shell;

@@ -5,10 +5,9 @@
 
 use std::env;
 use std::ffi::OsString;
-use std::io;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process;
+use std::{io, process};
 
 use clap::{Arg, ArgAction, ArgMatches, Command};
 

@@ -149,7 +149,7 @@ fn values<T: hdf5_reader::H5Type>(
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use proptest::prelude::*;
 
     use super::*;

@@ -163,4 +163,4 @@ impl Opv2v {
 }
 
 #[cfg(test)]
-pub(super) mod tests;
+pub(crate) mod tests;

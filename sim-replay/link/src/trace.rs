@@ -4,10 +4,9 @@ use std::path::Path;
 
 use protocol::text::excerpt;
 
-use support::bounded_file;
 use support::csv_file::{CsvFile, CsvRow};
 use support::file_error::{AtFile, FileError};
-use support::rounding;
+use support::{bounded_file, rounding};
 
 /// First line of a CSV trace.
 const HEADER: &str = "time_s,bandwidth_mbps,latency_ms,loss";

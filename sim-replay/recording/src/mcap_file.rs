@@ -10,12 +10,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use mcap::Message;
 use mcap::records::op;
 
-use super::RecordingError;
 use super::chunk::{Channels, in_words, unpack};
 use super::damage::Damage;
-use super::is_own;
 use super::lengths::{self, RECORD_HEAD};
 use super::records::{RawRecord, Records};
+use super::{RecordingError, is_own};
 
 /// Unpacked chunks in the cache: neighbours in time are neighbours in the file.
 const KEPT_CHUNKS: usize = 4;

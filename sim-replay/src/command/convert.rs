@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, IntensityScale, OpenOptions};
 use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use support::cli::Outcome;
 

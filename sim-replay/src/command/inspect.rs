@@ -7,8 +7,7 @@ use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{IntensityScale, OpenOptions, layouts_text};
 use serde::Serialize;
 use sim_replay::inspect::{Report, inspect, inspect_map};
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use support::cli::Outcome;
 

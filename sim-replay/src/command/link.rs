@@ -76,10 +76,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
 
 fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let config = match args.config.validated() {
-        Ok(config) => config,
-        Err(error) => return Ok(Outcome::bad_input(&error)),
-    };
+    let config = args.config.validated()?;
     let emulator = match LinkEmulator::open(&config.link.model, config.link.seed) {
         Ok(emulator) => emulator,
         Err(error) => return Ok(Outcome::bad_input(&error)),

@@ -24,10 +24,7 @@ pub(crate) struct Args {
 /// Records and prints a summary to standard output.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let config = match args.config.validated() {
-        Ok(config) => config,
-        Err(error) => return Ok(Outcome::bad_input(&error)),
-    };
+    let config = args.config.validated()?;
     let stop = config.bus.stop().context("installing signal handlers")?;
     let bus = config
         .bus

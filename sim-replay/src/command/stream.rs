@@ -31,10 +31,7 @@ pub(crate) struct Args {
 /// Plays the scene and prints a summary to standard output.
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let config = match args.config.validated() {
-        Ok(config) => config,
-        Err(error) => return Ok(Outcome::bad_input(&error)),
-    };
+    let config = args.config.validated()?;
     let scenario = match open(&config.scene) {
         Ok(scenario) => scenario,
         Err(error) => return Ok(Outcome::bad_input(&format_args!("{error:#}"))),

@@ -10,8 +10,7 @@ use simulator::generate::{
     self, ImageSize, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather,
 };
 use simulator::map::RoadMapSource;
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use support::cli::{BadInput, Outcome};
 

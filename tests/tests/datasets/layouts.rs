@@ -6,6 +6,7 @@ use std::path::Path;
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::pcd::{self, Encoding, IntensityField};
 use dataset::{self, Layout, OpenOptions};
+use ego_fuser_offline::evaluation::EvaluateConfig;
 use fusion::Method;
 use protocol::PointCloud;
 use runner::experiment::evaluation::{EvaluationOptions, evaluate};
@@ -32,7 +33,10 @@ const WEIGHTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/weights");
 fn average_precision(scene: &Path, method: Method) -> Value {
     let options = EvaluationOptions {
         dataset: scene.to_owned(),
-        weights: WEIGHTS.into(),
+        settings: EvaluateConfig {
+            weights: WEIGHTS.into(),
+            ..EvaluateConfig::default()
+        },
         // One protocol for all: each layout has its own otherwise.
         protocol: ProtocolConfig {
             preset: Some("opv2v".into()),

@@ -31,8 +31,7 @@ use perception::int8::InferencePrecision;
 use perception::weights::annotate;
 use protocol::config::Section;
 use serde_json::json;
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use super::scene_heads::{SceneHeadFile, by_head, with_files};
 use support::cli::{BadInput, Outcome};
@@ -230,24 +229,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn subject(&self, head: &Path, left_out: &mut LeftOut) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            return Ok(Subject::Localizer(self.localizer(
-                head,
-                self.inference()?,
-                left_out,
-            )?));
+            let localizer = self.localizer(head, self.inference()?, left_out)?;
+            return Ok(Subject::Localizer(localizer));
         }
-        if !self.map_spacing_m.is_finite() || self.map_spacing_m < 0.0 {
-            return Err(BadInput::new(format!(
-                "--map-spacing-m is {}, must be 0 or more",
-                self.map_spacing_m
-            )));
+        let spacing_m = self.map_spacing_m;
+        if !spacing_m.is_finite() || spacing_m < 0.0 {
+            let reason = format!("--map-spacing-m is {spacing_m}, must be 0 or more");
+            return Err(BadInput::new(reason));
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.icp_map, self.map_spacing_m, &config).map_err(BadInput::of)?;
-        Ok(Subject::Source(Box::new(IcpMapPose::new(
-            Arc::new(map),
-            config,
-        ))))
+        let map = read_map(&self.icp_map, spacing_m, &config).map_err(BadInput::of)?;
+        let source = IcpMapPose::new(Arc::new(map), config);
+        Ok(Subject::Source(Box::new(source)))
     }
 
     /// True unless another method takes the place of the head.
@@ -256,10 +249,9 @@ impl Args {
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
-        let device = self
-            .device
-            .open()
-            .map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        let device = self.device.open();
+        let device =
+            device.map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(Inference::new(device, self.precision))
     }
 
@@ -270,9 +262,8 @@ impl Args {
             ..self.tracker.0.clone()
         };
         config.validate().map_err(BadInput::of)?;
-        Ok(Subject::Source(Box::new(
-            TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?,
-        )))
+        let source = TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?;
+        Ok(Subject::Source(Box::new(source)))
     }
 
     fn localizer(
@@ -324,10 +315,8 @@ impl Args {
         };
         let database = read_database(&self.retrieval, &localizer, left_out, &mut on_sweep);
         bar.finish_and_clear();
-        Ok(Box::new(Retrieval::new(
-            localizer,
-            database.map_err(BadInput::of)?,
-        )))
+        let database = database.map_err(BadInput::of)?;
+        Ok(Box::new(Retrieval::new(localizer, database)))
     }
 
     fn encoder(&self, head: &Path) -> Result<PathBuf, BadInput> {
@@ -348,12 +337,8 @@ impl Args {
             bar.set_position(done as u64);
         };
         let evaluated = match subject {
-            Subject::Localizer(mut localizer) => {
-                evaluate(localizer.as_mut(), &options, &mut on_sweep)
-            }
-            Subject::Source(mut source) => {
-                evaluate_source(source.as_mut(), &options, &mut on_sweep)
-            }
+            Subject::Localizer(mut localizer) => evaluate(&mut *localizer, &options, &mut on_sweep),
+            Subject::Source(mut source) => evaluate_source(&mut *source, &options, &mut on_sweep),
         };
         bar.finish_and_clear();
         match evaluated {
@@ -373,9 +358,9 @@ impl Args {
             head.display()
         ));
         let confidence = Confidence::Calibrated(model);
-        sweeps
-            .iter_mut()
-            .for_each(|sweep| sweep.judge_again(&confidence));
+        for sweep in sweeps {
+            sweep.judge_again(&confidence);
+        }
         Ok(report)
     }
 
@@ -401,12 +386,8 @@ fn map_text(scenes: &[PathBuf]) -> Option<String> {
 }
 
 fn report_line(report: &FitReport) -> String {
-    let FitReport {
-        sweeps,
-        bad,
-        bad_rejected,
-        good_rejected,
-    } = report;
+    let (sweeps, bad) = (report.sweeps, report.bad);
+    let (bad_rejected, good_rejected) = (report.bad_rejected, report.good_rejected);
     let good = sweeps - bad;
     format!(
         "fitted to {sweeps} poses: rejects {bad_rejected} of {bad} bad ones, {good_rejected} of {good} good ones"
@@ -484,10 +465,6 @@ fn table(summary: &LocalizationSummary) -> String {
             percent(exceeded_share)
         )
     });
-    lines
-        .into_iter()
-        .chain(integrity)
-        .collect::<Vec<_>>()
-        .join("\n")
-        + "\n"
+    let lines = lines.into_iter().chain(integrity);
+    lines.map(|line| line + "\n").collect()
 }

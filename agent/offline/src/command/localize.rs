@@ -11,12 +11,11 @@ use localization::pose_source::{
 };
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
-use protocol::PoseEstimate;
-use support::output;
-use support::progress;
+use support::{output, progress};
 
 use super::scene_heads::{SceneHeadFile, head_of, with_files};
 use support::cli::{BadInput, Outcome};
+use tch::Device;
 
 /// Localize every sweep of scenes once and write poses and confidences to a table, for training and evaluation.
 ///
@@ -47,10 +46,9 @@ pub(crate) struct Args {
 /// Localizes the scenarios that are not in the table yet.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
-    let done = if args.out.exists() {
-        PoseTable::read(&args.out).map_err(bad)?
-    } else {
-        PoseTable::default()
+    let done = match args.out.exists() {
+        true => PoseTable::read(&args.out).map_err(bad)?,
+        false => PoseTable::default(),
     };
     let mut scenarios = Vec::new();
     for folder in &args.dataset {
@@ -66,12 +64,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let first_head = heads.first().copied();
     let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
-        let scenes: Vec<String> = args
-            .dataset
-            .iter()
-            .map(|scene| scene.display().to_string())
-            .collect();
-        return Err(bad(anyhow::anyhow!("no sweep in {}", scenes.join(", "))));
+        return Err(bad(anyhow::anyhow!("no sweep in {:?}", args.dataset)));
     }
     let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
@@ -107,10 +100,7 @@ impl Args {
             ..PgcConfig::default()
         };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
-        let inference = Inference {
-            precision: self.precision,
-            ..Inference::default()
-        };
+        let inference = Inference::new(Device::Cpu, self.precision);
         for (agent, cav) in scenario.agents.iter().enumerate() {
             let mut source = LocalizedPose::pgc(&config, inference).map_err(bad)?;
             for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
@@ -140,10 +130,10 @@ impl Args {
             }
         }
         PoseTable::append(&self.out, &scenario.name, &rows)?;
-        Ok(rows
+        let poses = rows
             .iter()
-            .filter(|row| matches!(row.estimate, PoseEstimate::Pose { .. }))
-            .count())
+            .filter(|row| row.estimate.world_from_cav().is_some());
+        Ok(poses.count())
     }
 }
 

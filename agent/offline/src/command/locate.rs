@@ -16,6 +16,7 @@ use protocol::{NoPoseReason, PoseEstimate};
 use serde::Serialize;
 use support::cli::{BadInput, Outcome};
 use support::output;
+use tch::Device;
 
 /// Find the pose of single point clouds: no other sensor, no earlier pose.
 ///
@@ -109,10 +110,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     let head = head_file(&args.head).map_err(BadInput::of)?;
     let encoder = encoder_or_named(args.encoder.as_deref(), &head).map_err(BadInput::of)?;
-    let inference = Inference {
-        precision: args.precision,
-        ..Inference::default()
-    };
+    let inference = Inference::new(Device::Cpu, args.precision);
     let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
     let (mut points, mut sweeps) = (Vec::new(), Vec::new());
@@ -144,11 +142,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
              it? Its map is {map}"
         ));
     }
-    let folder = args
-        .clouds
-        .first()
-        .map(PathBuf::as_path)
-        .unwrap_or(Path::new(""));
+    let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);
     let sweeps: Vec<&SweepFindings> = sweeps.iter().collect();
     findings::note(&findings::of_clouds(folder, &sweeps, IntensityScale::AUTO));
     if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &points) {
@@ -172,13 +166,10 @@ impl Args {
         let name = |file: &CloudFile| file.path().display().to_string();
         let (cloud, read) = match file {
             Ok(file) => (name(&file), file.read()),
-            Err(error) => (
-                error
-                    .path()
-                    .map(|path| path.display().to_string())
-                    .unwrap_or_default(),
-                Err(error),
-            ),
+            Err(error) => {
+                let path = error.path().map(|path| path.display().to_string());
+                (path.unwrap_or_default(), Err(error))
+            }
         };
         let Cloud {
             mut points,
@@ -190,19 +181,9 @@ impl Args {
             Err(error) => return Ok(Located::unreadable(cloud, map, &error)),
         };
         sweeps.push(findings);
-        let (count, y_axis) = (
-            points.len(),
-            if is_of_data_set {
-                YAxis::Left
-            } else {
-                self.y_axis
-            },
-        );
-        let mirror = |points: &mut protocol::PointCloud| {
-            points
-                .xyzi
-                .iter_mut()
-                .for_each(|point| point[1] = -point[1])
+        let (count, y_axis) = match is_of_data_set {
+            true => (points.len(), YAxis::Left),
+            false => (points.len(), self.y_axis),
         };
         if y_axis == YAxis::Right {
             mirror(&mut points);
@@ -248,12 +229,18 @@ fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
     }
 }
 
+/// Negates y, in place.
+fn mirror(points: &mut protocol::PointCloud) {
+    points
+        .xyzi
+        .iter_mut()
+        .for_each(|point| point[1] = -point[1]);
+}
+
 impl LocatedPose {
     fn of(found: FoundPose) -> Self {
-        let (translation, rotation) = (
-            found.world_from_sensor.translation,
-            found.world_from_sensor.rotation,
-        );
+        let pose = found.world_from_sensor;
+        let (translation, rotation) = (pose.translation, pose.rotation);
         let (roll, pitch, yaw) = rotation.euler_angles();
         Self {
             position_m: translation.vector.into(),
@@ -283,19 +270,13 @@ impl Located {
 
     /// One line for a person.
     fn text(&self) -> String {
-        let Self {
-            cloud,
-            inliers,
-            points,
-            ..
-        } = self;
+        let (cloud, inliers, points) = (&self.cloud, self.inliers, self.points);
         if let Some(error) = &self.error {
             return format!("error: {error}");
         }
-        let mirrored = if self.is_mirrored {
-            ", y of the file negated"
-        } else {
-            ""
+        let mirrored = match self.is_mirrored {
+            true => ", y of the file negated",
+            false => "",
         };
         let Some(pose) = &self.pose else {
             let reason = self.no_pose.unwrap_or("failed");

@@ -99,34 +99,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn config(&self) -> anyhow::Result<MapConfig> {
         check_folders(&self.drives)?;
-        let time = Duration::try_from_secs_f64(60.0 * self.minutes)
-            .ok()
-            .filter(|time| !time.is_zero());
-        let time = time.ok_or_else(|| {
-            BadInput::new(format!("--minutes is {}, must be above 0", self.minutes))
-        })?;
+        let minutes = self.minutes;
+        let time = Duration::try_from_secs_f64(60.0 * minutes).ok();
+        let time = time.filter(|time| !time.is_zero());
+        let time =
+            time.ok_or_else(|| BadInput::new(format!("--minutes is {minutes}, must be above 0")))?;
         check_out(&self.out, self.resume, self.force).map_err(BadInput::of)?;
         let missing = || BadInput::new("no released encoder is found: --encoder FILE");
-        let encoder = self
-            .encoder
-            .clone()
-            .or_else(released_encoder)
-            .ok_or_else(missing)?;
+        let encoder = self.encoder.clone().or_else(released_encoder);
+        let encoder = encoder.ok_or_else(missing)?;
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let threads = self.threads.map_or((cores / 2).clamp(1, 16), usize::from);
         tch::set_num_threads(i32::try_from(threads).unwrap_or(1));
-        let device = self
-            .device
-            .open()
-            .map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        let device = self.device.open();
+        let device =
+            device.map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
         Ok(MapConfig {
             drives: self.drives.clone(),
             place: self.name.clone().unwrap_or_else(|| name_of(&self.out)),
             encoder,
             time,
-            most_sweeps: self
-                .sweeps
-                .map(|count| usize::try_from(count).unwrap_or(usize::MAX)),
+            most_sweeps: self.sweeps.map(|count| count as usize),
             run: RunConfig {
                 learning_rate: 2e-3,
                 seed: self.seed,
@@ -144,10 +137,10 @@ impl Args {
 
 fn name_of(folder: &Path) -> String {
     let absolute = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    absolute.file_name().map_or_else(
-        || "place".to_owned(),
-        |name| name.to_string_lossy().into_owned(),
-    )
+    let name = absolute
+        .file_name()
+        .map(|name| name.to_string_lossy().into_owned());
+    name.unwrap_or_else(|| "place".to_owned())
 }
 
 /// Report as text.
@@ -200,12 +193,8 @@ fn write(config: &MapConfig, report: &MapReport) -> anyhow::Result<()> {
     );
     card.row("copies of each sweep", report.copies);
     card.row("encoder", format_args!("`{ENCODER_FILE}` beside the head"));
-    card.row(
-        "accuracy",
-        report
-            .held_out
-            .map_or("not measured".to_owned(), |accuracy| accuracy.text()),
-    );
+    let accuracy = report.held_out.map(|accuracy| accuracy.text());
+    card.row("accuracy", accuracy.as_deref().unwrap_or("not measured"));
     card.row("driven", report.coverage_text());
     card.row(
         "time of everything",

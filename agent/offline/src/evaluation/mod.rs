@@ -7,9 +7,7 @@ use crate::Error;
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
-use dataset::{
-    self, Dataset, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, Scenario, findings,
-};
+use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, Scenario, findings};
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
@@ -17,9 +15,8 @@ pub use summary::{
 };
 pub use table::{write_csv, write_error_table};
 
-use localization::pgc::LocalizerError;
 use localization::pgc::confidence::{Confidence, Labelled};
-use localization::pgc::{Localization, Localize, LocalizerInput, stopwatch};
+use localization::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use localization::pose_source::{PoseInput, PoseSource};
 use support::sampling::evenly_spread;
 
@@ -61,7 +58,6 @@ impl EvaluatedSweep {
     }
 
     /// Error of the pose that is published, if there is one.
-    #[must_use]
     pub(crate) fn told_error(&self) -> Option<PoseError> {
         self.localization
             .estimate
@@ -135,21 +131,14 @@ pub fn evaluate_source(
 ) -> Result<Evaluated, Error> {
     let mut ask = |frame: &Frame| {
         let measured = frame.gnss_world_from_lidar();
-        let Frame {
-            cav,
-            capture_nanos,
-            points,
-            ..
-        } = frame;
         let mut times = stopwatch();
-        let (capture_nanos, motion) = (*capture_nanos, frame.motion());
         let input = PoseInput {
-            cav,
-            capture_nanos,
-            cloud: points,
+            cav: &frame.cav,
+            capture_nanos: frame.capture_nanos,
+            cloud: &frame.points,
             levels: None,
             measured: measured.as_ref(),
-            motion,
+            motion: frame.motion(),
         };
         let estimate = source.estimate(&input);
         source.observe(&input);
@@ -185,33 +174,20 @@ fn evaluate_with(
         sweeps: Vec::with_capacity(chosen.len()),
         left_out: LeftOut::default(),
     };
-    for Dataset {
-        scenarios,
-        problems,
-        ..
-    } in &datasets
-    {
-        evaluated.left_out.add_files(problems);
-        let findings = findings::sampled(scenarios, IntensityScale::AUTO);
+    for dataset in &datasets {
+        evaluated.left_out.add_files(&dataset.problems);
+        let findings = findings::sampled(&dataset.scenarios, IntensityScale::AUTO);
         evaluated.left_out.add_findings(findings);
     }
-    for (
-        place,
-        &Sweep {
-            scenario,
-            agent,
-            tick,
-        },
-    ) in chosen.iter().enumerate()
-    {
+    for (place, sweep) in chosen.iter().enumerate() {
+        let (scenario, agent, tick) = (sweep.scenario, sweep.agent, sweep.tick);
         on_sweep(place + 1, chosen.len());
         let frame = match scenario.load(agent, tick, &load) {
             Ok(frame) => frame,
             Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
             Err(error) => {
-                evaluated
-                    .left_out
-                    .add_unreadable(agent, Problem::from(&error));
+                let problem = Problem::from(&error);
+                evaluated.left_out.add_unreadable(agent, problem);
                 continue;
             }
         };
@@ -273,7 +249,7 @@ fn outcome(estimate: &PoseEstimate) -> &'static str {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use super::*;
     use localization::pgc::synthetic::SyntheticScene;
     use protocol::PointCloud;

@@ -119,18 +119,9 @@ impl LocalizationSummary {
             .iter()
             .filter_map(EvaluatedSweep::told_error)
             .collect();
-        let metres = sorted(
-            &published
-                .iter()
-                .map(|error| error.distance_m)
-                .collect::<Vec<_>>(),
-        );
-        let degrees = sorted(
-            &published
-                .iter()
-                .map(|error| error.angle_deg)
-                .collect::<Vec<_>>(),
-        );
+        let metres: Vec<f64> = published.iter().map(|error| error.distance_m).collect();
+        let degrees: Vec<f64> = published.iter().map(|error| error.angle_deg).collect();
+        let (metres, degrees) = (sorted(&metres), sorted(&degrees));
         let success = |limit_m: f64| {
             metres.iter().filter(|&&error_m| error_m < limit_m).count() as f64
                 / sweeps.len().max(1) as f64
@@ -144,9 +135,8 @@ impl LocalizationSummary {
         let calibration = calibration(&judged);
         let mut outcomes = BTreeMap::new();
         for sweep in sweeps {
-            *outcomes
-                .entry(outcome(&sweep.localization.estimate))
-                .or_default() += 1;
+            let outcome = outcome(&sweep.localization.estimate);
+            *outcomes.entry(outcome).or_default() += 1;
         }
         let total_ms: Vec<f64> = sweeps
             .iter()

@@ -37,15 +37,13 @@ fn csv(sweeps: &[EvaluatedSweep]) -> String {
 }
 
 fn row(sweep: &EvaluatedSweep) -> Vec<String> {
-    let EvaluatedSweep {
-        scenario,
-        cav,
-        stem,
-        truth,
-        localization,
-    } = sweep;
-    let mut fields = vec![scenario.clone(), cav.to_string(), stem.clone()];
-    fields.extend(pose(truth));
+    let localization = &sweep.localization;
+    let mut fields = vec![
+        sweep.scenario.clone(),
+        sweep.cav.to_string(),
+        sweep.stem.clone(),
+    ];
+    fields.extend(pose(&sweep.truth));
     let outcome = outcome(&localization.estimate).to_owned();
     if let (Some(found), Some(error)) = (&localization.found, sweep.error()) {
         fields.extend(pose(&found.world_from_sensor.into()));
@@ -57,10 +55,8 @@ fn row(sweep: &EvaluatedSweep) -> Vec<String> {
         fields.push(outcome);
         fields.resize(fields.len() + 15, String::new());
     }
-    fields.push(format!(
-        "{:.3}",
-        localization.times.total().as_secs_f64() * 1e3
-    ));
+    let total_ms = localization.times.total().as_secs_f64() * 1e3;
+    fields.push(format!("{total_ms:.3}"));
     fields
 }
 
@@ -78,23 +74,14 @@ fn evidence_fields(evidence: &PoseEvidence) -> Vec<String> {
         .map(four),
     );
     let second = evidence.second.as_ref().map(|second| {
-        let [ratio, rms, epsilon, moved, quartile, worst] = [
-            second.inlier_ratio,
-            second.rms_m,
-            second.median_epsilon_m,
-            second.moved_m,
-            second.residual_quartile_m,
-            second.worst_axis_std_m,
-        ]
-        .map(four);
         [
-            ratio,
-            rms,
-            epsilon,
-            moved,
-            quartile,
+            four(second.inlier_ratio),
+            four(second.rms_m),
+            four(second.median_epsilon_m),
+            four(second.moved_m),
+            four(second.residual_quartile_m),
             format!("{:.3}", second.information_per_m2),
-            worst,
+            four(second.worst_axis_std_m),
         ]
     });
     fields.extend(second.unwrap_or_default());
@@ -119,12 +106,8 @@ fn error_table(sweeps: &[EvaluatedSweep]) -> String {
                 confidence,
                 ..
             } => {
-                let error: Pose = sweep
-                    .truth
-                    .isometry()
-                    .inv_mul(&world_from_cav.isometry())
-                    .into();
-                let [x, y, z, yaw] = pose(&error);
+                let error = sweep.truth.isometry().inv_mul(&world_from_cav.isometry());
+                let [x, y, z, yaw] = pose(&error.into());
                 text.row([x, y, z, yaw, format!("{confidence:.4}")]);
             }
             PoseEstimate::NoPose { .. } => text.row(["no_pose"]),

@@ -39,7 +39,6 @@ pub struct CoveredCell {
 
 impl Coverage {
     /// Coverage of drives, each the positions of its sweeps in the order of time, metres; `None` without sweeps.
-    #[must_use]
     pub(super) fn of(drives: &[Vec<Vector3<f64>>]) -> Option<Self> {
         let all = || drives.iter().flatten();
         let first = all().next()?;

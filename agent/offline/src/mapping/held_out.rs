@@ -15,7 +15,6 @@ const PIECE_SWEEPS: usize = 20;
 const LEAST_SWEEPS: usize = 4;
 
 /// For each sweep of a drive, whether it is held out. `positions_m`: of the sensor, in the order of time, metres.
-#[must_use]
 pub(super) fn held_out(positions_m: &[Vector3<f64>]) -> Vec<bool> {
     let count = positions_m.len();
     let mut is_held_out = vec![false; count];

@@ -85,29 +85,19 @@ pub fn make_map(
     };
     let sweeps = map.survey()?;
     let plan = map.plan(&sweeps)?;
-    let training = Arc::new(
-        sweeps
-            .list
-            .subset(&evenly_spread(&sweeps.training, plan.training)),
-    );
-    let held_out = sweeps
-        .list
-        .subset(&evenly_spread(&sweeps.held_out, plan.checked));
-    let coverage = sweeps.coverage(&evenly_spread(&sweeps.training, plan.training));
+    let used = evenly_spread(&sweeps.training, plan.training);
+    let training = Arc::new(sweeps.list.subset(&used));
+    let checked = evenly_spread(&sweeps.held_out, plan.checked);
+    let held_out = sweeps.list.subset(&checked);
+    let coverage = sweeps.coverage(&used);
     let (summary, run) = map.train(&training, &plan)?;
     map.copy_encoder()?;
     let weights = summary.trained.weights.clone();
     let activation_scales = map.quantise(&weights, &training, plan.scale_sweeps)?;
     let mut checked = map.check(&weights, &held_out)?;
     let (confidence, sha256) = map.fit(&weights, &mut checked)?;
-    let mut data = training.data();
-    data.problems.extend(
-        held_out
-            .data()
-            .problems
-            .into_iter()
-            .skip(data.problems.len()),
-    );
+    let (mut data, more) = (training.data(), held_out.data().problems.into_iter());
+    data.problems.extend(more.skip(data.problems.len()));
     data.without_pose += sweeps.without_pose;
     let accuracy = (!checked.sweeps.is_empty())
         .then(|| HeldOutAccuracy::of(&LocalizationSummary::of(&checked.sweeps)));
@@ -198,16 +188,9 @@ impl Map<'_> {
             .map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector)))
             .collect();
         let (mut training, mut held) = (Vec::new(), Vec::new());
-        let drives = positions
-            .iter()
-            .map(|(drive, _)| *drive)
-            .max()
-            .map_or(0, |last| last + 1);
-        for drive in 0..drives {
-            let of_drive = positions
-                .iter()
-                .enumerate()
-                .filter(|(_, (of, _))| *of == drive);
+        let last = positions.iter().map(|(drive, _)| *drive).max();
+        for drive in 0..last.map_or(0, |last| last + 1) {
+            let of_drive = { positions.iter().enumerate() }.filter(|(_, (of, _))| *of == drive);
             let known: Vec<(usize, Vector3<f64>)> = of_drive
                 .filter_map(|(index, (_, position))| Some((index, (*position)?)))
                 .collect();
@@ -239,30 +222,17 @@ impl Map<'_> {
         let with_pose = sweeps.training.len() + sweeps.held_out.len();
         if run.resume {
             let plan = StoredPlan::read(&run.out, with_pose)?;
-            let Plan {
-                training,
-                copies,
-                encoding_s,
-                ..
-            } = plan;
-            let encoded = training * copies;
+            let (encoded, encoding_s) = (plan.training * plan.copies, plan.encoding_s);
             self.note(format!(
                 "resuming: {encoded} sweeps are encoded again, in {encoding_s:.0} s, before the training"
             ));
             return Ok(plan);
         }
         let (encoder, _) = CellEncoder::load(&self.config.encoder, run.device)?;
-        let wanted = self
-            .config
-            .most_sweeps
-            .unwrap_or(usize::MAX)
-            .min(sweeps.training.len());
+        let most = self.config.most_sweeps.unwrap_or(usize::MAX);
+        let wanted = most.min(sweeps.training.len());
         let probes = Arc::new(sweeps.list.subset(&evenly_spread(&sweeps.training, PROBES)));
-        let unchanged = SweepAugmentation {
-            copies: 1,
-            turn_rad: 0.0,
-            keep: 1.0,
-        };
+        let unchanged = SweepAugmentation::NONE;
         let began = Instant::now();
         // The first sweeps are slower: they are not counted, unless there are no others.
         let mut first_s = 0.0;
@@ -459,10 +429,11 @@ impl Map<'_> {
             observe(MapProgress::At(started.elapsed().as_secs_f64(), text));
         };
         let deadline = started + self.config.time;
+        let seed = self.config.run.seed;
         Ok(check::check(
             &mut localizer,
             held_out,
-            self.config.run.seed,
+            seed,
             deadline,
             &mut progress,
         )?)
@@ -479,10 +450,9 @@ impl Map<'_> {
                 let text = serde_json::to_string(&model).expect("a model is numbers");
                 let sha256 = annotate(weights, CONFIDENCE_KEY, &text)?;
                 let confidence = Confidence::Calibrated(model);
-                checked
-                    .sweeps
-                    .iter_mut()
-                    .for_each(|sweep| sweep.judge_again(&confidence));
+                for sweep in &mut checked.sweeps {
+                    sweep.judge_again(&confidence);
+                }
                 Ok((Some(report), Some(sha256)))
             }
             Err(error) => {

@@ -65,22 +65,13 @@ pub struct HeldOutAccuracy {
 
 impl HeldOutAccuracy {
     pub(super) fn of(summary: &LocalizationSummary) -> Self {
-        let &LocalizationSummary {
-            sweeps,
-            success_3m,
-            success_1m,
-            p50_m,
-            p50_deg,
-            no_pose,
-            ..
-        } = summary;
         Self {
-            sweeps,
-            under_3m: success_3m,
-            under_1m: success_1m,
-            median_m: p50_m,
-            median_deg: p50_deg,
-            no_pose,
+            sweeps: summary.sweeps,
+            under_3m: summary.success_3m,
+            under_1m: summary.success_1m,
+            median_m: summary.p50_m,
+            median_deg: summary.p50_deg,
+            no_pose: summary.no_pose,
         }
     }
 
@@ -128,24 +119,17 @@ impl MapReport {
     /// The training, in one line.
     #[must_use]
     pub fn training_text(&self) -> String {
-        let Self {
-            training_sweeps,
-            copies,
-            cell_error_m,
-            trained,
-            ..
-        } = self;
-        let copies = if *copies > 1 {
-            format!(" in {copies} copies")
-        } else {
-            String::new()
+        let copies = match self.copies {
+            0 | 1 => String::new(),
+            copies => format!(" in {copies} copies"),
         };
-        let error = cell_error_m
-            .map(|error_m| format!(", error of cells {error_m:.1} m"))
-            .unwrap_or_default();
+        let error = self
+            .cell_error_m
+            .map(|error_m| format!(", error of cells {error_m:.1} m"));
+        let (sweeps, steps) = (self.training_sweeps, self.trained.steps);
         format!(
-            "{training_sweeps} sweeps{copies}, {} steps{error}",
-            trained.steps
+            "{sweeps} sweeps{copies}, {steps} steps{}",
+            error.unwrap_or_default()
         )
     }
 
@@ -171,13 +155,9 @@ impl MapReport {
 
     fn confidence_limit(&self) -> Option<String> {
         match (&self.held_out, &self.confidence) {
-            (
-                Some(_),
-                Some(FitReport {
-                    bad, bad_rejected, ..
-                }),
-            ) => {
-                let is_enough = *bad_rejected as f64 >= ENOUGH_REJECTED * *bad as f64;
+            (Some(_), Some(report)) => {
+                let (bad, bad_rejected) = (report.bad, report.bad_rejected);
+                let is_enough = bad_rejected as f64 >= ENOUGH_REJECTED * bad as f64;
                 (!is_enough).then(|| {
                     format!(
                         "Its confidence rejects only {bad_rejected} of {bad} wrong poses: others are given out, mostly with low confidence."

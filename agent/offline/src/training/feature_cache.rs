@@ -28,7 +28,16 @@ pub struct SweepAugmentation {
     pub keep: f64,
 }
 
-/// Cached features of cells, with their regression targets.
+impl SweepAugmentation {
+    /// Each sweep once, as it is.
+    pub(crate) const NONE: Self = Self {
+        copies: 1,
+        turn_rad: 0.0,
+        keep: 1.0,
+    };
+}
+
+/// Features of the cells of all sweeps of a scene, and where the cells are.
 #[derive(Debug)]
 pub(crate) struct FeatureCache {
     /// `[N, cell_channels]`, half precision.
@@ -87,10 +96,8 @@ impl FeatureCache {
                     0 => (Isometry3::identity(), 1.0),
                     _ => {
                         let angle = augmentation.turn_rad.clamp(1e-6, PI);
-                        (
-                            yaw(rng.random_range(-angle..angle)),
-                            rng.random_range(augmentation.keep..=1.0),
-                        )
+                        let turn = yaw(rng.random_range(-angle..angle));
+                        (turn, rng.random_range(augmentation.keep..=1.0))
                     }
                 };
                 Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))

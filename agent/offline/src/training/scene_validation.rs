@@ -6,12 +6,11 @@ use tch::{Kind, Tensor, no_grad};
 
 use super::feature_cache::FeatureCache;
 use crate::Error;
-use localization::pgc::SceneCoordinates;
 use localization::pgc::extensions::wider_search;
 use localization::pgc::pose_refinement::SweepCells;
 use localization::pgc::pose_search::PoseSearch;
 use localization::pgc::pose_solver::PoseSolver;
-use localization::pgc::{SceneHead, stopwatch};
+use localization::pgc::{SceneCoordinates, SceneHead, stopwatch};
 use perception::tensor_values::values;
 use protocol::PoseError;
 

@@ -69,13 +69,8 @@ pub fn train_sgloc(
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
-    let unchanged = SweepAugmentation {
-        copies: 1,
-        turn_rad: 0.0,
-        keep: 1.0,
-    };
     let mut encoded = |done, total| observe(&SgLocReport::Encoding(done, total));
-    let cache = FeatureCache::build(&list, &encoder, unchanged, run, &mut encoded)?;
+    let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, &mut encoded)?;
     let network_config = SgLocConfig {
         scene_name: config.scene_name.clone(),
         origin_m: cache.origin_m,
@@ -88,11 +83,8 @@ pub fn train_sgloc(
         cells: cache.cell_count(),
         device: run.device,
     };
-    network.set_statistics(
-        &cache
-            .cells
-            .f_index_select(0, &draw.rows(0, STATISTICS_CELLS)?)?,
-    )?;
+    let sample = draw.rows(0, STATISTICS_CELLS)?;
+    network.set_statistics(&cache.cells.f_index_select(0, &sample)?)?;
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
     let mut trainer = Trainer::begin(run, &variables, None, started)?;
     let mut window = Vec::new();
@@ -178,10 +170,8 @@ fn adopt_encoder(
         .map_err(LocalizerError::from)?;
     let stored = stored.variables();
     for (name, mut variable) in variables.variables() {
-        if let Some(source) = name
-            .strip_prefix("encoder.")
-            .and_then(|name| stored.get(name))
-        {
+        let of_encoder = name.strip_prefix("encoder.");
+        if let Some(source) = of_encoder.and_then(|name| stored.get(name)) {
             no_grad(|| variable.f_copy_(source))?;
             let _ = variable.f_set_requires_grad(false)?;
         }

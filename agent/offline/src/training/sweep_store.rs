@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use dataset::frame::Frame;
 use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario, findings, reasons};
@@ -167,39 +167,22 @@ impl SweepList {
 
     /// Identity of the data, and the part of it that proved unusable so far.
     pub(crate) fn data(&self) -> DataListing {
-        let without_pose = self
-            .without_pose
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .len();
-        let unreadable = self
-            .unreadable
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        let problems = self
-            .problems
-            .iter()
-            .chain(unreadable.values())
-            .cloned()
-            .collect();
+        let (without_pose, unreadable) = (locked(&self.without_pose), locked(&self.unreadable));
+        let problems = self.problems.iter().chain(unreadable.values());
         DataListing {
             sha256: self.sha256.clone(),
-            without_pose,
-            problems,
+            without_pose: without_pose.len(),
+            problems: problems.cloned().collect(),
         }
     }
 
     /// The sweeps at some indices, as a list of their own, in the order given.
     pub(crate) fn subset(&self, indices: &[usize]) -> Self {
-        let places = indices
-            .iter()
-            .filter_map(|&index| self.places.get(index).cloned())
-            .collect();
-        let (sha256, problems) = (self.sha256.clone(), self.problems.clone());
+        let places = indices.iter().filter_map(|&index| self.places.get(index));
         Self {
-            places,
-            sha256,
-            problems,
+            places: places.cloned().collect(),
+            sha256: self.sha256.clone(),
+            problems: self.problems.clone(),
             without_pose: Mutex::default(),
             unreadable: Mutex::default(),
         }
@@ -211,48 +194,29 @@ impl SweepList {
             points: false,
             ..LoadOptions::default()
         };
-        let pose = |(
-            index,
-            Place {
-                scenario,
-                agent,
-                tick,
-                drive,
-                ..
-            },
-        ): (usize, &Place)| match scenario.load(*agent, *tick, &options) {
-            Ok(frame) => (*drive, frame.world_from_lidar.map(|pose| pose.isometry())),
-            Err(error) => {
-                self.leave_out(index, &error);
-                (*drive, None)
-            }
-        };
-        self.places.iter().enumerate().map(pose).collect()
+        let mut poses = Vec::with_capacity(self.places.len());
+        for (index, place) in self.places.iter().enumerate() {
+            let loaded = place.scenario.load(place.agent, place.tick, &options);
+            let loaded = loaded.inspect_err(|error| self.leave_out(index, error));
+            let pose = loaded.ok().and_then(|frame| frame.world_from_lidar);
+            poses.push((place.drive, pose.map(|pose| pose.isometry())));
+        }
+        poses
     }
 
     /// Reads the whole frame of a sweep, with the names of its scenario and its files; `None` if it cannot be read.
     pub(crate) fn frame(&self, index: usize) -> Option<(Frame, String, String)> {
-        let Place {
-            scenario,
-            agent,
-            tick,
-            ..
-        } = self.places.get(index)?;
-        let stem = scenario.ticks.get(*tick)?.stem.clone();
-        match scenario.load(*agent, *tick, &LoadOptions::default()) {
-            Ok(frame) => Some((frame, scenario.name.clone(), stem)),
-            Err(error) => {
-                self.leave_out(index, &error);
-                None
-            }
-        }
+        let place = self.places.get(index)?;
+        let stem = place.scenario.ticks.get(place.tick)?.stem.clone();
+        let loaded = place
+            .scenario
+            .load(place.agent, place.tick, &LoadOptions::default());
+        let loaded = loaded.inspect_err(|error| self.leave_out(index, error));
+        Some((loaded.ok()?, place.scenario.name.clone(), stem))
     }
 
     fn leave_out(&self, index: usize, error: &ReadError) {
-        self.unreadable
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .insert(index, error.to_string());
+        locked(&self.unreadable).insert(index, error.to_string());
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
@@ -277,11 +241,13 @@ impl SweepList {
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
         let Place { world, drive, .. } = self.places[index];
-        let PosedSweep {
-            points,
-            world_from_sensor,
-        } = self.posed_sweep(index, range_m)?;
-        Some(StoredSweep::new(world, drive, world_from_sensor, &points))
+        let sweep = self.posed_sweep(index, range_m)?;
+        Some(StoredSweep::new(
+            world,
+            drive,
+            sweep.world_from_sensor,
+            &sweep.points,
+        ))
     }
 
     /// The same with the values of the file.
@@ -300,10 +266,7 @@ impl SweepList {
     pub(crate) fn posed_frame(&self, index: usize) -> Option<(Frame, Isometry3<f64>)> {
         let (frame, ..) = self.frame(index)?;
         let Some(pose) = frame.world_from_lidar else {
-            self.without_pose
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .insert(index);
+            locked(&self.without_pose).insert(index);
             return None;
         };
         Some((frame, pose.isometry()))
@@ -315,7 +278,11 @@ impl SweepList {
     }
 }
 
-/// All sweeps of some folders in memory.
+fn locked<T>(of_threads: &Mutex<T>) -> MutexGuard<'_, T> {
+    of_threads.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Sweeps of a list in memory, without those that cannot be read or have no pose.
 #[derive(Debug)]
 pub(crate) struct SweepStore {
     /// The sweeps, drive after drive.

@@ -31,10 +31,7 @@ impl TurnedSweep {
         rng: &mut impl Rng,
         format: &SweepFormat,
     ) -> Self {
-        let PosedSweep {
-            mut points,
-            world_from_sensor,
-        } = sweep;
+        let mut points = sweep.points;
         let in_range = points.len();
         points.retain(|_| keep >= 1.0 || rng.random_bool(keep));
         let turn: Isometry3<f32> = turned_from_sensor.cast();
@@ -44,14 +41,12 @@ impl TurnedSweep {
                 (*x, *y, *z) = (turned.x, turned.y, turned.z);
             });
         }
-        let sweep = format.prepare(&points);
-        let rows = choose(sweep.cells(), CELLS, rng);
-        let world_from_sensor = world_from_sensor * turned_from_sensor.inverse();
+        let prepared = format.prepare(&points);
         Self {
-            sweep,
-            rows,
+            rows: choose(prepared.cells(), CELLS, rng),
+            sweep: prepared,
             points: in_range,
-            world_from_sensor,
+            world_from_sensor: sweep.world_from_sensor * turned_from_sensor.inverse(),
         }
     }
 }

@@ -6,7 +6,7 @@ use anyhow::Context;
 use runner::fleet::Fleet;
 use runner::run::capacity::estimate;
 use runner::scenario::Scenario;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 use support::output;
 
 /// Largest scenario that is read, bytes.
@@ -21,7 +21,8 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let scenario: Scenario =
             serde_json::from_reader(io::stdin().lock().take(MAX_BYTES)).context("scenario")?;
-        let capacity = estimate(&Fleet::plan(&scenario)?)?;
+        let fleet = Fleet::plan(&scenario).map_err(BadInput::of)?;
+        let capacity = estimate(&fleet)?;
         output::line(serde_json::to_string(&capacity)?)?;
         Ok(Outcome::Done)
     }

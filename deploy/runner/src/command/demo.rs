@@ -13,13 +13,10 @@ use runner::experiment::report;
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
-use support::output;
-use support::progress;
-use support::shared_files;
+use support::{output, progress, shared_files};
 
 use super::programs;
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Seeds from here on are never trained with.
 const SEED: u64 = 1000;
@@ -75,7 +72,7 @@ impl Arguments {
     /// Generates the scene, runs the methods and prints their metrics.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let file = self.scenario()?;
-        let mut scenario = Scenario::read(&file)?;
+        let mut scenario = Scenario::read(&file).map_err(BadInput::of)?;
         scenario.scene.dir = self.scene()?;
         scenario.scene.rate = self.rate;
         let name = self.name.clone().unwrap_or_else(|| name_of_now("demo"));
@@ -86,7 +83,7 @@ impl Arguments {
             if self.view && Some(&method) == self.method.last() {
                 scenario.record.get_or_insert_default();
             }
-            scenario.check(&file)?;
+            scenario.check(&file).map_err(BadInput::of)?;
             let options = RunOptions {
                 runs: self.runs.clone(),
                 programs: programs()?,

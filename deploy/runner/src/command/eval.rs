@@ -1,6 +1,5 @@
 //! `v2vloc eval`.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use agent::attack::{AttackConfig, Falsification};
@@ -11,7 +10,8 @@ use dataset::IntensityScale;
 use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
-use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
+use ego_fuser_offline::evaluation::EvaluateConfig;
+use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
 use fusion::{Exchange, Method};
 use indicatif::ProgressBar;
 use link::{CapacityConfig, LatencyModel, LinkConfig};
@@ -22,13 +22,11 @@ use protocol::config::{FieldError, Section};
 use runner::experiment::evaluation::{EvaluationOptions, Part, evaluate};
 use runner::experiment::report;
 use runner::experiment::table::{self, TableObserver, TableSpec};
-use support::output;
-use support::progress;
+use support::{output, progress};
 use training::feature_store::KeptMaps;
 
 use super::left_out;
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options that a file of tables states itself.
 const OF_ONE_TABLE: [&str; 22] = [
@@ -174,13 +172,15 @@ impl Arguments {
             return tables(spec, out);
         }
         let options = self.options()?;
-        let data = options.part.open(&options.dataset, &options.protocol)?;
+        let data = options.part.open(&options.dataset, &options.protocol);
+        let data = data.map_err(BadInput::of)?;
         let frames = self.method.len() * options.frame_count(&data);
         let bar = progress::bar(frames, "frames");
         let mut all = Vec::new();
         for &method in &self.method {
             bar.set_message(method.name());
-            all.push(evaluate(&options, &data, method, &mut || bar.inc(1))?);
+            let metrics = evaluate(&options, &data, method, &mut || bar.inc(1));
+            all.push(metrics.map_err(BadInput::of)?);
         }
         bar.finish_and_clear();
         match (self.json, &all[..]) {
@@ -205,18 +205,14 @@ impl Arguments {
         self.codec.0.validate().map_err(bad)?;
         self.check_methods()?;
         if self.rate.0.watch_queue && !self.emulates_link() {
-            return Err(BadInput::new(
-                "--watch-queue: without --link there is no queue to watch",
-            ));
+            let reason = "--watch-queue: without --link there is no queue to watch";
+            return Err(BadInput::new(reason));
         }
-        let codec = self.codec.0;
-        Ok(EvaluationOptions {
-            // Required without a table.
-            dataset: self.dataset.clone().unwrap_or_default(),
+        let settings = EvaluateConfig {
             weights: self.weights.clone().unwrap_or_default(),
             precision: self.precision,
             pose_source: self.pose.0.clone().with_networks().map_err(BadInput::of)?,
-            codec,
+            codec: self.codec.0,
             rate: self.rate.0,
             delay_nanos: self.delay_ms * 1_000_000,
             attack: self.attack.map(|falsification| AttackConfig {
@@ -225,9 +221,14 @@ impl Arguments {
                 seed: self.attack_seed,
             }),
             trust: self.trust.then(MisbehaviourConfig::default),
+            ..EvaluateConfig::default()
+        };
+        Ok(EvaluationOptions {
+            dataset: self.dataset.clone().unwrap_or_default(),
+            settings,
             maps: self.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
-                dtype: codec.dtype,
+                dtype: self.codec.0.dtype,
                 limit_bytes: u64::MAX,
                 intensity_scale: self.intensity_scale,
             }),
@@ -281,16 +282,13 @@ impl Arguments {
         }
         link.validate().map_err(BadInput::of)?;
         let &[pose_ms, map_ms, fuse_ms] = &self.compute_ms[..] else {
+            let found = self.compute_ms.len();
             return Err(BadInput::new(format!(
-                "--compute-ms takes 3 numbers, not {}",
-                self.compute_ms.len()
+                "--compute-ms takes 3 numbers, not {found}"
             )));
         };
-        if let Some(ms) = self
-            .compute_ms
-            .iter()
-            .find(|ms| !(0.0..=60_000.0).contains(*ms))
-        {
+        let mut times = self.compute_ms.iter();
+        if let Some(ms) = times.find(|ms| !(0.0..=60_000.0).contains(*ms)) {
             return Err(BadInput::new(format!(
                 "--compute-ms: {ms} is not 0 to 60000 ms"
             )));
@@ -302,22 +300,17 @@ impl Arguments {
             ..defaults
         };
         ego.validate().map_err(bad)?;
-        Ok(SteppedConfig {
-            link,
-            link_folder,
-            seed: self.seed,
-            deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
-            pairing: ego.pairing(),
-            compute: ComputeTimes {
-                pose_ms,
-                map_ms,
-                fuse_ms,
-            },
-            crew: AgentPool::First(usize::MAX),
-            vehicles: BTreeMap::new(),
-            ticks: 0..usize::MAX,
-            lidar_variant: None,
-        })
+        let compute = ComputeTimes {
+            pose_ms,
+            map_ms,
+            fuse_ms,
+        };
+        Ok(SteppedConfig::new(
+            (link, link_folder),
+            self.seed,
+            &ego,
+            compute,
+        ))
     }
 }
 
@@ -328,7 +321,8 @@ fn bad(error: FieldError) -> BadInput {
 /// Fills tables and prints them.
 fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let mut progress = TableProgress(progress::spinner("frames"));
-    let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
+    let spec = TableSpec::read(spec).map_err(BadInput::of)?;
+    let filled = table::run(&spec, out, &mut progress).map_err(BadInput::of)?;
     progress.0.finish_and_clear();
     filled
         .iter()

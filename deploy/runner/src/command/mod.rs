@@ -13,12 +13,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use bus::{BusError, malloc_settings};
 use dataset::LeftOut;
-use runner::experiment::evaluation::EvaluationError;
-use runner::experiment::sweep::SweepError;
-use runner::experiment::table::TableError;
-use runner::fleet::FleetError;
 use runner::run::RunError;
-use runner::scenario::ScenarioError;
 use support::cli::Outcome;
 use support::output;
 
@@ -76,17 +71,8 @@ fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
 
 /// True if the cause of an error is a fault of usage or input, and not of the program.
 pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
-    cause.is::<ScenarioError>()
-        || cause.is::<FleetError>()
-        || cause.is::<EvaluationError>()
-        || cause.is::<TableError>()
-        || BusError::is_behind(cause)
-        || cause
-            .downcast_ref::<SweepError>()
-            .is_some_and(SweepError::is_bad_input)
-        || cause
-            .downcast_ref::<RunError>()
-            .is_some_and(RunError::is_bad_input)
+    let run = cause.downcast_ref::<RunError>();
+    BusError::is_behind(cause) || run.is_some_and(RunError::is_bad_input)
 }
 
 /// Folder of the programs: they are built and installed together.

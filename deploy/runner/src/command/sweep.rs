@@ -3,11 +3,11 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use runner::experiment::sweep::{Experiment, Sweep, SweepOptions};
+use runner::experiment::sweep::{Experiment, Sweep, SweepOptions, WorkerError};
 use support::output;
 
 use super::left_out;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -39,22 +39,26 @@ impl Arguments {
         tch::set_num_threads(1);
         let out = match self.out {
             Some(out) => out,
-            None => PathBuf::from("sweeps").join(Experiment::read(&self.experiment)?.name),
+            None => {
+                let experiment = Experiment::read(&self.experiment).map_err(BadInput::of)?;
+                PathBuf::from("sweeps").join(experiment.name)
+            }
         };
         let jobs = usize::from(self.jobs);
         if self.dry_run {
-            Sweep::announce(&self.experiment, &out, jobs)?;
+            Sweep::announce(&self.experiment, &out, jobs).map_err(BadInput::of)?;
             return Ok(Outcome::Done);
         }
-        let sweep = Sweep::open(&self.experiment, &out)?;
+        let sweep = Sweep::open(&self.experiment, &out).map_err(BadInput::of)?;
         if self.worker {
             sweep.work()?;
             return Ok(Outcome::Done);
         }
-        let swept = sweep.run(&SweepOptions {
+        let options = SweepOptions {
             jobs,
             keep_maps: self.keep_feature_maps,
-        })?;
+        };
+        let swept = sweep.run(&options).map_err(blamed)?;
         match self.json {
             true => output::line(serde_json::to_string_pretty(&swept.runs)?)?,
             false => output::text(&swept.table)?,
@@ -70,7 +74,15 @@ impl Arguments {
     }
 }
 
-/// Names the size of the feature maps that are kept.
+/// An error of the input, unless a worker or the file system has failed.
+fn blamed(error: anyhow::Error) -> anyhow::Error {
+    match error.is::<WorkerError>() {
+        true => error,
+        false => BadInput::of(error).into(),
+    }
+}
+
+/// Prints how much space the feature maps take.
 fn note_maps(folder: &Path) {
     let files = fs::read_dir(folder).into_iter().flatten().flatten();
     let bytes: u64 = files

@@ -10,7 +10,7 @@ use runner::scenario::{FieldOverride, Scenario};
 use support::output;
 
 use super::programs;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -53,7 +53,8 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Runs the scenario and prints the result.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut scenario = Scenario::read_with(&self.scenario, &self.set)?;
+        let scenario = Scenario::read_with(&self.scenario, &self.set);
+        let mut scenario = scenario.map_err(BadInput::of)?;
         if let Some(dataset) = self.dataset {
             scenario.scene.dir = std::path::absolute(dataset)?;
         }
@@ -65,7 +66,7 @@ impl Arguments {
             scenario.record.get_or_insert_default();
         }
         scenario.network.metrics = self.metrics.or(scenario.network.metrics);
-        scenario.check(&self.scenario)?;
+        scenario.check(&self.scenario).map_err(BadInput::of)?;
         let result = run_scenario(
             &scenario,
             &RunOptions {

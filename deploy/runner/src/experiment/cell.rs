@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
+use anyhow::{Context, Result};
 use deploy::score::metrics::{Messages, Metrics};
 use fusion::Method;
 use serde::{Deserialize, Serialize};
@@ -38,27 +39,6 @@ pub struct Cell {
     pub wall_seconds: f64,
 }
 
-/// Reason why a cell cannot be read or written.
-#[derive(Debug, thiserror::Error)]
-pub enum CellError {
-    /// Error of the operating system.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
-    /// The file is no cached cell.
-    #[error("{}: {problem}; without the file it is computed anew", path.display())]
-    Malformed {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the JSON reader.
-        problem: String,
-    },
-}
-
 impl CellKey {
     /// Cache file of the cell.
     #[must_use]
@@ -72,17 +52,19 @@ impl Cell {
     /// The cached cell; `None` if it does not exist.
     ///
     /// # Errors
-    /// [`CellError`] when the file cannot be read or is no cached cell.
-    pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>, CellError> {
+    /// An error when the file cannot be read or is no cached cell.
+    pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>> {
         let path = key.file(folder);
         let text = match fs::read_to_string(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-            Err(source) => return Err(CellError::Io { path, source }),
+            Err(error) => return Err(error).with_context(|| path.display().to_string()),
         };
-        let cell: Self = serde_json::from_str(&text).map_err(|error| CellError::Malformed {
-            path,
-            problem: error.to_string(),
+        let cell: Self = serde_json::from_str(&text).with_context(|| {
+            format!(
+                "{}: malformed; without the file it is computed anew",
+                path.display()
+            )
         })?;
         Ok((cell.key.sha256 == key.sha256).then_some(cell))
     }
@@ -90,11 +72,11 @@ impl Cell {
     /// Caches the cell; the file appears only when it is complete.
     ///
     /// # Errors
-    /// [`CellError::Io`] when it cannot be written.
-    pub fn write(&self, folder: &Path) -> Result<(), CellError> {
+    /// An error when it cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
         let path = self.key.file(folder);
-        let text = serde_json::to_string_pretty(self).unwrap_or_default();
-        atomic_file::write(&path, text).map_err(|source| CellError::Io { path, source })
+        let text = serde_json::to_string_pretty(self)?;
+        atomic_file::write(&path, text).with_context(|| path.display().to_string())
     }
 }
 

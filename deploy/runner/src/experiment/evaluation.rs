@@ -1,27 +1,22 @@
 //! Offline evaluation of a method on recorded scenes: without delays, or with link emulation in simulation time.
 
 use std::collections::BTreeMap;
-use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use agent::attack::AttackConfig;
-use agent::rate::RateConfig;
+use anyhow::{Context, Result, anyhow, ensure};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
 use deploy::score::FrameScores;
 use deploy::score::metrics::{Messages, Metrics};
-use ego_fuser::misbehaviour::MisbehaviourConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
-use fusion::Exchange;
-use fusion::Method;
-use localization::pose_source::PoseSourceConfig;
+use ego_fuser_offline::evaluation::{EvaluateConfig, Evaluator};
+use fusion::{Exchange, Method};
 use perception::int8::InferencePrecision;
 use perception::weights::Weights;
-use protocol::{CavId, CodecConfig, Counts, Stream, Topic};
+use protocol::{Counts, Stream, Topic};
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
 use support::sampling::evenly_spread;
@@ -29,31 +24,18 @@ use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
-use crate::experiment::frame_files::{self, FrameFiles, FrameFilesError};
+use crate::experiment::frame_files::{self, FrameFiles};
 use crate::scenario::fingerprint::{collect, files_of};
-use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
+use crate::scenario::weights_choice::weights_of;
 
 /// Settings of an evaluation.
 #[derive(Debug, Clone, Default)]
 pub struct EvaluationOptions {
     /// Data set, split or scenario.
     pub dataset: PathBuf,
-    /// Weights of the detector, or a folder that holds a file `<name>-<method>.safetensors` for each method.
-    pub weights: PathBuf,
-    /// Number format in which networks are computed.
-    pub precision: InferencePrecision,
-    /// Source of the vehicles' poses.
-    pub pose_source: PoseSourceConfig,
-    /// Encoding of feature maps.
-    pub codec: CodecConfig,
-    /// Adaptation of feature maps to the rate of the link.
-    pub rate: RateConfig,
-    /// Delay of the messages of neighbours, nanoseconds.
-    pub delay_nanos: u64,
-    /// Attack by neighbours; absent: none.
-    pub attack: Option<AttackConfig>,
-    /// Misbehaviour detection of the ego; absent: none.
-    pub trust: Option<MisbehaviourConfig>,
+    /// Settings of vehicles and ego. `weights` may be a folder with those of several methods; `method` and `protocol`
+    /// follow from the method that is evaluated and from the data set.
+    pub settings: EvaluateConfig,
     /// Cache of the encoders' feature maps, so that each is computed once for many evaluations.
     pub maps: Option<KeptMaps>,
     /// Run in simulation time with link emulation; absent: no link.
@@ -113,20 +95,15 @@ impl Part {
     /// are cached for all of them, so that another selection needs no others.
     ///
     /// # Errors
-    /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
-    pub fn open(
-        &self,
-        path: &Path,
-        protocol: &ProtocolConfig,
-    ) -> Result<OpenedData, EvaluationError> {
+    /// An error when it cannot be read, or the protocol contradicts itself.
+    pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData> {
         let options = OpenOptions {
             intensity_scale: self.intensity_scale,
             ..OpenOptions::default()
         };
         let dataset = dataset::open_with(path, &options)?;
-        let protocol = protocol
-            .resolve(dataset.layout)
-            .map_err(EvaluationError::Protocol)?;
+        let protocol = protocol.resolve(dataset.layout);
+        let protocol = protocol.map_err(|error| anyhow!("evaluation protocol: {error}"))?;
         let mut scenarios: Vec<Scenario> = dataset
             .scenarios
             .iter()
@@ -154,47 +131,6 @@ impl Part {
     }
 }
 
-/// Reason why an evaluation failed.
-#[derive(Debug, thiserror::Error)]
-pub enum EvaluationError {
-    /// No ground truth for the evaluation.
-    #[error(
-        "scenario {scenario} has no true poses of the ego {ego}: its results cannot be evaluated"
-    )]
-    NoPoses {
-        /// Name of the scenario.
-        scenario: String,
-        /// Id of its ego.
-        ego: CavId,
-    },
-    /// The data set cannot be read.
-    #[error(transparent)]
-    Dataset(#[from] ReadError),
-    /// The protocol is not known or contradicts itself.
-    #[error("evaluation protocol: {0}")]
-    Protocol(String),
-    /// The data set has no frame to evaluate.
-    #[error("{}: there is no frame in it that can be evaluated{reasons}", path.display())]
-    Empty {
-        /// The data set.
-        path: PathBuf,
-        /// Reasons of the frames that were left out.
-        reasons: String,
-    },
-    /// A file cannot be hashed.
-    #[error(transparent)]
-    Digest(io::Error),
-    /// There are no weights for a method.
-    #[error(transparent)]
-    Weights(#[from] WeightsChoiceError),
-    /// Error of the pipeline.
-    #[error(transparent)]
-    Evaluate(#[from] EvaluateError),
-    /// The frames' results cannot be written.
-    #[error(transparent)]
-    Files(#[from] FrameFilesError),
-}
-
 impl EvaluationOptions {
     /// Number of frames to evaluate, over all scenarios.
     #[must_use]
@@ -214,7 +150,8 @@ impl EvaluationOptions {
             Some(_) => ("stepped", board.seconds()),
             None => ("offline", began.elapsed().as_secs_f64()),
         };
-        let metrics = metrics(board, evaluator, clock, self.pose_source.name(), seconds);
+        let poses = self.settings.pose_source.name();
+        let metrics = metrics(board, evaluator, clock, poses, seconds);
         Metrics {
             provenance: Some(provenance.with_command()),
             ..metrics
@@ -224,17 +161,17 @@ impl EvaluationOptions {
     /// Identity of the result of a method: these settings, and the digests of all that they are applied to.
     ///
     /// # Errors
-    /// [`EvaluationError`] names the file that cannot be read.
-    pub fn key(&self, data: &OpenedData, method: Method) -> Result<CellKey, EvaluationError> {
+    /// An error that names the file that cannot be read.
+    pub fn key(&self, data: &OpenedData, method: Method) -> Result<CellKey> {
         let provenance = self.provenance(data, method)?;
         // The contents of data and weights count, their places do not; kept maps change no result.
-        let settings = Self {
+        let mut settings = Self {
             dataset: PathBuf::new(),
-            weights: PathBuf::new(),
             maps: None,
             out: None,
             ..self.clone()
         };
+        settings.settings.weights = PathBuf::new();
         Ok(CellKey {
             method,
             sha256: provenance.key(&format!("{method} {settings:?}")),
@@ -243,16 +180,17 @@ impl EvaluationOptions {
     }
 
     /// Digests of all that these settings are applied to.
-    fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance, EvaluationError> {
+    fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance> {
         let stepped = self.stepped.as_ref();
         let link = stepped.map(|stepped| (&stepped.link, stepped.link_folder.as_path()));
         let variant = stepped.and_then(|stepped| stepped.lidar_variant.as_deref());
         let vehicles = stepped.into_iter().flat_map(|stepped| &stepped.vehicles);
-        let poses =
-            std::iter::once(&self.pose_source).chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
-        let files = files_of(method, weights_of(&self.weights, method)?, poses, link);
+        let poses = std::iter::once(&self.settings.pose_source)
+            .chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
+        let weights = weights_of(&self.settings.weights, method)?;
+        let files = files_of(method, weights, poses, link);
         let data_sha256 = data.sha256(&self.part, variant);
-        collect(&[], data_sha256, files, &data.digests).map_err(EvaluationError::Digest)
+        Ok(collect(&[], data_sha256, files, &data.digests)?)
     }
 }
 
@@ -260,13 +198,13 @@ impl EvaluationOptions {
 /// every frame. Frames and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
 /// # Errors
-/// [`EvaluationError`] when no frame can be evaluated.
+/// An error when no frame can be evaluated.
 pub fn evaluate(
     options: &EvaluationOptions,
     data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
-) -> Result<Metrics, EvaluationError> {
+) -> Result<Metrics> {
     let began = Instant::now();
     let (board, evaluator) = judged(options, data, method, on_frame)?;
     let provenance = options.provenance(data, method)?;
@@ -286,19 +224,17 @@ pub fn compute(
     data: &OpenedData,
     key: CellKey,
     on_frame: &mut dyn FnMut(),
-) -> Result<Cell, EvaluationError> {
+) -> Result<Cell> {
     let began = Instant::now();
     let (board, evaluator) = judged(options, data, key.method, on_frame)?;
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
-        if !matches!(
-            account.topic,
+        match account.topic {
             Topic::Stream {
                 stream: Stream::Pose,
                 ..
-            }
-        ) {
-            messages.add(counts);
+            } => {}
+            _ => messages.add(counts),
         }
     }
     let used = board.records().iter().map(|record| record.fused as u64);
@@ -318,90 +254,66 @@ fn judged(
     data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
-) -> Result<(FrameScores, Evaluator), EvaluationError> {
-    let OpenedData {
-        scenarios,
-        protocol,
-        problems,
-        ..
-    } = data;
-    let weights = weights_of(&options.weights, method)?;
+) -> Result<(FrameScores, Evaluator)> {
+    let scenarios = &data.scenarios;
+    let (weights, precision) = (
+        weights_of(&options.settings.weights, method)?,
+        options.settings.precision,
+    );
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
-        precision: options.precision,
         method: Some(method),
-        pose_source: options.pose_source.clone(),
-        codec: options.codec,
-        rate: options.rate,
-        protocol: Some(protocol.clone()),
-        delay_nanos: options.delay_nanos,
-        attack: options.attack,
-        trust: options.trust,
+        protocol: Some(data.protocol.clone()),
+        ..options.settings.clone()
     })?;
-    if let Some(kept) = options
-        .maps
-        .as_ref()
-        .filter(|_| method.exchange() != Exchange::Points)
-    {
-        evaluator = evaluator.with_maps(maps(kept, &weights, options.precision, data)?);
+    let kept = options.maps.as_ref();
+    if let Some(kept) = kept.filter(|_| method.exchange() != Exchange::Points) {
+        evaluator = evaluator.with_maps(maps(kept, &weights, precision, data)?);
     }
     if let Some(stepped) = &options.stepped {
         evaluator = evaluator.with_link(stepped.clone());
     }
-    evaluator.add_data_set(
-        problems,
-        findings::sampled(scenarios, options.part.intensity_scale),
-    );
-    let grid = evaluator.ego().detector().config().feature_grid();
-    let channels = evaluator.ego().detector().config().sent_channels();
-    let map_values =
-        u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
+    let findings = findings::sampled(scenarios, options.part.intensity_scale);
+    evaluator.add_data_set(&data.problems, findings);
+    let detector = evaluator.ego().detector().config();
+    let map_values = detector.feature_grid().cells() as u64 * detector.sent_channels() as u64;
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
-    let is_timed = options
-        .stepped
-        .as_ref()
-        .is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
+    let stepped = options.stepped.as_ref();
+    let is_timed = stepped.is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
     let mut board: Option<FrameScores> = None;
-    let mut files = options
-        .out
-        .as_ref()
-        .map(|out| FrameFiles::create(out, method))
-        .transpose()?;
+    let out = options.out.as_ref();
+    let mut files = out.map(|out| FrameFiles::create(out, method)).transpose()?;
     for scenario in options.part.chosen(scenarios) {
         let Some(ego) = scenario.agents.first() else {
             continue;
         };
-        if !scenario.has_poses(0, 0) {
-            return Err(EvaluationError::NoPoses {
-                scenario: scenario.name.clone(),
-                ego: ego.clone(),
-            });
-        }
+        ensure!(
+            scenario.has_poses(0, 0),
+            "scenario {} has no true poses of the ego {ego}: its results cannot be evaluated",
+            scenario.name
+        );
         let board = board
             .get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
-            let is_written = files
-                .as_mut()
-                .is_none_or(|files| files.add(&scenario.name, &frame));
+            let mut files = files.iter_mut();
+            let is_written = files.all(|files| files.add(&scenario.name, &frame));
             judge(board, frame, is_timed);
             on_frame();
-            if !is_written {
-                ControlFlow::Break(())
-            } else {
-                ControlFlow::Continue(())
+            match is_written {
+                true => ControlFlow::Continue(()),
+                false => ControlFlow::Break(()),
             }
         })?;
         if judged.is_break() {
             break;
         }
     }
-    let board = board
-        .filter(|board| !board.records().is_empty())
-        .ok_or_else(|| EvaluationError::Empty {
-            path: options.dataset.clone(),
-            reasons: evaluator.left_out().reasons(),
-        })?;
+    let board = board.filter(|board| !board.records().is_empty());
+    let board = board.with_context(|| {
+        let (path, reasons) = (options.dataset.display(), evaluator.left_out().reasons());
+        format!("{path}: there is no frame in it that can be evaluated{reasons}")
+    })?;
     files.map(|files| files.finish(&board)).transpose()?;
     Ok((board, evaluator))
 }
@@ -412,22 +324,9 @@ fn maps(
     weights: &Path,
     precision: InferencePrecision,
     data: &OpenedData,
-) -> Result<MapSource, EvaluationError> {
-    let weights = Arc::new(
-        Weights::load(weights)
-            .map_err(EvaluateError::from)?
-            .with_precision(precision),
-    );
-    let store = FeatureStore::open(
-        kept,
-        &weights,
-        &data.scenarios,
-        &data.digests,
-        1,
-        &mut |_, _| {},
-    );
-    Ok(MapSource::new(
-        Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?),
-        weights,
-    ))
+) -> Result<MapSource> {
+    let weights = Arc::new(Weights::load(weights)?.with_precision(precision));
+    let (scenarios, digests) = (&data.scenarios, &data.digests);
+    let store = FeatureStore::open(kept, &weights, scenarios, digests, 1, &mut |_, _| {})?;
+    Ok(MapSource::new(Arc::new(store), weights))
 }

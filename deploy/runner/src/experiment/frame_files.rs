@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
 
 use deploy::operate::run_folder::frames_csv;
 use deploy::score::FrameScores;
@@ -23,29 +24,17 @@ pub(crate) struct FrameFiles {
     scenarios: Vec<String>,
 }
 
-/// Files that cannot be written.
-#[derive(Debug, thiserror::Error)]
-#[error("{}: {source}", folder.display())]
-pub struct FrameFilesError {
-    folder: PathBuf,
-    source: io::Error,
-}
-
 impl FrameFiles {
     /// Empty files of a method in a folder of `out`.
     ///
     /// # Errors
-    /// [`FrameFilesError`] when there are such files already, or they cannot be written.
-    pub(crate) fn create(out: &Path, method: Method) -> Result<Self, FrameFilesError> {
+    /// An error when there are such files already, or they cannot be written.
+    pub(crate) fn create(out: &Path, method: Method) -> Result<Self> {
         let folder = out.join(file_name(method));
-        let failed = |source| FrameFilesError {
-            folder: folder.clone(),
-            source,
-        };
-        fs::create_dir_all(out)
+        let lines = fs::create_dir_all(out)
             .and_then(|()| fs::create_dir(&folder))
-            .map_err(failed)?;
-        let lines = FrameLines::create(&folder).map_err(failed)?;
+            .and_then(|()| FrameLines::create(&folder))
+            .with_context(|| folder.display().to_string())?;
         Ok(Self {
             folder,
             lines,
@@ -62,42 +51,24 @@ impl FrameFiles {
     /// Writes the rest, with the scores of the same frames.
     ///
     /// # Errors
-    /// [`FrameFilesError`] with the first error of the operating system.
-    pub(crate) fn finish(self, board: &FrameScores) -> Result<(), FrameFilesError> {
-        let Self {
-            folder,
-            lines,
-            scenarios,
-        } = self;
-        let write = || {
-            lines.finish()?;
-            fs::write(
-                folder.join("frames.csv"),
-                frames_csv(board.records(), &BTreeMap::new(), Some(&scenarios)),
-            )?;
-            fs::write(
-                folder.join("precision_recall.csv"),
-                board.precision_recall_csv(),
-            )
-        };
-        write().map_err(|source| FrameFilesError {
-            folder: folder.clone(),
-            source,
-        })
+    /// An error with the first error of the operating system.
+    pub(crate) fn finish(self, board: &FrameScores) -> Result<()> {
+        let folder = self.folder;
+        let frames = frames_csv(board.records(), &BTreeMap::new(), Some(&self.scenarios));
+        let curve = board.precision_recall_csv();
+        { self.lines.finish() }
+            .and_then(|()| fs::write(folder.join("frames.csv"), frames))
+            .and_then(|()| fs::write(folder.join("precision_recall.csv"), curve))
+            .with_context(|| folder.display().to_string())
     }
 }
 
 /// Writes `metrics.json` into the folder of a method in `out`.
 ///
 /// # Errors
-/// [`FrameFilesError`] with the error of the operating system.
-pub(crate) fn write_metrics(
-    out: &Path,
-    method: Method,
-    metrics: &Metrics,
-) -> Result<(), FrameFilesError> {
+/// An error with the error of the operating system.
+pub(crate) fn write_metrics(out: &Path, method: Method, metrics: &Metrics) -> Result<()> {
     let folder = out.join(file_name(method));
-    // Numbers and names have a spelling in JSON.
-    let text = serde_json::to_string_pretty(metrics).unwrap_or_default();
-    fs::write(folder.join(metrics::FILE), text).map_err(|source| FrameFilesError { folder, source })
+    let text = serde_json::to_string_pretty(metrics)?;
+    fs::write(folder.join(metrics::FILE), text).with_context(|| folder.display().to_string())
 }

@@ -6,8 +6,7 @@ use std::path::Path;
 
 use deploy::operate::progress::bytes;
 use deploy::score::metrics::{ByIou, Contribution, Metrics, PartPrecision, Percentiles};
-use fusion::Exchange;
-use fusion::Method;
+use fusion::{Exchange, Method};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::PoseSourceConfig;
 use support::output;
@@ -38,12 +37,11 @@ pub fn run_report(result: &RunResult) -> String {
 pub fn print_loss(result: &RunResult, with_method: bool) {
     result.metrics.left_out.print();
     if let Some(sentence) = loss::sentence(result) {
-        let method = if with_method {
-            format!("{}: ", result.metrics.method)
-        } else {
-            String::new()
-        };
-        output::note(format_args!("exit 3: {method}{sentence}"));
+        let method = &result.metrics.method;
+        match with_method {
+            true => output::note(format_args!("exit 3: {method}: {sentence}")),
+            false => output::note(format_args!("exit 3: {sentence}")),
+        }
     }
 }
 
@@ -55,13 +53,12 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
         _ => return,
     };
     if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
-        let scenarios = dataset::open(scene)
-            .map(|dataset| dataset.scenarios)
-            .unwrap_or_default();
-        let map = scenarios
-            .first()
-            .and_then(|scenario| scenario.generated_map().ok())
-            .map(|map| map.to_string());
+        let dataset = dataset::open(scene).ok();
+        let first = dataset
+            .as_ref()
+            .and_then(|dataset| dataset.scenarios.first());
+        let map = first.and_then(|scenario| scenario.generated_map().ok());
+        let map = map.map(|map| map.to_string());
         output::note(wrong_place_hint(metrics.pose.no_pose, head, map.as_deref()));
     }
 }
@@ -83,27 +80,15 @@ pub fn run_notes(result: &RunResult) -> String {
             "stuck     most messages were still in flight at the end: the link carries next to nothing"
         );
     }
-    let dropped: Vec<String> = messages
-        .dropped
-        .iter()
-        .map(|(reason, count)| format!("{count} {reason}"))
-        .collect();
-    let _ = writeln!(
-        text,
-        "dropped   {}",
-        if dropped.is_empty() {
-            "none".into()
-        } else {
-            dropped.join(", ")
-        }
-    );
-    let verdict = if result.balance.is_exact() {
-        "every message is accounted for".into()
-    } else {
-        format!(
-            "{} accounts do not add up, see ledger.json",
-            result.balance.discrepancies.len()
-        )
+    let dropped = { messages.dropped.iter() }.map(|(reason, count)| format!("{count} {reason}"));
+    let dropped = match messages.dropped.is_empty() {
+        true => "none".into(),
+        false => dropped.collect::<Vec<_>>().join(", "),
+    };
+    let _ = writeln!(text, "dropped   {dropped}");
+    let verdict = match result.balance.discrepancies.len() {
+        0 => "every message is accounted for".into(),
+        count => format!("{count} accounts do not add up, see ledger.json"),
     };
     let _ = writeln!(text, "ledger    {verdict}");
     if result.missed > 0 {
@@ -133,11 +118,8 @@ pub fn table(all: &[Metrics]) -> String {
         Column::left("poses", all, |metrics| metrics.pose_source.clone()),
     ];
     let is_live = all.iter().any(|metrics| metrics.ap_streaming.is_some());
-    columns.push(Column::right(
-        if is_live { "answered" } else { "frames" },
-        all,
-        frames,
-    ));
+    let name = if is_live { "answered" } else { "frames" };
+    columns.push(Column::right(name, all, frames));
     for (name, of) in BY_IOU {
         columns.push(Column::right(&format!("AP@{name}"), all, |metrics| {
             number(of(&metrics.ap_global), 3)
@@ -168,10 +150,15 @@ pub fn table(all: &[Metrics]) -> String {
 /// AP by distance and by class, a line for each part of each method.
 #[must_use]
 pub fn breakdown(all: &[Metrics]) -> String {
-    let names = ["method", "part", "objects", "AP@0.3", "AP@0.5", "AP@0.7"];
-    let side = |index: usize| if index < 2 { Side::Left } else { Side::Right };
-    let mut table =
-        TextTable::new({ names.iter().enumerate() }.map(|(index, name)| (*name, side(index))));
+    let (left, right) = (
+        ["method", "part"],
+        ["objects", "AP@0.3", "AP@0.5", "AP@0.7"],
+    );
+    let left = left.map(|name| (name, Side::Left));
+    let mut table = TextTable::new(
+        left.into_iter()
+            .chain(right.map(|name| (name, Side::Right))),
+    );
     for metrics in all {
         let parts = [(" m", &metrics.ap_by_distance), ("", &metrics.ap_by_class)];
         for (unit, parts) in parts {
@@ -207,32 +194,19 @@ fn comparison(all: &[Metrics]) -> String {
         let _ = writeln!(text, "{protocol}");
     }
     if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
-        let compare = match all.iter().any(|metrics| metrics.ap_streaming.is_some()) {
+        text += "\nwarning: rows are evaluated over different frames: ";
+        text += match all.iter().any(|metrics| metrics.ap_streaming.is_some()) {
             true => {
-                "compare \"AP@0.5 all\" and sAP@0.5, in which unanswered ticks count, and not AP over other frames"
+                "compare \"AP@0.5 all\" and sAP@0.5, in which unanswered ticks count, and not AP over other frames\n"
             }
-            false => "their AP cannot be compared",
+            false => "their AP cannot be compared\n",
         };
-        let _ = writeln!(
-            text,
-            "\nwarning: rows are evaluated over different frames: {compare}"
-        );
     }
-    for Metrics {
-        method,
-        contribution:
-            Contribution {
-                sent,
-                used,
-                sent_bytes_mean,
-                ..
-            },
-        ..
-    } in all
-    {
+    for metrics in all {
+        let (method, Contribution { sent, used, .. }) = (&metrics.method, metrics.contribution);
         if let Some(what) = shared(method).filter(|_| used < sent) {
-            let size =
-                sent_bytes_mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
+            let size = { metrics.contribution.sent_bytes_mean }
+                .map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
             let _ = writeln!(
                 text,
                 "{method}: of {sent} {what}{size} {used} arrived in time"
@@ -260,23 +234,19 @@ fn frames(metrics: &Metrics) -> String {
 }
 
 fn latency(metrics: &Metrics) -> String {
-    match &metrics.latency_ms.capture_to_detection {
-        Percentiles {
-            p50: None,
-            p95: None,
-            ..
-        } => "-".into(),
-        Percentiles { p50, p95, .. } => format!("{} / {}", number(*p50, 0), number(*p95, 0)),
+    let Percentiles { p50, p95, .. } = metrics.latency_ms.capture_to_detection;
+    match p50.or(p95) {
+        None => "-".into(),
+        Some(_) => format!("{} / {}", number(p50, 0), number(p95, 0)),
     }
 }
 
 /// Wire bytes of the fused messages, or if there were none, of all messages sent.
 fn wire_bytes(metrics: &Metrics) -> String {
-    let mean = metrics
-        .comm
-        .wire_bytes_mean
-        .or(metrics.contribution.sent_bytes_mean);
-    mean.map_or("-".into(), bytes)
+    let sent = metrics.contribution.sent_bytes_mean;
+    { metrics.comm.wire_bytes_mean }
+        .or(sent)
+        .map_or("-".into(), bytes)
 }
 
 /// Column of the table.
@@ -305,11 +275,10 @@ impl Column {
 
 /// Header and rows.
 fn lines(columns: &[Column], rows: usize) -> String {
-    let mut table = TextTable::new(
-        columns
-            .iter()
-            .map(|column| (column.name.as_str(), column.side)),
-    );
+    let heads = columns
+        .iter()
+        .map(|column| (column.name.as_str(), column.side));
+    let mut table = TextTable::new(heads);
     (0..rows).for_each(|row| table.row(columns.iter().map(|column| column.cells[row].clone())));
     table.to_string()
 }

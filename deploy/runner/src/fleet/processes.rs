@@ -46,25 +46,19 @@ impl Fleet {
     ) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(context);
         self.plan_agents(&mut planner)?;
-        planner.plan(
-            format!("ego-{}", self.ego),
-            "ego-fuser run",
-            RestartPolicy::Service,
-            |bus| self.ego_config(context, bus),
-        )?;
+        let (ego, link) = (format!("ego-{}", self.ego), format!("link-{}", self.ego));
+        let config = |bus| self.ego_config(context, bus);
+        planner.plan(ego, "ego-fuser run", RestartPolicy::Service, config)?;
         if self.is_over_link() {
-            planner.plan(
-                format!("link-{}", self.ego),
-                "sim-replay link",
-                RestartPolicy::Service,
-                |bus| self.link_config(context, bus),
-            )?;
+            let config = |bus| self.link_config(context, bus);
+            planner.plan(link, "sim-replay link", RestartPolicy::Service, config)?;
         }
+        let config = |bus| self.replay_config(context, bus);
         planner.plan(
             REPLAY.into(),
             "sim-replay stream",
             RestartPolicy::Task,
-            |bus| self.replay_config(context, bus),
+            config,
         )?;
         if let Some(record) = &self.scenario.record {
             let (run, out) = (context.run.clone(), context.folder.file(RECORDING));
@@ -76,12 +70,8 @@ impl Fleet {
                 bus,
             };
             // A recording cannot be resumed after an interruption.
-            planner.plan(
-                RECORDER.into(),
-                "sim-replay record --json",
-                RestartPolicy::Optional,
-                config,
-            )?;
+            let command = "sim-replay record --json";
+            planner.plan(RECORDER.into(), command, RestartPolicy::Optional, config)?;
         }
         Ok(planner.specs)
     }
@@ -115,17 +105,15 @@ impl Fleet {
     }
 
     fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
-        for cav in self
-            .agents
-            .iter()
-            .filter(|cav| !self.scenario.remote_agents.contains(cav))
-        {
+        let remote = &self.scenario.remote_agents;
+        for cav in self.agents.iter().filter(|cav| !remote.contains(cav)) {
             let context = planner.context;
+            let config = |bus| self.agent_config(cav, context, bus);
             planner.plan(
                 format!("agent-{cav}"),
                 "agent run",
                 RestartPolicy::Service,
-                |bus| self.agent_config(cav, context, bus),
+                config,
             )?;
         }
         Ok(())
@@ -218,22 +206,15 @@ impl Planner<'_> {
         life: RestartPolicy,
         config: impl FnOnce(BusConfig) -> C,
     ) -> Result<(), RunFolderError> {
-        let SessionContext {
-            keys,
-            programs,
-            folder,
-            ..
-        } = self.context;
         self.metrics = self.metrics.and_then(port_behind);
-        let keys = keys.map(|keys| keys.of_process(&name));
         let bus = BusConfig {
-            keys,
+            keys: self.context.keys.map(|keys| keys.of_process(&name)),
             metrics: self.metrics,
             ..self.bus.clone()
         };
-        let file = folder.write_config(&name, &config(bus))?;
+        let file = self.context.folder.write_config(&name, &config(bus))?;
         let mut parts = command.split(' ');
-        let program = programs.join(parts.next().unwrap_or_default());
+        let program = self.context.programs.join(parts.next().unwrap_or_default());
         let mut args: Vec<_> = parts.map(Into::into).collect();
         args.extend(["--config".into(), file.into()]);
         self.specs.push(ProcessSpec {

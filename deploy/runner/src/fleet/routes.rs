@@ -40,14 +40,13 @@ impl Fleet {
         }
         for cav in self.neighbours() {
             if self.is_over_link() {
-                let topic = Topic::Received {
-                    ego: self.ego.clone(),
-                    cav: cav.clone(),
-                    stream,
-                };
                 routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));
                 routes.push(Route {
-                    topic,
+                    topic: Topic::Received {
+                        ego: self.ego.clone(),
+                        cav: cav.clone(),
+                        stream,
+                    },
                     receiver: ego.clone(),
                 });
             } else {
@@ -68,11 +67,8 @@ impl Fleet {
                     stream,
                 })
             });
-            let topics: BTreeSet<Topic> = routes
-                .iter()
-                .map(|route| route.topic.clone())
-                .chain(sensors)
-                .collect();
+            let topics = routes.iter().map(|route| route.topic.clone());
+            let topics: BTreeSet<Topic> = topics.chain(sensors).collect();
             routes.extend(topics.into_iter().map(|topic| Route {
                 topic,
                 receiver: receiver.clone(),

@@ -77,43 +77,26 @@ impl CrewProcesses {
             }
         });
         let (_, stream) = fleet.publish();
-        let vehicles: Vec<_> = fleet
-            .agents
-            .iter()
-            .map(|cav| (cav.clone(), stream))
-            .collect();
+        let vehicles = fleet.agents.iter().map(|cav| (cav.clone(), stream));
+        let vehicles: Vec<_> = vehicles.collect();
         let timeouts = &fleet.scenario.timeouts;
-        let remote = RemotePool::connect(
-            &bus,
-            &vehicles,
-            Duration::from_secs_f64(timeouts.ready_s),
-            &stop,
-        )
-        .map_err(|error| EvaluateError::from(Box::new(error)))?;
-        let grace = Duration::from_secs_f64(timeouts.stop_s);
-        Ok((
-            Self {
-                supervisor,
-                bus,
-                place,
-                grace,
-                _keys: keys,
-            },
-            remote,
-        ))
+        let ready = Duration::from_secs_f64(timeouts.ready_s);
+        let remote = RemotePool::connect(&bus, &vehicles, ready, &stop);
+        let remote = remote.map_err(|error| EvaluateError::from(Box::new(error)))?;
+        let processes = Self {
+            supervisor,
+            bus,
+            place,
+            grace: Duration::from_secs_f64(timeouts.stop_s),
+            _keys: keys,
+        };
+        Ok((processes, remote))
     }
 
     /// Ends all processes; returns the names of those that had to be killed.
     pub(crate) fn end(self) -> Vec<String> {
-        let Self {
-            supervisor,
-            bus,
-            place,
-            grace,
-            _keys,
-        } = self;
-        let killed = supervisor.stop(grace).killed;
-        for closed in [bus.leave(LEAVE_LIMIT), place.close()] {
+        let killed = self.supervisor.stop(self.grace).killed;
+        for closed in [self.bus.leave(LEAVE_LIMIT), self.place.close()] {
             if let Err(overdue) = closed {
                 tracing::warn!("{overdue}");
             }

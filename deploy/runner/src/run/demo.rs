@@ -30,48 +30,34 @@ fn try_draw(
     path: &Path,
 ) -> Result<(), Box<dyn std::error::Error>> {
     let pose_of = |cav: &CavId| {
-        frame
-            .world_from_lidar
-            .iter()
-            .find(|(known, _)| known == cav)
-            .map(|(_, pose)| *pose)
+        let mut poses = frame.world_from_lidar.iter();
+        Some(poses.find(|(known, _)| known == cav)?.1)
     };
     let world_from_ego: Pose = pose_of(&fleet.ego).ok_or("the truth names no pose of the ego")?;
     let dataset = dataset::open(&fleet.scenario.scene.dir)?;
     let name = fleet.scenario.scene.scenario.as_deref();
-    let scenario = dataset
-        .scenarios
-        .iter()
-        .find(|known| Some(known.name.as_str()) == name);
+    let mut scenarios = dataset.scenarios.iter();
+    let scenario = scenarios.find(|known| Some(known.name.as_str()) == name);
     let scenario = scenario.ok_or("the scene is gone")?;
     let options = LoadOptions {
         lidar_variant: fleet.scenario.scene.variant.clone(),
         ..LoadOptions::default()
     };
-    let shown = std::iter::once(&fleet.ego)
-        .chain(frame.result.fused.iter().map(|neighbour| &neighbour.cav));
+    let fused = frame.result.fused.iter().map(|neighbour| &neighbour.cav);
+    let shown = std::iter::once(&fleet.ego).chain(fused);
     let mut loaded = Vec::new();
     for cav in shown {
-        let (Some(index), Some(world_from_cav)) = (
-            scenario.agents.iter().position(|agent| agent == cav),
-            pose_of(cav),
-        ) else {
+        let index = scenario.agents.iter().position(|agent| agent == cav);
+        let (Some(index), Some(world_from_cav)) = (index, pose_of(cav)) else {
             continue;
         };
         let recorded = scenario.load(index, usize::try_from(frame.tick)?, &options)?;
-        loaded.push((
-            cav.to_string(),
-            world_from_ego.from_world(&world_from_cav),
-            recorded.points.xyzi,
-        ));
+        let ego_from_cav = world_from_ego.from_world(&world_from_cav);
+        loaded.push((cav.to_string(), ego_from_cav, recorded.points.xyzi));
     }
     let rule = fleet.ground_truth_rule();
-    let detections: Vec<_> = frame
-        .result
-        .detections
-        .iter()
-        .map(|detection| (detection.box3d, detection.score))
-        .collect();
+    let found = frame.result.detections.iter();
+    let detections: Vec<_> = found.map(|found| (found.box3d, found.score)).collect();
     let places = |axis: usize| {
         let boxes = frame
             .truth
@@ -106,14 +92,12 @@ fn try_draw(
 
 /// Range of the places and a margin around it, metres, within a limit: the rest of the limit is empty.
 fn around(places: impl Iterator<Item = f64>, [low, high]: [f64; 2]) -> [f64; 2] {
-    let (first, last) = places.filter(|place| (low..=high).contains(place)).fold(
-        (f64::INFINITY, f64::NEG_INFINITY),
-        |(first, last), place| (first.min(place), last.max(place)),
-    );
-    if first > last {
-        return [low, high];
+    let inside = places.filter(|place| (low..=high).contains(place));
+    let ends = inside.map(|place| (place, place));
+    match ends.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))) {
+        Some((first, last)) => [(first - MARGIN_M).max(low), (last + MARGIN_M).min(high)],
+        None => [low, high],
     }
-    [(first - MARGIN_M).max(low), (last + MARGIN_M).min(high)]
 }
 
 #[cfg(test)]

@@ -56,7 +56,6 @@ pub(crate) struct ProcessReport {
 impl LedgerReport {
     /// Report on `ledgers`, whose sum is `sum`; processes that were offline, and the number of messages exempt for
     /// that.
-    #[must_use]
     pub(crate) fn new(
         ledgers: &[ProcessStats],
         sum: &Ledger,
@@ -81,23 +80,13 @@ impl LedgerReport {
     }
 
     /// Adds the requests that the router of the run refused.
-    #[must_use]
     pub(crate) fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
-        let refused = refused.iter().map(
-            |(
-                Rejection {
-                    peer,
-                    message,
-                    reason,
-                },
-                count,
-            )| RefusedReport {
-                peer: peer.clone(),
-                message: message.clone(),
-                reason: reason.clone(),
-                count: *count,
-            },
-        );
+        let refused = refused.iter().map(|(of, count)| RefusedReport {
+            peer: of.peer.clone(),
+            message: of.message.clone(),
+            reason: of.reason.clone(),
+            count: *count,
+        });
         Self {
             refused: refused.collect(),
             ..self

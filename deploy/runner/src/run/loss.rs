@@ -10,17 +10,10 @@ use crate::run::run_fleet::RunResult;
 const OVERLOAD: [DropReason; 2] = [DropReason::Superseded, DropReason::Stale];
 
 /// Reasons for exit code 3 and what would help; `None` if nothing was lost beyond the drops of the link.
-#[must_use]
 pub(crate) fn sentence(result: &RunResult) -> Option<String> {
-    let reasons = reasons(result);
-    let help = help(result);
-    (!reasons.is_empty()).then(|| {
-        format!(
-            "{}{}",
-            listed(&reasons, "and"),
-            help.map_or(String::new(), |help| format!("; {help}"))
-        )
-    })
+    let (reasons, help) = (reasons(result), help(result));
+    let help = help.map_or(String::new(), |help| format!("; {help}"));
+    (!reasons.is_empty()).then(|| listed(&reasons, "and") + &help)
 }
 
 fn reasons(result: &RunResult) -> Vec<String> {
@@ -32,13 +25,10 @@ fn reasons(result: &RunResult) -> Vec<String> {
         ));
     }
     let messages = &result.metrics.messages;
-    let dropped = messages
-        .dropped
-        .iter()
-        .filter(|(reason, count)| reason.is_loss() && **count > 0);
-    let dropped: Vec<String> = dropped
-        .map(|(reason, count)| format!("{count} {}", spoken(*reason)))
-        .collect();
+    let dropped = messages.dropped.iter();
+    let lost = dropped.filter(|(reason, count)| reason.is_loss() && **count > 0);
+    let dropped = lost.map(|(reason, count)| format!("{count} {}", spoken(*reason)));
+    let dropped: Vec<String> = dropped.collect();
     if !dropped.is_empty() {
         reasons.push(format!("messages lost ({})", dropped.join(", ")));
     }
@@ -46,40 +36,25 @@ fn reasons(result: &RunResult) -> Vec<String> {
         reasons.push("most messages were still in flight at the end".into());
     }
     if !result.balance.is_exact() {
-        reasons.push(format!(
-            "{} accounts of ledger.json do not add up",
-            result.balance.discrepancies.len()
-        ));
+        let count = result.balance.discrepancies.len();
+        reasons.push(format!("{count} accounts of ledger.json do not add up"));
     }
     let left_out = &result.metrics.left_out;
     reasons.extend((!left_out.is_nothing()).then(|| left_out.to_string()));
     reasons.extend(result.failures.iter().cloned());
-    reasons.extend(
-        result
-            .killed
-            .iter()
-            .map(|process| format!("{process} did not end in time")),
-    );
+    let killed = result.killed.iter();
+    reasons.extend(killed.map(|process| format!("{process} did not end in time")));
     if !result.unwritten.is_empty() {
-        reasons.push(format!(
-            "{} files of the run are incomplete",
-            result.unwritten.len()
-        ));
+        let count = result.unwritten.len();
+        reasons.push(format!("{count} files of the run are incomplete"));
     }
     reasons
 }
 
 /// What would help, from the first cause that applies.
 fn help(result: &RunResult) -> Option<String> {
-    let count = |reason: &DropReason| {
-        result
-            .metrics
-            .messages
-            .dropped
-            .get(reason)
-            .copied()
-            .unwrap_or(0)
-    };
+    let dropped = &result.metrics.messages.dropped;
+    let count = |reason: &DropReason| dropped.get(reason).copied().unwrap_or(0);
     let log = |folder: &Path| format!("see {}", folder.join("log").display());
     if !result.unwritten.is_empty() {
         Some("free disk space".into())
@@ -94,10 +69,8 @@ fn help(result: &RunResult) -> Option<String> {
     } else if count(&DropReason::NoPose) > 0 && result.metrics.pose.success_3m == Some(0.0) {
         Some("no vehicle found itself: is the head of agents.pose that of this scene?".into())
     } else if result.missed > 0 || OVERLOAD.iter().any(|reason| count(reason) > 0) {
-        result
-            .remedies
-            .as_ref()
-            .map(|remedies| format!("{remedies} would answer more"))
+        let remedies = result.remedies.as_ref();
+        remedies.map(|remedies| format!("{remedies} would answer more"))
     } else if !result.metrics.left_out.is_nothing() {
         None
     } else {

@@ -20,7 +20,6 @@ const KERNEL: [i64; 4] = [64, 64, 3, 3];
 const REPETITIONS: usize = 6;
 
 /// This machine.
-#[must_use]
 pub(crate) fn this_machine() -> Machine {
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let limits = LIMITS
@@ -82,7 +81,6 @@ fn has_amx() -> bool {
 
 /// Speed of a core while `threads` cores compute, relative to one that computes alone, at most 1. Two hyperthreads of
 /// one core, as many virtual machines have them, reach little more than 0.5; other programs lower it too.
-#[must_use]
 pub(crate) fn speed_of_many(threads: usize) -> f64 {
     let alone = convolve_together(1);
     let together = convolve_together(threads);

@@ -74,46 +74,30 @@ pub(crate) struct Picture<'a> {
     pub detections: Vec<(Box3d, f32)>,
 }
 
-/// Reason why a picture could not be made.
-#[derive(Debug, thiserror::Error)]
-pub(crate) enum PictureError {
-    /// The range is empty or far too large to draw.
-    #[error("cannot draw x {x_m:?} m, y {y_m:?} m: a side must be above 0 and below {} m", MAX_SIDE / PIXELS_PER_M)]
-    Range {
-        /// Lower and upper x, metres.
-        x_m: [f64; 2],
-        /// Lower and upper y, metres.
-        y_m: [f64; 2],
-    },
-    /// The picture cannot be drawn or written.
-    #[error(transparent)]
-    Figure(#[from] FigureError),
-}
-
 impl Picture<'_> {
     /// Draws the frame into the PNG `path`: x to the right, y up.
     ///
     /// # Errors
-    /// [`PictureError`] when the range makes no picture or the file cannot be written.
-    pub(crate) fn save(&self, path: &Path) -> Result<(), PictureError> {
+    /// [`FigureError`] when the range makes no picture or the file cannot be written.
+    pub(crate) fn save(&self, path: &Path) -> Result<(), FigureError> {
         let map = self.map_size()?;
-        Ok(figures::save_image(path, picture_size(map), |image| {
-            self.draw(map, image)
-        })?)
+        figures::save_image(path, picture_size(map), |image| self.draw(map, image))
     }
 
     /// Width and height of the plan view, pixels.
-    fn map_size(&self) -> Result<(u32, u32), PictureError> {
+    fn map_size(&self) -> Result<(u32, u32), FigureError> {
         let [width, height] =
             [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
         let can_be_drawn = |side: f64| (1.0..=MAX_SIDE).contains(&side);
         if can_be_drawn(width) && can_be_drawn(height) {
             Ok((width as u32, height as u32))
         } else {
-            Err(PictureError::Range {
-                x_m: self.x_m,
-                y_m: self.y_m,
-            })
+            Err(FigureError::Draw(format!(
+                "x {:?} m, y {:?} m: a side must be above 0 and below {} m",
+                self.x_m,
+                self.y_m,
+                MAX_SIDE / PIXELS_PER_M
+            )))
         }
     }
 

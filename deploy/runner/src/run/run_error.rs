@@ -10,14 +10,12 @@ use deploy::score::ScorerError;
 use ego_fuser_offline::evaluation::EvaluateError;
 use protocol::{ProcessId, RunId};
 
-use crate::fleet::FleetError;
-
 /// Reason why a run failed.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// No fleet can be built from the scenario.
     #[error(transparent)]
-    Fleet(#[from] FleetError),
+    Fleet(anyhow::Error),
     /// The run folder cannot be used.
     #[error(transparent)]
     Folder(#[from] RunFolderError),

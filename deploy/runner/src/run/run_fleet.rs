@@ -19,17 +19,15 @@ use deploy::operate::supervise::{ProcessSpec, Supervisor};
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
 use deploy::score::metrics::Metrics;
-use deploy::score::offline_intervals;
-use deploy::score::{FrameScores, Progress, Scored, ScorerNode};
+use deploy::score::{FrameScores, Progress, Scored, ScorerNode, offline_intervals};
 use protocol::{Ledger, Reconciliation, RunId};
 use support::output;
 use support::provenance::Provenance;
 
 use crate::fleet::{Fleet, SessionContext};
-use crate::run::RunError;
 use crate::run::capacity::{estimate_apart, remedies};
 use crate::run::ledger_report::LedgerReport;
-use crate::run::loss;
+use crate::run::{RunError, loss};
 use crate::scenario::{Clock, Scenario};
 
 /// Update interval of the display.
@@ -101,13 +99,10 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     if scenario.clock == Clock::Stepped {
         return crate::run::stepped::run_scenario(scenario, options);
     }
-    let fleet = Fleet::plan(scenario)?;
+    let fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
-    let run = fleet
-        .scenario
-        .run
-        .clone()
-        .unwrap_or_else(|| name_of_now(options.prefix));
+    let named = fleet.scenario.run.clone();
+    let run = named.unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, options, &run, &folder);
     if result.as_ref().is_err_and(RunError::is_refusal) {
@@ -158,20 +153,11 @@ fn go(
     let specs = fleet.processes(&context)?;
     check_free(&place, &fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
-    let board = FrameScores::new(
-        fleet.ego.clone(),
-        fleet.ground_truth_rule(),
-        fleet.map_values(),
-    );
+    let (ego, agents) = (&fleet.ego, &fleet.agents);
+    let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let files = LINES.map(|name| folder.file(name));
-    let mut scorer = ScorerNode::start(
-        place.session.clone(),
-        run,
-        &fleet.agents,
-        &fleet.ego,
-        board,
-        files,
-    )?;
+    let session = place.session.clone();
+    let mut scorer = ScorerNode::start(session, run, agents, ego, board, files)?;
     if let Some(address) = fleet.scenario.network.metrics {
         let peer = |spec: &ProcessSpec| {
             Some(MetricsPeer {
@@ -267,9 +253,8 @@ fn watch(
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
     if let Some(address) = fleet.scenario.network.metrics {
-        display.print_line(&format!(
-            "metrics of all processes at http://{address}/metrics"
-        ));
+        let line = format!("metrics of all processes at http://{address}/metrics");
+        display.print_line(&line);
     }
     let restarts = fleet.scenario.timeouts.restarts;
     display.print_line(&format!(
@@ -287,12 +272,8 @@ fn watch(
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
     drain(&supervisor, scorer, limits.drain, &mut display);
-    killed.extend(
-        supervisor
-            .end(|name| name.starts_with("agent"), limits.all)
-            .killed,
-    );
-    // The recorder captures the last messages of all others.
+    let agents = supervisor.end(|name| name.starts_with("agent"), limits.all);
+    killed.extend(agents.killed);
     killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
     killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
     display.finish();
@@ -380,10 +361,8 @@ fn write(
     } = scored;
     let mut unwritten = Vec::new();
     for (name, lines) in LINES.iter().zip(lines).filter(|(_, lines)| *lines > 0) {
-        unwritten.push(format!(
-            "{lines} lines are missing in {}",
-            folder.file(name).display()
-        ));
+        let file = folder.file(name);
+        unwritten.push(format!("{lines} lines are missing in {}", file.display()));
     }
     let mut note = |written: Result<(), RunFolderError>| {
         if let Err(error) = written {
@@ -447,17 +426,15 @@ fn write(
 /// their number only, once the scene is over.
 fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
     let (reported, _) = board.ticks();
-    let played = fleet
-        .ticks
-        .filter(|_| matches!(ending, Ending::Over))
-        .unwrap_or(0) as u64;
-    board.missed() + played.saturating_sub(reported)
+    let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over));
+    board.missed() + (played.unwrap_or(0) as u64).saturating_sub(reported)
 }
 
 fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
-    let seconds = progress.span.map_or(0.0, |(first, last)| {
-        last.duration_since(first).as_secs_f64()
-    });
+    let span = progress
+        .span
+        .map(|(first, last)| last.duration_since(first));
+    let seconds = span.map_or(0.0, |span| span.as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     Metrics {
         protocol: Some(fleet.applied_protocol()),

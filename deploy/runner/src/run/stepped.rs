@@ -14,53 +14,39 @@ use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
-use link::LinkConfig;
+use link::{LinkConfig, LinkError};
 use protocol::RunId;
 use support::progress;
 use support::provenance::Provenance;
 
 use crate::evaluated_frame::{judge, metrics};
-use crate::fleet::{Fleet, FleetError};
+use crate::fleet::Fleet;
 use crate::frame_lines::FrameLines;
 use crate::run::RunError;
 use crate::run::agent_pool::CrewProcesses;
 use crate::run::ledger_report::LedgerReport;
 use crate::run::run_fleet::{RunOptions, RunResult};
-use crate::scenario::{Scenario, Stepped};
+use crate::scenario::Scenario;
 
 /// Runs a scenario in simulation time to its end.
 ///
 /// # Errors
 /// [`RunError`] when no fleet can be built from the scenario, or a frame cannot be read or computed.
 pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResult, RunError> {
-    let mut fleet = Fleet::plan(scenario)?;
+    let mut fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
     fleet.scenario.models.threads.apply();
     let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
-    let compute = match fleet
-        .scenario
-        .stepped
-        .as_ref()
-        .and_then(|stepped| stepped.compute)
-    {
+    let stepped = fleet.scenario.stepped.get_or_insert_default();
+    let compute = match stepped.compute {
         Some(compute) => compute,
         None => evaluator.measure(&fleet.recorded)?,
     };
-    // Written into the run's scenario, from which another run can take it.
-    let processes = fleet
-        .scenario
-        .stepped
-        .is_some_and(|stepped| stepped.processes);
-    fleet.scenario.stepped = Some(Stepped {
-        compute: Some(compute),
-        processes,
-    });
-    let run = fleet
-        .scenario
-        .run
-        .clone()
-        .unwrap_or_else(|| name_of_now(options.prefix));
-    let mut evaluator = evaluator.with_link(stepped_config(&fleet, compute)?);
+    stepped.compute = Some(compute);
+    let named = fleet.scenario.run.clone();
+    let run = named.unwrap_or_else(|| name_of_now(options.prefix));
+    let config = stepped_config(&fleet, compute).map_err(|error| RunError::Fleet(error.into()))?;
+    let mut evaluator = evaluator.with_link(config);
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, &mut evaluator, (&run, &folder), options);
     if result.as_ref().is_err_and(RunError::is_refusal) {
@@ -80,16 +66,15 @@ fn go(
         .scenario
         .stepped
         .is_some_and(|stepped| stepped.processes);
-    let crew = processes
-        .then(|| CrewProcesses::start(fleet, run, folder, &options.programs))
-        .transpose()?;
-    let processes = crew.map(|(processes, remote)| {
+    let mut running = None;
+    if processes {
+        let (processes, remote) = CrewProcesses::start(fleet, run, folder, &options.programs)?;
         evaluator.set_processes(Some(remote));
-        processes
-    });
+        running = Some(processes);
+    }
     let board = play(fleet, evaluator, folder)?;
     evaluator.set_processes(None);
-    let killed = processes.map(CrewProcesses::end).unwrap_or_default();
+    let killed = running.map(CrewProcesses::end).unwrap_or_default();
     let result = write(fleet, evaluator, &board, (run, folder.clone()), options)?;
     Ok(RunResult { killed, ..result })
 }
@@ -110,34 +95,23 @@ pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
     }
 }
 
-fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig, FleetError> {
+fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig, LinkError> {
     let Scenario {
         scene, ego, link, ..
     } = &fleet.scenario;
-    let (config, link_folder, seed) = match link {
-        Some(link) => {
-            let (config, folder) = LinkConfig::open(&link.model)?;
-            (config, folder, link.seed)
-        }
-        None => (LinkConfig::default(), PathBuf::from("."), 0),
+    let (opened, seed) = match link {
+        Some(link) => (LinkConfig::open(&link.model)?, link.seed),
+        None => ((LinkConfig::default(), PathBuf::from(".")), 0),
     };
     let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
-    let vehicles = fleet
-        .agents
-        .iter()
-        .map(|cav| (cav.clone(), fleet.settings_of(cav)));
+    let vehicles = { fleet.agents.iter() }.map(|cav| (cav.clone(), fleet.settings_of(cav)));
     let last = fleet.ticks.map_or(usize::MAX, |ticks| scene.seek + ticks);
     Ok(SteppedConfig {
-        link: config,
-        link_folder,
-        seed,
-        deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
-        pairing: ego.pairing(),
-        compute,
         crew: AgentPool::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
         vehicles: vehicles.collect(),
         ticks: scene.seek..last,
         lidar_variant: scene.variant.clone(),
+        ..SteppedConfig::new(opened, seed, ego, compute)
     })
 }
 
@@ -147,11 +121,8 @@ fn play(
     evaluator: &mut Evaluator,
     folder: &RunFolder,
 ) -> Result<FrameScores, RunError> {
-    let mut board = FrameScores::new(
-        fleet.ego.clone(),
-        fleet.ground_truth_rule(),
-        fleet.map_values(),
-    );
+    let (rule, map_values) = (fleet.ground_truth_rule(), fleet.map_values());
+    let mut board = FrameScores::new(fleet.ego.clone(), rule, map_values);
     let unwritable = |source| RunFolderError::Write {
         path: folder.path().to_owned(),
         source,
@@ -182,13 +153,8 @@ fn write(
 ) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
-    let metrics = metrics(
-        board,
-        evaluator,
-        "stepped",
-        fleet.pose_source(),
-        board.seconds(),
-    );
+    let (poses, seconds) = (fleet.pose_source(), board.seconds());
+    let metrics = metrics(board, evaluator, "stepped", poses, seconds);
     let provenance = fleet.provenance(&options.programs);
     let provenance = provenance
         .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))

@@ -3,22 +3,19 @@
 use std::path::Path;
 
 use bus::Endpoint;
-use bus::config_file::ConfigError;
 use perception::compute_device::ComputeDevice;
 use protocol::config::{FieldError, above_zero, within};
+use support::file_error::{AtFile, FileError};
 
-use super::{Clock, Scenario, ScenarioError};
+use super::{Clock, Scenario};
 
 impl Scenario {
     /// Checks the values of the fields and that what they name exists.
     ///
     /// # Errors
-    /// [`ScenarioError`] for the first invalid field, by path.
-    pub fn check(&self, path: &Path) -> Result<(), ScenarioError> {
-        self.check_values().map_err(|error| ConfigError::Value {
-            path: Some(path.into()),
-            error,
-        })?;
+    /// [`FileError`] for the first invalid field, by path.
+    pub fn check(&self, path: &Path) -> Result<(), FileError> {
+        self.check_values().at(path)?;
         self.check_files(path)
     }
 
@@ -37,12 +34,7 @@ impl Scenario {
     }
 
     fn check_numbers(&self) -> Result<(), FieldError> {
-        let Self {
-            scene,
-            network,
-            timeouts,
-            ..
-        } = self;
+        let (scene, network, timeouts) = (&self.scene, &self.network, &self.timeouts);
         for (field, number) in [
             ("scene.rate", scene.rate),
             ("network.stall_limit_s", network.stall_limit_s),
@@ -63,30 +55,17 @@ impl Scenario {
     }
 
     fn check_network(&self) -> Result<(), FieldError> {
-        let listen = [("network.listen", &self.network.listen)];
-        for (field, text) in listen.into_iter().chain(
-            self.network
-                .connect
-                .iter()
-                .map(|at| ("network.connect", at)),
-        ) {
-            match Endpoint::new(text) {
-                Err(_) => {
-                    return Err(FieldError::new(
-                        field,
-                        text,
-                        "must read tcp/ADDRESS:PORT or quic/ADDRESS:PORT",
-                    ));
-                }
+        let listen = [("network.listen", &self.network.listen)].into_iter();
+        let connect = { self.network.connect.iter() }.map(|at| ("network.connect", at));
+        for (field, text) in listen.chain(connect) {
+            let rule = match Endpoint::new(text) {
+                Err(_) => "must read tcp/ADDRESS:PORT or quic/ADDRESS:PORT",
                 Ok(endpoint) if endpoint.is_secured() && self.security.is_none() => {
-                    return Err(FieldError::new(
-                        field,
-                        text,
-                        "must begin with tcp/, or security must be given",
-                    ));
+                    "must begin with tcp/, or security must be given"
                 }
-                Ok(_) => {}
-            }
+                Ok(_) => continue,
+            };
+            return Err(FieldError::new(field, text, rule));
         }
         match self.network.metrics {
             Some(metrics) if metrics.port() == 0 => {
@@ -98,36 +77,20 @@ impl Scenario {
     }
 
     /// Checks that files and folders that are named exist.
-    fn check_files(&self, path: &Path) -> Result<(), ScenarioError> {
-        let keys = self
-            .security
-            .iter()
-            .flat_map(|security| &security.keys)
-            .map(|keys| ("security.keys", keys.clone()));
-        let poses = self.settings().flat_map(|settings| {
-            settings
-                .pose
-                .files()
-                .into_iter()
-                .map(Path::to_owned)
-                .collect::<Vec<_>>()
-        });
-        let places = [
+    fn check_files(&self, path: &Path) -> Result<(), FileError> {
+        let mut places = vec![
             ("scene.dir", self.scene.dir.clone()),
             ("models.weights", self.models.weights.clone()),
         ];
-        let places = places
-            .into_iter()
-            .chain(keys)
-            .chain(poses.map(|file| ("agents.pose", file)));
-        for (field, missing) in places {
-            if !missing.exists() {
-                return Err(ScenarioError::Missing {
-                    path: path.into(),
-                    field,
-                    missing,
-                });
-            }
+        let keys = self.security.iter().flat_map(|security| &security.keys);
+        places.extend(keys.map(|keys| ("security.keys", keys.clone())));
+        for settings in self.settings() {
+            let files = settings.pose.files().into_iter();
+            places.extend(files.map(|file| ("agents.pose", file.to_owned())));
+        }
+        if let Some((field, missing)) = places.iter().find(|(_, file)| !file.exists()) {
+            let problem = format_args!("{field}: {} does not exist", missing.display());
+            return Err(FileError::new(path, problem));
         }
         Ok(())
     }
@@ -153,53 +116,54 @@ impl Scenario {
     /// Checks that no field contradicts the clock: simulation time has no pace, no waiting and no other hosts.
     fn check_clock(&self) -> Result<(), FieldError> {
         if self.clock == Clock::Wall {
-            return match self.stepped {
-                Some(_) => Err(FieldError::new(
-                    "stepped",
-                    "given",
-                    "must be left out unless clock is stepped",
-                )),
-                None => Ok(()),
-            };
+            let rule = "must be left out unless clock is stepped";
+            let given = self
+                .stepped
+                .map(|_| FieldError::new("stepped", "given", rule));
+            return given.map_or(Ok(()), Err);
         }
-        if self.scene.rate != 1.0 {
-            return Err(FieldError::new(
+        let (scene, remote) = (&self.scene, self.remote_agents.first());
+        let refused = [
+            (
                 "scene.rate",
-                self.scene.rate,
+                (scene.rate != 1.0).then(|| scene.rate.to_string()),
                 "must be 1 with clock stepped, which has no pace",
-            ));
-        }
-        for (field, is_set) in [
-            ("scene.loop", self.scene.repeat),
-            ("scene.lockstep", self.scene.lockstep),
-        ] {
-            if is_set {
-                return Err(FieldError::new(
-                    field,
-                    "true",
-                    "must be false with clock stepped",
-                ));
-            }
-        }
-        if self.models.device != ComputeDevice::Cpu {
-            let rule =
-                "must be cpu with clock stepped, whose results are the same bytes on any machine";
-            return Err(FieldError::new("models.device", "cuda", rule));
-        }
-        if self.record.is_some() {
-            let rule = "must be left out with clock stepped, whose processes publish nothing";
-            return Err(FieldError::new("record", "given", rule));
-        }
-        if let Some(metrics) = self.network.metrics {
-            return Err(FieldError::new(
+            ),
+            (
+                "scene.loop",
+                scene.repeat.then(|| "true".into()),
+                "must be false with clock stepped",
+            ),
+            (
+                "scene.lockstep",
+                scene.lockstep.then(|| "true".into()),
+                "must be false with clock stepped",
+            ),
+            (
+                "models.device",
+                (self.models.device != ComputeDevice::Cpu).then(|| "cuda".into()),
+                "must be cpu with clock stepped, whose results are the same bytes on any machine",
+            ),
+            (
+                "record",
+                self.record.as_ref().map(|_| "given".into()),
+                "must be left out with clock stepped, whose processes publish nothing",
+            ),
+            (
                 "network.metrics",
-                metrics,
+                self.network.metrics.map(|address| address.to_string()),
                 "must be left out with clock stepped",
-            ));
-        }
-        if let Some(cav) = self.remote_agents.first() {
-            let rule = "must be left out with clock stepped, whose processes run here";
-            return Err(FieldError::new("remote_agents", cav, rule));
+            ),
+            (
+                "remote_agents",
+                remote.map(ToString::to_string),
+                "must be left out with clock stepped, whose processes run here",
+            ),
+        ];
+        for (field, found, rule) in refused {
+            if let Some(found) = found {
+                return Err(FieldError::new(field, found, rule));
+            }
         }
         let Some(compute) = self.stepped.and_then(|stepped| stepped.compute) else {
             return Ok(());

@@ -2,17 +2,18 @@
 
 use std::path::{Path, PathBuf};
 
-use bus::config_file::{self, ConfigError};
+use bus::config_file;
 use localization::pose_source::PoseSourceConfig;
+use support::file_error::{AtFile, FileError};
 
-use super::{FieldOverride, Scenario, ScenarioError};
+use super::{FieldOverride, Scenario};
 
 impl Scenario {
     /// Reads and checks a scenario. Relative paths are resolved against its folder.
     ///
     /// # Errors
-    /// [`ScenarioError`] names the file, the line or field, and what is wrong.
-    pub fn load(path: &Path) -> Result<Self, ScenarioError> {
+    /// [`FileError`] names the file, the line or field, and what is wrong.
+    pub fn load(path: &Path) -> Result<Self, FileError> {
         let scenario = Self::read(path)?;
         scenario.check(path)?;
         Ok(scenario)
@@ -22,7 +23,6 @@ impl Scenario {
     ///
     /// # Panics
     /// Never: every field has a spelling in YAML.
-    #[must_use]
     pub(crate) fn to_yaml(&self) -> String {
         serde_saphyr::to_string(self).expect("plain structs, texts and numbers")
     }
@@ -30,8 +30,8 @@ impl Scenario {
     /// Reads a scenario without checking it: for callers that first fill in or replace some fields.
     ///
     /// # Errors
-    /// [`ScenarioError`] when the file cannot be read or is no scenario.
-    pub fn read(path: &Path) -> Result<Self, ScenarioError> {
+    /// [`FileError`] when the file cannot be read or is no scenario.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
         Self::read_with(path, &[])
     }
 
@@ -39,16 +39,13 @@ impl Scenario {
     ///
     /// # Errors
     /// As [`Self::read`]; also when a field that is set is not one of a scenario.
-    pub fn read_with(path: &Path, overrides: &[FieldOverride]) -> Result<Self, ScenarioError> {
+    pub fn read_with(path: &Path, overrides: &[FieldOverride]) -> Result<Self, FileError> {
         // Read as it is first: errors of the file have lines.
         let mut scenario: Self = config_file::read(path)?;
         if !overrides.is_empty() {
             scenario = overridden(path, overrides)?;
         }
-        let file = std::path::absolute(path).map_err(|source| ConfigError::Io {
-            path: path.into(),
-            source,
-        })?;
+        let file = std::path::absolute(path).at(path)?;
         let folder = file.parent().unwrap_or(Path::new("/"));
         let absolute = |place: &Path| without_dots(&folder.join(place));
         let Scenario {
@@ -70,10 +67,7 @@ impl Scenario {
         }
         let with_files = |pose: PoseSourceConfig| {
             let found = pose.map_files(absolute).with_networks();
-            found.map_err(|source| ScenarioError::Head {
-                path: path.into(),
-                source,
-            })
+            found.map_err(|error| FileError::new(path, format_args!("agents.pose: {error}")))
         };
         agents.pose = with_files(std::mem::take(&mut agents.pose))?;
         vehicles
@@ -89,27 +83,15 @@ impl Scenario {
 }
 
 /// The scenario of a file with other values for some fields.
-fn overridden(path: &Path, overrides: &[FieldOverride]) -> Result<Scenario, ScenarioError> {
+fn overridden(path: &Path, overrides: &[FieldOverride]) -> Result<Scenario, FileError> {
     let mut document: serde_json::Value = config_file::read(path)?;
     for field in overrides {
         field.apply(&mut document);
         // One by one, so that an error names the field.
-        serde_json::from_value::<Scenario>(document.clone()).map_err(|error| {
-            ConfigError::Syntax {
-                path: path.into(),
-                line: None,
-                reason: format!("--set {field}: {error}"),
-            }
-        })?;
+        serde_json::from_value::<Scenario>(document.clone())
+            .map_err(|error| FileError::new(path, format_args!("--set {field}: {error}")))?;
     }
-    serde_json::from_value(document).map_err(|error| {
-        ConfigError::Syntax {
-            path: path.into(),
-            line: None,
-            reason: error.to_string(),
-        }
-        .into()
-    })
+    serde_json::from_value(document).at(path)
 }
 
 /// The path without `.` and `a/..`, for readable messages and resolved copies.
@@ -139,8 +121,8 @@ mod tests {
 
     const SMALL: &str = "scene: {dir: ../scene}\nmodels: {weights: w.safetensors}\n";
 
-    fn parse(text: &str) -> Result<Scenario, ScenarioError> {
-        Ok(config_file::parse(text, Path::new("s.yaml"))?)
+    fn parse(text: &str) -> Result<Scenario, FileError> {
+        config_file::parse(text, Path::new("s.yaml"))
     }
 
     #[test]

@@ -5,7 +5,6 @@
 //! `deploy/scenarios/scenario.schema.json` describes them for editors.
 
 mod check;
-mod error;
 mod field_override;
 pub mod fingerprint;
 mod load;
@@ -28,7 +27,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sim_replay::config::{LinkSelection, RecordingConfig, SceneConfig};
 
-pub use error::ScenarioError;
 pub use field_override::FieldOverride;
 pub use overrides::AgentOverrides;
 
@@ -142,7 +140,6 @@ impl Scenario {
     }
 
     /// Settings of vehicle `cav`: `agents`, with its own entry of `vehicles` on top.
-    #[must_use]
     pub(crate) fn settings_of(&self, cav: &CavId) -> AgentSettings {
         self.vehicles
             .get(cav)

@@ -3,53 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use fusion::Method;
-use perception::weights::{FileError, METHOD_KEY, Weights};
+use perception::weights::{METHOD_KEY, Weights};
+use support::file_error::{AtFile, FileError};
 
 /// File name of the weights of a training.
 const TRAINED_FILE: &str = "weights.safetensors";
-
-/// Reason why a method has no weights.
-#[derive(Debug, thiserror::Error)]
-pub enum WeightsChoiceError {
-    /// The folder cannot be listed.
-    #[error("{}: {source}", folder.display())]
-    Io {
-        /// Path of the folder.
-        folder: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
-    /// The folder has none, or several.
-    #[error(
-        "{}: {found} files named *-{name}.safetensors or {name}/{TRAINED_FILE}, method {method} needs one, or {TRAINED_FILE}",
-        folder.display()
-    )]
-    NotOne {
-        /// Path of the folder.
-        folder: PathBuf,
-        /// Requested method.
-        method: Method,
-        /// Method that such weights are trained for.
-        name: &'static str,
-        /// Number of matching files.
-        found: usize,
-    },
-    /// The folder is one of a training of another method.
-    #[error("{}: trained for {trained}, and method {method} needs weights trained for {name}", file.display())]
-    OtherMethod {
-        /// Path of the weights.
-        file: PathBuf,
-        /// Requested method.
-        method: Method,
-        /// Method that such weights are trained for.
-        name: &'static str,
-        /// Method that the file names.
-        trained: String,
-    },
-    /// The weights of a training cannot be read.
-    #[error(transparent)]
-    Weights(#[from] FileError),
-}
 
 /// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or
 /// `METHOD/weights.safetensors`, or if it has neither, `weights.safetensors` of a training of that method.
@@ -58,8 +16,8 @@ pub enum WeightsChoiceError {
 /// the folder has none of its own.
 ///
 /// # Errors
-/// [`WeightsChoiceError`] when the folder does not hold exactly one.
-pub(crate) fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceError> {
+/// [`FileError`] when the folder does not hold exactly one.
+pub(crate) fn weights_of(path: &Path, method: Method) -> Result<PathBuf, FileError> {
     if !path.is_dir() {
         return Ok(path.to_path_buf());
     }
@@ -81,44 +39,35 @@ pub(crate) fn weights_of(path: &Path, method: Method) -> Result<PathBuf, Weights
     if found == 0 && trained.is_file() {
         return trained_for(trained, method, &candidates);
     }
-    Err(WeightsChoiceError::NotOne {
-        folder: path.to_path_buf(),
-        method,
-        name,
-        found,
-    })
+    let files = format!("*-{name}.safetensors or {name}/{TRAINED_FILE}");
+    let problem =
+        format!("{found} files named {files}, method {method} needs one, or {TRAINED_FILE}");
+    Err(FileError::new(path, problem))
 }
 
 /// The weights of a training of a method that `method` can run with.
-fn trained_for(
-    file: PathBuf,
-    method: Method,
-    candidates: &[&'static str],
-) -> Result<PathBuf, WeightsChoiceError> {
+fn trained_for(file: PathBuf, method: Method, candidates: &[&str]) -> Result<PathBuf, FileError> {
     let weights = Weights::load(&file)?;
     match weights.metadata(METHOD_KEY) {
         Some(trained) if !candidates.contains(&trained) => {
-            let trained = trained.to_owned();
-            Err(WeightsChoiceError::OtherMethod {
+            let needed = format!(
+                "method {method} needs weights trained for {}",
+                candidates[0]
+            );
+            Err(FileError::new(
                 file,
-                method,
-                name: candidates[0],
-                trained,
-            })
+                format_args!("trained for {trained}, and {needed}"),
+            ))
         }
         _ => Ok(file),
     }
 }
 
-fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>, WeightsChoiceError> {
-    let io = |source| WeightsChoiceError::Io {
-        folder: folder.to_path_buf(),
-        source,
-    };
+fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>, FileError> {
     let ending = format!("-{name}.safetensors");
     let mut files = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
+    for entry in std::fs::read_dir(folder).at(folder)? {
+        let entry = entry.at(folder)?;
         if entry.file_name().to_string_lossy().ends_with(&ending) {
             files.push(entry.path());
         }

@@ -7,8 +7,9 @@ use std::sync::Arc;
 use agent::agent::Agent;
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::{Context, Result};
+use bus::config_file;
 use clap::ValueEnum;
-use dataset::{IntensityScale, Scenario};
+use dataset::Scenario;
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use ego_fuser_offline::evaluation::alignment::table::{Row, Tally, markdown};
@@ -18,11 +19,11 @@ use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
 use perception::inference::Inference;
 use protocol::CavId;
-use support::output;
-use support::progress;
+use support::file_error::AtFile;
+use support::{output, progress};
 use tch::Device;
 
-use super::scenarios;
+use super::DataSets;
 use support::cli::BadInput;
 
 /// Compares methods to align the ego and a neighbour: time per pair, transmitted bytes, success.
@@ -31,17 +32,8 @@ use support::cli::BadInput;
 /// aligned counts as missed.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Datasets, splits or scenarios with true poses.
-    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
-    data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    data: DataSets,
     /// Methods; none named: all but icp-map.
     #[arg(long, num_args = 1.., value_delimiter = ',', value_enum)]
     method: Vec<Method>,
@@ -134,7 +126,7 @@ impl Arguments {
     /// Compares, and prints the table.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = scenarios(&self.data, self.intensity_scale)?;
+        let scenarios = self.data.scenarios()?;
         let mut rows = Vec::new();
         for (number, &boxes) in self.boxes.iter().enumerate() {
             let mut methods = self.methods()?;
@@ -142,15 +134,12 @@ impl Arguments {
             methods.retain(|method| number == 0 || method.needs_boxes);
             let mut source = self.box_source(boxes, &methods)?;
             let found = self.compare(&methods, &mut source, &scenarios)?;
-            rows.extend(found.into_iter().zip(&methods).map(|(row, method)| {
-                match self.boxes.len() > 1 && method.needs_boxes {
-                    true => Row {
-                        method: format!("{}, {}", row.method, boxes.adjective()),
-                        ..row
-                    },
-                    false => row,
+            for (mut row, method) in found.into_iter().zip(&methods) {
+                if self.boxes.len() > 1 && method.needs_boxes {
+                    row.method += &format!(", {}", boxes.adjective());
                 }
-            }));
+                rows.push(row);
+            }
         }
         if self.json {
             output::line(serde_json::to_string_pretty(&rows)?)?;
@@ -187,10 +176,8 @@ impl Arguments {
 
     fn icp_map(&self) -> Result<AlignmentSpec> {
         if self.icp_map.is_empty() || self.map_spacing_m.is_nan() || self.map_spacing_m < 0.0 {
-            return Err(BadInput::new(
-                "icp-map needs --icp-map DIR, and a spacing that is not negative",
-            )
-            .into());
+            let reason = "icp-map needs --icp-map DIR, and a spacing that is not negative";
+            return Err(BadInput::new(reason).into());
         }
         let config = IcpConfig::default();
         let map = read_map(&self.icp_map, self.map_spacing_m, &config).map_err(BadInput::of)?;
@@ -205,18 +192,13 @@ impl Arguments {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {
-            return Err(BadInput::new(
-                "detected boxes need --weights FILE; or use --boxes annotated",
-            )
-            .into());
+            let reason = "detected boxes need --weights FILE; or use --boxes annotated";
+            return Err(BadInput::new(reason).into());
         };
         let detector = Detector::load(weights, Device::Cpu).map_err(BadInput::of)?;
         let cav = CavId::new("detector").context("a name")?;
-        Ok(BoxSource::Detected(Box::new(Agent::new(
-            cav,
-            Box::new(RecordedPose),
-            detector,
-        ))))
+        let agent = Agent::new(cav, Box::new(RecordedPose), detector);
+        Ok(BoxSource::Detected(Box::new(agent)))
     }
 
     fn compare(
@@ -247,14 +229,10 @@ impl Arguments {
 
 fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let NamedSource { name, file } = source;
-    let bad = |error: &dyn std::fmt::Display| BadInput::new(format!("{}: {error}", file.display()));
-    let text = support::bounded_file::read_text(file, 1 << 20).map_err(|error| bad(&error))?;
-    let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
-    let config = config.with_networks().map_err(|error| bad(&error))?;
-    // Built once without use, so that a missing file is found before the first scene.
-    config
-        .build(Inference::default())
-        .map_err(|error| bad(&error))?;
+    let config: PoseSourceConfig = config_file::read(file).map_err(BadInput::of)?;
+    let config = config.with_networks().at(file).map_err(BadInput::of)?;
+    let built = config.build(Inference::default());
+    built.at(file).map_err(BadInput::of)?;
     Ok(Poses::spec(name.clone(), Measured::True, move || {
         config.build(Inference::default())
     }))

@@ -3,29 +3,19 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
-use dataset::IntensityScale;
 use ego_fuser_offline::alignment_error::{AlignmentError, AlignmentMeter, Offset};
 use perception::weights::Weights;
 use support::output;
 use support::text_table::{Side, TextTable};
 
-use super::scenarios;
+use super::DataSets;
 use support::cli::BadInput;
 
 /// Add offsets to the true poses of neighbours and measure the part that the method's own alignment corrects.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
-    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
-    data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    data: DataSets,
     /// Weights of a method that aligns maps itself, such as pastat.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
@@ -65,12 +55,8 @@ impl Arguments {
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
         let mut meter = AlignmentMeter::load(&weights).map_err(BadInput::of)?;
-        let found = meter.measure(
-            &scenarios(&self.data, self.intensity_scale)?,
-            self.every,
-            &offsets,
-            self.seed,
-        )?;
+        let scenarios = self.data.scenarios()?;
+        let found = meter.measure(&scenarios, self.every, &offsets, self.seed)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&found)?)?;
             return Ok(());
@@ -81,17 +67,13 @@ impl Arguments {
 }
 
 fn table(found: &[AlignmentError]) -> TextTable {
-    let right = [
-        "pairs",
-        "mean m before/after",
-        "median m before/after",
-        "mean degrees before/after",
-    ];
-    let mut table = TextTable::new(
-        [("offset", Side::Left)]
-            .into_iter()
-            .chain(right.map(|name| (name, Side::Right))),
-    );
+    let mut table = TextTable::new([
+        ("offset", Side::Left),
+        ("pairs", Side::Right),
+        ("mean m before/after", Side::Right),
+        ("median m before/after", Side::Right),
+        ("mean degrees before/after", Side::Right),
+    ]);
     for summary in found {
         let Offset { shift_m, turn_deg } = summary.offset;
         let [mean, median, angle] = [summary.mean_m, summary.p50_m, summary.mean_deg]

@@ -4,26 +4,23 @@ use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
+use super::DataSets;
 use anyhow::Result;
 use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
-use dataset::{
-    self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, Scenario, findings,
-};
+use dataset::{self, LeftOut, LoadOptions, Scenario, findings};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
 use perception::int8::InferencePrecision;
 use perception::weights::{KIND_KEY, Weights};
 use serde_json::{Value, json};
-use support::cli::BadInput;
-use support::cli::Outcome;
+use support::cli::{BadInput, Outcome};
 use support::file_digests::FileDigests;
-use support::output;
-use support::progress;
 use support::provenance::Provenance;
+use support::{output, progress};
 
 /// A data set with its evaluation protocol.
 struct Data {
@@ -34,17 +31,8 @@ struct Data {
 /// Measures AP on datasets, with true poses, without delay and without loss.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Datasets, splits or scenarios.
-    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
-    data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    data: DataSets,
     /// Weights of encoder and head.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
@@ -77,10 +65,9 @@ impl Arguments {
             self.run_multi_scale(&data, &mut left_out)?;
             return Ok(print_left_out(&left_out));
         }
-        let methods = if self.method.is_empty() {
-            vec![None]
-        } else {
-            self.method.iter().map(|method| Some(*method)).collect()
+        let methods = match &self.method[..] {
+            [] => vec![None],
+            methods => methods.iter().copied().map(Some).collect(),
         };
         let mut rows = Vec::new();
         for method in methods {
@@ -112,41 +99,37 @@ fn print_left_out(left_out: &LeftOut) -> Outcome {
 impl Arguments {
     /// The data sets, each with the agents of its protocol.
     fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
-        let options = OpenOptions {
-            intensity_scale: self.intensity_scale,
-            ..OpenOptions::default()
-        };
-        let open = |folder: &PathBuf| {
-            let Dataset {
-                layout,
-                scenarios,
-                problems,
-            } = dataset::open_with(folder, &options).map_err(BadInput::of)?;
-            left_out.add_files(&problems);
-            left_out.add_findings(findings::sampled(&scenarios, self.intensity_scale));
-            let protocol = self.protocol.resolve(layout).map_err(BadInput::new)?;
-            let mut scenarios: Vec<Scenario> = scenarios
-                .iter()
-                .filter_map(|scenario| protocol.arrange(scenario))
-                .collect();
-            let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
-            scenarios
-                .iter_mut()
-                .for_each(|scenario| scenario.ticks.truncate(most));
-            Ok(Data {
+        let mut all = Vec::with_capacity(self.data.data.len());
+        for folder in &self.data.data {
+            let opened = dataset::open_with(folder, &self.data.options()).map_err(BadInput::of)?;
+            left_out.add_files(&opened.problems);
+            let scale = self.data.intensity_scale;
+            left_out.add_findings(findings::sampled(&opened.scenarios, scale));
+            let protocol = self
+                .protocol
+                .resolve(opened.layout)
+                .map_err(BadInput::new)?;
+            let mut scenarios = Vec::with_capacity(opened.scenarios.len());
+            for scenario in &opened.scenarios {
+                if let Some(mut scenario) = protocol.arrange(scenario) {
+                    let most = self.frames.map_or(usize::MAX, |frames| frames as usize);
+                    scenario.ticks.truncate(most);
+                    scenarios.push(scenario);
+                }
+            }
+            all.push(Data {
                 protocol,
                 scenarios,
-            })
-        };
-        self.data.iter().map(open).collect()
+            });
+        }
+        Ok(all)
     }
 
     /// A network that fuses at every level is one method of its own.
     fn run_multi_scale(&self, data: &[Data], left_out: &mut LeftOut) -> Result<()> {
         if !self.method.is_empty() {
-            return Err(
-                BadInput::new("a multi-scale network has one method: leave --method out").into(),
-            );
+            let reason = "a multi-scale network has one method: leave --method out";
+            return Err(BadInput::new(reason).into());
         }
         let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let mut tally = Tally::default();
@@ -257,12 +240,8 @@ fn evaluate(
     for data in data {
         let mut evaluator = Evaluator::new(config(data)).map_err(BadInput::of)?;
         name = evaluator.ego().method().name();
-        let frame_count = data
-            .scenarios
-            .iter()
-            .map(|scenario| scenario.ticks.len())
-            .sum();
-        let bar = progress::bar(frame_count, "frames").with_message(name);
+        let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());
+        let bar = progress::bar(frames.sum(), "frames").with_message(name);
         for scenario in &data.scenarios {
             let _ = evaluator.run(scenario, &mut |frame| {
                 tally.add(&frame);
@@ -309,13 +288,9 @@ impl Tally {
         }
         self.frames += 1;
         self.scorer.add(&frame.result.detections, &frame.truth);
-        self.payload_bytes.extend(
-            frame
-                .result
-                .fused
-                .iter()
-                .map(|neighbour| neighbour.payload_bytes),
-        );
+        let fused = frame.result.fused.iter();
+        self.payload_bytes
+            .extend(fused.map(|neighbour| neighbour.payload_bytes));
     }
 
     fn row(&self, method: &str) -> Value {

@@ -28,8 +28,24 @@ pub(crate) enum Command {
     Train(Box<train::Arguments>),
 }
 
+/// Data sets of a command.
+#[derive(Debug, clap::Args)]
+struct DataSets {
+    /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
+    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
+    #[arg(
+        long,
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
+    intensity_scale: IntensityScale,
+}
+
 impl Command {
-    /// Carries out the subcommand.
+    /// Runs it.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
             .context("restarting with malloc settings")?;
@@ -45,21 +61,20 @@ impl Command {
 }
 
 /// All scenarios of some datasets.
-fn scenarios(
-    folders: &[PathBuf],
-    intensity_scale: IntensityScale,
-) -> anyhow::Result<Vec<Scenario>> {
-    let options = OpenOptions {
-        intensity_scale,
-        ..OpenOptions::default()
-    };
-    let mut scenarios = Vec::new();
-    for folder in folders {
-        scenarios.extend(
-            dataset::open_with(folder, &options)
-                .map_err(BadInput::of)?
-                .scenarios,
-        );
+impl DataSets {
+    fn options(&self) -> OpenOptions {
+        OpenOptions {
+            intensity_scale: self.intensity_scale,
+            ..OpenOptions::default()
+        }
     }
-    Ok(scenarios)
+
+    fn scenarios(&self) -> Result<Vec<Scenario>, BadInput> {
+        let mut scenarios = Vec::new();
+        for folder in &self.data {
+            let opened = dataset::open_with(folder, &self.options()).map_err(BadInput::of)?;
+            scenarios.extend(opened.scenarios);
+        }
+        Ok(scenarios)
+    }
 }

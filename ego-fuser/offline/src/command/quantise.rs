@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
-use dataset::{IntensityScale, LeftOut};
+use dataset::LeftOut;
 use ego_fuser_offline::scale_search::search_scales;
 use perception::int8::SCALES_KEY;
 use perception::weights::annotate;
 use support::cli::{BadInput, Outcome};
 use support::output;
 
-use super::scenarios;
+use super::DataSets;
 
 /// Search the scales of activations on a few training sweeps and store them in the weights files, which are then
 /// computed in 8-bit integers.
@@ -19,17 +19,8 @@ pub(crate) struct Arguments {
     /// Weights files; their parameters stay as they are.
     #[arg(required = true, value_name = "FILE")]
     weights: Vec<PathBuf>,
-    /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
-    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
-    data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    data: DataSets,
     /// Number of frames of each scenario.
     #[arg(long, value_name = "N", default_value_t = 5)]
     frames: usize,
@@ -39,11 +30,10 @@ impl Arguments {
     /// Searches, stores and prints a line per file.
     pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(1);
-        let scenarios = scenarios(&self.data, self.intensity_scale)?;
+        let scenarios = self.data.scenarios()?;
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) || self.frames == 0 {
-            return Err(
-                BadInput::new("--dataset and --frames: no frame to search scales on").into(),
-            );
+            let reason = "--dataset and --frames: no frame to search scales on";
+            return Err(BadInput::new(reason).into());
         }
         let mut left_out = LeftOut::default();
         for path in &self.weights {

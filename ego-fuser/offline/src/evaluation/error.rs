@@ -56,7 +56,6 @@ pub enum EvaluateError {
 
 impl EvaluateError {
     /// True if one frame cannot be computed, and others may be, see [`DetectorError::is_of_frame`].
-    #[must_use]
     pub(super) fn is_of_frame(&self) -> bool {
         match self {
             Self::Detector(error) => error.is_of_frame(),

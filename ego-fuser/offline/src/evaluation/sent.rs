@@ -39,18 +39,11 @@ impl Sent {
 
     /// As received by the ego; absent where nothing was sent.
     pub(super) fn into_view(self) -> Option<View> {
-        let Self {
-            cav,
-            capture_nanos,
-            pose,
-            content,
-            ..
-        } = self;
         Some(View {
-            cav,
-            pose,
-            capture_nanos,
-            content: content?,
+            cav: self.cav,
+            pose: self.pose,
+            capture_nanos: self.capture_nanos,
+            content: self.content?,
         })
     }
 
@@ -157,13 +150,8 @@ fn perceived(
 /// Encodes and decodes a message; returns its size on the wire too.
 fn through_the_wire<M: Payload>(stamp: &Stamp, message: M) -> Result<(M, u64), WireError> {
     let encoded = wire::encode(stamp, message)?;
-    let bytes = encoded
-        .pieces()
-        .iter()
-        .map(|piece| piece.len() as u64)
-        .sum();
     let (_, message): (Header, M) = wire::decode(encoded.pieces(), &Limits::default())?;
-    Ok((message, bytes))
+    Ok((message, encoded.wire_bytes() as u64))
 }
 
 /// Sender and capture time of a sweep's messages, stamped at the capture time.

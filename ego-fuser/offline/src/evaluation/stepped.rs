@@ -17,6 +17,7 @@ use agent::config::AgentSettings;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
+use ego_fuser::config::EgoSettings;
 use link::{LinkConfig, LinkEmulator};
 use protocol::{
     CavId, Detections, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
@@ -32,7 +33,7 @@ use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
 use ego_fuser::ego::{EgoOutput, Skipped, View};
-use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
+use ego_fuser::pairing::{Pairing, PairingConfig};
 use ego_fuser::silence::Silence;
 use fusion::method::Exchange;
 
@@ -61,7 +62,31 @@ pub struct SteppedConfig {
     pub lidar_variant: Option<String>,
 }
 
-/// Vehicles that take part.
+impl SteppedConfig {
+    /// All vehicles and ticks over a link, given with the folder of its trace, and an ego with these limits.
+    #[must_use]
+    pub fn new(
+        (link, link_folder): (LinkConfig, PathBuf),
+        seed: u64,
+        ego: &EgoSettings,
+        compute: ComputeTimes,
+    ) -> Self {
+        Self {
+            link,
+            link_folder,
+            seed,
+            deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
+            pairing: ego.pairing(),
+            compute,
+            crew: AgentPool::First(usize::MAX),
+            vehicles: BTreeMap::new(),
+            ticks: 0..usize::MAX,
+            lidar_variant: None,
+        }
+    }
+}
+
+/// Vehicles of a run in simulation time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum AgentPool {
     /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. Annotations of the
@@ -150,21 +175,19 @@ impl<'a> Run<'a> {
         let mut crew = Vec::with_capacity(places.len());
         for &place in &places {
             let cav = &scenario.agents[place];
-            if evaluator.remote.is_some() {
-                crew.push(Member {
-                    place,
-                    cav: cav.clone(),
-                    pipeline: Pipeline::Elsewhere,
-                });
-                continue;
-            }
-            let own = config.vehicles.get(cav).cloned();
-            let settings = own.unwrap_or_else(|| evaluator.settings(scenario, crew.len()));
-            let participant = evaluator.participant(scenario, cav, &settings)?;
+            let pipeline = if evaluator.remote.is_some() {
+                Pipeline::Elsewhere
+            } else {
+                let own = config.vehicles.get(cav).cloned();
+                let settings = own.unwrap_or_else(|| evaluator.settings(scenario, crew.len()));
+                let participant = evaluator.participant(scenario, cav, &settings)?;
+                Pipeline::Here(Box::new(participant))
+            };
+            let cav = cav.clone();
             crew.push(Member {
                 place,
-                cav: cav.clone(),
-                pipeline: Pipeline::Here(Box::new(participant)),
+                cav,
+                pipeline,
             });
         }
         let is_witness =
@@ -454,26 +477,20 @@ impl<'a> Run<'a> {
     ) -> Result<Result<Detections, String>, EvaluateError> {
         let (paired, dropped) = self.pairing.pair(own.capture_nanos);
         let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
-        for Paired {
-            is_first_use,
-            message,
-            ..
-        } in paired
-        {
-            // A copy, as the message may serve the next tick too.
-            views.push(message.view.clone());
-            bytes.push((message.payload_bytes, message.wire_bytes));
-            first_uses.push(is_first_use);
+        for pair in paired {
+            views.push(pair.message.view.clone());
+            bytes.push((pair.message.payload_bytes, pair.message.wire_bytes));
+            first_uses.push(pair.is_first_use);
         }
         let output = self.evaluator.detect(self.scenario, tick, own, &views)?;
         for lost in &dropped {
             self.delivery.dropped(&lost.cav, lost.reason);
         }
-        for (index, view) in views
+        let new = views
             .iter()
             .enumerate()
-            .filter(|(index, _)| first_uses[*index])
-        {
+            .filter(|(index, _)| first_uses[*index]);
+        for (index, view) in new {
             // The messages of a frame that failed are valid.
             let skipped = output.as_ref().map_or(&[][..], |output| &output.skipped);
             let left_out = skipped.iter().find(|(skipped, _)| *skipped == index);
@@ -541,19 +558,15 @@ fn enqueue(
         delivery.adapted(&cav, stream, reason);
     }
     if let Some(view) = sent.into_view() {
-        let envelope = Envelope {
-            view,
-            payload_bytes,
-            wire_bytes,
-        };
-        delivery.enqueue(
-            stream,
-            sequence,
+        let (bytes, envelope) = (
             wire_bytes - pose_bytes,
-            sent_nanos,
-            distance_m,
-            envelope,
+            Envelope {
+                view,
+                payload_bytes,
+                wire_bytes,
+            },
         );
+        delivery.enqueue(stream, sequence, bytes, sent_nanos, distance_m, envelope);
     }
 }
 

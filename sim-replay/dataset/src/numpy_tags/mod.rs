@@ -250,4 +250,4 @@ fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
 }
 
 #[cfg(test)]
-pub(super) mod tests;
+pub(crate) mod tests;

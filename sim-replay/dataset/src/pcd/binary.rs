@@ -185,7 +185,7 @@ impl Column {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use protocol::PointCloud;
 
     use crate::pcd::{Place, decode, lzf};

@@ -3,8 +3,7 @@
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use tch::nn;
-use tch::{Kind, TchError, Tensor, no_grad};
+use tch::{Kind, TchError, Tensor, nn, no_grad};
 
 use super::config::DiffLocConfig;
 use super::denoiser::{POSE, PoseDenoiser, Windows};

@@ -2,8 +2,7 @@
 
 use perception::layers::convolution::ConvLayer;
 use perception::layers::residual::ResidualBlock;
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor, nn};
 
 use super::network::WIDTH;
 use super::range_image::{CHANNELS, channels};

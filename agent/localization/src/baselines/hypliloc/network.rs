@@ -1,8 +1,7 @@
 //! Network: two branches, two fusions with blocks of each modality between them, three heads.
 
 use perception::layers::residual::ResidualBlock;
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor, nn};
 
 use super::dense_norm::LayerNormed;
 use super::fusion::{Fusion, normalise};

@@ -1,8 +1,7 @@
 //! Head of a branch: position and heading from the mean of its tokens.
 
 use perception::layers::convolution::Norm;
-use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor, nn};
 
 use super::network::WIDTH;
 use crate::pgc::dense::Dense;

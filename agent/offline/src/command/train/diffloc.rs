@@ -48,19 +48,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         &title,
         "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.",
     );
-    card.trained(
-        &config.run,
-        &summary.trained,
-        &format!("{} sweeps", summary.sweeps),
-        "sweeps",
-    );
-    card.row(
-        "augmentation",
-        format_args!(
-            "turns up to {} degrees, shifts up to {} m",
-            args.turns.turn_deg, args.shift_m
-        ),
-    );
+    let data = format!("{} sweeps", summary.sweeps);
+    card.trained(&config.run, &summary.trained, &data, "sweeps");
+    let (turn_deg, shift_m) = (args.turns.turn_deg, args.shift_m);
+    let turns = format!("turns up to {turn_deg} degrees, shifts up to {shift_m} m");
+    card.row("augmentation", turns);
     card.row(
         "mask of static objects",
         "supervised: pixels in annotated boxes are not static",
@@ -79,10 +71,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 impl Args {
     fn config(&self) -> anyhow::Result<DiffLocTrainConfig> {
-        if !(0.0..=10.0).contains(&self.shift_m) {
+        let shift_m = self.shift_m;
+        if !(0.0..=10.0).contains(&shift_m) {
             return Err(bad(&format!(
-                "--shift-m is {}, must be 0 to 10 metres",
-                self.shift_m
+                "--shift-m is {shift_m}, must be 0 to 10 metres"
             )));
         }
         check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;

@@ -46,11 +46,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         } => {
             latest = Some((error_m, error_deg));
             let places = format!("places {points:.2} {image:.2} {fusion:.2}");
-            bar.report(
-                share_done,
-                seconds,
-                &format!("step {step} error {error_m:.2} m {error_deg:.1} deg, {places}"),
-            );
+            let text = format!("step {step} error {error_m:.2} m {error_deg:.1} deg, {places}");
+            bar.report(share_done, seconds, &text);
         }
     })?;
     bar.finish();

@@ -29,13 +29,13 @@ pub(crate) struct SensorTurns {
 impl SensorTurns {
     /// The largest turn, radians; an impossible one is a usage error.
     pub(crate) fn largest_rad(&self) -> anyhow::Result<f64> {
-        if !(0.0..=180.0).contains(&self.turn_deg) {
+        let turn_deg = self.turn_deg;
+        if !(0.0..=180.0).contains(&turn_deg) {
             return Err(bad(&format!(
-                "--turn-deg is {}, must be 0 to 180 degrees",
-                self.turn_deg
+                "--turn-deg is {turn_deg}, must be 0 to 180 degrees"
             )));
         }
-        Ok(self.turn_deg.to_radians())
+        Ok(turn_deg.to_radians())
     }
 }
 

@@ -44,11 +44,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             error_m,
         } => {
             latest_m = Some(error_m);
-            bar.report(
-                share_done,
-                seconds,
-                &format!("step {step} error {error_m:.2} m"),
-            );
+            let text = format!("step {step} error {error_m:.2} m");
+            bar.report(share_done, seconds, &text);
         }
     })?;
     bar.finish();

@@ -3,9 +3,7 @@
 use tch::nn::VarStore;
 use tch::{TchError, Tensor, no_grad};
 
-use localization::pgc::LocalizerError;
-use localization::pgc::SceneHead;
-use localization::pgc::{RefinerConfig, SceneHeadConfig};
+use localization::pgc::{LocalizerError, RefinerConfig, SceneHead, SceneHeadConfig};
 
 /// Smallest distance between corners, metres; a large scene has a coarser grid, since the number of corners is limited.
 const SPACING_M: f64 = 1.5;

@@ -30,8 +30,7 @@ use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use crate::Error;
-use localization::pgc::SceneHead;
-use localization::pgc::SceneHeadConfig;
+use localization::pgc::{SceneHead, SceneHeadConfig};
 use perception::train::{Curve, DataListing, Length, RunConfig, Trainer};
 
 /// Weight of a unit of cross entropy over the centres, metres.

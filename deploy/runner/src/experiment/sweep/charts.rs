@@ -1,6 +1,6 @@
 //! Charts of average precision against each axis that varies.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use deploy::score::metrics::Metrics;
 use figures::{Axis, Chart, Mark, Series};
@@ -20,9 +20,9 @@ pub(super) struct Figure {
 
 /// A quantity that each point has.
 struct Dimension {
+    /// Name of its figure.
     name: &'static str,
     label: &'static str,
-    is_logarithmic: bool,
     value: fn(&Run) -> Option<f64>,
     /// Label that distinguishes series by it, if it is not on the axis.
     text: fn(&Point) -> Option<String>,
@@ -30,131 +30,105 @@ struct Dimension {
 
 const DIMENSIONS: [Dimension; 7] = [
     Dimension {
-        name: "latency",
+        name: "ap_latency",
         label: "latency, ms",
-        is_logarithmic: false,
         value: |run| run.point.latency_ms,
         text: |point| point.latency_ms.map(|ms| format!("{ms} ms")),
     },
     Dimension {
-        name: "jitter",
+        name: "ap_jitter",
         label: "standard deviation of the latency, ms",
-        is_logarithmic: false,
         value: |run| run.point.jitter_ms,
         text: |point| point.jitter_ms.map(|ms| format!("jitter {ms} ms")),
     },
     Dimension {
-        name: "bandwidth",
+        name: BANDWIDTH,
         label: "rate of a link, Mbit/s",
-        is_logarithmic: true,
         value: |run| run.point.bandwidth_mbps,
         text: |point| {
-            Some(
-                point
-                    .bandwidth_mbps
-                    .map_or("unlimited".into(), |mbps| format!("{mbps} Mbit/s")),
-            )
+            let limited = point.bandwidth_mbps.map(|mbps| format!("{mbps} Mbit/s"));
+            limited.or_else(|| Some("unlimited".into()))
         },
     },
     Dimension {
-        name: "loss",
+        name: "ap_loss",
         label: "share of messages lost",
-        is_logarithmic: false,
         value: |run| run.point.loss,
         text: |point| point.loss.map(|share| format!("loss {share}")),
     },
     Dimension {
-        name: "pose_noise",
+        name: "ap_pose_noise",
         label: "pose noise, m (degrees alike)",
-        is_logarithmic: false,
         value: |run| run.point.pose_noise.map(|noise| noise.position_std_m),
         text: |point| {
-            point
-                .pose_noise
-                .map(|noise| format!("{} m {} deg", noise.position_std_m, noise.heading_std_deg))
+            let noise = point.pose_noise?;
+            Some(format!(
+                "{} m {} deg",
+                noise.position_std_m, noise.heading_std_deg
+            ))
         },
     },
     Dimension {
-        name: "agents",
+        name: "ap_agents",
         label: "vehicles that take part",
-        is_logarithmic: false,
         value: |run| run.point.agents.map(|agents| agents as f64),
         text: |point| point.agents.map(|agents| format!("{agents} vehicles")),
     },
     Dimension {
-        name: "bytes",
+        name: BYTES,
         label: "log2 of a message's bytes",
-        is_logarithmic: false,
         value: |run| run.cell.metrics.comm.log2_payload,
         text: codec,
     },
 ];
 
+/// The one figure with a logarithmic axis.
+const BANDWIDTH: &str = "ap_bandwidth";
+/// The one figure whose values are far from zero.
+const BYTES: &str = "ap_bytes";
+
 fn codec(point: &Point) -> Option<String> {
     if point.method.exchange() != Exchange::Features {
         return None;
     }
-    let name = point.codec.name();
-    Some(
-        point
-            .codec
-            .keep
-            .map_or(name.clone(), |keep| format!("{name} {} %", 100.0 * keep)),
-    )
+    let kept = { point.codec.keep }.map_or(String::new(), |keep| format!(" {} %", 100.0 * keep));
+    Some(point.codec.name() + &kept)
 }
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.
 pub(super) fn figures(experiment: &Experiment, runs: &[Run]) -> Vec<Figure> {
-    let varies = |dimension: &Dimension| {
-        let mut texts: Vec<_> = runs
-            .iter()
-            .filter_map(|run| (dimension.text)(&run.point))
-            .collect();
-        texts.sort();
-        texts.dedup();
-        texts.len() > 1
-    };
-    let varying: Vec<usize> = (0..DIMENSIONS.len())
-        .filter(|&place| varies(&DIMENSIONS[place]))
+    let varying: Vec<&Dimension> = { DIMENSIONS.iter() }
+        .filter(|dimension| {
+            let texts = runs.iter().filter_map(|run| (dimension.text)(&run.point));
+            texts.collect::<BTreeSet<_>>().len() > 1
+        })
         .collect();
-    let figure = |&place: &usize| {
+    let mut figures = Vec::new();
+    for &dimension in &varying {
         let chart = |title: &str, precision: fn(&Metrics) -> Option<f64>| {
-            chart(experiment, runs, place, &varying, title, precision)
+            chart(experiment, runs, dimension, &varying, title, precision)
         };
         let charts = [
             chart("AP@0.5", |metrics| metrics.ap_global.at_50),
             chart("AP@0.7", |metrics| metrics.ap_global.at_70),
         ];
         let charts: Vec<Chart> = charts.into_iter().flatten().collect();
-        (!charts.is_empty()).then(|| Figure {
-            name: file_name(place),
-            charts,
-        })
-    };
-    varying.iter().filter_map(figure).collect()
-}
-
-fn file_name(place: usize) -> &'static str {
-    [
-        "ap_latency",
-        "ap_jitter",
-        "ap_bandwidth",
-        "ap_loss",
-        "ap_pose_noise",
-        "ap_agents",
-        "ap_bytes",
-    ][place]
+        let name = dimension.name;
+        if !charts.is_empty() {
+            figures.push(Figure { name, charts });
+        }
+    }
+    figures
 }
 
 fn chart(
     experiment: &Experiment,
     runs: &[Run],
-    place: usize,
-    varying: &[usize],
+    dimension: &Dimension,
+    varying: &[&Dimension],
     title: &str,
     precision: fn(&Metrics) -> Option<f64>,
 ) -> Option<Chart> {
-    let dimension = &DIMENSIONS[place];
     // Along bytes, the cells of all values of a codec form one line.
     let mut series: Vec<(String, Points)> = Vec::new();
     for run in runs {
@@ -162,46 +136,29 @@ fn chart(
             continue;
         };
         let point = &run.point;
-        let others = varying.iter().filter(|other| **other != place);
-        let texts = others.filter_map(|&other| (DIMENSIONS[other].text)(point));
-        let name = std::iter::once(point.method.name().to_owned())
-            .chain(texts)
-            .collect::<Vec<_>>()
-            .join(", ");
-        let known = series
-            .iter()
-            .position(|(known, _)| *known == name)
-            .unwrap_or_else(|| {
-                series.push((name.clone(), BTreeMap::new()));
-                series.len() - 1
-            });
+        let others = varying.iter().filter(|other| other.name != dimension.name);
+        let mut names = vec![point.method.name().to_owned()];
+        names.extend(others.filter_map(|other| (other.text)(point)));
+        let name = names.join(", ");
+        let known = series.iter().position(|(known, _)| *known == name);
+        let known = known.unwrap_or_else(|| {
+            series.push((name.clone(), BTreeMap::new()));
+            series.len() - 1
+        });
         let key = (dimension.text)(point).map_or(Key::Value(x.to_bits()), Key::Text);
         series[known].1.entry(key).or_default().push((x, y));
     }
-    let series: Vec<Series> = series
-        .into_iter()
+    let series: Vec<Series> = { series.into_iter() }
         .map(|(name, points)| line(name, points))
         .collect();
-    let xs = || {
-        series
-            .iter()
-            .flat_map(|series| series.points.iter().map(|(x, _)| *x))
-    };
-    let (low, high) = (
-        xs().fold(f64::INFINITY, f64::min),
-        xs().fold(f64::NEG_INFINITY, f64::max),
-    );
-    if low > high {
-        return None;
-    }
-    let x = if dimension.is_logarithmic {
-        let decades = [
-            low.log10().floor(),
-            high.log10().ceil().max(low.log10().floor() + 1.0),
-        ];
+    let xs = { series.iter() }.flat_map(|series| series.points.iter().map(|(x, _)| (*x, *x)));
+    let (low, high) = xs.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
+    let x = if dimension.name == BANDWIDTH {
+        let first = low.log10().floor();
+        let decades = [first, high.log10().ceil().max(first + 1.0)];
         Axis::logarithmic(dimension.label, decades.map(|decade| 10f64.powf(decade)))
     } else {
-        Axis::linear(dimension.label, span(low, high, dimension.name == "bytes"))
+        Axis::linear(dimension.label, span(low, high, dimension.name == BYTES))
     };
     let title = format!("{}: {title}", experiment.name);
     Some(Chart {

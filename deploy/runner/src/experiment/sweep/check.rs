@@ -7,7 +7,7 @@ use dataset::Scenario;
 use fusion::Exchange;
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
-use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
+use super::spec::{CodecSpec, Experiment, Grid};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
 /// Largest number of runs; more are a mistake.
@@ -15,41 +15,23 @@ pub(super) const MOST_RUNS: usize = 10_000;
 
 /// Checks everything that does not depend on the data.
 pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
-    let Experiment {
-        name,
-        grid,
-        ego,
-        poses,
-        compute,
-        feature_maps_limit_gb,
-        scenarios,
-        frames,
-        ..
-    } = experiment;
-    let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-    if name.is_empty() || !name.chars().all(is_name) {
-        return Err(format!(
-            "name {name:?} is to name files: letters, digits, - and _"
-        ));
-    }
-    for (field, value) in [("scenarios", scenarios), ("frames", frames)] {
-        if *value == Some(0) {
+    let (grid, compute) = (&experiment.grid, experiment.compute);
+    check_name("name", &experiment.name)?;
+    for (field, value) in [
+        ("scenarios", experiment.scenarios),
+        ("frames", experiment.frames),
+    ] {
+        if value == Some(0) {
             return Err(format!("{field} is 0: there would be nothing to evaluate"));
         }
     }
-    ego.validate().map_err(|error| error.to_string())?;
-    poses
-        .validate()
-        .map_err(|error| format!("poses: {error}"))?;
+    { experiment.ego.validate() }.map_err(|error| error.to_string())?;
+    { experiment.poses.validate() }.map_err(|error| format!("poses: {error}"))?;
     number("compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
     number("compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
     number("compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)?;
-    number(
-        "feature_maps_limit_gb",
-        *feature_maps_limit_gb,
-        0.0,
-        10_000.0,
-    )?;
+    let limit_gb = experiment.feature_maps_limit_gb;
+    number("feature_maps_limit_gb", limit_gb, 0.0, 10_000.0)?;
     axes(grid)?;
     let (link, _) = LinkConfig::open(&experiment.link).map_err(|error| format!("link: {error}"))?;
     contradictions(experiment, &link)?;
@@ -64,17 +46,23 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     Ok(())
 }
 
+/// Refuses a name that cannot be one of files.
+pub(in super::super) fn check_name(field: &str, name: &str) -> Result<(), String> {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    match !name.is_empty() && name.chars().all(is_plain) {
+        true => Ok(()),
+        false => Err(format!(
+            "{field} {name:?} is to name files: letters, digits, - and _"
+        )),
+    }
+}
+
 /// Checks everything that depends on the data.
 pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> Result<(), String> {
     for scenario in scenarios {
         let found = scenario.agents.len();
-        let asked = experiment
-            .grid
-            .agents
-            .iter()
-            .flatten()
-            .find(|asked| **asked > found);
-        if let Some(asked) = asked {
+        let mut asked = experiment.grid.agents.iter().flatten();
+        if let Some(asked) = asked.find(|asked| **asked > found) {
             return Err(format!(
                 "grid.agents is {asked}, but scenario {} has {found} vehicles",
                 scenario.name
@@ -86,101 +74,61 @@ pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> R
 
 /// Checks every axis on its own.
 fn axes(grid: &Grid) -> Result<(), String> {
-    let Grid {
-        method,
-        codec,
-        latency_ms,
-        jitter_ms,
-        bandwidth_mbps,
-        loss,
-        pose_noise,
-        agents,
-        seed,
-    } = grid;
-    values("grid.method", Some(method), |_| Ok(()))?;
-    values(
-        "grid.codec",
-        codec.as_ref(),
-        |CodecSpec {
-             keep,
-             zstd_level,
-             fit,
-             ..
-         }| {
-            if let Some(keep) = keep
-                && !(*keep > 0.0 && *keep <= 1.0)
-            {
-                return Err(format!(
-                    "grid.codec: keep is {keep}, must be above 0 and at most 1"
-                ));
-            }
-            number("grid.codec: fit", fit.unwrap_or(1.0), 0.01, 1.0)?;
-            number(
-                "grid.codec: zstd_level",
-                f64::from(zstd_level.unwrap_or(1)),
-                1.0,
-                22.0,
-            )
-        },
-    )?;
-    values("grid.latency_ms", latency_ms.as_ref(), |ms| {
-        number("grid.latency_ms", *ms, 0.0, 600_000.0)
-    })?;
-    values("grid.jitter_ms", jitter_ms.as_ref(), |ms| {
-        number("grid.jitter_ms", *ms, 0.0, 600_000.0)
-    })?;
+    values("grid.method", Some(&grid.method), |_| Ok(()))?;
+    values("grid.codec", grid.codec.as_ref(), codec)?;
+    numbers("grid.latency_ms", &grid.latency_ms, 0.0, 600_000.0)?;
+    numbers("grid.jitter_ms", &grid.jitter_ms, 0.0, 600_000.0)?;
     values(
         "grid.bandwidth_mbps",
-        bandwidth_mbps.as_ref(),
+        grid.bandwidth_mbps.as_ref(),
         |mbps| match *mbps {
             f64::INFINITY => Ok(()),
             mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
         },
     )?;
-    values("grid.loss", loss.as_ref(), |share| {
-        number("grid.loss", *share, 0.0, 1.0)
+    numbers("grid.loss", &grid.loss, 0.0, 1.0)?;
+    values("grid.pose_noise", grid.pose_noise.as_ref(), |noise| {
+        number(
+            "grid.pose_noise: position_std_m",
+            noise.position_std_m,
+            0.0,
+            1000.0,
+        )?;
+        number(
+            "grid.pose_noise: heading_std_deg",
+            noise.heading_std_deg,
+            0.0,
+            360.0,
+        )
     })?;
-    values(
-        "grid.pose_noise",
-        pose_noise.as_ref(),
-        |NoiseSpec {
-             position_std_m,
-             heading_std_deg,
-         }| {
-            number(
-                "grid.pose_noise: position_std_m",
-                *position_std_m,
-                0.0,
-                1000.0,
-            )?;
-            number(
-                "grid.pose_noise: heading_std_deg",
-                *heading_std_deg,
-                0.0,
-                360.0,
-            )
-        },
-    )?;
-    values("grid.agents", agents.as_ref(), |count| {
+    values("grid.agents", grid.agents.as_ref(), |count| {
         number("grid.agents", *count as f64, 1.0, 64.0)
     })?;
-    values("grid.seed", seed.as_ref(), |_| Ok(()))
+    values("grid.seed", grid.seed.as_ref(), |_| Ok(()))
+}
+
+fn codec(codec: &CodecSpec) -> Result<(), String> {
+    if let Some(keep) = codec.keep.filter(|keep| !(*keep > 0.0 && *keep <= 1.0)) {
+        return Err(format!(
+            "grid.codec: keep is {keep}, must be above 0 and at most 1"
+        ));
+    }
+    number("grid.codec: fit", codec.fit.unwrap_or(1.0), 0.01, 1.0)?;
+    let level = f64::from(codec.zstd_level.unwrap_or(1));
+    number("grid.codec: zstd_level", level, 1.0, 22.0)
+}
+
+/// Checks an axis of numbers from `low` to `high`.
+fn numbers(field: &str, axis: &Option<Vec<f64>>, low: f64, high: f64) -> Result<(), String> {
+    values(field, axis.as_ref(), |value| {
+        number(field, *value, low, high)
+    })
 }
 
 /// Contradictory or impossible combinations of fields.
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
-    let Experiment {
-        grid,
-        ego,
-        poses,
-        link: name,
-        ..
-    } = experiment;
-    let contradiction = |axis: &str, field: &str| {
-        Err(format!(
-            "{axis} and the {field} of link {name} contradict each other"
-        ))
-    };
+    let (grid, ego, poses) = (&experiment.grid, &experiment.ego, &experiment.poses);
+    let exchanges = || grid.method.iter().map(|method| method.exchange());
     if let Some(ego) = &ego.id {
         return Err(format!(
             "ego.id is {ego}: choose by protocol.ego_kind instead"
@@ -194,14 +142,32 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if experiment.noise_mode == NoiseMode::Replayed {
         return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
     }
-    if grid.latency_ms.is_some() && link.latency != LatencyModel::None {
-        return contradiction("grid.latency_ms", "latency");
-    }
-    if grid.bandwidth_mbps.is_some() && link.capacity != CapacityConfig::Unlimited {
-        return contradiction("grid.bandwidth_mbps", "capacity");
-    }
-    if grid.loss.is_some() && link.loss != LossModel::None {
-        return contradiction("grid.loss", "loss");
+    for (axis, is_varied, field, is_set) in [
+        (
+            "latency_ms",
+            grid.latency_ms.is_some(),
+            "latency",
+            link.latency != LatencyModel::None,
+        ),
+        (
+            "bandwidth_mbps",
+            grid.bandwidth_mbps.is_some(),
+            "capacity",
+            link.capacity != CapacityConfig::Unlimited,
+        ),
+        (
+            "loss",
+            grid.loss.is_some(),
+            "loss",
+            link.loss != LossModel::None,
+        ),
+    ] {
+        if is_varied && is_set {
+            let name = &experiment.link;
+            return Err(format!(
+                "grid.{axis} and the {field} of link {name} contradict each other"
+            ));
+        }
     }
     if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
         return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());
@@ -210,12 +176,8 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     {
         return Err("grid.codec.fit is a share of grid.bandwidth_mbps, which is left out".into());
     }
-    if let Some(ms) = grid
-        .latency_ms
-        .iter()
-        .flatten()
-        .find(|ms| **ms > ego.max_age_ms as f64 + ego.deadline_ms as f64)
-    {
+    let oldest_ms = ego.max_age_ms as f64 + ego.deadline_ms as f64;
+    if let Some(ms) = { grid.latency_ms.iter().flatten() }.find(|ms| **ms > oldest_ms) {
         return Err(format!(
             "grid.latency_ms is {ms}, but ego.max_age_ms is {}: every message would be too old to be fused",
             ego.max_age_ms
@@ -227,40 +189,22 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
             poses.name()
         ));
     }
-    if grid.codec.is_some()
-        && grid
-            .method
-            .iter()
-            .all(|method| method.exchange() != Exchange::Features)
-    {
+    if grid.codec.is_some() && exchanges().all(|exchange| exchange != Exchange::Features) {
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
         return Err(format!(
             "grid.codec varies the encoding of feature maps, but grid.method ({}) sends none",
             names.join(", ")
         ));
     }
-    if grid
-        .method
-        .iter()
-        .all(|method| method.exchange() == Exchange::Nothing)
-        && grid.agents.is_some()
-    {
-        return Err(
-            "grid.agents varies the transmitting vehicles, but grid.method is none: there are none"
-                .into(),
-        );
+    if grid.agents.is_some() && exchanges().all(|exchange| exchange == Exchange::Nothing) {
+        let reason =
+            "grid.agents varies the transmitting vehicles, but grid.method is none: there are none";
+        return Err(reason.into());
     }
+    let (mut loss, mut noise) = (grid.loss.iter().flatten(), grid.pose_noise.iter().flatten());
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
-    let loses = grid
-        .loss
-        .iter()
-        .flatten()
-        .any(|share| *share > 0.0 && *share < 1.0);
-    let errs = grid
-        .pose_noise
-        .iter()
-        .flatten()
-        .any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
+    let loses = loss.any(|share| *share > 0.0 && *share < 1.0);
+    let errs = noise.any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
     let is_random = jitters || loses || errs || is_random(link);
     if !is_random && grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1) {
         return Err("grid.seed has several values, but nothing in the experiment is random".into());
@@ -296,11 +240,9 @@ fn values<T: PartialEq + Debug>(
 }
 
 fn number(field: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
-    let fits = (low..=high).contains(&value);
-    if fits {
-        Ok(())
-    } else {
-        Err(format!("{field} is {value}, must be {low} to {high}"))
+    match (low..=high).contains(&value) {
+        true => Ok(()),
+        false => Err(format!("{field} is {value}, must be {low} to {high}")),
     }
 }
 

@@ -3,9 +3,6 @@
 use std::path::PathBuf;
 
 use agent::rate::RateConfig;
-use ego_fuser::config::EgoSettings;
-use ego_fuser::pairing::PairingConfig;
-use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use fusion::Method;
 use link::{CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
@@ -39,20 +36,19 @@ pub struct Point {
 
 /// Number of values of each axis.
 pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
-    let size = |length: Option<usize>| length.unwrap_or(1);
     vec![
         ("method", grid.method.len()),
-        ("codec", size(grid.codec.as_ref().map(Vec::len))),
-        ("latency_ms", size(grid.latency_ms.as_ref().map(Vec::len))),
-        ("jitter_ms", size(grid.jitter_ms.as_ref().map(Vec::len))),
+        ("codec", grid.codec.as_ref().map_or(1, Vec::len)),
+        ("latency_ms", grid.latency_ms.as_ref().map_or(1, Vec::len)),
+        ("jitter_ms", grid.jitter_ms.as_ref().map_or(1, Vec::len)),
         (
             "bandwidth_mbps",
-            size(grid.bandwidth_mbps.as_ref().map(Vec::len)),
+            grid.bandwidth_mbps.as_ref().map_or(1, Vec::len),
         ),
-        ("loss", size(grid.loss.as_ref().map(Vec::len))),
-        ("pose_noise", size(grid.pose_noise.as_ref().map(Vec::len))),
-        ("agents", size(grid.agents.as_ref().map(Vec::len))),
-        ("seed", size(grid.seed.as_ref().map(Vec::len))),
+        ("loss", grid.loss.as_ref().map_or(1, Vec::len)),
+        ("pose_noise", grid.pose_noise.as_ref().map_or(1, Vec::len)),
+        ("agents", grid.agents.as_ref().map_or(1, Vec::len)),
+        ("seed", grid.seed.as_ref().map_or(1, Vec::len)),
     ]
 }
 
@@ -66,64 +62,54 @@ pub(super) fn count(grid: &Grid) -> usize {
 /// Every point; the last field varies fastest.
 #[must_use]
 pub fn points(grid: &Grid) -> Vec<Point> {
-    let mut points: Vec<Point> = Vec::new();
-    let codecs = grid
-        .codec
-        .clone()
-        .unwrap_or_else(|| vec![CodecSpec::default()]);
-    for &method in &grid.method {
-        for &codec in &codecs {
-            points.push(Point {
-                method,
-                codec,
-                latency_ms: None,
-                jitter_ms: None,
-                bandwidth_mbps: None,
-                loss: None,
-                pose_noise: None,
-                agents: None,
-                seed: 0,
-            });
-        }
-    }
-    points = spread(points, grid.latency_ms.as_deref(), |point, value| {
-        point.latency_ms = Some(value)
+    let methods = grid.method.iter().map(|&method| Point {
+        method,
+        codec: CodecSpec::default(),
+        latency_ms: None,
+        jitter_ms: None,
+        bandwidth_mbps: None,
+        loss: None,
+        pose_noise: None,
+        agents: None,
+        seed: 0,
     });
-    points = spread(points, grid.jitter_ms.as_deref(), |point, value| {
-        point.jitter_ms = Some(value)
+    let points = spread(methods.collect(), &grid.codec, |point, codec| {
+        point.codec = codec
     });
-    points = spread(points, grid.bandwidth_mbps.as_deref(), |point, value| {
-        point.bandwidth_mbps = Some(value).filter(|mbps| mbps.is_finite());
+    let points = spread(points, &grid.latency_ms, |point, ms| {
+        point.latency_ms = Some(ms)
     });
-    points = spread(points, grid.loss.as_deref(), |point, value| {
-        point.loss = Some(value)
+    let points = spread(points, &grid.jitter_ms, |point, ms| {
+        point.jitter_ms = Some(ms)
     });
-    points = spread(points, grid.pose_noise.as_deref(), |point, value| {
-        point.pose_noise = Some(value)
+    let points = spread(points, &grid.bandwidth_mbps, |point, mbps| {
+        point.bandwidth_mbps = Some(mbps).filter(|mbps| mbps.is_finite());
     });
-    points = spread(points, grid.agents.as_deref(), |point, value| {
-        point.agents = Some(value)
+    let points = spread(points, &grid.loss, |point, share| point.loss = Some(share));
+    let points = spread(points, &grid.pose_noise, |point, noise| {
+        point.pose_noise = Some(noise)
     });
-    spread(points, grid.seed.as_deref(), |point, value| {
-        point.seed = value
-    })
+    let points = spread(points, &grid.agents, |point, agents| {
+        point.agents = Some(agents)
+    });
+    spread(points, &grid.seed, |point, seed| point.seed = seed)
 }
 
 fn spread<T: Copy>(
     points: Vec<Point>,
-    values: Option<&[T]>,
+    values: &Option<Vec<T>>,
     set: impl Fn(&mut Point, T),
 ) -> Vec<Point> {
     let Some(values) = values else { return points };
-    let with = |point: Point| {
-        let set = &set;
-        values.iter().map(move |&value| {
+    let mut spread = Vec::with_capacity(points.len() * values.len());
+    for point in points {
+        for &value in values {
             let mut point = point.clone();
             set(&mut point, value);
-            point
-        })
-    };
-    points.into_iter().flat_map(with).collect()
+            spread.push(point);
+        }
+    }
+    spread
 }
 
 impl Point {
@@ -202,31 +188,6 @@ impl Point {
             bytes_per_second: share.map(|(share, mbps)| (share * mbps * 1e6 / 8.0) as u64),
             ..RateConfig::default()
         }
-    }
-}
-
-/// Simulation-time settings of a point.
-pub(super) fn stepped(
-    (link, link_folder): (LinkConfig, PathBuf),
-    point: &Point,
-    ego: &EgoSettings,
-    compute: ComputeTimes,
-) -> SteppedConfig {
-    SteppedConfig {
-        link,
-        link_folder,
-        seed: point.seed,
-        deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
-        pairing: PairingConfig {
-            // At 10 Hz as many messages wait as may still be used.
-            depth: (ego.max_age_ms / 100 + 4) as usize,
-            ..ego.pairing()
-        },
-        compute,
-        crew: AgentPool::First(point.agents.unwrap_or(usize::MAX)),
-        vehicles: std::collections::BTreeMap::new(),
-        ticks: 0..usize::MAX,
-        lidar_variant: None,
     }
 }
 

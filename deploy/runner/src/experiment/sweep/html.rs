@@ -3,8 +3,6 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-use support::provenance::Provenance;
-
 use super::Run;
 use super::spec::Experiment;
 use super::table::{NOTES, rows};
@@ -24,10 +22,9 @@ pub(super) fn page(
     runs: &[Run],
     figures: &[Vec<String>],
 ) -> String {
-    let title = if experiment.title.is_empty() {
-        &experiment.name
-    } else {
-        &experiment.title
+    let title = match experiment.title.as_str() {
+        "" => &experiment.name,
+        title => title,
     };
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
@@ -81,26 +78,18 @@ fn runs_table(table: &VaryingTable) -> String {
         text += "<tr>";
         for (column, field) in fields.iter().enumerate() {
             let field = escaped(field);
-            let field = if table.is_best(line, column) {
-                format!("<b>{field}</b>")
-            } else {
-                field
+            text += &match table.is_best(line, column) {
+                true => format!("<td><b>{field}</b></td>"),
+                false => format!("<td>{field}</td>"),
             };
-            text += &format!("<td>{field}</td>");
         }
         text += "</tr>\n";
     }
     text += "</tbody></table></div>\n";
-    let constants: Vec<String> = table
-        .constants
-        .iter()
-        .map(|(name, value)| format!("{name} {value}"))
-        .collect();
-    if !constants.is_empty() {
-        text += &format!(
-            "<p>The same in all runs: {}.</p>\n",
-            escaped(&constants.join(", "))
-        );
+    let constants = { table.constants.iter() }.map(|(name, value)| format!("{name} {value}"));
+    if !table.constants.is_empty() {
+        let constants = escaped(&constants.collect::<Vec<_>>().join(", "));
+        text += &format!("<p>The same in all runs: {constants}.</p>\n");
     }
     text
 }
@@ -117,19 +106,13 @@ fn escaped(text: &str) -> String {
 fn provenance(runs: &[Run]) -> Vec<String> {
     let mut lines = BTreeSet::new();
     for run in runs {
-        let Provenance {
-            version,
-            commit,
-            program_sha256,
-            data_sha256,
-            files_sha256,
-            command: _,
-        } = &run.cell.key.provenance;
+        let of = &run.cell.key.provenance;
+        let (version, commit, sha256) = (&of.version, &of.commit, &of.program_sha256);
         lines.insert(format!(
-            "program {version}, commit {commit}, SHA-256 {program_sha256}"
+            "program {version}, commit {commit}, SHA-256 {sha256}"
         ));
-        lines.insert(format!("data SHA-256 {data_sha256}"));
-        for (file, sha256) in files_sha256 {
+        lines.insert(format!("data SHA-256 {}", of.data_sha256));
+        for (file, sha256) in &of.files_sha256 {
             lines.insert(format!("{} SHA-256 {sha256}", file.display()));
         }
     }

@@ -18,29 +18,29 @@ use std::fs;
 use std::io::{self, BufRead, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use bus::config_file::ConfigError;
+use anyhow::{Context, Result};
 use dataset::Scenario;
-use ego_fuser_offline::evaluation::EvaluateError;
 use figures;
-use figures::FigureError;
 use fusion::Exchange;
-use link::LinkError;
+use perception::weights::Weights;
 use serde::Serialize;
-use simulator::generate::{self, Subset, SynthError, SynthOptions};
-use support::output;
-use support::progress;
+use simulator::generate::{self, Subset, SynthOptions};
+use support::file_error::FileError;
+use support::{output, progress};
 use training::feature_store::FeatureStore;
 
+pub(super) use check::check_name;
 pub use grid::{Point, points};
 pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
 use self::varying::VaryingTable;
-use crate::experiment::cell::{Cell, CellError, CellKey};
-use crate::experiment::evaluation::{EvaluationError, OpenedData, compute, evaluate};
-use crate::scenario::weights_choice::{WeightsChoiceError, weights_of};
+use crate::experiment::cell::{Cell, CellKey};
+use crate::experiment::evaluation::{OpenedData, compute, evaluate};
+use crate::scenario::weights_choice::weights_of;
 
 /// Number of ticks that are timed before a sweep begins, for its estimate.
 const PROBED_TICKS: usize = 4;
@@ -54,58 +54,10 @@ pub struct Swept {
     pub runs: Vec<Run>,
 }
 
-/// Reason why a sweep failed.
+/// A worker process of a sweep has ended, or reports why it cannot compute a run.
 #[derive(Debug, thiserror::Error)]
-pub enum SweepError {
-    /// Error of the operating system.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
-    /// A file has invalid content.
-    #[error("{}: {problem}", path.display())]
-    Spec {
-        /// Path of the file.
-        path: PathBuf,
-        /// The field, and the error.
-        problem: String,
-    },
-    /// The experiment cannot be read.
-    #[error(transparent)]
-    File(#[from] ConfigError),
-    /// The data set cannot be generated.
-    #[error("generate: {0}")]
-    Generate(#[from] SynthError),
-    /// A method has no weights.
-    #[error("weights: {0}")]
-    Weights(#[from] WeightsChoiceError),
-    /// The link cannot be used.
-    #[error("link: {0}")]
-    Link(#[from] LinkError),
-    /// A cached run cannot be used.
-    #[error(transparent)]
-    Cell(#[from] CellError),
-    /// A run cannot be computed.
-    #[error(transparent)]
-    Evaluation(#[from] Box<EvaluationError>),
-    /// A process that computes runs has failed.
-    #[error("a worker has failed: {0}")]
-    Worker(String),
-    /// A chart cannot be drawn.
-    #[error(transparent)]
-    Chart(#[from] FigureError),
-}
-
-impl SweepError {
-    /// True if the input is at fault, and not the run.
-    #[must_use]
-    pub fn is_bad_input(&self) -> bool {
-        !matches!(self, Self::Worker(_) | Self::Chart(_))
-    }
-}
+#[error("a worker has failed: {0}")]
+pub struct WorkerError(pub String);
 
 /// Settings of a sweep.
 #[derive(Debug, Clone)]
@@ -139,8 +91,8 @@ impl Sweep {
     /// Reads an experiment, generates its data if requested, and checks the one against the other.
     ///
     /// # Errors
-    /// [`SweepError`] names the file and the field.
-    pub fn open(file: &Path, out: &Path) -> Result<Self, SweepError> {
+    /// An error that names the file and the field.
+    pub fn open(file: &Path, out: &Path) -> Result<Self> {
         let experiment = Experiment::read(file)?;
         generate(&experiment)?;
         Self::over(experiment, file, out)
@@ -151,7 +103,7 @@ impl Sweep {
     ///
     /// # Errors
     /// As [`Self::open`].
-    pub fn announce(file: &Path, out: &Path, jobs: usize) -> Result<(), SweepError> {
+    pub fn announce(file: &Path, out: &Path, jobs: usize) -> Result<()> {
         let experiment = Experiment::read(file)?;
         if let Some(generate) = &experiment.generate
             && !is_generated(&experiment)?
@@ -174,48 +126,39 @@ impl Sweep {
         sweep.print_estimate(&known, jobs)
     }
 
-    fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self, SweepError> {
+    fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self> {
         let part = experiment.part();
-        let data = part
-            .open(&experiment.dataset, &experiment.protocol)
-            .map_err(Box::new)?;
+        let data = part.open(&experiment.dataset, &experiment.protocol)?;
         let scenarios: Vec<Scenario> = part.chosen(&data.scenarios).cloned().collect();
-        let spec = |problem| SweepError::Spec {
-            path: file.to_owned(),
-            problem,
-        };
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {
-            return Err(spec(format!(
-                "dataset {}: there is no frame in it",
-                experiment.dataset.display()
-            )));
+            let dataset = experiment.dataset.display();
+            let problem = format!("dataset {dataset}: there is no frame in it");
+            return Err(FileError::new(file, problem).into());
         }
-        check::check_scenes(&experiment, &scenarios).map_err(spec)?;
-        let points = points(&experiment.grid);
-        let (file, out) = (file.to_owned(), out.to_owned());
+        check::check_scenes(&experiment, &scenarios)
+            .map_err(|problem| FileError::new(file, problem))?;
         Ok(Self {
-            file,
+            file: file.to_owned(),
+            points: points(&experiment.grid),
             experiment,
-            points,
             data,
-            out,
+            out: out.to_owned(),
         })
     }
 
     /// Identity of the run of each point.
-    fn keys(&self) -> Result<Vec<CellKey>, SweepError> {
+    fn keys(&self) -> Result<Vec<CellKey>> {
         let mut keys = Vec::with_capacity(self.points.len());
         for point in &self.points {
             let options = point_options::options(&self.experiment, point, &self.maps())?;
-            keys.push(options.key(&self.data, point.method).map_err(Box::new)?);
+            keys.push(options.key(&self.data, point.method)?);
         }
         Ok(keys)
     }
 
-    /// Cached runs, by place in the grid.
-    fn known(&self, keys: &[CellKey]) -> Result<Vec<Option<Cell>>, SweepError> {
-        keys.iter()
-            .map(|key| Ok(Cell::read(key, &self.cells())?))
+    fn known(&self, keys: &[CellKey]) -> Result<Vec<Option<Cell>>> {
+        { keys.iter() }
+            .map(|key| Cell::read(key, &self.cells()))
             .collect()
     }
 
@@ -235,12 +178,10 @@ impl Sweep {
     /// Computes the missing runs and writes table, charts and report.
     ///
     /// # Errors
-    /// [`SweepError`] at the first run that cannot be computed; earlier runs are cached.
-    pub fn run(&self, options: &SweepOptions) -> Result<Swept, SweepError> {
-        fs::create_dir_all(self.cells()).map_err(|source| SweepError::Io {
-            path: self.cells(),
-            source,
-        })?;
+    /// An error at the first run that cannot be computed; earlier runs are cached.
+    pub fn run(&self, options: &SweepOptions) -> Result<Swept> {
+        let cells = self.cells();
+        fs::create_dir_all(&cells).with_context(|| cells.display().to_string())?;
         let keys = self.keys()?;
         let known = self.known(&keys)?;
         let missing: Vec<usize> = (0..known.len())
@@ -254,8 +195,7 @@ impl Sweep {
             .collect();
         self.compute(&missing, options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known(&keys)?.into_iter().collect();
-        let cells =
-            cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
+        let cells = cells.ok_or_else(|| WorkerError("a run that was done is not there".into()))?;
         let runs: Vec<Run> = (self.points.iter().cloned().zip(cells))
             .map(|(point, cell)| Run { point, cell })
             .collect();
@@ -267,7 +207,7 @@ impl Sweep {
     }
 
     /// Prints the number of runs and the estimated time.
-    fn print_estimate(&self, known: &[Option<Cell>], jobs: usize) -> Result<(), SweepError> {
+    fn print_estimate(&self, known: &[Option<Cell>], jobs: usize) -> Result<()> {
         let (runs, frames) = (known.len(), self.frames());
         let missing = known.iter().filter(|cell| cell.is_none()).count();
         output::note(format_args!(
@@ -296,25 +236,20 @@ impl Sweep {
     }
 
     /// Time of a frame, seconds, from the first few without cached feature maps: an overestimate.
-    fn probe(&self, point: &Point) -> Result<f64, SweepError> {
+    fn probe(&self, point: &Point) -> Result<f64> {
         let mut options = point_options::options(&self.experiment, point, &self.maps())?;
         options.maps = None;
         options.part.scenarios = Some(1);
-        options.part.frames = Some(
-            self.experiment
-                .frames
-                .unwrap_or(PROBED_TICKS)
-                .min(PROBED_TICKS),
-        );
-        let data = options.part.open(&options.dataset, &options.protocol);
-        let data = data.map_err(Box::new)?;
+        let frames = self.experiment.frames.unwrap_or(PROBED_TICKS);
+        options.part.frames = Some(frames.min(PROBED_TICKS));
+        let data = options.part.open(&options.dataset, &options.protocol)?;
         let began = Instant::now();
-        let metrics = evaluate(&options, &data, point.method, &mut || {}).map_err(Box::new)?;
+        let metrics = evaluate(&options, &data, point.method, &mut || {})?;
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
     }
 
     /// Computes the feature maps of all sweeps, once for each encoder that is needed; returns their files.
-    fn encode(&self, missing: &[usize], jobs: usize) -> Result<BTreeSet<PathBuf>, SweepError> {
+    fn encode(&self, missing: &[usize], jobs: usize) -> Result<BTreeSet<PathBuf>> {
         let methods = missing.iter().map(|&index| self.points[index].method);
         let mut files = Vec::new();
         for method in methods.filter(|method| method.exchange() != Exchange::Points) {
@@ -323,13 +258,10 @@ impl Sweep {
                 files.push(file);
             }
         }
-        // Methods that share an encoder share a file of maps.
         let mut stored = BTreeSet::new();
         for file in files {
-            let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
-            let weights =
-                perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
-            let weights = Arc::new(weights.with_precision(self.experiment.precision));
+            let weights = Weights::load(&file)?.with_precision(self.experiment.precision);
+            let weights = Arc::new(weights);
             let bar = progress::bar(0, "sweeps encoded");
             let kept = point_options::kept_maps(&self.experiment, &self.maps());
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
@@ -337,33 +269,26 @@ impl Sweep {
                 bar.set_length(all as u64);
                 bar.set_position(done as u64);
             };
-            let store = FeatureStore::open(&kept, &weights, scenarios, digests, jobs, on_sweep);
-            let store = store.map_err(|error| refused(Box::new(error).into()))?;
+            let store = FeatureStore::open(&kept, &weights, scenarios, digests, jobs, on_sweep)?;
             stored.insert(store.path().to_owned());
             bar.finish_and_clear();
         }
         Ok(stored)
     }
 
-    fn compute(&self, missing: &[(usize, &CellKey)], jobs: usize) -> Result<(), SweepError> {
+    fn compute(&self, missing: &[(usize, &CellKey)], jobs: usize) -> Result<()> {
         let bar = progress::bar(missing.len() * self.frames(), "frames");
-        let done = std::sync::atomic::AtomicUsize::new(0);
+        let done = AtomicUsize::new(0);
         let on_done = || {
-            let done = 1 + done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            let done = 1 + done.fetch_add(1, Ordering::Relaxed);
             bar.set_message(format!("{done}/{} runs", missing.len()));
             if bar.is_hidden() {
                 output::note(format_args!("{done}/{} runs done", missing.len()));
             }
         };
         let computed = if jobs > 1 && missing.len() > 1 {
-            workers::run(
-                &self.file,
-                &self.out,
-                missing,
-                jobs,
-                &|| bar.inc(1),
-                &on_done,
-            )
+            let on_frame = || bar.inc(1);
+            workers::run(&self.file, &self.out, missing, jobs, &on_frame, &on_done)
         } else {
             missing.iter().try_for_each(|&(index, key)| {
                 self.compute_one(index, key.clone(), &mut || bar.inc(1))?;
@@ -376,36 +301,28 @@ impl Sweep {
     }
 
     /// Computes the run of a point and caches it.
-    fn compute_one(
-        &self,
-        index: usize,
-        key: CellKey,
-        on_frame: &mut dyn FnMut(),
-    ) -> Result<(), SweepError> {
+    fn compute_one(&self, index: usize, key: CellKey, on_frame: &mut dyn FnMut()) -> Result<()> {
         let point = &self.points[index];
         let options = point_options::options(&self.experiment, point, &self.maps())?;
-        let cell = compute(&options, &self.data, key, on_frame).map_err(Box::new)?;
-        Ok(cell.write(&self.cells())?)
+        compute(&options, &self.data, key, on_frame)?.write(&self.cells())
     }
 
     /// Runs as a worker: computes the points that the parent process requests.
     ///
     /// # Errors
-    /// [`SweepError::Io`] when the parent process has ended.
-    pub fn work(&self) -> Result<(), SweepError> {
-        let gone = |source| SweepError::Io {
-            path: "the parent sweep".into(),
-            source,
-        };
+    /// An error when the parent process has ended.
+    pub fn work(&self) -> Result<()> {
+        const PARENT: &str = "the parent sweep";
         let reply = |line: &str| {
             let mut output = io::stdout().lock();
             writeln!(output, "{line}").and_then(|()| output.flush())
         };
         for line in io::stdin().lock().lines() {
-            let request: Option<(usize, CellKey)> = serde_json::from_str(&line.map_err(gone)?).ok();
+            let request: Option<(usize, CellKey)> =
+                serde_json::from_str(&line.context(PARENT)?).ok();
             let Some((index, key)) = request.filter(|(index, _)| *index < self.points.len()) else {
-                reply(&format!("{} that is no point of the grid", workers::FAILED))
-                    .map_err(gone)?;
+                let answer = format!("{} that is no point of the grid", workers::FAILED);
+                reply(&answer).context(PARENT)?;
                 continue;
             };
             // The parent may have ended; then the answer to the run fails too.
@@ -414,45 +331,29 @@ impl Sweep {
             });
             let answer = match computed {
                 Ok(()) => workers::DONE.to_owned(),
-                Err(error) => format!("{} {error}", workers::FAILED),
+                Err(error) => format!("{} {error:#}", workers::FAILED),
             };
-            reply(&answer).map_err(gone)?;
+            reply(&answer).context(PARENT)?;
         }
         Ok(())
     }
 
     /// Writes table, charts and report; returns the table for a terminal.
-    fn write(&self, runs: &[Run]) -> Result<String, SweepError> {
-        let text = csv(&self.experiment, runs);
-        let write = |name: &str, text: &str| {
-            let path = self.out.join(name);
-            fs::write(&path, text).map_err(|source| SweepError::Io { path, source })
-        };
-        write(&format!("{}.csv", self.experiment.name), &text)?;
+    fn write(&self, runs: &[Run]) -> Result<String> {
         let mut drawings = Vec::new();
         for figure in charts::figures(&self.experiment, runs) {
-            let svg = figures::svg(&figure.charts)?;
-            write(&format!("{}.svg", figure.name), &svg)?;
-            // Charts of their own: side by side where there is room, and else below each other.
-            let each = figure
-                .charts
-                .chunks(1)
-                .map(figures::svg)
-                .collect::<Result<Vec<_>, _>>()?;
-            drawings.push(each);
-            figures::save_png(
-                &figure.charts,
-                &self.out.join(format!("{}.png", figure.name)),
-            )?;
+            let path = self.out.join(figure.name);
+            write(&path.with_extension("svg"), &figures::svg(&figure.charts)?)?;
+            figures::save_png(&figure.charts, &path.with_extension("png"))?;
+            let each = figure.charts.chunks(1).map(figures::svg);
+            drawings.push(each.collect::<Result<Vec<_>, _>>()?);
         }
-        let spec = fs::read_to_string(&self.file).map_err(|source| SweepError::Io {
-            path: self.file.clone(),
-            source,
-        })?;
-        write(
-            "report.html",
-            &html::page(&self.experiment, &spec, runs, &drawings),
-        )?;
+        let spec =
+            fs::read_to_string(&self.file).with_context(|| self.file.display().to_string())?;
+        let page = html::page(&self.experiment, &spec, runs, &drawings);
+        write(&self.out.join("report.html"), &page)?;
+        let name = format!("{}.csv", self.experiment.name);
+        write(&self.out.join(name), &csv(&self.experiment, runs))?;
         let (columns, lines) = table::rows(&self.experiment, runs);
         Ok(VaryingTable::new(&columns, &lines).text())
     }
@@ -460,12 +361,9 @@ impl Sweep {
 
 /// Removes files of feature maps, which are most of what a sweep writes and are of no use once all runs are cached. Other
 /// files of their folder stay.
-fn remove_maps(files: &BTreeSet<PathBuf>) -> Result<(), SweepError> {
+fn remove_maps(files: &BTreeSet<PathBuf>) -> Result<()> {
     for path in files {
-        fs::remove_file(path).map_err(|source| SweepError::Io {
-            path: path.clone(),
-            source,
-        })?;
+        fs::remove_file(path).with_context(|| path.display().to_string())?;
     }
     if let Some(folder) = files.first().and_then(|file| file.parent()) {
         // It stays where it holds anything else.
@@ -474,7 +372,12 @@ fn remove_maps(files: &BTreeSet<PathBuf>) -> Result<(), SweepError> {
     Ok(())
 }
 
-/// Settings of the generator, if the experiment has a generated data set.
+/// Writes a file of the sweep.
+fn write(path: &Path, text: &str) -> Result<()> {
+    fs::write(path, text).with_context(|| path.display().to_string())
+}
+
+/// Options with which the data set of the experiment is generated.
 fn generator(experiment: &Experiment) -> Option<SynthOptions> {
     let generate = experiment.generate.as_ref()?;
     Some(SynthOptions {
@@ -487,17 +390,17 @@ fn generator(experiment: &Experiment) -> Option<SynthOptions> {
 }
 
 /// True if no data set is requested, or it exists.
-fn is_generated(experiment: &Experiment) -> Result<bool, SweepError> {
-    let options = generator(experiment);
-    Ok(options.map_or(Ok(true), |options| generate::are_kept(&options))?)
+fn is_generated(experiment: &Experiment) -> Result<bool> {
+    let kept = generator(experiment).map_or(Ok(true), |options| generate::are_kept(&options));
+    kept.context("generate")
 }
 
-/// Generates the data set if it is requested and does not exist.
-fn generate(experiment: &Experiment) -> Result<(), SweepError> {
+/// Generates the data set, unless it is there.
+fn generate(experiment: &Experiment) -> Result<()> {
     let Some(options) = generator(experiment) else {
         return Ok(());
     };
-    if generate::are_kept(&options)? {
+    if is_generated(experiment)? {
         return Ok(());
     }
     output::note(format_args!(
@@ -509,6 +412,6 @@ fn generate(experiment: &Experiment) -> Result<(), SweepError> {
     let generated =
         generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
-    generated?;
+    generated.context("generate")?;
     Ok(())
 }

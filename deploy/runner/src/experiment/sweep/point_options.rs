@@ -2,18 +2,20 @@
 
 use std::path::Path;
 
+use anyhow::{Context, Result};
 use dataset::IntensityScale;
-use ego_fuser_offline::evaluation::EvaluateError;
+use ego_fuser::pairing::PairingConfig;
+use ego_fuser_offline::evaluation::EvaluateConfig;
+use ego_fuser_offline::evaluation::stepped::{AgentPool, SteppedConfig};
 use fusion::Exchange;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
 use protocol::Dtype;
 use training::feature_store::KeptMaps;
 
-use super::SweepError;
-use super::grid::{self, Point};
+use super::grid::Point;
 use super::spec::Experiment;
-use crate::experiment::evaluation::{EvaluationError, EvaluationOptions};
+use crate::experiment::evaluation::EvaluationOptions;
 use crate::scenario::weights_choice::weights_of;
 
 /// Settings of the evaluation of a point.
@@ -21,28 +23,33 @@ pub(super) fn options(
     experiment: &Experiment,
     point: &Point,
     maps: &Path,
-) -> Result<EvaluationOptions, SweepError> {
-    let weights = weights_of(&experiment.weights, point.method)?;
-    let read = Weights::load(&weights)
-        .map_err(EvaluateError::from)
-        .map_err(boxed)?;
-    let config: DetectorConfig = read.config().map_err(EvaluateError::from).map_err(boxed)?;
+) -> Result<EvaluationOptions> {
+    let weights = weights_of(&experiment.weights, point.method).context("weights")?;
+    let config: DetectorConfig = Weights::load(&weights)?.config()?;
     let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
-    Ok(EvaluationOptions {
-        dataset: experiment.dataset.clone(),
+    let settings = EvaluateConfig {
         weights,
         precision: experiment.precision,
         pose_source: point.poses(experiment),
         codec: point.codec(config.feature_grid(), channels),
         rate: point.rate(),
         trust: experiment.ego.trust(),
+        ..EvaluateConfig::default()
+    };
+    let (ego, link) = (&experiment.ego, point.link(experiment).context("link")?);
+    Ok(EvaluationOptions {
+        dataset: experiment.dataset.clone(),
+        settings,
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
-        stepped: Some(grid::stepped(
-            point.link(experiment)?,
-            point,
-            &experiment.ego,
-            experiment.compute,
-        )),
+        stepped: Some(SteppedConfig {
+            // Deep enough for the oldest map that is still fused, at 10 Hz.
+            pairing: PairingConfig {
+                depth: (ego.max_age_ms / 100 + 4) as usize,
+                ..ego.pairing()
+            },
+            crew: AgentPool::First(point.agents.unwrap_or(usize::MAX)),
+            ..SteppedConfig::new(link, point.seed, ego, experiment.compute)
+        }),
         part: experiment.part(),
         protocol: experiment.protocol.clone(),
         ..EvaluationOptions::default()
@@ -58,8 +65,4 @@ pub(super) fn kept_maps(experiment: &Experiment, folder: &Path) -> KeptMaps {
         limit_bytes,
         intensity_scale: IntensityScale::AUTO,
     }
-}
-
-fn boxed(error: EvaluateError) -> SweepError {
-    SweepError::Evaluation(Box::new(EvaluationError::from(error)))
 }

@@ -15,8 +15,10 @@ use protocol::Dtype;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::SweepError;
+use support::file_error::FileError;
+
 use super::check;
+use crate::experiment::evaluation::Part;
 
 /// An experiment.
 #[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
@@ -189,12 +191,8 @@ impl Experiment {
     /// which are resolved against the working directory as on the command line.
     ///
     /// # Errors
-    /// [`SweepError`] names the file and the field.
-    pub fn read(path: &Path) -> Result<Self, SweepError> {
-        let spec = |problem: String| SweepError::Spec {
-            path: path.into(),
-            problem,
-        };
+    /// [`FileError`] names the file and the field.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
         let mut experiment: Self = config_file::read(path)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         experiment.dataset = folder.join(&experiment.dataset);
@@ -204,15 +202,16 @@ impl Experiment {
             experiment.link = folder.join(&experiment.link).to_string_lossy().into_owned();
         }
         let poses = std::mem::take(&mut experiment.poses).with_networks();
-        experiment.poses = poses.map_err(|error| spec(format!("poses: {error}")))?;
-        check::check(&experiment).map_err(spec)?;
+        experiment.poses =
+            poses.map_err(|error| FileError::new(path, format_args!("poses: {error}")))?;
+        check::check(&experiment).map_err(|problem| FileError::new(path, problem))?;
         Ok(experiment)
     }
 
     /// The part of the data set that is evaluated.
     #[must_use]
-    pub fn part(&self) -> crate::experiment::evaluation::Part {
-        crate::experiment::evaluation::Part {
+    pub fn part(&self) -> Part {
+        Part {
             scenarios: self.scenarios,
             frames: self.frames,
             ..Default::default()

@@ -7,7 +7,6 @@ use support::csv_file::CsvText;
 
 use super::Run;
 use super::spec::Experiment;
-use crate::experiment::cell::Cell;
 
 /// Reasons with a column of their own; the last column is the sum of the others.
 const REASONS: [DropReason; 7] = [
@@ -94,52 +93,28 @@ pub(super) fn rows(experiment: &Experiment, runs: &[Run]) -> (Vec<&'static str>,
 }
 
 fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
-    let Cell {
-        metrics,
-        used,
-        messages,
-        ..
-    } = cell;
-    let sends_maps = point.method.exchange() == Exchange::Features;
-    let is_plain = sends_maps && point.codec.fit.is_none() && point.codec.zstd_level.is_none();
+    let (metrics, used, messages) = (&cell.metrics, cell.used, &cell.messages);
+    let codec = (point.method.exchange() == Exchange::Features).then_some(point.codec);
+    let is_plain = codec.is_some_and(|codec| codec.fit.is_none() && codec.zstd_level.is_none());
     let bandwidth = match point.bandwidth_mbps {
         None if experiment.grid.bandwidth_mbps.is_some() => "inf".into(),
         mbps => plain(mbps),
     };
-    let mut fields = vec![point.method.name().to_owned()];
-    fields.push(if sends_maps {
-        point.codec.name()
-    } else {
-        String::new()
-    });
-    fields.push(if sends_maps {
-        plain(point.codec.keep)
-    } else {
-        String::new()
-    });
-    fields.push(
-        point
-            .codec
-            .zstd_level
-            .filter(|_| sends_maps)
-            .map_or(String::new(), |level| level.to_string()),
-    );
-    fields.extend([
+    let mut fields = vec![
+        point.method.name().to_owned(),
+        plain(codec.map(|codec| codec.name())),
+        plain(codec.and_then(|codec| codec.keep)),
+        plain(codec.and_then(|codec| codec.zstd_level)),
         plain(point.latency_ms),
         plain(point.jitter_ms),
         bandwidth,
         plain(point.loss),
-    ]);
-    fields.extend([
         plain(point.pose_noise.map(|noise| noise.position_std_m)),
         plain(point.pose_noise.map(|noise| noise.heading_std_deg)),
-    ]);
-    fields.push(
-        point
-            .agents
-            .map_or(String::new(), |agents| agents.to_string()),
-    );
-    fields.extend([point.seed.to_string(), metrics.frames.to_string()]);
+        plain(point.agents),
+        point.seed.to_string(),
+        metrics.frames.to_string(),
+    ];
     for ByIou {
         at_30,
         at_50,
@@ -155,54 +130,34 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
         fixed(comm.log2_payload, 4),
     ]);
     let log2 = |bytes: Option<f64>| fixed(bytes.filter(|bytes| *bytes > 0.0).map(f64::log2), 4);
-    fields.push(log2(comm.wire_bytes_mean));
-    fields
-        .push(log2(comm.wire_bytes_mean.map(|bytes| {
-            bytes * *used as f64 / metrics.frames.max(1) as f64
-        })));
-    fields.push(log2(
-        comm.payload_bytes_mean
-            .filter(|_| is_plain)
-            .map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64),
-    ));
-    fields.push(fixed(Some(comm.nominal_fp32_log2), 4));
-    let latency = &metrics.latency_ms.capture_to_detection;
-    fields.extend(
-        [
-            latency.p50,
-            latency.p95,
-            latency.p99,
-            metrics.age_ms.p50,
-            metrics.age_ms.p95,
-        ]
-        .map(|ms| fixed(ms, 3)),
-    );
+    let per_frame = used as f64 / metrics.frames.max(1) as f64;
+    let payload = comm.payload_bytes_mean.filter(|_| is_plain);
+    fields.extend([
+        log2(comm.wire_bytes_mean),
+        log2(comm.wire_bytes_mean.map(|bytes| bytes * per_frame)),
+        log2(payload.map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64)),
+        fixed(Some(comm.nominal_fp32_log2), 4),
+    ]);
+    let (latency, age) = (&metrics.latency_ms.capture_to_detection, &metrics.age_ms);
+    let times = [latency.p50, latency.p95, latency.p99, age.p50, age.p95];
+    fields.extend(times.map(|ms| fixed(ms, 3)));
     let count = |reason: &DropReason| messages.dropped.get(reason).copied().unwrap_or(0);
-    fields.extend(
-        [
-            *used,
-            count(&DropReason::Stale),
-            messages.sent,
-            messages.received,
-            messages.in_flight,
-        ]
-        .map(text),
-    );
-    fields.extend(REASONS.iter().map(|reason| text(count(reason))));
-    let others = messages
-        .dropped
-        .iter()
-        .filter(|(reason, _)| !REASONS.contains(reason));
-    fields.push(text(others.map(|(_, count)| *count).sum()));
+    let stale = count(&DropReason::Stale);
+    let mut counts = vec![
+        used,
+        stale,
+        messages.sent,
+        messages.received,
+        messages.in_flight,
+    ];
+    counts.extend(REASONS.iter().map(count));
+    let all: u64 = messages.dropped.values().sum();
+    counts.push(all - REASONS.iter().map(count).sum::<u64>());
+    fields.extend(counts.iter().map(ToString::to_string));
     fields
 }
 
-fn text(count: u64) -> String {
-    count.to_string()
-}
-
-/// Shortest decimal text of a value.
-fn plain(value: Option<f64>) -> String {
+fn plain(value: Option<impl ToString>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 

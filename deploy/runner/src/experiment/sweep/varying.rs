@@ -42,29 +42,18 @@ impl VaryingTable {
             .filter(is_shown)
             .partition(|&place| PRECISIONS.contains(&columns[place]));
         let varied: Vec<usize> = (0..settings).filter(|&place| varies(place)).collect();
-        let kept: Vec<usize> = varied
-            .iter()
-            .copied()
-            .chain(precisions)
-            .chain(others)
-            .collect();
+        let kept: Vec<usize> = [&varied[..], &precisions, &others].concat();
         let constant = |place: usize| {
             let value = values(place).next().filter(|value| !value.is_empty())?;
             Some((columns[place].to_owned(), value.to_owned()))
         };
+        let names = kept.iter().map(|&place| columns[place].to_owned());
+        let cells = |line: &Vec<String>| kept.iter().map(|&place| line[place].clone()).collect();
+        let others = (0..columns.len()).filter(|place| !kept.contains(place));
         Self {
-            columns: kept
-                .iter()
-                .map(|&place| columns[place].to_owned())
-                .collect(),
-            lines: lines
-                .iter()
-                .map(|line| kept.iter().map(|&place| line[place].clone()).collect())
-                .collect(),
-            constants: (0..columns.len())
-                .filter(|place| !kept.contains(place))
-                .filter_map(constant)
-                .collect(),
+            columns: names.collect(),
+            lines: lines.iter().map(cells).collect(),
+            constants: others.filter_map(constant).collect(),
             settings: varied.len(),
         }
     }
@@ -84,10 +73,7 @@ impl VaryingTable {
         let run_with = |value: f64| {
             (0..self.lines.len()).find(|&line| self.number(line, column) == Some(value))
         };
-        let (best, worst) = (
-            self.settings_of(run_with(high)?),
-            self.settings_of(run_with(low)?),
-        );
+        let [worst, best] = [run_with(low)?, run_with(high)?].map(|run| self.settings_of(run));
         Some(format!(
             "AP@0.5 is between {low:.3} ({worst}) and {high:.3} ({best})."
         ))
@@ -118,11 +104,8 @@ impl VaryingTable {
             });
             if is_number { Side::Right } else { Side::Left }
         };
-        let mut table = TextTable::new(
-            shown
-                .iter()
-                .map(|&place| (self.columns[place].as_str(), side(place))),
-        );
+        let heads = shown.iter().map(|&place| (name(place), side(place)));
+        let mut table = TextTable::new(heads);
         for line in &self.lines {
             table.row(shown.iter().map(|&place| match line[place].as_str() {
                 "" => "-".to_owned(),
@@ -141,11 +124,9 @@ impl VaryingTable {
             .iter()
             .zip(&self.lines[line])
             .take(self.settings);
-        pairs
-            .filter(|(_, value)| !value.is_empty())
-            .map(|(name, value)| format!("{name} {value}"))
-            .collect::<Vec<_>>()
-            .join(", ")
+        let given = pairs.filter(|(_, value)| !value.is_empty());
+        let texts = given.map(|(name, value)| format!("{name} {value}"));
+        texts.collect::<Vec<_>>().join(", ")
     }
 
     fn number(&self, line: usize, column: usize) -> Option<f64> {

@@ -6,9 +6,11 @@
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 
-use super::SweepError;
+use anyhow::{Context, Result};
+
+use super::WorkerError;
 use crate::experiment::cell::CellKey;
 
 /// Answer of a worker: a frame is computed.
@@ -29,25 +31,21 @@ pub(super) fn run(
     jobs: usize,
     on_frame: &(dyn Fn() + Sync),
     on_done: &(dyn Fn() + Sync),
-) -> Result<(), SweepError> {
+) -> Result<()> {
     let queue = Mutex::new(missing.iter().copied());
     let failure = Mutex::new(None);
     std::thread::scope(|scope| {
         for _ in 0..jobs.min(missing.len()) {
             scope.spawn(|| {
                 if let Err(error) = serve(file, out, &queue, &failure, on_frame, on_done) {
-                    failure
-                        .lock()
-                        .unwrap_or_else(std::sync::PoisonError::into_inner)
-                        .get_or_insert(error);
+                    let mut first = failure.lock().unwrap_or_else(PoisonError::into_inner);
+                    first.get_or_insert(error);
                 }
             });
         }
     });
-    failure
-        .into_inner()
-        .unwrap_or_else(std::sync::PoisonError::into_inner)
-        .map_or(Ok(()), Err)
+    let failure = failure.into_inner().unwrap_or_else(PoisonError::into_inner);
+    failure.map_or(Ok(()), Err)
 }
 
 /// Feeds one worker until no run is left, or another worker has failed.
@@ -55,66 +53,48 @@ fn serve<'r>(
     file: &Path,
     out: &Path,
     queue: &Mutex<impl Iterator<Item = Request<'r>>>,
-    failure: &Mutex<Option<SweepError>>,
+    failure: &Mutex<Option<anyhow::Error>>,
     on_frame: &dyn Fn(),
     on_done: &dyn Fn(),
-) -> Result<(), SweepError> {
+) -> Result<()> {
     let mut worker = Worker(start(file, out)?);
-    let silent = || SweepError::Worker("it ended without an answer".into());
+    let silent = || WorkerError("it ended without an answer".into());
     let mut input = worker.0.stdin.take().ok_or_else(silent)?;
     let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
     loop {
-        if failure
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
-            .is_some()
-        {
-            return Ok(());
-        }
-        let Some(request) = queue
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
-            .next()
-        else {
+        let has_failed = { failure.lock() }
+            .unwrap_or_else(PoisonError::into_inner)
+            .is_some();
+        let request = queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let Some(request) = request.filter(|_| !has_failed) else {
             return Ok(());
         };
-        let request = serde_json::to_string(&request).unwrap_or_default();
-        writeln!(input, "{request}").map_err(|error| SweepError::Worker(error.to_string()))?;
+        let request = serde_json::to_string(&request)?;
+        writeln!(input, "{request}").map_err(|error| WorkerError(error.to_string()))?;
         loop {
-            let line = output
-                .next()
-                .ok_or_else(silent)?
-                .map_err(|error| SweepError::Worker(error.to_string()))?;
+            let line = output.next().ok_or_else(silent)?;
+            let line = line.map_err(|error| WorkerError(error.to_string()))?;
             match line.split_once(' ').unwrap_or((line.as_str(), "")) {
                 (FRAME, _) => on_frame(),
                 (DONE, _) => break on_done(),
-                (FAILED, reason) => return Err(SweepError::Worker(reason.to_owned())),
-                _ => return Err(SweepError::Worker(format!("unexpected answer {line:?}"))),
+                (FAILED, reason) => return Err(WorkerError(reason.to_owned()).into()),
+                _ => return Err(WorkerError(format!("unexpected answer {line:?}")).into()),
             }
         }
     }
 }
 
-fn start(file: &Path, out: &Path) -> Result<Child, SweepError> {
-    let program = std::env::current_exe().map_err(|source| SweepError::Io {
-        path: "this program".into(),
-        source,
-    })?;
-    Command::new(&program)
-        .args([
-            "sweep".as_ref(),
-            file.as_os_str(),
-            "--out".as_ref(),
-            out.as_os_str(),
-            "--worker".as_ref(),
-        ])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .spawn()
-        .map_err(|source| SweepError::Io {
-            path: program,
-            source,
-        })
+fn start(file: &Path, out: &Path) -> Result<Child> {
+    let program = std::env::current_exe().context("this program")?;
+    let mut command = Command::new(&program);
+    command
+        .arg("sweep")
+        .arg(file)
+        .arg("--out")
+        .arg(out)
+        .arg("--worker");
+    let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+    child.with_context(|| program.display().to_string())
 }
 
 /// A process that is killed when it is dropped.

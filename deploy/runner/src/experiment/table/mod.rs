@@ -7,59 +7,19 @@ mod spec;
 mod text;
 
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
-use agent::rate::RateConfig;
-use bus::config_file::ConfigError;
+use anyhow::{Context, Result};
 use dataset::IntensityScale;
+use ego_fuser_offline::evaluation::EvaluateConfig;
 
 pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
 
-use crate::experiment::cell::{Cell, CellError};
-use crate::experiment::evaluation::{
-    EvaluationError, EvaluationOptions, OpenedData, Part, compute,
-};
-use crate::scenario::weights_choice::WeightsChoiceError;
+use crate::experiment::cell::Cell;
+use crate::experiment::evaluation::{EvaluationOptions, OpenedData, Part, compute};
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use training::feature_store::KeptMaps;
-
-/// Reason why a table failed.
-#[derive(Debug, thiserror::Error)]
-pub enum TableError {
-    /// Error of the operating system.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: io::Error,
-    },
-    /// A file has invalid content.
-    #[error("{}: {problem}", path.display())]
-    Spec {
-        /// Path of the file.
-        path: PathBuf,
-        /// Description of the error.
-        problem: String,
-    },
-    /// The file of tables cannot be read.
-    #[error(transparent)]
-    File(#[from] ConfigError),
-    /// Neither the row nor the file of tables names weights.
-    #[error("row {0} has no weights, and there is no folder of weights")]
-    NoWeights(String),
-    /// The folder of weights has none for a method.
-    #[error(transparent)]
-    Weights(#[from] WeightsChoiceError),
-    /// A cached cell cannot be used.
-    #[error(transparent)]
-    Cell(#[from] CellError),
-    /// A cell cannot be evaluated.
-    #[error(transparent)]
-    Evaluation(#[from] Box<EvaluationError>),
-}
 
 /// The cells of a row: for each column one per training.
 #[derive(Debug, Clone, PartialEq)]
@@ -92,32 +52,27 @@ pub trait TableObserver {
 /// Computes the missing cells and writes every table into `out`: `NAME.md`, `NAME.csv`, and `cells/`.
 ///
 /// # Errors
-/// [`TableError`] at the first cell that cannot be computed; earlier cells are cached.
+/// An error at the first cell that cannot be computed; earlier cells are cached.
 pub fn run(
     spec: &TableSpec,
     out: &Path,
     observer: &mut dyn TableObserver,
-) -> Result<Vec<FilledTable>, TableError> {
+) -> Result<Vec<FilledTable>> {
     let cells = out.join("cells");
-    fs::create_dir_all(&cells).map_err(|source| TableError::Io {
-        path: cells.clone(),
-        source,
-    })?;
+    fs::create_dir_all(&cells).with_context(|| cells.display().to_string())?;
     let part = Part {
         frames: spec.frames,
         ..Part::default()
     };
-    let data = part.open(&spec.dataset, &spec.protocol).map_err(Box::new)?;
+    let data = part.open(&spec.dataset, &spec.protocol)?;
     let run = Run { spec, cells, data };
     let mut filled = Vec::with_capacity(spec.tables.len());
     for table in &spec.tables {
         let table = run.fill(table, observer)?;
-        let write = |ending: &str, text: String| {
+        for (ending, text) in [("md", markdown(&table)), ("csv", csv(&table))] {
             let path = out.join(format!("{}.{ending}", table.name));
-            fs::write(&path, text).map_err(|source| TableError::Io { path, source })
-        };
-        write("md", markdown(&table))?;
-        write("csv", csv(&table))?;
+            fs::write(&path, text).with_context(|| path.display().to_string())?;
+        }
         filled.push(table);
     }
     Ok(filled)
@@ -130,11 +85,7 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    fn fill(
-        &self,
-        table: &Table,
-        observer: &mut dyn TableObserver,
-    ) -> Result<FilledTable, TableError> {
+    fn fill(&self, table: &Table, observer: &mut dyn TableObserver) -> Result<FilledTable> {
         let mut rows = Vec::with_capacity(table.rows.len());
         for row in &table.rows {
             let weights = self.spec.weights_of(row)?;
@@ -161,16 +112,15 @@ impl Run<'_> {
         column: &Column,
         weights: &Path,
         observer: &mut dyn TableObserver,
-    ) -> Result<Cell, TableError> {
+    ) -> Result<Cell> {
         let options = self.options(table, row, column, weights);
-        let key = options.key(&self.data, row.method).map_err(Box::new)?;
+        let key = options.key(&self.data, row.method)?;
         let known = Cell::read(&key, &self.cells)?;
         observer.cell(&table.name, &row.label(), &column.name, known.is_some());
         if let Some(cell) = known {
             return Ok(cell);
         }
-        let on_frame = &mut || observer.frame();
-        let cell = compute(&options, &self.data, key, on_frame).map_err(Box::new)?;
+        let cell = compute(&options, &self.data, key, &mut || observer.frame())?;
         cell.write(&self.cells)?;
         Ok(cell)
     }
@@ -182,16 +132,19 @@ impl Run<'_> {
         column: &Column,
         weights: &Path,
     ) -> EvaluationOptions {
-        EvaluationOptions {
-            dataset: self.spec.dataset.clone(),
+        let settings = EvaluateConfig {
             weights: weights.to_owned(),
             precision: self.spec.precision,
             pose_source: row.poses.as_ref().unwrap_or(&column.poses).clone(),
             codec: self.spec.codec(),
-            rate: RateConfig::default(),
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
             attack: column.attack,
             trust: column.trust.then(MisbehaviourConfig::default),
+            ..EvaluateConfig::default()
+        };
+        EvaluationOptions {
+            dataset: self.spec.dataset.clone(),
+            settings,
             maps: self.spec.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: self.spec.dtype,

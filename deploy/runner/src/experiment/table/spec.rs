@@ -12,7 +12,10 @@ use protocol::{CodecConfig, Dtype};
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::TableError;
+use anyhow::{Result, bail};
+use support::file_error::FileError;
+
+use crate::experiment::sweep::check_name;
 use crate::scenario::weights_choice::weights_of;
 
 /// A file of tables: common settings, and each table.
@@ -110,14 +113,11 @@ impl TableSpec {
     /// Reads a file of tables.
     ///
     /// # Errors
-    /// [`TableError`] names the file and the error.
-    pub fn read(path: &Path) -> Result<Self, TableError> {
+    /// [`FileError`] names the file and the error.
+    pub fn read(path: &Path) -> Result<Self, FileError> {
         let mut spec: Self = config_file::read(path)?;
         let checked = spec.check().and_then(|()| spec.find_networks());
-        checked.map_err(|problem| TableError::Spec {
-            path: path.to_owned(),
-            problem,
-        })?;
+        checked.map_err(|problem| FileError::new(path, problem))?;
         Ok(spec)
     }
 
@@ -135,17 +135,9 @@ impl TableSpec {
 
     fn check(&self) -> Result<(), String> {
         for (index, table) in self.tables.iter().enumerate() {
-            let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-            if table.name.is_empty() || !table.name.chars().all(is_name) {
-                return Err(format!(
-                    "table name {:?} is to name files: letters, digits, - and _",
-                    table.name
-                ));
-            }
-            if self.tables[..index]
-                .iter()
-                .any(|other| other.name == table.name)
-            {
+            check_name("table name", &table.name)?;
+            let mut before = self.tables[..index].iter();
+            if before.any(|other| other.name == table.name) {
                 return Err(format!("two tables are called {:?}", table.name));
             }
             if table.rows.is_empty() || table.columns.is_empty() {
@@ -158,11 +150,14 @@ impl TableSpec {
     /// The weights of a row, one file per training.
     ///
     /// # Errors
-    /// [`TableError`] when neither the row nor the folder has any.
-    pub(crate) fn weights_of(&self, row: &Row) -> Result<Vec<PathBuf>, TableError> {
+    /// An error when neither the row nor the folder has any.
+    pub(crate) fn weights_of(&self, row: &Row) -> Result<Vec<PathBuf>> {
         match (&row.weights[..], &self.weights) {
             ([], Some(folder)) => Ok(vec![weights_of(folder, row.method)?]),
-            ([], None) => Err(TableError::NoWeights(row.label())),
+            ([], None) => bail!(
+                "row {} has no weights, and there is no folder of weights",
+                row.label()
+            ),
             (files, _) => Ok(files.to_vec()),
         }
     }
@@ -204,7 +199,7 @@ tables:
   - {name: 1 m, poses: {noisy: {mode: independent, position_std_m: 1}}, delay_ms: 100}
 ";
 
-    fn read(text: &str) -> Result<TableSpec, TableError> {
+    fn read(text: &str) -> Result<TableSpec, FileError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("tables.yaml");
         std::fs::write(&path, text).unwrap();

@@ -5,7 +5,6 @@ use std::fmt::Write as _;
 
 use deploy::score::metrics::ByIou;
 use support::csv_file::CsvText;
-use support::provenance::Provenance;
 
 use super::{FilledRow, FilledTable};
 use crate::experiment::cell::Cell;
@@ -17,10 +16,8 @@ pub fn markdown(table: &FilledTable) -> String {
     let mut text = format!("# {}\n\n", table.name);
     let single = table.columns.len() == 1;
     let heads: Vec<String> = if single {
-        let global = format!(
-            "{}: AP@0.3 / 0.5 / 0.7, global order",
-            table.columns[0].name
-        );
+        let name = &table.columns[0].name;
+        let global = format!("{name}: AP@0.3 / 0.5 / 0.7, global order");
         vec![
             global,
             "frame order".into(),
@@ -47,10 +44,8 @@ pub fn markdown(table: &FilledTable) -> String {
                 bytes(2, &|cell| cell.metrics.comm.log2_payload),
             ]
         } else {
-            cells
-                .iter()
-                .map(|cells| precision(cells, |cell| cell.metrics.ap_global))
-                .collect()
+            let global = |cells: &Vec<Cell>| precision(cells, |cell| cell.metrics.ap_global);
+            cells.iter().map(global).collect()
         };
         let _ = writeln!(text, "| {} | {} |", row.label(), values.join(" | "));
     }
@@ -65,26 +60,16 @@ fn provenance(table: &FilledTable) -> String {
     let (mut frames, mut programs, mut data) = (BTreeSet::new(), BTreeSet::new(), BTreeSet::new());
     let mut files = BTreeSet::new();
     for cell in table.rows.iter().flat_map(|row| row.cells.iter().flatten()) {
-        let Provenance {
-            version,
-            commit,
-            program_sha256,
-            data_sha256,
-            files_sha256,
-            command: _,
-        } = &cell.key.provenance;
+        let of = &cell.key.provenance;
+        let (version, commit, sha256) = (&of.version, &of.commit, &of.program_sha256);
         frames.insert(cell.metrics.frames.to_string());
-        programs.insert(format!(
-            "{version}, commit {commit}, SHA-256 `{program_sha256}`"
-        ));
-        data.insert(format!("`{data_sha256}`"));
-        files.extend(files_sha256);
+        programs.insert(format!("{version}, commit {commit}, SHA-256 `{sha256}`"));
+        data.insert(format!("`{}`", of.data_sha256));
+        files.extend(&of.files_sha256);
     }
+    let [frames, programs, data] = [frames, programs, data].map(joined);
     let mut text = format!(
-        "\nFrames: {}. Program: {}. Data: contents SHA-256 {}. Weights and other files:\n\n",
-        joined(frames),
-        joined(programs),
-        joined(data),
+        "\nFrames: {frames}. Program: {programs}. Data: contents SHA-256 {data}. Weights and other files:\n\n"
     );
     for (file, sha256) in files {
         let _ = writeln!(text, "- `{}`, SHA-256 `{sha256}`", file.display());
@@ -107,20 +92,17 @@ pub fn csv(table: &FilledTable) -> String {
     for FilledRow { row, cells } in &table.rows {
         for (column, trainings) in table.columns.iter().zip(cells) {
             for (training, cell) in trainings.iter().enumerate() {
+                let poses = row.poses.as_ref().unwrap_or(&column.poses);
                 let place = [
                     table.name.clone(),
                     row.label(),
                     column.name.clone(),
                     training.to_string(),
-                ];
-                let poses = row.poses.as_ref().unwrap_or(&column.poses);
-                let conditions = [
                     row.method.to_string(),
                     poses.name().to_owned(),
                     column.delay_ms.to_string(),
                 ];
-                let fields = place.into_iter().chain(conditions);
-                text.row(fields.chain(cell_fields(cell)));
+                text.row(place.into_iter().chain(cell_fields(cell)));
             }
         }
     }
@@ -138,24 +120,20 @@ fn cell_fields(cell: &Cell) -> Vec<String> {
     {
         fields.extend([at_30, at_50, at_70].map(plain));
     }
-    let (comm, pose) = (&metrics.comm, &metrics.pose);
-    let files: Vec<&str> = (key.provenance.files_sha256.values())
-        .map(String::as_str)
-        .collect();
-    fields.extend(
-        [
-            comm.payload_bytes_mean,
-            comm.log2_payload,
-            pose.mean_m,
-            pose.p95_m,
-        ]
-        .map(plain),
-    );
+    let (comm, pose, of) = (&metrics.comm, &metrics.pose, &key.provenance);
+    let numbers = [
+        comm.payload_bytes_mean,
+        comm.log2_payload,
+        pose.mean_m,
+        pose.p95_m,
+    ];
+    fields.extend(numbers.map(plain));
+    let files: Vec<&str> = of.files_sha256.values().map(String::as_str).collect();
     fields.extend([
         pose.no_pose.to_string(),
-        key.provenance.commit.clone(),
-        key.provenance.program_sha256.clone(),
-        key.provenance.data_sha256.clone(),
+        of.commit.clone(),
+        of.program_sha256.clone(),
+        of.data_sha256.clone(),
         files.join(" "),
     ]);
     fields
@@ -185,10 +163,8 @@ fn number(value: &Option<(f64, Option<f64>)>, digits: usize) -> String {
 /// Three precisions in per cent.
 fn precision(cells: &[Cell], of: impl Fn(&Cell) -> ByIou) -> String {
     let at = |pick: fn(ByIou) -> Option<f64>| {
-        number(
-            &mean(cells, &|cell| pick(of(cell)).map(|value| 100.0 * value)),
-            2,
-        )
+        let percent = |cell: &Cell| pick(of(cell)).map(|value| 100.0 * value);
+        number(&mean(cells, &percent), 2)
     };
     [at(|ap| ap.at_30), at(|ap| ap.at_50), at(|ap| ap.at_70)].join(" / ")
 }
@@ -205,6 +181,7 @@ mod tests {
     use super::*;
     use crate::experiment::cell::CellKey;
     use deploy::score::metrics::{Communication, Metrics};
+    use support::provenance::Provenance;
 
     fn cell(method: Method, at_50: f64) -> Cell {
         let ap = ByIou {

@@ -71,12 +71,10 @@ impl ComputeTimes {
         ];
         for (what, takes_nanos) in steps {
             if takes_nanos > period_nanos {
-                let [takes_ms, period_ms] =
-                    [takes_nanos, period_nanos].map(|nanos| nanos as f64 * 1e-6);
                 return Err(EvaluateError::TooSlow {
                     what,
-                    takes_ms,
-                    period_ms,
+                    takes_ms: takes_nanos as f64 * 1e-6,
+                    period_ms: period_nanos as f64 * 1e-6,
                 });
             }
         }
@@ -104,14 +102,10 @@ impl Evaluator {
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
         let samples = self.samples(scenario, MEASURED_VEHICLES, &|ticks| ticks < MEASURED_TICKS)?;
         let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
-        let Samples {
-            pose, map, fuse, ..
-        } = &samples;
-        let [pose_ms, map_ms, fuse_ms] = [pose, map, fuse].map(|sample| median(sample));
         Ok(ComputeTimes {
-            pose_ms,
-            map_ms,
-            fuse_ms,
+            pose_ms: median(&samples.pose),
+            map_ms: median(&samples.map),
+            fuse_ms: median(&samples.fuse),
         })
     }
 
@@ -135,27 +129,17 @@ impl Evaluator {
         self.config.pose_source = source.clone().measuring_every_sweep();
         let samples = self.samples(scenario, vehicles, &goes_on);
         self.config.pose_source = source;
-        let Samples {
-            pose,
-            observe,
-            map,
-            fuse,
-            motion,
-        } = &samples?;
+        let samples = samples?;
         let warm = |per_tick: usize, sample: &[f64]| {
-            let warm = sample
-                .get(per_tick..)
-                .filter(|warm| !warm.is_empty())
-                .unwrap_or(sample);
-            median(warm).unwrap_or(0.0)
+            let warm = sample.get(per_tick..).filter(|warm| !warm.is_empty());
+            median(warm.unwrap_or(sample)).unwrap_or(0.0)
         };
         let agents = vehicles.min(MEASURED_VEHICLES);
-        let interval = f64::from(self.config.pose_source.measuring_interval(motion));
-        let pose_ms = warm(agents, pose) + warm(agents, observe) / interval;
+        let interval = f64::from(self.config.pose_source.measuring_interval(&samples.motion));
         Ok(ComputeTimes {
-            pose_ms,
-            map_ms: warm(agents, map),
-            fuse_ms: warm(1, fuse),
+            pose_ms: warm(agents, &samples.pose) + warm(agents, &samples.observe) / interval,
+            map_ms: warm(agents, &samples.map),
+            fuse_ms: warm(1, &samples.fuse),
         })
     }
 
@@ -174,13 +158,7 @@ impl Evaluator {
             .enumerate()
             .map(|(index, cav)| self.participant(scenario, cav, &self.settings(scenario, index)))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
-        let Samples {
-            mut pose,
-            mut observe,
-            mut map,
-            mut fuse,
-            mut motion,
-        } = Samples::default();
+        let mut samples = Samples::default();
         self.ego.forget();
         for tick in (0..scenario.ticks.len()).take_while(|tick| goes_on(*tick)) {
             let mut sent = Vec::with_capacity(participants.len());
@@ -189,14 +167,16 @@ impl Evaluator {
                     continue;
                 }
                 let frame = scenario.load(place, tick, &LoadOptions::default())?;
-                motion = frame.motion();
+                samples.motion = frame.motion();
                 let began = Instant::now();
                 sent.extend(view(participant, &frame, None, Some(exchange))?.into_view());
                 let all = began.elapsed();
                 let times = participant.pose_times();
-                pose.push(ms(times.estimate));
-                observe.push(ms(times.observe));
-                map.push(ms(all.saturating_sub(times.estimate + times.observe)));
+                samples.pose.push(ms(times.estimate));
+                samples.observe.push(ms(times.observe));
+                samples
+                    .map
+                    .push(ms(all.saturating_sub(times.estimate + times.observe)));
             }
             let others = scenario.agents.iter().take(vehicles).skip(sent.len());
             let copies = sent.get(1).map(|neighbour: &View| {
@@ -215,16 +195,10 @@ impl Evaluator {
             {
                 return Err(error.into());
             }
-            fuse.push(ms(began.elapsed()));
+            samples.fuse.push(ms(began.elapsed()));
         }
         self.ego.forget();
-        Ok(Samples {
-            pose,
-            observe,
-            map,
-            fuse,
-            motion,
-        })
+        Ok(samples)
     }
 }
 

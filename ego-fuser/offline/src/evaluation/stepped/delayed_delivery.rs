@@ -92,15 +92,8 @@ impl DelayedDelivery {
         envelope.view.capture_nanos =
             clock.shown_since(self.began_nanos, envelope.view.capture_nanos);
         let from = envelope.view.cav.clone();
-        self.hand_over(
-            &from,
-            stream,
-            sequence,
-            bytes,
-            nanos,
-            distance_m,
-            Some(envelope),
-        );
+        let envelope = Some(envelope);
+        self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, envelope);
     }
 
     /// Counts a map that the rate control has adapted.
@@ -122,19 +115,13 @@ impl DelayedDelivery {
     ) {
         let id = self.next_id;
         self.next_id += 1;
-        self.kept.insert(
-            id,
-            Kept {
-                topic: topic(from, stream),
-                envelope,
-            },
-        );
+        let topic = topic(from, stream);
+        self.kept.insert(id, Kept { topic, envelope });
         let submitted_nanos = nanos.saturating_sub(self.began_nanos);
-        let (from, to) = (from.clone(), self.ego.clone());
         let packet = Packet {
             id,
-            from,
-            to,
+            from: from.clone(),
+            to: self.ego.clone(),
             stream,
             sequence,
             bytes,
@@ -166,13 +153,9 @@ impl DelayedDelivery {
     }
 
     fn settle(&mut self, outcome: Outcome) -> Option<Arrived> {
-        let Outcome {
-            nanos,
-            packet,
-            delivery,
-        } = outcome;
+        let packet = outcome.packet;
         let account = Account::towards(topic(&packet.from, packet.stream), &self.receiver);
-        let envelope = match delivery {
+        let envelope = match outcome.delivery {
             Delivery::Dropped(reason) => {
                 self.kept.remove(&packet.id);
                 self.ledger.dropped(&account, reason);
@@ -189,16 +172,11 @@ impl DelayedDelivery {
             }
             Delivery::Arrived { .. } => self.kept.remove(&packet.id).and_then(|kept| kept.envelope),
         };
-        match envelope {
-            Some(envelope) => Some(Arrived {
-                nanos: nanos.saturating_add(self.began_nanos),
-                envelope,
-            }),
-            None => {
-                self.ledger.received(&account);
-                None
-            }
+        if envelope.is_none() {
+            self.ledger.received(&account);
         }
+        let nanos = outcome.nanos.saturating_add(self.began_nanos);
+        envelope.map(|envelope| Arrived { nanos, envelope })
     }
 
     /// The ego has used a message.
@@ -209,10 +187,8 @@ impl DelayedDelivery {
 
     /// The ego has not used a message.
     pub(super) fn dropped(&mut self, cav: &CavId, reason: DropReason) {
-        self.ledger.dropped(
-            &Account::towards(topic(cav, self.stream), &self.receiver),
-            reason,
-        );
+        let account = Account::towards(topic(cav, self.stream), &self.receiver);
+        self.ledger.dropped(&account, reason);
     }
 
     /// Counts a vehicle's messages that neither arrived nor were lost; `waiting` messages of it have arrived and were
@@ -221,15 +197,11 @@ impl DelayedDelivery {
         let not_sent: BTreeSet<u64> = self.pending.values().map(|packet| packet.id).collect();
         for (stream, waiting) in [(Stream::Pose, 0), (self.stream, waiting)] {
             let topic = topic(cav, stream);
-            let under_way = self
-                .kept
-                .iter()
-                .filter(|(id, kept)| kept.topic == topic && !not_sent.contains(id))
-                .count();
-            self.ledger.set_in_flight(
-                &Account::towards(topic, &self.receiver),
-                under_way as u64 + waiting,
-            );
+            let is_under_way =
+                |(id, kept): &(&u64, &Kept)| kept.topic == topic && !not_sent.contains(id);
+            let under_way = self.kept.iter().filter(is_under_way).count() as u64;
+            let account = Account::towards(topic, &self.receiver);
+            self.ledger.set_in_flight(&account, under_way + waiting);
         }
     }
 

@@ -3,10 +3,9 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::Layout;
 use super::builder::Builder;
 use super::grid::{GridPlan, grid, spread};
-use super::streets;
+use super::{Layout, streets};
 
 /// Speed limit: 25 mph, as in CARLA's Town01.
 const LIMIT_MPS: f64 = 11.176;

@@ -8,13 +8,12 @@ use rand_chacha::ChaCha8Rng;
 
 use super::super::profile::Profile;
 use super::super::road::{Contact, LaneKind};
-use super::Layout;
 use super::builder::{Builder, CrossProfile, RoadEnd, path};
 use super::grid::{GridPlan, grid, spread};
 use super::motorway::{Motorway, RAMP_ZONE_M};
 use super::ring::Ring;
 use super::roundabout::Roundabout;
-use super::streets;
+use super::{Layout, streets};
 
 /// Distance along the ring from the interchange's middle to where its ramps begin and end, metres.
 const RAMP_FROM_MIDDLE_M: f64 = 235.0;
