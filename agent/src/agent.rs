@@ -35,9 +35,9 @@ pub struct AgentInput<'a> {
 pub struct Perception {
     /// The BEV feature map for intermediate fusion as it is transmitted: with a compressor, its code.
     pub features: BevFeatures,
-    /// `[H, W]`, 0..1: probability of a vehicle per cell; selects the cells that are sent.
+    /// `[H, W]`, 0..1: probability of a vehicle per cell; selects the cells that are sent. Empty without head.
     pub confidence: Vec<f32>,
-    /// Detections of this vehicle by itself, in its own LiDAR frame, for late fusion.
+    /// Detections of this vehicle by itself, in its own LiDAR frame, for late fusion. Empty without head.
     pub detections: Vec<Detection>,
     /// Durations: the encoder's stages, the copy of the map out of the tensor library, the head, and decoding with
     /// suppression.
@@ -62,6 +62,7 @@ pub struct Agent {
     pose_source: Box<dyn PoseSource>,
     detector: Option<Detector>,
     rate: RateControl,
+    has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
     /// The current sweep, if it was encoded before its pose was estimated.
@@ -90,6 +91,7 @@ impl Agent {
             pose_source,
             detector: None,
             rate: RateControl::default(),
+            has_head: true,
             shares_encoder: false,
             encoded: None,
             levels: None,
@@ -101,6 +103,15 @@ impl Agent {
     pub fn within(self, rate: RateConfig) -> Self {
         Self {
             rate: RateControl::new(rate),
+            ..self
+        }
+    }
+
+    /// The same with neither confidence nor detections, for maps that are sent whole.
+    #[must_use]
+    pub(crate) fn without_head(self) -> Self {
+        Self {
+            has_head: false,
             ..self
         }
     }
@@ -239,12 +250,34 @@ impl Agent {
     /// [`DetectorError::Shape`] if it is not a feature map of this detector.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let detector = self.detector.as_ref().ok_or(DetectorError::Absent)?;
-        let settings = PostprocessConfig::for_late_fusion(detector.config());
         let mut times = StageTimes::start();
         let sent = detector.compressed(map)?;
-        let (map, features) = (detector.decompressed(&sent)?, detector.to_message(&sent)?);
+        let features = detector.to_message(&sent)?;
         times.lap("message");
-        let heads = detector.heads(&map)?;
+        let mut perception = Perception {
+            features,
+            confidence: Vec::new(),
+            detections: Vec::new(),
+            times: Vec::new(),
+        };
+        if self.has_head {
+            let map = detector.decompressed(&sent)?;
+            (perception.confidence, perception.detections) =
+                self.detect(detector, &map, &mut times)?;
+        }
+        perception.times = times.into_timings();
+        Ok(perception)
+    }
+
+    /// Confidence and detections of the map that receivers have.
+    fn detect(
+        &self,
+        detector: &Detector,
+        map: &Tensor,
+        times: &mut StageTimes,
+    ) -> Result<(Vec<f32>, Vec<Detection>), DetectorError> {
+        let settings = PostprocessConfig::for_late_fusion(detector.config());
+        let heads = detector.heads(map)?;
         times.lap("head");
         let boxes = detector.boxes(&heads, settings.score_threshold)?;
         let own = AgentBoxes {
@@ -257,12 +290,7 @@ impl Agent {
             .map(|candidate| candidate.detection(Some(self.cav.clone())))
             .collect();
         times.lap("boxes");
-        Ok(Perception {
-            features,
-            confidence: heads.confidence,
-            detections,
-            times: times.into_timings(),
-        })
+        Ok((heads.confidence, detections))
     }
 
     /// All steps.
@@ -370,6 +398,18 @@ mod tests {
             );
         }
         agent.warm_up().unwrap();
+    }
+
+    #[test]
+    fn without_its_head_an_agent_sends_the_same_map() {
+        let cloud = PointCloud {
+            xyzi: vec![[3.0, 2.0, -1.0, 0.2]; 5],
+        };
+        let whole = agent().perceive(&cloud).unwrap();
+        let map = agent().without_head().perceive(&cloud).unwrap();
+        assert_eq!(map.features, whole.features);
+        assert!(map.confidence.is_empty() && map.detections.is_empty());
+        assert!(map.times.iter().all(|stage| stage.stage != "head"));
     }
 
     #[test]

@@ -33,6 +33,15 @@ pub struct AgentConfig {
     #[arg(long, value_enum, value_delimiter = ',')]
     #[serde(default = "Publish::maps")]
     pub publish: Vec<Publish>,
+    /// Egos whose pace the agent follows. Absent: all egos.
+    #[arg(
+        long,
+        value_name = "ID",
+        value_delimiter = ',',
+        allow_hyphen_values = true
+    )]
+    #[serde(default)]
+    pub egos: Vec<CavId>,
     /// Keep running when the replay ends, for the next one; always so with `supervised`.
     #[arg(long)]
     #[serde(default)]
@@ -304,6 +313,7 @@ impl AgentConfig {
                 .collect(),
             codec: self.settings.codec,
             rate: self.settings.rate,
+            egos: self.egos.clone(),
             keeps_running: self.keep_running || self.bus.supervised,
             sweep_log: self.sweep_log.clone(),
             ..NodeOptions::default()

@@ -44,6 +44,8 @@ pub struct NodeOptions {
     pub codec: CodecConfig,
     /// Rate control of feature maps.
     pub rate: RateConfig,
+    /// Egos whose pace is followed; none: any ego's is.
+    pub egos: Vec<CavId>,
     /// True to keep running when the replay has ended, for the next one.
     pub keeps_running: bool,
     /// Limits of incoming messages.
@@ -62,6 +64,7 @@ impl Default for NodeOptions {
                 ..CodecConfig::default()
             },
             rate: RateConfig::default(),
+            egos: Vec::new(),
             keeps_running: false,
             limits: Limits::DEFAULT,
             sweep_log: None,
@@ -73,6 +76,17 @@ impl NodeOptions {
     /// True if the detector's network is computed: points are published as they are, and poses need none.
     fn needs_network(&self) -> bool {
         self.publish.iter().any(|stream| *stream != Stream::Points)
+    }
+
+    /// True if detections are published, or confidence chooses the cells of maps.
+    fn needs_head(&self) -> bool {
+        let CodecConfig {
+            budget_bytes, gate, ..
+        } = self.codec;
+        self.publish.contains(&Stream::Boxes)
+            || budget_bytes.is_some()
+            || gate.is_some()
+            || self.rate != RateConfig::default()
     }
 }
 
@@ -89,7 +103,7 @@ pub struct NodeReport {
     pub failure: Option<String>,
     /// Poses that the vehicle cannot have reached from the previous ones; they are published with little confidence.
     pub pose_jumps: u64,
-    /// Messages of egos whose pace is not followed, because there are too many egos.
+    /// Paces that are not followed: their egos are not of the run, or there are too many.
     pub unfollowed_paces: u64,
 }
 
@@ -117,7 +131,11 @@ pub fn run_filtered(
     options: &NodeOptions,
     stop: &Stop,
 ) -> Result<NodeReport, BusError> {
-    let mut agent = agent;
+    let mut agent = if options.needs_head() || filter.reads_head() {
+        agent
+    } else {
+        agent.without_head()
+    };
     if options.needs_network()
         && let Err(error) = agent.warm_up()
     {
@@ -197,7 +215,7 @@ impl<'a> Node<'a> {
             gnss,
             imu,
             pairing,
-            selection: SweepSelection::default(),
+            selection: SweepSelection::of(&options.egos),
             publishers,
             report: NodeReport::default(),
             sweep_log,
@@ -291,11 +309,11 @@ impl<'a> Node<'a> {
         });
     }
 
-    /// Follows the pace of an ego; one beyond the limit of egos is counted, and the first is logged.
+    /// Follows the pace of an ego of the run; others are counted, and the first is logged.
     fn follow_pace(&mut self, ego: &CavId, pace: Pace) {
         if !self.selection.follow(ego, pace, Instant::now()) {
             if self.report.unfollowed_paces == 0 {
-                tracing::warn!(%ego, followed = MAX_EGOS, "more egos than are followed: paces of others are ignored");
+                tracing::warn!(%ego, "the pace of this ego is ignored: the run has other egos, or {MAX_EGOS} already");
             }
             self.report.unfollowed_paces += 1;
         }

@@ -6,6 +6,11 @@ use crate::agent::Perception;
 
 /// Changes the output of an agent before it is published. By default each part passes unchanged.
 pub trait OutputFilter: std::fmt::Debug + Send {
+    /// True if the filter may read confidence or detections.
+    fn reads_head(&self) -> bool {
+        true
+    }
+
     /// The published pose.
     fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
         pose
@@ -26,4 +31,8 @@ pub trait OutputFilter: std::fmt::Debug + Send {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Unfiltered;
 
-impl OutputFilter for Unfiltered {}
+impl OutputFilter for Unfiltered {
+    fn reads_head(&self) -> bool {
+        false
+    }
+}

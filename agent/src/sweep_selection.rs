@@ -1,6 +1,6 @@
 //! Sweep selection: leaves out sweeps that no ego has time for, the same in every vehicle.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Pace};
@@ -13,6 +13,8 @@ const MAX_SILENCE: Duration = Duration::from_secs(5);
 /// Paces of the egos, and the interval of the last computed sweep under each.
 #[derive(Debug, Default)]
 pub(crate) struct SweepSelection {
+    /// Egos of the run; none: any ego is of it.
+    egos: BTreeSet<CavId>,
     paces: BTreeMap<CavId, Followed>,
 }
 
@@ -26,9 +28,21 @@ struct Followed {
 }
 
 impl SweepSelection {
-    /// Follows the pace of an ego from now on. False if there are too many egos already.
+    /// Selection by the paces of `egos` only; of any ego if they are none.
+    #[must_use]
+    pub(crate) fn of(egos: &[CavId]) -> Self {
+        Self {
+            egos: egos.iter().cloned().collect(),
+            ..Self::default()
+        }
+    }
+
+    /// Follows the pace of an ego from now on. False if the ego is not of the run, or there are too many already.
     #[must_use]
     pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace, now: Instant) -> bool {
+        if !self.egos.is_empty() && !self.egos.contains(ego) {
+            return false;
+        }
         let known = self.paces.get(ego);
         if known.is_none() && self.paces.len() >= MAX_EGOS {
             return false;
@@ -89,10 +103,12 @@ mod tests {
             .collect()
     }
 
-    fn every(sweeps: u64) -> Pace {
+    fn every(sweeps: u8) -> Pace {
         Pace {
-            interval_nanos: sweeps * 100_000_000,
+            period_nanos: 100_000_000,
             phase_nanos: 300_000_000,
+            computed: 1,
+            of: sweeps,
         }
     }
 
@@ -144,6 +160,20 @@ mod tests {
             computed(&mut selection, 27..30, silent + MAX_SILENCE),
             [27, 28, 29]
         );
+    }
+
+    #[test]
+    fn only_egos_of_the_run_set_the_pace() {
+        let [own, stranger] = ["1", "2"].map(|ego| CavId::new(ego).unwrap());
+        let (mut selection, now) = (
+            SweepSelection::of(std::slice::from_ref(&own)),
+            Instant::now(),
+        );
+        assert!(!selection.follow(&stranger, every(100), now));
+        assert_eq!(computed(&mut selection, 0..3, now), [0, 1, 2]);
+        assert!(selection.follow(&own, every(3), now));
+        assert!(!selection.follow(&stranger, Pace::EVERY_SWEEP, now));
+        assert_eq!(computed(&mut selection, 3..12, now), [3, 6, 9]);
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! Pace control: where a machine cannot keep up, answers come less often instead of later.
 //!
 //! The controller counts overloaded frames: the own agent left a sweep out, or a frame waited for another one. Too many
-//! of them lengthen the interval by one sweep; a while without any shortens it again. Failed attempts double that while.
+//! of them lower the share of sweeps that the fleet computes to what it achieved, in tenths; a while without any raises
+//! it by a tenth. Failed attempts double that while.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -10,11 +11,15 @@ use protocol::Pace;
 
 /// Number of frames that are judged together.
 const WINDOW: usize = 10;
-/// Overloaded frames among them that lengthen the interval.
+/// Overloaded frames among them that lower the share.
 const TOO_MANY: usize = 3;
-/// Longest interval.
+/// Denominator of the share.
+const TENTHS: u8 = 10;
+/// Largest step downwards, tenths: the first frames of a run are slower than others.
+const MAX_STEP: u8 = 2;
+/// Longest mean interval.
 const MAX_INTERVAL: Duration = Duration::from_secs(1);
-/// First and longest time without an overloaded frame after which the interval is shortened.
+/// First and longest time without an overloaded frame after which the share is raised.
 const PATIENCE: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(80)];
 
 /// Controller of an ego's pace.
@@ -22,14 +27,21 @@ const PATIENCE: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(80)
 pub(crate) struct PaceControl {
     /// Shortest interval between two sweeps of the own agent so far, nanoseconds.
     period_nanos: Option<u64>,
-    /// Sweeps per interval.
-    step: u64,
+    pace: Pace,
     last_nanos: Option<u64>,
-    overloaded: VecDeque<bool>,
+    judged: VecDeque<Judged>,
     /// Time of the last overloaded frame or change.
     quiet_since: Instant,
-    shortened_at: Option<Instant>,
+    raised_at: Option<Instant>,
     patience: Duration,
+}
+
+/// A frame since the last change.
+#[derive(Debug)]
+struct Judged {
+    /// Capture time since the frame before, nanoseconds.
+    gap_nanos: u64,
+    is_overloaded: bool,
 }
 
 impl PaceControl {
@@ -38,11 +50,11 @@ impl PaceControl {
     pub(crate) fn new(now: Instant) -> Self {
         Self {
             period_nanos: None,
-            step: 1,
+            pace: Pace::EVERY_SWEEP,
             last_nanos: None,
-            overloaded: VecDeque::new(),
+            judged: VecDeque::new(),
             quiet_since: now,
-            shortened_at: None,
+            raised_at: None,
             patience: PATIENCE[0],
         }
     }
@@ -54,53 +66,64 @@ impl PaceControl {
         waited: Duration,
         now: Instant,
     ) -> Option<Pace> {
-        let gap_nanos = self
-            .last_nanos
-            .replace(capture_nanos)
-            .and_then(|last| capture_nanos.checked_sub(last));
+        let last_nanos = self.last_nanos.replace(capture_nanos);
         // The first frame, or one of a scene that has restarted.
-        let gap_nanos = gap_nanos.filter(|gap| *gap > 0)?;
-        let period_nanos = self
-            .period_nanos
-            .map_or(gap_nanos, |period| period.min(gap_nanos));
+        let last_nanos = last_nanos.filter(|last| *last < capture_nanos)?;
+        let gap_nanos = capture_nanos - last_nanos;
+        let period_nanos = self.period_nanos.unwrap_or(gap_nanos).min(gap_nanos);
         self.period_nanos = Some(period_nanos);
-        let interval_nanos = period_nanos.saturating_mul(self.step);
-        let has_waited = waited > Duration::from_nanos(period_nanos / 2);
-        let is_overloaded =
-            has_waited || gap_nanos > interval_nanos.saturating_add(period_nanos / 2);
+        let is_left_out = self
+            .pace
+            .interval_of(capture_nanos)
+            .zip(self.pace.interval_of(last_nanos))
+            .map_or(
+                gap_nanos > period_nanos.saturating_add(period_nanos / 2),
+                |(interval, last)| interval > last + 1,
+            );
+        // Between two sweeps that are left out, frames wait for each other.
+        let is_every_sweep = self.pace == Pace::EVERY_SWEEP;
+        let longest_nanos = period_nanos / if is_every_sweep { 2 } else { 1 };
+        let is_overloaded = is_left_out || waited > Duration::from_nanos(longest_nanos);
         if is_overloaded {
             self.quiet_since = now;
         }
-        self.overloaded.push_back(is_overloaded);
-        if self.overloaded.len() > WINDOW {
-            self.overloaded.pop_front();
+        self.judged.push_back(Judged {
+            gap_nanos,
+            is_overloaded,
+        });
+        if self.judged.len() > WINDOW {
+            self.judged.pop_front();
         }
-        let step = self.next_step(period_nanos, now)?;
-        self.overloaded.clear();
+        let computed = self.next_share(period_nanos, now)?;
+        self.judged.clear();
         self.quiet_since = now;
-        self.step = step;
-        let interval_nanos = if step == 1 {
-            0
+        self.pace = if computed == TENTHS {
+            Pace::EVERY_SWEEP
         } else {
-            period_nanos.saturating_mul(step)
+            Pace {
+                period_nanos,
+                phase_nanos: capture_nanos,
+                computed,
+                of: TENTHS,
+            }
         };
-        Some(Pace {
-            interval_nanos,
-            phase_nanos: capture_nanos,
-        })
+        Some(self.pace)
     }
 
-    /// Another number of sweeps per interval, if it is time for one.
-    fn next_step(&mut self, period_nanos: u64, now: Instant) -> Option<u64> {
+    /// Another share, tenths, if it is time for one.
+    fn next_share(&mut self, period_nanos: u64, now: Instant) -> Option<u8> {
+        let share = self.pace.computed * (TENTHS / self.pace.of);
         let count = self
-            .overloaded
+            .judged
             .iter()
-            .filter(|is_overloaded| **is_overloaded)
+            .filter(|frame| frame.is_overloaded)
             .count();
-        let longer = Duration::from_nanos(period_nanos.saturating_mul(self.step + 1));
-        if count >= TOO_MANY && longer <= MAX_INTERVAL {
+        let lowest =
+            period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL.as_nanos() as u64;
+        let lowest = u8::try_from(lowest.max(1)).unwrap_or(TENTHS);
+        if count >= TOO_MANY && share > lowest {
             let has_failed = self
-                .shortened_at
+                .raised_at
                 .take()
                 .is_some_and(|at| now < at + PATIENCE[0]);
             self.patience = if has_failed {
@@ -108,13 +131,22 @@ impl PaceControl {
             } else {
                 PATIENCE[0]
             };
-            return Some(self.step + 1);
+            let least = share.saturating_sub(MAX_STEP).max(lowest);
+            return Some(self.achieved_share(period_nanos).clamp(least, share - 1));
         }
         let is_quiet = now >= self.quiet_since + self.patience;
-        (self.step > 1 && is_quiet).then(|| {
-            self.shortened_at = Some(now);
-            self.step - 1
+        (share < TENTHS && is_quiet).then(|| {
+            self.raised_at = Some(now);
+            share + 1
         })
+    }
+
+    /// Share of the sweeps that were computed since the last change, whole tenths.
+    fn achieved_share(&self, period_nanos: u64) -> u8 {
+        let span_nanos: u64 = self.judged.iter().map(|frame| frame.gap_nanos).sum();
+        let frames = self.judged.len() as u64;
+        let share = (u64::from(TENTHS) * frames).saturating_mul(period_nanos) / span_nanos.max(1);
+        u8::try_from(share).unwrap_or(TENTHS)
     }
 }
 
@@ -124,38 +156,80 @@ mod tests {
 
     const SWEEP_NANOS: u64 = 100_000_000;
 
-    fn waited(is_long: bool) -> Duration {
-        Duration::from_millis(if is_long { 60 } else { 40 })
-    }
-
-    /// A machine that needs `needed` sweep periods for a frame; the intervals of the paces that its ego publishes.
-    fn intervals(needed: u64, seconds: u64) -> Vec<u64> {
+    /// A machine with one place for a waiting sweep that needs `needed_ms` for a frame: the sweeps that it answers, each
+    /// with its waiting time.
+    fn answered(needed_ms: u64, seconds: u64) -> Vec<(u64, Duration)> {
         let start = Instant::now();
         let mut control = PaceControl::new(start);
-        let (mut pace, mut free_at, mut last, mut changes) =
-            (Pace::EVERY_SWEEP, 0, None, Vec::new());
-        for sweep in 0..seconds * 10 {
-            let capture_nanos = sweep * SWEEP_NANOS;
-            let interval = pace.interval_of(capture_nanos);
-            let is_due = interval.is_none() || interval != last;
-            if !is_due || sweep < free_at {
-                continue;
+        let (mut pace, mut last, mut free_at_ms) = (Pace::EVERY_SWEEP, None, 0);
+        let (mut waiting, mut answers) = (None::<u64>, Vec::new());
+        for time_ms in 0..seconds * 1000 {
+            if time_ms % 100 == 0 {
+                let interval = pace.interval_of(time_ms * 1_000_000);
+                if interval.is_none() || interval != last {
+                    (last, waiting) = (interval, Some(time_ms));
+                }
             }
-            last = interval;
-            free_at = sweep + needed;
-            let now = start + Duration::from_nanos(capture_nanos);
-            if let Some(next) = control.judge(capture_nanos, Duration::ZERO, now) {
-                pace = next;
-                last = next.interval_of(capture_nanos);
-                changes.push(next.interval_nanos / SWEEP_NANOS);
+            if let Some(captured_ms) = waiting.take_if(|_| time_ms >= free_at_ms) {
+                let waited = Duration::from_millis(time_ms - captured_ms);
+                free_at_ms = time_ms + needed_ms;
+                answers.push((captured_ms / 100, waited));
+                let now = start + Duration::from_millis(time_ms);
+                if let Some(next) = control.judge(captured_ms * 1_000_000, waited, now) {
+                    pace = next;
+                    last = pace.interval_of(captured_ms * 1_000_000);
+                }
             }
         }
-        changes
+        answers
     }
 
     #[test]
-    fn a_machine_that_keeps_up_never_changes_its_pace() {
-        assert_eq!(intervals(1, 60), [0; 0]);
+    fn a_machine_that_keeps_up_answers_every_sweep() {
+        assert_eq!(answered(100, 60).len(), 600);
+    }
+
+    #[test]
+    fn a_machine_that_misses_the_rate_by_little_answers_little_less() {
+        // Milliseconds of work per 100 ms sweep, and frames that it has time for in a minute.
+        for (needed_ms, capacity) in [
+            (105, 571),
+            (112, 535),
+            (120, 500),
+            (150, 400),
+            (240, 250),
+            (700, 85),
+        ] {
+            let answers = answered(needed_ms, 60);
+            let count = answers.len();
+            assert!(
+                count * 100 >= capacity * 85 && count <= capacity + 1,
+                "{needed_ms} ms: {count} of {capacity}"
+            );
+            let settled = &answers[count / 2..];
+            let gaps = settled.windows(2).map(|pair| pair[1].0 - pair[0].0);
+            let floor = needed_ms / 100;
+            let uneven = gaps
+                .filter(|gap| !(floor..=floor + 2).contains(gap))
+                .count();
+            assert!(uneven * 10 <= count, "{needed_ms} ms: {uneven} of {count}");
+            let mut waits: Vec<_> = settled.iter().map(|(_, waited)| *waited).collect();
+            waits.sort();
+            assert!(
+                waits[waits.len() / 2] <= Duration::from_millis(100),
+                "{needed_ms} ms: {waits:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn eight_of_ten_sweeps_are_answered_by_a_machine_that_has_time_for_eight_point_three() {
+        let answers = answered(120, 6);
+        assert!(
+            (46..=50).contains(&answers.len()),
+            "{} of 60",
+            answers.len()
+        );
     }
 
     #[test]
@@ -164,31 +238,25 @@ mod tests {
         let mut control = PaceControl::new(start);
         for sweep in 0..100u64 {
             let now = start + Duration::from_millis(100 * sweep);
-            assert_eq!(
-                control.judge(sweep * SWEEP_NANOS, waited(sweep % 6 == 0), now),
-                None
-            );
+            let waited = Duration::from_millis(if sweep % 6 == 0 { 60 } else { 40 });
+            assert_eq!(control.judge(sweep * SWEEP_NANOS, waited, now), None);
         }
     }
 
     #[test]
-    fn waiting_frames_slow_the_fleet_and_quiet_ones_let_it_try_again_less_and_less_often() {
+    fn failed_attempts_become_less_and_less_frequent() {
         let start = Instant::now();
         let mut control = PaceControl::new(start);
-        let (mut sweep, mut step, mut tries) = (0, 1, Vec::new());
-        while sweep < 3000 {
+        let (mut share, mut tries) = (10, Vec::new());
+        for sweep in 0..3000 {
             let now = start + Duration::from_millis(100 * sweep);
-            // Every sweep is too much, every second one is not.
-            if let Some(pace) =
-                control.judge(sweep * SWEEP_NANOS, waited(step == 1 && sweep > 0), now)
-            {
-                step = (pace.interval_nanos / SWEEP_NANOS).max(1);
-                if step == 1 {
-                    tries.push(sweep);
-                }
-                assert!(step <= 2);
+            // Every sweep is too much, nine of ten are not.
+            let waited = Duration::from_millis(if share == 10 { 60 } else { 40 });
+            if let Some(pace) = control.judge(sweep * SWEEP_NANOS, waited, now) {
+                share = pace.computed * (TENTHS / pace.of);
+                tries.extend((share == 10).then_some(sweep));
+                assert!(share >= 9);
             }
-            sweep += step;
         }
         let pauses: Vec<u64> = tries.windows(2).map(|pair| pair[1] - pair[0]).collect();
         assert!(
@@ -203,10 +271,8 @@ mod tests {
         let start = Instant::now();
         let mut control = PaceControl::new(start);
         for sweep in (0..50).rev() {
-            assert_eq!(
-                control.judge(sweep * SWEEP_NANOS, waited(true), start),
-                None
-            );
+            let waited = Duration::from_millis(60);
+            assert_eq!(control.judge(sweep * SWEEP_NANOS, waited, start), None);
         }
     }
 }

@@ -27,7 +27,7 @@ use crate::{CavId, IdError, Kind, WireError};
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"V2VL";
 /// Version of the whole wire format; any change of layout or metadata raises it.
-pub const WIRE_VERSION: u16 = 5;
+pub const WIRE_VERSION: u16 = 6;
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 92;
 

@@ -4,8 +4,13 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use super::Pace;
+
 /// Share of the ticks from which a run counts as keeping up.
 const KEEPS_UP: f64 = 0.99;
+
+/// Deviation of the answered from the expected frames that a report states, as a share of these.
+const DEVIATION: f64 = 0.15;
 
 /// Cores and instruction set.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -31,6 +36,8 @@ pub struct Capacity {
     pub agent_ms: f64,
     /// CPU time of the fusion per frame, milliseconds.
     pub fuse_ms: f64,
+    /// CPU time per frame of messages, replay, router and scorer, milliseconds.
+    pub messages_ms: f64,
     /// Time between two frames, milliseconds.
     pub period_ms: f64,
     /// Speed of a core while the others compute too and other programs run, relative to one of an idle machine, 0..=1.
@@ -48,6 +55,21 @@ impl Capacity {
     #[must_use]
     pub fn keeps_up(&self) -> bool {
         self.expected_share >= KEEPS_UP
+    }
+
+    /// Expected and answered frames of a run, if they differ by more than 15 %.
+    #[must_use]
+    pub(super) fn deviation(&self, pace: &Pace) -> Option<String> {
+        let expected = self.expected_share * pace.ticks as f64;
+        let deviation = pace.answered as f64 / expected - 1.0;
+        (deviation.abs() > DEVIATION).then(|| {
+            format!(
+                "expected {expected:.0} of {} frames, answered {} ({:+.0} %)",
+                pace.ticks,
+                pace.answered,
+                100.0 * deviation
+            )
+        })
     }
 
     /// Replay rate at which the machine is expected to keep up, relative to the current one: a multiple of 0.05 below

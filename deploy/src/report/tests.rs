@@ -205,6 +205,7 @@ fn a_report_reads_back_and_is_a_table_for_people() {
         local_vehicles: 2,
         agent_ms: 100.0,
         fuse_ms: 100.0,
+        messages_ms: 26.0,
         period_ms: 100.0,
         shared_speed: 1.0,
         needed_ms: 326.0,
@@ -226,6 +227,7 @@ fn a_report_reads_back_and_is_a_table_for_people() {
     for part in [
         "2 cores, AVX2; pastat with 2 vehicles needs about 326 ms of CPU per frame of 200 available",
         "answered 3/4 (75 %), 3.6 detections a second; between detections median 275 ms",
+        "forecast  expected 2 of 4 frames, answered 3 (+25 %)",
         "computed  1 4/4 (100 %), 2 3/4 (75 %)",
         "capture to detection: median 100 ms, 95th percentile 280, longest 300",
         "agent, slowest of 3  agent",

@@ -16,6 +16,10 @@ impl fmt::Display for RunReport {
             writeln!(f, "machine   {capacity}")?;
         }
         write!(f, "{}", self.pace)?;
+        let capacity = self.capacity.as_ref();
+        if let Some(deviation) = capacity.and_then(|capacity| capacity.deviation(&self.pace)) {
+            writeln!(f, "forecast  {deviation}")?;
+        }
         writeln!(
             f,
             "latency   capture to detection: {}",

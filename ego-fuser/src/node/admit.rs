@@ -53,9 +53,7 @@ impl Node<'_> {
             } else {
                 Duration::MAX
             };
-            self.pace
-                .iter_mut()
-                .for_each(|pace| pace.judge(capture_nanos, waited));
+            self.pace.judge(capture_nanos, waited);
             self.frames.push_back(OwnFrame {
                 agent_frame,
                 capture_nanos,

@@ -50,7 +50,7 @@ pub struct NodeOptions {
     pub over_link: bool,
     /// True to continue when the own agent has ended, for its next instance.
     pub keeps_running: bool,
-    /// True to slow the fleet down where this machine cannot keep up.
+    /// True to slow the fleet down where this machine cannot keep up; false to ask for every sweep.
     pub sets_pace: bool,
     /// Limits of received messages.
     pub limits: Limits,
@@ -133,7 +133,7 @@ pub fn run(
         report,
         ..
     } = node;
-    pace.into_iter().for_each(PaceKeeper::finish);
+    pace.finish();
     detections.finish();
     json.finish();
     presence.withdraw()?;
@@ -169,7 +169,7 @@ struct Node<'a> {
     models: PeerModels,
     pairing: Pairing<Received>,
     frames: VecDeque<OwnFrame>,
-    pace: Option<PaceKeeper>,
+    pace: PaceKeeper,
     /// Capture time of the ego's newest sweep, nanoseconds.
     own_nanos: Option<u64>,
     ended: BTreeSet<CavId>,
@@ -228,10 +228,7 @@ impl<'a> Node<'a> {
             models: PeerModels::new(ego.detector()),
             pairing: Pairing::new(options.pairing),
             frames: VecDeque::new(),
-            pace: options
-                .sets_pace
-                .then(|| PaceKeeper::open(bus, cav))
-                .transpose()?,
+            pace: PaceKeeper::open(bus, cav, options.sets_pace)?,
             own_nanos: None,
             ended: BTreeSet::new(),
             detections: bus.publisher(
@@ -250,7 +247,7 @@ impl<'a> Node<'a> {
         let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
             self.look_round()?;
-            self.pace.iter_mut().for_each(PaceKeeper::repeat);
+            self.pace.repeat();
             match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
                 Pop::Item(topic, Event::End { .. }) if !self.options.keeps_running => {

@@ -13,21 +13,22 @@ const REPEAT_PERIOD: Duration = Duration::from_secs(1);
 
 /// Controller of the pace, and its publisher.
 pub(super) struct PaceKeeper {
-    control: PaceControl,
+    /// None where every sweep is computed in any case.
+    control: Option<PaceControl>,
     publisher: Publisher,
     pace: Pace,
     published: Instant,
 }
 
 impl PaceKeeper {
-    pub(super) fn open(bus: &Bus, cav: &CavId) -> Result<Self, BusError> {
+    pub(super) fn open(bus: &Bus, cav: &CavId, is_controlled: bool) -> Result<Self, BusError> {
         let topic = Topic::Stream {
             cav: cav.clone(),
             stream: Stream::Pace,
         };
         let now = Instant::now();
         Ok(Self {
-            control: PaceControl::new(now),
+            control: is_controlled.then(|| PaceControl::new(now)),
             publisher: bus.publisher(topic, PublisherOptions::POSE)?,
             pace: Pace::EVERY_SWEEP,
             published: now,
@@ -36,14 +37,16 @@ impl PaceKeeper {
 
     /// Judges a frame of the own agent that has waited for another one.
     pub(super) fn judge(&mut self, capture_nanos: u64, waited: Duration) {
-        let Some(pace) = self.control.judge(capture_nanos, waited, Instant::now()) else {
+        let now = Instant::now();
+        let judged = self.control.as_mut();
+        let Some(pace) = judged.and_then(|control| control.judge(capture_nanos, waited, now))
+        else {
             return;
         };
-        let interval = Duration::from_nanos(pace.interval_nanos);
+        let Pace { computed, of, .. } = pace;
         tracing::info!(
             capture_nanos,
-            ?interval,
-            "the pace of the fleet changes; interval 0: every sweep"
+            "the pace of the fleet changes to {computed} of {of} sweeps"
         );
         self.publish(pace);
     }

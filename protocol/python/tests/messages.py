@@ -11,20 +11,21 @@ from fleet import FRAMES
 
 def header(kind: int, cav: bytes, metadata: bytes) -> bytes:
     """A message without a body, as the reference of the wire format describes it."""
-    fields = struct.pack("<4sHBB32sQQQQQII", b"V2VL", 5, kind, len(cav), cav, 7, 3, 100_000_000, 0, 0, len(metadata),
+    fields = struct.pack("<4sHBB32sQQQQQII", b"V2VL", 6, kind, len(cav), cav, 7, 3, 100_000_000, 0, 0, len(metadata),
                          zlib.crc32(metadata))
     return fields + struct.pack("<I", zlib.crc32(fields)) + metadata
 
 
-#: Pace of 0.2 s from 0.5 s on: two integers, each in bincode's variable length (251: 16 bits, 252: 32, 253: 64).
-PACE = header(14, b"1000", b"\xfc" + struct.pack("<I", 200_000_000) + b"\xfc" + struct.pack("<I", 500_000_000))
+#: Pace of four of five sweeps of 0.1 s from 0.5 s on: two integers in bincode's variable length (251: 16 bits, 252: 32,
+#: 253: 64), and two bytes.
+PACE = header(14, b"1000", b"\xfc" + struct.pack("<I", 100_000_000) + b"\xfc" + struct.pack("<I", 500_000_000) + b"\x04\x05")
 
 
 def test_a_message_is_decoded_by_kind_and_by_key(run):
     for name in ("pace", "v2v/fleet/1000/pace"):
         message = v2vloc.decode(name, PACE)
         assert (message.kind, message.cav, message.sequence, message.capture_time_ns) == ("pace", "1000", 3, 100_000_000)
-        assert message.payload == {"interval_nanos": 200_000_000, "phase_nanos": 500_000_000}, message.payload
+        assert message.payload == {"period_nanos": 100_000_000, "phase_nanos": 500_000_000, "computed": 4, "of": 5}, message.payload
         assert message.wire_bytes == len(PACE) and (message.key is None) == ("/" not in name)
 
 

@@ -1,47 +1,80 @@
 //! Pace of an ego: the sweeps that it has time for.
 
+use std::time::Duration;
+
 use serde::{Deserialize, Serialize};
 
-use super::metadata_only;
+use super::{check_within, metadata_only};
 use crate::{Limits, WireError};
 
-/// Pace of an ego: one sweep per interval is computed by every vehicle, the same by all. Ego to agents.
+/// Pace of an ego: of every `of` sweeps, `computed` are computed, evenly spaced and the same ones in every vehicle. Ego
+/// to agents.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Pace {
-    /// Interval of capture time, nanoseconds; 0: every sweep.
-    pub interval_nanos: u64,
-    /// A capture time at which an interval begins, nanoseconds.
+    /// Sweep period, nanoseconds; 0: every sweep is computed.
+    pub period_nanos: u64,
+    /// Capture time of sweep 0, nanoseconds.
     pub phase_nanos: u64,
+    /// Number of sweeps that are computed, 1..=`of`.
+    pub computed: u8,
+    /// Number of sweeps among which they are counted.
+    pub of: u8,
 }
 
-/// Sweeps captured this long before an interval belong to it: sensors of different vehicles are not synchronised.
+/// Sweeps captured this long before their time count as in time, or half a period: sensors of different vehicles are
+/// not synchronised.
 const TOLERANCE_NANOS: u64 = 25_000_000;
 
-/// Longest interval of a message, nanoseconds: no ego may stop the agents of others.
+/// Longest mean interval of a message, nanoseconds: no ego may stop the agents of others.
 const MAX_INTERVAL_NANOS: u64 = 10_000_000_000;
 
 impl Pace {
     /// Every sweep.
     pub const EVERY_SWEEP: Self = Self {
-        interval_nanos: 0,
+        period_nanos: 0,
         phase_nanos: 0,
+        computed: 1,
+        of: 1,
     };
 
     /// Number of the interval of a capture time: the first sweep of each interval is computed. `None`: every sweep is.
+    ///
+    /// Bresenham's line: sweep `n` is in interval `floor(n * computed / of)`, so that intervals differ in length by one
+    /// sweep at most.
     pub fn interval_of(&self, capture_nanos: u64) -> Option<i128> {
-        let since =
-            i128::from(capture_nanos) + i128::from(TOLERANCE_NANOS) - i128::from(self.phase_nanos);
-        (self.interval_nanos > 0).then(|| since.div_euclid(i128::from(self.interval_nanos)))
+        let [period, tolerance, capture, phase] = [
+            self.period_nanos,
+            TOLERANCE_NANOS.min(self.period_nanos / 2),
+            capture_nanos,
+            self.phase_nanos,
+        ]
+        .map(i128::from);
+        let sweep = (capture + tolerance - phase).checked_div_euclid(period)?;
+        (sweep * i128::from(self.computed)).checked_div_euclid(i128::from(self.of))
+    }
+
+    /// Mean time between two computed sweeps; zero for every sweep.
+    #[must_use]
+    pub fn mean_interval(&self) -> Duration {
+        let sweeps = u128::from(self.period_nanos) * u128::from(self.of);
+        let nanos = sweeps / u128::from(self.computed.max(1));
+        Duration::from_nanos(u64::try_from(nanos).unwrap_or(u64::MAX))
     }
 
     fn check_values(&self, _: &Limits) -> Result<(), WireError> {
-        let (max, found) = (MAX_INTERVAL_NANOS, self.interval_nanos);
-        if found <= max {
+        check_within(
+            "computed",
+            f64::from(self.computed),
+            1.0,
+            f64::from(self.of),
+        )?;
+        let found = u64::try_from(self.mean_interval().as_nanos()).unwrap_or(u64::MAX);
+        if found <= MAX_INTERVAL_NANOS {
             Ok(())
         } else {
             Err(WireError::Limit {
-                what: "interval_nanos",
-                max,
+                what: "mean interval, nanoseconds",
+                max: MAX_INTERVAL_NANOS,
                 found,
             })
         }
@@ -54,24 +87,74 @@ metadata_only!(Pace, Pace);
 mod tests {
     use super::*;
 
+    const PERIOD_NANOS: u64 = 100_000_000;
+
+    fn pace(computed: u8, of: u8) -> Pace {
+        Pace {
+            period_nanos: PERIOD_NANOS,
+            phase_nanos: 5 * PERIOD_NANOS,
+            computed,
+            of,
+        }
+    }
+
+    /// Numbers of the computed sweeps of a vehicle whose captures are `late_nanos` late.
+    fn computed(pace: &Pace, late_nanos: impl Fn(u64) -> i64) -> Vec<u64> {
+        let capture = |sweep: u64| (sweep * PERIOD_NANOS).saturating_add_signed(late_nanos(sweep));
+        let interval = |sweep| pace.interval_of(capture(sweep));
+        (1..1001)
+            .filter(|&sweep| interval(sweep) != interval(sweep - 1))
+            .collect()
+    }
+
     #[test]
-    fn sweeps_of_one_time_are_in_one_interval_whatever_their_jitter() {
-        let pace = Pace {
-            interval_nanos: 200_000_000,
-            phase_nanos: 500_000_000,
-        };
-        let interval = |ms: u64| pace.interval_of(ms * 1_000_000).unwrap();
-        assert_eq!([interval(480), interval(500), interval(600)], [0, 0, 0]);
-        assert_eq!([interval(680), interval(700), interval(860)], [1, 1, 1]);
-        assert_eq!(interval(100), -2, "before the phase");
-        assert_eq!(Pace::EVERY_SWEEP.interval_of(u64::MAX), None);
-        assert!(
-            Pace {
-                interval_nanos: 1,
-                phase_nanos: u64::MAX
+    fn every_ratio_is_exact_evenly_spaced_and_the_same_in_every_vehicle() {
+        for of in 1..=20u8 {
+            for share in 1..=of {
+                let pace = pace(share, of);
+                let sweeps = computed(&pace, |_| 0);
+                for window in [20, 100, 1000].map(|tens| tens / usize::from(of) * usize::from(of)) {
+                    let expected = window / usize::from(of) * usize::from(share);
+                    let within = sweeps.iter().filter(|sweep| **sweep <= window as u64);
+                    assert_eq!(within.count(), expected, "{pace:?} {window}");
+                }
+                let gaps: Vec<u64> = sweeps.windows(2).map(|pair| pair[1] - pair[0]).collect();
+                let floor = u64::from(of / share);
+                assert!(
+                    gaps.iter().all(|gap| (floor..=floor + 1).contains(gap)),
+                    "{pace:?} {gaps:?}"
+                );
+                let jitter = |sweep: u64| (sweep as i64 * 7_919_333) % 49_000_000 - 24_000_000;
+                assert_eq!(computed(&pace, jitter), sweeps, "{pace:?}");
+                assert!(sweeps.contains(&5), "sweep 0 of the pace is computed");
             }
-            .interval_of(0)
-            .is_some()
-        );
+        }
+    }
+
+    #[test]
+    fn every_sweep_has_no_interval_and_no_value_overflows() {
+        assert_eq!(Pace::EVERY_SWEEP.interval_of(u64::MAX), None);
+        let pace = Pace {
+            period_nanos: 1,
+            phase_nanos: u64::MAX,
+            computed: u8::MAX,
+            of: u8::MAX,
+        };
+        assert!(pace.interval_of(0).is_some_and(|interval| interval < 0));
+        assert_eq!(Pace { of: 0, ..pace }.interval_of(0), None);
+    }
+
+    #[test]
+    fn a_pace_of_no_sweep_and_one_beyond_the_longest_interval_are_refused() {
+        let error = |pace: Pace| {
+            pace.check_values(&Limits::DEFAULT)
+                .map_err(|e| e.to_string())
+        };
+        assert_eq!(error(pace(1, 100)), Ok(()));
+        assert_eq!(error(Pace::EVERY_SWEEP), Ok(()));
+        assert!(error(pace(1, 101)).unwrap_err().contains("10100000000"));
+        for (computed, of) in [(0, 1), (2, 1), (0, 0)] {
+            assert!(error(pace(computed, of)).unwrap_err().contains("computed"));
+        }
     }
 }

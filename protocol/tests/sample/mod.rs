@@ -266,8 +266,10 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Message::Radar(Radar { points: points() }),
         Message::Camera(camera()),
         Message::Pace(Pace {
-            interval_nanos: 200_000_000,
+            period_nanos: 100_000_000,
             phase_nanos: 1_500_000_000,
+            computed: 4,
+            of: 5,
         }),
         Message::Imu(EgoMotion {
             speed_mps: Some(8.25),

@@ -116,8 +116,10 @@ fn an_agent_serves_the_faster_of_two_egos_and_forgets_those_that_leave() {
                 slow.submit(
                     0,
                     Pace {
-                        interval_nanos: SWEEPS * PERIOD_NANOS,
+                        period_nanos: PERIOD_NANOS,
                         phase_nanos: 0,
+                        computed: 1,
+                        of: SWEEPS as u8,
                     },
                 );
                 sweeps.interval() == expected

@@ -64,8 +64,9 @@ const MAX_ABS_VALUE: f64 = 1e9;
 /// [`DetectorError::Values`] with `what` and the value.
 pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorError> {
     let limit = MAX_ABS_VALUE;
-    // The maximum of a tensor with NaN is NaN.
-    let value = tensor.f_abs()?.f_max()?.f_double_value(&[])?;
+    // Both are NaN for a tensor with NaN.
+    let (min, max) = tensor.f_aminmax(None, false)?;
+    let value = f64::max(-min.f_double_value(&[])?, max.f_double_value(&[])?);
     if value <= limit {
         Ok(())
     } else {

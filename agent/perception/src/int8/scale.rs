@@ -6,6 +6,9 @@ use tch::{Kind, TchError, Tensor};
 /// Largest quantised activation.
 pub(super) const MAX_ACTIVATION: f32 = 255.0;
 
+/// 1.5 times 2 to the power of 23: `f32` of this magnitude are whole numbers.
+const WHOLE: f32 = 12_582_912.0;
+
 /// Value of one quantisation step: 2 to the power of the exponent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -80,11 +83,16 @@ impl Quantisation {
             .f_to_kind(Kind::Uint8)
     }
 
-    /// The same of one value.
-    pub fn quantise_value(&self, value: f32) -> u8 {
-        let steps = (value * self.scale.step().recip() as f32).round_ties_even()
-            + f32::from(self.zero_point);
-        steps.clamp(0.0, MAX_ACTIVATION) as u8
+    /// The same of plain values, as many as `steps` has places.
+    pub fn quantise_values(&self, values: &[f32], steps: &mut [u8]) {
+        let (factor, zero) = (self.scale.step().recip() as f32, f32::from(self.zero_point));
+        for (step, value) in steps.iter_mut().zip(values) {
+            // A sum with this number is rounded to a whole one, half to even; rounding by the processor needs SSE 4.1.
+            let rounded = (value * factor).clamp(-256.0, 256.0) + WHOLE - WHOLE;
+            let place = (rounded + zero).clamp(0.0, MAX_ACTIVATION) + WHOLE;
+            // The whole number is in the lowest bits of the sum.
+            *step = place.to_bits() as u8;
+        }
     }
 
     /// Values of quantised ones, `f32`.
@@ -113,12 +121,43 @@ mod tests {
         let expected = [0_u8, 0, 10, 10, 11, 14, 255, 255];
         let found = quantisation.quantise(&Tensor::from_slice(&values)).unwrap();
         assert_eq!(Vec::<u8>::try_from(&found).unwrap(), expected);
-        assert_eq!(
-            values.map(|value| quantisation.quantise_value(value)),
-            expected
-        );
+        let mut steps = [7; 8];
+        quantisation.quantise_values(&values, &mut steps);
+        assert_eq!(steps, expected);
         let back = Vec::<f32>::try_from(quantisation.dequantise(&found).unwrap()).unwrap();
         assert_eq!(back, [-2.5, -2.5, 0.0, 0.0, 0.25, 1.0, 61.25, 61.25]);
+    }
+
+    #[test]
+    fn plain_values_are_quantised_as_tensors_are() {
+        for (exponent, zero_point) in [(-6, 0), (-3, 101), (2, 255)] {
+            let quantisation = Quantisation {
+                scale: Scale::of_exponent(exponent),
+                zero_point,
+            };
+            let step = quantisation.scale.step() as f32;
+            let near_halves = (-1200..1200).flat_map(|half| {
+                let value = half as f32 * 0.5 * step;
+                [value.next_down(), value, value.next_up()]
+            });
+            let extremes = [
+                f32::MIN,
+                f32::MAX,
+                f32::INFINITY,
+                f32::NEG_INFINITY,
+                0.0,
+                -0.0,
+            ];
+            let values: Vec<f32> = near_halves.chain(extremes).collect();
+            let expected = quantisation.quantise(&Tensor::from_slice(&values)).unwrap();
+            let mut steps = vec![0; values.len()];
+            quantisation.quantise_values(&values, &mut steps);
+            assert_eq!(
+                steps,
+                Vec::<u8>::try_from(&expected).unwrap(),
+                "{quantisation:?}"
+            );
+        }
     }
 
     #[test]

@@ -119,9 +119,7 @@ impl PillarProjection {
                 has_free_slot,
                 &mut features,
             );
-            for (steps, &value) in canvas[cell..cell + self.channels].iter_mut().zip(&features) {
-                *steps = quantisation.quantise_value(value);
-            }
+            quantisation.quantise_values(&features, &mut canvas[cell..cell + self.channels]);
         }
     }
 

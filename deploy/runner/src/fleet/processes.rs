@@ -133,6 +133,7 @@ impl Fleet {
             models: self.scenario.models.clone(),
             settings,
             publish: vec![self.publish().0],
+            egos: vec![self.ego.clone()],
             keep_running: false,
             sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),
             bus,
