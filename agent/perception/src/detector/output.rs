@@ -64,8 +64,14 @@ const MAX_ABS_VALUE: f64 = 1e9;
 /// [`DetectorError::Values`] with `what` and the value.
 pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorError> {
     let limit = MAX_ABS_VALUE;
-    // The maximum of a tensor with NaN is NaN.
-    let value = tensor.f_abs()?.f_max()?.f_double_value(&[])?;
+    // Both are NaN for a tensor with NaN. In either memory order they are read without a copy.
+    let most = tensor
+        .f_amax([0_i64; 0].as_slice(), false)?
+        .f_double_value(&[])?;
+    let least = tensor
+        .f_amin([0_i64; 0].as_slice(), false)?
+        .f_double_value(&[])?;
+    let value = most.max(-least);
     if value <= limit {
         Ok(())
     } else {

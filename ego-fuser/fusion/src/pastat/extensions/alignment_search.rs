@@ -3,6 +3,9 @@
 //! Measured gain: one neighbour 14 m off with full confidence costs 0.9 instead of 2.9 percentage points of AP@0.5
 //! (ablation, FSA with search). A fine comparison at both places and a repeated comparison give 0.7
 //! percentage points of AP@0.7 with all poses 1 m off; rotations give 1.5 with poses 4 m and 4 degrees off.
+//!
+//! Only newest maps are searched for. An earlier map is tried where the newest of its agent was found: both have poses
+//! of one source.
 
 use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
@@ -45,11 +48,14 @@ impl AlignmentSearch {
 
     /// Displacements by the network. Outside training it compares up to three times: at the poses, at better positions
     /// of the search, and once more after large moves. Training uses the first comparison, and searches shifts only.
+    ///
+    /// `known` `[K, 3]` replaces the search outside training: large displacements found before, metres and radians.
     pub(crate) fn displacements(
         &self,
         network: &AlignmentNetwork,
         pairs: &Pairs,
         area: &Area,
+        known: Option<&Tensor>,
         is_training: bool,
     ) -> Result<Displacements, TchError> {
         let nowhere = Tensor::f_zeros(
@@ -71,15 +77,14 @@ impl AlignmentSearch {
         }
         let near = network.displacements(pairs, &nowhere, area)?;
         let rows = rows_where(&near.similarity.f_lt(FITS)?)?;
-        let found = match rows.is_empty() {
-            true => near,
-            false => compare_there(
-                network,
-                pairs,
-                near,
-                (&rows, &search(&pairs.only(&rows)?)?),
-                area,
-            )?,
+        let found = if rows.is_empty() {
+            near
+        } else {
+            let far = match known.filter(|_| self.config.is_some()) {
+                Some(known) => picked(&large_only(known)?, &rows)?,
+                None => search(&pairs.only(&rows)?)?,
+            };
+            compare_there(network, pairs, near, (&rows, &far), area)?
         };
         compare_again(network, pairs, found, area)
     }
@@ -116,17 +121,26 @@ fn compare_again(
     found: Displacements,
     area: &Area,
 ) -> Result<Displacements, TchError> {
-    let square = found
-        .deltas
-        .f_narrow(1, 0, 2)?
-        .f_square()?
-        .f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
-    let rows = rows_where(&square.f_gt(AGAIN_M * AGAIN_M)?)?;
+    let rows = rows_where(&is_large(&found.deltas)?.f_squeeze_dim(1)?)?;
     if rows.is_empty() {
         return Ok(found);
     }
     let again = network.displacements(&pairs.only(&rows)?, &picked(&found.deltas, &rows)?, area)?;
     found.with(&rows, &again)
+}
+
+/// `[K, 1]`: true for displacements `[K, 3]` by more than [`AGAIN_M`].
+fn is_large(deltas: &Tensor) -> Result<Tensor, TchError> {
+    deltas
+        .f_narrow(1, 0, 2)?
+        .f_square()?
+        .f_sum_dim_intlist([1_i64].as_slice(), true, None)?
+        .f_gt(AGAIN_M * AGAIN_M)
+}
+
+/// Displacements `[K, 3]`, zeros in place of small ones, which the comparison at the poses finds.
+fn large_only(deltas: &Tensor) -> Result<Tensor, TchError> {
+    deltas.f_mul(&is_large(deltas)?)
 }
 
 /// Coarse offset of each map from its pose, to the pooled cell, `[K, 3]` along x and y, metres, and about its sender,
@@ -371,7 +385,7 @@ mod tests {
                 .pairs([&ego, &others], &confidences, &poses, &area)
                 .unwrap();
             AlignmentSearch::new(Some(search))
-                .displacements(&fsa, &pairs, &area, train)
+                .displacements(&fsa, &pairs, &area, None, train)
                 .unwrap()
                 .deltas
         };
@@ -458,7 +472,7 @@ mod tests {
                 .pairs([&maps[0], &maps[1]], &confidences, &[Pose::IDENTITY], &area)
                 .unwrap();
             let found = AlignmentSearch::new(None)
-                .displacements(&fsa, &pairs, &area, train)
+                .displacements(&fsa, &pairs, &area, None, train)
                 .unwrap();
             found.deltas.double_value(&[0, 0])
         };
