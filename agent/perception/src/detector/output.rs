@@ -78,3 +78,26 @@ pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorE
         Err(DetectorError::Values { what, value, limit })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_that_are_not_valid_are_stated_in_either_memory_order() {
+        for wrong in [f64::NAN, f64::INFINITY, -2e9] {
+            let map = Tensor::from_slice(&[1.0_f32; 24]).view([2, 3, 4]);
+            assert!(check_values("a map", &map).is_ok());
+            let _ = map.get(1).get(2).get(0).fill_(wrong);
+            for map in [map.permute([1, 2, 0]), map] {
+                let error = check_values("a map", &map).unwrap_err();
+                let DetectorError::Values { value, .. } = error else {
+                    panic!("{error}");
+                };
+                assert!(
+                    value.is_nan() == wrong.is_nan() && (value.is_nan() || value == wrong.abs())
+                );
+            }
+        }
+    }
+}

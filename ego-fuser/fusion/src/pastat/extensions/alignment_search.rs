@@ -346,7 +346,7 @@ mod tests {
 
     /// Corrections of FSA with a search for three maps: the ego's; the same twelve cells too far along x and sixteen
     /// back along y; and a map of another scene.
-    fn far_off(search: SearchConfig, train: bool) -> Vec<f32> {
+    fn far_off(search: SearchConfig, known: Option<&Tensor>, train: bool) -> Vec<f32> {
         let grid = BevGrid {
             x_min_m: -24.0,
             y_min_m: -16.0,
@@ -385,7 +385,7 @@ mod tests {
                 .pairs([&ego, &others], &confidences, &poses, &area)
                 .unwrap();
             AlignmentSearch::new(Some(search))
-                .displacements(&fsa, &pairs, &area, None, train)
+                .displacements(&fsa, &pairs, &area, known, train)
                 .unwrap()
                 .deltas
         };
@@ -400,8 +400,8 @@ mod tests {
             margin: 0.3,
         };
         let back = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
-        assert_eq!(far_off(search, true), back);
-        assert_eq!(far_off(search, false), back);
+        assert_eq!(far_off(search, None, true), back);
+        assert_eq!(far_off(search, None, false), back);
         // Beyond the search range it is not found.
         assert_eq!(
             far_off(
@@ -409,10 +409,27 @@ mod tests {
                     radius: 1,
                     ..search
                 },
+                None,
                 false
             ),
             [0.0; 9]
         );
+    }
+
+    #[test]
+    fn a_known_large_displacement_replaces_the_search() {
+        let search = SearchConfig {
+            cells: 4,
+            radius: 9,
+            margin: 0.3,
+        };
+        let back: [f32; 9] = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
+        let known = Tensor::from_slice(&back).view([3, 3]);
+        assert_eq!(far_off(search, Some(&known), false), back);
+        // Small ones are found at the poses, and nothing is searched.
+        let small = &known * 0.04;
+        assert_eq!(far_off(search, Some(&small), false), [0.0; 9]);
+        assert_eq!(large_only(&small).unwrap(), known.zeros_like());
     }
 
     #[test]
@@ -422,9 +439,9 @@ mod tests {
             radius: 9,
             margin: 2.0,
         };
-        assert_eq!(far_off(search, true), [0.0; 9]);
+        assert_eq!(far_off(search, None, true), [0.0; 9]);
         assert_eq!(
-            far_off(search, false),
+            far_off(search, None, false),
             [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0]
         );
     }

@@ -232,3 +232,19 @@ fn moved_maps(
         .collect();
     NeighbourMaps::at(coarse.received.only(1, count + 1)?, cells, places)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn earlier_maps_have_the_displacement_of_their_agents_newest() {
+        // Newest maps of the ego, 7 and 4; earlier ones of 4, the ego, 7 and of 9, which has no newest map.
+        let deltas = Tensor::from_slice(&[1.0_f32, 2.0, 0.1, 3.0, 4.0, 0.2]).view([2, 3]);
+        let found = of_newest(&deltas, &[0, 7, 4, 4, 0, 7, 9], 3).unwrap();
+        let expected = [
+            3.0_f32, 4.0, 0.2, 0.0, 0.0, 0.0, 1.0, 2.0, 0.1, 0.0, 0.0, 0.0,
+        ];
+        assert_eq!(found, Tensor::from_slice(&expected).view([4, 3]));
+    }
+}
