@@ -19,7 +19,7 @@ use self::pairs::{Displacements, picked};
 use super::coarse_alignment::{CoarseMaps, Origins};
 use super::confidence_embedding::Confidences;
 use super::config::PastatConfig;
-use super::extensions::alignment_search::AlignmentSearch;
+use super::extensions::alignment_search::displacements;
 use super::extensions::pooled_history::pooled;
 use super::patches::PatchTokens;
 use crate::full_resolution::FullResolutionMap;
@@ -29,7 +29,6 @@ use crate::full_resolution::FullResolutionMap;
 pub(super) struct SpatialAlignment {
     /// Absent: maps are aligned by their poses only, for the ablation.
     network: Option<AlignmentNetwork>,
-    search: AlignmentSearch,
     /// Cells along each edge of a cell of earlier maps.
     earlier_cells: i64,
 }
@@ -61,7 +60,6 @@ impl SpatialAlignment {
             |fsa| AlignmentNetwork::new(&(path / "fsa"), [config.channels, config.dim], fsa);
         Self {
             network: config.fsa.as_ref().map(network),
-            search: AlignmentSearch::new(config.fsa.as_ref().and_then(|fsa| fsa.alignment_search)),
             earlier_cells: config.earlier_cells,
         }
     }
@@ -138,8 +136,7 @@ impl SpatialAlignment {
                 &poses[1..agents as usize],
                 area,
             )?;
-            let search = &self.search;
-            found.push(search.displacements(network, &pairs, area, None, is_training)?);
+            found.push(displacements(network, &pairs, area, None, is_training)?);
         }
         if let Some(earlier) = earlier {
             // Means of reduced maps are reduced means of maps.
@@ -157,8 +154,7 @@ impl SpatialAlignment {
                 .first()
                 .map(|newest| of_newest(&newest.deltas, &origins.agent, agents as usize))
                 .transpose()?;
-            let search = &self.search;
-            found.push(search.displacements(
+            found.push(displacements(
                 network,
                 &pairs,
                 &area,
