@@ -1,14 +1,17 @@
-//! Frames of the ego with released weights on a recorded scene: time of each stage, by method and number of vehicles.
+//! Sweeps of an agent and frames of the ego with released weights on a recorded scene: time of each stage, by method and
+//! number of vehicles, in milliseconds and in units that hardly depend on the machine.
 //!
 //! `cargo bench -p ego-fuser --bench ego_frame -- --scene SCENE --weights deploy/weights pastat max`
 //!
 //! Maps pass through the codec as live ones do. Poses err by 0.2 m. Each frame is computed several times, on the same
 //! history; a figure is the mean over the frames of each frame's fastest run. `--boxes FILE` writes what was detected,
-//! so that two versions can be compared.
+//! so that two versions can be compared. A unit is the time of one 3x3 convolution of 64 to 64 channels on 96 x 128 cells
+//! in 32-bit floating point on one thread. `ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2` holds libtorch to AVX2.
 
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::fs;
+use std::hint::black_box;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -24,16 +27,18 @@ use perception::detector::Detector;
 use perception::inference::Inference;
 use perception::int8::InferencePrecision;
 use perception::weights::Weights;
-use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate};
+use protocol::{CodecConfig, EncodedFeatures, Limits, Pose, PoseEstimate, StageTiming};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use support::stage_times::StageTimes;
-use tch::Device;
+use tch::{Device, Kind, Tensor};
 
 /// Largest error of a pose along x and y, metres.
 const POSE_ERROR_M: f64 = 0.2;
 /// The same of its heading, radians.
 const HEADING_ERROR_RAD: f64 = 0.004;
+/// Convolutions of which the fastest is the unit.
+const UNIT_RUNS: usize = 40;
 /// Confidence of every pose.
 const CONFIDENCE: f32 = 0.9;
 
@@ -85,6 +90,8 @@ fn main() -> Result<(), Failure> {
         .into_iter()
         .next()
         .ok_or("no scenario")?;
+    let unit_ms = unit_ms();
+    println!("unit: {unit_ms:.2} ms");
     let mut boxes = String::new();
     for &method in &arguments.methods {
         // Boxes and single vehicles have the weights of `none`.
@@ -96,7 +103,9 @@ fn main() -> Result<(), Failure> {
         };
         for &vehicles in &arguments.vehicles {
             let weights = Weights::load(&weights)?.with_precision(arguments.precision);
-            let frames = sent(&scenario, &weights, method, [vehicles, arguments.frames])?;
+            let mut sweep = BTreeMap::new();
+            let size = [vehicles, arguments.frames];
+            let frames = sent(&scenario, &weights, method, size, &mut sweep)?;
             let mut best: Vec<BTreeMap<String, f64>> = vec![BTreeMap::new(); frames.len()];
             for run in 0..arguments.runs {
                 let mut ego = Ego::from_weights(&weights, Some(method), Device::Cpu)?;
@@ -107,13 +116,42 @@ fn main() -> Result<(), Failure> {
                     }
                 }
             }
-            print(method, vehicles, &best);
+            print(&format!("{method}/{vehicles} sweep"), &[sweep], unit_ms);
+            print(&format!("{method}/{vehicles} frame"), &best, unit_ms);
         }
     }
     if let Some(path) = &arguments.boxes {
         fs::write(path, boxes)?;
     }
     Ok(())
+}
+
+/// The fastest of some convolutions, milliseconds.
+fn unit_ms() -> f64 {
+    let of = |size: &[i64]| Tensor::rand(size, (Kind::Float, Device::Cpu));
+    let (map, weight) = (
+        of(&[1, 96, 128, 64]).permute([0, 3, 1, 2]),
+        of(&[64, 64, 3, 3]),
+    );
+    let times = (0..UNIT_RUNS).map(|_| {
+        let start = Instant::now();
+        black_box(map.conv2d(&weight, None::<&Tensor>, [1, 1], [1, 1], [1, 1], 1));
+        start.elapsed().as_secs_f64() * 1e3
+    });
+    times.fold(f64::INFINITY, f64::min)
+}
+
+/// Lowers the fastest time of each stage, milliseconds.
+fn lower(best: &mut BTreeMap<String, f64>, stages: impl IntoIterator<Item = (String, f64)>) {
+    for (stage, ms) in stages {
+        let least = best.entry(stage).or_insert(f64::INFINITY);
+        *least = least.min(ms);
+    }
+}
+
+/// Name and duration of a stage, milliseconds.
+fn in_ms(stage: &StageTiming) -> (String, f64) {
+    (stage.stage.clone(), stage.nanos as f64 * 1e-6)
 }
 
 /// Computes one frame and lowers the fastest time of each stage, milliseconds; returns the boxes as text.
@@ -132,16 +170,10 @@ fn timed(
     let output = ego.detect(&views[0], &views[1..])?;
     let whole_ms = start.elapsed().as_secs_f64() * 1e3;
     let stages = times.into_timings().into_iter().chain(output.stages);
-    let mut all: Vec<(String, f64)> = stages
-        .map(|stage| (stage.stage.clone(), stage.nanos as f64 * 1e-6))
-        .collect();
+    let mut all: Vec<(String, f64)> = stages.map(|stage| in_ms(&stage)).collect();
     let staged_ms: f64 = all.iter().skip(1).map(|(_, ms)| ms).sum();
     all.push(("keep".to_owned(), whole_ms - staged_ms));
-    all.push(("whole".to_owned(), whole_ms + all[0].1));
-    for (stage, ms) in all {
-        let least = best.entry(stage).or_insert(f64::INFINITY);
-        *least = least.min(ms);
-    }
+    lower(best, all);
     let text = |found: &protocol::Detection| {
         let [x, y, _] = found.box3d.center_m;
         format!(
@@ -179,12 +211,13 @@ impl Sent {
     }
 }
 
-/// Messages of all vehicles, frame by frame.
+/// Messages of all vehicles, frame by frame; `sweep` gets the fastest time of each stage of an agent.
 fn sent(
     scenario: &Scenario,
     weights: &Weights,
     method: Method,
     [vehicles, frames]: [usize; 2],
+    sweep: &mut BTreeMap<String, f64>,
 ) -> Result<Vec<Vec<Sent>>, Failure> {
     let mut random = ChaCha8Rng::seed_from_u64(vehicles as u64);
     let mut agents = Vec::new();
@@ -209,6 +242,7 @@ fn sent(
                 method,
                 *agent == 0,
                 &mut random,
+                sweep,
             )?);
         }
         all.push(sent);
@@ -222,6 +256,7 @@ fn message(
     method: Method,
     is_ego: bool,
     random: &mut ChaCha8Rng,
+    sweep: &mut BTreeMap<String, f64>,
 ) -> Result<Sent, Failure> {
     let input = AgentInput {
         capture_nanos: frame.capture_nanos,
@@ -251,6 +286,7 @@ fn message(
         ),
         Exchange::Features | Exchange::Nothing => {
             let perception = agent.perceive(&frame.points)?;
+            lower(sweep, perception.times.iter().map(in_ms));
             let gate = method.gate().filter(|_| !is_ego);
             let codec = CodecConfig {
                 gate,
@@ -274,8 +310,8 @@ fn message(
     Ok(Sent { view, features })
 }
 
-/// One line: the mean over the frames from the third on, where the history is full.
-fn print(method: Method, vehicles: usize, best: &[BTreeMap<String, f64>]) {
+/// One line: the mean over the frames from the third on, where the history is full, and the sum of the stages.
+fn print(what: &str, best: &[BTreeMap<String, f64>], unit_ms: f64) {
     let full = &best[best.len().min(3) - 1..];
     let stages = full.last().into_iter().flat_map(BTreeMap::keys);
     let mean = |stage: &String| {
@@ -284,8 +320,10 @@ fn print(method: Method, vehicles: usize, best: &[BTreeMap<String, f64>]) {
             .sum::<f64>()
             / full.len() as f64
     };
-    let texts: Vec<String> = stages
-        .map(|stage| format!("{stage} {:.2}", mean(stage)))
-        .collect();
-    println!("{method}/{vehicles}: {} ms", texts.join(", "));
+    let stages: Vec<(&String, f64)> = stages.map(|stage| (stage, mean(stage))).collect();
+    let sum: f64 = stages.iter().map(|(_, ms)| ms).sum();
+    let text = |name: &str, ms: f64| format!("{name} {ms:.2} ms = {:.2} units", ms / unit_ms);
+    let mut texts: Vec<String> = stages.iter().map(|(name, ms)| text(name, *ms)).collect();
+    texts.push(text("sum", sum));
+    println!("{what}: {}", texts.join(", "));
 }

@@ -200,15 +200,16 @@ pub(crate) fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
     }
 }
 
-/// Indices of the entries of `mask` `[N, 1, H, W]` that reach any cell, and of the ego's, the first.
-pub(crate) fn present(mask: &Tensor) -> Result<Vec<i64>, TchError> {
-    let most = mask
-        .f_amax([1i64, 2, 3].as_slice(), false)?
-        .f_to_kind(tch::Kind::Float)?;
-    let most = Vec::<f32>::try_from(most.f_to_device(tch::Device::Cpu)?)?;
+/// Indices of the entries of `mask` `[N, 1, H, W]` that reach any cell; `with_ego`: the first is always one.
+pub(crate) fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchError> {
+    let most = mask.f_amax([1i64, 2, 3].as_slice(), false)?;
+    let most = Vec::<f32>::try_from(
+        most.f_to_kind(tch::Kind::Float)?
+            .f_to_device(tch::Device::Cpu)?,
+    )?;
     Ok((0i64..)
         .zip(most)
-        .filter(|(entry, most)| *entry == 0 || *most > 0.0)
+        .filter(|(entry, most)| (with_ego && *entry == 0) || *most > 0.0)
         .map(|(entry, _)| entry)
         .collect())
 }

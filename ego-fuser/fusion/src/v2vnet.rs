@@ -15,7 +15,7 @@ use tch::{Device, Kind, TchError, Tensor};
 
 use super::conv_gru::{Conv, ConvGru};
 use super::interface::{Fusion, FusionOutput};
-use super::maps::{AlignedMaps, MapMetadata, present};
+use super::maps::{AlignedMaps, MapMetadata, reaching};
 use super::settings::{FusionSettings, of_size};
 use super::spec::{Exchange, FusionSpec, MethodSpec};
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, cav_from_ego_normalized};
@@ -263,7 +263,7 @@ impl Fusion for V2vNet {
             grid,
             ..
         } = aligned;
-        let entries = present(&warped.mask)?;
+        let entries = reaching(&warped.mask, true)?;
         let nodes: Vec<MapMetadata> = entries
             .iter()
             .map(|&entry| metadata[entry as usize])

@@ -64,12 +64,40 @@ const MAX_ABS_VALUE: f64 = 1e9;
 /// [`DetectorError::Values`] with `what` and the value.
 pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorError> {
     let limit = MAX_ABS_VALUE;
-    // Both are NaN for a tensor with NaN.
-    let (min, max) = tensor.f_aminmax(None, false)?;
-    let value = f64::max(-min.f_double_value(&[])?, max.f_double_value(&[])?);
+    // Both are NaN for a tensor with NaN. In either memory order they are read without a copy.
+    let most = tensor
+        .f_amax([0_i64; 0].as_slice(), false)?
+        .f_double_value(&[])?;
+    let least = tensor
+        .f_amin([0_i64; 0].as_slice(), false)?
+        .f_double_value(&[])?;
+    let value = most.max(-least);
     if value <= limit {
         Ok(())
     } else {
         Err(DetectorError::Values { what, value, limit })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_that_are_not_valid_are_stated_in_either_memory_order() {
+        for wrong in [f64::NAN, f64::INFINITY, -2e9] {
+            let map = Tensor::from_slice(&[1.0_f32; 24]).view([2, 3, 4]);
+            assert!(check_values("a map", &map).is_ok());
+            let _ = map.get(1).get(2).get(0).fill_(wrong);
+            for map in [map.permute([1, 2, 0]), map] {
+                let error = check_values("a map", &map).unwrap_err();
+                let DetectorError::Values { value, .. } = error else {
+                    panic!("{error}");
+                };
+                assert!(
+                    value.is_nan() == wrong.is_nan() && (value.is_nan() || value == wrong.abs())
+                );
+            }
+        }
     }
 }

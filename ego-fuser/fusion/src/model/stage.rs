@@ -204,7 +204,7 @@ impl FusionStage {
         let history = self.requirements.history;
         let kept = match history.earlier_cells {
             Some(cells) => ReceivedMaps::new(
-                cell_by_cell(&larger_cells(maps, cells)?)?,
+                larger_cells(maps, cells)?,
                 // A pooled cell was sent where any of its cells was.
                 sent.as_ref()
                     .map(|sent| larger_cells(sent, cells)?.f_ceil())
@@ -412,17 +412,6 @@ fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
         ego.from_world(&facts[entry].ego_from_cav)
     };
     (newest..facts.len()).map(of_entry).collect()
-}
-
-/// Maps with the channels of a cell contiguous in memory, where no gradient flows.
-fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
-    match are_numbers(maps) {
-        true => maps
-            .f_permute([0, 2, 3, 1])?
-            .f_contiguous()?
-            .f_permute([0, 3, 1, 2]),
-        false => Ok(maps.shallow_clone()),
-    }
 }
 
 /// Names the method of the weights beside an error, if it is another one.

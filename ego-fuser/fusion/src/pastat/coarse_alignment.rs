@@ -9,7 +9,7 @@ use tch::{Kind, TchError, Tensor};
 
 use super::config::PastatConfig;
 use crate::full_resolution::FullResolutionMap;
-use crate::maps::{AlignedMaps, MapMetadata};
+use crate::maps::{AlignedMaps, MapMetadata, reaching};
 use crate::padding::Padding;
 use crate::warp::WarpedMaps;
 
@@ -205,18 +205,4 @@ fn padded(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
         features: padded(&maps.features)?,
         mask: padded(&maps.mask)?,
     })
-}
-
-/// The entries of `mask` `[N, 1, H, W]` that reach any cell; `with_ego`: the first is always one.
-fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchError> {
-    let reach: Vec<f32> = Vec::try_from(
-        mask.f_amax([1_i64, 2, 3].as_slice(), false)?
-            .f_to_kind(Kind::Float)?,
-    )?;
-    let counts = |(entry, reach): &(i64, f32)| (with_ego && *entry == 0) || *reach > 0.0;
-    Ok((0..)
-        .zip(reach)
-        .filter(counts)
-        .map(|(entry, _)| entry)
-        .collect())
 }

@@ -31,7 +31,7 @@ pub(crate) use config::TrafAlignConfig;
 use self::attention::TrajectoryAttention;
 use self::field::Trajectories;
 use super::interface::{Fusion, FusionOutput};
-use super::maps::{AlignedMaps, MapMetadata, present};
+use super::maps::{AlignedMaps, MapMetadata, reaching};
 use super::padding::Padding;
 use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
 use super::spec::{Exchange, FusionSpec, MethodSpec};
@@ -242,7 +242,7 @@ impl Fusion for TrafAlign {
             ..
         }: &AlignedMaps,
     ) -> Result<FusionOutput, TchError> {
-        let entries = present(&warped.mask)?;
+        let entries = reaching(&warped.mask, true)?;
         let agents = Agents::new(metadata, &entries);
         let index = Tensor::f_from_slice(&entries)?.f_to_device(warped.features.device())?;
         let pick = |tensor: &Tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float);

@@ -11,7 +11,7 @@ use super::config::PastatConfig;
 use super::patches::channels_last;
 use super::spatial_alignment::FineMaps;
 use super::temporal_encoding::Tokens;
-use crate::f64_tensor;
+use crate::f64_tensor::{self, are_numbers};
 
 /// Tokens back to cells. The context of the transformer is used in two ways: as a weight of each neighbour's newest
 /// map, of which the maximum is taken, and as an additive change of that; neutral before training.
@@ -75,7 +75,7 @@ impl Decoder {
     }
 
     /// A map `[1, C, H, W]` with the additive change by the context, tokens `[1, h, w, D]`; the channels of a cell are
-    /// contiguous in memory.
+    /// contiguous in memory. Without a gradient `fused` is overwritten if its channels are last in memory.
     pub(super) fn changed(&self, fused: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
         let (_, rows, columns, dim) = ego.size4()?;
         let Self {
@@ -102,8 +102,12 @@ impl Decoder {
             .f_to_kind(Kind::Float)?
             .f_view([1, rows, columns, patch, patch, channels].as_slice())?;
         let fused = fused.f_permute([0, 2, 3, 1])?.f_contiguous()?;
-        let by_patch = fused.f_view([1, rows, patch, columns, patch, channels].as_slice())?;
-        let changed = by_patch.f_add(&cells.f_permute([0, 1, 3, 2, 4, 5])?)?;
+        let mut by_patch = fused.f_view([1, rows, patch, columns, patch, channels].as_slice())?;
+        let cells = cells.f_permute([0, 1, 3, 2, 4, 5])?;
+        let changed = match are_numbers(&by_patch) && are_numbers(&cells) {
+            true => by_patch.f_add_(&cells)?,
+            false => by_patch.f_add(&cells)?,
+        };
         changed
             .f_view([1, rows * patch, columns * patch, channels])?
             .f_permute([0, 3, 1, 2])

@@ -3,6 +3,9 @@
 //! Measured gain: one neighbour 14 m off with full confidence costs 0.9 instead of 2.9 percentage points of AP@0.5
 //! (ablation, FSA with search). A fine comparison at both places and a repeated comparison give 0.7
 //! percentage points of AP@0.7 with all poses 1 m off; rotations give 1.5 with poses 4 m and 4 degrees off.
+//!
+//! Only newest maps are searched for. An earlier map is tried where the newest of its agent was found: both have poses
+//! of one source.
 
 use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
@@ -31,58 +34,38 @@ const TURNED_RADIUS: i64 = 4;
 /// A rotated map has to correlate better by this, since one of many trials correlates better by chance.
 const TURN_MARGIN: f64 = 0.03;
 
-/// Comparisons besides the one at the poses.
-#[derive(Debug)]
-pub(crate) struct AlignmentSearch {
-    /// Absent: no search.
-    config: Option<SearchConfig>,
-}
-
-impl AlignmentSearch {
-    pub(crate) fn new(config: Option<SearchConfig>) -> Self {
-        Self { config }
+/// Displacements by the network. Outside training it compares up to three times: at the poses, at better positions of
+/// the search, and once more after large moves. Training uses the first comparison, and searches shifts only.
+///
+/// `known` `[K, 3]` replaces the search outside training: displacements found before, metres and radians; small ones are
+/// found at the poses.
+pub(crate) fn displacements(
+    network: &AlignmentNetwork,
+    pairs: &Pairs,
+    area: &Area,
+    known: Option<&Tensor>,
+    is_training: bool,
+) -> Result<Displacements, TchError> {
+    let count = pairs.ego_from_cav.len() as i64;
+    let nowhere = Tensor::f_zeros([count, 3], (Kind::Float, pairs.shown.device()))?;
+    let config = network.search();
+    if is_training {
+        let searched = config.map(|config| offsets(pairs, area, config, true));
+        return network.displacements(pairs, &searched.unwrap_or(Ok(nowhere))?, area);
     }
-
-    /// Displacements by the network. Outside training it compares up to three times: at the poses, at better positions
-    /// of the search, and once more after large moves. Training uses the first comparison, and searches shifts only.
-    pub(crate) fn displacements(
-        &self,
-        network: &AlignmentNetwork,
-        pairs: &Pairs,
-        area: &Area,
-        is_training: bool,
-    ) -> Result<Displacements, TchError> {
-        let nowhere = Tensor::f_zeros(
-            [pairs.ego_from_cav.len() as i64, 3],
-            (Kind::Float, pairs.shown.device()),
-        )?;
-        let search = |pairs: &Pairs| match self.config {
-            Some(config) => offsets(
-                [&pairs.ego, &pairs.shown],
-                &pairs.ego_from_cav,
-                area,
-                config,
-                is_training,
-            ),
-            None => nowhere.f_narrow(0, 0, pairs.ego_from_cav.len() as i64),
-        };
-        if is_training {
-            return network.displacements(pairs, &search(pairs)?, area);
+    let near = network.displacements(pairs, &nowhere, area)?;
+    let rows = rows_where(&near.similarity.f_lt(FITS)?)?;
+    let found = match config.filter(|_| !rows.is_empty()) {
+        Some(config) => {
+            let far = match known {
+                Some(known) => picked(&large_only(known)?, &rows)?,
+                None => offsets(&pairs.only(&rows)?, area, config, false)?,
+            };
+            compare_there(network, pairs, near, (&rows, &far), area)?
         }
-        let near = network.displacements(pairs, &nowhere, area)?;
-        let rows = rows_where(&near.similarity.f_lt(FITS)?)?;
-        let found = match rows.is_empty() {
-            true => near,
-            false => compare_there(
-                network,
-                pairs,
-                near,
-                (&rows, &search(&pairs.only(&rows)?)?),
-                area,
-            )?,
-        };
-        compare_again(network, pairs, found, area)
-    }
+        None => near,
+    };
+    compare_again(network, pairs, found, area)
 }
 
 /// Displacements of the comparison at the poses, `near`, or for some rows at `far` `[rows, 3]`, metres and radians in the
@@ -116,17 +99,26 @@ fn compare_again(
     found: Displacements,
     area: &Area,
 ) -> Result<Displacements, TchError> {
-    let square = found
-        .deltas
-        .f_narrow(1, 0, 2)?
-        .f_square()?
-        .f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
-    let rows = rows_where(&square.f_gt(AGAIN_M * AGAIN_M)?)?;
+    let rows = rows_where(&is_large(&found.deltas)?.f_squeeze_dim(1)?)?;
     if rows.is_empty() {
         return Ok(found);
     }
     let again = network.displacements(&pairs.only(&rows)?, &picked(&found.deltas, &rows)?, area)?;
     found.with(&rows, &again)
+}
+
+/// `[K, 1]`: true for displacements `[K, 3]` by more than [`AGAIN_M`].
+fn is_large(deltas: &Tensor) -> Result<Tensor, TchError> {
+    deltas
+        .f_narrow(1, 0, 2)?
+        .f_square()?
+        .f_sum_dim_intlist([1_i64].as_slice(), true, None)?
+        .f_gt(AGAIN_M * AGAIN_M)
+}
+
+/// Displacements `[K, 3]`, zeros in place of small ones, which the comparison at the poses finds.
+fn large_only(deltas: &Tensor) -> Result<Tensor, TchError> {
+    deltas.f_mul(&is_large(deltas)?)
 }
 
 /// Coarse offset of each map from its pose, to the pooled cell, `[K, 3]` along x and y, metres, and about its sender,
@@ -136,12 +128,9 @@ fn compare_again(
 /// Training adds a margin and tries shifts only. No gradient flows: the reduced maps are learnt from the fine
 /// comparison.
 ///
-/// # Shapes
-/// - `ego`, `others`: `[1, M, H, W]`, `[K, M, H, W]`: reduced maps, on the grid of `area`
-/// - `ego_from_cav`: `K` poses of the maps' senders
+/// The maps are on the grid of `area`.
 fn offsets(
-    [ego, others]: [&Tensor; 2],
-    ego_from_cav: &[Pose],
+    pairs: &Pairs,
     area: &Area,
     SearchConfig {
         cells,
@@ -162,7 +151,7 @@ fn offsets(
             None::<i64>,
         )
     };
-    let maps = [&large(ego)?, &large(others)?];
+    let maps = [&large(&pairs.ego)?, &large(&pairs.shown)?];
     let cell_m = area.cell_m() * cells as f64;
     let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
@@ -172,7 +161,7 @@ fn offsets(
     if !train {
         tries.extend(turned_tries(
             maps,
-            ego_from_cav,
+            &pairs.ego_from_cav,
             area,
             cell_m,
             radius.min(TURNED_RADIUS),
@@ -239,6 +228,8 @@ fn turned(
 
 #[cfg(test)]
 mod tests {
+    use std::rc::Rc;
+
     use protocol::BevGrid;
     use tch::nn::VarStore;
     use tch::{Device, no_grad};
@@ -276,8 +267,17 @@ mod tests {
 
     /// Offsets found for senders at the ego's position.
     fn found(maps: [&Tensor; 2], area: &Area, config: SearchConfig, train: bool) -> Vec<f32> {
-        let poses = vec![Pose::IDENTITY; maps[1].size()[0] as usize];
-        Vec::try_from(offsets(maps, &poses, area, config, train).unwrap().view(-1)).unwrap()
+        let [ego, shown] = maps.map(Tensor::shallow_clone);
+        let count = shown.size()[0];
+        let pairs = Pairs {
+            own: Rc::new(Shifted::new(&ego, 1, 1).unwrap()),
+            ego,
+            shown,
+            mask: Tensor::ones([count, 1, 1, 1], FLOAT),
+            confidences: Tensor::ones([count, CONFIDENCES], FLOAT),
+            ego_from_cav: vec![Pose::IDENTITY; count as usize],
+        };
+        Vec::try_from(offsets(&pairs, area, config, train).unwrap().view(-1)).unwrap()
     }
 
     #[test]
@@ -332,7 +332,7 @@ mod tests {
 
     /// Corrections of FSA with a search for three maps: the ego's; the same twelve cells too far along x and sixteen
     /// back along y; and a map of another scene.
-    fn far_off(search: SearchConfig, train: bool) -> Vec<f32> {
+    fn far_off(search: SearchConfig, known: Option<&Tensor>, train: bool) -> Vec<f32> {
         let grid = BevGrid {
             x_min_m: -24.0,
             y_min_m: -16.0,
@@ -345,7 +345,11 @@ mod tests {
             Tensor::ones([3, CONFIDENCES], FLOAT),
         );
         let variables = VarStore::new(Device::Cpu);
-        let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &FsaConfig::default());
+        let config = FsaConfig {
+            alignment_search: Some(search),
+            ..FsaConfig::default()
+        };
+        let fsa = AlignmentNetwork::new(&variables.root(), [4, 6], &config);
         redraw(&variables, &["matching"], 0.3);
         let map = |seed| uniform(seed, &[1, 4, 64, 96]).gt(0.99).to_kind(Kind::Float);
         let with_mask = |features: Tensor| {
@@ -370,8 +374,7 @@ mod tests {
             let pairs = fsa
                 .pairs([&ego, &others], &confidences, &poses, &area)
                 .unwrap();
-            AlignmentSearch::new(Some(search))
-                .displacements(&fsa, &pairs, &area, train)
+            displacements(&fsa, &pairs, &area, known, train)
                 .unwrap()
                 .deltas
         };
@@ -386,8 +389,8 @@ mod tests {
             margin: 0.3,
         };
         let back = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
-        assert_eq!(far_off(search, true), back);
-        assert_eq!(far_off(search, false), back);
+        assert_eq!(far_off(search, None, true), back);
+        assert_eq!(far_off(search, None, false), back);
         // Beyond the search range it is not found.
         assert_eq!(
             far_off(
@@ -395,10 +398,27 @@ mod tests {
                     radius: 1,
                     ..search
                 },
+                None,
                 false
             ),
             [0.0; 9]
         );
+    }
+
+    #[test]
+    fn a_known_large_displacement_replaces_the_search() {
+        let search = SearchConfig {
+            cells: 4,
+            radius: 9,
+            margin: 0.3,
+        };
+        let back: [f32; 9] = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
+        let known = Tensor::from_slice(&back).view([3, 3]);
+        assert_eq!(far_off(search, Some(&known), false), back);
+        // Small ones are found at the poses, and nothing is searched.
+        let small = &known * 0.04;
+        assert_eq!(far_off(search, Some(&small), false), [0.0; 9]);
+        assert_eq!(large_only(&small).unwrap(), known.zeros_like());
     }
 
     #[test]
@@ -408,9 +428,9 @@ mod tests {
             radius: 9,
             margin: 2.0,
         };
-        assert_eq!(far_off(search, true), [0.0; 9]);
+        assert_eq!(far_off(search, None, true), [0.0; 9]);
         assert_eq!(
-            far_off(search, false),
+            far_off(search, None, false),
             [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0]
         );
     }
@@ -457,9 +477,7 @@ mod tests {
             let pairs = fsa
                 .pairs([&maps[0], &maps[1]], &confidences, &[Pose::IDENTITY], &area)
                 .unwrap();
-            let found = AlignmentSearch::new(None)
-                .displacements(&fsa, &pairs, &area, train)
-                .unwrap();
+            let found = displacements(&fsa, &pairs, &area, None, train).unwrap();
             found.deltas.double_value(&[0, 0])
         };
         let (first, both) = (shift_x_m(true), shift_x_m(false));

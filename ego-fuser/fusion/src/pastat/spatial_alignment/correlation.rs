@@ -182,7 +182,13 @@ fn by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
 
 /// `[parts^2, N]`: sums of maps `[N, M, H, W]` over each part.
 fn sum_by_part(maps: &Tensor, parts: i64) -> Result<Tensor, TchError> {
-    by_part(maps, parts)?.f_sum_dim_intlist([2_i64].as_slice(), false, None)
+    let (count, channels, height, width) = maps.size4()?;
+    let by_part = [count, channels, parts, height / parts, parts, width / parts];
+    // Summed where they are: by_part would copy them.
+    maps.f_reshape(by_part)?
+        .f_sum_dim_intlist([1_i64, 3, 5].as_slice(), false, None)?
+        .f_flatten(1, 2)?
+        .f_transpose(0, 1)
 }
 
 /// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by

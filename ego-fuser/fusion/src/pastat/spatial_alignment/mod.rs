@@ -15,22 +15,20 @@ use tch::{TchError, Tensor, nn};
 use self::area::{Area, own_sampling_grid, resample, sampling_grid};
 use self::neighbour_maps::NeighbourMaps;
 use self::network::AlignmentNetwork;
-use self::pairs::Displacements;
+use self::pairs::{Displacements, picked};
 use super::coarse_alignment::{CoarseMaps, Origins};
 use super::confidence_embedding::Confidences;
 use super::config::PastatConfig;
-use super::extensions::alignment_search::AlignmentSearch;
+use super::extensions::alignment_search::displacements;
 use super::extensions::pooled_history::pooled;
 use super::patches::PatchTokens;
 use crate::full_resolution::FullResolutionMap;
-use crate::warp::WarpedMaps;
 
 /// Feature Spatial Alignment.
 #[derive(Debug)]
 pub(super) struct SpatialAlignment {
     /// Absent: maps are aligned by their poses only, for the ablation.
     network: Option<AlignmentNetwork>,
-    search: AlignmentSearch,
     /// Cells along each edge of a cell of earlier maps.
     earlier_cells: i64,
 }
@@ -62,7 +60,6 @@ impl SpatialAlignment {
             |fsa| AlignmentNetwork::new(&(path / "fsa"), [config.channels, config.dim], fsa);
         Self {
             network: config.fsa.as_ref().map(network),
-            search: AlignmentSearch::new(config.fsa.as_ref().and_then(|fsa| fsa.alignment_search)),
             earlier_cells: config.earlier_cells,
         }
     }
@@ -132,22 +129,14 @@ impl SpatialAlignment {
         );
         let ego = newest.only(0, 1)?;
         let mut found = Vec::with_capacity(2);
-        let mut add = |maps: [&WarpedMaps; 2], first: i64, end: i64, area: &Area| {
-            let confidences = confidences.f_narrow(0, first, end - first)?;
+        if agents > 1 {
             let pairs = network.pairs(
-                maps,
-                &confidences,
-                &poses[first as usize..end as usize],
+                [&ego, &newest.only(1, agents)?],
+                &confidences.f_narrow(0, 1, agents - 1)?,
+                &poses[1..agents as usize],
                 area,
             )?;
-            found.push(
-                self.search
-                    .displacements(network, &pairs, area, is_training)?,
-            );
-            Ok::<_, TchError>(())
-        };
-        if agents > 1 {
-            add([&ego, &newest.only(1, agents)?], 1, agents, area)?;
+            found.push(displacements(network, &pairs, area, None, is_training)?);
         }
         if let Some(earlier) = earlier {
             // Means of reduced maps are reduced means of maps.
@@ -155,15 +144,35 @@ impl SpatialAlignment {
                 pooled(&ego, self.earlier_cells)?,
                 area.with_cells_of(self.earlier_cells),
             );
-            add(
+            let pairs = network.pairs(
                 [&ego, &network.reduced(earlier)?],
-                agents,
-                poses.len() as i64,
+                &confidences.f_narrow(0, agents, poses.len() as i64 - agents)?,
+                &poses[agents as usize..],
                 &area,
             )?;
+            let known = found
+                .first()
+                .map(|newest| of_newest(&newest.deltas, &origins.agent, agents as usize))
+                .transpose()?;
+            found.push(displacements(
+                network,
+                &pairs,
+                &area,
+                known.as_ref(),
+                is_training,
+            )?);
         }
         Displacements::all(&found)
     }
+}
+
+/// For each entry of `agent` from `newest` on the displacement of the newest map of its agent, given those of all
+/// newest maps but the ego's, `deltas` `[newest - 1, 3]`; zeros for the ego's and for an agent without a newest map.
+fn of_newest(deltas: &Tensor, agent: &[usize], newest: usize) -> Result<Tensor, TchError> {
+    let with_ego = deltas.f_constant_pad_nd([0, 0, 1, 0])?;
+    let (newest, earlier) = agent.split_at(newest);
+    let entry_of = |agent: &usize| newest.iter().position(|of| of == agent).unwrap_or(0) as i64;
+    picked(&with_ego, &earlier.iter().map(entry_of).collect::<Vec<_>>())
 }
 
 /// Tokens `[N, D, h, w]` and their validity `[N, h, w]`, all but the first entry's moved by `deltas` `[N - 1, 3]`.
@@ -218,4 +227,20 @@ fn moved_maps(
         .map(FullResolutionMap::shallow_clone)
         .collect();
     NeighbourMaps::at(coarse.received.only(1, count + 1)?, cells, places)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn earlier_maps_have_the_displacement_of_their_agents_newest() {
+        // Newest maps of the ego, 7 and 4; earlier ones of 4, the ego, 7 and of 9, which has no newest map.
+        let deltas = Tensor::from_slice(&[1.0_f32, 2.0, 0.1, 3.0, 4.0, 0.2]).view([2, 3]);
+        let found = of_newest(&deltas, &[0, 7, 4, 4, 0, 7, 9], 3).unwrap();
+        let expected = [
+            3.0_f32, 4.0, 0.2, 0.0, 0.0, 0.0, 1.0, 2.0, 0.1, 0.0, 0.0, 0.0,
+        ];
+        assert_eq!(found, Tensor::from_slice(&expected).view([4, 3]));
+    }
 }

@@ -11,7 +11,7 @@ use super::correlation::{PARTS, Shifted, peaks, shifts};
 use super::pairs::{Displacements, Pairs};
 use crate::f64_tensor::pointwise;
 use crate::pastat::confidence_embedding::CONFIDENCES;
-use crate::pastat::config::FsaConfig;
+use crate::pastat::config::{FsaConfig, SearchConfig};
 use crate::warp::WarpedMaps;
 
 /// Prevents division by the weight of a map that matches nowhere.
@@ -76,6 +76,11 @@ impl AlignmentNetwork {
     /// Largest offset between compared cells, cells.
     pub(crate) fn radius(&self) -> i64 {
         self.config.radius
+    }
+
+    /// The search for maps with a large offset; absent: none.
+    pub(crate) fn search(&self) -> Option<SearchConfig> {
+        self.config.alignment_search
     }
 
     /// The reduced channels in which maps are compared.

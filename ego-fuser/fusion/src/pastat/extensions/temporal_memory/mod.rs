@@ -14,6 +14,7 @@ use tch::nn::{self, Init, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
 use self::selection::{AROUND, Selection};
+use crate::f64_tensor::are_numbers;
 use crate::full_resolution::{CellSamples, FullResolutionMap};
 use crate::maps::AlignedMaps;
 use crate::pastat::coarse_alignment::{CoarseMaps, Origins};
@@ -177,7 +178,7 @@ impl TemporalMemory {
     }
 
     /// `[1, C, H, W]` of `now`, the maximum of all agents' newest maps, of that shape, and the ego's `own`,
-    /// `[C, H, W]`.
+    /// `[C, H, W]`. Without a gradient `now` is overwritten if its channels are last in memory.
     ///
     /// # Shapes
     /// - `ego`: `[1, h, w, D]`, the ego's tokens after the transformer
@@ -192,7 +193,7 @@ impl TemporalMemory {
         let (_, channels, height, width) = now.size4()?;
         let selection = Selection::most_likely(likely, self.patch, self.share)?;
         let at = Places::of(&selection, width, now.device())?;
-        let cells = channels_last(now)?.f_flatten(0, 2)?;
+        let mut cells = channels_last(now)?.f_flatten(0, 2)?;
         let own = channels_last(&own.f_unsqueeze(0)?)?
             .f_flatten(0, 2)?
             .f_index_select(0, &at.near)?;
@@ -210,7 +211,11 @@ impl TemporalMemory {
             // Cells without valid data in any map get no blending.
             change = change.f_addcmul(&gate, &(apart * mask.f_index_select(0, &at.middle)?))?;
         }
-        let blended = cells.f_index_add(0, &at.cells, &change)?;
+        // Where no gradient flows, nothing reads the map as it was before.
+        let blended = match are_numbers(&cells) {
+            true => cells.f_index_add_(0, &at.cells, &change)?,
+            false => cells.f_index_add(0, &at.cells, &change)?,
+        };
         blended
             .f_view([1, height, width, channels])?
             .f_permute([0, 3, 1, 2])
