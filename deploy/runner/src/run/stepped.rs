@@ -182,13 +182,14 @@ fn write(
 ) -> Result<RunResult, RunError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
-    let metrics = metrics(
+    let mut metrics = metrics(
         board,
         evaluator,
         "stepped",
         fleet.pose_source(),
         board.seconds(),
     );
+    metrics.left_out.add_findings(fleet.findings.clone());
     let provenance = fleet.provenance(&options.programs);
     let provenance = provenance
         .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))

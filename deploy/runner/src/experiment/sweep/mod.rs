@@ -29,6 +29,7 @@ use fusion::Exchange;
 use link::LinkError;
 use serde::Serialize;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::output;
 use support::progress;
 use training::feature_store::FeatureStore;
@@ -445,9 +446,11 @@ impl Sweep {
                 &self.out.join(format!("{}.png", figure.name)),
             )?;
         }
-        let spec = fs::read_to_string(&self.file).map_err(|source| SweepError::Io {
-            path: self.file.clone(),
-            source,
+        let spec = bounded_file::read_text(&self.file, MAX_TEXT_BYTES).map_err(|source| {
+            SweepError::Io {
+                path: self.file.clone(),
+                source,
+            }
         })?;
         write(
             "report.html",
