@@ -181,6 +181,23 @@ impl Principal {
         rights
     }
 
+    /// True if it publishes messages of this topic, as far as the ledger covers them.
+    pub(crate) fn publishes(&self, topic: &Topic) -> bool {
+        match topic {
+            Topic::Stream { cav, stream } => match self.role {
+                Role::Agent => *cav == self.cav && SHARED.contains(stream),
+                Role::Ego => *cav == self.cav && DETECTIONS.contains(stream),
+                Role::Replay | Role::Ros2 => {
+                    !SHARED.contains(stream) && !DETECTIONS.contains(stream)
+                }
+                _ => false,
+            },
+            Topic::Received { ego, .. } => self.role == Role::Link && *ego == self.cav,
+            Topic::Truth => self.role == Role::Replay,
+            _ => false,
+        }
+    }
+
     /// Liveliness tokens that this role subscribes to, below the run.
     fn watched(&self) -> Option<&'static str> {
         match self.role {

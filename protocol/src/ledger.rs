@@ -21,7 +21,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use crate::reconciliation::Discrepancy;
-use crate::{DropReason, ProcessId, RateReason, Reconciliation, Topic};
+use crate::{DropReason, Principal, ProcessId, RateReason, Reconciliation, Topic};
 
 /// Key of a set of counters: a topic and its receiver (`None`: any receiver).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -286,6 +286,26 @@ impl Ledger {
         exempted
     }
 
+    /// Removes the accounts of messages that `process` neither receives nor publishes, and returns them: a report speaks
+    /// of its own process only.
+    pub fn remove_foreign(&mut self, process: &ProcessId) -> Vec<Account> {
+        let principal: Option<Principal> = process.to_string().parse().ok();
+        let mut foreign = Vec::new();
+        self.accounts.retain(|account, _| {
+            let is_own = match &account.to {
+                Some(to) => to == process,
+                None => principal
+                    .as_ref()
+                    .is_some_and(|principal| principal.publishes(&account.topic)),
+            };
+            if !is_own {
+                foreign.push(account.clone());
+            }
+            is_own
+        });
+        foreign
+    }
+
     fn counts(&mut self, account: &Account) -> &mut Counts {
         if !self.accounts.contains_key(account) {
             self.accounts.insert(account.clone(), Counts::default());
@@ -305,6 +325,39 @@ mod tests {
 
     fn bev() -> Topic {
         "4288/bev".parse().unwrap()
+    }
+
+    #[test]
+    fn a_process_accounts_for_what_it_publishes_and_receives() {
+        let own = [
+            ("agent-4288", "4288/bev", None),
+            ("agent-4288", "4288/lidar", Some("agent-4288")),
+            ("ego-4279", "4279/detections", None),
+            ("ego-4279", "rx/4279/4288/bev", Some("ego-4279")),
+            ("link-4279", "rx/4279/4288/bev", None),
+            ("link-4279", "4288/bev", Some("link-4279")),
+            ("replay", "4288/camera/0", None),
+            ("replay", "truth", None),
+            ("ros2", "4288/imu", None),
+            ("scorer", "truth", Some("scorer")),
+        ];
+        for (name, topic, to) in own {
+            let account = Account {
+                topic: topic.parse().unwrap(),
+                to: to.map(process),
+            };
+            let mut ledger = Ledger::default();
+            ledger.sent(&account);
+            for other in ["agent-666", "ego-666", "link-666", "viewer", "unknown"] {
+                assert_eq!(
+                    ledger.clone().remove_foreign(&process(other)),
+                    [account.clone()],
+                    "{other}"
+                );
+            }
+            assert_eq!(ledger.remove_foreign(&process(name)), [], "{account}");
+            assert_eq!(ledger.len(), 1);
+        }
     }
 
     /// An agent sends 10 messages: the link holds 1, loses 2 and repeats 1; the ego uses 6 and drops 2.

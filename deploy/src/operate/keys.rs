@@ -23,6 +23,7 @@ use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
     Issuer, KeyPair, KeyUsagePurpose, SanType, date_time_ymd,
 };
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 
 /// File name of the authority's key.
 pub(crate) const AUTHORITY_KEY: &str = "authority.key";
@@ -258,7 +259,7 @@ fn make_folder(path: &Path) -> Result<(), KeyError> {
 }
 
 fn read(path: &Path) -> Result<String, KeyError> {
-    fs::read_to_string(path).map_err(|cause| KeyError::Io {
+    bounded_file::read_text(path, MAX_TEXT_BYTES).map_err(|cause| KeyError::Io {
         path: path.to_path_buf(),
         cause,
     })

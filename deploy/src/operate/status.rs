@@ -7,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use protocol::NeighbourState;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::text_table::{Side, TextTable};
 
 use crate::operate::health::{ProcessStatus, State, Usage};
@@ -110,10 +111,11 @@ impl RunStatus {
     /// [`StatusError`] names the file.
     pub fn read(folder: &Path) -> Result<Self, StatusError> {
         let path = folder.join(FILE);
-        let text = fs::read_to_string(&path).map_err(|source| StatusError::Read {
-            path: path.clone(),
-            source,
-        })?;
+        let text =
+            bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|source| StatusError::Read {
+                path: path.clone(),
+                source,
+            })?;
         let status: Self = serde_json::from_str(&text).map_err(|error| StatusError::Syntax {
             path: path.clone(),
             problem: error.to_string(),

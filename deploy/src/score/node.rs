@@ -410,7 +410,7 @@ impl Worker {
     fn stats(&mut self, sender: &ProcessId, arrival: &Arrival) {
         let Some(Stats {
             process,
-            ledger,
+            mut ledger,
             stages,
             usage,
             traffic,
@@ -423,6 +423,11 @@ impl Worker {
         let has_room = self.stats.len() < MAX_INSTANCES || self.stats.contains_key(&instance);
         if process != *sender || !has_room {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
+        }
+        let foreign = ledger.remove_foreign(&process);
+        if let Some(first) = foreign.first() {
+            let others = foreign.len() - 1;
+            tracing::warn!(%process, "report on messages of other processes, {first} and {others} more: ignored");
         }
         let (name, at) = (process.to_string(), arrival.at);
         // Until the first tick: the loading of models belongs to no frame.

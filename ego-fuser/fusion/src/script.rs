@@ -1,18 +1,24 @@
 //! TorchScript plug-in: a fusion from a file, `script:FILE.pt` as the name of a method.
 
 use std::collections::BTreeMap;
+use std::io::{self, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
+use support::bounded_file;
 use tch::{CModule, Device, TchError, Tensor, nn};
+use zip::ZipArchive;
 
 use crate::interface::{Fusion, FusionOutput};
 use crate::maps::{AlignedMaps, MapMetadata};
 use crate::settings::{FusionConfig, FusionSettings};
 use crate::spec::{Exchange, FusionSpec, MethodSpec};
 
+/// Most bytes that the files of a module may have beyond their compressed size: its source is compressed, its tensors are
+/// not.
+const MAX_GAINED_BYTES: u64 = 64 << 20;
 /// Start of the names of such methods.
 pub(crate) const PREFIX: &str = "script:";
 
@@ -68,18 +74,37 @@ impl FusionSettings for ScriptConfig {
     }
 
     fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
-        if let Err(error) = std::fs::File::open(&self.file) {
-            return Err(ConfigError::ScriptFile {
-                file: self.file.clone(),
-                problem: error.to_string(),
-            });
-        }
+        check_size(&self.file).map_err(|error| ConfigError::ScriptFile {
+            file: self.file.clone(),
+            problem: error.to_string(),
+        })?;
         let script = ScriptFusion::load(&self.file, path.device());
         Ok(Box::new(script.map_err(|source| ConfigError::Script {
             file: self.file.clone(),
             reason: first_line(&source),
         })?))
     }
+}
+
+/// Refuses what is no regular file, and an archive that unpacks to far more than its own size: libtorch unpacks all of
+/// its source. A file that is no archive passes; libtorch says what is wrong with it.
+fn check_size(file: &Path) -> io::Result<()> {
+    let opened = bounded_file::open(file)?;
+    let Ok(mut archive) = ZipArchive::new(BufReader::new(opened)) else {
+        return Ok(());
+    };
+    let mut gained_bytes = 0_u64;
+    for index in 0..archive.len() {
+        let entry = archive.by_index_raw(index)?;
+        gained_bytes += entry.size().saturating_sub(entry.compressed_size());
+    }
+    if gained_bytes > MAX_GAINED_BYTES {
+        let problem = format!(
+            "unpacks to {gained_bytes} bytes more than it has, at most {MAX_GAINED_BYTES} are read"
+        );
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, problem));
+    }
+    Ok(())
 }
 
 /// A TorchScript module `forward(features, mask, ego_from_cav, confidence, age_s) -> fused`, outside training:
@@ -167,8 +192,12 @@ fn first_line(error: &TchError) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write;
+
     use protocol::{BevGrid, Pose};
     use tch::Kind;
+    use zip::write::FileOptions;
+    use zip::{CompressionMethod, ZipWriter};
 
     use super::*;
     use crate::Method;
@@ -279,6 +308,28 @@ mod tests {
     }
 
     #[test]
+    fn a_module_whose_source_unpacks_to_gigabytes_is_refused_unread() {
+        let mut archive = ZipWriter::new(io::Cursor::new(Vec::new()));
+        let options = FileOptions::default().compression_method(CompressionMethod::Stored);
+        archive.start_file("code/__torch__.py", options).unwrap();
+        archive.write_all(b"# a comment").unwrap();
+        let mut bytes = archive.finish().unwrap().into_inner();
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("mine.pt");
+        std::fs::write(&file, &bytes).unwrap();
+        check_size(&file).unwrap();
+        // The unpacked size in the central directory.
+        let entry = bytes
+            .windows(4)
+            .position(|bytes| bytes == b"PK\x01\x02")
+            .unwrap();
+        bytes[entry + 24..entry + 28].copy_from_slice(&400_000_000_u32.to_le_bytes());
+        std::fs::write(&file, &bytes).unwrap();
+        let error = check_size(&file).unwrap_err().to_string();
+        assert!(error.contains("unpacks to 399999989 bytes more"), "{error}");
+    }
+
+    #[test]
     fn what_is_wrong_with_a_file_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let build = |file: &Path| {
@@ -298,6 +349,7 @@ mod tests {
         );
         let broken = folder.path().join("broken.pt");
         std::fs::write(&broken, b"no archive").unwrap();
+        assert!(build(Path::new("/dev/zero")).contains("no regular file"));
         let message = build(&broken);
         assert!(
             message.contains("broken.pt") && !message.contains('\n'),

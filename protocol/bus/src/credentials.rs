@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use protocol::Principal;
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use x509_parser::pem::parse_x509_pem;
 
 use super::BusError;
@@ -111,7 +112,7 @@ fn bad(path: &Path, what: &impl ToString) -> BusError {
 }
 
 fn readable(path: &Path) -> Result<String, BusError> {
-    fs::read_to_string(path).map_err(|cause| bad(path, &cause))
+    bounded_file::read_text(path, MAX_TEXT_BYTES).map_err(|cause| bad(path, &cause))
 }
 
 /// Common name of a certificate that is valid at this time.

@@ -5,6 +5,16 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
+/// Largest text of settings, keys or results that is read, bytes.
+pub const MAX_TEXT_BYTES: u64 = 64 << 20;
+
+/// Largest number of bytes that a compressed file may unpack to: recorded data shrink to a tenth, constant ones to some
+/// hundredth.
+#[must_use]
+pub fn most_unpacked(packed_bytes: u64) -> u64 {
+    packed_bytes.saturating_mul(300).saturating_add(64 << 20)
+}
+
 /// Opens a file for reading.
 ///
 /// # Errors

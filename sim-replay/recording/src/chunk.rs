@@ -126,34 +126,40 @@ fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
     Ok((stated == [0; 4] || stated == crc.finalize().to_le_bytes()).then_some(summary))
 }
 
-/// The messages of a chunk, after its checksum was verified, and the number of those whose channel is not described
-/// anywhere; its channels are added to `channels`.
-pub(super) fn unpack(
-    body: &[u8],
-    channels: &mut Channels,
-) -> McapResult<(Vec<Message<'static>>, usize)> {
+/// Contents of a chunk.
+#[derive(Debug, Default)]
+pub(super) struct UnpackedChunk {
+    pub(super) messages: Vec<Message<'static>>,
+    /// Messages whose channel is not described anywhere.
+    pub(super) orphans: usize,
+    /// Bytes of all records.
+    pub(super) bytes: usize,
+}
+
+/// Unpacks a chunk and verifies its checksum; its channels are added to `channels`.
+pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<UnpackedChunk> {
     lengths::check(op::CHUNK, body)?;
     let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
     let options = LinearReaderOptions::default()
         .with_skip_start_magic(true)
         .with_prevalidate_chunk_crcs(true);
-    let (mut messages, mut orphans, mut unpacked_bytes) = (Vec::new(), 0, 0);
+    let mut chunk = UnpackedChunk::default();
     for_each_record(head.chain(body), options, |opcode, data| {
-        unpacked_bytes += data.len();
-        if unpacked_bytes > MAX_RECORD_BYTES {
-            return Err(McapError::ChunkTooLarge(unpacked_bytes as u64));
+        chunk.bytes += data.len();
+        if chunk.bytes > MAX_RECORD_BYTES {
+            return Err(McapError::ChunkTooLarge(chunk.bytes as u64));
         }
         // Other records are not allowed in a chunk, and the parser trusts the lengths in some of them.
         match opcode {
             op::MESSAGE => match channels.message(data)? {
-                Some(message) => messages.push(message),
-                None => orphans += 1,
+                Some(message) => chunk.messages.push(message),
+                None => chunk.orphans += 1,
             },
             _ => channels.add(opcode, data)?,
         }
         Ok(ControlFlow::Continue(()))
     })?;
-    Ok((messages, orphans))
+    Ok(chunk)
 }
 
 /// The text of an error, as the decompressor gives it.

@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use mcap::Message;
 use mcap::records::op;
+use support::bounded_file;
 
 use super::chunk::{Channels, in_words, unpack};
 use super::damage::Damage;
@@ -62,7 +63,7 @@ pub struct McapFile {
 /// True for a file of another program, as far as its summary shows: no message is read.
 pub(super) fn is_foreign(path: &Path) -> Result<bool, RecordingError> {
     let io = |source| RecordingError::io(path, source);
-    let file = File::open(path).map_err(io)?;
+    let file = bounded_file::open(path).map_err(io)?;
     let size = file.metadata().map_err(io)?.len();
     Ok(Channels::of_summary(&file, size).map_err(io)?.are_foreign())
 }
@@ -79,7 +80,7 @@ impl McapFile {
         visit: &mut dyn FnMut(&Message<'static>, Place) -> bool,
     ) -> Result<Self, RecordingError> {
         let io = |source| RecordingError::io(path, source);
-        let file = File::open(path).map_err(io)?;
+        let file = bounded_file::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
         let mut records = Records::open(&file, size)
             .map_err(io)?
@@ -89,6 +90,8 @@ impl McapFile {
             holders: Vec::new(),
             arrivals: Vec::new(),
             lost: Vec::new(),
+            unpacked_bytes: 0,
+            most_unpacked: bounded_file::most_unpacked(size),
             visit,
         };
         contents.look_through(&mut records, size).map_err(io)?;
@@ -165,7 +168,7 @@ impl McapFile {
             .read_exact_at(&mut body, begin + RECORD_HEAD as u64);
         read.map_err(|source| RecordingError::io(&self.path, source))?;
         let messages = match is_chunk {
-            true => unpack(&body, &mut unpacked.channels).map(|(messages, _)| messages),
+            true => unpack(&body, &mut unpacked.channels).map(|chunk| chunk.messages),
             false => unpacked
                 .channels
                 .message(&body)
@@ -195,6 +198,9 @@ struct Contents<'a> {
     /// Times of the messages between which damage is timed.
     arrivals: Vec<u64>,
     lost: Vec<Lost>,
+    /// Bytes that the chunks so far unpack to, and the most that those of a file of this size may.
+    unpacked_bytes: u64,
+    most_unpacked: u64,
     visit: &'a mut dyn FnMut(&Message<'static>, Place) -> bool,
 }
 
@@ -255,16 +261,24 @@ impl Contents<'_> {
                 return Ok(ControlFlow::Break(crc));
             }
             op::CHUNK => {
-                let (messages, orphans) = unpack(body, &mut self.channels).map_err(in_words)?;
+                if self.unpacked_bytes > self.most_unpacked {
+                    return Err(format!(
+                        "a chunk after others that unpack to {} bytes, {} at most are read of a file of this size",
+                        self.unpacked_bytes, self.most_unpacked
+                    ));
+                }
+                let chunk = unpack(body, &mut self.channels).map_err(in_words)?;
+                self.unpacked_bytes += chunk.bytes as u64;
                 self.add(
                     Holder {
                         begin,
                         len: body.len(),
                         is_chunk: true,
                     },
-                    &messages,
+                    &chunk.messages,
                 );
-                if orphans > 0 {
+                if chunk.orphans > 0 {
+                    let orphans = chunk.orphans;
                     let what = format!("{orphans} messages of channels that are described nowhere");
                     self.lose((begin, begin), what);
                 }

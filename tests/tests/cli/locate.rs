@@ -1,4 +1,4 @@
-//! `agent locate` and `agent map`: one sweep in every format, foreign and unreadable clouds, and a map of a few drives.
+//! `agent locate` and `agent map`: one sweep in every format, foreign and unreadable clouds, and a map of a robot's bag.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use dataset::LoadOptions;
+use mcap::records::MessageHeader;
+use re_cdr::{CdrWriter, LittleEndian};
 use serde_json::Value;
 use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::programs;
@@ -82,6 +84,66 @@ fn write_all(folder: &Path, points: &[[f32; 4]]) -> Vec<PathBuf> {
 }
 
 /// One JSON object per line.
+/// `sensor_msgs/PointCloud2` of x, y, z and intensity in single precision.
+fn point_cloud(nanos: u64, points: &[[f32; 4]]) -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0];
+    let mut cdr = CdrWriter::<LittleEndian>::new(&mut bytes);
+    cdr.write_i32((nanos / 1_000_000_000) as i32);
+    cdr.write_u32((nanos % 1_000_000_000) as u32);
+    cdr.write_string("os_sensor");
+    cdr.write_u32(1);
+    cdr.write_u32(points.len() as u32);
+    cdr.write_sequence_length(4);
+    for (offset, name) in (0..).step_by(4).zip(["x", "y", "z", "intensity"]) {
+        cdr.write_string(name);
+        cdr.write_u32(offset);
+        cdr.write_u8(7);
+        cdr.write_u32(1);
+    }
+    cdr.write_bool(false);
+    cdr.write_u32(16);
+    cdr.write_u32(16 * points.len() as u32);
+    cdr.write_bytes(&little_endian(points));
+    cdr.write_bool(true);
+    bytes
+}
+
+/// Writes a drive as the bag of a robot that records its sweeps, and where they are as transforms.
+fn write_bag(scene: &Path, bag: &Path) {
+    let options = mcap::WriteOptions::new().profile("ros2");
+    let mut writer = options.create(fs::File::create(bag).unwrap()).unwrap();
+    let mut channel = |topic: &str, type_name: &str| {
+        let schema = writer.add_schema(type_name, "ros2msg", b"").unwrap();
+        let none = std::collections::BTreeMap::new();
+        writer.add_channel(schema, topic, "cdr", &none).unwrap()
+    };
+    let channels = [
+        channel("/tf", "tf2_msgs/msg/TFMessage"),
+        channel("/points", "sensor_msgs/msg/PointCloud2"),
+    ];
+    let scenario = &dataset::open(scene).unwrap().scenarios[0];
+    for tick in 0..scenario.ticks.len() {
+        let frame = scenario.load(0, tick, &LoadOptions::default()).unwrap();
+        let nanos = 1_000_000_000_000 + frame.capture_nanos;
+        let pose = frame.world_from_lidar.unwrap();
+        let place = ("map".to_owned(), "os_sensor".to_owned(), pose);
+        let messages = [
+            ros2::transforms(nanos, &[place]),
+            point_cloud(nanos, &frame.points.xyzi),
+        ];
+        for (channel_id, message) in channels.into_iter().zip(messages) {
+            let head = MessageHeader {
+                channel_id,
+                sequence: 0,
+                log_time: nanos,
+                publish_time: nanos,
+            };
+            writer.write_to_known_channel(&head, &message).unwrap();
+        }
+    }
+    writer.finish().unwrap();
+}
+
 fn objects(output: &Output) -> Vec<Value> {
     String::from_utf8_lossy(&output.stdout)
         .lines()
@@ -120,6 +182,17 @@ fn the_same_sweep_has_the_same_pose_in_every_format_and_a_foreign_cloud_has_none
     );
     let objects_found = objects(&located);
     assert_eq!(objects_found.len(), 5, "{objects_found:?}");
+    let bag = folder.path().join("drive.mcap");
+    write_bag(&scene, &bag);
+    let of_bag = objects(&agent(&[
+        "locate",
+        bag.to_str().unwrap(),
+        "--head",
+        &head,
+        "--json",
+    ]));
+    assert_eq!(of_bag.len(), 2, "{of_bag:?}");
+    assert_eq!(of_bag[1]["pose"], objects_found[0]["pose"]);
     for object in &objects_found[..4] {
         let position: [f64; 3] =
             serde_json::from_value(object["pose"]["position_m"].clone()).unwrap();
@@ -227,11 +300,14 @@ fn a_map_of_a_drive_finds_its_sweeps_and_reports_where_it_was_driven() {
     let folder = tempfile::tempdir().unwrap();
     let scene = drive(&folder.path().join("drive"), 30, 0.5);
     let out = folder.path().join("my place");
-    let (scene_text, out_text) = (scene.to_str().unwrap(), out.to_str().unwrap());
+    // As a robot records it.
+    let bag = folder.path().join("drive.mcap");
+    write_bag(&scene, &bag);
+    let (bag_text, out_text) = (bag.to_str().unwrap(), out.to_str().unwrap());
     let encoder = weights("pgc-encoder.safetensors");
     let arguments = [
         "map",
-        scene_text,
+        bag_text,
         "--out",
         out_text,
         "--encoder",

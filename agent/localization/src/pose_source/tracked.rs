@@ -122,6 +122,7 @@ pub struct TrackedPose {
     measured_nanos: Option<u64>,
     global_nanos: Option<u64>,
     jumps: u64,
+    is_speed_refuted: bool,
     times: Vec<StageTiming>,
 }
 
@@ -151,6 +152,7 @@ impl TrackedPose {
             measured_nanos: None,
             global_nanos: None,
             jumps: 0,
+            is_speed_refuted: false,
             times: Vec::new(),
         }
     }
@@ -196,6 +198,24 @@ impl TrackedPose {
         }
     }
 
+    /// Names a speed that is not used from here on, once.
+    fn report_speed(&mut self, input: &PoseInput<'_>) {
+        let Some(refuted) = self
+            .tracker
+            .refuted_speed()
+            .filter(|_| !self.is_speed_refuted)
+        else {
+            return;
+        };
+        self.is_speed_refuted = true;
+        tracing::warn!(
+            cav = %input.cav,
+            "the vehicle measures a speed of {:.1} m/s where its poses give {:.1} m/s: its speed is not used from here on",
+            refuted.measured_mps,
+            refuted.of_poses_mps
+        );
+    }
+
     /// Localizes a vehicle that is lost.
     fn start(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         let Some(localization) = self.measure(input, None) else {
@@ -231,7 +251,9 @@ impl PoseSource for TrackedPose {
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
         self.sweeps += 1;
-        match self.tracker.predict(input.capture_nanos, &input.motion) {
+        let predicted = self.tracker.predict(input.capture_nanos, &input.motion);
+        self.report_speed(input);
+        match predicted {
             Some(state) => published(&state),
             None => self.start(input),
         }
@@ -409,8 +431,9 @@ mod tests {
                 "sweep {sweep}: {x}, {y}"
             );
         }
-        // Four seconds: one at the start and one every two seconds.
-        assert_eq!((globals, globals + nears), (3, 21));
+        // Four seconds: one at the start and one every two seconds. The second sweep is measured as well, since one pose
+        // cannot contradict a speed.
+        assert_eq!((globals, globals + nears), (3, 22));
         assert!(
             estimates
                 .iter()

@@ -6,15 +6,15 @@
 
 mod measurement;
 mod motion_filter;
+mod track;
 
 use nalgebra::Isometry3;
 use protocol::{EgoMotion, PlanarCovariance};
 
 pub use measurement::PoseMeasurement;
-use motion_filter::MotionFilter;
+pub use track::SpeedContradiction;
+use track::{SpeedTrust, Track};
 
-/// Gate of a measurement: 99.9 % quantile of the chi-square distribution with three degrees of freedom.
-const GATE: f64 = 16.27;
 /// Number of rejected measurements in a row that have to agree on another place.
 const AGREEING: usize = 3;
 /// Largest speed between rejected measurements of one vehicle, metres per second, beside [`SLACK_M`].
@@ -61,7 +61,8 @@ pub enum Correction {
 #[derive(Debug, Clone)]
 pub struct PoseTracker {
     limits: TrackerLimits,
-    filter: Option<MotionFilter>,
+    track: Option<Track>,
+    speed_trust: SpeedTrust,
     /// Last accepted measurement.
     accepted: Option<PoseMeasurement>,
     /// Rejected measurements in a row that can be reached from each other.
@@ -75,7 +76,8 @@ impl PoseTracker {
     pub fn new(limits: TrackerLimits) -> Self {
         Self {
             limits,
-            filter: None,
+            track: None,
+            speed_trust: SpeedTrust::default(),
             accepted: None,
             rejected: Vec::new(),
             contradiction_m: 0.0,
@@ -85,16 +87,13 @@ impl PoseTracker {
     /// Moves the state to the capture time of a sweep. `None`: the vehicle is lost, or the clock went back.
     pub fn predict(&mut self, capture_nanos: u64, motion: &EgoMotion) -> Option<TrackedState> {
         if !self.can_predict(capture_nanos) {
-            self.filter = None;
+            self.track = None;
             self.rejected.clear();
         }
-        let filter = self.filter.as_mut()?;
-        filter.advance(capture_nanos, motion.yaw_rate_rad_s);
-        if let Some(speed_mps) = motion.speed_mps {
-            filter.correct_speed(speed_mps);
-        }
-        if filter.planar_covariance().worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
-            self.filter = None;
+        let track = self.track.as_mut()?;
+        track.advance(capture_nanos, motion, &mut self.speed_trust);
+        if track.covariance().worst_variance_m2() > self.limits.max_position_std_m.powi(2) {
+            self.track = None;
         }
         self.state()
     }
@@ -104,16 +103,16 @@ impl PoseTracker {
             seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s
         };
         let is_ahead = self
-            .filter
+            .track
             .as_ref()
-            .is_some_and(|filter| filter.capture_nanos <= capture_nanos);
+            .is_some_and(|track| track.filter.capture_nanos <= capture_nanos);
         is_ahead && self.accepted.as_ref().is_some_and(is_recent)
     }
 
     /// Current state, if the vehicle is not lost.
     pub fn state(&self) -> Option<TrackedState> {
-        let filter = self.filter.as_ref()?;
-        let mut covariance = filter.planar_covariance();
+        let track = self.track.as_ref()?;
+        let mut covariance = track.covariance();
         if self.is_contradicted() {
             // Two places that are equally likely.
             let variance = (self.contradiction_m / 2.0).powi(2) as f32;
@@ -121,7 +120,7 @@ impl PoseTracker {
             covariance.yy_m2 += variance;
         }
         Some(TrackedState {
-            world_from_lidar: filter.world_from_lidar(),
+            world_from_lidar: track.filter.world_from_lidar(),
             covariance,
         })
     }
@@ -133,19 +132,16 @@ impl PoseTracker {
 
     /// Uses a measurement of the time of the last prediction.
     pub fn correct(&mut self, measurement: &PoseMeasurement) -> Correction {
-        let Some(filter) = self.filter.as_mut() else {
+        let Some(track) = self.track.as_mut() else {
             self.start(measurement);
             return Correction::Started;
         };
-        if filter.capture_nanos == measurement.capture_nanos
-            && filter.distance_squared(measurement) <= GATE
-        {
-            filter.correct(measurement);
+        if track.correct(measurement) {
             self.accepted = Some(*measurement);
             self.rejected.clear();
             return Correction::Accepted;
         }
-        let off = filter.world_from_lidar().translation.vector
+        let off = track.filter.world_from_lidar().translation.vector
             - measurement.world_from_lidar.translation.vector;
         self.contradiction_m = off.norm();
         self.reject(measurement)
@@ -177,12 +173,11 @@ impl PoseTracker {
 
     /// Starts at a measurement; with the speed from the one before it, if that is recent.
     fn start(&mut self, measurement: &PoseMeasurement) {
-        let mut filter = MotionFilter::at(measurement);
         let before = self.accepted.replace(*measurement);
-        if let Some(before) = before.filter(|before| can_follow(before, measurement)) {
-            filter.set_speed(speed_mps(&before, measurement), SPEED_STD_MPS);
-        }
-        self.filter = Some(filter);
+        let speed = before
+            .filter(|before| can_follow(before, measurement))
+            .map(|before| [speed_mps(&before, measurement), SPEED_STD_MPS]);
+        self.track = Some(Track::at(measurement, speed));
         self.rejected.clear();
     }
 
@@ -190,9 +185,14 @@ impl PoseTracker {
     pub fn needs_measurement(&self) -> bool {
         self.is_contradicted()
             || self
-                .filter
+                .track
                 .as_ref()
-                .is_none_or(|filter| filter.speed_std_mps() > SPEED_STD_MPS)
+                .is_none_or(|track| track.speed_std_mps() > SPEED_STD_MPS)
+    }
+
+    /// The speed that is not used any more, since measured poses contradict it.
+    pub fn refuted_speed(&self) -> Option<SpeedContradiction> {
+        self.speed_trust.refuted
     }
 }
 

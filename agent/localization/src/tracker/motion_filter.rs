@@ -1,6 +1,6 @@
 //! Motion filter: extended Kalman filter of a vehicle that turns at a constant rate (CTRV), and of its height.
 //!
-//! Two constants of the vehicle are states too: the bias of its gyroscope, and the place of the LiDAR ahead of the point
+//! Three constants of the vehicle are states too: the bias of its gyroscope, the scale of its speed, and the place of the LiDAR ahead of the point
 //! that moves straight along the heading (the middle of the rear axle), which swings the LiDAR sideways in a turn.
 
 use std::f64::consts::{PI, TAU};
@@ -24,8 +24,12 @@ const RESIDUAL_YAW_ACCELERATION_STD: f64 = 0.25;
 const SLIP_STD_M: f64 = 0.05;
 /// Standard deviation of the vertical acceleration beside that of the slope, metres per second squared.
 const VERTICAL_ACCELERATION_STD: f64 = 0.1;
-/// Standard deviation of a measured speed, metres per second: OpenCDA's 0.2 and the error of a wheel's radius.
-const SPEED_STD_MPS: f64 = 0.25;
+/// Standard deviation of a measured speed without its scale, metres per second: OpenCDA's.
+const SPEED_STD_MPS: f64 = 0.2;
+/// Standard deviation of the unknown scale of the speed: radius of the wheels, tyres, calibration.
+const SCALE_STD: f64 = 0.1;
+/// Standard deviation of the change of that scale after one second.
+const SCALE_DRIFT_STD: f64 = 0.001;
 /// Standard deviation of a measured yaw rate without its bias, radians per second: 0.1 degrees/s, as of a MEMS gyroscope.
 const YAW_RATE_STD: f64 = 0.002;
 /// Standard deviation of the gyroscope's unknown bias, radians per second: 0.6 degrees/s, not calibrated.
@@ -47,7 +51,8 @@ const SPEED: usize = 3;
 const YAW_RATE: usize = 4;
 const BIAS: usize = 5;
 const LEVER: usize = 6;
-const STATES: usize = 7;
+const SCALE: usize = 7;
+const STATES: usize = 8;
 
 type State = SVector<f64, STATES>;
 type Covariance = SMatrix<f64, STATES, STATES>;
@@ -58,7 +63,8 @@ pub(super) struct MotionFilter {
     /// Capture time of the state, nanoseconds.
     pub(super) capture_nanos: u64,
     /// x, y (metres, world) and yaw (radians) of the LiDAR, speed along the heading (m/s), yaw rate (rad/s), bias of the
-    /// gyroscope (rad/s), and the LiDAR's place ahead of the rear axle (metres).
+    /// gyroscope (rad/s), the LiDAR's place ahead of the rear axle (metres), and the share of the measured speed by which
+    /// the true one exceeds it.
     state: State,
     covariance: Covariance,
     /// Height (metres, world) and vertical speed beside that of the slope (m/s).
@@ -84,10 +90,11 @@ impl MotionFilter {
             yaw_rate,
             BIAS_STD,
             LEVER_STD_M,
+            SCALE_STD,
         ]);
         Self {
             capture_nanos: measurement.capture_nanos,
-            state: State::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0]),
+            state: State::from([x, y, yaw, 0.0, 0.0, 0.0, 0.0, 0.0]),
             covariance: Covariance::from_diagonal(&std.component_mul(&std)),
             height: Vector2::new(z, 0.0),
             height_covariance: Matrix2::new(position * position, 0.0, 0.0, 1.0),
@@ -118,7 +125,7 @@ impl MotionFilter {
     }
 
     fn advance_plane(&mut self, time_s: f64, yaw_acceleration_std: f64) {
-        let [_, _, yaw, speed, yaw_rate, _, lever_m] = self.state.data.0[0];
+        let [_, _, yaw, speed, yaw_rate, _, lever_m, _] = self.state.data.0[0];
         // Midpoint rule: the heading half way.
         let (sin, cos) = (yaw + yaw_rate * time_s / 2.0).sin_cos();
         let (ahead_m, aside_m) = (speed * time_s, lever_m * yaw_rate * time_s);
@@ -146,16 +153,18 @@ impl MotionFilter {
             0.0,
             0.0,
             0.0,
+            0.0,
         ]) * ACCELERATION_STD;
         let turned =
-            State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0]) * yaw_acceleration_std;
+            State::from([0.0, 0.0, half_square, 0.0, time_s, 0.0, 0.0, 0.0]) * yaw_acceleration_std;
         let slipped =
-            State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
+            State::from([-sin, cos, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) * SLIP_STD_M * time_s.sqrt();
         self.covariance = step * self.covariance * step.transpose()
             + pushed * pushed.transpose()
             + turned * turned.transpose()
             + slipped * slipped.transpose();
         self.covariance[(BIAS, BIAS)] += BIAS_DRIFT_STD * BIAS_DRIFT_STD * time_s;
+        self.covariance[(SCALE, SCALE)] += SCALE_DRIFT_STD * SCALE_DRIFT_STD * time_s;
     }
 
     fn advance_height(&mut self, time_s: f64) {
@@ -179,15 +188,27 @@ impl MotionFilter {
 
     /// Uses the speed that the vehicle measured at the time of the state.
     pub(super) fn correct_speed(&mut self, speed_mps: f64) {
-        if !speed_mps.is_finite() {
-            return;
-        }
+        let (off, variance, selects) = self.speed_innovation(speed_mps);
+        let gain = self.covariance * selects.transpose() / variance;
+        self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
+    }
+
+    /// Squared Mahalanobis distance between a speed that the vehicle measured at the time of the state and the state.
+    pub(super) fn speed_distance_squared(&self, speed_mps: f64) -> f64 {
+        let (off, variance, _) = self.speed_innovation(speed_mps);
+        off * off / variance
+    }
+
+    /// Measured speed at its scale minus that of the state (m/s), the variance of the difference, and its derivative by
+    /// the state, negative. It is linear in the state: the speed of the state need not be known.
+    fn speed_innovation(&self, speed_mps: f64) -> (f64, f64, RowSVector<f64, STATES>) {
         let mut selects = RowSVector::<f64, STATES>::zeros();
         selects[SPEED] = 1.0;
-        let variance = self.covariance[(SPEED, SPEED)] + SPEED_STD_MPS * SPEED_STD_MPS;
-        let gain = self.covariance.column(SPEED) / variance;
-        let off = speed_mps - self.state[SPEED];
-        self.move_by(&(gain * off), &(Covariance::identity() - gain * selects));
+        selects[SCALE] = -speed_mps;
+        let off = speed_mps * (1.0 + self.state[SCALE]) - self.state[SPEED];
+        let variance =
+            (selects * self.covariance * selects.transpose())[0] + SPEED_STD_MPS * SPEED_STD_MPS;
+        (off, variance, selects)
     }
 
     /// Squared Mahalanobis distance between a pose of the same time and the state: x, y and yaw.
@@ -254,6 +275,11 @@ impl MotionFilter {
             yy_m2: entry(Y, Y),
             yaw_rad2: entry(YAW, YAW),
         }
+    }
+
+    /// Speed along the heading, metres per second.
+    pub(super) fn speed_mps(&self) -> f64 {
+        self.state[SPEED]
     }
 
     /// Standard deviation of the speed, metres per second.

@@ -301,3 +301,75 @@ fn a_tunnel_and_a_restarted_scene_end_the_track() {
         "the clock went back"
     );
 }
+
+/// Follows the drive with a measurement in every fourth sweep, at the speed that `measures_mps` makes of the true one.
+/// Position errors and bounds of all predictions, and the tracker at the end.
+fn driven_at_speeds(
+    measures_mps: impl Fn(f64) -> f64,
+    seed: u64,
+) -> (Vec<(f64, f64)>, PoseTracker) {
+    let mut tracker = PoseTracker::new(LIMITS);
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let noise = Normal::new(0.0, 0.03).unwrap();
+    let mut results = Vec::new();
+    for sweep in 0..120 {
+        let motion = EgoMotion {
+            speed_mps: Some(measures_mps(10.0)),
+            ..motion(sweep, 0.0)
+        };
+        if let Some(state) = tracker.predict(sweep * TENTH_NANOS, &motion) {
+            results.push((error_m(&state, sweep), state.covariance.bound_95_m()));
+        }
+        if sweep % 4 == 0 || tracker.needs_measurement() {
+            let off_m = [noise.sample(&mut random), noise.sample(&mut random)];
+            tracker.correct(&measured(sweep, off_m, 0.03));
+        }
+    }
+    (results, tracker)
+}
+
+/// Mean error (metres) and share of the errors beyond their bounds over some drives at these speeds.
+fn errors_at_speeds(measures_mps: impl Fn(f64) -> f64) -> (f64, f64) {
+    let results: Vec<(f64, f64)> = (0..10)
+        .flat_map(|seed| driven_at_speeds(&measures_mps, seed).0)
+        .collect();
+    let exceeded = results
+        .iter()
+        .map(|(error_m, bound_m)| f64::from(error_m > bound_m));
+    (
+        mean(results.iter().map(|(error_m, _)| *error_m)),
+        mean(exceeded),
+    )
+}
+
+#[test]
+fn the_bound_holds_at_any_scale_of_the_speed_and_without_it() {
+    let (right_m, _) = errors_at_speeds(|speed| speed);
+    for scale in [0.95, 1.0, 1.05, 1.3, 0.0, 2.0, 3.6, -1.0] {
+        let (error_m, exceeded) = errors_at_speeds(|speed| scale * speed);
+        assert!(exceeded <= 0.05, "{scale}: {exceeded} beyond the bound");
+        assert!(
+            error_m < 0.3,
+            "{scale}: {error_m} m, {right_m} m with the right speed"
+        );
+    }
+    assert!(right_m < 0.06, "{right_m}");
+}
+
+#[test]
+fn a_speed_that_poses_contradict_is_named_and_one_of_a_slightly_wrong_scale_is_not() {
+    for (scale, is_refuted) in [
+        (1.0, false),
+        (1.05, false),
+        (1.3, false),
+        (0.0, true),
+        (3.6, true),
+    ] {
+        let (_, tracker) = driven_at_speeds(|speed| scale * speed, 1);
+        let refuted = tracker.refuted_speed();
+        assert_eq!(refuted.is_some(), is_refuted, "{scale}: {refuted:?}");
+        if let Some(refuted) = refuted {
+            assert!((refuted.of_poses_mps - 10.0).abs() < 1.0, "{refuted:?}");
+        }
+    }
+}

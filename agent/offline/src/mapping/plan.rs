@@ -5,6 +5,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 
 use super::check::LEAST_CHECKED;
 use crate::Error;
@@ -117,7 +118,8 @@ impl StoredPlan {
     /// The plan of a stopped map of `sweeps` sweeps.
     pub(super) fn read(out: &Path, sweeps: usize) -> Result<Plan, Error> {
         let path = out.join(Self::FILE);
-        let text = fs::read_to_string(&path).map_err(|error| error.to_string());
+        let text =
+            bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|error| error.to_string());
         let stored = text.and_then(|text| {
             serde_json::from_str::<Self>(&text).map_err(|error| error.to_string())
         });

@@ -5,19 +5,19 @@
 //! of its sweeps.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs;
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use support::atomic_file;
 use support::file_error::{AtFile, FileError};
+use support::{atomic_file, bounded_file};
 use tch::nn::VarStore;
 use tch::{Tensor, no_grad};
 
 use super::adamw::AdamW;
 use crate::tensor_values::values;
+use crate::weights::MAX_BYTES;
 
 /// Name of the checkpoint in the folder of the results.
 pub(super) const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
@@ -75,7 +75,7 @@ pub(crate) fn restore<P: DeserializeOwned>(
     variables: &VarStore,
     optimizer: &mut AdamW,
 ) -> Result<P, FileError> {
-    let bytes = fs::read(path).at(path)?;
+    let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
     let incomplete = |error| format!("not a complete checkpoint: {error}");
     let (_, header) = SafeTensors::read_metadata(&bytes)
         .map_err(incomplete)
@@ -126,6 +126,8 @@ fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorErro
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use tch::nn::Init;
     use tch::{Device, Kind};
 

@@ -1,10 +1,11 @@
 //! Training curve as CSV.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use support::atomic_file;
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::file_error::{AtFile, FileError};
 
 /// Appends rows that begin with the step; every row is on disk when the call returns.
@@ -22,7 +23,10 @@ impl Curve {
     /// [`FileError`] when the file cannot be read or written.
     pub fn open(path: &Path, header: &str, checkpoint: Option<u64>) -> Result<Self, FileError> {
         let kept = match checkpoint {
-            Some(step) if path.exists() => rows_until(&fs::read_to_string(path).at(path)?, step),
+            Some(step) if path.exists() => rows_until(
+                &bounded_file::read_text(path, MAX_TEXT_BYTES).at(path)?,
+                step,
+            ),
             _ => format!("{header}\n"),
         };
         atomic_file::write(path, kept).at(path)?;
@@ -73,6 +77,8 @@ fn rows_until(csv: &str, step: u64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

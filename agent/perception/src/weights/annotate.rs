@@ -1,17 +1,16 @@
 //! Annotation of an existing weights file with a text.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::Path;
 
 use protocol::text::hex;
 use safetensors::tensor::SafeTensors;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
-use support::atomic_file;
 use support::file_error::{AtFile, FileError};
+use support::{atomic_file, bounded_file};
 
-use super::incomplete;
+use super::{MAX_BYTES, incomplete};
 
 /// Key of the header that contains the metadata.
 const METADATA: &str = "__metadata__";
@@ -22,7 +21,7 @@ const METADATA: &str = "__metadata__";
 /// # Errors
 /// [`FileError`] when the file is missing, not a complete safetensors file or not writable.
 pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, FileError> {
-    let old = fs::read(path).at(path)?;
+    let old = bounded_file::read(path, MAX_BYTES).at(path)?;
     SafeTensors::deserialize(&old).map_err(|error| incomplete(path, old.len(), error))?;
     let new = annotated(&old, key, text)
         .map_err(|error| FileError::new(path, format_args!("metadata {key:?}: {error}")))?;
@@ -56,6 +55,8 @@ fn annotated(file: &[u8], key: &str, text: &str) -> Result<Vec<u8>, serde_json::
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use tch::nn::VarStore;
     use tch::{Device, Kind};
 

@@ -56,7 +56,7 @@ struct Values {
 }
 
 /// Largest file that is read, bytes: a hundred times the largest network here.
-const MAX_BYTES: u64 = 4 << 30;
+pub(crate) const MAX_BYTES: u64 = 4 << 30;
 
 impl Weights {
     /// Reads a whole file.

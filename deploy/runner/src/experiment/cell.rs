@@ -1,13 +1,14 @@
 //! Cells: results of evaluations, cached on disk by everything that they were made of. Sweeps and tables print them.
 
+use std::io;
 use std::path::{Path, PathBuf};
-use std::{fs, io};
 
 use anyhow::{Context, Result};
 use deploy::score::metrics::{Messages, Metrics};
 use fusion::Method;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::provenance::Provenance;
 
 /// Digits of the key in the name of a file.
@@ -55,7 +56,7 @@ impl Cell {
     /// An error when the file cannot be read or is no cached cell.
     pub fn read(key: &CellKey, folder: &Path) -> Result<Option<Self>> {
         let path = key.file(folder);
-        let text = match fs::read_to_string(&path) {
+        let text = match bounded_file::read_text(&path, MAX_TEXT_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(error).with_context(|| path.display().to_string()),
@@ -92,6 +93,8 @@ pub(crate) fn file_name(method: Method) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

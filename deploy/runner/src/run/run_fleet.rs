@@ -384,7 +384,8 @@ fn write(
         }
         Err(_) => None,
     };
-    let metrics = metrics(fleet, &board, &progress, &sum);
+    let mut metrics = metrics(fleet, &board, &progress, &sum);
+    metrics.left_out.add_findings(fleet.findings.clone());
     let metrics = Metrics {
         ticks: metrics.answered + missed,
         provenance: provenance.clone().map(Provenance::with_command),

@@ -154,7 +154,8 @@ fn write(
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
     let (poses, seconds) = (fleet.pose_source(), board.seconds());
-    let metrics = metrics(board, evaluator, "stepped", poses, seconds);
+    let mut metrics = metrics(board, evaluator, "stepped", poses, seconds);
+    metrics.left_out.add_findings(fleet.findings.clone());
     let provenance = fleet.provenance(&options.programs);
     let provenance = provenance
         .inspect_err(|error| tracing::warn!("no hashes of what the run read: {error}"))

@@ -4,6 +4,7 @@ use csv::StringRecord;
 use figures::{self, Axis, Chart, Mark, Series};
 use perception::train::{Curve, Trainer};
 use perception::weights::FileError;
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::csv_file;
 use support::file_error::AtFile;
 
@@ -57,7 +58,7 @@ impl DetectorCurve {
     /// Draws the curve so far, including rows of an interrupted training, into a PNG file beside it.
     pub(super) fn draw(&self, title: &str) -> Result<(), Error> {
         let path = self.0.path();
-        let text = std::fs::read_to_string(path).at(path)?;
+        let text = bounded_file::read_text(path, MAX_TEXT_BYTES).at(path)?;
         Ok(figures::save_png(
             &charts(title, &text),
             &path.with_extension("png"),

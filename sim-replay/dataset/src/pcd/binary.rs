@@ -5,6 +5,7 @@
 
 use super::header::{Field, Header, IntensitySource, Kind};
 use super::{PcdCloud, PcdError, lzf, unpack_rgb};
+use crate::points::MAX_BYTES;
 
 /// Position of a field's numbers: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
@@ -54,6 +55,10 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
         );
         return Err(PcdError::of("DATA", reason));
     };
+    if unpacked_len as u64 > MAX_BYTES {
+        let reason = format!("{unpacked_len} bytes unpacked, at most {MAX_BYTES} are read");
+        return Err(PcdError::of("DATA", reason));
+    }
     let (points, stride) = (header.points, header.stride());
     let expected = points.checked_mul(stride);
     if expected != Some(unpacked_len) {

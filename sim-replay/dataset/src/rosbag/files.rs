@@ -1,10 +1,10 @@
 //! Files of a bag: one file, or those that `metadata.yaml` lists, unpacked where they are compressed.
 
 use std::borrow::Cow;
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use support::bounded_file;
 use tempfile::TempPath;
 
 use crate::ReadError;
@@ -19,8 +19,6 @@ const INFORMATION: &str = "rosbag2_bagfile_information";
 const COMPRESSED: &str = ".zstd";
 /// Bytes by which zstd data begin.
 const ZSTD_MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
-/// Largest message after decompression, bytes.
-const MAX_MESSAGE_BYTES: u64 = 1 << 30;
 /// Bytes of a description that are searched for its key.
 const HEAD_BYTES: u64 = 4096;
 
@@ -63,7 +61,7 @@ pub(super) fn is_bag(path: &Path) -> bool {
 /// True for a folder with the description of a bag.
 fn is_described(dir: &Path) -> bool {
     let mut head = Vec::new();
-    let read = File::open(dir.join(METADATA))
+    let read = bounded_file::open(&dir.join(METADATA))
         .and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head));
     read.is_ok() && String::from_utf8_lossy(&head).contains(INFORMATION)
 }
@@ -156,12 +154,7 @@ impl Unpacked {
         if !is_compressed {
             return Ok(Self::AsIs(path.to_owned()));
         }
-        let unpack = || -> io::Result<TempPath> {
-            let mut copy = tempfile::NamedTempFile::new()?;
-            zstd::stream::copy_decode(File::open(path)?, copy.as_file_mut())?;
-            Ok(copy.into_temp_path())
-        };
-        unpack()
+        unpacked_copy(path)
             .map(Self::Copy)
             .map_err(|error| ReadError::malformed(path, format!("cannot be unpacked: {error}")))
     }
@@ -174,6 +167,19 @@ impl Unpacked {
     }
 }
 
+fn unpacked_copy(path: &Path) -> io::Result<TempPath> {
+    let file = bounded_file::open(path)?;
+    let most = bounded_file::most_unpacked(file.metadata()?.len());
+    let mut unpacked = zstd::stream::Decoder::new(file)?.take(most.saturating_add(1));
+    let mut copy = tempfile::NamedTempFile::new()?;
+    if io::copy(&mut unpacked, copy.as_file_mut())? > most {
+        return Err(io::Error::other(format!(
+            "more than {most} bytes, the most that is read of a file of this size"
+        )));
+    }
+    Ok(copy.into_temp_path())
+}
+
 /// A message as it was published, unpacked if it is compressed by itself: a message in CDR never begins as zstd does.
 pub(super) fn unpacked_message(data: &[u8]) -> io::Result<Cow<'_, [u8]>> {
     if !data.starts_with(&ZSTD_MAGIC) {
@@ -181,6 +187,7 @@ pub(super) fn unpacked_message(data: &[u8]) -> io::Result<Cow<'_, [u8]>> {
     }
     let mut message = Vec::new();
     let decoder = zstd::stream::Decoder::new(data)?;
-    decoder.take(MAX_MESSAGE_BYTES).read_to_end(&mut message)?;
+    let most = bounded_file::most_unpacked(data.len() as u64);
+    decoder.take(most).read_to_end(&mut message)?;
     Ok(Cow::Owned(message))
 }

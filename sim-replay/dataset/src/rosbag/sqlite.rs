@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 use rusqlite::{Connection, OpenFlags, Result, Row};
+use support::bounded_file;
 
 use super::files::unpacked_message;
 use super::scan::{At, Message, Place, Scan, Topic};
@@ -24,6 +25,7 @@ impl SqliteFile {
     ) -> std::result::Result<Self, ReadError> {
         let fault = |error| ReadError::malformed(name, format!("SQLite: {error}"));
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        bounded_file::open(path).map_err(|error| ReadError::io(name, error))?;
         let connection = Connection::open_with_flags(path, flags).map_err(fault)?;
         for (id, topic) in topics(&connection).map_err(fault)? {
             if !scan.declare(&topic) {

@@ -208,6 +208,54 @@ fn a_chunk_that_asks_for_a_huge_window_is_refused() {
 }
 
 #[test]
+fn chunks_that_unpack_to_far_more_than_the_file_are_left_out_and_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = WriteOptions::new()
+        .compression(Some(Compression::Zstd))
+        .emit_summary_records(false);
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    let mut writer = options.create(&mut bytes).unwrap();
+    let message = Message {
+        channel: Arc::new(mcap::Channel {
+            id: 0,
+            topic: "zeros".into(),
+            schema: None,
+            message_encoding: "cdr".into(),
+            metadata: std::collections::BTreeMap::new(),
+        }),
+        sequence: 0,
+        log_time: 1,
+        publish_time: 1,
+        data: std::borrow::Cow::Owned(vec![0; 20 << 20]),
+    };
+    writer.write(&message).unwrap();
+    writer.finish().unwrap();
+    drop(writer);
+    let bytes = bytes.into_inner();
+    let begin = chunk_places(&bytes)[0];
+    let len = 9 + u64::from_le_bytes(bytes[begin + 1..begin + 9].try_into().unwrap()) as usize;
+    let (head, chunk) = (&bytes[..begin], &bytes[begin..begin + len]);
+    let file = [head, &chunk.repeat(10), &bytes[begin + len..]].concat();
+    let mut read = 0;
+    let file = McapFile::open(&write(folder.path(), &file), &mut |_, _| {
+        read += 1;
+        true
+    })
+    .unwrap();
+    // 64 MiB, and 300 times a file of some kilobytes.
+    assert!((4..8).contains(&read), "{read} of 10 messages");
+    let damage = file
+        .damage()
+        .iter()
+        .map(ToString::to_string)
+        .collect::<Vec<_>>();
+    assert!(
+        damage[0].contains("at most are read of a file of this size"),
+        "{damage:?}"
+    );
+}
+
+#[test]
 fn a_record_that_reaches_beyond_its_chunk_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let mut bytes = recorded(

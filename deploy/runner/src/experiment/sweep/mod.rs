@@ -28,6 +28,7 @@ use fusion::Exchange;
 use perception::weights::Weights;
 use serde::Serialize;
 use simulator::generate::{self, Subset, SynthOptions};
+use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::file_error::FileError;
 use support::{output, progress};
 use training::feature_store::FeatureStore;
@@ -348,8 +349,8 @@ impl Sweep {
             let each = figure.charts.chunks(1).map(figures::svg);
             drawings.push(each.collect::<Result<Vec<_>, _>>()?);
         }
-        let spec =
-            fs::read_to_string(&self.file).with_context(|| self.file.display().to_string())?;
+        let spec = bounded_file::read_text(&self.file, MAX_TEXT_BYTES)
+            .with_context(|| self.file.display().to_string())?;
         let page = html::page(&self.experiment, &spec, runs, &drawings);
         write(&self.out.join("report.html"), &page)?;
         let name = format!("{}.csv", self.experiment.name);

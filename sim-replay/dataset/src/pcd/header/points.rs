@@ -4,7 +4,7 @@ use super::super::PcdError;
 use super::Entries;
 
 /// Limit on the number of points, above that of any sweep; a header that states more is invalid.
-const MAX_POINTS: u64 = 50_000_000;
+const MAX_POINTS: u64 = 10_000_000;
 
 impl Entries<'_> {
     /// `POINTS`, or `WIDTH` times `HEIGHT`: the values present must be consistent, and one of `POINTS` and `WIDTH` is

@@ -145,7 +145,7 @@ fn absurd_counts_are_refused() {
         Header::parse(absurd.as_bytes())
             .unwrap_err()
             .reason
-            .contains("at most 50000000")
+            .contains("at most 10000000")
     );
     let wrapping = SOUND
         .replace("WIDTH 2", "WIDTH 9223372036854775808")

@@ -1,0 +1,117 @@
+//! Track: motion filter that uses the vehicle's speed, and one beside it that does not and so can contradict that speed.
+
+use protocol::{EgoMotion, PlanarCovariance};
+
+use super::measurement::PoseMeasurement;
+use super::motion_filter::MotionFilter;
+
+/// Squared Mahalanobis distance between a measured speed and that of the poses from which on they contradict each other:
+/// four standard deviations, since a vehicle that brakes hard is ahead of the poses.
+const SPEED_GATE: f64 = 16.0;
+/// Gate of a measured pose: 99.9 % quantile of the chi-square distribution with three degrees of freedom.
+const POSE_GATE: f64 = 16.27;
+/// Contradictions in a row after which a speed is not used any more: a second of sweeps, longer than wheels slip.
+const MOST_CONTRADICTIONS: u32 = 10;
+
+/// Speed that poses contradict.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SpeedContradiction {
+    /// Speed that the vehicle measures, metres per second.
+    pub measured_mps: f64,
+    /// Speed that the poses of its sweeps give, metres per second.
+    pub of_poses_mps: f64,
+}
+
+/// Trust in the speed that a vehicle measures, over all its tracks.
+#[derive(Debug, Clone, Default)]
+pub(super) struct SpeedTrust {
+    in_a_row: u32,
+    pub(super) refuted: Option<SpeedContradiction>,
+}
+
+impl SpeedTrust {
+    /// Judges a speed by a filter that has not used it; true if it can be used.
+    fn admits(&mut self, unaided: &MotionFilter, measured_mps: f64) -> bool {
+        if self.refuted.is_some() {
+            return false;
+        }
+        if unaided.speed_distance_squared(measured_mps) <= SPEED_GATE {
+            self.in_a_row = 0;
+            return true;
+        }
+        self.in_a_row += 1;
+        if self.in_a_row >= MOST_CONTRADICTIONS {
+            self.refuted = Some(SpeedContradiction {
+                measured_mps,
+                of_poses_mps: unaided.speed_mps(),
+            });
+        }
+        false
+    }
+}
+
+/// State of a vehicle that is not lost.
+#[derive(Debug, Clone)]
+pub(super) struct Track {
+    pub(super) filter: MotionFilter,
+    /// Filter without the measured speed.
+    unaided: MotionFilter,
+}
+
+impl Track {
+    /// Track from a first pose on, at a speed with its standard deviation if one is known (metres per second).
+    pub(super) fn at(measurement: &PoseMeasurement, speed_mps: Option<[f64; 2]>) -> Self {
+        let mut filter = MotionFilter::at(measurement);
+        if let Some([speed_mps, std_mps]) = speed_mps {
+            filter.set_speed(speed_mps, std_mps);
+        }
+        Self {
+            unaided: filter.clone(),
+            filter,
+        }
+    }
+
+    /// Moves to a later capture time. A speed that the poses contradict is not used, and what it did before is undone.
+    pub(super) fn advance(
+        &mut self,
+        capture_nanos: u64,
+        motion: &EgoMotion,
+        trust: &mut SpeedTrust,
+    ) {
+        for filter in [&mut self.filter, &mut self.unaided] {
+            filter.advance(capture_nanos, motion.yaw_rate_rad_s);
+        }
+        match motion.speed_mps.filter(|speed| speed.is_finite()) {
+            Some(speed) if trust.admits(&self.unaided, speed) => self.filter.correct_speed(speed),
+            Some(_) => self.filter = self.unaided.clone(),
+            None => {}
+        }
+    }
+
+    /// Uses a pose of the same time; false if it contradicts the track. A pose that only the filter without the speed
+    /// expects is right, and the speed wrong.
+    pub(super) fn correct(&mut self, measurement: &PoseMeasurement) -> bool {
+        let is_expected = |filter: &MotionFilter| {
+            filter.capture_nanos == measurement.capture_nanos
+                && filter.distance_squared(measurement) <= POSE_GATE
+        };
+        match (is_expected(&self.filter), is_expected(&self.unaided)) {
+            (false, false) => return false,
+            (false, true) => self.filter = self.unaided.clone(),
+            (true, _) => {}
+        }
+        self.filter.correct(measurement);
+        self.unaided.correct(measurement);
+        true
+    }
+
+    /// Covariance of the pose.
+    pub(super) fn covariance(&self) -> PlanarCovariance {
+        self.filter.planar_covariance()
+    }
+
+    /// Standard deviation of the speed that the poses alone give, metres per second.
+    pub(super) fn speed_std_mps(&self) -> f64 {
+        self.unaided.speed_std_mps()
+    }
+}
