@@ -339,7 +339,7 @@ mod tests {
                 arrived_nanos,
             },
         );
-        assert_eq!(clocks.update(), [cav.clone()]);
+        assert_eq!(clocks.update(), std::slice::from_ref(&cav));
         let mut states = Vec::new();
         clocks.describe(&mut states);
         assert!(states[0].capture_offset_s.unwrap() > 9e9);
