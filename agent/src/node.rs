@@ -3,6 +3,7 @@
 //! It subscribes to the sensors of its own vehicle only; access control keeps the ground truth from it. One thread
 //! receives, computes and submits; encoding and sending have threads of their own.
 
+use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,11 +11,12 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
-    Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription,
+    Arrival, Bus, BusError, Event, Inbox, MessageStats, NETWORK_TRANSIT_S, Publisher,
+    PublisherOptions, Subscription,
 };
 use perception::detector::Detector;
 use protocol::codec::CodecConfig;
-use protocol::message::{Bev, Boxes, Descriptor, Points};
+use protocol::message::{Bev, Boxes, Descriptor, Points, SweepArrival};
 use protocol::{
     CavId, DropReason, Dtype, Gnss, GnssSource, KeyExpr, Lidar, Limits, Pace, PointCloud,
     PoseEstimate, Role, Stream, Topic, wire,
@@ -31,8 +33,12 @@ use crate::sweep_selection::{MAX_EGOS, SweepSelection};
 const POSE_TIMEOUT: Duration = Duration::from_millis(200);
 /// Poses that may wait in the inbox while a sweep is computed.
 const POSE_SLOTS: usize = 32;
-/// Period at which an agent publishes its descriptor, for processes that join late.
-const DESCRIPTOR_PERIOD: Duration = Duration::from_secs(1);
+/// Period at which an agent publishes its descriptor, for processes that join late and as a report of its sweeps.
+const DESCRIPTOR_PERIOD: Duration = Duration::from_millis(500);
+/// First sweeps that are reported at once: so many make an estimate of the capture clock.
+const EARLY_SWEEPS: usize = 3;
+/// Sweeps of a report at most.
+const MAX_SWEEPS: usize = 32;
 
 /// Options of an agent's node.
 #[derive(Debug, Clone)]
@@ -253,6 +259,10 @@ impl<'a> Node<'a> {
 
     fn admit(&mut self, arrival: Arrival) {
         let capture_nanos = arrival.header.stamp.capture_nanos;
+        if arrival.topic == self.lidar {
+            self.publishers
+                .note_sweep(capture_nanos, arrival.unix_nanos());
+        }
         if let Topic::Stream {
             cav,
             stream: Stream::Pace,
@@ -354,7 +364,10 @@ impl<'a> Node<'a> {
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else {
                 continue;
             };
-            self.bus.stats().timed("lidar transport", sweep.transport());
+            let stats = self.bus.stats();
+            if let Some(transport) = stats.transport(&sweep, NETWORK_TRANSIT_S) {
+                stats.timed("lidar transport", transport);
+            }
             let arrived_nanos = sweep.unix_nanos();
             let is_used = self.process(&AgentInput {
                 capture_nanos,
@@ -460,6 +473,10 @@ struct Publishers {
     /// Feature maps submitted so far.
     submitted: u64,
     next_descriptor: Instant,
+    /// Capture and arrival times of the sweeps since the last descriptor, nanoseconds.
+    sweeps: VecDeque<(u64, u64)>,
+    /// Sweeps that are still reported at once.
+    early: usize,
 }
 
 impl Publishers {
@@ -488,6 +505,7 @@ impl Publishers {
             streams: std::iter::once(Stream::Pose)
                 .chain(options.publish.iter().copied())
                 .collect(),
+            sweeps: Vec::new(),
         };
         let descriptor = agent.detector().map(|detector| {
             let publisher = publisher(Stream::Descriptor, PublisherOptions::POSE)?;
@@ -503,6 +521,8 @@ impl Publishers {
             rate: Arc::new(Mutex::new(RateControl::new(options.rate))),
             submitted: 0,
             next_descriptor: Instant::now(),
+            sweeps: VecDeque::new(),
+            early: EARLY_SWEEPS,
         })
     }
 
@@ -510,9 +530,41 @@ impl Publishers {
         let now = Instant::now();
         if now >= self.next_descriptor {
             self.next_descriptor = now + DESCRIPTOR_PERIOD;
+            let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
+            let arrival = |(capture, arrived_nanos): (u64, u64)| SweepArrival {
+                before_nanos: newest.saturating_sub(capture),
+                arrived_nanos,
+            };
+            let sweeps = self.sweeps.drain(..).map(arrival).collect();
             if let Some((publisher, description)) = &self.descriptor {
-                publisher.submit(0, description.clone());
+                let streams = description.streams.clone();
+                publisher.submit(
+                    newest,
+                    Descriptor {
+                        sweeps,
+                        streams,
+                        ..*description
+                    },
+                );
             }
+        }
+    }
+
+    /// Adds a sweep to the next descriptor.
+    fn note_sweep(&mut self, capture_nanos: u64, arrived_nanos: u64) {
+        // The clock of the scene was set back.
+        if (self.sweeps.back()).is_some_and(|(newest, _)| capture_nanos < *newest) {
+            self.sweeps.clear();
+        }
+        self.sweeps.push_back((capture_nanos, arrived_nanos));
+        if self.sweeps.len() > MAX_SWEEPS {
+            self.sweeps.pop_front();
+        }
+        if self.early > 0 {
+            self.early -= 1;
+            self.next_descriptor = Instant::now();
+            // Before the sweep is computed.
+            self.describe();
         }
     }
 

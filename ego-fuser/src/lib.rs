@@ -1,7 +1,8 @@
 //! Ego of a collaborating fleet: received BEV feature maps, poses and boxes in, detections around the ego out.
 //!
 //! - [`ego`]: the pipeline, the same live and offline; [`node`]: the process around it.
-//! - [`pairing`]: the messages that belong to a frame; [`silence`]: the neighbours that it waits for.
+//! - [`pairing`]: the messages that belong to a frame; [`silence`]: the neighbours that it waits for; [`capture_clock`]:
+//!   neighbours whose capture times differ.
 //! - [`misbehaviour`]: neighbours whose messages contradict the ego's perception.
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
@@ -24,6 +25,7 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+pub mod capture_clock;
 mod command;
 pub mod command_line;
 pub mod config;

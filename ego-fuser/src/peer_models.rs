@@ -83,6 +83,7 @@ impl PeerModels {
             channels,
             dtype: _,
             streams: _,
+            sweeps: _,
         } = descriptor;
         if *grid != self.grid {
             Some(OtherModel::Grid {
@@ -135,6 +136,7 @@ mod tests {
             channels: 64,
             dtype: Dtype::I8,
             streams: vec![Stream::Bev],
+            sweeps: vec![],
         };
         assert_eq!(models.update(&cav, &same), None);
         assert!(!models.is_other(&cav));

@@ -99,7 +99,7 @@ class Detections:
         """Neighbours that were not: ``cav``, ``reason``."""
     @property
     def neighbours(self) -> list[dict[str, Any]]:
-        """State of neighbours: ``cav``, ``trust``, ``misbehaviour``, ``clock_offset_s``."""
+        """State of neighbours: ``cav``, ``trust``, ``misbehaviour``, ``clock_offset_s``, ``capture_offset_s``."""
     @property
     def stages_ms(self) -> dict[str, float]:
         """Durations of the ego's stages, milliseconds."""

@@ -45,6 +45,8 @@ named! {
         /// Taken by the router and not handed on to this receiver, which took earlier messages too slowly or had lost
         /// its connection.
         Undelivered = "undelivered",
+        /// The capture clock of its sender is unsteady or was corrected anew.
+        Clock = "clock",
     }
 }
 

@@ -139,7 +139,7 @@ pub use message::{
     DetectionsReport, EgoMotion, FusedNeighbour, Gnss, GnssSource, ImageFormat, Kind, Lidar,
     Message, ModelHash, NeighbourState, NoPoseReason, Pace, Payload, Pinhole, PlanarCovariance,
     Points, PoseEstimate, ProcessUsage, Radar, SkippedNeighbour, StageSummary, StageTiming, Stats,
-    TopicCount, TopicTraffic, TrueObject, Truth,
+    SweepArrival, TopicCount, TopicTraffic, TrueObject, Truth,
 };
 pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};

@@ -260,7 +260,7 @@ impl RunStatus {
     }
 
     fn neighbours_table(&self) -> TextTable {
-        let numbers = ["clock ms", "trust"].map(|name| (name, Side::Right));
+        let numbers = ["clock ms", "capture ms", "trust"].map(|name| (name, Side::Right));
         let mut table = TextTable::new(
             [("neighbour", Side::Left)]
                 .into_iter()
@@ -271,6 +271,7 @@ impl RunStatus {
             table.row([
                 neighbour.cav.to_string(),
                 optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
+                optional(neighbour.capture_offset_s.map(|seconds| seconds * 1e3), 1),
                 optional(neighbour.trust, 2),
                 neighbour
                     .misbehaviour
@@ -419,6 +420,7 @@ mod tests {
             trust: Some(0.03),
             misbehaviour: Some(protocol::MisbehaviourReason::GhostObjects),
             clock_offset_s: Some(0.0125),
+            capture_offset_s: Some(0.3),
         };
         let progress = Progress {
             frames: 7,
@@ -441,7 +443,7 @@ mod tests {
             "{table}"
         );
         assert!(
-            table.ends_with("4279           12.5   0.03  ghost_objects\n"),
+            table.ends_with("4279           12.5       300.0   0.03  ghost_objects\n"),
             "{table}"
         );
         assert!(

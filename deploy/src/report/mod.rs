@@ -1,20 +1,23 @@
 //! `report.json`: pace, latency, stages, CPU, memory and bytes of a run that has ended.
 
 mod capacity;
+mod clocks;
 mod comparison;
 mod pace;
 mod resources;
 mod text;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use protocol::RunId;
+use protocol::{CavId, RunId};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
 use support::statistics::{quantile, sorted};
 
 pub use capacity::{Capacity, Machine};
+pub use clocks::OtherClock;
 pub use comparison::Comparison;
 pub use pace::{AgentPace, Pace};
 pub use resources::{ProcessResources, StageTimes, StreamBytes};
@@ -50,6 +53,9 @@ pub struct RunReport {
     pub processes: Vec<ProcessResources>,
     /// Published bytes by stream.
     pub streams: Vec<StreamBytes>,
+    /// Vehicles whose clocks differ from the ego's.
+    #[serde(default)]
+    pub other_clocks: BTreeMap<CavId, OtherClock>,
 }
 
 /// Quantiles of a sample; `null` for an empty one.
@@ -124,6 +130,7 @@ impl RunReport {
             stages: resources::stages(processes),
             processes: resources::processes(processes, &pace),
             streams: resources::streams(processes),
+            other_clocks: clocks::others(&metrics.neighbours),
             pace,
         }
     }

@@ -25,6 +25,9 @@ impl fmt::Display for RunReport {
             "latency   capture to detection: {}",
             milliseconds(&self.latency_ms)
         )?;
+        for (cav, clock) in &self.other_clocks {
+            writeln!(f, "clock     {cav}: {clock}")?;
+        }
         for (rows, table) in [
             (self.stages.len(), self.stage_table()),
             (self.processes.len(), self.process_table()),

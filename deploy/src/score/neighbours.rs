@@ -24,6 +24,9 @@ pub struct NeighbourRecord {
     /// Offset of its clock from the ego's, less the shortest transmission time, at the end, seconds; `None` in
     /// simulation time.
     pub clock_offset_s: Option<f64>,
+    /// Offset of its capture times from the ego's that the ego corrected last, seconds; `None` if they agreed.
+    #[serde(default)]
+    pub capture_offset_s: Option<f64>,
     /// Misbehaviour reason at the end, if it was excluded.
     pub misbehaviour: Option<MisbehaviourReason>,
 }
@@ -58,6 +61,7 @@ pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &De
                 .flatten()
                 .reduce(f64::min);
             record.clock_offset_s = neighbour.clock_offset_s.or(record.clock_offset_s);
+            record.capture_offset_s = neighbour.capture_offset_s.or(record.capture_offset_s);
         });
     }
 }

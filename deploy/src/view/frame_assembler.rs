@@ -580,6 +580,7 @@ impl OpenFrame {
             };
             (link.trust, link.misbehaviour) = (known.trust, known.misbehaviour);
             link.clock_ms = known.clock_offset_s.map(|seconds| seconds * 1e3);
+            link.capture_ms = known.capture_offset_s.map(|seconds| seconds * 1e3);
         }
         all
     }

@@ -149,6 +149,8 @@ pub struct Link {
     pub misbehaviour: Option<MisbehaviourReason>,
     /// Offset of the sender's clock from the receiver's, less the shortest transmission time, milliseconds.
     pub clock_ms: Option<f64>,
+    /// Offset of the sender's capture times from the receiver's that the receiver corrects, milliseconds.
+    pub capture_ms: Option<f64>,
 }
 
 /// The stages of a process.

@@ -100,6 +100,7 @@ fn detections_of(ego: &str, tick: u64) -> Detections {
             trust: Some(0.75),
             misbehaviour: None,
             clock_offset_s: Some(-0.25),
+            capture_offset_s: Some(0.3),
         }],
         stages: vec![
             StageTiming::new("wait", Duration::from_millis(12)),
@@ -303,8 +304,8 @@ fn check(frame: &Value, points: usize) {
         (&OTHER.into(), &1_250.into(), &true.into())
     );
     assert_eq!(
-        (&link["trust"], &link["clock_ms"]),
-        (&0.75.into(), &(-250.0).into())
+        (&link["trust"], &link["clock_ms"], &link["capture_ms"]),
+        (&0.75.into(), &(-250.0).into(), &300.0.into())
     );
 }
 

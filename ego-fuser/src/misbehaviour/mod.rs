@@ -107,10 +107,9 @@ pub fn neighbour_states(
             .find(|(known, _)| *known == index)
             .map(|(_, assessment)| assessment);
         NeighbourState {
-            cav: view.cav.clone(),
             trust: assessment.map(|assessment| assessment.trust),
             misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
-            clock_offset_s: None,
+            ..NeighbourState::new(view.cav.clone())
         }
     };
     views.iter().enumerate().map(of).collect()

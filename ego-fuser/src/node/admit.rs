@@ -2,11 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use bus::Arrival;
-use protocol::message::{Bev, Boxes, Descriptor, Points};
+use bus::{Arrival, LINK_TRANSIT_S, NETWORK_TRANSIT_S};
+use protocol::message::{Bev, Boxes, Descriptor, Points, SweepArrival};
 use protocol::{CavId, DropReason, HEADER_LEN, PoseEstimate, Stamp, Stream, wire};
 
 use super::{Node, OwnFrame, Received};
+use crate::capture_clock::SweepTime;
 use crate::ego::{Content, View};
 use crate::neighbourhood::sender_of;
 
@@ -25,19 +26,29 @@ impl Node<'_> {
         if *cav != self.cav && self.models.is_other(cav) {
             return self.bus.stats().dropped(&arrival.topic, DropReason::Shape);
         }
-        if let Some(reason) = self.out_of_time(arrival).filter(|_| *cav != self.cav) {
-            return self.bus.stats().dropped(&arrival.topic, reason);
-        }
+        let stated_nanos = arrival.header.stamp.capture_nanos;
+        let timed = if *cav == self.cav {
+            Ok(stated_nanos)
+        } else {
+            self.in_time(cav, stated_nanos)
+        };
+        let capture_nanos = match timed {
+            Ok(capture_nanos) => capture_nanos,
+            Err(reason) => return self.bus.stats().dropped(&arrival.topic, reason),
+        };
         let began = Instant::now();
         let Some((pose, content)) = self.decode(arrival) else {
             return;
         };
         self.bus.stats().timed("decode", began.elapsed());
-        let transport = arrival.transport();
-        self.bus
+        let transport = self
+            .bus
             .stats()
-            .timed(&format!("{} transport", self.stream), transport);
-        let capture_nanos = arrival.header.stamp.capture_nanos;
+            .transport(arrival, self.longest_transit_s());
+        if let Some(transport) = transport {
+            let stage = format!("{} transport", self.stream);
+            self.bus.stats().timed(&stage, transport);
+        }
         let view = View {
             cav: cav.clone(),
             pose,
@@ -82,21 +93,27 @@ impl Node<'_> {
         }
     }
 
-    /// Reason to drop a message by its time: it is in the future, later than the ego's own sweeps by more than its own
-    /// agent may lag behind; or so old that no frame of the ego will use it.
-    fn out_of_time(&self, arrival: &Arrival) -> Option<DropReason> {
-        let capture_nanos = arrival.header.stamp.capture_nanos;
-        let newest = self.own_nanos?;
+    /// Capture time of a neighbour's message on the ego's clock, nanoseconds.
+    ///
+    /// # Errors
+    /// Reason to drop it: its clock is unsteady; it is in the future, later than the ego's own sweeps by more than its
+    /// own agent may lag behind; or it is so old that no frame of the ego will use it.
+    fn in_time(&self, cav: &CavId, stated_nanos: u64) -> Result<u64, DropReason> {
+        let corrected = self.clocks.corrected(cav, stated_nanos);
+        let capture_nanos = corrected.ok_or(DropReason::Clock)?;
+        let Some(newest) = self.own_nanos else {
+            return Ok(capture_nanos);
+        };
         let oldest = self
             .frames
             .front()
             .map_or(newest, |frame| frame.capture_nanos);
         if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
-            Some(DropReason::Future)
+            Err(DropReason::Future)
         } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {
-            Some(DropReason::Stale)
+            Err(DropReason::Stale)
         } else {
-            None
+            Ok(capture_nanos)
         }
     }
 
@@ -128,6 +145,11 @@ impl Node<'_> {
         else {
             return;
         };
+        self.compare_clocks(cav, arrival.header.stamp.capture_nanos, &descriptor.sweeps);
+        // Boxes and points belong to no network.
+        if self.stream != Stream::Bev {
+            return;
+        }
         let Some(other) = self.models.update(cav, &descriptor) else {
             return;
         };
@@ -140,6 +162,43 @@ impl Node<'_> {
             self.bus
                 .stats()
                 .dropped(&self.topic(cav), DropReason::Shape);
+        }
+    }
+
+    /// Longest transit time of a message, seconds; the own agent's, which takes no link, has one clock with the ego.
+    fn longest_transit_s(&self) -> f64 {
+        if self.options.over_link {
+            LINK_TRANSIT_S
+        } else {
+            NETWORK_TRANSIT_S
+        }
+    }
+
+    /// Compares the capture clocks of two vehicles by the arrivals of their sweeps. Messages that wait under a capture
+    /// time that is corrected otherwise now are dropped.
+    fn compare_clocks(&mut self, cav: &CavId, newest_nanos: u64, sweeps: &[SweepArrival]) {
+        let offset_s = self
+            .bus
+            .stats()
+            .system_clock_offset_s(cav, self.longest_transit_s());
+        let offset_nanos = (offset_s * 1e9) as i64;
+        for sweep in sweeps {
+            let time = SweepTime {
+                capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),
+                arrived_nanos: sweep.arrived_nanos.saturating_sub_signed(offset_nanos),
+            };
+            if *cav == self.cav {
+                self.clocks.note_own(time);
+            } else {
+                self.clocks.note(cav, time);
+            }
+        }
+        for cav in self.clocks.update() {
+            for _ in 0..self.pairing.forget(&cav) {
+                self.bus
+                    .stats()
+                    .dropped(&self.topic(&cav), DropReason::Clock);
+            }
         }
     }
 

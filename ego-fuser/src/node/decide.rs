@@ -82,11 +82,9 @@ impl Node<'_> {
                 self.bus.stats().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);
-                let before = [
-                    StageTiming::new("transport", transport),
-                    StageTiming::new("wait", waited),
-                ];
-                let stages = before.into_iter().chain(stages).collect();
+                let transport = transport.map(|transport| StageTiming::new("transport", transport));
+                let wait = StageTiming::new("wait", waited);
+                let stages = transport.into_iter().chain([wait]).chain(stages).collect();
                 let result = Detections {
                     ego: self.cav.clone(),
                     agent_frame,
@@ -129,12 +127,14 @@ impl Node<'_> {
         let clocks = stats.peers();
         let clock = |cav: &CavId| clocks.iter().find(|peer| peer.cav == *cav)?.clock_offset_s;
         let reports = misbehaviour::neighbour_states(assessments, views).into_iter();
-        reports
+        let mut reports: Vec<NeighbourState> = reports
             .map(|neighbour| NeighbourState {
                 clock_offset_s: clock(&neighbour.cav),
                 ..neighbour
             })
-            .collect()
+            .collect();
+        self.clocks.describe(&mut reports);
+        reports
     }
 
     /// The neighbours' messages for a frame, and the neighbours without one.

@@ -17,6 +17,7 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
 
+use crate::capture_clock::CaptureClocks;
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::{Ego, View};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
@@ -152,8 +153,8 @@ struct OwnFrame {
     /// Sequence of the own agent's message.
     agent_frame: u64,
     capture_nanos: u64,
-    /// From its publication to its arrival.
-    transport: Duration,
+    /// From its publication to its arrival; `None` if its agent has another clock.
+    transport: Option<Duration>,
     begun: Instant,
     view: View,
 }
@@ -168,6 +169,7 @@ struct Node<'a> {
     neighbourhood: Option<Neighbourhood>,
     models: PeerModels,
     pairing: Pairing<Received>,
+    clocks: CaptureClocks,
     frames: VecDeque<OwnFrame>,
     pace: PaceKeeper,
     /// Capture time of the ego's newest sweep, nanoseconds.
@@ -197,12 +199,7 @@ impl<'a> Node<'a> {
             cav: cav.clone(),
             stream,
         };
-        // Boxes and points belong to no network.
-        let streams = if stream == Stream::Bev {
-            vec![Stream::Descriptor, stream]
-        } else {
-            vec![stream]
-        };
+        let streams = vec![Stream::Descriptor, stream];
         let own = streams
             .iter()
             .map(|&stream| bus.subscribe(topic(stream), &inbox))
@@ -227,6 +224,7 @@ impl<'a> Node<'a> {
             neighbourhood,
             models: PeerModels::new(ego.detector()),
             pairing: Pairing::new(options.pairing),
+            clocks: CaptureClocks::measured(),
             frames: VecDeque::new(),
             pace: PaceKeeper::open(bus, cav, options.sets_pace)?,
             own_nanos: None,
@@ -314,6 +312,7 @@ impl<'a> Node<'a> {
         for cav in neighbourhood.update(self.bus, &self.inbox)? {
             let topic = self.topic(&cav);
             self.models.forget(&cav);
+            self.clocks.forget(&cav);
             self.ended.remove(&cav);
             for _ in 0..self.pairing.forget(&cav) {
                 self.bus.stats().dropped(&topic, DropReason::Stale);

@@ -5,9 +5,12 @@ use std::time::{Duration, Instant};
 /// The fastest message of this period and of the period before it gives the estimate.
 const WINDOW: Duration = Duration::from_secs(10);
 /// Offset ahead beyond which a warning is logged, seconds.
-const AHEAD_S: f64 = 0.05;
-/// Offset behind beyond which a warning is logged, seconds; a long transit time has the same effect.
-const BEHIND_S: f64 = 2.0;
+pub(super) const AHEAD_S: f64 = 0.05;
+/// Longest transit time without a link emulation, seconds: the fastest message of a busy machine takes less.
+pub const NETWORK_TRANSIT_S: f64 = 0.15;
+/// Longest transit time behind a link emulation, seconds. A clock that is behind has the same effect, so that a warning
+/// is logged beyond it.
+pub const LINK_TRANSIT_S: f64 = 2.0;
 
 /// Clock offset of one sender.
 #[derive(Debug, Clone, Copy)]
@@ -44,7 +47,7 @@ impl ClockOffset {
         self.shortest[0] = self.shortest[0].min(took);
         let offset_s = self.seconds();
         let half = if self.was_far { 0.5 } else { 1.0 };
-        let is_far = offset_s > AHEAD_S * half || offset_s < -BEHIND_S * half;
+        let is_far = offset_s > AHEAD_S * half || offset_s < -LINK_TRANSIT_S * half;
         let has_changed = is_far != self.was_far;
         self.was_far = is_far;
         has_changed.then_some(is_far)

@@ -12,7 +12,8 @@ use protocol::{
 
 use support::statistics::{quantile, sorted};
 
-use super::clock_offset::ClockOffset;
+use super::Arrival;
+use super::clock_offset::{AHEAD_S, ClockOffset};
 use super::frame_stats::FrameStats;
 
 /// Maximum number of accounts of one process, equal to the limit of the ledger's receivers.
@@ -287,6 +288,26 @@ impl MessageStats {
         if let Some(peer) = self.lock().peer(cav) {
             peer.trust = Some(trust);
         }
+    }
+
+    /// System clock of a vehicle minus ours, seconds; 0 if they count as one clock. A transit time of up to
+    /// `longest_transit_s` looks like a clock that is behind.
+    pub fn system_clock_offset_s(&self, cav: &CavId, longest_transit_s: f64) -> f64 {
+        let state = self.lock();
+        let peer = state.peers.get(cav);
+        let clock = peer.and_then(|peer| peer.clock.as_ref());
+        let offset_s = clock.map_or(0.0, ClockOffset::seconds);
+        if (-longest_transit_s..=AHEAD_S).contains(&offset_s) {
+            0.0
+        } else {
+            offset_s
+        }
+    }
+
+    /// Time from the publication of a message to its arrival; `None` if its sender has another clock.
+    pub fn transport(&self, arrival: &Arrival, longest_transit_s: f64) -> Option<Duration> {
+        let offset_s = self.system_clock_offset_s(&arrival.header.stamp.cav, longest_transit_s);
+        (offset_s == 0.0).then(|| arrival.transport())
     }
 
     /// State of the vehicles that have sent messages.

@@ -77,7 +77,7 @@ impl Arrival {
     }
 
     /// Time from the publication to the arrival; what the message waits for here is no part of it.
-    pub fn transport(&self) -> Duration {
+    pub(super) fn transport(&self) -> Duration {
         let published = self.header.stamp.publish_nanos;
         Duration::from_nanos(self.unix_nanos().saturating_sub(published))
     }

@@ -24,6 +24,17 @@ pub struct Descriptor {
     pub dtype: Dtype,
     /// Streams that it publishes.
     pub streams: Vec<Stream>,
+    /// Sweeps since the descriptor before, oldest first. The capture time of the newest is that of the message.
+    pub sweeps: Vec<SweepArrival>,
+}
+
+/// Arrival of a sweep at its agent. An ego compares the capture clocks of vehicles with it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SweepArrival {
+    /// Capture time of the newest sweep minus that of this one, nanoseconds.
+    pub before_nanos: u64,
+    /// Arrival, nanoseconds on the Unix clock of the agent.
+    pub arrived_nanos: u64,
 }
 
 impl Descriptor {
@@ -37,6 +48,7 @@ impl Descriptor {
                 found,
             });
         }
+        check_count("sweeps", self.sweeps.len(), limits.max_entries)?;
         check_count("streams", self.streams.len(), limits.max_entries)
     }
 }

@@ -27,7 +27,8 @@ pub struct Detections {
     pub fused: Vec<FusedNeighbour>,
     /// Neighbours whose data were not fused.
     pub skipped: Vec<SkippedNeighbour>,
-    /// Misbehaviour detection and clock offset of each neighbour that sent data for this frame.
+    /// Misbehaviour detection and clock offset of each neighbour that sent data for this frame, and of each whose capture
+    /// clock differs from the ego's.
     pub neighbours: Vec<NeighbourState>,
     /// Durations of the stages.
     pub stages: Vec<StageTiming>,
@@ -70,6 +71,23 @@ pub struct NeighbourState {
     /// Its clock minus the ego's, minus the shortest transit time of its messages, seconds; `None` if both share one
     /// clock.
     pub clock_offset_s: Option<f64>,
+    /// Its capture times minus the ego's at one moment, seconds: the offset that the ego corrects; `None` if they agree
+    /// within 50 ms.
+    pub capture_offset_s: Option<f64>,
+}
+
+impl NeighbourState {
+    /// A vehicle of which nothing is known.
+    #[must_use]
+    pub fn new(cav: CavId) -> Self {
+        Self {
+            cav,
+            trust: None,
+            misbehaviour: None,
+            clock_offset_s: None,
+            capture_offset_s: None,
+        }
+    }
 }
 
 impl Detections {
@@ -87,12 +105,12 @@ impl Detections {
         for neighbour in &self.neighbours {
             check_within("trust", neighbour.trust.unwrap_or(0.0), 0.0, 1.0)?;
             // The clock of an attacker may be wrong by any amount.
-            check_within(
-                "clock offset",
-                neighbour.clock_offset_s.unwrap_or(0.0),
-                -1e11,
-                1e11,
-            )?;
+            for (name, offset_s) in [
+                ("clock offset", neighbour.clock_offset_s),
+                ("capture offset", neighbour.capture_offset_s),
+            ] {
+                check_within(name, offset_s.unwrap_or(0.0), -1e11, 1e11)?;
+            }
         }
         StageTiming::check_all(&self.stages, limits)
     }

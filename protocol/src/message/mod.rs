@@ -27,7 +27,7 @@ pub use bev::{Bev, BevMetadata};
 pub use boxes::Boxes;
 pub use camera::{Camera, CameraMetadata, ImageFormat, Pinhole};
 pub use control::{Control, TopicCount};
-pub use descriptor::{Descriptor, ModelHash};
+pub use descriptor::{Descriptor, ModelHash, SweepArrival};
 pub use detections::{
     Detections, DetectionsReport, FusedNeighbour, NeighbourState, SkippedNeighbour,
 };

@@ -224,8 +224,13 @@ fn any_bev() -> impl Strategy<Value = Bev> {
 }
 
 fn any_descriptor() -> impl Strategy<Value = Descriptor> {
-    (any::<[u8; 32]>(), any_map(), vec(any_stream(), 0..8)).prop_map(
-        |(hash, (features, _, config), streams)| {
+    let sweep = any::<[u64; 2]>().prop_map(|[before_nanos, arrived_nanos]| SweepArrival {
+        before_nanos,
+        arrived_nanos,
+    });
+    let lists = (vec(any_stream(), 0..8), vec(sweep, 0..8));
+    (any::<[u8; 32]>(), any_map(), lists).prop_map(
+        |(hash, (features, _, config), (streams, sweeps))| {
             let (model_hash, dtype) = (ModelHash(hash), config.dtype);
             Descriptor {
                 model_hash,
@@ -233,6 +238,7 @@ fn any_descriptor() -> impl Strategy<Value = Descriptor> {
                 channels: features.channels,
                 dtype,
                 streams,
+                sweeps,
             }
         },
     )
@@ -266,14 +272,15 @@ fn any_detections() -> impl Strategy<Value = Detections> {
         any_cav(),
         option::of(0.0..=1.0f64),
         misbehaviour,
-        option::of(-1e9..1e9f64),
+        [option::of(-1e9..1e9f64), option::of(-1e9..1e9f64)],
     )
         .prop_map(
-            |(cav, trust, misbehaviour, clock_offset_s)| NeighbourState {
+            |(cav, trust, misbehaviour, [clock_offset_s, capture_offset_s])| NeighbourState {
                 cav,
                 trust,
                 misbehaviour,
                 clock_offset_s,
+                capture_offset_s,
             },
         );
     let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(states, 0..4));

@@ -22,7 +22,7 @@ use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
 use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
-use protocol::message::{Descriptor, ModelHash};
+use protocol::message::{Descriptor, ModelHash, SweepArrival};
 use protocol::{
     Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason,
     Stream, Topic,
@@ -465,6 +465,8 @@ struct ScriptedAgent {
     publisher: bus::Publisher,
     agent: Agent,
     index: usize,
+    /// Offset of its capture times, nanoseconds.
+    ahead_nanos: u64,
     _presence: bus::LivelinessToken,
 }
 
@@ -483,6 +485,7 @@ impl ScriptedAgent {
             publisher,
             agent: agent(AGENTS[index]),
             index,
+            ahead_nanos: 0,
             _presence: presence,
         }
     }
@@ -501,7 +504,7 @@ impl ScriptedAgent {
         let output = self.agent.process(&input).unwrap();
         let pose = output.pose;
         self.publisher
-            .submit_encoded(tick.capture_nanos, move |stamp| {
+            .submit_encoded(tick.capture_nanos + self.ahead_nanos, move |stamp| {
                 let features = protocol::encode_features(
                     output.perception.features,
                     &protocol::CodecConfig::default(),
@@ -509,6 +512,35 @@ impl ScriptedAgent {
                 )?;
                 protocol::wire::encode(stamp, protocol::message::Bev { pose, features })
             });
+    }
+
+    /// Reports sweeps of the first three ticks of a scene that is played in real time.
+    fn describe_sweeps(&self, scenario: &Scenario, began_nanos: u64) {
+        let times = [0, 1, 2].map(|tick| scenario.ticks[tick].capture_nanos);
+        let sweeps = times.map(|capture_nanos| SweepArrival {
+            before_nanos: times[2] - capture_nanos,
+            arrived_nanos: began_nanos + capture_nanos - times[0],
+        });
+        self.describe(
+            times[2] + self.ahead_nanos,
+            Descriptor {
+                sweeps: sweeps.into(),
+                ..own_descriptor()
+            },
+        );
+    }
+
+    fn describe(&self, capture_nanos: u64, descriptor: Descriptor) {
+        let publisher = self
+            .bus
+            .publisher(
+                topic(AGENTS[self.index], Stream::Descriptor),
+                PublisherOptions::POSE,
+            )
+            .unwrap();
+        publisher.submit(capture_nanos, descriptor);
+        // It is transmitted before the next map is.
+        publisher.finish();
     }
 
     fn wait_for_route(&self, receiver: &str) {
@@ -521,6 +553,18 @@ impl ScriptedAgent {
             .unwrap()
             .wait(TIMEOUT)
             .unwrap();
+    }
+}
+
+/// Descriptor of an agent that runs the ego's network.
+fn own_descriptor() -> Descriptor {
+    Descriptor {
+        model_hash: detector().model_hash(),
+        grid: detector().grid(),
+        channels: u32::try_from(detector().map_shape()[0]).unwrap(),
+        dtype: protocol::Dtype::F32,
+        streams: vec![Stream::Bev],
+        sweeps: vec![],
     }
 }
 
@@ -656,6 +700,48 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
 }
 
 #[test]
+fn a_neighbour_whose_capture_clock_is_ahead_is_fused_with_the_frames_of_its_sweeps() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let mut fleet = [0, 1].map(|index| ScriptedAgent::new(&router, index));
+    fleet[1].ahead_nanos = 3_000_000_000;
+    let results = Results::of_10(&router);
+    std::thread::scope(|scope| {
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            let options = ego_node::NodeOptions {
+                deadline: TIMEOUT,
+                keeps_running: true,
+                ..Default::default()
+            };
+            ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
+        });
+        fleet
+            .iter()
+            .for_each(|agent| agent.wait_for_route("ego-10"));
+        let began_nanos = bus::unix_nanos();
+        for agent in &fleet {
+            agent.describe_sweeps(&scenario, began_nanos);
+        }
+        for tick in 0..3 {
+            fleet
+                .iter_mut()
+                .rev()
+                .for_each(|agent| agent.send(&scenario, tick));
+            let result = results.next();
+            assert_eq!(fused(&result), ["20"], "{result:?}");
+            assert_eq!(result.fused[0].age_nanos, 0);
+            let offset_s = result.neighbours[0].capture_offset_s.unwrap();
+            assert!((offset_s - 3.0).abs() < 0.02, "{offset_s}");
+        }
+        stop.request();
+        ego.join().unwrap();
+    });
+}
+
+#[test]
 fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
@@ -665,13 +751,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         .map(|index| ScriptedAgent::new(&router, index))
         .collect();
     let results = Results::of_10(&router);
-    let own = Descriptor {
-        model_hash: detector().model_hash(),
-        grid: detector().grid(),
-        channels: u32::try_from(detector().map_shape()[0]).unwrap(),
-        dtype: protocol::Dtype::F32,
-        streams: vec![Stream::Bev],
-    };
+    let own = own_descriptor();
     let ledger = std::thread::scope(|scope| {
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
@@ -689,15 +769,6 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         fleet
             .iter()
             .for_each(|agent| agent.wait_for_route("ego-10"));
-        let describe = |agent: &ScriptedAgent, descriptor: Descriptor| {
-            let publisher = agent
-                .bus
-                .publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE)
-                .unwrap();
-            publisher.submit(0, descriptor);
-            // It is transmitted before the next map is.
-            publisher.finish();
-        };
         let send_all = |fleet: &mut [ScriptedAgent], tick| {
             [1, 2, 0].map(|index| fleet[index].send(&scenario, tick))
         };
@@ -709,8 +780,8 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             "no descriptor has arrived"
         );
 
-        describe(
-            &fleet[1],
+        fleet[1].describe(
+            0,
             Descriptor {
                 model_hash: ModelHash([9; 32]),
                 ..own.clone()
@@ -731,7 +802,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         restarted.bus.session().close().wait().unwrap();
         fleet.insert(1, ScriptedAgent::new(&router, 1));
         fleet[1].wait_for_route("ego-10");
-        describe(&fleet[1], own);
+        fleet[1].describe(0, own);
         send_all(&mut fleet, 3);
         assert_eq!(fused(&results.next()), ["20", "30"]);
         stop.request();

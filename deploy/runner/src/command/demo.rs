@@ -16,7 +16,7 @@ use simulator::generate::{self, Subset, SynthError, SynthOptions};
 use support::{output, progress, shared_files};
 
 use super::programs;
-use support::cli::{BadInput, Outcome};
+use support::cli::{BadInput, Interrupted, Outcome};
 
 /// Seeds from here on are never trained with.
 const SEED: u64 = 1000;
@@ -107,7 +107,14 @@ impl Arguments {
         if let Some(last) = results.last().filter(|last| self.view && !last.interrupted) {
             show_recorded(&last.folder.file("recording.mcap"), self.page)?;
         }
-        Ok(Outcome::of(results.iter().any(RunResult::lost_data)))
+        match self.method.get(results.len()..) {
+            None | Some([]) => Ok(Outcome::of(results.iter().any(RunResult::lost_data))),
+            Some(left) => {
+                let left: Vec<&str> = left.iter().map(|method| method.name()).collect();
+                let text = format!("ended on request; not run: {}", left.join(", "));
+                Err(anyhow::Error::from(Interrupted).context(text))
+            }
+        }
     }
 
     fn scenario(&self) -> Result<PathBuf, BadInput> {

@@ -18,6 +18,9 @@ pub(crate) fn sentence(result: &RunResult) -> Option<String> {
 
 fn reasons(result: &RunResult) -> Vec<String> {
     let mut reasons = Vec::new();
+    if result.interrupted && result.metrics.ticks == 0 {
+        reasons.push("ended before its first tick".into());
+    }
     if result.missed > 0 {
         reasons.push(format!(
             "{} of {} ticks unanswered",
@@ -59,7 +62,7 @@ fn help(result: &RunResult) -> Option<String> {
     if !result.unwritten.is_empty() {
         Some("free disk space".into())
     } else if result.interrupted {
-        Some("the run was ended before its time".into())
+        (result.metrics.ticks > 0).then(|| "the run was ended before its time".into())
     } else if !result.failures.is_empty() || !result.crashed.is_empty() {
         let crashed = match &result.crashed[..] {
             [] => String::new(),

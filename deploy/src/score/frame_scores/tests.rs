@@ -89,6 +89,7 @@ fn result(tick: u64, at_x: &[f64]) -> Detections {
             trust: Some(0.5 + 0.25 * tick as f64),
             misbehaviour: None,
             clock_offset_s: Some(0.125),
+            capture_offset_s: Some(0.3),
         }],
         stages: vec![],
     }
@@ -275,6 +276,7 @@ fn neighbours_are_followed_over_the_run() {
             trust: Some(0.25),
             misbehaviour: Some(MisbehaviourReason::GhostObjects),
             clock_offset_s: None,
+            capture_offset_s: None,
         }],
         ..result(1, &[])
     };

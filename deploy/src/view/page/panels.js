@@ -34,9 +34,10 @@ function panels(frame) {
   const hasTrust = last.links.some((link) => isKnown(link.trust));
   table("links", [["from"], ["latency", "From publication to arrival at the ego"], ["size", "Bytes of all its messages for this frame"],
     ["age", "Capture of the ego's sweep minus that of the neighbour's"], ["clock", "Offset of the neighbour's clock from the ego's, as estimated"],
+    ["capture", "Offset of the neighbour's capture times from the ego's, which the ego corrects"],
     ...(hasTrust ? [["trust", "Trust score of misbehaviour detection"]] : []), [""]],
   last.links.map((link) => [
-    link.from, ms(link.latency_ms), bytes(link.wire_bytes), ms(link.age_ms), ms(link.clock_ms), ...(hasTrust ? [number(link.trust, 2)] : []),
+    link.from, ms(link.latency_ms), bytes(link.wire_bytes), ms(link.age_ms), ms(link.clock_ms), ms(link.capture_ms), ...(hasTrust ? [number(link.trust, 2)] : []),
     link.is_fused ? "fused" : [[link.skipped || "silent", link.misbehaviour].filter(Boolean).map(words).join(": "), "bad"],
   ]), last.ego ? "No neighbour sends to the ego." : "No result yet.");
   stages(last);

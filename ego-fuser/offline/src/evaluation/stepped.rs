@@ -20,7 +20,7 @@ use dataset::{LoadOptions, Scenario};
 use ego_fuser::config::EgoSettings;
 use link::{LinkConfig, LinkEmulator};
 use protocol::{
-    CavId, Detections, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
+    CavId, Detections, DropReason, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
 };
 use support::random::derive_seed;
 
@@ -32,6 +32,7 @@ use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
+use ego_fuser::capture_clock::{CaptureClocks, SweepTime};
 use ego_fuser::ego::{EgoOutput, Skipped, View};
 use ego_fuser::pairing::{Pairing, PairingConfig};
 use ego_fuser::silence::Silence;
@@ -159,6 +160,7 @@ struct Run<'a> {
     /// Messages that arrive after the last decision, in order of time.
     arriving: VecDeque<Arrived>,
     pairing: Pairing<Envelope>,
+    clocks: CaptureClocks,
     silence: Silence,
     /// Time at which the ego finishes its current fusion, nanoseconds.
     ego_free_nanos: u64,
@@ -220,6 +222,7 @@ impl<'a> Run<'a> {
             computed: VecDeque::new(),
             arriving: VecDeque::new(),
             pairing: Pairing::new(config.pairing),
+            clocks: CaptureClocks::exact(),
             silence: Silence::default(),
             ego_free_nanos: 0,
         })
@@ -324,6 +327,10 @@ impl<'a> Run<'a> {
         while self.next <= tick {
             self.compute()?;
         }
+        self.clocks.note_own(SweepTime {
+            capture_nanos,
+            arrived_nanos: capture_nanos,
+        });
         let Some(Computed { own, frames, poses }) = self.computed.pop_front().flatten() else {
             return Ok(None);
         };
@@ -447,9 +454,20 @@ impl<'a> Run<'a> {
 
     /// Queues an arrived message for its tick.
     fn take_in(&mut self, arrived: Arrived) {
-        let envelope = arrived.envelope;
-        let (cav, capture_nanos) = (envelope.view.cav.clone(), envelope.view.capture_nanos);
+        let mut envelope = arrived.envelope;
+        let cav = envelope.view.cav.clone();
+        self.clocks.note(&cav, envelope.sweep);
+        for cav in self.clocks.update() {
+            for _ in 0..self.pairing.forget(&cav) {
+                self.delivery.dropped(&cav, DropReason::Clock);
+            }
+        }
         self.silence.reset(&cav);
+        let stated_nanos = envelope.view.capture_nanos;
+        let Some(capture_nanos) = self.clocks.corrected(&cav, stated_nanos) else {
+            return self.delivery.dropped(&cav, DropReason::Clock);
+        };
+        envelope.view.capture_nanos = capture_nanos;
         if let Some(lost) = self.pairing.insert(&cav, capture_nanos, envelope) {
             self.delivery.dropped(&lost.cav, lost.reason);
         }
@@ -516,6 +534,7 @@ impl<'a> Run<'a> {
         Ok(output.map(|output| {
             let mut result = self.evaluator.report(number, own, &views, &bytes, output);
             result.skipped.extend(skipped);
+            self.clocks.describe(&mut result.neighbours);
             result
         }))
     }
@@ -558,14 +577,16 @@ fn enqueue(
         delivery.adapted(&cav, stream, reason);
     }
     if let Some(view) = sent.into_view() {
-        let (bytes, envelope) = (
-            wire_bytes - pose_bytes,
-            Envelope {
-                view,
-                payload_bytes,
-                wire_bytes,
+        let envelope = Envelope {
+            sweep: SweepTime {
+                capture_nanos: view.capture_nanos,
+                arrived_nanos: view.capture_nanos,
             },
-        );
+            view,
+            payload_bytes,
+            wire_bytes,
+        };
+        let bytes = wire_bytes - pose_bytes;
         delivery.enqueue(stream, sequence, bytes, sent_nanos, distance_m, envelope);
     }
 }

@@ -7,12 +7,15 @@ use bus::process_id;
 use link::{Delivery, LinkEmulator, Outcome, Packet};
 use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateReason, Role, Stream, Topic};
 
+use ego_fuser::capture_clock::SweepTime;
 use ego_fuser::ego::View;
 
 /// A neighbour's message for the ego.
 #[derive(Debug, Clone)]
 pub(super) struct Envelope {
     pub(super) view: View,
+    /// Its sweep, which arrives at the agent at its capture.
+    pub(super) sweep: SweepTime,
     pub(super) payload_bytes: u64,
     /// Headers and the pose message included.
     pub(super) wire_bytes: u64,
@@ -91,6 +94,7 @@ impl DelayedDelivery {
         let clock = self.link.clock();
         envelope.view.capture_nanos =
             clock.shown_since(self.began_nanos, envelope.view.capture_nanos);
+        envelope.sweep.capture_nanos = envelope.view.capture_nanos;
         let from = envelope.view.cav.clone();
         let envelope = Some(envelope);
         self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, envelope);

@@ -1,0 +1,86 @@
+//! Clocks of a run's vehicles that differ from the ego's.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use protocol::CavId;
+use serde::{Deserialize, Serialize};
+
+use crate::score::NeighbourRecord;
+
+/// Offset of a system clock up to which durations count as measured, seconds.
+const SAME_CLOCK_S: f64 = 0.05;
+
+/// Offsets of a vehicle's clocks from the ego's.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct OtherClock {
+    /// Offset of its system clock, less the shortest transit time, seconds; `None` where it is the ego's.
+    pub system_s: Option<f64>,
+    /// Offset of its capture times, which the ego corrected, seconds; `None` where they agreed.
+    pub capture_s: Option<f64>,
+}
+
+/// Neighbours with another clock than the ego.
+pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<CavId, OtherClock> {
+    let other = |(cav, record): (&CavId, &NeighbourRecord)| {
+        let system_s = record
+            .clock_offset_s
+            .filter(|offset_s| offset_s.abs() > SAME_CLOCK_S);
+        let capture_s = record.capture_offset_s;
+        let is_other = system_s.is_some() || capture_s.is_some();
+        is_other.then(|| {
+            let clock = OtherClock {
+                system_s,
+                capture_s,
+            };
+            (cav.clone(), clock)
+        })
+    };
+    neighbours.iter().filter_map(other).collect()
+}
+
+impl fmt::Display for OtherClock {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let system = self.system_s.map(|offset_s| match offset_s > 0.0 {
+            true => format!("clock {offset_s:.3} s ahead, durations from it not measurable"),
+            false => format!("clock {:.3} s behind, or as long a transit", -offset_s),
+        });
+        let capture = self.capture_s.map(|offset_s| {
+            let side = if offset_s > 0.0 { "ahead" } else { "behind" };
+            format!("capture times {:.3} s {side}, corrected", offset_s.abs())
+        });
+        let parts: Vec<String> = system.into_iter().chain(capture).collect();
+        f.write_str(&parts.join("; "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clocks_that_differ_are_named_with_their_offsets() {
+        let record = |clock_offset_s, capture_offset_s| NeighbourRecord {
+            clock_offset_s,
+            capture_offset_s,
+            ..NeighbourRecord::default()
+        };
+        let neighbours = [
+            ("1", record(Some(-0.002), None)),
+            ("2", record(Some(3.0), Some(0.3))),
+            ("3", record(None, Some(-0.1))),
+        ];
+        let neighbours = neighbours.map(|(cav, record)| (CavId::new(cav).unwrap(), record));
+        let lines: Vec<String> = others(&neighbours.into())
+            .iter()
+            .map(|(cav, clock)| format!("{cav}: {clock}"))
+            .collect();
+        assert_eq!(
+            lines,
+            [
+                "2: clock 3.000 s ahead, durations from it not measurable; capture times 0.300 s ahead, corrected",
+                "3: capture times 0.100 s behind, corrected",
+            ]
+        );
+    }
+}

@@ -1,0 +1,349 @@
+//! Capture clocks: estimates by how much each neighbour's capture times are ahead of the ego's, and corrects them.
+//!
+//! Agents report when their sweeps arrived. Sweeps that arrive at one moment were captured at one moment, so their
+//! capture times differ by the offset of the clocks. Compute times and links do not matter, as only the arrival at the
+//! agent counts. The ego's own sweeps give capture time over arrival time: a scene that is played slower or faster
+//! than real time is no offset.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use protocol::CavId;
+use protocol::message::NeighbourState;
+
+/// Offset beyond which a clock is named and corrected, nanoseconds.
+const LIMIT_NANOS: i64 = 50_000_000;
+/// Spread of the samples beyond which no correction is possible, nanoseconds.
+const UNSTEADY_NANOS: i64 = 500_000_000;
+/// Time that an estimate looks back, nanoseconds.
+const WINDOW_NANOS: u64 = 1_300_000_000;
+/// Largest number of sweeps and of samples that are kept of a vehicle.
+const MAX_KEPT: usize = 64;
+/// Largest number of vehicles.
+const MAX_VEHICLES: usize = 128;
+
+/// A sweep of a vehicle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SweepTime {
+    /// Capture time as the vehicle states it, nanoseconds.
+    pub capture_nanos: u64,
+    /// Arrival at the vehicle's agent on the ego's clock, nanoseconds.
+    pub arrived_nanos: u64,
+}
+
+/// Capture clocks of the neighbours.
+#[derive(Debug)]
+pub struct CaptureClocks {
+    /// Samples of an estimate at least.
+    fewest: usize,
+    /// The ego's own sweeps, by arrival.
+    own: VecDeque<SweepTime>,
+    neighbours: BTreeMap<CavId, Clock>,
+}
+
+#[derive(Debug, Default)]
+struct Clock {
+    /// Sweeps that arrived after the ego's newest.
+    pending: VecDeque<SweepTime>,
+    /// Arrival, nanoseconds, and how far the capture time is ahead, nanoseconds.
+    samples: VecDeque<(u64, i64)>,
+    /// Offset that is subtracted from capture times, nanoseconds.
+    offset_nanos: i64,
+    is_unsteady: bool,
+}
+
+impl CaptureClocks {
+    /// Arrivals that are measured: three sweeps of a vehicle make an estimate.
+    #[must_use]
+    pub fn measured() -> Self {
+        Self::new(3)
+    }
+
+    /// Arrivals in simulation time, which are exact: one sweep of a vehicle makes an estimate.
+    #[must_use]
+    pub fn exact() -> Self {
+        Self::new(1)
+    }
+
+    fn new(fewest: usize) -> Self {
+        Self {
+            fewest,
+            own: VecDeque::new(),
+            neighbours: BTreeMap::new(),
+        }
+    }
+
+    /// Adds a sweep of the ego's own vehicle.
+    pub fn note_own(&mut self, sweep: SweepTime) {
+        match self.own.back() {
+            Some(last) if last.arrived_nanos == sweep.arrived_nanos => return,
+            // The system clock was set back.
+            Some(last) if last.arrived_nanos > sweep.arrived_nanos => self.own.clear(),
+            _ => {}
+        }
+        self.own.push_back(sweep);
+        if self.own.len() > MAX_KEPT {
+            self.own.pop_front();
+        }
+    }
+
+    /// Adds a sweep of a neighbour.
+    pub fn note(&mut self, cav: &CavId, sweep: SweepTime) {
+        if self.neighbours.len() >= MAX_VEHICLES && !self.neighbours.contains_key(cav) {
+            return;
+        }
+        let clock = self.neighbours.entry(cav.clone()).or_default();
+        clock.pending.push_back(sweep);
+        if clock.pending.len() > MAX_KEPT {
+            clock.pending.pop_front();
+        }
+    }
+
+    /// Estimates anew and logs what changes. Returns the neighbours whose capture times are corrected otherwise than
+    /// before: their waiting messages belong to other frames.
+    pub fn update(&mut self) -> Vec<CavId> {
+        let pace = self.pace();
+        let mut changed = Vec::new();
+        for (cav, clock) in &mut self.neighbours {
+            while let Some(sweep) = clock.pending.front().copied() {
+                if (self.own.back()).is_none_or(|own| own.arrived_nanos < sweep.arrived_nanos) {
+                    break;
+                }
+                clock.pending.pop_front();
+                if let Some(own_nanos) = own_capture(&self.own, sweep.arrived_nanos) {
+                    let ahead = i128::from(sweep.capture_nanos) - own_nanos;
+                    clock.add(sweep.arrived_nanos, saturated(ahead));
+                }
+            }
+            if clock.samples.len() >= self.fewest && clock.judge(cav, pace) {
+                changed.push(cav.clone());
+            }
+        }
+        changed
+    }
+
+    /// A neighbour's capture time on the ego's clock, nanoseconds; `None` while its clock is too unsteady.
+    #[must_use]
+    pub fn corrected(&self, cav: &CavId, capture_nanos: u64) -> Option<u64> {
+        match self.neighbours.get(cav) {
+            Some(clock) if clock.is_unsteady => None,
+            Some(clock) => {
+                let corrected = i128::from(capture_nanos) - i128::from(clock.offset_nanos);
+                Some(u64::try_from(corrected.max(0)).unwrap_or(u64::MAX))
+            }
+            None => Some(capture_nanos),
+        }
+    }
+
+    /// Adds the offsets that are corrected to the states of neighbours, also of those without a message.
+    pub fn describe(&self, states: &mut Vec<NeighbourState>) {
+        for (cav, clock) in &self.neighbours {
+            if clock.offset_nanos == 0 {
+                continue;
+            }
+            let capture_offset_s = Some(clock.offset_nanos as f64 * 1e-9);
+            match states.iter_mut().find(|state| state.cav == *cav) {
+                Some(state) => state.capture_offset_s = capture_offset_s,
+                None => states.push(NeighbourState {
+                    capture_offset_s,
+                    ..NeighbourState::new(cav.clone())
+                }),
+            }
+        }
+    }
+
+    /// Removes a neighbour that has left.
+    pub fn forget(&mut self, cav: &CavId) {
+        self.neighbours.remove(cav);
+    }
+
+    /// Seconds of the scene per second, at least 1: errors of arrival times grow with it.
+    fn pace(&self) -> f64 {
+        let (Some(first), Some(last)) = (self.own.front(), self.own.back()) else {
+            return 1.0;
+        };
+        let captured = last.capture_nanos.saturating_sub(first.capture_nanos);
+        let arrived = last.arrived_nanos.saturating_sub(first.arrived_nanos);
+        (captured as f64 / arrived.max(1) as f64).clamp(1.0, 100.0)
+    }
+}
+
+impl Clock {
+    fn add(&mut self, arrived_nanos: u64, ahead_nanos: i64) {
+        self.samples.push_back((arrived_nanos, ahead_nanos));
+        let is_old = |&(at, _): &(u64, i64)| at.saturating_add(WINDOW_NANOS) < arrived_nanos;
+        // Few sweeps of a slow scene are kept for longer.
+        while self.samples.len() > MAX_KEPT
+            || self.samples.len() > 3 && self.samples.front().is_some_and(is_old)
+        {
+            self.samples.pop_front();
+        }
+    }
+
+    /// Estimates the offset; true if it has changed by more than sweeps may differ.
+    fn judge(&mut self, cav: &CavId, pace: f64) -> bool {
+        let mut sorted: Vec<i64> = self.samples.iter().map(|(_, ahead)| *ahead).collect();
+        sorted.sort_unstable();
+        let quartile = |quarter: usize| sorted.get(quarter * sorted.len() / 4).copied();
+        let ends = [sorted.first(), sorted.last()];
+        let ([Some(low), Some(median), Some(high)], [Some(&least), Some(&most)]) =
+            ([1, 2, 3].map(quartile), ends)
+        else {
+            return false;
+        };
+        let [limit, unsteady] =
+            [LIMIT_NANOS, UNSTEADY_NANOS].map(|nanos| (nanos as f64 * pace) as i64);
+        // Arrivals are late on a busy machine, so that one sample that agrees is enough.
+        let is_off = least > limit || most < -limit;
+        let agrees =
+            least.max(most.saturating_neg()) < limit / 2 && high.saturating_sub(low) <= limit;
+        let before = self.offset_nanos;
+        let distance = |offset: i64| median.saturating_sub(offset).saturating_abs();
+        let is_certain = most.saturating_sub(least) <= limit || distance(before) > limit;
+        self.offset_nanos = match before {
+            _ if is_off && is_certain && distance(before) > limit / 5 => median,
+            0 => 0,
+            _ if agrees => 0,
+            _ => before,
+        };
+        let is_unsteady =
+            high.saturating_sub(low) > unsteady || distance(self.offset_nanos) > unsteady;
+        if is_unsteady && !self.is_unsteady {
+            let spread_s = most.saturating_sub(least) as f64 * 1e-9;
+            tracing::warn!(%cav, spread_s, "capture clock of the vehicle is unsteady: its messages are left out");
+        }
+        self.is_unsteady = is_unsteady;
+        let change = self.offset_nanos.saturating_sub(before).saturating_abs();
+        if before != 0 && self.offset_nanos == 0 {
+            tracing::info!(%cav, "capture clock of the vehicle agrees with the ego's again");
+        } else if change > limit {
+            let ahead_s = self.offset_nanos as f64 * 1e-9;
+            tracing::warn!(%cav, ahead_s, "capture clock of the vehicle differs from the ego's: its capture times are corrected");
+        }
+        change > limit / 2
+    }
+}
+
+/// Capture time on the ego's clock of a sweep that arrived at `arrived_nanos`, between those of the ego's own sweeps;
+/// `None` before the first.
+fn own_capture(own: &VecDeque<SweepTime>, arrived_nanos: u64) -> Option<i128> {
+    let next = own.partition_point(|sweep| sweep.arrived_nanos <= arrived_nanos);
+    let before = own.get(next.checked_sub(1)?)?;
+    let [capture, since] = [
+        before.capture_nanos.into(),
+        i128::from(arrived_nanos) - i128::from(before.arrived_nanos),
+    ];
+    let Some(after) = own.get(next) else {
+        return Some(capture);
+    };
+    let took = i128::from(after.arrived_nanos) - i128::from(before.arrived_nanos);
+    let passed = i128::from(after.capture_nanos) - capture;
+    Some(capture + passed * since / took)
+}
+
+fn saturated(nanos: i128) -> i64 {
+    i64::try_from(nanos).unwrap_or(if nanos < 0 { i64::MIN } else { i64::MAX })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    /// Offset of a neighbour, milliseconds, after each sweep of a scene with a period of 100 ms. `wall_ms` is the time
+    /// between two sweeps; `ahead_ms` and `late_ms` give offset and delay of arrival of the neighbour's.
+    fn offsets(
+        wall_ms: u64,
+        ahead_ms: impl Fn(u64) -> i64,
+        late_ms: impl Fn(u64) -> u64,
+    ) -> Vec<Option<i64>> {
+        let mut clocks = CaptureClocks::measured();
+        let cav = CavId::new("9").unwrap();
+        let began = 1_000_000_000_000 * MS;
+        let offset = |clocks: &CaptureClocks| {
+            let nanos = clocks.corrected(&cav, began)?;
+            Some(((began as i64 - nanos as i64) as f64 / 1e6).round() as i64)
+        };
+        (0..60)
+            .map(|tick| {
+                let scene = 50_000 * MS + tick * 100 * MS;
+                let arrived_nanos = began + tick * wall_ms * MS;
+                clocks.note_own(SweepTime {
+                    capture_nanos: scene,
+                    arrived_nanos,
+                });
+                clocks.note(
+                    &cav,
+                    SweepTime {
+                        capture_nanos: scene.saturating_add_signed(ahead_ms(tick) * MS as i64),
+                        arrived_nanos: arrived_nanos + late_ms(tick) * MS,
+                    },
+                );
+                clocks.update();
+                offset(&clocks)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_constant_offset_is_found_after_three_sweeps() {
+        for ahead in [100, 300, 3000, -300] {
+            let found = offsets(100, |_| ahead, |tick| tick % 3);
+            assert_eq!(found[1], Some(0));
+            let is_near = |found: &Option<i64>| (found.unwrap() - ahead).abs() <= 3;
+            assert!(found[4..].iter().all(is_near), "{ahead}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn jitter_of_arrivals_is_no_offset_at_any_pace() {
+        for wall_ms in [30, 100, 420, 5000] {
+            let found = offsets(wall_ms, |_| 0, |tick| tick * 7 % 19);
+            assert!(
+                found.iter().all(|offset| *offset == Some(0)),
+                "{wall_ms}: {found:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn an_offset_of_a_slow_scene_is_in_its_seconds() {
+        let found = offsets(420, |_| 300, |_| 20);
+        assert!((found[10].unwrap() - 295).abs() <= 2, "{found:?}");
+    }
+
+    #[test]
+    fn a_step_is_followed_within_two_seconds_and_back() {
+        let step = |tick: u64| if (20..40).contains(&tick) { -1000 } else { 0 };
+        let found = offsets(100, step, |_| 2);
+        assert_eq!(found[19], Some(0));
+        assert!((found[39].unwrap() + 1000).abs() <= 3, "{found:?}");
+        assert!((found[38].unwrap() + 1000).abs() <= 3, "{found:?}");
+        assert_eq!(found[59], Some(0), "{found:?}");
+        assert!(found.contains(&None), "left out in between");
+    }
+
+    #[test]
+    fn extreme_times_are_no_error() {
+        let mut clocks = CaptureClocks::exact();
+        let cav = CavId::new("9").unwrap();
+        let [capture_nanos, arrived_nanos] = [u64::MAX, 7];
+        clocks.note_own(SweepTime {
+            capture_nanos: 0,
+            arrived_nanos,
+        });
+        clocks.note(
+            &cav,
+            SweepTime {
+                capture_nanos,
+                arrived_nanos,
+            },
+        );
+        assert_eq!(clocks.update(), std::slice::from_ref(&cav));
+        let mut states = Vec::new();
+        clocks.describe(&mut states);
+        assert!(states[0].capture_offset_s.unwrap() > 9e9);
+        clocks.forget(&cav);
+        assert_eq!(clocks.corrected(&cav, 5), Some(5));
+    }
+}
