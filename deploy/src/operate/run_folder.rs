@@ -7,6 +7,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use protocol::RunId;
 use serde::Serialize;
+use support::atomic_file;
 use support::csv_file::CsvText;
 
 use crate::score::{FrameRecord, StageStamps, StreamedResult};
@@ -101,11 +102,7 @@ impl RunFolder {
     /// [`RunFolderError::Write`].
     pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
         let path = self.file(name);
-        fs::write(&path, text).map_err(|source| {
-            // A partial file is worse than none.
-            let _ = fs::remove_file(&path);
-            RunFolderError::Write { path, source }
-        })
+        atomic_file::write(&path, text).map_err(|source| RunFolderError::Write { path, source })
     }
 
     /// Writes the configuration of a process to `config/<process>.yaml`; returns its path.

@@ -355,7 +355,7 @@ impl StatusWriter {
             dropped: progress.dropped,
             processes: processes(now),
         };
-        match atomic_file::write(
+        match atomic_file::write_volatile(
             &self.path,
             serde_json::to_string_pretty(&status).unwrap_or_default(),
         ) {

@@ -96,6 +96,21 @@ pub struct FeatureStore {
 }
 
 impl FeatureStore {
+    /// Path of the file of these scenarios: its name has digests of everything that the maps depend on.
+    ///
+    /// # Errors
+    /// [`Error`] when a file cannot be read.
+    pub fn file(
+        kept: &KeptMaps,
+        weights: &Weights,
+        scenarios: &[Scenario],
+        digests: &FileDigests,
+    ) -> Result<PathBuf, Error> {
+        Ok(kept
+            .folder
+            .join(file_name(kept, weights, scenarios, digests)?))
+    }
+
     /// Opens the file of these scenarios and encodes the missing sweeps on `threads` CPU threads, up to its size;
     /// `digests` has those of files that were read before.
     ///
@@ -111,9 +126,7 @@ impl FeatureStore {
         threads: usize,
         on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, Error> {
-        let path = kept
-            .folder
-            .join(file_name(kept, weights, scenarios, digests)?);
+        let path = Self::file(kept, weights, scenarios, digests)?;
         fs::create_dir_all(&kept.folder).at(&path)?;
         let file = OpenOptions::new()
             .create(true)
@@ -216,11 +229,6 @@ impl FeatureStore {
             i64::from(features.grid.width),
         ];
         Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
-    }
-
-    /// File of the maps.
-    pub fn path(&self) -> &Path {
-        &self.path
     }
 
     /// The index of a scenario.

@@ -1,8 +1,10 @@
 //! Shipped experiments: every file of `deploy/experiments` runs to its end, shortened to one frame.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Child, Command, Stdio};
+use std::time::SystemTime;
 
 use serde_json::{Value, json};
 use simulator::generate::{Subset, SynthOptions, generate};
@@ -88,4 +90,62 @@ fn every_shipped_experiment_runs_to_its_end() {
         assert!(out.join(format!("{name}.csv")).is_file(), "{name}");
         assert!(!out.join("maps").exists(), "{name}: maps are removed");
     }
+}
+
+/// A sweep of the smoke test over one frame of `scene`, with these options; the caller waits for its end.
+fn start_smoke(experiment: &Path, out: &Path, options: &[&str]) -> Child {
+    let mut command = Command::new(programs().join("v2vloc"));
+    command.arg("sweep").arg(experiment).arg("--out").arg(out);
+    command.args(options).stdout(Stdio::null()).spawn().unwrap()
+}
+
+fn is_done(mut sweep: Child) -> bool {
+    sweep.wait().unwrap().success()
+}
+
+/// Paths of the cells of a sweep, with their times of writing.
+fn cells_of(out: &Path) -> BTreeMap<PathBuf, SystemTime> {
+    let entries = fs::read_dir(out.join("cells")).unwrap();
+    let paths = entries.map(|entry| entry.unwrap().path());
+    paths
+        .map(|path| {
+            let written = fs::metadata(&path).unwrap().modified().unwrap();
+            (path, written)
+        })
+        .collect()
+}
+
+#[test]
+fn slices_give_the_bytes_of_one_process_and_a_lost_cell_is_the_only_one_computed_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = Path::new(EXPERIMENTS).join("smoke.yaml");
+    let text = fs::read_to_string(file).unwrap().replace(".inf", "1e6");
+    let mut experiment: Value = serde_saphyr::from_str(&text).unwrap();
+    let scene = folder.path().join("scene");
+    shorten_experiment(&mut experiment, &scene);
+    // The first of two slices that start together generates the scene.
+    let generator = json!({"seed": 1201, "scenes": 1, "frames": 1, "vehicles": [3, 3]});
+    experiment["generate"] = generator;
+    let short = folder.path().join("smoke.yaml");
+    fs::write(&short, experiment.to_string()).unwrap();
+    let (whole, sliced) = (folder.path().join("whole"), folder.path().join("sliced"));
+
+    let slices = ["1/2", "2/2"].map(|slice| start_smoke(&short, &sliced, &["--slice", slice]));
+    assert!(slices.into_iter().all(is_done));
+    let computed = cells_of(&sliced);
+    assert!(is_done(start_smoke(&short, &sliced, &[])));
+    assert_eq!(cells_of(&sliced), computed, "nothing is missing");
+    assert!(is_done(start_smoke(&short, &whole, &[])));
+    let csv = |out: &Path| fs::read(out.join("smoke.csv")).unwrap();
+    assert_eq!(csv(&sliced), csv(&whole));
+
+    let lost = computed.keys().next().unwrap();
+    fs::remove_file(lost).unwrap();
+    for slice in ["1/2", "2/2"] {
+        assert!(is_done(start_smoke(&short, &sliced, &["--slice", slice])));
+    }
+    let again = cells_of(&sliced);
+    assert!(again[lost] > computed[lost]);
+    let differs = |path: &&PathBuf| again[*path] != computed[*path];
+    assert_eq!(computed.keys().filter(differs).count(), 1);
 }

@@ -401,7 +401,7 @@ fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
     };
     let out = folder.path().join("out");
     let mut first = Cells::default();
-    table::run(&spec(""), &out, &mut first).unwrap();
+    table::run(&spec(""), &out, None, &mut first).unwrap();
     assert_eq!((first.known, first.computed), (0, 2));
     let row = format!(
         "  - {{name: best, method: max, weights: [{}, {}]}}\n",
@@ -409,7 +409,7 @@ fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
         init.display()
     );
     let mut second = Cells::default();
-    let filled = table::run(&spec(&row), &out, &mut second).unwrap();
+    let filled = table::run(&spec(&row), &out, None, &mut second).unwrap();
     // The second training is the same file: its cells are those of the first.
     assert_eq!((second.known, second.computed), (4, 2));
     assert_eq!(filled[0].rows[1].cells[0].len(), 2);

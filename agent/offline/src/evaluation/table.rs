@@ -1,10 +1,10 @@
 //! Table of an evaluation: one row per sweep.
 
-use std::fs;
 use std::io;
 use std::path::Path;
 
 use protocol::{Pose, PoseEstimate};
+use support::atomic_file;
 use support::csv_file::CsvText;
 
 use super::{EvaluatedSweep, outcome};
@@ -19,7 +19,7 @@ const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg
 /// # Errors
 /// The system's, if the file cannot be written.
 pub fn write_csv(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
-    fs::write(path, csv(sweeps))
+    atomic_file::write(path, csv(sweeps))
 }
 
 /// Writes the errors of all sweeps as the table that the pose source `noisy` replays.
@@ -27,7 +27,7 @@ pub fn write_csv(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
 /// # Errors
 /// The system's, if the file cannot be written.
 pub fn write_error_table(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
-    fs::write(path, error_table(sweeps))
+    atomic_file::write(path, error_table(sweeps))
 }
 
 fn csv(sweeps: &[EvaluatedSweep]) -> String {

@@ -71,6 +71,6 @@ impl ModelCard {
     /// [`FileError`] when the file cannot be written.
     pub fn write(&self, out: &Path) -> Result<(), FileError> {
         let path = out.join("model-card.md");
-        std::fs::write(&path, &self.text).at(&path)
+        support::atomic_file::write(&path, &self.text).at(&path)
     }
 }

@@ -26,6 +26,7 @@ use support::{output, progress};
 use training::feature_store::KeptMaps;
 
 use super::left_out;
+use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 /// Options and groups of options that a file of tables states itself.
@@ -56,6 +57,7 @@ const OF_ONE_TABLE: [&str; 22] = [
 
 #[derive(Debug, clap::Args)]
 #[command(group = ArgGroup::new("emulation").args(["link", "bandwidth_mbps", "latency_ms"]).multiple(true))]
+#[command(group = ArgGroup::new("sliced").args(["slice", "print"]).requires("table"))]
 pub(crate) struct Arguments {
     /// Data set, split or scenario; its layout is detected. The first vehicle of each scenario is the ego.
     #[arg(long, value_name = "DIR", required_unless_present = "table")]
@@ -73,6 +75,8 @@ pub(crate) struct Arguments {
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
     #[arg(long, value_name = "FILE", conflicts_with_all = OF_ONE_TABLE, requires = "out")]
     table: Option<PathBuf>,
+    #[command(flatten)]
+    slices: SliceArgs,
     /// Folder for metrics.json, detections.jsonl, truth.jsonl, frames.csv and precision_recall.csv of each method; with
     /// --table, of the tables [default: nothing is written].
     #[arg(long, value_name = "DIR")]
@@ -169,7 +173,7 @@ impl Arguments {
         threads.validate().map_err(bad)?;
         threads.apply();
         if let (Some(spec), Some(out)) = (&self.table, &self.out) {
-            return tables(spec, out);
+            return tables(spec, out, &self.slices);
         }
         let options = self.options()?;
         let data = options.part.open(&options.dataset, &options.protocol);
@@ -319,11 +323,24 @@ fn bad(error: FieldError) -> BadInput {
 }
 
 /// Fills tables and prints them.
-fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
+fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome> {
+    let spec = TableSpec::read(file).map_err(BadInput::of)?;
+    let (name, folder) = (file.to_string_lossy(), out.to_string_lossy());
+    let command = ["v2vloc", "eval", "--table", &*name, "--out", &*folder];
+    let last = spec.tables.last().map_or("", |table| &table.name);
+    if let Some(text) = slices.engine_file(&command, &out.join(format!("{last}.csv"))) {
+        output::text(&text)?;
+        return Ok(Outcome::Done);
+    }
+    let slice = slices.slice()?;
     let mut progress = TableProgress(progress::spinner("frames"));
-    let spec = TableSpec::read(spec).map_err(BadInput::of)?;
-    let filled = table::run(&spec, out, &mut progress).map_err(BadInput::of)?;
+    let filled = table::run(&spec, out, slice, &mut progress).map_err(BadInput::of)?;
     progress.0.finish_and_clear();
+    if let Some(slice) = slice {
+        output::note(format_args!(
+            "slice {slice} is computed; without --slice, this command writes the tables"
+        ));
+    }
     filled
         .iter()
         .try_for_each(|table| output::line(table::markdown(table)))?;

@@ -4,6 +4,7 @@ mod capacity;
 mod demo;
 mod eval;
 mod schema;
+mod slices;
 mod sweep;
 mod up;
 

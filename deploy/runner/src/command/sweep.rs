@@ -7,6 +7,7 @@ use runner::experiment::sweep::{Experiment, Sweep, SweepOptions, WorkerError};
 use support::output;
 
 use super::left_out;
+use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
 #[derive(Debug, clap::Args)]
@@ -25,8 +26,10 @@ pub(crate) struct Arguments {
     /// Keep the feature maps of all sweeps after the last run: a grid that is extended later needs no encoding again.
     #[arg(long, conflicts_with = "dry_run")]
     keep_feature_maps: bool,
+    #[command(flatten)]
+    slices: SliceArgs,
     /// Print the settings and metrics of every run as JSON instead of a table.
-    #[arg(long, conflicts_with = "dry_run")]
+    #[arg(long, conflicts_with_all = ["dry_run", "slice"])]
     json: bool,
     /// Compute the runs whose numbers come on standard input, for another sweep.
     #[arg(long, hide = true)]
@@ -37,13 +40,19 @@ impl Arguments {
     /// Runs the experiment and prints its table.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         tch::set_num_threads(1);
-        let out = match self.out {
-            Some(out) => out,
-            None => {
-                let experiment = Experiment::read(&self.experiment).map_err(BadInput::of)?;
-                PathBuf::from("sweeps").join(experiment.name)
-            }
-        };
+        let name = Experiment::read(&self.experiment)
+            .map_err(BadInput::of)?
+            .name;
+        let out = self
+            .out
+            .unwrap_or_else(|| PathBuf::from("sweeps").join(&name));
+        let (file, folder) = (self.experiment.to_string_lossy(), out.to_string_lossy());
+        let command = ["v2vloc", "sweep", &*file, "--out", &*folder];
+        let result = out.join(format!("{name}.csv"));
+        if let Some(text) = self.slices.engine_file(&command, &result) {
+            output::text(&text)?;
+            return Ok(Outcome::Done);
+        }
         let jobs = usize::from(self.jobs);
         if self.dry_run {
             Sweep::announce(&self.experiment, &out, jobs).map_err(BadInput::of)?;
@@ -52,6 +61,13 @@ impl Arguments {
         let sweep = Sweep::open(&self.experiment, &out).map_err(BadInput::of)?;
         if self.worker {
             sweep.work()?;
+            return Ok(Outcome::Done);
+        }
+        if let Some(slice) = self.slices.slice()? {
+            sweep.run_slice(slice, jobs).map_err(blamed)?;
+            output::note(format_args!(
+                "slice {slice} is computed; without --slice, this command writes the table"
+            ));
             return Ok(Outcome::Done);
         }
         let options = SweepOptions {

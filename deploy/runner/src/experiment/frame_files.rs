@@ -11,6 +11,7 @@ use deploy::score::FrameScores;
 use deploy::score::metrics::{self, Metrics};
 use ego_fuser_offline::evaluation::EvaluatedFrame;
 use fusion::Method;
+use support::atomic_file;
 
 use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
@@ -57,8 +58,8 @@ impl FrameFiles {
         let frames = frames_csv(board.records(), &BTreeMap::new(), Some(&self.scenarios));
         let curve = board.precision_recall_csv();
         { self.lines.finish() }
-            .and_then(|()| fs::write(folder.join("frames.csv"), frames))
-            .and_then(|()| fs::write(folder.join("precision_recall.csv"), curve))
+            .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
+            .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))
             .with_context(|| folder.display().to_string())
     }
 }
@@ -70,5 +71,6 @@ impl FrameFiles {
 pub(crate) fn write_metrics(out: &Path, method: Method, metrics: &Metrics) -> Result<()> {
     let folder = out.join(file_name(method));
     let text = serde_json::to_string_pretty(metrics)?;
-    fs::write(folder.join(metrics::FILE), text).with_context(|| folder.display().to_string())
+    atomic_file::write(&folder.join(metrics::FILE), text)
+        .with_context(|| folder.display().to_string())
 }

@@ -4,5 +4,6 @@ pub mod cell;
 pub mod evaluation;
 mod frame_files;
 pub mod report;
+pub mod slices;
 pub mod sweep;
 pub mod table;

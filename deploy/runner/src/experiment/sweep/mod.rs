@@ -14,8 +14,9 @@ mod varying;
 mod workers;
 
 use std::collections::BTreeSet;
-use std::fs;
+use std::fs::{self, File};
 use std::io::{self, BufRead, Write};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -30,7 +31,7 @@ use serde::Serialize;
 use simulator::generate::{self, Subset, SynthOptions};
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::file_error::FileError;
-use support::{output, progress};
+use support::{atomic_file, output, progress};
 use training::feature_store::FeatureStore;
 
 pub(super) use check::check_name;
@@ -41,6 +42,7 @@ pub use table::csv;
 use self::varying::VaryingTable;
 use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::evaluation::{OpenedData, compute, evaluate};
+use crate::experiment::slices::Slice;
 use crate::scenario::weights_choice::weights_of;
 
 /// Number of ticks that are timed before a sweep begins, for its estimate.
@@ -124,7 +126,7 @@ impl Sweep {
         }
         let sweep = Self::over(experiment, file, out)?;
         let known = sweep.known(&sweep.keys()?)?;
-        sweep.print_estimate(&known, jobs)
+        sweep.print_estimate(&known, &missing(&known, 0..known.len()), jobs)
     }
 
     fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self> {
@@ -176,25 +178,22 @@ impl Sweep {
         scenarios.map(|scenario| scenario.ticks.len()).sum()
     }
 
+    /// Computes the missing runs of a slice. Feature maps stay for the other slices.
+    ///
+    /// # Errors
+    /// As [`Self::run`].
+    pub fn run_slice(&self, slice: Slice, jobs: usize) -> Result<()> {
+        let keys = self.keys()?;
+        self.compute_missing(&keys, slice.part(keys.len()), jobs)
+    }
+
     /// Computes the missing runs and writes table, charts and report.
     ///
     /// # Errors
     /// An error at the first run that cannot be computed; earlier runs are cached.
     pub fn run(&self, options: &SweepOptions) -> Result<Swept> {
-        let cells = self.cells();
-        fs::create_dir_all(&cells).with_context(|| cells.display().to_string())?;
         let keys = self.keys()?;
-        let known = self.known(&keys)?;
-        let missing: Vec<usize> = (0..known.len())
-            .filter(|&index| known[index].is_none())
-            .collect();
-        self.print_estimate(&known, options.jobs)?;
-        let maps = self.encode(&missing, options.jobs)?;
-        let missing: Vec<(usize, &CellKey)> = missing
-            .into_iter()
-            .map(|index| (index, &keys[index]))
-            .collect();
-        self.compute(&missing, options.jobs)?;
+        self.compute_missing(&keys, 0..keys.len(), options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known(&keys)?.into_iter().collect();
         let cells = cells.ok_or_else(|| WorkerError("a run that was done is not there".into()))?;
         let runs: Vec<Run> = (self.points.iter().cloned().zip(cells))
@@ -202,24 +201,39 @@ impl Sweep {
             .collect();
         let table = self.write(&runs)?;
         if !options.keep_maps {
-            remove_maps(&maps)?;
+            self.remove_maps()?;
         }
         Ok(Swept { table, runs })
     }
 
-    /// Prints the number of runs and the estimated time.
-    fn print_estimate(&self, known: &[Option<Cell>], jobs: usize) -> Result<()> {
+    /// Computes the runs of `part` that are not cached.
+    fn compute_missing(&self, keys: &[CellKey], part: Range<usize>, jobs: usize) -> Result<()> {
+        let cells = self.cells();
+        fs::create_dir_all(&cells).with_context(|| cells.display().to_string())?;
+        let known = self.known(keys)?;
+        let missing = missing(&known, part);
+        self.print_estimate(&known, &missing, jobs)?;
+        self.encode(&missing, jobs)?;
+        let missing: Vec<(usize, &CellKey)> = missing
+            .into_iter()
+            .map(|index| (index, &keys[index]))
+            .collect();
+        self.compute(&missing, jobs)
+    }
+
+    /// Prints the number of runs and the estimated time of the missing ones.
+    fn print_estimate(&self, known: &[Option<Cell>], missing: &[usize], jobs: usize) -> Result<()> {
         let (runs, frames) = (known.len(), self.frames());
-        let missing = known.iter().filter(|cell| cell.is_none()).count();
         output::note(format_args!(
             "{}: {} = {runs} runs of {frames} frames, {} done before",
             self.experiment.name,
             check::product(&self.experiment.grid),
-            runs - missing
+            known.iter().flatten().count()
         ));
-        let Some(first) = known.iter().position(Option::is_none) else {
+        let Some(&first) = missing.first() else {
             return Ok(());
         };
+        let missing = missing.len();
         let done: Vec<&Cell> = known.iter().flatten().collect();
         let seconds: f64 = done.iter().map(|cell| cell.wall_seconds).sum();
         let judged: f64 = done.iter().map(|cell| cell.metrics.frames as f64).sum();
@@ -249,20 +263,9 @@ impl Sweep {
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
     }
 
-    /// Computes the feature maps of all sweeps, once for each encoder that is needed; returns their files.
-    fn encode(&self, missing: &[usize], jobs: usize) -> Result<BTreeSet<PathBuf>> {
-        let methods = missing.iter().map(|&index| self.points[index].method);
-        let mut files = Vec::new();
-        for method in methods.filter(|method| method.exchange() != Exchange::Points) {
-            let file = weights_of(&self.experiment.weights, method)?;
-            if !files.contains(&file) {
-                files.push(file);
-            }
-        }
-        let mut stored = BTreeSet::new();
-        for file in files {
-            let weights = Weights::load(&file)?.with_precision(self.experiment.precision);
-            let weights = Arc::new(weights);
+    /// Computes the feature maps of all sweeps, once for each encoder that is needed.
+    fn encode(&self, missing: &[usize], jobs: usize) -> Result<()> {
+        for weights in self.encoders(missing)? {
             let bar = progress::bar(0, "sweeps encoded");
             let kept = point_options::kept_maps(&self.experiment, &self.maps());
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
@@ -270,11 +273,46 @@ impl Sweep {
                 bar.set_length(all as u64);
                 bar.set_position(done as u64);
             };
-            let store = FeatureStore::open(&kept, &weights, scenarios, digests, jobs, on_sweep)?;
-            stored.insert(store.path().to_owned());
+            FeatureStore::open(&kept, &weights, scenarios, digests, jobs, on_sweep)?;
             bar.finish_and_clear();
         }
-        Ok(stored)
+        Ok(())
+    }
+
+    /// Removes the feature maps of the experiment, which are most of what a sweep writes and are of no use once all runs
+    /// are cached. Other files of their folder stay.
+    fn remove_maps(&self) -> Result<()> {
+        let kept = point_options::kept_maps(&self.experiment, &self.maps());
+        // Methods that share an encoder share a file of maps.
+        let mut files = BTreeSet::new();
+        let all: Vec<usize> = (0..self.points.len()).collect();
+        for weights in self.encoders(&all)? {
+            let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
+            files.insert(FeatureStore::file(&kept, &weights, scenarios, digests)?);
+        }
+        for path in files.into_iter().filter(|file| file.exists()) {
+            fs::remove_file(&path).with_context(|| path.display().to_string())?;
+        }
+        // The folder stays where it holds anything else.
+        let _ = fs::remove_dir(self.maps());
+        Ok(())
+    }
+
+    /// Weights of the encoders of some points, each file once.
+    fn encoders(&self, points: &[usize]) -> Result<Vec<Arc<Weights>>> {
+        let methods = points.iter().map(|&index| self.points[index].method);
+        let mut files = Vec::new();
+        for method in methods.filter(|method| method.exchange() != Exchange::Points) {
+            let file = weights_of(&self.experiment.weights, method)?;
+            if !files.contains(&file) {
+                files.push(file);
+            }
+        }
+        let precision = self.experiment.precision;
+        let weights = files.iter().map(|file| Weights::load(file));
+        weights
+            .map(|loaded| Ok(Arc::new(loaded?.with_precision(precision))))
+            .collect()
     }
 
     fn compute(&self, missing: &[(usize, &CellKey)], jobs: usize) -> Result<()> {
@@ -360,22 +398,14 @@ impl Sweep {
     }
 }
 
-/// Removes files of feature maps, which are most of what a sweep writes and are of no use once all runs are cached. Other
-/// files of their folder stay.
-fn remove_maps(files: &BTreeSet<PathBuf>) -> Result<()> {
-    for path in files {
-        fs::remove_file(path).with_context(|| path.display().to_string())?;
-    }
-    if let Some(folder) = files.first().and_then(|file| file.parent()) {
-        // It stays where it holds anything else.
-        let _ = fs::remove_dir(folder);
-    }
-    Ok(())
+/// Places in `part` whose runs are not cached.
+fn missing(known: &[Option<Cell>], part: Range<usize>) -> Vec<usize> {
+    part.filter(|&place| known[place].is_none()).collect()
 }
 
 /// Writes a file of the sweep.
 fn write(path: &Path, text: &str) -> Result<()> {
-    fs::write(path, text).with_context(|| path.display().to_string())
+    atomic_file::write(path, text).with_context(|| path.display().to_string())
 }
 
 /// Options with which the data set of the experiment is generated.
@@ -404,6 +434,12 @@ fn generate(experiment: &Experiment) -> Result<()> {
     if is_generated(experiment)? {
         return Ok(());
     }
+    // Of two slices that start together one generates, the other waits for it.
+    let path = options.out.with_added_extension("lock");
+    let _lock = lock(&path).with_context(|| path.display().to_string())?;
+    if is_generated(experiment)? {
+        return Ok(());
+    }
     output::note(format_args!(
         "generating {} scenarios into {}",
         options.scenes,
@@ -414,5 +450,15 @@ fn generate(experiment: &Experiment) -> Result<()> {
         generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     generated.context("generate")?;
-    Ok(())
+    fs::remove_file(&path).with_context(|| path.display().to_string())
+}
+
+/// A lock that other processes wait for, on this host and on those that share the folder, until it is dropped.
+fn lock(path: &Path) -> io::Result<File> {
+    if let Some(folder) = path.parent() {
+        fs::create_dir_all(folder)?;
+    }
+    let file = File::create(path)?;
+    file.lock()?;
+    Ok(file)
 }

@@ -12,12 +12,14 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use dataset::IntensityScale;
 use ego_fuser_offline::evaluation::EvaluateConfig;
+use support::atomic_file;
 
 pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
 
 use crate::experiment::cell::Cell;
 use crate::experiment::evaluation::{EvaluationOptions, OpenedData, Part, compute};
+use crate::experiment::slices::Slice;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
 use training::feature_store::KeptMaps;
 
@@ -49,13 +51,15 @@ pub trait TableObserver {
     fn frame(&mut self);
 }
 
-/// Computes the missing cells and writes every table into `out`: `NAME.md`, `NAME.csv`, and `cells/`.
+/// Computes the missing cells and writes every table into `out`: `NAME.md`, `NAME.csv`, and `cells/`. Of a slice only
+/// its cells are computed, and no table is written.
 ///
 /// # Errors
 /// An error at the first cell that cannot be computed; earlier cells are cached.
 pub fn run(
     spec: &TableSpec,
     out: &Path,
+    slice: Option<Slice>,
     observer: &mut dyn TableObserver,
 ) -> Result<Vec<FilledTable>> {
     let cells = out.join("cells");
@@ -66,12 +70,22 @@ pub fn run(
     };
     let data = part.open(&spec.dataset, &spec.protocol)?;
     let run = Run { spec, cells, data };
+    let places = run.places()?;
+    let part = slice.map_or(0..places.len(), |slice| slice.part(places.len()));
+    let mut cells = Vec::with_capacity(part.len());
+    for place in &places[part] {
+        cells.push(run.cell(place, observer)?);
+    }
+    if slice.is_some() {
+        return Ok(Vec::new());
+    }
+    let mut cells = cells.into_iter();
     let mut filled = Vec::with_capacity(spec.tables.len());
     for table in &spec.tables {
-        let table = run.fill(table, observer)?;
+        let table = run.fill(table, &mut cells)?;
         for (ending, text) in [("md", markdown(&table)), ("csv", csv(&table))] {
             let path = out.join(format!("{}.{ending}", table.name));
-            fs::write(&path, text).with_context(|| path.display().to_string())?;
+            atomic_file::write(&path, text).with_context(|| path.display().to_string())?;
         }
         filled.push(table);
     }
@@ -84,19 +98,45 @@ struct Run<'a> {
     data: OpenedData,
 }
 
+/// Place of a cell in the tables.
+struct Place<'a> {
+    table: &'a Table,
+    row: &'a Row,
+    column: &'a Column,
+    /// Weights of one training.
+    weights: PathBuf,
+}
+
 impl Run<'_> {
-    fn fill(&self, table: &Table, observer: &mut dyn TableObserver) -> Result<FilledTable> {
+    /// Every cell: by table, row, column and training.
+    fn places(&self) -> Result<Vec<Place<'_>>> {
+        let mut places = Vec::new();
+        for table in &self.spec.tables {
+            for row in &table.rows {
+                for column in &table.columns {
+                    places.extend(self.spec.weights_of(row)?.into_iter().map(|weights| Place {
+                        table,
+                        row,
+                        column,
+                        weights,
+                    }));
+                }
+            }
+        }
+        Ok(places)
+    }
+
+    /// The table with the next of `cells`, which are in the order of [`Self::places`].
+    fn fill(&self, table: &Table, cells: &mut impl Iterator<Item = Cell>) -> Result<FilledTable> {
         let mut rows = Vec::with_capacity(table.rows.len());
         for row in &table.rows {
-            let weights = self.spec.weights_of(row)?;
-            let mut cells = Vec::with_capacity(table.columns.len());
-            for column in &table.columns {
-                let of_training =
-                    |weights: &PathBuf| self.cell(table, row, column, weights, observer);
-                cells.push(weights.iter().map(of_training).collect::<Result<_, _>>()?);
-            }
-            let row = row.clone();
-            rows.push(FilledRow { row, cells });
+            let trainings = self.spec.weights_of(row)?.len();
+            rows.push(FilledRow {
+                row: row.clone(),
+                cells: (table.columns.iter())
+                    .map(|_| cells.by_ref().take(trainings).collect())
+                    .collect(),
+            });
         }
         Ok(FilledTable {
             name: table.name.clone(),
@@ -105,15 +145,11 @@ impl Run<'_> {
         })
     }
 
-    fn cell(
-        &self,
-        table: &Table,
-        row: &Row,
-        column: &Column,
-        weights: &Path,
-        observer: &mut dyn TableObserver,
-    ) -> Result<Cell> {
-        let options = self.options(table, row, column, weights);
+    fn cell(&self, place: &Place<'_>, observer: &mut dyn TableObserver) -> Result<Cell> {
+        let Place {
+            table, row, column, ..
+        } = place;
+        let options = self.options(place);
         let key = options.key(&self.data, row.method)?;
         let known = Cell::read(&key, &self.cells)?;
         observer.cell(&table.name, &row.label(), &column.name, known.is_some());
@@ -125,15 +161,15 @@ impl Run<'_> {
         Ok(cell)
     }
 
-    fn options(
-        &self,
-        table: &Table,
-        row: &Row,
-        column: &Column,
-        weights: &Path,
-    ) -> EvaluationOptions {
+    fn options(&self, place: &Place<'_>) -> EvaluationOptions {
+        let Place {
+            table,
+            row,
+            column,
+            weights,
+        } = place;
         let settings = EvaluateConfig {
-            weights: weights.to_owned(),
+            weights: weights.clone(),
             precision: self.spec.precision,
             pose_source: row.poses.as_ref().unwrap_or(&column.poses).clone(),
             codec: self.spec.codec(),
