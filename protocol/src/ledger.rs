@@ -351,7 +351,7 @@ mod tests {
             for other in ["agent-666", "ego-666", "link-666", "viewer", "unknown"] {
                 assert_eq!(
                     ledger.clone().remove_foreign(&process(other)),
-                    [account.clone()],
+                    std::slice::from_ref(&account),
                     "{other}"
                 );
             }

@@ -11,7 +11,7 @@ use crate::Error;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use dataset::{self, IntensityScale, LoadOptions, Scenario};

@@ -147,16 +147,14 @@ fn quoted(word: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use proptest::prelude::*;
-
     use super::*;
 
-    proptest! {
-        #[test]
-        fn every_cell_is_in_exactly_one_slice(cells in 0usize..500, count in 1usize..40) {
+    #[test]
+    fn every_cell_is_in_exactly_one_slice() {
+        for (cells, count) in [(0, 1), (5, 7), (12, 5), (100, 3), (499, 39)] {
             let slices = (1..=count).map(|number| Slice { number, count });
             let places: Vec<usize> = slices.flat_map(|slice| slice.part(cells)).collect();
-            prop_assert_eq!(places, (0..cells).collect::<Vec<_>>());
+            assert_eq!(places, (0..cells).collect::<Vec<_>>());
         }
     }
 

@@ -215,8 +215,8 @@ fn chunks_that_unpack_to_far_more_than_the_file_are_left_out_and_counted() {
         .emit_summary_records(false);
     let mut bytes = std::io::Cursor::new(Vec::new());
     let mut writer = options.create(&mut bytes).unwrap();
-    let message = Message {
-        channel: Arc::new(mcap::Channel {
+    let message = mcap::Message {
+        channel: std::sync::Arc::new(mcap::Channel {
             id: 0,
             topic: "zeros".into(),
             schema: None,
