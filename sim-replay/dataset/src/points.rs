@@ -21,10 +21,7 @@ use floats::FloatForm;
 use intensity::SAMPLES;
 
 use super::{OpenOptions, ReadError, files, npy, ply};
-use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
-
-/// Largest point file that is read, bytes, compressed or not: a sweep of a 128-channel LiDAR has some 10 MB.
-pub(super) const MAX_BYTES: u64 = 1 << 30;
+use crate::pcd::{self, IntensityKind, IntensityOrigin, MAX_BYTES, PcdCloud};
 
 /// Storage of the points of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

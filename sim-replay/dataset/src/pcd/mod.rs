@@ -30,6 +30,8 @@ pub use encode::{Encoding, IntensityField, encode};
 use header::{Data, Header};
 pub use protocol::IntensityKind;
 
+/// Largest point file that is read, bytes, compressed or not: a sweep of a 128-channel LiDAR has some 10 MB.
+pub(super) const MAX_BYTES: u64 = 1 << 30;
 /// Red of full intensity.
 const RED_SCALE: f32 = 255.0;
 
