@@ -140,7 +140,7 @@ impl CaptureClocks {
             if clock.offset_nanos == 0 {
                 continue;
             }
-            let capture_offset_s = Some(clock.offset_nanos as f64 * 1e-9);
+            let capture_offset_s = Some(clock.offset_nanos as f64 / 1e9);
             match states.iter_mut().find(|state| state.cav == *cav) {
                 Some(state) => state.capture_offset_s = capture_offset_s,
                 None => states.push(NeighbourState {

@@ -23,6 +23,12 @@ pub(crate) fn explained(reason: String, fields: &[String]) -> String {
     let Some((unknown, expected)) = parts(&reason) else {
         return reason;
     };
+    // A field that only another kind of file has says more than one that is spelled like a known one.
+    let is_of_another_kind =
+        |field: &str| !expected.contains(&field) && fields.iter().any(|own| own == field);
+    if let Some((_, kind)) = KINDS.iter().find(|(field, _)| is_of_another_kind(field)) {
+        return format!("unknown field `{unknown}`: this is {kind}");
+    }
     let likeness = |name: &&str| strsim::jaro_winkler(unknown, name);
     let nearest = expected
         .iter()
@@ -33,27 +39,17 @@ pub(crate) fn explained(reason: String, fields: &[String]) -> String {
             "unknown field `{unknown}`, did you mean `{name}`? The fields are {}",
             expected.join(", ")
         ),
-        // A type with nested fields names no expected ones: only the unknown field itself tells the kind then.
-        None => match KINDS.iter().find(|(field, _)| match expected.is_empty() {
-            true => unknown == *field,
-            false => !expected.contains(field) && fields.iter().any(|own| own == field),
-        }) {
-            Some((_, kind)) => format!("unknown field `{unknown}`: this is {kind}"),
-            None => reason,
-        },
+        None => reason,
     }
 }
 
-/// The unknown field and the known ones of serde's message.
+/// The unknown field and the known ones of serde's message, in which these are quoted or not.
 fn parts(reason: &str) -> Option<(&str, Vec<&str>)> {
-    let mut quoted = reason
-        .strip_prefix("unknown field `")?
-        .split('`')
-        .step_by(2);
-    Some((
-        quoted.next()?,
-        quoted.filter(|name| !name.is_empty()).collect(),
-    ))
+    let (unknown, rest) = reason.strip_prefix("unknown field `")?.split_once('`')?;
+    let known = rest.strip_prefix(", expected ")?;
+    let known = known.strip_prefix("one of ").unwrap_or(known);
+    let names = known.split(", ").map(|name| name.trim_matches('`'));
+    Some((unknown, names.collect()))
 }
 
 #[cfg(test)]
@@ -70,6 +66,8 @@ mod tests {
         );
         let other = REASON.replace("metod", "velocity");
         assert_eq!(explained(other.clone(), &["velocity".into()]), other);
+        let plain = "unknown field `metod`, expected one of run, method, scene";
+        assert_eq!(explained(plain.into(), &[]), explained(REASON.into(), &[]));
         let single = "unknown field `rat`, expected `rate`";
         assert_eq!(explained(single.into(), &[]), single);
         assert_eq!(

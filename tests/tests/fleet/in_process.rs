@@ -329,6 +329,7 @@ fn a_recorded_run_replayed_gives_the_same_detections() {
                 (again_capture, again.pose),
                 "{method}"
             );
+            assert_eq!(live.fused, again.fused, "{method} at {capture}");
             assert_eq!(live.detections, again.detections, "{method} at {capture}");
         }
     }

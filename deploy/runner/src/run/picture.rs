@@ -450,7 +450,7 @@ mod tests {
             }
             .map_size()
             .unwrap_err();
-            assert!(error.to_string().starts_with("cannot draw x"), "{error}");
+            assert!(error.to_string().starts_with("cannot draw: x"), "{error}");
         }
     }
 }

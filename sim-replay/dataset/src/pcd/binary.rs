@@ -315,12 +315,20 @@ pub(crate) mod tests {
         );
         let stretched = [&file[..], &[0; 3731]].concat();
         assert_eq!(decode(&stretched).unwrap().points, cloud);
-        let mut absurd = file.clone();
-        absurd[lengths_at + 4..lengths_at + 8].copy_from_slice(&u32::MAX.to_le_bytes());
-        assert_eq!(
-            decode(&absurd).unwrap_err().to_string(),
-            "DATA: 10 points of 16 bytes stated, but unpacked they are 4294967295 bytes: more"
-        );
+        for (unpacked, message) in [
+            (
+                100_000,
+                "DATA: 10 points of 16 bytes stated, but unpacked they are 100000 bytes: more",
+            ),
+            (
+                u32::MAX,
+                "DATA: 4294967295 bytes unpacked, at most 1073741824 are read",
+            ),
+        ] {
+            let mut absurd = file.clone();
+            absurd[lengths_at + 4..lengths_at + 8].copy_from_slice(&unpacked.to_le_bytes());
+            assert_eq!(decode(&absurd).unwrap_err().to_string(), message);
+        }
     }
 
     fn decode_packed_len(file: &[u8]) -> usize {
