@@ -405,8 +405,9 @@ mod tests {
         let cloud = PointCloud {
             xyzi: vec![[3.0, 2.0, -1.0, 0.2]; 5],
         };
-        let whole = agent().perceive(&cloud).unwrap();
-        let map = agent().without_head().perceive(&cloud).unwrap();
+        let mut agent = agent();
+        let whole = agent.perceive(&cloud).unwrap();
+        let map = agent.without_head().perceive(&cloud).unwrap();
         assert_eq!(map.features, whole.features);
         assert!(map.confidence.is_empty() && map.detections.is_empty());
         assert!(map.times.iter().all(|stage| stage.stage != "head"));

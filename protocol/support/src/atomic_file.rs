@@ -23,10 +23,10 @@ pub fn write(path: &Path, contents: impl AsRef<[u8]>) -> io::Result<()> {
     File::open(folder_of(path))?.sync_all()
 }
 
-/// [`write`] for a file that is written again within seconds: it may be lost in a power cut, and waits for no disk.
+/// [`write()`] for a file that is written again within seconds: it may be lost in a power cut, and waits for no disk.
 ///
 /// # Errors
-/// As [`write`].
+/// As [`write()`].
 pub fn write_volatile(path: &Path, contents: impl AsRef<[u8]>) -> io::Result<()> {
     unfinished(path, contents.as_ref())?.persist(path)?;
     Ok(())

@@ -47,7 +47,7 @@ fn default_layout() -> String {
 ///
 /// # Errors
 /// [`SynthError::Kept`] if the folder holds other scenes, with the first setting in which they differ;
-/// [`SynthError::Read`] if their settings cannot be read.
+/// [`SynthError::File`] if their settings cannot be read.
 pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
     let folder = options.out.as_path();
     if !folder.exists() {

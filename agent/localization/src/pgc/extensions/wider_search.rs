@@ -1,6 +1,6 @@
 //! Wider search, an extension: while few cells are inliers, a search for cells with larger errors.
 //!
-//! Measured gain: none apart; fog and snow need it together with [`super::other_parts`].
+//! Measured gain: none apart; fog and snow need it together with the search of other parts.
 
 use support::stage_times::StageTimes;
 use tch::TchError;
