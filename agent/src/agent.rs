@@ -107,7 +107,7 @@ impl Agent {
         }
     }
 
-    /// The same with neither confidence nor detections, for maps that are sent whole.
+    /// An agent that computes neither confidence nor detections, for maps that are sent whole.
     #[must_use]
     pub(crate) fn without_head(self) -> Self {
         Self {

@@ -1,7 +1,7 @@
 //! Test fixtures: golden archives of the project and sample data outside it.
 //!
 //! Golden archives are in `tests/golden`, or in `V2V_GOLDEN`. Sample data may not be redistributed: tests that need it
-//! are `#[ignore]`d, and read it from `V2V_DATA`, else from `../shared/data` beside the project. A missing fixture
+//! are `#[ignore]`d, and read it from `V2V_DATA`, else from the folder `shared/data` beside the project. A missing fixture
 //! fails the test with its path. A missing tensor or an unexpected type fails with the names in the message.
 //!
 //! ```

@@ -3,13 +3,11 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use bus::{NETWORK_TRANSIT_S, is_same_clock};
 use protocol::CavId;
 use serde::{Deserialize, Serialize};
 
 use crate::score::NeighbourRecord;
-
-/// Offset of a system clock up to which durations count as measured, seconds.
-const SAME_CLOCK_S: f64 = 0.05;
 
 /// Offsets of a vehicle's clocks from the ego's.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -25,7 +23,7 @@ pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<
     let other = |(cav, record): (&CavId, &NeighbourRecord)| {
         let system_s = record
             .clock_offset_s
-            .filter(|offset_s| offset_s.abs() > SAME_CLOCK_S);
+            .filter(|offset_s| !is_same_clock(*offset_s, NETWORK_TRANSIT_S));
         let capture_s = record.capture_offset_s;
         let is_other = system_s.is_some() || capture_s.is_some();
         is_other.then(|| {

@@ -183,6 +183,7 @@ impl ScorerNode {
             bus_stats: bus.stats().clone(),
             board,
             stats: BTreeMap::new(),
+            reported_foreign: BTreeSet::new(),
             progress: Arc::clone(&progress),
             detections,
             truth_lines,
@@ -294,6 +295,8 @@ struct Worker {
     bus_stats: bus::MessageStats,
     board: FrameScores,
     stats: ScoreStats,
+    /// Processes whose reports on messages of others are named already.
+    reported_foreign: BTreeSet<ProcessId>,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
     truth_lines: ResultLines,
@@ -425,7 +428,9 @@ impl Worker {
             return tracing::warn!(%sender, %process, "report with another process's name, or of too many processes: ignored");
         }
         let foreign = ledger.remove_foreign(&process);
-        if let Some(first) = foreign.first() {
+        if let Some(first) = foreign.first()
+            && self.reported_foreign.insert(process.clone())
+        {
             let others = foreign.len() - 1;
             tracing::warn!(%process, "report on messages of other processes, {first} and {others} more: ignored");
         }

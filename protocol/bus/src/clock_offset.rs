@@ -5,12 +5,18 @@ use std::time::{Duration, Instant};
 /// The fastest message of this period and of the period before it gives the estimate.
 const WINDOW: Duration = Duration::from_secs(10);
 /// Offset ahead beyond which a warning is logged, seconds.
-pub(super) const AHEAD_S: f64 = 0.05;
+const AHEAD_S: f64 = 0.05;
 /// Longest transit time without a link emulation, seconds: the fastest message of a busy machine takes less.
 pub const NETWORK_TRANSIT_S: f64 = 0.15;
 /// Longest transit time behind a link emulation, seconds. A clock that is behind has the same effect, so that a warning
 /// is logged beyond it.
 pub const LINK_TRANSIT_S: f64 = 2.0;
+
+/// True if the clock of a sender with this offset (its clock minus ours, seconds, minus the shortest transit time) counts
+/// as ours: a transit time of up to `longest_transit_s` looks like a clock that is behind.
+pub fn is_same_clock(offset_s: f64, longest_transit_s: f64) -> bool {
+    (-longest_transit_s..=AHEAD_S).contains(&offset_s)
+}
 
 /// Clock offset of one sender.
 #[derive(Debug, Clone, Copy)]

@@ -75,7 +75,7 @@ pub mod web;
 pub use access_control::AccessControl;
 pub use args::{BusConfig, InboxConfig, STOP_LIMIT, log_to_stderr};
 pub use bus::{Bus, Identity};
-pub use clock_offset::{LINK_TRANSIT_S, NETWORK_TRANSIT_S};
+pub use clock_offset::{LINK_TRANSIT_S, NETWORK_TRANSIT_S, is_same_clock};
 pub use credentials::{
     AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER,
 };

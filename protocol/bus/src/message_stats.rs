@@ -13,7 +13,7 @@ use protocol::{
 use support::statistics::{quantile, sorted};
 
 use super::Arrival;
-use super::clock_offset::{AHEAD_S, ClockOffset};
+use super::clock_offset::{ClockOffset, is_same_clock};
 use super::frame_stats::FrameStats;
 
 /// Maximum number of accounts of one process, equal to the limit of the ledger's receivers.
@@ -297,7 +297,7 @@ impl MessageStats {
         let peer = state.peers.get(cav);
         let clock = peer.and_then(|peer| peer.clock.as_ref());
         let offset_s = clock.map_or(0.0, ClockOffset::seconds);
-        if (-longest_transit_s..=AHEAD_S).contains(&offset_s) {
+        if is_same_clock(offset_s, longest_transit_s) {
             0.0
         } else {
             offset_s

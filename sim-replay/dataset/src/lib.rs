@@ -92,7 +92,9 @@ pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::content_sha256;
 pub use open::{OpenOptions, open, open_with};
-pub use points::{IntensityScale, IntensityScaleError, LiveIntensities, Plausibility};
+pub use points::{
+    IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities, Plausibility,
+};
 pub use presence::LoadedTick;
 pub use problem::{Problem, reasons};
 pub use recorded::recording_of;

@@ -14,7 +14,7 @@ use std::sync::OnceLock;
 use protocol::{CavId, PointCloud, intensity_divisor};
 
 pub(crate) use intensity::NO_INTENSITY;
-pub use intensity::{IntensityScale, IntensityScaleError, LiveIntensities};
+pub use intensity::{IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities};
 pub use plausibility::Plausibility;
 
 use floats::FloatForm;

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use dataset::{self, IntensityScale, OpenOptions};
+use dataset::{self, IntensityOption, OpenOptions};
 use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
 use support::{output, progress};
 
@@ -24,15 +24,8 @@ pub(crate) struct Args {
     /// Layout of the files.
     #[arg(long, value_enum)]
     layout: SceneLayout,
-    /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as shown by
-    /// inspect].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    intensity: IntensityOption,
     /// Write into a folder that is not empty; existing files of the layout are replaced.
     #[arg(long)]
     force: bool,
@@ -44,7 +37,7 @@ pub(crate) struct Args {
 /// Converts and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let open = OpenOptions {
-        intensity_scale: args.intensity_scale,
+        intensity_scale: args.intensity.scale,
         ..OpenOptions::default()
     };
     let input = match dataset::open_with(&args.from, &open) {

@@ -83,7 +83,7 @@ impl Quantisation {
             .f_to_kind(Kind::Uint8)
     }
 
-    /// The same of plain values, as many as `steps` has places.
+    /// Quantises plain values as [`Self::quantise`] does, one into each place of `steps`.
     pub fn quantise_values(&self, values: &[f32], steps: &mut [u8]) {
         let (factor, zero) = (self.scale.step().recip() as f32, f32::from(self.zero_point));
         for (step, value) in steps.iter_mut().zip(values) {

@@ -6,7 +6,7 @@ use agent::attack::{AttackConfig, Falsification};
 use agent::config::Threads;
 use agent::rate::RateConfig;
 use clap::ArgGroup;
-use dataset::IntensityScale;
+use dataset::IntensityOption;
 use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::misbehaviour::MisbehaviourConfig;
@@ -141,16 +141,10 @@ pub(crate) struct Arguments {
     /// Largest number of scenarios to evaluate, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
-    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` describes the rule].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    intensity: IntensityOption,
     /// Number of compute threads, 1 to 256 [default: 1].
-    #[arg(long)]
+    #[arg(long, conflicts_with = "print")]
     threads: Option<Threads>,
     #[command(flatten)]
     protocol: ProtocolConfig,
@@ -234,13 +228,13 @@ impl Arguments {
                 folder: folder.clone(),
                 dtype: self.codec.0.dtype,
                 limit_bytes: u64::MAX,
-                intensity_scale: self.intensity_scale,
+                intensity_scale: self.intensity.scale,
             }),
             stepped: self.emulates_link().then(|| self.stepped()).transpose()?,
             part: Part {
                 scenarios: self.scenarios.map(at_most),
                 frames: self.frames.map(at_most),
-                intensity_scale: self.intensity_scale,
+                intensity_scale: self.intensity.scale,
             },
             protocol: self.protocol.clone(),
             out: self.out.clone(),

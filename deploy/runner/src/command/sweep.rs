@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use figures::FigureError;
 use runner::experiment::sweep::{Experiment, Sweep, SweepOptions, WorkerError};
 use support::output;
 
@@ -18,18 +19,18 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Number of compute processes, each with one thread. The results do not depend on it.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    #[arg(long, default_value_t = 1, conflicts_with = "print", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: u16,
     /// Only print the number of runs and the time that they will take; nothing is written.
-    #[arg(long)]
+    #[arg(long, conflicts_with_all = ["slice", "print"])]
     dry_run: bool,
     /// Keep the feature maps of all sweeps after the last run: a grid that is extended later needs no encoding again.
-    #[arg(long, conflicts_with = "dry_run")]
+    #[arg(long, conflicts_with_all = ["dry_run", "slice", "print"])]
     keep_feature_maps: bool,
     #[command(flatten)]
     slices: SliceArgs,
     /// Print the settings and metrics of every run as JSON instead of a table.
-    #[arg(long, conflicts_with_all = ["dry_run", "slice"])]
+    #[arg(long, conflicts_with_all = ["dry_run", "slice", "print"])]
     json: bool,
     /// Compute the runs whose numbers come on standard input, for another sweep.
     #[arg(long, hide = true)]
@@ -90,9 +91,9 @@ impl Arguments {
     }
 }
 
-/// An error of the input, unless a worker or the file system has failed.
+/// An error of the input, unless a worker or a drawing has failed.
 fn blamed(error: anyhow::Error) -> anyhow::Error {
-    match error.is::<WorkerError>() {
+    match error.is::<WorkerError>() || error.is::<FigureError>() {
         true => error,
         false => BadInput::of(error).into(),
     }

@@ -121,18 +121,25 @@ fn parallel(command: &str, count: usize) -> String {
 }
 
 fn snakemake(command: &str, count: usize, result: &Path) -> String {
-    // Braces are Snakemake's own, and its strings are Python's.
-    let command = command.replace('{', "{{").replace('}', "}}");
     let result = result.display();
+    let [table, slices] =
+        [format!("{result}"), format!("{result}.slices/")].map(|text| python(&text));
+    let command = python(command);
     format!(
         "rule table:\n    \
-             input: expand(\"{result}.slices/{{slice}}\", slice=range(1, {count} + 1))\n    \
-             output: \"{result}\"\n    \
-             shell: r\"\"\"{command}\"\"\"\n\n\
+             input: expand({slices} + \"{{slice}}\", slice=range(1, {count} + 1))\n    \
+             output: {table}\n    \
+             shell: {command}\n\n\
          rule slice:\n    \
-             output: touch(\"{result}.slices/{{slice}}\")\n    \
-             shell: r\"\"\"{command} --slice {{wildcards.slice}}/{count}\"\"\"\n",
+             output: touch({slices} + \"{{slice}}\")\n    \
+             shell: {command} + \" --slice {{wildcards.slice}}/{count}\"\n",
     )
+}
+
+/// A text as a string of Python, with braces that Snakemake leaves alone. JSON has the escapes that Python has.
+fn python(text: &str) -> String {
+    let text = text.replace('{', "{{").replace('}', "}}");
+    serde_json::Value::from(text).to_string()
 }
 
 /// A word as a shell reads it back.
@@ -214,5 +221,7 @@ mod tests {
             "{snakefile}"
         );
         assert!(snakefile.contains("output: \"out/a.csv\""), "{snakefile}");
+        let odd = Engine::Snakemake.file(&command, 1, Path::new("a \"{b}.csv"));
+        assert!(odd.contains(r#"output: "a \"{{b}}.csv""#), "{odd}");
     }
 }

@@ -103,7 +103,7 @@ impl Arguments {
         for folder in &self.data.data {
             let opened = dataset::open_with(folder, &self.data.options()).map_err(BadInput::of)?;
             left_out.add_files(&opened.problems);
-            let scale = self.data.intensity_scale;
+            let scale = self.data.intensity.scale;
             left_out.add_findings(findings::sampled(&opened.scenarios, scale));
             let protocol = self
                 .protocol

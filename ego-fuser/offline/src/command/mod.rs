@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use bus::malloc_settings;
-use dataset::{self, IntensityScale, OpenOptions, Scenario};
+use dataset::{self, IntensityOption, OpenOptions, Scenario};
 use support::cli::{BadInput, Outcome};
 
 /// Subcommands of `ego-fuser` that read data sets.
@@ -34,14 +34,8 @@ struct DataSets {
     /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
     #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    intensity: IntensityOption,
 }
 
 impl Command {
@@ -64,7 +58,7 @@ impl Command {
 impl DataSets {
     fn options(&self) -> OpenOptions {
         OpenOptions {
-            intensity_scale: self.intensity_scale,
+            intensity_scale: self.intensity.scale,
             ..OpenOptions::default()
         }
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use clap::ArgGroup;
 use dataset::evaluation_protocol::ProtocolConfig;
-use dataset::{IntensityScale, Layout, OpenOptions};
+use dataset::{IntensityOption, Layout, OpenOptions};
 use fusion::model::ModelError;
 use fusion::pastat::{Part, ablated};
 use fusion::{Exchange, FusionConfig, Method};
@@ -33,14 +33,8 @@ pub(crate) struct Arguments {
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    /// Number that stored intensities are divided by [default: auto; see `sim-replay inspect --help`].
-    #[arg(
-        long,
-        value_name = "auto|1|255|NUMBER",
-        default_value_t,
-        hide_default_value = true
-    )]
-    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    intensity: IntensityOption,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value_t = Method::NONE)]
     method: Method,
@@ -242,7 +236,7 @@ impl Arguments {
             validation: self.validation.clone(),
             protocol: self.protocol.clone(),
             open: OpenOptions {
-                intensity_scale: self.intensity_scale,
+                intensity_scale: self.intensity.scale,
                 ..OpenOptions::default()
             },
             method: self.method,
@@ -256,7 +250,7 @@ impl Arguments {
                     Exactness::I8 => Dtype::I8,
                 },
                 limit_bytes: (self.feature_maps_limit_gb.max(0.0) * 1e9) as u64,
-                intensity_scale: self.intensity_scale,
+                intensity_scale: self.intensity.scale,
             }),
             run: RunConfig {
                 optimizer: AdamWConfig {

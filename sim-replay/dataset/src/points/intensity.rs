@@ -32,6 +32,20 @@ pub struct IntensityScale {
 // Never NaN.
 impl Eq for IntensityScale {}
 
+/// Option of commands that read sweeps of a data set.
+#[derive(Debug, Clone, Copy, Default, clap::Args)]
+pub struct IntensityOption {
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` describes the rule].
+    #[arg(
+        id = "intensity_scale",
+        long = "intensity-scale",
+        value_name = "auto|1|255|NUMBER",
+        default_value_t,
+        hide_default_value = true
+    )]
+    pub scale: IntensityScale,
+}
+
 /// Reasons why a text is no [`IntensityScale`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(

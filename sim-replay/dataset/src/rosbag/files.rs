@@ -173,11 +173,15 @@ fn unpacked_copy(path: &Path) -> io::Result<TempPath> {
     let mut unpacked = zstd::stream::Decoder::new(file)?.take(most.saturating_add(1));
     let mut copy = tempfile::NamedTempFile::new()?;
     if io::copy(&mut unpacked, copy.as_file_mut())? > most {
-        return Err(io::Error::other(format!(
-            "more than {most} bytes, the most that is read of a file of this size"
-        )));
+        return Err(too_much(most));
     }
     Ok(copy.into_temp_path())
+}
+
+fn too_much(most: u64) -> io::Error {
+    io::Error::other(format!(
+        "unpacks to more than {most} bytes, the most that is read of its size"
+    ))
 }
 
 /// A message as it was published, unpacked if it is compressed by itself: a message in CDR never begins as zstd does.
@@ -188,6 +192,11 @@ pub(super) fn unpacked_message(data: &[u8]) -> io::Result<Cow<'_, [u8]>> {
     let mut message = Vec::new();
     let decoder = zstd::stream::Decoder::new(data)?;
     let most = bounded_file::most_unpacked(data.len() as u64);
-    decoder.take(most).read_to_end(&mut message)?;
+    decoder
+        .take(most.saturating_add(1))
+        .read_to_end(&mut message)?;
+    if message.len() as u64 > most {
+        return Err(too_much(most));
+    }
     Ok(Cow::Owned(message))
 }

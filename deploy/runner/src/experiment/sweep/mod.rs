@@ -5,6 +5,7 @@
 
 mod charts;
 mod check;
+mod generated_data;
 mod grid;
 mod html;
 mod point_options;
@@ -14,7 +15,7 @@ mod varying;
 mod workers;
 
 use std::collections::BTreeSet;
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, BufRead, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -28,7 +29,6 @@ use figures;
 use fusion::Exchange;
 use perception::weights::Weights;
 use serde::Serialize;
-use simulator::generate::{self, Subset, SynthOptions};
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::file_error::FileError;
 use support::{atomic_file, output, progress};
@@ -39,6 +39,7 @@ pub use grid::{Point, points};
 pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
+use self::generated_data::{generate, is_generated};
 use self::varying::VaryingTable;
 use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::evaluation::{OpenedData, compute, evaluate};
@@ -406,59 +407,4 @@ fn missing(known: &[Option<Cell>], part: Range<usize>) -> Vec<usize> {
 /// Writes a file of the sweep.
 fn write(path: &Path, text: &str) -> Result<()> {
     atomic_file::write(path, text).with_context(|| path.display().to_string())
-}
-
-/// Options with which the data set of the experiment is generated.
-fn generator(experiment: &Experiment) -> Option<SynthOptions> {
-    let generate = experiment.generate.as_ref()?;
-    Some(SynthOptions {
-        frames: generate.frames,
-        scenes: generate.scenes,
-        agents: generate.vehicles(),
-        threads: std::thread::available_parallelism().map_or(1, usize::from),
-        ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
-    })
-}
-
-/// True if no data set is requested, or it exists.
-fn is_generated(experiment: &Experiment) -> Result<bool> {
-    let kept = generator(experiment).map_or(Ok(true), |options| generate::are_kept(&options));
-    kept.context("generate")
-}
-
-/// Generates the data set, unless it is there.
-fn generate(experiment: &Experiment) -> Result<()> {
-    let Some(options) = generator(experiment) else {
-        return Ok(());
-    };
-    if is_generated(experiment)? {
-        return Ok(());
-    }
-    // Of two slices that start together one generates, the other waits for it.
-    let path = options.out.with_added_extension("lock");
-    let _lock = lock(&path).with_context(|| path.display().to_string())?;
-    if is_generated(experiment)? {
-        return Ok(());
-    }
-    output::note(format_args!(
-        "generating {} scenarios into {}",
-        options.scenes,
-        experiment.dataset.display()
-    ));
-    let bar = progress::percent_bar(options.scenes);
-    let generated =
-        generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
-    bar.finish_and_clear();
-    generated.context("generate")?;
-    fs::remove_file(&path).with_context(|| path.display().to_string())
-}
-
-/// A lock that other processes wait for, on this host and on those that share the folder, until it is dropped.
-fn lock(path: &Path) -> io::Result<File> {
-    if let Some(folder) = path.parent() {
-        fs::create_dir_all(folder)?;
-    }
-    let file = File::create(path)?;
-    file.lock()?;
-    Ok(file)
 }

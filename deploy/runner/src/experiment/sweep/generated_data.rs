@@ -1,0 +1,73 @@
+//! Generated data set of an experiment: made once, also where several slices start together.
+
+use std::fs::{self, File};
+use std::io;
+use std::path::Path;
+
+use anyhow::{Context, Result};
+use simulator::generate::{self, Subset, SynthOptions};
+use support::{output, progress};
+
+use super::Experiment;
+
+/// Options with which the data set of the experiment is generated.
+fn generator(experiment: &Experiment) -> Option<SynthOptions> {
+    let generate = experiment.generate.as_ref()?;
+    Some(SynthOptions {
+        frames: generate.frames,
+        scenes: generate.scenes,
+        agents: generate.vehicles(),
+        threads: std::thread::available_parallelism().map_or(1, usize::from),
+        ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
+    })
+}
+
+/// True if no data set is requested, or it exists.
+pub(super) fn is_generated(experiment: &Experiment) -> Result<bool> {
+    let kept = generator(experiment).map_or(Ok(true), |options| generate::are_kept(&options));
+    kept.context("generate")
+}
+
+/// Generates the data set, unless it is there.
+pub(super) fn generate(experiment: &Experiment) -> Result<()> {
+    let Some(options) = generator(experiment) else {
+        return Ok(());
+    };
+    if is_generated(experiment)? {
+        return Ok(());
+    }
+    // Of two slices that start together one generates, the other waits for it.
+    let path = options.out.with_added_extension("lock");
+    let lock = lock(&path).with_context(|| path.display().to_string())?;
+    if !is_generated(experiment)? {
+        generate_now(&options)?;
+    }
+    drop(lock);
+    match fs::remove_file(&path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(error).with_context(|| path.display().to_string())
+        }
+        // Another slice has removed it.
+        Ok(()) | Err(_) => Ok(()),
+    }
+}
+
+fn generate_now(options: &SynthOptions) -> Result<()> {
+    let (scenes, folder) = (options.scenes, options.out.display());
+    output::note(format_args!("generating {scenes} scenarios into {folder}"));
+    let bar = progress::percent_bar(scenes);
+    let generated = generate::generate_whole(options, &|thousandths| bar.set_position(thousandths));
+    bar.finish_and_clear();
+    generated.context("generate")?;
+    Ok(())
+}
+
+/// A lock that other processes wait for, on this host and on those that share the folder, until it is dropped.
+fn lock(path: &Path) -> io::Result<File> {
+    if let Some(folder) = path.parent() {
+        fs::create_dir_all(folder)?;
+    }
+    let file = File::create(path)?;
+    file.lock()?;
+    Ok(file)
+}
