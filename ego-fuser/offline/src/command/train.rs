@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use clap::ArgGroup;
+use dataset::Layout;
 use dataset::evaluation_protocol::ProtocolConfig;
-use dataset::{IntensityOption, Layout, OpenOptions};
 use fusion::model::ModelError;
 use fusion::pastat::{Part, ablated};
 use fusion::{Exchange, FusionConfig, Method};
@@ -21,20 +21,18 @@ use training::loss::{LossConfig, Unassigned};
 use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
 use training::train::{self, Accuracy, Observer, StepReport, TrainConfig};
 
+use super::DataSets;
 use support::cli::BadInput;
 
 /// Trains a method on scenes; writes checkpoint, curve.csv and curve.png, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 #[command(group = ArgGroup::new("noise").args(["noise_position_std_m", "noise_heading_std_deg"]).multiple(true))]
 pub(crate) struct Arguments {
-    /// Datasets, splits or scenarios to learn from.
-    #[arg(long = "dataset", required = true, num_args = 1.., value_name = "DIR")]
-    data: Vec<PathBuf>,
+    #[command(flatten)]
+    data: DataSets,
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    #[command(flatten)]
-    intensity: IntensityOption,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value_t = Method::NONE)]
     method: Method,
@@ -194,7 +192,7 @@ impl Arguments {
             let reason = "--drop-neighbour is a probability, --validate-every-steps is above zero";
             return Err(BadInput::new(reason).into());
         }
-        for folder in self.data.iter().chain(&self.validation) {
+        for folder in self.data.data.iter().chain(&self.validation) {
             std::fs::read_dir(folder)
                 .map_err(|error| BadInput::new(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
@@ -232,13 +230,10 @@ impl Arguments {
             .run_config(self.batch, self.lr)
             .map_err(BadInput::of)?;
         Ok(TrainConfig {
-            data: self.data.clone(),
+            data: self.data.data.clone(),
             validation: self.validation.clone(),
             protocol: self.protocol.clone(),
-            open: OpenOptions {
-                intensity_scale: self.intensity.scale,
-                ..OpenOptions::default()
-            },
+            open: self.data.options(),
             method: self.method,
             detector: self.network.clone(),
             init: self.init.clone(),
@@ -250,7 +245,7 @@ impl Arguments {
                     Exactness::I8 => Dtype::I8,
                 },
                 limit_bytes: (self.feature_maps_limit_gb.max(0.0) * 1e9) as u64,
-                intensity_scale: self.intensity.scale,
+                intensity_scale: self.data.intensity.scale,
             }),
             run: RunConfig {
                 optimizer: AdamWConfig {
