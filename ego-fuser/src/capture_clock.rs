@@ -52,21 +52,12 @@ struct Clock {
 }
 
 impl CaptureClocks {
-    /// Arrivals that are measured: three sweeps of a vehicle make an estimate.
+    /// Clocks without a sweep. Where arrivals are exact, as in simulation time, one sweep of a vehicle makes an
+    /// estimate; where they are measured, three do.
     #[must_use]
-    pub fn measured() -> Self {
-        Self::new(3)
-    }
-
-    /// Arrivals in simulation time, which are exact: one sweep of a vehicle makes an estimate.
-    #[must_use]
-    pub fn exact() -> Self {
-        Self::new(1)
-    }
-
-    fn new(fewest: usize) -> Self {
+    pub fn new(has_exact_arrivals: bool) -> Self {
         Self {
-            fewest,
+            fewest: if has_exact_arrivals { 1 } else { 3 },
             own: VecDeque::new(),
             neighbours: BTreeMap::new(),
         }
@@ -257,7 +248,7 @@ mod tests {
         ahead_ms: impl Fn(u64) -> i64,
         late_ms: impl Fn(u64) -> u64,
     ) -> Vec<Option<i64>> {
-        let mut clocks = CaptureClocks::measured();
+        let mut clocks = CaptureClocks::new(false);
         let cav = CavId::new("9").unwrap();
         let began = 1_000_000_000_000 * MS;
         let offset = |clocks: &CaptureClocks| {
@@ -325,7 +316,7 @@ mod tests {
 
     #[test]
     fn extreme_times_are_no_error() {
-        let mut clocks = CaptureClocks::exact();
+        let mut clocks = CaptureClocks::new(true);
         let cav = CavId::new("9").unwrap();
         let [capture_nanos, arrived_nanos] = [u64::MAX, 7];
         clocks.note_own(SweepTime {

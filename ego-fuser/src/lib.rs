@@ -1,6 +1,6 @@
 //! Ego of a collaborating fleet: received BEV feature maps, poses and boxes in, detections around the ego out.
 //!
-//! - [`ego`]: the pipeline, the same live and offline; [`node`]: the process around it.
+//! - [`ego`]: the pipeline; [`ego_loop`]: its decisions, the same live and offline; [`node`]: the process around it.
 //! - [`pairing`]: the messages that belong to a frame; [`silence`]: the neighbours that it waits for; [`capture_clock`]:
 //!   neighbours whose capture times differ.
 //! - [`misbehaviour`]: neighbours whose messages contradict the ego's perception.
@@ -30,6 +30,7 @@ mod command;
 pub mod command_line;
 pub mod config;
 pub mod ego;
+pub mod ego_loop;
 pub mod misbehaviour;
 mod neighbourhood;
 pub mod node;

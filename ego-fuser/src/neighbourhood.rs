@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bus::{Bus, BusError, Inbox, Membership, Subscription};
 use protocol::{CavId, Role, Stream, Topic};
 
-use crate::silence::Silence;
+use crate::ego_loop::Input;
 
 /// Largest number of subscribed neighbours: a flood of tokens must not become a flood of subscriptions.
 const MAX_NEIGHBOURS: usize = 64;
@@ -21,7 +21,6 @@ pub(crate) struct Neighbourhood {
     allowed: Option<BTreeSet<CavId>>,
     membership: Membership,
     members: BTreeMap<CavId, Vec<Subscription>>,
-    silence: Silence,
     queue: Queue,
 }
 
@@ -73,30 +72,29 @@ impl Neighbourhood {
             allowed,
             membership,
             members,
-            silence: Silence::default(),
             queue,
         })
     }
 
-    /// Handles agents that joined and left; returns those that left.
-    pub(crate) fn update(&mut self, bus: &Bus, inbox: &Arc<Inbox>) -> Result<Vec<CavId>, BusError> {
-        let mut gone = Vec::new();
+    /// Handles agents that joined and left, as inputs of the ego's loop.
+    pub(crate) fn update(&mut self, bus: &Bus, inbox: &Arc<Inbox>) -> Result<Vec<Input>, BusError> {
+        let mut changes = Vec::new();
         while let Some((cav, is_there)) = self.membership.next() {
             if is_there && self.is_wanted(&cav) {
                 self.queue.add(cav);
             } else if !is_there {
                 self.queue.remove(&cav);
-                self.silence.reset(&cav);
                 if self.members.remove(&cav).is_some() {
                     tracing::info!(%cav, "a neighbour has left");
-                    gone.push(cav);
+                    changes.push(Input::Left(cav));
                 }
             }
             while let Some(cav) = self.queue.next(self.members.len()) {
-                self.subscribe(cav, bus, inbox)?;
+                self.subscribe(cav.clone(), bus, inbox)?;
+                changes.push(Input::Joined(cav));
             }
         }
-        Ok(gone)
+        Ok(changes)
     }
 
     fn subscribe(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
@@ -119,26 +117,6 @@ impl Neighbourhood {
                 .allowed
                 .as_ref()
                 .is_none_or(|allowed| allowed.contains(cav))
-    }
-
-    /// All current members.
-    pub(crate) fn members(&self) -> impl Iterator<Item = &CavId> {
-        self.members.keys()
-    }
-
-    /// Members whose messages a frame waits for.
-    pub(crate) fn awaited(&self) -> impl Iterator<Item = &CavId> {
-        self.members().filter(|cav| self.silence.is_awaited(cav))
-    }
-
-    /// Records a message from `cav`.
-    pub(crate) fn received(&mut self, cav: &CavId) {
-        self.silence.reset(cav);
-    }
-
-    /// Records that a frame was decided without a message from `cav`.
-    pub(crate) fn missed(&mut self, cav: &CavId) {
-        self.silence.missed(cav);
     }
 }
 

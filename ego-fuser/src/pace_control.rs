@@ -5,7 +5,6 @@
 //! it by a tenth. Failed attempts double that while.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
 
 use protocol::Pace;
 
@@ -17,10 +16,10 @@ const TOO_MANY: usize = 3;
 const TENTHS: u8 = 10;
 /// Largest step downwards, tenths: the first frames of a run are slower than others.
 const MAX_STEP: u8 = 2;
-/// Longest mean interval.
-const MAX_INTERVAL: Duration = Duration::from_secs(1);
-/// First and longest time without an overloaded frame after which the share is raised.
-const PATIENCE: [Duration; 2] = [Duration::from_secs(5), Duration::from_secs(80)];
+/// Longest mean interval, nanoseconds.
+const MAX_INTERVAL_NANOS: u64 = 1_000_000_000;
+/// First and longest time without an overloaded frame after which the share is raised, nanoseconds.
+const PATIENCE_NANOS: [u64; 2] = [5_000_000_000, 80_000_000_000];
 
 /// Controller of an ego's pace.
 #[derive(Debug)]
@@ -30,10 +29,10 @@ pub(crate) struct PaceControl {
     pace: Pace,
     last_nanos: Option<u64>,
     judged: VecDeque<Judged>,
-    /// Time of the last overloaded frame or change.
-    quiet_since: Instant,
-    raised_at: Option<Instant>,
-    patience: Duration,
+    /// Time of the last overloaded frame or change, nanoseconds.
+    quiet_since_nanos: u64,
+    raised_at_nanos: Option<u64>,
+    patience_nanos: u64,
 }
 
 /// A frame since the last change.
@@ -47,15 +46,15 @@ struct Judged {
 impl PaceControl {
     /// Controller that begins with every sweep.
     #[must_use]
-    pub(crate) fn new(now: Instant) -> Self {
+    pub(crate) fn new() -> Self {
         Self {
             period_nanos: None,
             pace: Pace::EVERY_SWEEP,
             last_nanos: None,
             judged: VecDeque::new(),
-            quiet_since: now,
-            raised_at: None,
-            patience: PATIENCE[0],
+            quiet_since_nanos: 0,
+            raised_at_nanos: None,
+            patience_nanos: PATIENCE_NANOS[0],
         }
     }
 
@@ -63,8 +62,8 @@ impl PaceControl {
     pub(crate) fn judge(
         &mut self,
         capture_nanos: u64,
-        waited: Duration,
-        now: Instant,
+        waited_nanos: u64,
+        now_nanos: u64,
     ) -> Option<Pace> {
         let last_nanos = self.last_nanos.replace(capture_nanos);
         // The first frame, or one of a scene that has restarted.
@@ -83,9 +82,9 @@ impl PaceControl {
         // Between two sweeps that are left out, frames wait for each other.
         let is_every_sweep = self.pace == Pace::EVERY_SWEEP;
         let longest_nanos = period_nanos / if is_every_sweep { 2 } else { 1 };
-        let is_overloaded = is_left_out || waited > Duration::from_nanos(longest_nanos);
+        let is_overloaded = is_left_out || waited_nanos > longest_nanos;
         if is_overloaded {
-            self.quiet_since = now;
+            self.quiet_since_nanos = now_nanos;
         }
         self.judged.push_back(Judged {
             gap_nanos,
@@ -94,9 +93,9 @@ impl PaceControl {
         if self.judged.len() > WINDOW {
             self.judged.pop_front();
         }
-        let computed = self.next_share(period_nanos, now)?;
+        let computed = self.next_share(period_nanos, now_nanos)?;
         self.judged.clear();
-        self.quiet_since = now;
+        self.quiet_since_nanos = now_nanos;
         self.pace = if computed == TENTHS {
             Pace::EVERY_SWEEP
         } else {
@@ -111,32 +110,30 @@ impl PaceControl {
     }
 
     /// Another share, tenths, if it is time for one.
-    fn next_share(&mut self, period_nanos: u64, now: Instant) -> Option<u8> {
+    fn next_share(&mut self, period_nanos: u64, now_nanos: u64) -> Option<u8> {
         let share = self.pace.computed * (TENTHS / self.pace.of);
         let count = self
             .judged
             .iter()
             .filter(|frame| frame.is_overloaded)
             .count();
-        let lowest =
-            period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL.as_nanos() as u64;
+        let lowest = period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL_NANOS;
         let lowest = u8::try_from(lowest.max(1)).unwrap_or(TENTHS);
         if count >= TOO_MANY && share > lowest {
-            let has_failed = self
-                .raised_at
-                .take()
-                .is_some_and(|at| now < at + PATIENCE[0]);
-            self.patience = if has_failed {
-                (2 * self.patience).min(PATIENCE[1])
+            let raised_at_nanos = self.raised_at_nanos.take();
+            let has_failed =
+                raised_at_nanos.is_some_and(|at| now_nanos < at.saturating_add(PATIENCE_NANOS[0]));
+            self.patience_nanos = if has_failed {
+                (2 * self.patience_nanos).min(PATIENCE_NANOS[1])
             } else {
-                PATIENCE[0]
+                PATIENCE_NANOS[0]
             };
             let least = share.saturating_sub(MAX_STEP).max(lowest);
             return Some(self.achieved_share(period_nanos).clamp(least, share - 1));
         }
-        let is_quiet = now >= self.quiet_since + self.patience;
+        let is_quiet = now_nanos >= self.quiet_since_nanos.saturating_add(self.patience_nanos);
         (share < TENTHS && is_quiet).then(|| {
-            self.raised_at = Some(now);
+            self.raised_at_nanos = Some(now_nanos);
             share + 1
         })
     }
@@ -156,11 +153,14 @@ mod tests {
 
     const SWEEP_NANOS: u64 = 100_000_000;
 
+    fn nanos(ms: u64) -> u64 {
+        ms * 1_000_000
+    }
+
     /// A machine with one place for a waiting sweep that needs `needed_ms` for a frame: the sweeps that it answers, each
     /// with its waiting time.
-    fn answered(needed_ms: u64, seconds: u64) -> Vec<(u64, Duration)> {
-        let start = Instant::now();
-        let mut control = PaceControl::new(start);
+    fn answered(needed_ms: u64, seconds: u64) -> Vec<(u64, u64)> {
+        let mut control = PaceControl::new();
         let (mut pace, mut last, mut free_at_ms) = (Pace::EVERY_SWEEP, None, 0);
         let (mut waiting, mut answers) = (None::<u64>, Vec::new());
         for time_ms in 0..seconds * 1000 {
@@ -171,11 +171,11 @@ mod tests {
                 }
             }
             if let Some(captured_ms) = waiting.take_if(|_| time_ms >= free_at_ms) {
-                let waited = Duration::from_millis(time_ms - captured_ms);
+                let waited_ms = time_ms - captured_ms;
                 free_at_ms = time_ms + needed_ms;
-                answers.push((captured_ms / 100, waited));
-                let now = start + Duration::from_millis(time_ms);
-                if let Some(next) = control.judge(captured_ms * 1_000_000, waited, now) {
+                answers.push((captured_ms / 100, waited_ms));
+                let [captured, waited, now] = [captured_ms, waited_ms, time_ms].map(nanos);
+                if let Some(next) = control.judge(captured, waited, now) {
                     pace = next;
                     last = pace.interval_of(captured_ms * 1_000_000);
                 }
@@ -213,11 +213,11 @@ mod tests {
                 .filter(|gap| !(floor..=floor + 2).contains(gap))
                 .count();
             assert!(uneven * 10 <= count, "{needed_ms} ms: {uneven} of {count}");
-            let mut waits: Vec<_> = settled.iter().map(|(_, waited)| *waited).collect();
-            waits.sort();
+            let mut waits_ms: Vec<_> = settled.iter().map(|(_, waited)| *waited).collect();
+            waits_ms.sort();
             assert!(
-                waits[waits.len() / 2] <= Duration::from_millis(100),
-                "{needed_ms} ms: {waits:?}"
+                waits_ms[waits_ms.len() / 2] <= 100,
+                "{needed_ms} ms: {waits_ms:?}"
             );
         }
     }
@@ -234,24 +234,22 @@ mod tests {
 
     #[test]
     fn a_frame_that_waits_now_and_then_is_no_overload() {
-        let start = Instant::now();
-        let mut control = PaceControl::new(start);
+        let mut control = PaceControl::new();
         for sweep in 0..100u64 {
-            let now = start + Duration::from_millis(100 * sweep);
-            let waited = Duration::from_millis(if sweep % 6 == 0 { 60 } else { 40 });
+            let now = sweep * SWEEP_NANOS;
+            let waited = nanos(if sweep % 6 == 0 { 60 } else { 40 });
             assert_eq!(control.judge(sweep * SWEEP_NANOS, waited, now), None);
         }
     }
 
     #[test]
     fn failed_attempts_become_less_and_less_frequent() {
-        let start = Instant::now();
-        let mut control = PaceControl::new(start);
+        let mut control = PaceControl::new();
         let (mut share, mut tries) = (10, Vec::new());
         for sweep in 0..3000 {
-            let now = start + Duration::from_millis(100 * sweep);
+            let now = sweep * SWEEP_NANOS;
             // Every sweep is too much, nine of ten are not.
-            let waited = Duration::from_millis(if share == 10 { 60 } else { 40 });
+            let waited = nanos(if share == 10 { 60 } else { 40 });
             if let Some(pace) = control.judge(sweep * SWEEP_NANOS, waited, now) {
                 share = pace.computed * (TENTHS / pace.of);
                 tries.extend((share == 10).then_some(sweep));
@@ -268,11 +266,9 @@ mod tests {
 
     #[test]
     fn a_restarted_scene_and_a_first_frame_are_not_judged() {
-        let start = Instant::now();
-        let mut control = PaceControl::new(start);
+        let mut control = PaceControl::new();
         for sweep in (0..50).rev() {
-            let waited = Duration::from_millis(60);
-            assert_eq!(control.judge(sweep * SWEEP_NANOS, waited, start), None);
+            assert_eq!(control.judge(sweep * SWEEP_NANOS, nanos(60), 0), None);
         }
     }
 }

@@ -21,13 +21,14 @@ pub struct PairingConfig {
 }
 
 impl PairingConfig {
-    /// Messages of at most that age, half a frame of 10 Hz of lead, eight messages.
+    /// Messages of at most that age, half a frame of 10 Hz of lead, and at least eight messages: at 10 Hz all that may
+    /// still be fused.
     #[must_use]
     pub fn with_max_age_nanos(max_age_nanos: u64) -> Self {
         Self {
             max_age_nanos,
             max_lead_nanos: 50_000_000,
-            depth: 8,
+            depth: usize::try_from(max_age_nanos / 100_000_000 + 4).map_or(8, |depth| depth.max(8)),
         }
     }
 }
@@ -216,14 +217,11 @@ impl<T> Pairing<T> {
             .map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
     }
 
-    /// Messages that wait and were never used, at the end of a run: in flight in the message accounting.
+    /// Messages of a CAV that wait and were never used, at the end of a run: in flight in the message accounting.
     #[must_use]
-    pub fn unused(&self) -> usize {
-        self.waiting
-            .values()
-            .flatten()
-            .filter(|held| !held.is_used)
-            .count()
+    pub fn unused(&self, cav: &CavId) -> usize {
+        let queue = self.waiting.get(cav).into_iter().flatten();
+        queue.filter(|held| !held.is_used).count()
     }
 }
 
@@ -302,7 +300,7 @@ mod tests {
         }
         // It was received, so its removal is no loss.
         assert_eq!(ages(&mut pairing, 14 * FRAME), (vec![], vec![]));
-        assert_eq!(pairing.unused(), 0);
+        assert_eq!(pairing.unused(&cav("a")), 0);
     }
 
     #[test]
@@ -372,7 +370,8 @@ mod tests {
                     lost += dropped.len();
                 }
             }
-            prop_assert_eq!(sent, received + lost + pairing.unused());
+            let unused: usize = pairing.cavs().iter().map(|cav| pairing.unused(cav)).sum();
+            prop_assert_eq!(sent, received + lost + unused);
         }
     }
 }

@@ -4,11 +4,22 @@ use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
 use bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, bounded_queue::Pop};
+use ego_fuser::config::EgoSettings;
+use ego_fuser::node::NodeOptions;
 use protocol::{CavId, ProcessId, RunId, Topic};
 use zenoh::Session;
 
 /// Longer than any step of a test takes, on a machine however busy.
 pub const TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Options of an ego's node whose frames wait that long for their neighbours.
+#[must_use]
+pub fn ego_options(deadline: Duration) -> NodeOptions {
+    NodeOptions::from(&EgoSettings {
+        deadline_ms: u64::try_from(deadline.as_millis()).unwrap_or(u64::MAX),
+        ..EgoSettings::default()
+    })
+}
 
 /// Router for the clients of one test.
 pub struct TestRouter {

@@ -2,6 +2,7 @@
 
 use crate::config::EgoConfig;
 use crate::ego::{Ego, EgoError};
+use crate::ego_loop::LoopReport;
 use crate::node::{self, NodeOptions};
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
@@ -55,7 +56,7 @@ impl Arguments {
         if self.json {
             output::line(serde_json::to_string(&report)?)?;
         } else {
-            let node::NodeReport {
+            let LoopReport {
                 frames,
                 fused,
                 at_deadline,

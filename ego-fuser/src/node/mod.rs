@@ -1,30 +1,26 @@
-//! Node of the ego on the bus: its own agent's message and those of its neighbours in, detections out.
+//! Node of the ego on the bus: brings what arrives to the [ego's loop](crate::ego_loop), and publishes what it decides.
 //!
-//! A frame begins with the message of the ego's own agent. It is decided when every neighbour's message of the same
-//! capture time has arrived, or when the deadline has passed; later messages serve the next frame, if they are still
-//! young enough. One thread receives, fuses and publishes; sending has threads of its own.
+//! One thread receives, fuses and publishes; sending has threads of its own.
 
-mod admit;
-mod decide;
-mod pace_keeper;
+mod receive;
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
-use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
+use bus::{
+    Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription, unix_nanos,
+};
+use protocol::message::{DetectionsReport, StageTiming};
+use protocol::{Body, CavId, Detections, Encoded, Limits, Role, Stream, Topic, wire};
 
-use crate::capture_clock::CaptureClocks;
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
-use crate::ego::{Ego, View};
+use crate::ego::Ego;
+use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
-use crate::pairing::{Pairing, PairingConfig};
-use crate::peer_models::PeerModels;
 use fusion::method::Exchange;
-use pace_keeper::PaceKeeper;
 
 /// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period
 /// answers frames that have waited this long, so it is no more than a short pause needs.
@@ -35,24 +31,18 @@ const RESULTS: usize = 4;
 const MAX_TOPICS: usize = 130;
 /// Interval of checks for new agents while no message arrives.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
-/// Time that a node whose own agent has ended waits for the last messages of its neighbours.
-const LAST_WORDS: Duration = Duration::from_secs(2);
 
 /// Options of an ego node.
 #[derive(Debug, Clone)]
 pub struct NodeOptions {
-    /// Longest wait of a frame for its neighbours, from the arrival of the own agent's message.
-    pub deadline: Duration,
-    /// Pairing of messages with a frame.
-    pub pairing: PairingConfig,
+    /// Options of the ego's loop.
+    pub of_loop: LoopOptions,
     /// The neighbours that may take part; `None`: all that are discovered.
     pub neighbours: Option<BTreeSet<CavId>>,
     /// True if neighbours are received behind the link emulation.
     pub over_link: bool,
     /// True to continue when the own agent has ended, for its next instance.
     pub keeps_running: bool,
-    /// True to slow the fleet down where this machine cannot keep up; false to ask for every sweep.
-    pub sets_pace: bool,
     /// Limits of received messages.
     pub limits: Limits,
     /// Limits of the inbox, for each sender and in total.
@@ -70,12 +60,14 @@ impl From<&EgoSettings> for NodeOptions {
     /// All neighbours, received directly, until the own agent ends.
     fn from(settings: &EgoSettings) -> Self {
         Self {
-            deadline: Duration::from_millis(settings.deadline_ms),
-            pairing: settings.pairing(),
+            of_loop: LoopOptions {
+                sets_pace: settings.pace == PaceMode::Auto,
+                has_exact_arrivals: false,
+                ..LoopOptions::stepped(settings)
+            },
             neighbours: None,
             over_link: false,
             keeps_running: false,
-            sets_pace: settings.pace == PaceMode::Auto,
             limits: Limits::DEFAULT,
             inbox: settings.inbox.limits(),
         }
@@ -94,21 +86,6 @@ impl From<&EgoConfig> for NodeOptions {
     }
 }
 
-/// Summary of an ego's run.
-#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
-pub struct NodeReport {
-    /// Frames decided.
-    pub frames: u64,
-    /// Neighbours' messages that were fused, over all frames.
-    pub fused: u64,
-    /// Frames that were decided at the deadline.
-    pub at_deadline: u64,
-    /// Frames that could not be fused.
-    pub failed: u64,
-    /// Reason of the first of these.
-    pub failure: Option<String>,
-}
-
 /// Runs `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.
 ///
 /// # Errors
@@ -116,11 +93,10 @@ pub struct NodeReport {
 pub fn run(
     bus: &Bus,
     cav: &CavId,
-    ego: Ego,
+    mut ego: Ego,
     options: &NodeOptions,
     stop: &Stop,
-) -> Result<NodeReport, BusError> {
-    let mut ego = ego;
+) -> Result<LoopReport, BusError> {
     if let Err(error) = ego.warm_up(cav) {
         tracing::warn!("the networks are not warmed up: {error}");
     }
@@ -131,53 +107,29 @@ pub fn run(
         detections,
         json,
         pace,
-        report,
+        ego_loop,
         ..
     } = node;
     pace.finish();
     detections.finish();
     json.finish();
     presence.withdraw()?;
-    Ok(report)
-}
-
-/// A message as received, decoded.
-struct Received {
-    view: View,
-    payload_bytes: u64,
-    wire_bytes: u64,
-}
-
-/// A frame that has begun.
-struct OwnFrame {
-    /// Sequence of the own agent's message.
-    agent_frame: u64,
-    capture_nanos: u64,
-    /// From its publication to its arrival; `None` if its agent has another clock.
-    transport: Option<Duration>,
-    begun: Instant,
-    view: View,
+    Ok(ego_loop.report().clone())
 }
 
 struct Node<'a> {
     bus: &'a Bus,
     cav: CavId,
     ego: Ego,
+    ego_loop: EgoLoop,
     options: &'a NodeOptions,
-    stream: Stream,
     inbox: Arc<Inbox>,
     neighbourhood: Option<Neighbourhood>,
-    models: PeerModels,
-    pairing: Pairing<Received>,
-    clocks: CaptureClocks,
-    frames: VecDeque<OwnFrame>,
-    pace: PaceKeeper,
-    /// Capture time of the ego's newest sweep, nanoseconds.
-    own_nanos: Option<u64>,
-    ended: BTreeSet<CavId>,
+    /// A moment, and its time on the loop's clock: the Unix time of the beginning, which is not set back later.
+    began: (Instant, u64),
+    pace: Publisher,
     detections: Publisher,
     json: Publisher,
-    report: NodeReport,
     _own: Vec<Subscription>,
 }
 
@@ -189,20 +141,16 @@ impl<'a> Node<'a> {
         options: &'a NodeOptions,
         stop: &Stop,
     ) -> Result<Self, BusError> {
-        let stream = stream_of(ego.method().own_content());
+        let ego_loop = EgoLoop::new(cav, &ego, options.of_loop);
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let topic = |stream| Topic::Stream {
-            cav: cav.clone(),
-            stream,
-        };
-        let streams = vec![Stream::Descriptor, stream];
+        let streams = vec![Stream::Descriptor, ego_loop.stream()];
         let own = streams
             .iter()
-            .map(|&stream| bus.subscribe(topic(stream), &inbox))
+            .map(|&stream| bus.subscribe(own_topic(cav, stream), &inbox))
             .collect::<Result<_, _>>()?;
         // An ego-only method needs no messages of others.
         let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
@@ -220,22 +168,19 @@ impl<'a> Node<'a> {
             bus,
             cav: cav.clone(),
             options,
-            stream,
             neighbourhood,
-            models: PeerModels::new(ego.detector()),
-            pairing: Pairing::new(options.pairing),
-            clocks: CaptureClocks::measured(),
-            frames: VecDeque::new(),
-            pace: PaceKeeper::open(bus, cav, options.sets_pace)?,
-            own_nanos: None,
-            ended: BTreeSet::new(),
+            began: (Instant::now(), unix_nanos()),
+            pace: bus.publisher(own_topic(cav, Stream::Pace), PublisherOptions::POSE)?,
             detections: bus.publisher(
-                topic(Stream::Detections),
+                own_topic(cav, Stream::Detections),
                 PublisherOptions::DETECTIONS.waiting(RESULTS),
             )?,
-            json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
-            report: NodeReport::default(),
+            json: bus.publisher(
+                own_topic(cav, Stream::DetectionsJson),
+                PublisherOptions::DETECTIONS,
+            )?,
             _own: own,
+            ego_loop,
             ego,
             inbox,
         })
@@ -243,100 +188,127 @@ impl<'a> Node<'a> {
 
     fn receive(&mut self, stop: &Stop) -> Result<(), BusError> {
         let _working = self.bus.works_from(&self.inbox);
-        while !stop.requested() {
+        // Messages since a frame could be decided last.
+        let mut taken = 0;
+        while !stop.requested() && !self.ego_loop.is_finished() {
             self.look_round()?;
-            self.pace.repeat();
-            match self.inbox.take(Some(self.next_moment())) {
+            // Everything that has arrived is taken in before a frame is decided, but a flood must not prevent that.
+            let until = if taken == 0 {
+                self.next_moment()
+            } else {
+                Instant::now()
+            };
+            match self.inbox.take(Some(until)) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
-                Pop::Item(topic, Event::End { .. }) if !self.options.keeps_running => {
-                    if topic == self.topic(&self.cav) {
-                        return self.finish(stop);
-                    }
-                    self.end(topic);
-                }
-                Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
+                Pop::Item(topic, Event::End { .. }) => self.end(&topic),
+                Pop::TimedOut => taken = MAX_TOPICS,
                 Pop::Closed => return Ok(()),
             }
-            self.decide(false);
-        }
-        Ok(())
-    }
-
-    /// Ends after the own agent: the frames that wait have their usual time, the neighbours' last messages are counted.
-    fn finish(&mut self, stop: &Stop) -> Result<(), BusError> {
-        let until = Instant::now() + LAST_WORDS.max(self.options.deadline);
-        while !stop.requested()
-            && Instant::now() < until
-            && !(self.frames.is_empty() && self.all_have_ended())
-        {
-            self.look_round()?;
-            match self.inbox.take(Some(self.next_moment())) {
-                Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
-                Pop::Item(topic, Event::End { .. }) => self.end(topic),
-                Pop::TimedOut => {}
-                Pop::Closed => break,
+            taken += 1;
+            if taken > MAX_TOPICS {
+                taken = 0;
+                self.handle(Input::Wake);
             }
-            self.decide(false);
-        }
-        self.decide(true);
-        // Messages that wait for a frame that will not come.
-        let (_, dropped) = self.pairing.pair(u64::MAX);
-        for lost in dropped {
-            self.bus
-                .stats()
-                .dropped(&self.topic(&lost.cav), lost.reason);
         }
         Ok(())
     }
 
-    /// Records the end of a neighbour's stream.
-    fn end(&mut self, topic: Topic) {
-        if let Some((cav, stream)) = sender_of(&topic)
-            && stream == self.stream
+    fn end(&mut self, topic: &Topic) {
+        if let Some((cav, stream)) = sender_of(topic)
+            && stream == self.ego_loop.stream()
+            && !self.options.keeps_running
         {
-            self.ended.insert(cav.clone());
+            self.handle(Input::Ended(cav.clone()));
         }
-    }
-
-    fn all_have_ended(&self) -> bool {
-        self.neighbourhood
-            .iter()
-            .flat_map(Neighbourhood::members)
-            .all(|cav| self.ended.contains(cav))
     }
 
     fn look_round(&mut self) -> Result<(), BusError> {
         let Some(neighbourhood) = &mut self.neighbourhood else {
             return Ok(());
         };
-        for cav in neighbourhood.update(self.bus, &self.inbox)? {
-            let topic = self.topic(&cav);
-            self.models.forget(&cav);
-            self.clocks.forget(&cav);
-            self.ended.remove(&cav);
-            for _ in 0..self.pairing.forget(&cav) {
-                self.bus.stats().dropped(&topic, DropReason::Stale);
-            }
+        for change in neighbourhood.update(self.bus, &self.inbox)? {
+            self.handle(change);
         }
         Ok(())
     }
 
+    /// Hands an input to the loop and carries out what it decides.
+    fn handle(&mut self, input: Input) {
+        let now_nanos = self.nanos(Instant::now());
+        for output in self.ego_loop.handle(&mut self.ego, input, now_nanos) {
+            match output {
+                Output::Publish {
+                    capture_nanos,
+                    result,
+                } => self.publish(capture_nanos, *result),
+                Output::Failed {
+                    capture_nanos,
+                    error,
+                } => tracing::error!(capture_nanos, "a frame could not be fused: {error}"),
+                Output::Received(cav) => self.bus.stats().received(&self.topic(&cav)),
+                Output::Dropped(cav, reason) => {
+                    self.bus.stats().dropped(&self.topic(&cav), reason);
+                }
+                Output::Pace(pace) => self.pace.submit(0, pace),
+            }
+        }
+    }
+
+    fn publish(&mut self, capture_nanos: u64, result: Detections) {
+        let stats = self.bus.stats();
+        // The own message's transport is counted already.
+        for stage in { result.stages.iter() }.filter(|stage| stage.stage != "transport") {
+            stats.timed(&stage.stage, Duration::from_nanos(stage.nanos));
+        }
+        for neighbour in &result.neighbours {
+            if let Some(trust) = neighbour.trust {
+                stats.trusted(&neighbour.cav, trust);
+            }
+        }
+        // The ego does not know when the sensors of its vehicle measured.
+        stats.answered(None, result.fused.len());
+        let (fused, binary) = (unix_nanos(), result.clone());
+        self.detections.submit_encoded(capture_nanos, move |stamp| {
+            let mut result = binary;
+            let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
+            result.stages.push(StageTiming::new("send", sending));
+            wire::encode(stamp, result)
+        });
+        self.json.submit_encoded(capture_nanos, move |stamp| {
+            let head = DetectionsReport::new(stamp, None, result)
+                .to_json()
+                .into_bytes();
+            Ok(Encoded {
+                head,
+                body: Body::Empty,
+            })
+        });
+    }
+
     fn topic(&self, cav: &CavId) -> Topic {
-        topic_of(&self.cav, cav, self.stream, self.options.over_link)
+        let stream = self.ego_loop.stream();
+        topic_of(&self.cav, cav, stream, self.options.over_link)
+    }
+
+    /// A moment on the loop's clock, nanoseconds.
+    fn nanos(&self, at: Instant) -> u64 {
+        let (began, began_nanos) = self.began;
+        let since = support::nanos::of(at.saturating_duration_since(began));
+        let before = support::nanos::of(began.saturating_duration_since(at));
+        began_nanos.saturating_add(since).saturating_sub(before)
     }
 
     fn next_moment(&self) -> Instant {
-        let soon = Instant::now() + LOOK_ROUND;
-        self.frames
-            .front()
-            .map_or(soon, |frame| soon.min(frame.begun + self.options.deadline))
+        let now = Instant::now();
+        let now_nanos = self.nanos(now);
+        let wakes_nanos = self.ego_loop.wakes_nanos().unwrap_or(u64::MAX);
+        now + LOOK_ROUND.min(Duration::from_nanos(wakes_nanos.saturating_sub(now_nanos)))
     }
 }
 
-fn stream_of(exchange: Exchange) -> Stream {
-    match exchange {
-        Exchange::Boxes => Stream::Boxes,
-        Exchange::Points => Stream::Points,
-        Exchange::Features | Exchange::Nothing => Stream::Bev,
+fn own_topic(cav: &CavId, stream: Stream) -> Topic {
+    Topic::Stream {
+        cav: cav.clone(),
+        stream,
     }
 }

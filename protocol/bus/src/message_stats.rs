@@ -290,13 +290,16 @@ impl MessageStats {
         }
     }
 
+    /// System clock of a vehicle minus ours, seconds, minus the shortest transit time; `None`: no message of it.
+    pub fn measured_clock_offset_s(&self, cav: &CavId) -> Option<f64> {
+        let state = self.lock();
+        Some(state.peers.get(cav)?.clock.as_ref()?.seconds())
+    }
+
     /// System clock of a vehicle minus ours, seconds; 0 if they count as one clock. A transit time of up to
     /// `longest_transit_s` looks like a clock that is behind.
     pub fn system_clock_offset_s(&self, cav: &CavId, longest_transit_s: f64) -> f64 {
-        let state = self.lock();
-        let peer = state.peers.get(cav);
-        let clock = peer.and_then(|peer| peer.clock.as_ref());
-        let offset_s = clock.map_or(0.0, ClockOffset::seconds);
+        let offset_s = self.measured_clock_offset_s(cav).unwrap_or(0.0);
         if is_same_clock(offset_s, longest_transit_s) {
             0.0
         } else {

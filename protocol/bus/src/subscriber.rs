@@ -91,6 +91,11 @@ impl Arrival {
         &self.payload
     }
 
+    /// The message on the wire, header included, in the pieces in which it was received.
+    pub fn pieces(&self) -> impl Iterator<Item = &[u8]> {
+        self.payload.slices()
+    }
+
     /// Decodes the message from its pieces, copying its tensor once.
     ///
     /// # Errors

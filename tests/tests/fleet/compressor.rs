@@ -26,7 +26,7 @@ use protocol::{
 };
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::{Device, Kind, Tensor, no_grad};
-use tests::bus::{TIMEOUT, TestRouter};
+use tests::bus::{TIMEOUT, TestRouter, ego_options};
 use tests::scene;
 
 const AGENTS: [&str; 2] = ["10", "20"];
@@ -148,8 +148,7 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
         let ego = scope.spawn(move || {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions {
-                deadline: TIMEOUT,
-                ..ego_node::NodeOptions::default()
+                ..ego_options(TIMEOUT)
             };
             ego_node::run(&bus, &cav("10"), ego, &options, &own_stop).unwrap();
             let stats = bus.stats().clone();

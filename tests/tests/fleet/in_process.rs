@@ -15,7 +15,6 @@ use bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
 use dataset::{self, LoadOptions, Scenario};
 use ego_fuser::ego::{Content, Ego, View};
 use ego_fuser::node as ego_node;
-use ego_fuser::pairing::PairingConfig;
 use fusion::Exchange;
 use fusion::Method;
 use localization::pose_source::RecordedPose;
@@ -32,7 +31,7 @@ use sim_replay::recorder::{self, RecordReport, RecorderOptions};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
 use tch::nn::VarStore;
-use tests::bus::{TIMEOUT, TestRouter, next_event};
+use tests::bus::{TIMEOUT, TestRouter, ego_options, next_event};
 use tests::locks::random_generator_lock;
 use tests::scene;
 use zenoh::Wait;
@@ -222,8 +221,7 @@ fn play_and_record(
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions {
-                deadline: TIMEOUT,
-                ..ego_node::NodeOptions::default()
+                ..ego_options(TIMEOUT)
             };
             let report = ego_node::run(&bus, &cav("10"), ego(method), &options, &stop).unwrap();
             assert_eq!(
@@ -623,10 +621,8 @@ fn late_killed_and_faulty_neighbours_are_named_and_the_ego_goes_on() {
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions {
-                deadline: Duration::from_millis(400),
-                pairing: PairingConfig::with_max_age_nanos(150_000_000),
                 keeps_running: true,
-                ..ego_node::NodeOptions::default()
+                ..ego_options(Duration::from_millis(400))
             };
             ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             leave(bus)
@@ -713,9 +709,8 @@ fn a_neighbour_whose_capture_clock_is_ahead_is_fused_with_the_frames_of_its_swee
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions {
-                deadline: TIMEOUT,
                 keeps_running: true,
-                ..Default::default()
+                ..ego_options(TIMEOUT)
             };
             ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
         });
@@ -758,9 +753,8 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             let bus = router.join("ego-10", "10");
             // A frame that waited for an excluded neighbour would take for ever.
             let options = ego_node::NodeOptions {
-                deadline: TIMEOUT,
                 keeps_running: true,
-                ..Default::default()
+                ..ego_options(TIMEOUT)
             };
             let report =
                 ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();

@@ -5,6 +5,8 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
+use ego_fuser::config::EgoSettings;
+use ego_fuser::ego_loop::LoopOptions;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
@@ -31,8 +33,10 @@ fn config(link: LinkConfig) -> SteppedConfig {
         link,
         link_folder: ".".into(),
         seed: 3,
-        deadline_nanos: 100 * MS,
-        pairing: PairingConfig::with_max_age_nanos(300 * MS),
+        of_ego: LoopOptions {
+            pairing: PairingConfig::with_max_age_nanos(300 * MS),
+            ..LoopOptions::stepped(&EgoSettings::default())
+        },
         compute: ComputeTimes::NONE,
         crew: AgentPool::First(usize::MAX),
         vehicles: Default::default(),

@@ -22,7 +22,7 @@ use protocol::{
 };
 use tch::Device;
 use tch::nn::VarStore;
-use tests::bus::{TIMEOUT, TestRouter, next_event, wait_for};
+use tests::bus::{TIMEOUT, TestRouter, ego_options, next_event, wait_for};
 use tests::locks::random_generator_lock;
 use tests::mutation::wire_target::reseal;
 use tests::scene;
@@ -348,9 +348,8 @@ fn play(
         let ego = scope.spawn(|| {
             let bus = bus;
             let options = NodeOptions {
-                deadline: TIMEOUT,
                 keeps_running: true,
-                ..NodeOptions::default()
+                ..ego_options(TIMEOUT)
             };
             let ego = Ego::new(network(), Method::MAX).unwrap();
             node::run(&bus, &cav("10"), ego, &options, &stop).unwrap();

@@ -1,9 +1,7 @@
-//! Simulation time: compute times are given, the link emulation determines arrivals, and the ego fuses at each tick
-//! exactly the messages that have arrived when it decides. It decides as the live ego does: once the messages of all
-//! awaited neighbours are there, at the latest when the deadline passes or its own next map arrives.
+//! Simulation time: compute times are given, the link emulation determines arrivals, and the [ego's loop](EgoLoop), the
+//! same as in the live process, decides at these times.
 //!
-//! No wall clock is read, so the same inputs and seed give the same result on a busy and on an idle machine. The
-//! pipelines, the pairing and the link emulation are those of the live processes.
+//! No wall clock is read, so the same inputs and seed give the same result on a busy and on an idle machine.
 
 mod compute;
 mod delayed_delivery;
@@ -12,6 +10,7 @@ mod remote;
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::{ControlFlow, Range};
 use std::path::PathBuf;
+use std::time::Duration;
 
 use agent::config::AgentSettings;
 use dataset::frame::Frame;
@@ -19,9 +18,7 @@ use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
 use ego_fuser::config::EgoSettings;
 use link::{LinkConfig, LinkEmulator};
-use protocol::{
-    CavId, Detections, DropReason, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream,
-};
+use protocol::{CavId, Detections, PoseEstimate, RateChoice, StageTiming, Stream};
 use support::random::derive_seed;
 
 pub use compute::ComputeTimes;
@@ -32,10 +29,9 @@ use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
-use ego_fuser::capture_clock::{CaptureClocks, SweepTime};
-use ego_fuser::ego::{EgoOutput, Skipped, View};
-use ego_fuser::pairing::{Pairing, PairingConfig};
-use ego_fuser::silence::Silence;
+use ego_fuser::capture_clock::SweepTime;
+use ego_fuser::ego::EgoOutput;
+use ego_fuser::ego_loop::{EgoLoop, Input, LoopOptions, Message, Output};
 use fusion::method::Exchange;
 
 /// Configuration of a fleet in simulation time.
@@ -47,10 +43,8 @@ pub struct SteppedConfig {
     pub link_folder: PathBuf,
     /// Seed of losses and delays. Every scenario derives its own from it.
     pub seed: u64,
-    /// Longest time that the ego waits for its neighbours after its own map has arrived, nanoseconds.
-    pub deadline_nanos: u64,
-    /// Pairing of messages with a frame.
-    pub pairing: PairingConfig,
+    /// Deadline of the ego, and pairing of messages with a frame.
+    pub of_ego: LoopOptions,
     /// Compute times of all processes.
     pub compute: ComputeTimes,
     /// Vehicles that take part.
@@ -76,8 +70,7 @@ impl SteppedConfig {
             link,
             link_folder,
             seed,
-            deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
-            pairing: ego.pairing(),
+            of_ego: LoopOptions::stepped(ego),
             compute,
             crew: AgentPool::First(usize::MAX),
             vehicles: BTreeMap::new(),
@@ -115,7 +108,7 @@ pub(super) fn run(
             break;
         }
     }
-    run.close();
+    run.close()?;
     Ok(flow)
 }
 
@@ -136,8 +129,8 @@ enum Pipeline {
 
 /// A tick whose sweeps are computed.
 struct Computed {
-    /// The ego's view, or the reason why its sweep cannot be computed.
-    own: Result<View, String>,
+    /// Reason why the ego's sweep cannot be computed.
+    failure: Option<String>,
     /// Of all vehicles that take part, the ego first.
     frames: Vec<Frame>,
     poses: Vec<PoseEstimate>,
@@ -159,9 +152,11 @@ struct Run<'a> {
     delivery: DelayedDelivery,
     /// Messages that arrive after the last decision, in order of time.
     arriving: VecDeque<Arrived>,
-    pairing: Pairing<Envelope>,
-    clocks: CaptureClocks,
-    silence: Silence,
+    /// The own agent's messages that arrive after the last decision.
+    own: VecDeque<Message>,
+    ego_loop: EgoLoop,
+    /// Results that are not reported yet, each with the time of its decision, nanoseconds, or the reason of a failure.
+    decided: VecDeque<(u64, Result<Detections, String>)>,
     /// Time at which the ego finishes its current fusion, nanoseconds.
     ego_free_nanos: u64,
 }
@@ -210,6 +205,14 @@ impl<'a> Run<'a> {
         let ego = crew
             .first()
             .map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
+        let mut ego_loop = EgoLoop::new(&ego, &evaluator.ego, config.of_ego);
+        // An ego-only method needs no messages of others.
+        if evaluator.ego.method().exchange() != Exchange::Nothing {
+            for member in crew.iter().skip(1) {
+                let joined = Input::Joined(member.cav.clone());
+                ego_loop.handle(&mut evaluator.ego, joined, began_nanos);
+            }
+        }
         Ok(Self {
             delivery: DelayedDelivery::new(link, &ego, began_nanos),
             evaluator,
@@ -221,9 +224,9 @@ impl<'a> Run<'a> {
             end: ticks.end,
             computed: VecDeque::new(),
             arriving: VecDeque::new(),
-            pairing: Pairing::new(config.pairing),
-            clocks: CaptureClocks::exact(),
-            silence: Silence::default(),
+            own: VecDeque::new(),
+            ego_loop,
+            decided: VecDeque::new(),
             ego_free_nanos: 0,
         })
     }
@@ -250,7 +253,11 @@ impl<'a> Run<'a> {
         }
         let all = self.perceive(&sweeps)?;
         let mut frames: Vec<Frame> = sweeps.into_iter().map(|sweep| sweep.frame).collect();
-        let (mut poses, mut own) = (Vec::with_capacity(all.len()), Err(String::new()));
+        let (mut poses, mut failure) = (Vec::with_capacity(all.len()), None);
+        let own_sweep = SweepTime {
+            capture_nanos: self.scenario.ticks[tick].capture_nanos,
+            arrived_nanos: self.scenario.ticks[tick].capture_nanos,
+        };
         for (place, sent) in all.into_iter().enumerate() {
             poses.push(sent.pose);
             if let Some(reason) = &sent.failure {
@@ -258,7 +265,7 @@ impl<'a> Run<'a> {
                     .count_failure(self.scenario, tick, &sent.cav, reason);
             }
             if place == 0 {
-                own = sent.view().ok_or(sent.failure.unwrap_or_default());
+                failure = self.send_own(tick, sent, own_sweep)?;
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 enqueue(
@@ -279,9 +286,39 @@ impl<'a> Run<'a> {
             .load_tick(tick, self.observers.iter().copied(), &blind);
         self.evaluator.left_out.add_tick(&observers);
         frames.extend(observers.frames.into_iter().map(|(_, frame)| frame));
-        self.computed
-            .push_back(Some(Computed { own, frames, poses }));
+        self.computed.push_back(Some(Computed {
+            failure,
+            frames,
+            poses,
+        }));
         Ok(())
+    }
+
+    /// Queues the own agent's message; returns the reason where there is none.
+    fn send_own(
+        &mut self,
+        tick: usize,
+        sent: Sent,
+        sweep: SweepTime,
+    ) -> Result<Option<String>, EvaluateError> {
+        self.handle(
+            Input::Sweeps(sent.cav.clone(), vec![sweep]),
+            sweep.arrived_nanos,
+        )?;
+        let failure = sent.failure.clone();
+        let Some(view) = sent.into_view() else {
+            return Ok(Some(failure.unwrap_or_default()));
+        };
+        self.own.push_back(Message {
+            view,
+            sequence: (tick - self.config.ticks.start) as u64,
+            arrived_nanos: self.ready_nanos(tick),
+            transport: None,
+            clock_offset_s: None,
+            payload_bytes: 0,
+            wire_bytes: 0,
+        });
+        Ok(None)
     }
 
     /// Messages of all vehicles for the sweeps of a tick.
@@ -322,35 +359,127 @@ impl<'a> Run<'a> {
 
     /// Fuses a tick; `None` where the ego's sweep cannot be read.
     fn decide(&mut self, tick: usize) -> Result<Option<EvaluatedFrame>, EvaluateError> {
-        let capture_nanos = self.scenario.ticks[tick].capture_nanos;
-        let compute = self.config.compute;
         while self.next <= tick {
             self.compute()?;
         }
-        self.clocks.note_own(SweepTime {
-            capture_nanos,
-            arrived_nanos: capture_nanos,
-        });
-        let Some(Computed { own, frames, poses }) = self.computed.pop_front().flatten() else {
+        let Some(Some(computed)) = self.computed.pop_front() else {
             return Ok(None);
         };
-        // Arrival of the own map.
-        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
-        let (decided_nanos, fused) = match own {
-            Ok(own) => {
-                let decided_nanos = self.wait(capture_nanos, ready_nanos)?;
-                self.ego_free_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
-                (decided_nanos, self.fuse(tick, &own)?)
-            }
+        let ready_nanos = self.ready_nanos(tick);
+        let (decided_nanos, fused) = match &computed.failure {
             // The ego gets no map to begin with.
-            Err(reason) => (ready_nanos, Err(reason)),
+            Some(reason) => (ready_nanos, Err(reason.clone())),
+            None => loop {
+                if let Some(decided) = self.decided.pop_front() {
+                    break decided;
+                }
+                self.advance()?;
+            },
         };
-        Ok(Some(self.evaluated(
-            tick,
-            decided_nanos,
-            (frames, poses),
-            fused,
-        )))
+        if let Err(reason) = &fused
+            && computed.failure.is_none()
+        {
+            let cav = &computed.frames[0].cav;
+            self.evaluator
+                .count_failure(self.scenario, tick, cav, reason);
+        }
+        Ok(Some(self.evaluated(tick, decided_nanos, computed, fused)))
+    }
+
+    /// Time at which the ego's own map of a tick arrives, nanoseconds.
+    fn ready_nanos(&self, tick: usize) -> u64 {
+        let capture_nanos = self.scenario.ticks[tick].capture_nanos;
+        capture_nanos.saturating_add(self.config.compute.agent_nanos())
+    }
+
+    /// Goes on to the next moment at which the ego can act: a message arrives, or a frame has waited long enough. Sweeps
+    /// that are captured until then are computed first.
+    fn advance(&mut self) -> Result<(), EvaluateError> {
+        loop {
+            let moments = [
+                self.own.front().map(|message| message.arrived_nanos),
+                self.arriving.front().map(|arrived| arrived.nanos),
+                self.ego_loop.wakes_nanos(),
+            ];
+            let next = moments.into_iter().flatten().min().unwrap_or(u64::MAX);
+            let now_nanos = next.max(self.ego_free_nanos);
+            let next_tick = self.scenario.ticks.get(self.next);
+            let captured = next_tick.filter(|_| self.next < self.end);
+            if captured.is_some_and(|tick| tick.capture_nanos <= now_nanos) {
+                self.compute()?;
+                continue;
+            }
+            // What arrives by then may arrive earlier than anything that was known.
+            let arrived = self.delivery.until(now_nanos);
+            let is_known = arrived.is_empty();
+            self.arriving.extend(arrived);
+            if is_known {
+                return self.act(now_nanos);
+            }
+        }
+    }
+
+    /// Takes everything in that has arrived, and wakes the ego.
+    fn act(&mut self, now_nanos: u64) -> Result<(), EvaluateError> {
+        loop {
+            let own_nanos = self.own.front().map(|message| message.arrived_nanos);
+            let other_nanos = self.arriving.front().map(|arrived| arrived.nanos);
+            let is_own_first = own_nanos.is_some_and(|own| other_nanos.is_none_or(|it| own <= it));
+            let next_nanos = own_nanos.into_iter().chain(other_nanos).min();
+            if next_nanos.is_none_or(|next| next > now_nanos) {
+                break;
+            }
+            if is_own_first {
+                if let Some(message) = self.own.pop_front() {
+                    self.handle(Input::Message(Box::new(message)), now_nanos)?;
+                }
+            } else if let Some(arrived) = self.arriving.pop_front() {
+                self.take_in(arrived, now_nanos)?;
+            }
+        }
+        self.handle(Input::Wake, now_nanos)
+    }
+
+    /// Hands a neighbour's message to the ego, and before it the arrival of its sweep.
+    fn take_in(&mut self, arrived: Arrived, now_nanos: u64) -> Result<(), EvaluateError> {
+        let Arrived { nanos, envelope } = arrived;
+        let cav = envelope.view.cav.clone();
+        self.handle(Input::Sweeps(cav, vec![envelope.sweep]), now_nanos)?;
+        let message = Message {
+            view: envelope.view,
+            sequence: 0,
+            arrived_nanos: nanos,
+            transport: None,
+            clock_offset_s: None,
+            payload_bytes: envelope.payload_bytes,
+            wire_bytes: envelope.wire_bytes,
+        };
+        self.handle(Input::Message(Box::new(message)), now_nanos)
+    }
+
+    /// Hands an input to the ego's loop and carries out what it decides.
+    fn handle(&mut self, input: Input, now_nanos: u64) -> Result<(), EvaluateError> {
+        let ego = &mut self.evaluator.ego;
+        for output in self.ego_loop.handle(ego, input, now_nanos) {
+            let fused = match output {
+                Output::Publish { result, .. } => Ok(*result),
+                Output::Failed { error, .. } if error.is_of_frame() => Err(error.to_string()),
+                Output::Failed { error, .. } => return Err(error.into()),
+                Output::Received(cav) => {
+                    self.delivery.received(&cav);
+                    continue;
+                }
+                Output::Dropped(cav, reason) => {
+                    self.delivery.dropped(&cav, reason);
+                    continue;
+                }
+                // The sweeps of simulation time are all computed.
+                Output::Pace(_) => continue,
+            };
+            self.ego_free_nanos = now_nanos.saturating_add(self.config.compute.fuse_nanos());
+            self.decided.push_back((now_nanos, fused));
+        }
+        Ok(())
     }
 
     /// The frame of a tick that was decided at that time.
@@ -358,12 +487,13 @@ impl<'a> Run<'a> {
         &self,
         tick: usize,
         decided_nanos: u64,
-        (frames, poses): (Vec<Frame>, Vec<PoseEstimate>),
+        computed: Computed,
         fused: Result<Detections, String>,
     ) -> EvaluatedFrame {
+        let Computed { frames, poses, .. } = computed;
         let compute = self.config.compute;
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
-        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
+        let ready_nanos = self.ready_nanos(tick);
         let done_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
         let (ego, pose) = (&frames[0].cav, poses[0]);
         let (mut result, failure) = match fused {
@@ -377,16 +507,14 @@ impl<'a> Run<'a> {
             }
         };
         // Measured times would differ in every run.
-        let stage = |name: &str, nanos| StageTiming {
-            stage: name.into(),
-            nanos,
-        };
-        result.stages = vec![
-            stage("pose", compute.pose_nanos()),
-            stage("map", compute.map_nanos()),
-            stage("wait", decided_nanos - ready_nanos),
-            stage("fuse", done_nanos - decided_nanos),
-        ];
+        result.stages = [
+            ("pose", compute.pose_nanos()),
+            ("map", compute.map_nanos()),
+            ("wait", decided_nanos - ready_nanos),
+            ("fuse", done_nanos - decided_nanos),
+        ]
+        .map(|(stage, nanos)| StageTiming::new(stage, Duration::from_nanos(nanos)))
+        .into();
         let views: Vec<&Frame> = frames.iter().collect();
         EvaluatedFrame {
             tick,
@@ -402,155 +530,19 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Takes in messages until the ego decides on the frame; returns the time at which it does.
-    fn wait(&mut self, capture_nanos: u64, ready_nanos: u64) -> Result<u64, EvaluateError> {
-        let deadline_nanos = ready_nanos.saturating_add(self.config.deadline_nanos);
-        // It may still fuse the frame before.
-        let begins_nanos = ready_nanos.max(self.ego_free_nanos);
-        let mut closes_nanos = begins_nanos.max(deadline_nanos);
-        loop {
-            // A frame that is followed by a newer one waits no longer.
-            let computed = self.computed.iter().flatten();
-            if let Some(next) = { computed }.find_map(|next| next.own.as_ref().ok()) {
-                let arrives_nanos = next
-                    .capture_nanos
-                    .saturating_add(self.config.compute.agent_nanos());
-                closes_nanos = closes_nanos.min(begins_nanos.max(arrives_nanos));
-            }
-            let next = self
-                .scenario
-                .ticks
-                .get(self.next)
-                .filter(|_| self.next < self.end);
-            if next.is_none_or(|next| next.capture_nanos > closes_nanos) {
-                break;
-            }
-            self.compute()?;
-        }
-        self.arriving.extend(self.delivery.until(closes_nanos));
-        while let Some(arrived) = self.next_arrival(begins_nanos) {
-            self.take_in(arrived);
-        }
-        let mut decided_nanos = begins_nanos;
-        while !self.is_complete(capture_nanos) {
-            let Some(arrived) = self.next_arrival(closes_nanos) else {
-                return Ok(closes_nanos);
-            };
-            decided_nanos = arrived.nanos;
-            self.take_in(arrived);
-        }
-        Ok(decided_nanos)
-    }
-
-    /// The next message that arrives by a time.
-    fn next_arrival(&mut self, by_nanos: u64) -> Option<Arrived> {
-        let is_due = self.arriving.front()?.nanos <= by_nanos;
-        if is_due {
-            self.arriving.pop_front()
-        } else {
-            None
-        }
-    }
-
-    /// Queues an arrived message for its tick.
-    fn take_in(&mut self, arrived: Arrived) {
-        let mut envelope = arrived.envelope;
-        let cav = envelope.view.cav.clone();
-        self.clocks.note(&cav, envelope.sweep);
-        for cav in self.clocks.update() {
-            for _ in 0..self.pairing.forget(&cav) {
-                self.delivery.dropped(&cav, DropReason::Clock);
-            }
-        }
-        self.silence.reset(&cav);
-        let stated_nanos = envelope.view.capture_nanos;
-        let Some(capture_nanos) = self.clocks.corrected(&cav, stated_nanos) else {
-            return self.delivery.dropped(&cav, DropReason::Clock);
-        };
-        envelope.view.capture_nanos = capture_nanos;
-        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, envelope) {
-            self.delivery.dropped(&lost.cav, lost.reason);
-        }
-    }
-
-    /// True if a frame waits for nothing more.
-    fn is_complete(&self, capture_nanos: u64) -> bool {
-        self.neighbours().all(|cav| {
-            !self.silence.is_awaited(cav) || self.pairing.has_reached(cav, capture_nanos)
-        })
-    }
-
-    /// Vehicles whose messages the ego can use.
-    fn neighbours(&self) -> impl Iterator<Item = &CavId> {
-        let exchanges = self.evaluator.ego.method().exchange() != Exchange::Nothing;
-        let neighbours = self.crew.iter().skip(1).filter(move |_| exchanges);
-        neighbours.map(|member| &member.cav)
-    }
-
-    /// The result of a tick, or the reason why it cannot be computed.
-    fn fuse(
-        &mut self,
-        tick: usize,
-        own: &View,
-    ) -> Result<Result<Detections, String>, EvaluateError> {
-        let (paired, dropped) = self.pairing.pair(own.capture_nanos);
-        let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
-        for pair in paired {
-            views.push(pair.message.view.clone());
-            bytes.push((pair.message.payload_bytes, pair.message.wire_bytes));
-            first_uses.push(pair.is_first_use);
-        }
-        let output = self.evaluator.detect(self.scenario, tick, own, &views)?;
-        for lost in &dropped {
-            self.delivery.dropped(&lost.cav, lost.reason);
-        }
-        let new = views
-            .iter()
-            .enumerate()
-            .filter(|(index, _)| first_uses[*index]);
-        for (index, view) in new {
-            // The messages of a frame that failed are valid.
-            let skipped = output.as_ref().map_or(&[][..], |output| &output.skipped);
-            let left_out = skipped.iter().find(|(skipped, _)| *skipped == index);
-            match left_out {
-                Some((_, Skipped::Unusable(reason))) => self.delivery.dropped(&view.cav, *reason),
-                Some((_, Skipped::NotNeeded)) | None => self.delivery.received(&view.cav),
-            }
-        }
-        let silent: Vec<CavId> = self
-            .neighbours()
-            .filter(|cav| views.iter().all(|view| view.cav != **cav))
-            .cloned()
-            .collect();
-        let mut skipped = Vec::with_capacity(silent.len());
-        for cav in silent {
-            self.silence.missed(&cav);
-            let lost = dropped.iter().rev().find(|lost| lost.cav == cav);
-            let reason = lost.map(|lost| lost.reason);
-            skipped.push(SkippedNeighbour { cav, reason });
-        }
-        let number = tick - self.config.ticks.start;
-        let own = (&own.cav, own.pose, own.capture_nanos);
-        Ok(output.map(|output| {
-            let mut result = self.evaluator.report(number, own, &views, &bytes, output);
-            result.skipped.extend(skipped);
-            self.clocks.describe(&mut result.neighbours);
-            result
-        }))
-    }
-
     /// Closes the accounting: messages still on the link or queued for a tick that will not come are in flight.
-    fn close(&mut self) {
+    fn close(&mut self) -> Result<(), EvaluateError> {
         while let Some(arrived) = self.arriving.pop_front() {
-            self.take_in(arrived);
+            let nanos = arrived.nanos.max(self.ego_free_nanos);
+            self.take_in(arrived, nanos)?;
         }
         for member in self.crew.iter().skip(1) {
-            let cav = &member.cav;
-            let waiting = self.pairing.forget(cav) as u64;
-            self.delivery.close(cav, waiting);
+            let waiting = self.ego_loop.unused(&member.cav) as u64;
+            self.delivery.close(&member.cav, waiting);
         }
         self.evaluator.ledger.merge(self.delivery.ledger());
         self.evaluator.sent_bytes += self.delivery.sent_bytes();
+        Ok(())
     }
 }
 

@@ -4,7 +4,6 @@ use std::path::Path;
 
 use anyhow::{Context, Result};
 use dataset::IntensityScale;
-use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::EvaluateConfig;
 use ego_fuser_offline::evaluation::stepped::{AgentPool, SteppedConfig};
 use fusion::Exchange;
@@ -42,11 +41,6 @@ pub(super) fn options(
         settings,
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
         stepped: Some(SteppedConfig {
-            // Deep enough for the oldest map that is still fused, at 10 Hz.
-            pairing: PairingConfig {
-                depth: (ego.max_age_ms / 100 + 4) as usize,
-                ..ego.pairing()
-            },
             crew: AgentPool::First(point.agents.unwrap_or(usize::MAX)),
             ..SteppedConfig::new(link, point.seed, ego, experiment.compute)
         }),

@@ -1,0 +1,228 @@
+//! Messages of an ego's loop: decoded, dated and queued.
+
+use protocol::message::{Bev, Boxes, Descriptor, Payload, Points};
+use protocol::{
+    CavId, DropReason, HEADER_LEN, Header, Limits, PoseEstimate, Stamp, Stream, WireError, wire,
+};
+
+use super::{EgoLoop, Message, Output, OwnFrame};
+use crate::capture_clock::SweepTime;
+use crate::ego::{Content, Ego, View};
+
+/// Largest lead of a neighbour's message over the newest of the ego's own, nanoseconds: its computer may be faster.
+const MAX_AHEAD_NANOS: u64 = 2_000_000_000;
+
+/// Reason why a message is not decoded.
+#[derive(Debug)]
+pub(crate) enum Refusal {
+    /// No frame will use it.
+    Unneeded(DropReason),
+    /// It is malformed.
+    Malformed(WireError),
+}
+
+impl From<WireError> for Refusal {
+    fn from(error: WireError) -> Self {
+        Self::Malformed(error)
+    }
+}
+
+/// View of a message on the wire, with its payload bytes and the bytes of all messages for its frame.
+pub(crate) type Decoded = (View, u64, u64);
+
+impl EgoLoop {
+    /// Decodes a vehicle's perception from its pieces on the wire.
+    ///
+    /// # Errors
+    /// [`Refusal`] if no frame will use it, which is found out before the map is decoded, or if it is malformed.
+    pub(crate) fn decode<'a>(
+        &self,
+        cav: &CavId,
+        header: &Header,
+        pieces: impl IntoIterator<Item = &'a [u8]>,
+        limits: &Limits,
+    ) -> Result<Decoded, Refusal> {
+        if *cav != self.cav {
+            self.dated(cav, header.stamp.capture_nanos)
+                .map_err(Refusal::Unneeded)?;
+        }
+        let (pose, content) = match self.stream {
+            Stream::Boxes => {
+                let Boxes { pose, detections } = payload(pieces, limits)?;
+                (pose, Content::Boxes(detections))
+            }
+            Stream::Points => {
+                let Points { pose, points } = payload(pieces, limits)?;
+                (pose, Content::Points(points))
+            }
+            _ => {
+                let Bev { pose, features } = payload(pieces, limits)?;
+                let fits = self.models.check(&features);
+                let map = features.decode(limits)?;
+                fits?;
+                (pose, Content::Features(map))
+            }
+        };
+        let payload_bytes = u64::from(header.metadata_len) + header.body_len;
+        let wire_bytes = payload_bytes + HEADER_LEN as u64 + pose_bytes(&header.stamp, pose);
+        let view = View {
+            cav: cav.clone(),
+            pose,
+            capture_nanos: header.stamp.capture_nanos,
+            content,
+        };
+        Ok((view, payload_bytes, wire_bytes))
+    }
+
+    /// Takes a message in: the own agent's begins a frame, a neighbour's is queued for one.
+    pub(super) fn take_in(&mut self, ego: &mut Ego, mut message: Message, now_nanos: u64) {
+        let cav = message.view.cav.clone();
+        let stated_nanos = message.view.capture_nanos;
+        if cav == self.cav {
+            return self.begin(ego, message, now_nanos);
+        }
+        match self.dated(&cav, stated_nanos) {
+            Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
+            Err(reason) => return self.drop_message(&cav, reason),
+        }
+        if let Some(offset_s) = message.clock_offset_s {
+            self.clock_offsets_s.insert(cav.clone(), offset_s);
+        }
+        self.silence.reset(&cav);
+        let capture_nanos = message.view.capture_nanos;
+        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, message) {
+            self.drop_message(&lost.cav, lost.reason);
+        }
+    }
+
+    /// Begins a frame with the own agent's message.
+    fn begin(&mut self, ego: &mut Ego, message: Message, now_nanos: u64) {
+        let capture_nanos = message.view.capture_nanos;
+        self.keep_time(ego, capture_nanos);
+        // In the inbox, while another frame was fused, or behind one that waits for its neighbours.
+        let waited_nanos = if self.frames.is_empty() {
+            now_nanos.saturating_sub(message.arrived_nanos)
+        } else {
+            u64::MAX
+        };
+        if let Some(pace) = self.pace.judge(capture_nanos, waited_nanos, now_nanos) {
+            self.outputs.push(Output::Pace(pace));
+        }
+        self.frames.push_back(OwnFrame {
+            agent_frame: message.sequence,
+            transport: message.transport,
+            begun_nanos: message.arrived_nanos,
+            view: message.view,
+        });
+    }
+
+    /// Capture time of a neighbour's message on the ego's clock, nanoseconds.
+    ///
+    /// # Errors
+    /// Reason to drop it: it is of another network; its clock is unsteady; it is in the future, later than the ego's own
+    /// sweeps by more than its own agent may lag behind; or it is so old that no frame of the ego will use it.
+    fn dated(&self, cav: &CavId, stated_nanos: u64) -> Result<u64, DropReason> {
+        if self.models.is_other(cav) {
+            return Err(DropReason::Shape);
+        }
+        let corrected = self.clocks.corrected(cav, stated_nanos);
+        let capture_nanos = corrected.ok_or(DropReason::Clock)?;
+        let Some(newest) = self.own_nanos else {
+            return Ok(capture_nanos);
+        };
+        let oldest = self.frames.front();
+        let oldest = oldest.map_or(newest, |frame| frame.view.capture_nanos);
+        if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
+            Err(DropReason::Future)
+        } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {
+            Err(DropReason::Stale)
+        } else {
+            Ok(capture_nanos)
+        }
+    }
+
+    /// Sets the clock by the ego's own sweeps. Where the scene restarts, all state is reset.
+    fn keep_time(&mut self, ego: &mut Ego, capture_nanos: u64) {
+        let max_age_nanos = self.options.pairing.max_age_nanos;
+        if self
+            .own_nanos
+            .is_some_and(|own| capture_nanos.saturating_add(max_age_nanos) < own)
+        {
+            tracing::info!(capture_nanos, "the scene has restarted");
+            for cav in self.pairing.cavs() {
+                let gone = self.pairing.turn_back(&cav, capture_nanos, MAX_AHEAD_NANOS);
+                self.drop_messages(&cav, gone, DropReason::Stale);
+            }
+            ego.forget();
+        }
+        self.own_nanos = Some(capture_nanos);
+    }
+
+    /// Compares an agent's network with the ego's. Maps of another network are left out from then on.
+    pub(super) fn compare_models(&mut self, cav: &CavId, descriptor: &Descriptor) {
+        // Boxes and points belong to no network.
+        if self.stream != Stream::Bev {
+            return;
+        }
+        let Some(other) = self.models.update(cav, descriptor) else {
+            return;
+        };
+        if *cav == self.cav {
+            tracing::error!(%cav, "the ego's own agent runs another network than the ego: {other}");
+            return;
+        }
+        tracing::warn!(%cav, "its maps are of another network and are left out: {other}");
+        let unused = self.pairing.forget(cav);
+        self.drop_messages(cav, unused, DropReason::Shape);
+    }
+
+    /// Compares the capture clocks of two vehicles by the arrivals of their sweeps. Messages that wait under a capture
+    /// time that is corrected otherwise now are dropped.
+    pub(super) fn compare_clocks(&mut self, cav: &CavId, sweeps: &[SweepTime]) {
+        for &sweep in sweeps {
+            if *cav == self.cav {
+                self.clocks.note_own(sweep);
+            } else {
+                self.clocks.note(cav, sweep);
+            }
+        }
+        for cav in self.clocks.update() {
+            let unused = self.pairing.forget(&cav);
+            self.drop_messages(&cav, unused, DropReason::Clock);
+        }
+    }
+
+    /// Forgets a neighbour that has left.
+    pub(super) fn forget(&mut self, cav: &CavId) {
+        self.members.remove(cav);
+        self.silence.reset(cav);
+        self.models.forget(cav);
+        self.clocks.forget(cav);
+        self.clock_offsets_s.remove(cav);
+        self.ended.remove(cav);
+        let unused = self.pairing.forget(cav);
+        self.drop_messages(cav, unused, DropReason::Stale);
+    }
+
+    pub(super) fn drop_message(&mut self, cav: &CavId, reason: DropReason) {
+        self.outputs.push(Output::Dropped(cav.clone(), reason));
+    }
+
+    fn drop_messages(&mut self, cav: &CavId, count: usize, reason: DropReason) {
+        for _ in 0..count {
+            self.drop_message(cav, reason);
+        }
+    }
+}
+
+fn payload<'a, M: Payload>(
+    pieces: impl IntoIterator<Item = &'a [u8]>,
+    limits: &Limits,
+) -> Result<M, WireError> {
+    wire::decode(pieces, limits).map(|(_, message)| message)
+}
+
+/// Wire size of the neighbour's `pose` message for the same frame, bytes: its content equals the pose inside this one.
+fn pose_bytes(stamp: &Stamp, pose: PoseEstimate) -> u64 {
+    wire::encode(stamp, pose).map_or(0, |encoded| encoded.wire_bytes() as u64)
+}

@@ -1,0 +1,233 @@
+//! Frames of an ego's loop: end of the wait, selection of messages, fusion and report.
+
+use std::time::Duration;
+
+use protocol::message::{FusedNeighbour, NeighbourState, SkippedNeighbour, StageTiming};
+use protocol::{CavId, Detections, DropReason};
+
+use super::{EgoLoop, Output, OwnFrame};
+use crate::ego::{Ego, EgoOutput, Skipped, View};
+use crate::misbehaviour::{self, Assessment};
+use crate::pairing::Paired;
+
+/// The neighbours' messages for a frame, and the neighbours without one.
+#[derive(Default)]
+struct Choice {
+    views: Vec<View>,
+    /// One for each view.
+    messages: Vec<MessageInfo>,
+    skipped: Vec<SkippedNeighbour>,
+}
+
+/// Fields of a message for accounting and report.
+struct MessageInfo {
+    is_first_use: bool,
+    payload_bytes: u64,
+    wire_bytes: u64,
+}
+
+impl EgoLoop {
+    /// Decides the oldest frame if it waits for nothing more, and ends the loop after the last.
+    pub(super) fn wake(&mut self, ego: &mut Ego, now_nanos: u64) {
+        if let Some(pace) = self.pace.repeat(now_nanos) {
+            self.outputs.push(Output::Pace(pace));
+        }
+        let is_over = self.ends_nanos.is_some_and(|ends| now_nanos >= ends);
+        if let Some(frame) = self.frames.front() {
+            let is_complete = self.is_complete(frame.view.capture_nanos);
+            let due_nanos = { frame.begun_nanos }.saturating_add(self.options.deadline_nanos);
+            // A frame followed by a newer one has waited too long already.
+            let is_due = now_nanos >= due_nanos || self.frames.len() > 1 || is_over;
+            if is_complete || is_due {
+                self.report.at_deadline += u64::from(!is_complete);
+                if let Some(frame) = self.frames.pop_front() {
+                    self.fuse(ego, frame, now_nanos);
+                }
+            }
+        }
+        let has_ended = self.ends_nanos.is_some() && (is_over || self.all_have_ended());
+        if has_ended && self.frames.is_empty() {
+            self.finish();
+        }
+    }
+
+    /// Counts the messages that wait for a frame that will not come.
+    fn finish(&mut self) {
+        let (_, dropped) = self.pairing.pair(u64::MAX);
+        for lost in dropped {
+            self.outputs.push(Output::Dropped(lost.cav, lost.reason));
+        }
+        self.is_finished = true;
+    }
+
+    fn is_complete(&self, capture_nanos: u64) -> bool {
+        let mut awaited = { self.members.iter() }.filter(|cav| self.silence.is_awaited(cav));
+        awaited.all(|cav| {
+            self.ended.contains(cav)
+                || self.models.is_other(cav)
+                || self.pairing.has_reached(cav, capture_nanos)
+        })
+    }
+
+    fn all_have_ended(&self) -> bool {
+        self.members.iter().all(|cav| self.ended.contains(cav))
+    }
+
+    fn fuse(&mut self, ego: &mut Ego, frame: OwnFrame, now_nanos: u64) {
+        let own = frame.view;
+        let waited = Duration::from_nanos(now_nanos.saturating_sub(frame.begun_nanos));
+        let mut choice = self.choose(own.capture_nanos);
+        match ego.detect(&own, &choice.views) {
+            Ok(EgoOutput {
+                detections,
+                fused,
+                skipped,
+                beliefs,
+                stages,
+            }) => {
+                let neighbours = self.neighbour_reports(&beliefs, &choice.views);
+                self.outputs.push(Output::Received(self.cav.clone()));
+                self.leave_out(&skipped, &mut choice);
+                let fused = self.use_messages(&own, &fused, &choice);
+                let transport =
+                    { frame.transport }.map(|transport| StageTiming::new("transport", transport));
+                let wait = StageTiming::new("wait", waited);
+                let result = Detections {
+                    ego: self.cav.clone(),
+                    agent_frame: frame.agent_frame,
+                    method: ego.method().name().to_owned(),
+                    pose: own.pose,
+                    detections,
+                    fused,
+                    skipped: choice.skipped,
+                    neighbours,
+                    stages: transport.into_iter().chain([wait]).chain(stages).collect(),
+                };
+                self.report.frames += 1;
+                self.outputs.push(Output::Publish {
+                    capture_nanos: own.capture_nanos,
+                    result: Box::new(result),
+                });
+            }
+            Err(error) => {
+                self.report.failed += 1;
+                let first = &mut self.report.failure;
+                first.get_or_insert_with(|| error.to_string());
+                let reason = match error.is_of_frame() {
+                    true => DropReason::NotFinite,
+                    false => DropReason::Shape,
+                };
+                self.drop_message(&self.cav.clone(), reason);
+                // The neighbours' messages are valid.
+                let all: Vec<usize> = (0..choice.views.len()).collect();
+                self.use_messages(&own, &all, &choice);
+                self.outputs.push(Output::Failed {
+                    capture_nanos: own.capture_nanos,
+                    error,
+                });
+            }
+        }
+    }
+
+    /// Report of the neighbours received for a frame.
+    fn neighbour_reports(
+        &self,
+        assessments: &[(usize, Assessment)],
+        views: &[View],
+    ) -> Vec<NeighbourState> {
+        let mut reports = misbehaviour::neighbour_states(assessments, views);
+        for report in &mut reports {
+            report.clock_offset_s = self.clock_offsets_s.get(&report.cav).copied();
+        }
+        self.clocks.describe(&mut reports);
+        reports
+    }
+
+    /// The neighbours' messages for a frame, and the neighbours without one.
+    fn choose(&mut self, capture_nanos: u64) -> Choice {
+        let (paired, dropped) = self.pairing.pair(capture_nanos);
+        let mut choice = Choice::default();
+        for Paired {
+            is_first_use,
+            message,
+            ..
+        } in paired
+        {
+            // A copy, as the message may serve the next frame too.
+            choice.views.push(message.view.clone());
+            choice.messages.push(MessageInfo {
+                is_first_use,
+                payload_bytes: message.payload_bytes,
+                wire_bytes: message.wire_bytes,
+            });
+        }
+        for lost in &dropped {
+            self.drop_message(&lost.cav, lost.reason);
+        }
+        for cav in &self.members {
+            if choice.views.iter().any(|view| view.cav == *cav) {
+                continue;
+            }
+            self.silence.missed(cav);
+            let lost = dropped.iter().rev().find(|lost| lost.cav == *cav);
+            let reason = if self.models.is_other(cav) {
+                Some(DropReason::Shape)
+            } else {
+                lost.map(|lost| lost.reason)
+            };
+            choice.skipped.push(SkippedNeighbour {
+                cav: cav.clone(),
+                reason,
+            });
+        }
+        choice
+    }
+
+    /// Counts the views that are in the result as received, and describes them.
+    fn use_messages(
+        &mut self,
+        own: &View,
+        fused: &[usize],
+        choice: &Choice,
+    ) -> Vec<FusedNeighbour> {
+        self.report.fused += fused.len() as u64;
+        let mut described = Vec::with_capacity(fused.len());
+        for &index in fused {
+            let (view, message) = (&choice.views[index], &choice.messages[index]);
+            self.count(&view.cav, message.is_first_use, None);
+            described.push(FusedNeighbour {
+                cav: view.cav.clone(),
+                age_nanos: view.age_nanos(own),
+                confidence: view.pose.confidence(),
+                payload_bytes: message.payload_bytes,
+                wire_bytes: message.wire_bytes,
+            });
+        }
+        described
+    }
+
+    /// Counts the views that are not in the result, and names those that should have been.
+    fn leave_out(&mut self, left_out: &[(usize, Skipped)], choice: &mut Choice) {
+        for &(index, why) in left_out {
+            let cav = choice.views[index].cav.clone();
+            let reason = match why {
+                Skipped::Unusable(reason) => Some(reason),
+                // It was evaluated, and rightly left out.
+                Skipped::NotNeeded => None,
+            };
+            self.count(&cav, choice.messages[index].is_first_use, reason);
+            if reason.is_some() {
+                choice.skipped.push(SkippedNeighbour { cav, reason });
+            }
+        }
+    }
+
+    /// Counts a message at its first use.
+    fn count(&mut self, cav: &CavId, is_first_use: bool, reason: Option<DropReason>) {
+        match reason {
+            _ if !is_first_use => {}
+            Some(reason) => self.drop_message(cav, reason),
+            None => self.outputs.push(Output::Received(cav.clone())),
+        }
+    }
+}

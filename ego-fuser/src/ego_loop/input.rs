@@ -1,0 +1,73 @@
+//! Inputs and outputs of an ego's loop.
+
+use std::time::Duration;
+
+use protocol::message::{Descriptor, Detections};
+use protocol::{CavId, DropReason, Pace};
+
+use crate::capture_clock::SweepTime;
+use crate::ego::EgoError;
+use crate::view::View;
+
+/// Something that happens to an ego.
+#[derive(Debug, Clone)]
+pub enum Input {
+    /// A vehicle's perception has arrived.
+    Message(Box<Message>),
+    /// An agent has named its network.
+    Model(CavId, Descriptor),
+    /// An agent has reported the arrivals of its sweeps, on the ego's clock.
+    Sweeps(CavId, Vec<SweepTime>),
+    /// A neighbour has joined: frames wait for its messages.
+    Joined(CavId),
+    /// A neighbour has left.
+    Left(CavId),
+    /// A vehicle sends no more. After the own agent's end the loop ends.
+    Ended(CavId),
+    /// Everything that has arrived by now is taken in: frames are decided.
+    Wake,
+}
+
+/// A vehicle's perception as received.
+#[derive(Debug, Clone)]
+pub struct Message {
+    /// Sender, pose and content, with the capture time that the sender states.
+    pub view: View,
+    /// Sequence of the message.
+    pub sequence: u64,
+    /// Arrival on the loop's clock, nanoseconds.
+    pub arrived_nanos: u64,
+    /// Time from the publication to the arrival; `None` if the sender has another clock.
+    pub transport: Option<Duration>,
+    /// System clock of the sender minus the ego's, seconds, minus the shortest transit time; `None`: unknown.
+    pub clock_offset_s: Option<f64>,
+    /// Bytes of metadata and body.
+    pub payload_bytes: u64,
+    /// Bytes of all messages for this frame, headers and the pose message included.
+    pub wire_bytes: u64,
+}
+
+/// Something that an ego does.
+#[derive(Debug)]
+pub enum Output {
+    /// Publishes the result of a frame.
+    Publish {
+        /// Capture time of the ego's sweep, nanoseconds.
+        capture_nanos: u64,
+        /// The result.
+        result: Box<Detections>,
+    },
+    /// A frame has no result.
+    Failed {
+        /// Capture time of the ego's sweep, nanoseconds.
+        capture_nanos: u64,
+        /// Cause.
+        error: EgoError,
+    },
+    /// Counts a message of a vehicle as used.
+    Received(CavId),
+    /// Counts a message of a vehicle as not used.
+    Dropped(CavId, DropReason),
+    /// Publishes the share of sweeps that the fleet computes.
+    Pace(Pace),
+}

@@ -1,0 +1,200 @@
+//! Ego loop: what an ego does with each input, at a time that is given. It has no network, clock or thread.
+//!
+//! A frame begins with the message of the ego's own agent. It is decided when every neighbour's message of the same
+//! capture time has arrived, or when the deadline has passed; later messages serve the next frame, if they are still
+//! young enough.
+//!
+//! The live process, simulation time and the replay of recorded inputs are adapters: they bring inputs in order of time
+//! and carry out the outputs. The same inputs give the same outputs.
+
+mod admit;
+mod decide;
+mod input;
+mod pace_keeper;
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::Duration;
+
+use protocol::{CavId, Stream};
+use serde::Serialize;
+
+use crate::capture_clock::CaptureClocks;
+use crate::config::EgoSettings;
+use crate::ego::Ego;
+use crate::pairing::{Pairing, PairingConfig};
+use crate::peer_models::PeerModels;
+use crate::silence::Silence;
+use crate::view::View;
+use fusion::method::Exchange;
+use pace_keeper::PaceKeeper;
+
+pub(crate) use admit::Refusal;
+pub use input::{Input, Message, Output};
+
+/// Time that an ego whose own agent has ended waits for the last messages of its neighbours, nanoseconds.
+const LAST_WAIT_NANOS: u64 = 2_000_000_000;
+
+/// Options of an ego's loop.
+#[derive(Debug, Clone, Copy)]
+pub struct LoopOptions {
+    /// Longest wait of a frame for its neighbours, from the arrival of the own agent's message, nanoseconds.
+    pub deadline_nanos: u64,
+    /// Pairing of messages with a frame.
+    pub pairing: PairingConfig,
+    /// True to slow the fleet down where this machine cannot keep up; false to ask for every sweep.
+    pub sets_pace: bool,
+    /// True where arrivals of sweeps are exact, as in simulation time.
+    pub has_exact_arrivals: bool,
+}
+
+impl LoopOptions {
+    /// Options in simulation time, with these limits.
+    #[must_use]
+    pub fn stepped(settings: &EgoSettings) -> Self {
+        Self {
+            deadline_nanos: settings.deadline_ms.saturating_mul(1_000_000),
+            pairing: settings.pairing(),
+            sets_pace: false,
+            has_exact_arrivals: true,
+        }
+    }
+}
+
+/// Summary of an ego's run.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct LoopReport {
+    /// Frames decided.
+    pub frames: u64,
+    /// Neighbours' messages that were fused, over all frames.
+    pub fused: u64,
+    /// Frames that were decided at the deadline.
+    pub at_deadline: u64,
+    /// Frames that could not be fused.
+    pub failed: u64,
+    /// Reason of the first of these.
+    pub failure: Option<String>,
+}
+
+/// A frame that has begun.
+struct OwnFrame {
+    /// Sequence of the own agent's message.
+    agent_frame: u64,
+    /// From its publication to its arrival; `None` if its agent has another clock.
+    transport: Option<Duration>,
+    begun_nanos: u64,
+    view: View,
+}
+
+/// The state of an ego between two inputs.
+pub struct EgoLoop {
+    cav: CavId,
+    stream: Stream,
+    options: LoopOptions,
+    members: BTreeSet<CavId>,
+    silence: Silence,
+    models: PeerModels,
+    pairing: Pairing<Message>,
+    clocks: CaptureClocks,
+    /// System clock of a neighbour minus the ego's, seconds, as of its last message.
+    clock_offsets_s: BTreeMap<CavId, f64>,
+    frames: VecDeque<OwnFrame>,
+    pace: PaceKeeper,
+    /// Capture time of the ego's newest sweep, nanoseconds.
+    own_nanos: Option<u64>,
+    ended: BTreeSet<CavId>,
+    /// Time at which the loop ends at the latest, after the own agent's end.
+    ends_nanos: Option<u64>,
+    is_finished: bool,
+    report: LoopReport,
+    outputs: Vec<Output>,
+}
+
+impl EgoLoop {
+    /// Loop of the vehicle `cav`, whose frames `ego` fuses, before its first input.
+    #[must_use]
+    pub fn new(cav: &CavId, ego: &Ego, options: LoopOptions) -> Self {
+        Self {
+            cav: cav.clone(),
+            stream: stream_of(ego.method().own_content()),
+            options,
+            members: BTreeSet::new(),
+            silence: Silence::default(),
+            models: PeerModels::new(ego.detector()),
+            pairing: Pairing::new(options.pairing),
+            clocks: CaptureClocks::new(options.has_exact_arrivals),
+            clock_offsets_s: BTreeMap::new(),
+            frames: VecDeque::new(),
+            pace: PaceKeeper::new(options.sets_pace),
+            own_nanos: None,
+            ended: BTreeSet::new(),
+            ends_nanos: None,
+            is_finished: false,
+            report: LoopReport::default(),
+            outputs: Vec::new(),
+        }
+    }
+
+    /// Takes an input in at `now_nanos`, which never decreases. Only [`Input::Wake`] decides a frame, and one at most:
+    /// fusing takes time, in which more may arrive.
+    pub fn handle(&mut self, ego: &mut Ego, input: Input, now_nanos: u64) -> Vec<Output> {
+        match input {
+            Input::Message(message) => self.take_in(ego, *message, now_nanos),
+            Input::Model(cav, descriptor) => self.compare_models(&cav, &descriptor),
+            Input::Sweeps(cav, sweeps) => self.compare_clocks(&cav, &sweeps),
+            Input::Joined(cav) => {
+                self.members.insert(cav);
+            }
+            Input::Left(cav) => self.forget(&cav),
+            Input::Ended(cav) if cav == self.cav => {
+                let wait_nanos = LAST_WAIT_NANOS.max(self.options.deadline_nanos);
+                self.ends_nanos = Some(now_nanos.saturating_add(wait_nanos));
+            }
+            Input::Ended(cav) => {
+                self.ended.insert(cav);
+            }
+            Input::Wake => self.wake(ego, now_nanos),
+        }
+        std::mem::take(&mut self.outputs)
+    }
+
+    /// Time by which the loop has to be woken; `None`: nothing waits.
+    #[must_use]
+    pub fn wakes_nanos(&self) -> Option<u64> {
+        let deadline_nanos = self.options.deadline_nanos;
+        let front = self.frames.front();
+        let due = front.map(|frame| frame.begun_nanos.saturating_add(deadline_nanos));
+        due.into_iter().chain(self.ends_nanos).min()
+    }
+
+    /// True after the own agent's end, when everything is decided.
+    #[must_use]
+    pub fn is_finished(&self) -> bool {
+        self.is_finished
+    }
+
+    /// Stream of the vehicles' perception that the method fuses.
+    #[must_use]
+    pub fn stream(&self) -> Stream {
+        self.stream
+    }
+
+    /// Summary so far.
+    #[must_use]
+    pub fn report(&self) -> &LoopReport {
+        &self.report
+    }
+
+    /// Messages of a neighbour that wait and were never used.
+    #[must_use]
+    pub fn unused(&self, cav: &CavId) -> usize {
+        self.pairing.unused(cav)
+    }
+}
+
+fn stream_of(exchange: Exchange) -> Stream {
+    match exchange {
+        Exchange::Boxes => Stream::Boxes,
+        Exchange::Points => Stream::Points,
+        Exchange::Features | Exchange::Nothing => Stream::Bev,
+    }
+}

@@ -1,0 +1,80 @@
+//! Messages from the bus as inputs of the ego's loop: decoded and timed.
+
+use std::time::Instant;
+
+use bus::{Arrival, LINK_TRANSIT_S, NETWORK_TRANSIT_S};
+use protocol::CavId;
+use protocol::message::Descriptor;
+
+use super::Node;
+use crate::capture_clock::SweepTime;
+use crate::ego_loop::{Input, Message, Refusal};
+use crate::neighbourhood::sender_of;
+
+impl Node<'_> {
+    /// Decodes a message and hands it to the loop.
+    pub(super) fn admit(&mut self, arrival: &Arrival) {
+        let Some((cav, stream)) = sender_of(&arrival.topic) else {
+            return;
+        };
+        if stream != self.ego_loop.stream() {
+            return self.admit_descriptor(cav, arrival);
+        }
+        let stats = self.bus.stats();
+        let began = Instant::now();
+        let pieces = arrival.pieces();
+        let decoded = self
+            .ego_loop
+            .decode(cav, &arrival.header, pieces, &self.options.limits);
+        let (view, payload_bytes, wire_bytes) = match decoded {
+            Ok(decoded) => decoded,
+            Err(Refusal::Unneeded(reason)) => return stats.dropped(&arrival.topic, reason),
+            Err(Refusal::Malformed(error)) => return stats.rejected(&arrival.topic, &error),
+        };
+        stats.timed("decode", began.elapsed());
+        let transport = stats.transport(arrival, self.longest_transit_s());
+        if let Some(transport) = transport {
+            let stage = format!("{} transport", self.ego_loop.stream());
+            stats.timed(&stage, transport);
+        }
+        let message = Message {
+            view,
+            sequence: arrival.header.stamp.sequence,
+            arrived_nanos: self.nanos(arrival.at),
+            transport,
+            clock_offset_s: stats.measured_clock_offset_s(cav),
+            payload_bytes,
+            wire_bytes,
+        };
+        self.handle(Input::Message(Box::new(message)));
+    }
+
+    /// Processes an agent's descriptor: its network, and the arrivals of its sweeps.
+    fn admit_descriptor(&mut self, cav: &CavId, arrival: &Arrival) {
+        let limits = &self.options.limits;
+        let Some(descriptor) = self.inbox.decode::<Descriptor>(arrival, limits) else {
+            return;
+        };
+        let stats = self.bus.stats();
+        let offset_s = stats.system_clock_offset_s(cav, self.longest_transit_s());
+        let offset_nanos = (offset_s * 1e9) as i64;
+        let newest_nanos = arrival.header.stamp.capture_nanos;
+        let sweeps = { descriptor.sweeps.iter() }
+            .map(|sweep| SweepTime {
+                capture_nanos: newest_nanos.saturating_sub(sweep.before_nanos),
+                arrived_nanos: sweep.arrived_nanos.saturating_sub_signed(offset_nanos),
+            })
+            .collect();
+        self.handle(Input::Sweeps(cav.clone(), sweeps));
+        self.handle(Input::Model(cav.clone(), descriptor));
+    }
+
+    /// Longest transit time of a message, seconds; the own agent's, which takes no link, has one clock with the ego.
+    fn longest_transit_s(&self) -> f64 {
+        if self.options.over_link {
+            LINK_TRANSIT_S
+        } else {
+            NETWORK_TRANSIT_S
+        }
+    }
+}
