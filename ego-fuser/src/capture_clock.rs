@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use protocol::CavId;
 use protocol::message::NeighbourState;
+use serde::{Deserialize, Serialize};
 
 /// Offset beyond which a clock is named and corrected, nanoseconds.
 const LIMIT_NANOS: i64 = 50_000_000;
@@ -22,7 +23,7 @@ const MAX_KEPT: usize = 64;
 const MAX_VEHICLES: usize = 128;
 
 /// A sweep of a vehicle.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SweepTime {
     /// Capture time as the vehicle states it, nanoseconds.
     pub capture_nanos: u64,

@@ -1,5 +1,7 @@
 //! Configuration of `ego-fuser run`: one type for file, options and JSON schema.
 
+use std::path::PathBuf;
+
 use agent::config::ModelConfig;
 use bus::{BusConfig, InboxConfig, ProcessConfig};
 use protocol::config::{FieldError, within};
@@ -47,6 +49,10 @@ pub struct EgoConfig {
     #[arg(long)]
     #[serde(default)]
     pub keep_running: bool,
+    /// Record everything that enters the ego's decisions into this file, for `ego-fuser replay-inputs`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inputs: Option<PathBuf>,
     /// Vehicle, deadline, age, misbehaviour detection and limits.
     #[command(flatten)]
     #[serde(default)]
@@ -142,6 +148,15 @@ impl EgoSettings {
     #[must_use]
     pub fn trust(&self) -> Option<MisbehaviourConfig> {
         self.trust.then(MisbehaviourConfig::default)
+    }
+}
+
+impl EgoConfig {
+    /// The configuration as JSON, on one line.
+    #[must_use]
+    pub fn to_json(&self) -> String {
+        // Numbers, names, paths and lists have a spelling in JSON.
+        serde_json::to_string(self).unwrap_or_default()
     }
 }
 

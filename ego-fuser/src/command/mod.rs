@@ -1,6 +1,7 @@
 //! Subcommands: one file each, with its arguments and the call into the library.
 
 mod methods;
+mod replay_inputs;
 mod run;
 
 use anyhow::Context;
@@ -33,6 +34,8 @@ pub(crate) enum Command {
     Run(Box<run::Arguments>),
     /// List the collaboration methods and what each sends
     Methods(methods::Arguments),
+    /// Decide again from the recorded inputs of a run
+    ReplayInputs(replay_inputs::Arguments),
 }
 
 impl Command {
@@ -45,6 +48,7 @@ impl Command {
                 arguments.run()
             }
             Self::Methods(arguments) => arguments.run().map(|()| Outcome::Done),
+            Self::ReplayInputs(arguments) => arguments.run(),
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::ego_loop::LoopReport;
 use crate::node::{self, NodeOptions};
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
-use protocol::Role;
+use protocol::{CavId, Role};
 use support::output;
 
 use support::cli::{BadInput, Outcome};
@@ -27,29 +27,13 @@ impl Arguments {
         log_to_stderr();
         let config = self.config.validated()?;
         let EgoConfig {
-            run,
-            models,
-            method,
-            ego: settings,
-            bus,
-            ..
+            run, models, bus, ..
         } = &config;
-        let cav = settings
-            .id
-            .as_ref()
-            .context("the configuration names no ego")?;
-        models.threads.apply();
-        let inference = models.inference().map_err(BadInput::of)?;
-        let ego = models.load(inference).map_err(EgoError::from);
-        let ego = ego.and_then(|weights| Ego::from_weights(&weights, *method, inference.device));
-        let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
-        let ego = ego
-            .with_comm_range(config.comm_range_m)
-            .with_misbehaviour_detection(settings.trust())?;
+        let (cav, ego) = build(&config)?;
         let stop = bus.stop().context("installing signal handlers")?;
-        let bus = bus.join(&stop, run, Role::Ego, cav)?;
+        let bus = bus.join(&stop, run, Role::Ego, &cav)?;
         tracing::info!(ego = %cav, method = %ego.method(), weights = %models.weights.display(), "ready");
-        let report = node::run(&bus, cav, ego, &NodeOptions::from(&config), &stop)?;
+        let report = node::run(&bus, &cav, ego, &NodeOptions::from(&config), &stop)?;
         if let Err(overdue) = bus.leave(STOP_LIMIT) {
             tracing::warn!("{overdue}");
         }
@@ -71,4 +55,20 @@ impl Arguments {
         }
         Ok(Outcome::of(report.failed > 0))
     }
+}
+
+/// Vehicle and pipeline of a configuration, ready for the first frame but for its warm-up.
+pub(super) fn build(config: &EgoConfig) -> anyhow::Result<(CavId, Ego)> {
+    let cav = config.ego.id.clone();
+    let cav = cav.context("the configuration names no ego")?;
+    let models = &config.models;
+    models.threads.apply();
+    let inference = models.inference().map_err(BadInput::of)?;
+    let ego = models.load(inference).map_err(EgoError::from);
+    let ego = ego.and_then(|weights| Ego::from_weights(&weights, config.method, inference.device));
+    let ego = ego.map_err(|error| BadInput::new(format!("weights: {error}")))?;
+    let ego = ego
+        .with_comm_range(config.comm_range_m)
+        .with_misbehaviour_detection(config.ego.trust())?;
+    Ok((cav, ego))
 }

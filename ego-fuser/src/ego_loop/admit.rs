@@ -5,7 +5,7 @@ use protocol::{
     CavId, DropReason, HEADER_LEN, Header, Limits, PoseEstimate, Stamp, Stream, WireError, wire,
 };
 
-use super::{EgoLoop, Message, Output, OwnFrame};
+use super::{EgoLoop, Message, Output, OwnFrame, Reception};
 use crate::capture_clock::SweepTime;
 use crate::ego::{Content, Ego, View};
 
@@ -27,9 +27,6 @@ impl From<WireError> for Refusal {
     }
 }
 
-/// View of a message on the wire, with its payload bytes and the bytes of all messages for its frame.
-pub(crate) type Decoded = (View, u64, u64);
-
 impl EgoLoop {
     /// Decodes a vehicle's perception from its pieces on the wire.
     ///
@@ -37,11 +34,12 @@ impl EgoLoop {
     /// [`Refusal`] if no frame will use it, which is found out before the map is decoded, or if it is malformed.
     pub(crate) fn decode<'a>(
         &self,
-        cav: &CavId,
+        reception: &Reception,
         header: &Header,
         pieces: impl IntoIterator<Item = &'a [u8]>,
         limits: &Limits,
-    ) -> Result<Decoded, Refusal> {
+    ) -> Result<Message, Refusal> {
+        let cav = &reception.cav;
         if *cav != self.cav {
             self.dated(cav, header.stamp.capture_nanos)
                 .map_err(Refusal::Unneeded)?;
@@ -71,7 +69,13 @@ impl EgoLoop {
             capture_nanos: header.stamp.capture_nanos,
             content,
         };
-        Ok((view, payload_bytes, wire_bytes))
+        Ok(Message {
+            reception: reception.clone(),
+            view,
+            sequence: header.stamp.sequence,
+            payload_bytes,
+            wire_bytes,
+        })
     }
 
     /// Takes a message in: the own agent's begins a frame, a neighbour's is queued for one.
@@ -85,7 +89,7 @@ impl EgoLoop {
             Ok(capture_nanos) => message.view.capture_nanos = capture_nanos,
             Err(reason) => return self.drop_message(&cav, reason),
         }
-        if let Some(offset_s) = message.clock_offset_s {
+        if let Some(offset_s) = message.reception.clock_offset_s {
             self.clock_offsets_s.insert(cav.clone(), offset_s);
         }
         self.silence.reset(&cav);
@@ -101,7 +105,7 @@ impl EgoLoop {
         self.keep_time(ego, capture_nanos);
         // In the inbox, while another frame was fused, or behind one that waits for its neighbours.
         let waited_nanos = if self.frames.is_empty() {
-            now_nanos.saturating_sub(message.arrived_nanos)
+            now_nanos.saturating_sub(message.reception.arrived_nanos)
         } else {
             u64::MAX
         };
@@ -110,8 +114,8 @@ impl EgoLoop {
         }
         self.frames.push_back(OwnFrame {
             agent_frame: message.sequence,
-            transport: message.transport,
-            begun_nanos: message.arrived_nanos,
+            transport: message.reception.transport,
+            begun_nanos: message.reception.arrived_nanos,
             view: message.view,
         });
     }

@@ -35,10 +35,7 @@ impl EgoLoop {
         let is_over = self.ends_nanos.is_some_and(|ends| now_nanos >= ends);
         if let Some(frame) = self.frames.front() {
             let is_complete = self.is_complete(frame.view.capture_nanos);
-            let due_nanos = { frame.begun_nanos }.saturating_add(self.options.deadline_nanos);
-            // A frame followed by a newer one has waited too long already.
-            let is_due = now_nanos >= due_nanos || self.frames.len() > 1 || is_over;
-            if is_complete || is_due {
+            if is_over || now_nanos >= self.due_nanos(frame) {
                 self.report.at_deadline += u64::from(!is_complete);
                 if let Some(frame) = self.frames.pop_front() {
                     self.fuse(ego, frame, now_nanos);
@@ -58,6 +55,15 @@ impl EgoLoop {
             self.outputs.push(Output::Dropped(lost.cav, lost.reason));
         }
         self.is_finished = true;
+    }
+
+    /// Time at which the oldest frame waits for nothing more; 0: it does not wait.
+    pub(super) fn due_nanos(&self, frame: &OwnFrame) -> u64 {
+        // A frame followed by a newer one has waited too long already.
+        if self.frames.len() > 1 || self.is_complete(frame.view.capture_nanos) {
+            return 0;
+        }
+        { frame.begun_nanos }.saturating_add(self.options.deadline_nanos)
     }
 
     fn is_complete(&self, capture_nanos: u64) -> bool {

@@ -4,16 +4,17 @@ use std::time::Duration;
 
 use protocol::message::{Descriptor, Detections};
 use protocol::{CavId, DropReason, Pace};
+use serde::{Deserialize, Serialize};
 
 use crate::capture_clock::SweepTime;
 use crate::ego::EgoError;
 use crate::view::View;
 
-/// Something that happens to an ego.
-#[derive(Debug, Clone)]
-pub enum Input {
+/// Something that happens to an ego. Its messages are decoded, or in a recording as on the wire.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub enum Input<M = Box<Message>> {
     /// A vehicle's perception has arrived.
-    Message(Box<Message>),
+    Message(M),
     /// An agent has named its network.
     Model(CavId, Descriptor),
     /// An agent has reported the arrivals of its sweeps, on the ego's clock.
@@ -28,19 +29,56 @@ pub enum Input {
     Wake,
 }
 
-/// A vehicle's perception as received.
-#[derive(Debug, Clone)]
-pub struct Message {
-    /// Sender, pose and content, with the capture time that the sender states.
-    pub view: View,
-    /// Sequence of the message.
-    pub sequence: u64,
+impl Input {
+    /// The input if it is no message, whose form on the wire is not known any more.
+    pub(crate) fn without_message<M>(&self) -> Option<Input<M>> {
+        match self {
+            Self::Message(_) => None,
+            other => other.clone().try_map(|_| Err(())).ok(),
+        }
+    }
+}
+
+impl<M> Input<M> {
+    /// The input with its message converted.
+    pub(crate) fn try_map<N, E>(
+        self,
+        convert: impl FnOnce(M) -> Result<N, E>,
+    ) -> Result<Input<N>, E> {
+        Ok(match self {
+            Self::Message(message) => Input::Message(convert(message)?),
+            Self::Model(cav, descriptor) => Input::Model(cav, descriptor),
+            Self::Sweeps(cav, sweeps) => Input::Sweeps(cav, sweeps),
+            Self::Joined(cav) => Input::Joined(cav),
+            Self::Left(cav) => Input::Left(cav),
+            Self::Ended(cav) => Input::Ended(cav),
+            Self::Wake => Input::Wake,
+        })
+    }
+}
+
+/// Sender of a message, and what is measured when it arrives.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Reception {
+    /// Sender.
+    pub cav: CavId,
     /// Arrival on the loop's clock, nanoseconds.
     pub arrived_nanos: u64,
     /// Time from the publication to the arrival; `None` if the sender has another clock.
     pub transport: Option<Duration>,
     /// System clock of the sender minus the ego's, seconds, minus the shortest transit time; `None`: unknown.
     pub clock_offset_s: Option<f64>,
+}
+
+/// A vehicle's perception as received.
+#[derive(Debug, Clone)]
+pub struct Message {
+    /// Sender and arrival.
+    pub reception: Reception,
+    /// Sender, pose and content, with the capture time that the sender states.
+    pub view: View,
+    /// Sequence of the message.
+    pub sequence: u64,
     /// Bytes of metadata and body.
     pub payload_bytes: u64,
     /// Bytes of all messages for this frame, headers and the pose message included.

@@ -11,6 +11,7 @@ mod admit;
 mod decide;
 mod input;
 mod pace_keeper;
+pub mod recorded;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
@@ -29,7 +30,7 @@ use fusion::method::Exchange;
 use pace_keeper::PaceKeeper;
 
 pub(crate) use admit::Refusal;
-pub use input::{Input, Message, Output};
+pub use input::{Input, Message, Output, Reception};
 
 /// Time that an ego whose own agent has ended waits for the last messages of its neighbours, nanoseconds.
 const LAST_WAIT_NANOS: u64 = 2_000_000_000;
@@ -157,13 +158,11 @@ impl EgoLoop {
         std::mem::take(&mut self.outputs)
     }
 
-    /// Time by which the loop has to be woken; `None`: nothing waits.
+    /// Time by which the loop has to be woken, 0 if at once; `None`: nothing waits.
     #[must_use]
     pub fn wakes_nanos(&self) -> Option<u64> {
-        let deadline_nanos = self.options.deadline_nanos;
-        let front = self.frames.front();
-        let due = front.map(|frame| frame.begun_nanos.saturating_add(deadline_nanos));
-        due.into_iter().chain(self.ends_nanos).min()
+        let front = self.frames.front().map(|frame| self.due_nanos(frame));
+        front.into_iter().chain(self.ends_nanos).min()
     }
 
     /// True after the own agent's end, when everything is decided.

@@ -2,9 +2,11 @@
 //!
 //! One thread receives, fuses and publishes; sending has threads of its own.
 
+mod input_log;
 mod receive;
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -18,9 +20,11 @@ use protocol::{Body, CavId, Detections, Encoded, Limits, Role, Stream, Topic, wi
 
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::Ego;
+use crate::ego_loop::recorded::Record;
 use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
 use fusion::method::Exchange;
+use input_log::InputLog;
 
 /// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period
 /// answers frames that have waited this long, so it is no more than a short pause needs.
@@ -47,6 +51,9 @@ pub struct NodeOptions {
     pub limits: Limits,
     /// Limits of the inbox, for each sender and in total.
     pub inbox: InboxLimits,
+    /// File in which the inputs of the loop are recorded, and the configuration of the process as JSON, which is its
+    /// first record; `None`: they are not recorded.
+    pub inputs: Option<(PathBuf, String)>,
 }
 
 impl Default for NodeOptions {
@@ -70,6 +77,7 @@ impl From<&EgoSettings> for NodeOptions {
             keeps_running: false,
             limits: Limits::DEFAULT,
             inbox: settings.inbox.limits(),
+            inputs: None,
         }
     }
 }
@@ -81,6 +89,7 @@ impl From<&EgoConfig> for NodeOptions {
             neighbours: Some(neighbours).filter(|named| !named.is_empty()),
             over_link: config.over_link,
             keeps_running: config.keep_running || config.bus.supervised,
+            inputs: { config.inputs.clone() }.map(|path| (path, config.to_json())),
             ..Self::from(&config.ego)
         }
     }
@@ -130,6 +139,7 @@ struct Node<'a> {
     pace: Publisher,
     detections: Publisher,
     json: Publisher,
+    log: Option<InputLog>,
     _own: Vec<Subscription>,
 }
 
@@ -142,6 +152,10 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let ego_loop = EgoLoop::new(cav, &ego, options.of_loop);
+        let log = { options.inputs.as_ref() }.and_then(|(path, config)| {
+            let start = Record::start(config.clone(), &ego);
+            InputLog::create(path, &start)
+        });
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
@@ -179,6 +193,7 @@ impl<'a> Node<'a> {
                 own_topic(cav, Stream::DetectionsJson),
                 PublisherOptions::DETECTIONS,
             )?,
+            log,
             _own: own,
             ego_loop,
             ego,
@@ -232,9 +247,19 @@ impl<'a> Node<'a> {
         Ok(())
     }
 
-    /// Hands an input to the loop and carries out what it decides.
+    /// Records an input without a message, hands it to the loop and carries out what that decides.
     fn handle(&mut self, input: Input) {
         let now_nanos = self.nanos(Instant::now());
+        if let Some(log) = &self.log
+            && let Some(input) = input.without_message()
+        {
+            log.add(&Record::Input { now_nanos, input });
+        }
+        self.decide(input, now_nanos);
+    }
+
+    /// Hands an input to the loop and carries out what it decides.
+    fn decide(&mut self, input: Input, now_nanos: u64) {
         for output in self.ego_loop.handle(&mut self.ego, input, now_nanos) {
             match output {
                 Output::Publish {
@@ -267,11 +292,17 @@ impl<'a> Node<'a> {
         }
         // The ego does not know when the sensors of its vehicle measured.
         stats.answered(None, result.fused.len());
-        let (fused, binary) = (unix_nanos(), result.clone());
+        let (fused, binary, log) = (unix_nanos(), result.clone(), self.log.clone());
         self.detections.submit_encoded(capture_nanos, move |stamp| {
             let mut result = binary;
             let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
             result.stages.push(StageTiming::new("send", sending));
+            if let Some(log) = log {
+                log.add(&Record::Published {
+                    stamp: stamp.clone(),
+                    stages: result.stages.clone(),
+                });
+            }
             wire::encode(stamp, result)
         });
         self.json.submit_encoded(capture_nanos, move |stamp| {

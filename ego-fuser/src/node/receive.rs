@@ -8,7 +8,8 @@ use protocol::message::Descriptor;
 
 use super::Node;
 use crate::capture_clock::SweepTime;
-use crate::ego_loop::{Input, Message, Refusal};
+use crate::ego_loop::recorded::{Record, WireMessage};
+use crate::ego_loop::{Input, Reception, Refusal};
 use crate::neighbourhood::sender_of;
 
 impl Node<'_> {
@@ -20,33 +21,35 @@ impl Node<'_> {
         if stream != self.ego_loop.stream() {
             return self.admit_descriptor(cav, arrival);
         }
-        let stats = self.bus.stats();
-        let began = Instant::now();
-        let pieces = arrival.pieces();
+        let (stats, began) = (self.bus.stats(), Instant::now());
+        let transport = stats.transport(arrival, self.longest_transit_s());
+        let reception = Reception {
+            cav: cav.clone(),
+            arrived_nanos: self.nanos(arrival.at),
+            transport,
+            clock_offset_s: stats.measured_clock_offset_s(cav),
+        };
+        let (header, limits) = (&arrival.header, &self.options.limits);
         let decoded = self
             .ego_loop
-            .decode(cav, &arrival.header, pieces, &self.options.limits);
-        let (view, payload_bytes, wire_bytes) = match decoded {
-            Ok(decoded) => decoded,
+            .decode(&reception, header, arrival.pieces(), limits);
+        let message = match decoded {
+            Ok(message) => message,
             Err(Refusal::Unneeded(reason)) => return stats.dropped(&arrival.topic, reason),
             Err(Refusal::Malformed(error)) => return stats.rejected(&arrival.topic, &error),
         };
         stats.timed("decode", began.elapsed());
-        let transport = stats.transport(arrival, self.longest_transit_s());
         if let Some(transport) = transport {
             let stage = format!("{} transport", self.ego_loop.stream());
             stats.timed(&stage, transport);
         }
-        let message = Message {
-            view,
-            sequence: arrival.header.stamp.sequence,
-            arrived_nanos: self.nanos(arrival.at),
-            transport,
-            clock_offset_s: stats.measured_clock_offset_s(cav),
-            payload_bytes,
-            wire_bytes,
-        };
-        self.handle(Input::Message(Box::new(message)));
+        let now_nanos = self.nanos(Instant::now());
+        if let Some(log) = &self.log {
+            let bytes = arrival.pieces().flatten().copied().collect();
+            let input = Input::Message(WireMessage { reception, bytes });
+            log.add(&Record::Input { now_nanos, input });
+        }
+        self.decide(Input::Message(Box::new(message)), now_nanos);
     }
 
     /// Processes an agent's descriptor: its network, and the arrivals of its sweeps.

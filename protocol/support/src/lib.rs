@@ -8,7 +8,7 @@
 //! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`provenance`]: the command, programs and digests that a result was made from.
 //! - [`rounding`]: floats to integers; [`sampling`]: parts of lists.
-//! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run.
+//! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run; [`record_log`]: records of a process.
 //! - [`random`]: seeds derived from seeds, and draws that depend on the seed only.
 //!
 //! ```
@@ -44,6 +44,7 @@ pub mod output;
 pub mod progress;
 pub mod provenance;
 pub mod random;
+pub mod record_log;
 pub mod rounding;
 pub mod sampling;
 pub mod shared_files;

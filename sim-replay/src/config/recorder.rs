@@ -45,6 +45,9 @@ pub struct RecordingConfig {
     /// Leave out the channels for ROS 2 tools: half the size, and still exactly the published messages.
     #[arg(long)]
     pub plain: bool,
+    /// Record what enters the ego's decisions too, in the run folder, for `ego-fuser replay-inputs`.
+    #[arg(skip)]
+    pub inputs: bool,
     /// zstd level, 1 to 22. Absent: not compressed; clouds and feature maps hardly shrink.
     #[arg(long, value_name = "LEVEL")]
     #[schemars(range(min = 1, max = 22))]
@@ -78,6 +81,7 @@ impl RecorderConfig {
             without,
             plain,
             zstd_level,
+            inputs: _,
         } = self.record.clone();
         let contents = if plain {
             Contents::Messages

@@ -1,13 +1,14 @@
 //! `v2vloc up` as a user runs it: to the end of a scene, interrupted, with a vehicle or the launcher killed.
 
 use std::fs;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use protocol::{Stream, Topic};
 use recording::Recording;
 use runner::scenario::Scenario;
 use serde_json::Value;
-use tests::fleet::{TIMEOUT, Up, fused, is_running, results, signal, write_scenario};
+use tests::fleet::{TIMEOUT, Up, fused, is_running, programs, results, signal, write_scenario};
 use tests::locks::exclusive_lock;
 
 fn json(path: &std::path::Path) -> Value {
@@ -168,7 +169,10 @@ fn ctrl_c_ends_everything_within_five_seconds() {
 fn a_killed_agent_is_started_again_and_fused_again() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    let scenario = write_scenario(folder.path(), 3, "loop: true", "");
+    // A fifth of the messages is lost, so that the run cannot be repeated from its scene.
+    fs::write(folder.path().join("link.yaml"), "loss: {bernoulli: 0.2}\n").unwrap();
+    let rest = "link: {model: link.yaml}\nrecord: {inputs: true, without: [bev]}";
+    let scenario = write_scenario(folder.path(), 3, "loop: true", rest);
     let mut up = Up::start(folder.path(), &scenario);
     let is_fused = |result: &Value| fused(result) == 1;
     up.wait_for_results("a fused result", |results| {
@@ -188,6 +192,20 @@ fn a_killed_agent_is_started_again_and_fused_again() {
         up.wait().code(),
         Some(3),
         "what was lost with the agent is not hidden"
+    );
+
+    let replayed = Command::new(programs().join("ego-fuser"))
+        .arg("replay-inputs")
+        .arg(up.folder.join("inputs-ego-4279.log"))
+        .output()
+        .unwrap();
+    let errors = String::from_utf8_lossy(&replayed.stderr);
+    assert_eq!(replayed.status.code(), Some(0), "{errors}");
+    let recorded = fs::read(up.folder.join("detections.jsonl")).unwrap();
+    assert_eq!(
+        String::from_utf8_lossy(&replayed.stdout),
+        String::from_utf8_lossy(&recorded),
+        "the same decisions from the same inputs: {errors}"
     );
 }
 

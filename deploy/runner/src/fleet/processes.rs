@@ -150,8 +150,16 @@ impl Fleet {
             comm_range_m: self.protocol.ground_truth.comm_range_m,
             over_link: self.is_over_link(),
             keep_running: false,
+            inputs: self
+                .records_inputs()
+                .then(|| context.folder.file(&format!("inputs-ego-{}.log", self.ego))),
             bus,
         }
+    }
+
+    /// True if the inputs of the processes' decisions are recorded.
+    fn records_inputs(&self) -> bool {
+        { self.scenario.record.as_ref() }.is_some_and(|record| record.inputs)
     }
 
     fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {

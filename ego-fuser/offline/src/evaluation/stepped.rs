@@ -31,7 +31,7 @@ use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
 use ego_fuser::ego::EgoOutput;
-use ego_fuser::ego_loop::{EgoLoop, Input, LoopOptions, Message, Output};
+use ego_fuser::ego_loop::{EgoLoop, Input, LoopOptions, Message, Output, Reception};
 use fusion::method::Exchange;
 
 /// Configuration of a fleet in simulation time.
@@ -310,11 +310,9 @@ impl<'a> Run<'a> {
             return Ok(Some(failure.unwrap_or_default()));
         };
         self.own.push_back(Message {
+            reception: exact_reception(&view.cav, self.ready_nanos(tick)),
             view,
             sequence: (tick - self.config.ticks.start) as u64,
-            arrived_nanos: self.ready_nanos(tick),
-            transport: None,
-            clock_offset_s: None,
             payload_bytes: 0,
             wire_bytes: 0,
         });
@@ -397,7 +395,9 @@ impl<'a> Run<'a> {
     fn advance(&mut self) -> Result<(), EvaluateError> {
         loop {
             let moments = [
-                self.own.front().map(|message| message.arrived_nanos),
+                self.own
+                    .front()
+                    .map(|message| message.reception.arrived_nanos),
                 self.arriving.front().map(|arrived| arrived.nanos),
                 self.ego_loop.wakes_nanos(),
             ];
@@ -422,7 +422,10 @@ impl<'a> Run<'a> {
     /// Takes everything in that has arrived, and wakes the ego.
     fn act(&mut self, now_nanos: u64) -> Result<(), EvaluateError> {
         loop {
-            let own_nanos = self.own.front().map(|message| message.arrived_nanos);
+            let own_nanos = self
+                .own
+                .front()
+                .map(|message| message.reception.arrived_nanos);
             let other_nanos = self.arriving.front().map(|arrived| arrived.nanos);
             let is_own_first = own_nanos.is_some_and(|own| other_nanos.is_none_or(|it| own <= it));
             let next_nanos = own_nanos.into_iter().chain(other_nanos).min();
@@ -446,11 +449,9 @@ impl<'a> Run<'a> {
         let cav = envelope.view.cav.clone();
         self.handle(Input::Sweeps(cav, vec![envelope.sweep]), now_nanos)?;
         let message = Message {
+            reception: exact_reception(&envelope.view.cav, nanos),
             view: envelope.view,
             sequence: 0,
-            arrived_nanos: nanos,
-            transport: None,
-            clock_offset_s: None,
             payload_bytes: envelope.payload_bytes,
             wire_bytes: envelope.wire_bytes,
         };
@@ -543,6 +544,16 @@ impl<'a> Run<'a> {
         self.evaluator.ledger.merge(self.delivery.ledger());
         self.evaluator.sent_bytes += self.delivery.sent_bytes();
         Ok(())
+    }
+}
+
+/// Arrival of a message whose sender has the clock of the ego.
+fn exact_reception(cav: &CavId, arrived_nanos: u64) -> Reception {
+    Reception {
+        cav: cav.clone(),
+        arrived_nanos,
+        transport: None,
+        clock_offset_s: None,
     }
 }
 

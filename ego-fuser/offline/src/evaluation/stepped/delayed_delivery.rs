@@ -183,16 +183,20 @@ impl DelayedDelivery {
         envelope.map(|envelope| Arrived { nanos, envelope })
     }
 
-    /// The ego has used a message.
+    /// The ego has used a message. That of its own agent takes no link.
     pub(super) fn received(&mut self, cav: &CavId) {
-        self.ledger
-            .received(&Account::towards(topic(cav, self.stream), &self.receiver));
+        if *cav != self.ego {
+            let account = Account::towards(topic(cav, self.stream), &self.receiver);
+            self.ledger.received(&account);
+        }
     }
 
-    /// The ego has not used a message.
+    /// The ego has not used a message. That of its own agent takes no link.
     pub(super) fn dropped(&mut self, cav: &CavId, reason: DropReason) {
-        let account = Account::towards(topic(cav, self.stream), &self.receiver);
-        self.ledger.dropped(&account, reason);
+        if *cav != self.ego {
+            let account = Account::towards(topic(cav, self.stream), &self.receiver);
+            self.ledger.dropped(&account, reason);
+        }
     }
 
     /// Counts a vehicle's messages that neither arrived nor were lost; `waiting` messages of it have arrived and were
