@@ -37,6 +37,8 @@ const POSE_SLOTS: usize = 32;
 const DESCRIPTOR_PERIOD: Duration = Duration::from_millis(500);
 /// First sweeps that are reported at once: so many make an estimate of the capture clock.
 const EARLY_SWEEPS: usize = 3;
+/// Time without a pose after which it is a problem.
+const NO_POSE: Duration = Duration::from_secs(3);
 /// Sweeps of a report at most.
 const MAX_SWEEPS: usize = 32;
 
@@ -172,6 +174,8 @@ struct Node<'a> {
     publishers: Publishers,
     report: NodeReport,
     sweep_log: Option<SweepLog>,
+    /// Last sweep with a pose, or the first sweep.
+    last_pose: Option<Instant>,
     _subscriptions: [Subscription; 4],
 }
 
@@ -225,6 +229,7 @@ impl<'a> Node<'a> {
             publishers,
             report: NodeReport::default(),
             sweep_log,
+            last_pose: None,
             _subscriptions: subscriptions,
         })
     }
@@ -401,7 +406,7 @@ impl<'a> Node<'a> {
         stats.timed("pose", pose_began.elapsed());
         self.publishers.pose.submit(input.capture_nanos, pose);
         self.time_pose_stages();
-        self.report.no_pose += u64::from(pose.world_from_cav().is_none());
+        self.note_pose(&pose);
         self.report.pose_jumps = self.agent.pose_jumps();
         let perceived = self
             .options
@@ -448,6 +453,24 @@ impl Node<'_> {
             self.time_pose_stages();
             self.bus.stats().timed("pose measurement", began.elapsed());
         }
+    }
+
+    /// Counts a missing pose; no pose for three seconds is a problem.
+    fn note_pose(&mut self, pose: &PoseEstimate) {
+        let last = *self.last_pose.get_or_insert_with(Instant::now);
+        let problem = match pose {
+            PoseEstimate::Pose { .. } => {
+                self.last_pose = Some(Instant::now());
+                None
+            }
+            PoseEstimate::NoPose { reason, .. } => {
+                self.report.no_pose += 1;
+                let reason = serde_json::to_string(reason).unwrap_or_default();
+                let reason = reason.trim_matches('"').replace('_', " ");
+                (last.elapsed() > NO_POSE).then(|| (format!("no pose: {reason}"), last))
+            }
+        };
+        self.bus.stats().set_problems("no pose", problem);
     }
 
     fn time_pose_stages(&self) {

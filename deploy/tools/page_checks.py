@@ -275,6 +275,10 @@ class LivePage(Checks):
         for has_router, words in ((True, "last message 4 s ago"), (False, "router gone, last message 4 s ago")):
             status = {"silent_s": 4.2, "is_over": False, "has_router": has_router}
             self.same("a run that has fallen silent", self.tab.value(f"probe.stateOf({json.dumps(status)})"), words)
+        waits = "ego-1000: late needs boxes, agent 1000 publishes pose, bev (for 12 s)"
+        for problems, words in (([], "no result for 12 s"), ([waits], waits)):
+            status = {"silent_s": 0.1, "unanswered_s": 12.3, "problems": problems, "is_over": False, "has_router": True}
+            self.same("a run without results", self.tab.value(f"probe.stateOf({json.dumps(status)})"), words)
 
     def other_ego(self) -> None:
         self.tab.wait("document.querySelectorAll('#ego option').length === 2", 20)

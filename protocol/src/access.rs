@@ -169,10 +169,13 @@ impl Principal {
         rights.push(right(Operation::Publish)(keys(&Topic::Ready(self.name()))));
         rights.push(right(Operation::Publish)(keys(&Topic::Stats(self.name()))));
         rights.extend(subscribe.into_iter().map(right(Operation::Subscribe)));
-        rights.push(right(Operation::DeclareLiveliness)(keys(&Topic::Alive {
+        let own_token = keys(&Topic::Alive {
             role: self.role,
             cav: self.cav.clone(),
-        })));
+        });
+        // A process looks for its own token before it declares it: another may have its name.
+        rights.push(right(Operation::SubscribeLiveliness)(own_token.clone()));
+        rights.push(right(Operation::DeclareLiveliness)(own_token));
         rights.extend(
             self.watched()
                 .map(|topic| right(Operation::SubscribeLiveliness)(keys(&topic))),

@@ -22,7 +22,7 @@ const PINNED: [(&str, usize, u64); 33] = [
     ("descriptor", 207, 0x8551_d6b6_150d_86d5),
     ("detections", 389, 0x8074_a234_fbf2_fd72),
     ("truth", 576, 0xaee0_3a8f_c53d_73c7),
-    ("stats", 222, 0x2990_3af5_e0c6_7148),
+    ("stats", 242, 0x6f2f_99b9_9aa8_578a),
     ("bev", 2490, 0xd2bb_1c32_4c64_bab3),
     ("bev", 583, 0x46cc_bb82_5c9b_2da5),
     ("bev", 1338, 0x3c06_3ddc_7d1c_e4b0),

@@ -65,7 +65,7 @@ impl TestRouter {
 
     /// A client of this router in the run `test`, named `<role>-<cav>` or, for processes without a vehicle, `<cav>`.
     ///
-    /// When it cannot connect.
+    /// # Panics
     /// When it cannot connect.
     #[must_use]
     pub fn join(&self, process: &str, cav: &str) -> Bus {

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use serde::{Deserialize, Serialize};
 
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
+use crate::score::Progress;
 
 /// Time without a report after which a process is shown as silent.
 const SILENT: Duration = Duration::from_millis(1500);
@@ -55,6 +56,9 @@ pub struct ProcessStatus {
     /// Description of its failure, for a process that has failed in its task.
     #[serde(default)]
     pub failure: Option<String>,
+    /// What keeps it from its task, as it reports while it runs.
+    #[serde(default)]
+    pub problems: Vec<String>,
     /// Time since its last report, seconds.
     pub silent_s: Option<f64>,
     /// Resident memory, MiB.
@@ -196,8 +200,8 @@ impl Health {
         hanging
     }
 
-    /// Status of every process.
-    pub(crate) fn statuses(&self, now: Instant) -> Vec<ProcessStatus> {
+    /// Status of every process; `progress` has what they reported.
+    pub(crate) fn statuses(&self, progress: &Progress, now: Instant) -> Vec<ProcessStatus> {
         let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
         let status = |(name, noted): (&String, &Noted)| {
             let usage = noted.pid.and_then(Usage::of).unwrap_or_default();
@@ -213,6 +217,10 @@ impl Health {
                 restarts: noted.restarts,
                 last_fall: noted.last_fall.clone(),
                 failure: noted.failure.clone(),
+                problems: { progress.problems.get(name) }
+                    .filter(|_| noted.pid.is_some())
+                    .cloned()
+                    .unwrap_or_default(),
                 silent_s: noted
                     .last_report
                     .filter(|_| noted.pid.is_some())
@@ -304,7 +312,7 @@ mod tests {
     fn a_silent_process_is_shown_and_then_replaced() {
         let (mut health, began) = watch();
         assert!(look(&mut health, began, [0, 900, 0]).is_empty());
-        let state = |health: &Health| health.statuses(began)[0].state;
+        let state = |health: &Health| health.statuses(&Progress::default(), began)[0].state;
         assert_eq!(state(&health), State::Starting);
         assert!(look(&mut health, began, [1000, 1500, 1000]).is_empty());
         assert_eq!(state(&health), State::Ready);
@@ -326,7 +334,7 @@ mod tests {
             ),
             began,
         );
-        let status = health.statuses(began).remove(0);
+        let status = health.statuses(&Progress::default(), began).remove(0);
         assert_eq!(
             (status.state, status.restarts, status.last_fall.as_deref()),
             (State::Fallen, 1, Some("hung"))
@@ -367,7 +375,10 @@ mod tests {
                 .step_by(100)
                 .all(|ms| health.look(&last_reports, at(ms)).is_empty())
         );
-        assert_eq!(health.statuses(at(30_000))[0].state, State::Silent);
+        assert_eq!(
+            health.statuses(&Progress::default(), at(30_000))[0].state,
+            State::Silent
+        );
     }
 
     #[test]

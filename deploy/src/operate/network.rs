@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bus::shutdown::{self, Overdue};
 use bus::{BusError, BusOptions, Endpoint, SharedMemory, open, present, process_id};
-use protocol::{Principal, ProcessId, Role, RunId};
+use protocol::{KeyExpr, Principal, ProcessId, Role, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
@@ -106,10 +106,12 @@ impl RouterEndpoint {
         let is_ours = |process: &ProcessId| {
             *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
         };
-        Ok(present(&self.session, run)?
-            .into_iter()
-            .filter(is_ours)
-            .collect())
+        Ok(
+            present(&self.session, KeyExpr::everyone_alive(run).as_str())?
+                .into_iter()
+                .filter(is_ours)
+                .collect(),
+        )
     }
 
     /// Closes the session.

@@ -39,6 +39,8 @@ pub struct RemoteProcess {
     pub sent: Option<u64>,
     /// Number of messages in its ledger that were dropped.
     pub dropped: Option<u64>,
+    /// What keeps it from its task.
+    pub problems: Vec<String>,
 }
 
 /// Results of one ego while it was observed.
@@ -88,7 +90,7 @@ impl RemoteStatus {
         // This observer reports, too.
         let own = &bus.identity().process;
         seen.reports.remove(own.as_str());
-        let alive = present(bus.session(), run)?
+        let alive = present(bus.session(), KeyExpr::everyone_alive(run).as_str())?
             .iter()
             .filter(|process| *process != own)
             .map(ToString::to_string)
@@ -102,12 +104,14 @@ impl RemoteStatus {
         if self.processes.is_empty() {
             return vec!["no process of it is connected to this router".to_owned()];
         }
-        let trouble = |process: &RemoteProcess| match process.state {
-            RemoteState::Alive => None,
-            RemoteState::Silent => Some(format!("{} is silent", process.name)),
-            RemoteState::Gone => Some(format!("{} has left", process.name)),
+        let troubles = |process: &RemoteProcess| match process.state {
+            RemoteState::Alive => { process.problems.iter() }
+                .map(|problem| format!("{}: {problem}", process.name))
+                .collect(),
+            RemoteState::Silent => vec![format!("{} is silent", process.name)],
+            RemoteState::Gone => vec![format!("{} has left", process.name)],
         };
-        self.processes.iter().filter_map(trouble).collect()
+        self.processes.iter().flat_map(troubles).collect()
     }
 
     /// The status as text for a terminal.
@@ -115,7 +119,8 @@ impl RemoteStatus {
     pub fn table(&self) -> String {
         let left = ["process", "state"].map(|name| (name, Side::Left));
         let right = ["cores", "MiB", "sent", "dropped"].map(|name| (name, Side::Right));
-        let mut table = TextTable::new(left.into_iter().chain(right));
+        let last = [("problem", Side::Left)];
+        let mut table = TextTable::new(left.into_iter().chain(right).chain(last));
         for RemoteProcess {
             name,
             state,
@@ -123,6 +128,7 @@ impl RemoteStatus {
             resident_mib,
             sent,
             dropped,
+            problems,
         } in &self.processes
         {
             let count =
@@ -139,6 +145,7 @@ impl RemoteStatus {
                 number(*resident_mib, 0),
                 count(sent),
                 count(dropped),
+                problems.join("; "),
             ]);
         }
         let results: String = self.egos.iter().map(result_line).collect();
@@ -238,6 +245,7 @@ impl Seen {
                     .map(|stats| stats.usage.resident_bytes as f64 / f64::from(1 << 20)),
                 sent: last.map(|stats| stats.ledger.total().sent),
                 dropped: last.map(|stats| stats.ledger.total().dropped_total()),
+                problems: last.map_or(Vec::new(), |stats| stats.problems.clone()),
             }
         };
         let processes = names.iter().map(process).collect();
@@ -288,6 +296,10 @@ mod tests {
             stages: vec![],
             usage,
             traffic: vec![],
+            problems: match name {
+                "agent-1002" => vec!["no pose (for 12 s)".into()],
+                _ => vec![],
+            },
         };
         let bytes = wire::encode(&stamp(0, (at_s * 1e9) as u64), stats)
             .unwrap()
@@ -301,7 +313,9 @@ mod tests {
         report(&mut seen, "agent-1000", 1.0, 10.0);
         report(&mut seen, "agent-1000", 3.0, 11.0);
         report(&mut seen, "agent-1001", 1.0, 4.0);
-        let alive = BTreeSet::from(["agent-1000".to_owned(), "ego-1000".to_owned()]);
+        report(&mut seen, "agent-1002", 1.0, 4.0);
+        let alive = ["agent-1000", "agent-1002", "ego-1000"];
+        let alive = BTreeSet::from(alive.map(str::to_owned));
         let status = seen.status("test".into(), Duration::from_secs(2), &alive);
         let states: Vec<_> = status
             .processes
@@ -311,6 +325,7 @@ mod tests {
         let expected = [
             ("agent-1000", RemoteState::Alive),
             ("agent-1001", RemoteState::Gone),
+            ("agent-1002", RemoteState::Alive),
             ("ego-1000", RemoteState::Silent),
         ];
         assert_eq!(states, expected);
@@ -321,7 +336,11 @@ mod tests {
         );
         assert_eq!(
             status.troubles(),
-            ["agent-1001 has left", "ego-1000 is silent"]
+            [
+                "agent-1001 has left",
+                "agent-1002: no pose (for 12 s)",
+                "ego-1000 is silent"
+            ]
         );
         assert!(status.table().contains("0.50"), "{}", status.table());
     }

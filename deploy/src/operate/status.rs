@@ -173,7 +173,9 @@ impl RunStatus {
     #[must_use]
     pub fn troubles(&self) -> Vec<String> {
         let is_well = |process: &&ProcessStatus| match self.phase {
-            Phase::Running => matches!(process.state, State::Ready | State::Ended),
+            Phase::Running => {
+                matches!(process.state, State::Ready | State::Ended) && process.problems.is_empty()
+            }
             Phase::Ending | Phase::Over => process.state != State::Down,
             Phase::Lost => true,
         };
@@ -182,12 +184,12 @@ impl RunStatus {
             .iter()
             .filter(|process| !is_well(process) || process.failure.is_some());
         let describe = |process: &ProcessStatus| {
-            let why = process.failure.as_ref().or(process.last_fall.as_ref());
+            let why = why(process);
             let state = name_of(&process.state);
             format!(
                 "{} is {state}{}",
                 process.name,
-                why.map_or(String::new(), |why| format!(" ({why})"))
+                why.map_or(String::new(), |why| format!(": {why}"))
             )
         };
         let lost = (self.phase == Phase::Lost).then(|| "the supervisor has ended".to_owned());
@@ -235,7 +237,7 @@ impl RunStatus {
         let mut table = TextTable::new(
             left.into_iter()
                 .chain(right)
-                .chain([("last crash or failure", Side::Left)]),
+                .chain([("problem, last crash or failure", Side::Left)]),
         );
         for process in &self.processes {
             table.row([
@@ -249,11 +251,7 @@ impl RunStatus {
                 process
                     .descriptors
                     .map_or("-".into(), |count| count.to_string()),
-                process
-                    .failure
-                    .clone()
-                    .or_else(|| process.last_fall.clone())
-                    .unwrap_or_default(),
+                why(process).unwrap_or_default(),
             ]);
         }
         table
@@ -280,6 +278,13 @@ impl RunStatus {
         }
         table
     }
+}
+
+/// Failure of a process, what keeps it from its task, or its last crash.
+fn why(process: &ProcessStatus) -> Option<String> {
+    let problems = (!process.problems.is_empty()).then(|| process.problems.join("; "));
+    let failure = process.failure.clone().or(problems);
+    failure.or_else(|| process.last_fall.clone())
 }
 
 fn optional(value: Option<f64>, digits: usize) -> String {
@@ -392,6 +397,7 @@ mod tests {
             restarts: 2,
             last_fall: Some("was ended by signal 9".into()),
             failure: (state == State::Failing).then(|| "recording cut".into()),
+            problems: vec![],
             silent_s: Some(0.2),
             resident_mib: Some(150.0),
             threads: Some(20),

@@ -70,7 +70,10 @@ impl StatusReporter {
 
     /// Processes that crashed at least once.
     pub fn fallen(&self) -> Vec<String> {
-        let statuses = self.health.statuses(Instant::now()).into_iter();
+        let statuses = self
+            .health
+            .statuses(&Progress::default(), Instant::now())
+            .into_iter();
         statuses
             .filter(|process| process.last_fall.is_some())
             .map(|process| process.name)
@@ -81,7 +84,7 @@ impl StatusReporter {
     pub fn tell(&mut self, phase: Phase, progress: &Progress) {
         let health = &self.health;
         self.status
-            .write(phase, progress, |now| health.statuses(now));
+            .write(phase, progress, |now| health.statuses(progress, now));
     }
 
     /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays

@@ -53,6 +53,8 @@ pub struct Progress {
     pub ended: bool,
     /// Time of the last report of each process, by name.
     pub last_reports: BTreeMap<String, Instant>,
+    /// What keeps each process from its task, by name, as it reported last.
+    pub problems: BTreeMap<String, Vec<String>>,
 }
 
 impl Progress {
@@ -417,6 +419,7 @@ impl Worker {
             stages,
             usage,
             traffic,
+            problems,
         }) = self.inbox.decode(arrival, &Limits::DEFAULT)
         else {
             return;
@@ -459,6 +462,7 @@ impl Worker {
             .sum();
         self.note(|progress| {
             progress.dropped = dropped;
+            progress.problems.insert(name.clone(), problems);
             progress.last_reports.insert(name, at);
         });
     }

@@ -11,7 +11,8 @@ use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
 use futures_util::{Stream as Pieces, stream};
 use protocol::{
-    Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, RunId, Stream, Topic, Verb, wire,
+    Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, ProcessId, RunId, Stats, Stream, Topic,
+    Verb, wire,
 };
 use serde::Serialize;
 use tokio::sync::watch;
@@ -37,6 +38,8 @@ const MOST_MAPS: usize = 16;
 const MOST_EGOS: usize = 16;
 /// Empty message.
 const NOTHING_NEW: [u8; 4] = [0; 4];
+/// Processes whose problems are kept at most.
+const MAX_REPORTERS: usize = 128;
 /// Interval at which the thread checks for open pages.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
@@ -65,6 +68,10 @@ pub struct LiveRun {
 pub(super) struct RunStatus {
     /// Time since the last message of the scene, seconds; `None`: there was none since a page is open.
     pub(super) silent_s: Option<f64>,
+    /// Time since the last result, or since the first message where there was no result, seconds.
+    pub(super) unanswered_s: Option<f64>,
+    /// What keeps processes from their task, as they report.
+    pub(super) problems: Vec<String>,
     /// True if its scene has been played to the end.
     pub(super) is_over: bool,
     /// True while there is a connection to its router.
@@ -77,6 +84,10 @@ pub(super) struct RunStatus {
 #[derive(Debug, Default)]
 struct RunActivity {
     last_message: Option<Instant>,
+    /// Last result, or the first message.
+    answered: Option<Instant>,
+    /// What keeps each process from its task.
+    problems: BTreeMap<ProcessId, Vec<String>>,
     is_over: bool,
     has_router: bool,
 }
@@ -135,6 +146,10 @@ impl LiveRun {
         let activity = lock(&self.activity);
         RunStatus {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
+            unanswered_s: activity.answered.map(|at| at.elapsed().as_secs_f64()),
+            problems: { activity.problems.iter() }
+                .flat_map(|(name, of)| of.iter().map(move |problem| format!("{name}: {problem}")))
+                .collect(),
             is_over: activity.is_over,
             has_router: activity.has_router,
             images_left_out: self.images.left_out(),
@@ -382,12 +397,30 @@ impl Listener {
     }
 
     /// Reports of processes are no activity: a viewer reports too, for as long as its page is open.
-    fn note(&self, topic: &Topic) {
-        if let Topic::Stats(_) = topic {
+    fn note(&self, topic: &Topic, bytes: &[u8]) {
+        let mut activity = lock(&self.activity);
+        if let Topic::Stats(name) = topic {
+            let report = wire::decode::<Stats>([bytes], &Limits::DEFAULT);
+            let known = &mut activity.problems;
+            let has_room = known.len() < MAX_REPORTERS || known.contains_key(name);
+            if let Ok((_, report)) = report
+                && has_room
+                && report.process == *name
+            {
+                known.insert(name.clone(), report.problems);
+            }
             return;
         }
-        let mut activity = lock(&self.activity);
-        activity.last_message = Some(Instant::now());
+        let now = Instant::now();
+        activity.last_message = Some(now);
+        activity.answered.get_or_insert(now);
+        if let Topic::Stream {
+            stream: Stream::Detections,
+            ..
+        } = topic
+        {
+            activity.answered = Some(now);
+        }
         match topic {
             Topic::Control(Verb::End) => activity.is_over = true,
             Topic::Truth => activity.is_over = false,
@@ -401,7 +434,7 @@ impl Listener {
             return;
         };
         let topic = &message.key.topic;
-        self.note(topic);
+        self.note(topic, &bytes);
         if header.kind == Kind::Control {
             return;
         }

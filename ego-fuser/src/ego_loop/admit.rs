@@ -82,6 +82,7 @@ impl EgoLoop {
     pub(super) fn take_in(&mut self, ego: &mut Ego, mut message: Message, now_nanos: u64) {
         let cav = message.view.cav.clone();
         let stated_nanos = message.view.capture_nanos;
+        self.waits.received(&cav, now_nanos);
         if cav == self.cav {
             return self.begin(ego, message, now_nanos);
         }

@@ -12,6 +12,7 @@ mod decide;
 mod input;
 mod pace_keeper;
 pub mod recorded;
+mod waits;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
@@ -28,6 +29,7 @@ use crate::silence::Silence;
 use crate::view::View;
 use fusion::method::Exchange;
 use pace_keeper::PaceKeeper;
+use waits::Waits;
 
 pub(crate) use admit::Refusal;
 pub use input::{Input, Message, Output, Reception};
@@ -103,6 +105,7 @@ pub struct EgoLoop {
     /// Capture time of the ego's newest sweep, nanoseconds.
     own_nanos: Option<u64>,
     ended: BTreeSet<CavId>,
+    waits: Waits,
     /// Time at which the loop ends at the latest, after the own agent's end.
     ends_nanos: Option<u64>,
     is_finished: bool,
@@ -114,9 +117,11 @@ impl EgoLoop {
     /// Loop of the vehicle `cav`, whose frames `ego` fuses, before its first input.
     #[must_use]
     pub fn new(cav: &CavId, ego: &Ego, options: LoopOptions) -> Self {
+        let stream = stream_of(ego.method().own_content());
         Self {
             cav: cav.clone(),
-            stream: stream_of(ego.method().own_content()),
+            stream,
+            waits: Waits::new(cav, ego.method().name(), stream),
             options,
             members: BTreeSet::new(),
             silence: Silence::default(),
@@ -140,12 +145,18 @@ impl EgoLoop {
     pub fn handle(&mut self, ego: &mut Ego, input: Input, now_nanos: u64) -> Vec<Output> {
         match input {
             Input::Message(message) => self.take_in(ego, *message, now_nanos),
-            Input::Model(cav, descriptor) => self.compare_models(&cav, &descriptor),
+            Input::Model(cav, descriptor) => {
+                self.waits.described(&cav, &descriptor, now_nanos);
+                self.compare_models(&cav, &descriptor);
+            }
             Input::Sweeps(cav, sweeps) => self.compare_clocks(&cav, &sweeps),
             Input::Joined(cav) => {
                 self.members.insert(cav);
             }
-            Input::Left(cav) => self.forget(&cav),
+            Input::Left(cav) => {
+                self.waits.left(&cav, self.ended.contains(&cav), now_nanos);
+                self.forget(&cav);
+            }
             Input::Ended(cav) if cav == self.cav => {
                 let wait_nanos = LAST_WAIT_NANOS.max(self.options.deadline_nanos);
                 self.ends_nanos = Some(now_nanos.saturating_add(wait_nanos));
@@ -175,6 +186,12 @@ impl EgoLoop {
     #[must_use]
     pub fn stream(&self) -> Stream {
         self.stream
+    }
+
+    /// What keeps the ego from its task, each with the time since when, nanoseconds.
+    #[must_use]
+    pub fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
+        self.waits.problems(now_nanos)
     }
 
     /// Summary so far.

@@ -223,15 +223,17 @@ impl<'a> Node<'a> {
             if taken > MAX_TOPICS {
                 taken = 0;
                 self.handle(Input::Wake);
+                self.report_problems();
             }
         }
         Ok(())
     }
 
     fn end(&mut self, topic: &Topic) {
+        // The own agent may come again.
         if let Some((cav, stream)) = sender_of(topic)
             && stream == self.ego_loop.stream()
-            && !self.options.keeps_running
+            && !(self.options.keeps_running && *cav == self.cav)
         {
             self.handle(Input::Ended(cav.clone()));
         }
@@ -277,6 +279,17 @@ impl<'a> Node<'a> {
                 Output::Pace(pace) => self.pace.submit(0, pace),
             }
         }
+    }
+
+    /// Reports what the ego waits for with the counters of the process.
+    fn report_problems(&self) {
+        let now = Instant::now();
+        let now_nanos = self.nanos(now);
+        let problems = { self.ego_loop.problems(now_nanos).into_iter() }.map(|(problem, since)| {
+            let before = Duration::from_nanos(now_nanos.saturating_sub(since));
+            (problem, now.checked_sub(before).unwrap_or(now))
+        });
+        self.bus.stats().set_problems("ego", problems);
     }
 
     fn publish(&mut self, capture_nanos: u64, result: Detections) {

@@ -131,6 +131,10 @@ impl BusConfig {
             credentials.check_name(identity.process.as_str())?;
         }
         let mut bus = Bus::join_unless(stop, &options, identity)?;
+        // The instance before of a supervised process may not have left yet.
+        if !self.supervised {
+            bus.check_name(role, stop)?;
+        }
         if let Some(address) = self.metrics {
             let address = bus.serve_metrics(address, Vec::new())?;
             tracing::info!("metrics at http://{address}/metrics");

@@ -4,7 +4,7 @@ use std::hash::{BuildHasher, RandomState};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, Key, KeyExpr, ProcessId, Role, RunId, Topic};
 use zenoh::qos::Priority;
@@ -12,7 +12,7 @@ use zenoh::{Session, Wait};
 
 use super::flush_barrier::FlushBarrier;
 use super::inbox_limits::InboxLimits;
-use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken};
+use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
 use super::metrics::{MetricsPeer, MetricsServer};
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
@@ -22,6 +22,11 @@ use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
 use super::watchdog::Heartbeat;
 use super::{BusError, BusOptions, MessageStats, open, open_unless};
+
+/// Longest wait for the end of another process of a name: longer than a router takes to notice that one was killed.
+const NAME_LIMIT: Duration = Duration::from_secs(11);
+/// Interval at which the name is looked for.
+const NAME_PERIOD: Duration = Duration::from_millis(250);
 
 /// Identity of a process in a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -105,6 +110,28 @@ impl Bus {
             status_thread,
             metrics: None,
         })
+    }
+
+    /// Waits until no other process of the run has this name, for [`NAME_LIMIT`] at most: one that was killed may count
+    /// as present for some seconds.
+    ///
+    /// # Errors
+    /// [`BusError::NameTaken`] if one still has it.
+    pub(super) fn check_name(&self, role: Role, stop: &Stop) -> Result<(), BusError> {
+        let Identity { run, process, cav } = &self.identity;
+        let token = Key::alive(run, role, cav).to_string();
+        let until = Instant::now() + NAME_LIMIT;
+        let mut is_first = true;
+        while !present(&self.session, &token)?.is_empty() {
+            if std::mem::take(&mut is_first) {
+                tracing::warn!("{process} is live in run {run} already: waiting for its end");
+            }
+            if Instant::now() > until || stop.wait_until(Instant::now() + NAME_PERIOD) {
+                let (run, process) = (run.clone(), process.clone());
+                return Err(BusError::NameTaken { run, process });
+            }
+        }
+        Ok(())
     }
 
     /// Serves the counters, and those of other processes, to Prometheus until this is dropped; returns the address.

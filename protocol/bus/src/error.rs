@@ -3,6 +3,7 @@
 use std::io::ErrorKind;
 use std::path::PathBuf;
 
+use protocol::{ProcessId, RunId};
 use serde_json::Value;
 use support::cli::Interrupted;
 
@@ -64,6 +65,14 @@ pub enum BusError {
         /// Gives the process the exit code of an end on request.
         source: Interrupted,
     },
+    /// Another process has the name; receivers would reject the messages of both.
+    #[error("{process} is live in run {run} already; end it first, or choose another name")]
+    NameTaken {
+        /// The run.
+        run: RunId,
+        /// Name of both processes.
+        process: ProcessId,
+    },
     /// The system cannot start a thread.
     #[error("no thread for {what}: {cause}")]
     Thread {
@@ -123,6 +132,7 @@ impl BusError {
                 | Self::Keys { .. }
                 | Self::NoKeys(_)
                 | Self::SharedMemory { .. }
+                | Self::NameTaken { .. }
         )
     }
 

@@ -49,15 +49,14 @@ impl LivelinessToken {
     }
 }
 
-/// Every process of a run that is alive now.
+/// Processes with a token that `selector` matches, which are alive now.
 ///
 /// # Errors
 /// [`BusError::Zenoh`] when the session is closed.
-pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, BusError> {
-    let selector = KeyExpr::everyone_alive(run);
+pub fn present(session: &Session, selector: &str) -> Result<BTreeSet<ProcessId>, BusError> {
     let tokens = session
         .liveliness()
-        .get(selector.as_str())
+        .get(selector)
         .timeout(QUERY_TIMEOUT)
         .wait();
     let tokens =

@@ -1,6 +1,6 @@
 //! Message counters and stage durations of one process, shared by its threads.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -20,6 +20,8 @@ use super::frame_stats::FrameStats;
 const MAX_ACCOUNTS: usize = Limits::DEFAULT.max_entries;
 /// Maximum number of vehicles whose clock offset and trust are kept.
 const MAX_PEERS: usize = 128;
+/// Maximum number of problems at a time.
+const MAX_PROBLEMS: usize = 16;
 /// Timings kept per stage: at 10 Hz the last three minutes.
 const KEPT_TIMINGS: usize = 2048;
 
@@ -68,6 +70,9 @@ struct State {
     frames: FrameStats,
     peers: BTreeMap<CavId, Peer>,
     shared: BTreeMap<SharedMemoryUse, u64>,
+    problems: BTreeMap<String, Vec<(String, Instant)>>,
+    // Problems that were logged.
+    logged: BTreeSet<String>,
     is_full: bool,
 }
 
@@ -323,6 +328,38 @@ impl MessageStats {
         self.lock().peers.iter().map(summary).collect()
     }
 
+    /// Sets the problems of a kind, in place of those before: what keeps the process from its task, and since when. Each
+    /// is logged once.
+    pub fn set_problems(&self, kind: &str, problems: impl IntoIterator<Item = (String, Instant)>) {
+        let problems: Vec<_> = problems.into_iter().take(MAX_PROBLEMS).collect();
+        let mut state = self.lock();
+        for (problem, _) in &problems {
+            if state.logged.len() < MAX_ACCOUNTS && state.logged.insert(problem.clone()) {
+                tracing::warn!("{problem}");
+            }
+        }
+        if problems.is_empty() {
+            state.problems.remove(kind);
+        } else if state.problems.len() < MAX_PROBLEMS || state.problems.contains_key(kind) {
+            state.problems.insert(kind.to_owned(), problems);
+        }
+    }
+
+    /// What keeps the process from its task, each with its duration.
+    pub fn problems(&self) -> Vec<String> {
+        let text = |(problem, since): &(String, Instant)| {
+            format!("{problem} (for {:.0} s)", since.elapsed().as_secs_f64())
+        };
+        let state = self.lock();
+        state
+            .problems
+            .values()
+            .flatten()
+            .map(text)
+            .take(MAX_PROBLEMS)
+            .collect()
+    }
+
     /// Records the duration of a stage for one frame.
     pub fn timed(&self, stage: &str, time: Duration) {
         let mut state = self.lock();
@@ -489,6 +526,20 @@ mod tests {
 
     fn topic() -> Topic {
         "4279/bev".parse().unwrap()
+    }
+
+    #[test]
+    fn a_problem_has_a_duration_and_ends() {
+        let stats = stats_of("ego-1");
+        let since = Instant::now().checked_sub(Duration::from_secs(12)).unwrap();
+        stats.set_problems("no pose", [("no pose: too few points".into(), since)]);
+        stats.set_problems("no sweep", [("no sweep".into(), since)]);
+        assert_eq!(
+            stats.problems(),
+            ["no pose: too few points (for 12 s)", "no sweep (for 12 s)"]
+        );
+        stats.set_problems("no pose", None);
+        assert_eq!(stats.problems(), ["no sweep (for 12 s)"]);
     }
 
     fn stats_of(process: &str) -> MessageStats {

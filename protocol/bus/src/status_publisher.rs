@@ -212,6 +212,7 @@ impl StatusSender {
             stages: self.stats.stages(),
             usage: process_usage(),
             traffic: self.stats.traffic(),
+            problems: self.stats.problems(),
         };
         self.put(&key, Priority::Background, 0, stats, sequence);
     }

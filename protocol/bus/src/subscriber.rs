@@ -409,14 +409,10 @@ impl IngressFilter {
                 .unwrap_or_else(PoisonError::into_inner);
             replay_window.admit(topic, stamp.epoch, stamp.sequence, at)
         };
-        match quarantine {
-            Some(true) => {
-                tracing::warn!(%topic, "two senders use one id: both are rejected until one is silent")
-            }
-            Some(false) => {
-                tracing::info!(%topic, "one sender of this id is left: its messages are accepted again")
-            }
-            None => {}
+        if let Some(is_twice) = quarantine {
+            let text = format!("two senders use {topic}: both are rejected");
+            let problem = is_twice.then(|| (text.clone(), at));
+            self.inbox.stats.set_problems(&text, problem);
         }
         if dropped.is_none() {
             self.inbox

@@ -348,6 +348,7 @@ mod tests {
             stages: Vec::new(),
             usage: ProcessUsage::default(),
             traffic: Vec::new(),
+            problems: Vec::new(),
         };
         let mut level = |stats: &Stats| translator.status(stats).level;
         assert_eq!(level(&stats), Level::Ok);

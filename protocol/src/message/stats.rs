@@ -21,6 +21,8 @@ pub struct Stats {
     pub usage: ProcessUsage,
     /// Published bytes, by topic.
     pub traffic: Vec<TopicTraffic>,
+    /// What keeps it from its task, each with its duration: `no pose (for 12 s)`.
+    pub problems: Vec<String>,
 }
 
 /// CPU time and memory of a process, 0 where the system does not tell.
@@ -94,6 +96,7 @@ impl Stats {
         check_count("accounts", self.ledger.len(), limits.max_entries)?;
         check_count("stages", self.stages.len(), limits.max_entries)?;
         check_count("topics", self.traffic.len(), limits.max_entries)?;
+        check_count("problems", self.problems.len(), limits.max_entries)?;
         check_within("cpu_s", self.usage.cpu_s, 0.0, MAX_CPU_S)?;
         for summary in &self.stages {
             check_name("stage", &summary.stage)?;

@@ -418,14 +418,18 @@ fn any_stats() -> impl Strategy<Value = Stats> {
         vec(stage, 0..4),
         usage,
         vec(traffic, 0..4),
+        vec("[a-z0-9 ]{0,40}", 0..4),
     )
-        .prop_map(|(process, ledger, stages, usage, traffic)| Stats {
-            process,
-            ledger,
-            stages,
-            usage,
-            traffic,
-        })
+        .prop_map(
+            |(process, ledger, stages, usage, traffic, problems)| Stats {
+                process,
+                ledger,
+                stages,
+                usage,
+                traffic,
+                problems,
+            },
+        )
 }
 
 fn any_camera() -> impl Strategy<Value = Camera> {

@@ -331,6 +331,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
                 messages: 3,
                 bytes: 4_500_000,
             }],
+            problems: vec!["no pose (for 12 s)".into()],
         }),
     ];
     messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));

@@ -4,13 +4,15 @@ use std::collections::BTreeMap;
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use bus::shutdown::Stop;
 use bus::{
-    self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, LivelinessEvent, Overflow,
-    Publisher, PublisherOptions, Route, SharedMemory, SharedMemoryUse, bounded_queue::Pop,
+    self, Barrier, Bus, BusConfig, BusError, BusOptions, Endpoint, Event, LivelinessEvent,
+    Overflow, Publisher, PublisherOptions, Route, SharedMemory, SharedMemoryUse,
+    bounded_queue::Pop,
 };
 use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose,
-    Role, Stamp, Stream, Topic,
+    Role, RunId, Stamp, Stream, Topic,
 };
 use tests::bus::{TIMEOUT, TestRouter, free_port, next_event, wait_for};
 use zenoh::Wait;
@@ -40,6 +42,26 @@ fn sweep(count: u16) -> Lidar {
             xyzi: (0..count).map(|i| [f32::from(i), 1.0, 2.0, 0.5]).collect(),
         },
     }
+}
+
+#[test]
+fn a_second_process_of_a_name_is_refused_until_the_first_has_left() {
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let config = BusConfig {
+        connect: router.endpoint.clone(),
+        ..BusConfig::default()
+    };
+    let (run, agent) = (RunId::new("test").unwrap(), cav("7"));
+    let first = config.join(&stop, &run, Role::Agent, &agent).unwrap();
+    let token = first.announce(Role::Agent).unwrap();
+    // Another vehicle, and another role of the vehicle, have names of their own.
+    config.join(&stop, &run, Role::Agent, &cav("8")).unwrap();
+    config.join(&stop, &run, Role::Ego, &agent).unwrap();
+    let error = config.join(&stop, &run, Role::Agent, &agent).err().unwrap();
+    assert!(matches!(error, BusError::NameTaken { .. }), "{error}");
+    assert!(error.is_bad_input() && error.to_string().starts_with("agent-7 is live in run test"));
+    token.withdraw().unwrap();
+    config.join(&stop, &run, Role::Agent, &agent).unwrap();
 }
 
 /// Waits on `receiver`'s behalf until a probe of `topic` has reached it.

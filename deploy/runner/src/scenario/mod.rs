@@ -101,7 +101,7 @@ pub enum Clock {
     #[default]
     Wall,
     /// Simulation time: every stage takes the compute time of [`Stepped`], the link emulation computes the arrival
-    /// times, and the ego fuses exactly what has arrived `ego.deadline_ms` after a tick. Same scenario, same bytes.
+    /// times, and the ego decides on these as on a wall clock. Same scenario, same bytes.
     Stepped,
 }
 

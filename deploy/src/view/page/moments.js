@@ -57,13 +57,15 @@ async function watch() {
 async function check() {
   const answer = await fetch("status").catch(() => null);
   if (!answer || !answer.ok) return;
-  const { silent_s: silent, is_over: over, has_router: router, images_left_out: leftOut } = await answer.json();
+  const status = await answer.json();
+  const { silent_s: silent, is_over: over, has_router: router, images_left_out: leftOut } = status;
   view.imagesLeftOut = leftOut;
   const before = isKnown(silent) ? ` ${seconds(silent)} ago` : "";
   if (over && silent > 2) state("over", `ended${before}${router ? "" : ", router gone"}`);
   else if (!router) state("ended", before ? `router gone, last message${before}` : "router gone");
   else if (!isKnown(silent)) state("waiting", "waiting for the run");
   else if (silent > 3) state("ended", `last message${before}`);
+  else if (status.unanswered_s > 3) state("ended", status.problems[0] || `no result for ${seconds(status.unanswered_s)}`);
   else state("live", "live");
   if (!isKnown(silent)) hint("Nothing is published in this run yet.");
 }
