@@ -38,9 +38,14 @@ impl Fleet {
         if self.scenario.method.exchange() == Exchange::Nothing {
             return routes;
         }
+        let link = process_id(Role::Link, &self.ego);
+        if self.is_over_link() {
+            // The link takes nothing else of the ego. A neighbour's position is subscribed to before its stream.
+            routes.push(route(&self.ego, Stream::Gnss, &link));
+        }
         for cav in self.neighbours() {
             if self.is_over_link() {
-                routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));
+                routes.push(route(cav, stream, &link));
                 routes.push(Route {
                     topic: Topic::Received {
                         ego: self.ego.clone(),
