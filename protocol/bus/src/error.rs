@@ -83,10 +83,10 @@ pub enum BusError {
     },
     /// The system has too little shared memory.
     #[error(
-        "a pool of {wanted_mib} MiB of shared memory: {free_mib} MiB are free in /dev/shm; every process has a pool of its own"
+        "{wanted_mib} MiB of shared memory: {free_mib} MiB are free in /dev/shm; every process has a pool of its own"
     )]
     SharedMemory {
-        /// Size of the pool, MiB.
+        /// Size of the pool, or of the pools of several processes, MiB.
         wanted_mib: usize,
         /// Free memory, MiB.
         free_mib: u64,

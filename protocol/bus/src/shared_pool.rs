@@ -109,8 +109,12 @@ fn is_router_attached(session: &Session) -> bool {
         .any(|transport| transport.is_shm())
 }
 
-/// A segment is made without its memory, and a process is killed when it writes where there is none.
-fn check_room(bytes: usize) -> Result<(), BusError> {
+/// Checks that the system has room for pools of `bytes` together: a segment is made without its memory, and a process
+/// is killed when it writes where there is none.
+///
+/// # Errors
+/// [`BusError::SharedMemory`] with the wanted and the free memory.
+pub fn check_room(bytes: usize) -> Result<(), BusError> {
     // Elsewhere shared memory is not in a folder.
     let Ok(room) = rustix::fs::statvfs(FOLDER) else {
         return Ok(());

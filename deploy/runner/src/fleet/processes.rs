@@ -92,7 +92,10 @@ impl Fleet {
     fn planner<'a>(&self, context: &'a SessionContext<'a>) -> Planner<'a> {
         let bus = BusConfig {
             connect: context.endpoint.clone(),
-            shared_memory_mib: self.scenario.network.shared_memory_mib,
+            shared_memory_mib: pool_mib(
+                self.scenario.network.shared_memory_mib,
+                self.process_count(),
+            ),
             supervised: true,
             ..BusConfig::default()
         };
@@ -102,6 +105,12 @@ impl Fleet {
             metrics: self.scenario.network.metrics,
             specs: Vec::new(),
         }
+    }
+
+    /// Processes that this run starts at most: agents, ego and replay, and link and recorder where there are such.
+    fn process_count(&self) -> usize {
+        let others = [self.is_over_link(), self.scenario.record.is_some()];
+        self.agents.len() + 2 + others.iter().filter(|is_there| **is_there).count()
     }
 
     fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
@@ -242,4 +251,28 @@ fn port_behind(address: SocketAddr) -> Option<SocketAddr> {
         address.ip(),
         address.port().checked_add(1)?,
     ))
+}
+
+/// Pool of each of some processes, MiB: the `wanted` one, or 0 with a warning where the system has no room for all.
+fn pool_mib(wanted: usize, processes: usize) -> usize {
+    match bus::check_room(wanted.saturating_mul(processes << 20)) {
+        Ok(()) => wanted,
+        Err(error) => {
+            tracing::warn!(
+                "network.shared_memory_mib {wanted}: messages of {processes} processes take the socket: {error}"
+            );
+            0
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn where_not_all_pools_have_room_messages_take_the_socket() {
+        assert_eq!([pool_mib(0, 4), pool_mib(1, 4)], [0, 1]);
+        assert_eq!(pool_mib(usize::MAX >> 22, 4), 0);
+    }
 }
