@@ -25,7 +25,7 @@ pub enum Input<M = Box<Message>> {
     Left(CavId),
     /// A vehicle sends no more. After the own agent's end the loop ends.
     Ended(CavId),
-    /// Everything that has arrived by now is taken in: frames are decided.
+    /// The oldest frame is decided, if it waits for nothing more.
     Wake,
 }
 

@@ -203,28 +203,17 @@ impl<'a> Node<'a> {
 
     fn receive(&mut self, stop: &Stop) -> Result<(), BusError> {
         let _working = self.bus.works_from(&self.inbox);
-        // Messages since a frame could be decided last.
-        let mut taken = 0;
         while !stop.requested() && !self.ego_loop.is_finished() {
             self.look_round()?;
-            // Everything that has arrived is taken in before a frame is decided, but a flood must not prevent that.
-            let until = if taken == 0 {
-                self.next_moment()
-            } else {
-                Instant::now()
-            };
-            match self.inbox.take(Some(until)) {
+            match self.inbox.take(Some(self.next_moment())) {
                 Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
                 Pop::Item(topic, Event::End { .. }) => self.end(&topic),
-                Pop::TimedOut => taken = MAX_TOPICS,
+                Pop::TimedOut => {}
                 Pop::Closed => return Ok(()),
             }
-            taken += 1;
-            if taken > MAX_TOPICS {
-                taken = 0;
-                self.handle(Input::Wake);
-                self.report_problems();
-            }
+            // After each message: frames that wait in the loop would be one more queue behind the inbox.
+            self.handle(Input::Wake);
+            self.report_problems();
         }
         Ok(())
     }

@@ -400,7 +400,6 @@ mod tests {
         (plain.scene.dir, plain.models.weights) =
             (demo.scene.dir.clone(), demo.models.weights.clone());
         plain.agents.codec.dtype = Dtype::F16;
-        plain.network.shared_memory_mib = 12;
         assert!(matches!(demo.agents.pose, PoseSourceConfig::Tracked(_)));
         plain.agents.pose = demo.agents.pose.clone();
         assert_eq!(demo, plain);
