@@ -56,7 +56,7 @@ pub struct ProcessStatus {
     /// Description of its failure, for a process that has failed in its task.
     #[serde(default)]
     pub failure: Option<String>,
-    /// What keeps it from its task, as it reports while it runs.
+    /// Problems that it reports while it runs.
     #[serde(default)]
     pub problems: Vec<String>,
     /// Time since its last report, seconds.

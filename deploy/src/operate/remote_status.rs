@@ -39,7 +39,7 @@ pub struct RemoteProcess {
     pub sent: Option<u64>,
     /// Number of messages in its ledger that were dropped.
     pub dropped: Option<u64>,
-    /// What keeps it from its task.
+    /// Problems that it reports.
     pub problems: Vec<String>,
 }
 

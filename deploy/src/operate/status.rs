@@ -280,7 +280,7 @@ impl RunStatus {
     }
 }
 
-/// Failure of a process, what keeps it from its task, or its last crash.
+/// Failure of a process, its problems, or its last crash.
 fn why(process: &ProcessStatus) -> Option<String> {
     let problems = (!process.problems.is_empty()).then(|| process.problems.join("; "));
     let failure = process.failure.clone().or(problems);

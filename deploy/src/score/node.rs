@@ -53,7 +53,7 @@ pub struct Progress {
     pub ended: bool,
     /// Time of the last report of each process, by name.
     pub last_reports: BTreeMap<String, Instant>,
-    /// What keeps each process from its task, by name, as it reported last.
+    /// Problems in the last report of each process, by name.
     pub problems: BTreeMap<String, Vec<String>>,
 }
 

@@ -70,7 +70,7 @@ pub(super) struct RunStatus {
     pub(super) silent_s: Option<f64>,
     /// Time since the last result, or since the first message where there was no result, seconds.
     pub(super) unanswered_s: Option<f64>,
-    /// What keeps processes from their task, as they report.
+    /// Problems that processes report.
     pub(super) problems: Vec<String>,
     /// True if its scene has been played to the end.
     pub(super) is_over: bool,
@@ -86,7 +86,7 @@ struct RunActivity {
     last_message: Option<Instant>,
     /// Last result, or the first message.
     answered: Option<Instant>,
-    /// What keeps each process from its task.
+    /// Problems that each process reports.
     problems: BTreeMap<ProcessId, Vec<String>>,
     is_over: bool,
     has_router: bool,

@@ -140,7 +140,7 @@ impl EgoLoop {
         }
     }
 
-    /// Takes an input in at `now_nanos`, which never decreases. Only [`Input::Wake`] decides a frame, and one at most:
+    /// Takes an input in at `now_nanos`, which does not decrease from one message or wake to the next. Only [`Input::Wake`] decides a frame, and one at most:
     /// fusing takes time, in which more may arrive.
     pub fn handle(&mut self, ego: &mut Ego, input: Input, now_nanos: u64) -> Vec<Output> {
         match input {
@@ -188,7 +188,7 @@ impl EgoLoop {
         self.stream
     }
 
-    /// What keeps the ego from its task, each with the time since when, nanoseconds.
+    /// Problems of the ego: missing messages and streams, each with the time of its beginning, nanoseconds.
     #[must_use]
     pub fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         self.waits.problems(now_nanos)

@@ -1,4 +1,4 @@
-//! Waits of an ego: what keeps it from its task, for its status.
+//! Waits of an ego: missing messages and streams, for its status.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ const AFTER_NANOS: u64 = 3_000_000_000;
 /// Largest number of vehicles of a kind.
 const MAX_VEHICLES: usize = 64;
 
-/// What an ego waits for, each with the time since when, nanoseconds.
+/// Messages, streams and vehicles that an ego waits for, each with the time of the beginning, nanoseconds.
 pub(super) struct Waits {
     ego: CavId,
     /// Method and the stream that it needs.

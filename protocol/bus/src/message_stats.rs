@@ -328,7 +328,7 @@ impl MessageStats {
         self.lock().peers.iter().map(summary).collect()
     }
 
-    /// Sets the problems of a kind, in place of those before: what keeps the process from its task, and since when. Each
+    /// Sets the problems of a kind, in place of those before: text, and time of the beginning. Each
     /// is logged once.
     pub fn set_problems(&self, kind: &str, problems: impl IntoIterator<Item = (String, Instant)>) {
         let problems: Vec<_> = problems.into_iter().take(MAX_PROBLEMS).collect();
@@ -345,7 +345,7 @@ impl MessageStats {
         }
     }
 
-    /// What keeps the process from its task, each with its duration.
+    /// Problems of the process, each with its duration.
     pub fn problems(&self) -> Vec<String> {
         let text = |(problem, since): &(String, Instant)| {
             format!("{problem} (for {:.0} s)", since.elapsed().as_secs_f64())

@@ -21,7 +21,7 @@ pub struct Stats {
     pub usage: ProcessUsage,
     /// Published bytes, by topic.
     pub traffic: Vec<TopicTraffic>,
-    /// What keeps it from its task, each with its duration: `no pose (for 12 s)`.
+    /// Problems: reasons why the process cannot work, each with its duration: `no pose (for 12 s)`.
     pub problems: Vec<String>,
 }
 

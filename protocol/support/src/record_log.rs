@@ -99,7 +99,8 @@ impl<T: DeserializeOwned> RecordReader<T> {
         if crc32fast::hash(&bytes) != u32::from_le_bytes(checksum) {
             return Err(io::Error::other("the checksum is wrong"));
         }
-        let config = bincode::config::standard();
+        // A length inside a record may claim more than the record holds.
+        let config = bincode::config::standard().with_limit::<{ MAX_RECORD_BYTES as usize }>();
         let (record, _) =
             bincode::serde::decode_from_slice(&bytes, config).map_err(io::Error::other)?;
         Ok(Some(record))
