@@ -18,6 +18,7 @@ import tempfile
 from PIL import Image
 
 import chromium
+import page_digest
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PROGRAMS = pathlib.Path(os.environ.get("CARGO_TARGET_DIR") or ROOT / "target").resolve() / "release"
@@ -71,6 +72,7 @@ def main():
         view.terminate()
     frames[0].save(options.out, save_all=True, append_images=frames[1:], duration=round(1000 * period_s), loop=0,
                    quality=options.quality, method=6)
+    page_digest.write(options.out)
     print(f"{options.out}: {len(frames)} frames, {options.out.stat().st_size / 1e6:.2f} MB")
 
 

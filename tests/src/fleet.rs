@@ -13,7 +13,8 @@ use fusion::Method;
 use fusion::model::CooperativeModel;
 use perception::model_config::{DetectorConfig, ShrinkConfig};
 use perception::weights;
-use serde_json::Value;
+use serde_json::{Value, json};
+use support::file_digests::FileDigests;
 
 use crate::locks::random_generator_lock;
 
@@ -284,6 +285,39 @@ pub fn results(run: &Path) -> Vec<Value> {
         .lines()
         .filter_map(|line| serde_json::from_str(line).ok())
         .collect()
+}
+
+/// Checks that the metrics of a run name their protocol and all that they were made of, its weights among it.
+///
+/// # Panics
+/// When they do not.
+pub fn check_origin(run: &Path, weights: &Path) {
+    let text = fs::read_to_string(run.join("metrics.json")).expect("metrics");
+    let metrics: Value = serde_json::from_str(&text).expect("JSON");
+    let (protocol, provenance) = (&metrics["protocol"], &metrics["provenance"]);
+    let range_m = &protocol["ground_truth"]["x_m"];
+    assert_eq!(
+        (&protocol["name"], range_m),
+        (&json!("opv2v"), &json!([-25.6, 25.6])),
+        "the range ends at the area of the network"
+    );
+    let is_filled = |value: &Value| value.as_str().is_some_and(|text| !text.is_empty());
+    let command = provenance["command"].as_array();
+    assert!(
+        command.is_some_and(|command| command.first().is_some_and(is_filled))
+            && is_filled(&provenance["commit"]),
+        "{provenance}"
+    );
+    for name in ["program_sha256", "data_sha256"] {
+        let len = provenance[name].as_str().map(str::len);
+        assert_eq!(len, Some(64), "{name}: {provenance}");
+    }
+    let weights_sha256 = FileDigests::default().sha256(weights).expect("weights");
+    let files = provenance["files_sha256"].as_object();
+    assert!(
+        files.is_some_and(|files| files.values().any(|sha256| *sha256 == weights_sha256)),
+        "{weights_sha256}: {provenance}"
+    );
 }
 
 /// Number of neighbours that a result was fused from.

@@ -10,6 +10,7 @@ pub mod localizer;
 pub mod locks;
 pub mod machine;
 pub mod mutation;
+pub mod networks;
 pub mod scene;
 pub mod sequences;
 pub mod tensors;

@@ -85,7 +85,7 @@ struct Sensors {
     /// Largest intensity of these messages; agents get shares of it, 0 to 1. `auto` is 255 for bytes and red, for other
     /// numbers the range of each LiDAR's first sweeps, as for files.
     #[arg(long, value_name = "auto|VALUE", default_value_t, requires = "lidar")]
-    intensity_max: IntensityScale,
+    intensity_scale: IntensityScale,
     /// Pass speed and yaw rate of a topic of nav_msgs/Odometry to an agent that has a --lidar, for example /odom=1000,
     /// and publish map -> odom, the robot's odometry frame, instead of map -> cav_1000/lidar; repeatable.
     #[arg(long, value_name = "TOPIC=AGENT", allow_hyphen_values = true)]
@@ -205,7 +205,7 @@ impl Arguments {
             lidars: sensors.lidar.clone(),
             motions: sensors.motions(),
             starting_poses: sensors.starting_pose.clone(),
-            intensity_scale: sensors.intensity_max,
+            intensity_scale: sensors.intensity_scale,
             initial_pose_of: content.initialpose.clone(),
         }
     }

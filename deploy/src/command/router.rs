@@ -14,6 +14,7 @@ use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::Wait;
 
+use crate::operate::router_panic;
 use support::cli::Outcome;
 
 /// Interval between reports of refused requests.
@@ -74,6 +75,7 @@ impl Arguments {
             stop.on_end_of_input()?;
         }
         stop.enforce(STOP_LIMIT);
+        router_panic::watch(&stop);
         let session = open(&options)?;
         output::note(format_args!(
             "routing at {} (Ctrl-C ends it)",
@@ -100,6 +102,11 @@ impl Arguments {
             if ended {
                 break;
             }
+        }
+        if let Some(panic) = router_panic::first() {
+            output::error(format_args!("the router failed and ends: {panic}"));
+            // Closing a session whose lock is poisoned would abort.
+            std::process::exit(1);
         }
         session.close().wait().map_err(anyhow::Error::from_boxed)?;
         Ok(Outcome::Done)

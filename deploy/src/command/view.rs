@@ -7,6 +7,7 @@ use std::sync::Arc;
 use crate::operate::status::{Phase, RunStatus};
 use crate::view::{LiveRun, serve_live, show_recorded, until_stopped};
 use bus::Endpoint;
+use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::RunId;
 use support::output;
 
@@ -45,11 +46,11 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         match self.shown()? {
             Shown::Recorded(path) => show_recorded(&path, self.page)?,
-            Shown::Live(name, router) => {
+            Shown::Live(name, router, protocol) => {
                 // On the machine of the run, the run has priority.
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let bus = viewer_bus(&name, &router, self.keys.as_deref())?;
-                let run = Arc::new(LiveRun::start(bus)?);
+                let run = Arc::new(LiveRun::start(bus, protocol)?);
                 until_stopped(self.page, |address| serve_live(address, run))?;
             }
         }
@@ -61,14 +62,14 @@ impl Arguments {
 enum Shown {
     /// A run folder or a recording.
     Recorded(PathBuf),
-    /// A run that goes on, and its router.
-    Live(RunId, Endpoint),
+    /// A run that goes on, its router, and its evaluation protocol if that is known.
+    Live(RunId, Endpoint, Option<EvaluationProtocol>),
 }
 
 impl Arguments {
     fn shown(&self) -> anyhow::Result<Shown> {
         if let (Some(name), Some(router)) = (&self.name, &self.connect) {
-            return Ok(Shown::Live(name.clone(), router.clone()));
+            return Ok(Shown::Live(name.clone(), router.clone(), None));
         }
         if let Some(file) = self.run.as_ref().filter(|path| path.is_file()) {
             return Ok(Shown::Recorded(file.clone()));
@@ -79,10 +80,11 @@ impl Arguments {
                 phase: Phase::Running,
                 run,
                 endpoint,
+                protocol,
                 ..
             }) => {
                 output::note(format_args!("run {run} goes on at {endpoint}"));
-                Ok(Shown::Live(run.parse()?, endpoint.parse()?))
+                Ok(Shown::Live(run.parse()?, endpoint.parse()?, protocol))
             }
             // Without a status it may still hold a recording.
             _ => Ok(Shown::Recorded(folder)),

@@ -6,6 +6,7 @@ pub mod keys;
 pub mod network;
 pub mod progress;
 pub mod remote_status;
+pub mod router_panic;
 pub mod run_folder;
 pub mod security;
 pub mod status;

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::NeighbourState;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
@@ -35,6 +36,9 @@ pub struct RunStatus {
     pub written_unix_ms: u64,
     /// Time since its start, seconds.
     pub seconds: f64,
+    /// Evaluation protocol of the run.
+    #[serde(default)]
+    pub protocol: Option<EvaluationProtocol>,
     /// Number of results of the ego so far: the answered ticks.
     pub frames: u64,
     /// Number of ticks that the replay has published so far.
@@ -305,6 +309,7 @@ pub(crate) struct StatusWriter {
     path: PathBuf,
     run: String,
     endpoint: String,
+    protocol: Option<EvaluationProtocol>,
     began: Instant,
     written: Option<Instant>,
     /// A full disk is reported once.
@@ -319,9 +324,19 @@ impl StatusWriter {
             path: folder.join(FILE),
             run: run.to_owned(),
             endpoint: endpoint.to_owned(),
+            protocol: None,
             began: Instant::now(),
             written: None,
             has_warned: false,
+        }
+    }
+
+    /// The same, with the protocol of the run.
+    #[must_use]
+    pub(crate) fn with_protocol(self, protocol: EvaluationProtocol) -> Self {
+        Self {
+            protocol: Some(protocol),
+            ..self
         }
     }
 
@@ -348,6 +363,7 @@ impl StatusWriter {
             endpoint: self.endpoint.clone(),
             written_unix_ms: unix_ms(),
             seconds: now.duration_since(self.began).as_secs_f64(),
+            protocol: self.protocol.clone(),
             frames: progress.frames,
             ticks: progress.ticks,
             rate_hz: progress.rate_hz(),

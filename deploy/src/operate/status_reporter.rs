@@ -5,12 +5,14 @@ use std::time::{Duration, Instant};
 
 use bus::Endpoint;
 use bus::shutdown::Stop;
+use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::RunId;
 
 use crate::operate::REPLAY;
 use crate::operate::failures::Failures;
 use crate::operate::health::Health;
 use crate::operate::progress::Display;
+use crate::operate::router_panic;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
@@ -26,6 +28,8 @@ pub enum Ending {
     Over,
     /// The user ended the run.
     Asked,
+    /// The router inside this process panicked: no message passes any more.
+    RouterFailed,
     /// A process crashed and is not restarted.
     Failed {
         /// Name of the process.
@@ -43,15 +47,22 @@ pub struct StatusReporter {
 }
 
 impl StatusReporter {
-    /// For a run with these timeouts and its router at `endpoint`.
+    /// For a run with these timeouts and its router at `endpoint`, judged by `protocol`.
     #[must_use]
-    pub fn new(timeouts: &Timeouts, run: &RunId, endpoint: &Endpoint, folder: &RunFolder) -> Self {
+    pub fn new(
+        timeouts: &Timeouts,
+        run: &RunId,
+        endpoint: &Endpoint,
+        folder: &RunFolder,
+        protocol: EvaluationProtocol,
+    ) -> Self {
         let [hang, start] =
             [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
         Self {
             health: Health::new(hang, start),
             failures: Failures::default(),
-            status: StatusWriter::new(folder.path(), run.as_str(), endpoint.as_str()),
+            status: StatusWriter::new(folder.path(), run.as_str(), endpoint.as_str())
+                .with_protocol(protocol),
         }
     }
 
@@ -98,6 +109,9 @@ impl StatusReporter {
         display: &mut Display,
     ) -> Ending {
         loop {
+            if router_panic::first().is_some() {
+                return Ending::RouterFailed;
+            }
             if stop.requested() {
                 display.print_line("ending");
                 return Ending::Asked;

@@ -1,6 +1,7 @@
 //! Scorer process on the bus: receives truth, detections, poses and the ledgers of all processes, and keeps the scores.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::mem;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -241,6 +242,26 @@ impl ScorerNode {
     /// When the scorer's own thread has panicked.
     #[must_use]
     pub fn finish(self) -> Scored {
+        let (scored, node) = self.scored();
+        drop((node.subscriptions, node.presence, node.offline));
+        if let Err(overdue) = node.bus.leave(LEAVE_LIMIT) {
+            tracing::warn!("{overdue}");
+        }
+        scored
+    }
+
+    /// [`Self::finish`] of a session that no longer answers: it is left as it is until the process ends.
+    ///
+    /// # Panics
+    /// As [`Self::finish`].
+    #[must_use]
+    pub fn abandon(self) -> Scored {
+        let (scored, node) = self.scored();
+        mem::forget(node);
+        scored
+    }
+
+    fn scored(self) -> (Scored, Connected) {
         self.inbox.close();
         let (board, stats, unwritten) = self
             .thread
@@ -265,21 +286,32 @@ impl ScorerNode {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .clone();
-        drop((self._subscriptions, self._presence, self.offline));
-        if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
-            tracing::warn!("{overdue}");
-        }
         // The scorer receives its own reports like those of others; its current counters are newer.
         let others = stats
             .into_values()
             .filter(|stats| stats.process != own.process);
-        Scored {
+        let scored = Scored {
             board,
             stats: others.chain([own.clone()]).collect(),
             progress,
             unwritten,
-        }
+        };
+        let node = Connected {
+            bus: self.bus,
+            offline: self.offline,
+            subscriptions: self._subscriptions,
+            presence: self._presence,
+        };
+        (scored, node)
     }
+}
+
+/// What a scorer holds of its session.
+struct Connected {
+    bus: Bus,
+    offline: OfflineIntervals,
+    subscriptions: Vec<Subscription>,
+    presence: LivelinessToken,
 }
 
 /// Id of the scorer in place of a vehicle's.

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use dataset::average_precision::Verdict;
+use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{
     Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload,
     Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
@@ -77,10 +78,14 @@ struct Arrival {
 }
 
 impl FrameAssembler {
-    /// An assembler that knows in which area each vehicle detects.
-    pub(crate) fn with_areas(areas: BTreeMap<CavId, DetectionArea>) -> Self {
+    /// An assembler that knows the protocol of the run and in which area each vehicle detects.
+    pub(crate) fn new(
+        protocol: Option<EvaluationProtocol>,
+        areas: BTreeMap<CavId, DetectionArea>,
+    ) -> Self {
         Self {
             areas,
+            judge: Judge::new(protocol),
             ..Self::default()
         }
     }
@@ -93,6 +98,7 @@ impl FrameAssembler {
             ledgers,
             egos,
             ego,
+            judge: self.judge.renewed(),
             ..Self::default()
         }
     }
@@ -168,6 +174,7 @@ impl FrameAssembler {
             pace,
             area,
             ap_50,
+            protocol: self.judge.protocol().to_owned(),
             egos: self.egos.iter().cloned().collect(),
             ..shown
         })
@@ -349,6 +356,7 @@ impl OpenFrame {
             egos: Vec::new(),
             area: None,
             ap_50: None,
+            protocol: String::new(),
             processes: ledgers
                 .iter()
                 .map(|(process, (_, stages))| Process {

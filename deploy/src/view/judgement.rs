@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer, Verdict};
+use dataset::evaluation_protocol::{ApOrder, EvaluationProtocol};
 use dataset::ground_truth::GroundTruthRule;
 use protocol::{BevGrid, Detections, Truth};
 use serde::Serialize;
@@ -57,20 +58,50 @@ impl Judgement {
     }
 }
 
-/// Judge of the frames of a run: objects of OPV2V's protocol within the area count.
+/// Judge of the frames of a run: objects of its protocol within the area count.
 pub(super) struct Judge {
     scorer: Scorer,
+    protocol: Option<EvaluationProtocol>,
 }
 
 impl Default for Judge {
     fn default() -> Self {
-        Self {
-            scorer: Scorer::new(&[IOU]),
-        }
+        Self::new(None)
     }
 }
 
 impl Judge {
+    /// A judge by the protocol of a run; `None`: by that of OPV2V.
+    pub(super) fn new(protocol: Option<EvaluationProtocol>) -> Self {
+        Self {
+            scorer: Scorer::new(&[IOU]),
+            protocol,
+        }
+    }
+
+    /// Another judge by the same protocol.
+    pub(super) fn renewed(&self) -> Self {
+        Self::new(self.protocol.clone())
+    }
+
+    /// Name of the protocol.
+    pub(super) fn protocol(&self) -> &str {
+        { self.protocol.as_ref() }.map_or("opv2v", |protocol| &protocol.name)
+    }
+
+    fn rule(&self, area: &DetectionArea) -> GroundTruthRule {
+        let ([x0, x1], [y0, y1]) = (area.x_m, area.y_m);
+        let area_m = [x0, y0, f64::NEG_INFINITY, x1, y1, f64::INFINITY];
+        match &self.protocol {
+            Some(protocol) => protocol.rule_within(area_m),
+            None => GroundTruthRule {
+                x_m: area.x_m,
+                y_m: area.y_m,
+                ..GroundTruthRule::OPV2V
+            },
+        }
+    }
+
     /// Judges a frame and adds it to those before.
     pub(super) fn judge(
         &mut self,
@@ -78,12 +109,7 @@ impl Judge {
         truth: &Truth,
         area: &DetectionArea,
     ) -> Judgement {
-        let rule = GroundTruthRule {
-            x_m: area.x_m,
-            y_m: area.y_m,
-            ..GroundTruthRule::OPV2V
-        };
-        let objects = ground_truth(truth, &result.ego, &rule);
+        let objects = ground_truth(truth, &result.ego, &self.rule(area));
         // The scorer has one threshold.
         let verdicts = self.scorer.add(&result.detections, &objects);
         let verdicts = verdicts.into_iter().next().unwrap_or_default();
@@ -105,7 +131,13 @@ impl Judge {
     /// Average precision of the frames so far; `None` without an object.
     pub(super) fn average_precision(&self) -> Option<f64> {
         let tally = self.scorer.tallies().first()?;
-        (tally.objects > 0).then(|| tally.curve(Ordering::Global).average_precision)
+        let order =
+            { self.protocol.as_ref() }.map_or(ApOrder::Global, |protocol| protocol.ap_order);
+        let ordering = match order {
+            ApOrder::Global => Ordering::Global,
+            ApOrder::Frame => Ordering::Frame,
+        };
+        (tally.objects > 0).then(|| tally.curve(ordering).average_precision)
     }
 }
 
@@ -194,5 +226,13 @@ mod tests {
         assert_eq!(judgement.counts(&result, 0.2), [2, 1, 0]);
         assert_eq!(judgement.counts(&result, 0.5), [1, 1, 1]);
         assert!(judge.average_precision().unwrap() > 0.8);
+
+        let mut protocol = EvaluationProtocol::preset("v2v4real").unwrap();
+        protocol.ground_truth.x_m = [-15.0, 15.0];
+        let mut judge = Judge::new(Some(protocol));
+        assert_eq!(judge.protocol(), "v2v4real");
+        let judgement = judge.judge(&result, &truth, &DetectionArea::from(&grid));
+        assert_eq!(judgement.found, BTreeMap::from([(1, Some(0.9))]));
+        assert_eq!(judgement.verdicts[2], ignored, "beyond the range");
     }
 }

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
+use dataset::evaluation_protocol::EvaluationProtocol;
 use futures_util::{Stream as Pieces, stream};
 use protocol::{
     Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, ProcessId, RunId, Stats, Stream, Topic,
@@ -93,11 +94,11 @@ struct RunActivity {
 }
 
 impl LiveRun {
-    /// Starts the thread that follows the run of `bus`.
+    /// Starts the thread that follows the run of `bus`, which is judged by `protocol`.
     ///
     /// # Errors
     /// [`BusError`] when the system gives no thread.
-    pub fn start(bus: Bus) -> Result<Self, BusError> {
+    pub fn start(bus: Bus, protocol: Option<EvaluationProtocol>) -> Result<Self, BusError> {
         let run = bus.identity().run.clone();
         let newest = Arc::<NewestFrames>::default();
         let ending = Arc::<AtomicBool>::default();
@@ -111,7 +112,7 @@ impl LiveRun {
             run: run.clone(),
             newest: Arc::clone(&newest),
             ending: Arc::clone(&ending),
-            assembly: FrameAssembler::default(),
+            assembly: FrameAssembler::new(protocol, BTreeMap::new()),
             others: BTreeMap::new(),
             activity: Arc::clone(&activity),
             images: Arc::clone(&images),

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use bytes::Bytes;
+use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{
     Camera, CavId, Descriptor, Detections, ImageFormat, Limits, Payload, PoseEstimate, Stream,
     Topic, Truth, wire,
@@ -18,6 +19,7 @@ use super::link_series::{LinkSeries, LinkTraffic};
 use super::pace_counter::PaceCounter;
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
+use crate::operate::status::RunStatus;
 
 /// Reason why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
@@ -28,9 +30,17 @@ pub enum ViewError {
     /// The recording cannot be read.
     #[error(transparent)]
     Recording(#[from] RecordingError),
+    /// No message of the recording can be read.
+    #[error("{}: none of its messages can be read: it is of another version of this program", .0.display())]
+    OtherVersion(PathBuf),
     /// Neither truth nor detections in the recording.
     #[error("{}: no truth and no detections in it", .0.display())]
     Empty(PathBuf),
+}
+
+/// Protocol of the run in a folder.
+fn protocol_of(folder: &Path) -> Option<EvaluationProtocol> {
+    RunStatus::read(folder).ok()?.protocol
 }
 
 /// Score from which detections are shown and counted at first.
@@ -48,6 +58,8 @@ pub struct RecordedRun {
     /// Entries with the reports of all processes.
     stats: Vec<usize>,
     areas: BTreeMap<CavId, DetectionArea>,
+    /// Protocol of the run, if its folder says it.
+    protocol: Option<EvaluationProtocol>,
 }
 
 /// One scene frame: its messages in the recording.
@@ -105,6 +117,9 @@ impl RecordedRun {
         for damage in recording.damage() {
             tracing::warn!("{}: {damage}", file.display());
         }
+        if recording.entries().is_empty() {
+            return Err(ViewError::OtherVersion(file));
+        }
         let name = recording
             .entries()
             .first()
@@ -147,6 +162,7 @@ impl RecordedRun {
             swept,
             stats,
             areas,
+            protocol: { file.parent() }.and_then(protocol_of),
         };
         run.moments = moments
             .into_iter()
@@ -203,8 +219,8 @@ impl RecordedRun {
         let (Some(moment), Some(timeline)) = (self.moments.get(index), self.shown(ego)) else {
             return Ok(None);
         };
-        let mut assembly =
-            FrameAssembler::with_areas(self.areas.clone()).for_ego(timeline.ego.clone());
+        let mut assembly = FrameAssembler::new(self.protocol.clone(), self.areas.clone())
+            .for_ego(timeline.ego.clone());
         let until = moment
             .entries
             .iter()
@@ -369,7 +385,7 @@ impl RecordedRun {
             .as_ref()
             .map(|ego| LinkSeries::new(self.recording.entries(), ego))
             .unwrap_or_default();
-        let (mut pace, mut judge) = (PaceCounter::default(), Judge::default());
+        let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
         let mut summaries = Vec::with_capacity(self.moments.len());
         for moment in &self.moments {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;

@@ -56,6 +56,8 @@ pub struct SceneFrame {
     pub area: Option<DetectionArea>,
     /// Average precision at an IoU of 0.5 of the frames until this one: live of those shown, recorded of the whole run.
     pub ap_50: Option<f64>,
+    /// Name of the evaluation protocol whose objects count.
+    pub protocol: String,
     /// Durations of the stages of each process.
     pub processes: Vec<Process>,
     /// Messages of all processes so far, by topic and receiver.

@@ -20,7 +20,9 @@ use super::server::serve_recorded;
 /// When the recording cannot be read, or the address cannot be listened at.
 pub fn show_recorded(recording: &Path, listen: SocketAddr) -> anyhow::Result<()> {
     let run = RecordedRun::open(recording).map_err(|error| match error {
-        ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput::of(error)),
+        ViewError::NotRecorded(_) | ViewError::OtherVersion(_) | ViewError::Empty(_) => {
+            anyhow::Error::from(BadInput::of(error))
+        }
         ViewError::Recording(_) => anyhow::Error::from(error),
     })?;
     output::note(format_args!("{} moments of run {}", run.len(), run.name()));

@@ -352,6 +352,50 @@ fn a_recorded_run_is_shown_in_any_order() {
 }
 
 #[test]
+fn a_recording_with_nothing_to_show_says_why() {
+    let all = messages(0, 0, Stream::Lidar);
+    let of_another_version: Vec<_> = { all.iter().cloned() }
+        .map(|(topic, mut payload)| {
+            // The version follows the four bytes that begin every message.
+            payload[4] ^= 1;
+            (topic, payload)
+        })
+        .collect();
+    let is_sweep = |topic: &Topic| {
+        matches!(
+            topic,
+            Topic::Stream {
+                stream: Stream::Lidar,
+                ..
+            }
+        )
+    };
+    let sweeps: Vec<_> = { all.into_iter() }
+        .filter(|(topic, _)| is_sweep(topic))
+        .collect();
+    let run = RunId::new("test").unwrap();
+    for (recorded, reason) in [
+        (
+            of_another_version,
+            "none of its messages can be read: it is of another version of this program",
+        ),
+        (sweeps, "no truth and no detections in it"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("run.mcap");
+        let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
+        for (topic, payload) in recorded {
+            writer.write(&topic.in_run(&run), 0, &payload).unwrap();
+        }
+        writer.finish().unwrap();
+        let Err(error) = RecordedRun::open(&file) else {
+            panic!("it is shown, and not: {reason}");
+        };
+        assert_eq!(error.to_string(), format!("{}: {reason}", file.display()));
+    }
+}
+
+#[test]
 fn every_ego_of_a_recorded_run_is_shown_with_its_own_results() {
     let folder = tempfile::tempdir().unwrap();
     let run = record(folder.path(), true);
@@ -555,10 +599,10 @@ fn publish(bus: Bus, ending: &AtomicBool, has_second_ego: bool) {
 fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
     let traffic = Traffic::start(false);
     let run = Arc::new(
-        LiveRun::start(join(
-            &BusOptions::client(traffic.endpoint.clone()),
-            "viewer",
-        ))
+        LiveRun::start(
+            join(&BusOptions::client(traffic.endpoint.clone()), "viewer"),
+            None,
+        )
         .unwrap(),
     );
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
@@ -612,10 +656,10 @@ fn a_live_run_is_shown_and_a_slow_page_delays_no_other() {
 fn another_ego_and_a_feature_map_of_a_live_run_are_shown_on_request() {
     let traffic = Traffic::start(true);
     let run = Arc::new(
-        LiveRun::start(join(
-            &BusOptions::client(traffic.endpoint.clone()),
-            "viewer",
-        ))
+        LiveRun::start(
+            join(&BusOptions::client(traffic.endpoint.clone()), "viewer"),
+            None,
+        )
         .unwrap(),
     );
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();

@@ -5,7 +5,7 @@
 
 use std::f64::consts::TAU;
 
-use dataset::{LoadOptions, ReadError, Scenario};
+use dataset::{LeftOut, LoadOptions, Scenario};
 use perception::detector::Detector;
 use perception::weights::{METHOD_KEY, Weights};
 use protocol::{PointCloud, Pose};
@@ -26,9 +26,6 @@ pub enum AlignmentMeterError {
     /// The weights are not usable, or the network reported an error.
     #[error(transparent)]
     Ego(#[from] EgoError),
-    /// A frame cannot be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
     /// The fusion has no alignment to measure.
     #[error("the fusion of these weights has no alignment of its own")]
     NoAlignment,
@@ -87,22 +84,24 @@ impl AlignmentMeter {
     }
 
     /// Measures on every `every`-th tick of scenarios, the first vehicle being the ego; the same directions for the
-    /// same seed.
+    /// same seed. Frames that cannot be read are added to `left_out`.
     ///
     /// # Errors
-    /// [`AlignmentMeterError`] at the first frame that cannot be read, and when the fusion has no alignment of its own.
+    /// [`AlignmentMeterError`] at the first frame that cannot be computed, and when the fusion has no alignment of its
+    /// own.
     pub fn measure(
         &mut self,
         scenarios: &[Scenario],
         every: usize,
         offsets: &[Offset],
         seed: u64,
+        left_out: &mut LeftOut,
     ) -> Result<Vec<AlignmentError>, AlignmentMeterError> {
         let mut errors: Vec<Vec<[[f64; 2]; 2]>> = offsets.iter().map(|_| Vec::new()).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         for scenario in scenarios {
             for tick in (0..scenario.ticks.len()).step_by(every.max(1)) {
-                for pair in self.pairs(scenario, tick)? {
+                for pair in self.pairs(scenario, tick, left_out)? {
                     for (offset, errors) in offsets.iter().zip(&mut errors) {
                         errors.push(self.around(&pair, offset, &mut rng)?);
                     }
@@ -121,15 +120,20 @@ impl AlignmentMeter {
         &mut self,
         scenario: &Scenario,
         tick: usize,
+        left_out: &mut LeftOut,
     ) -> Result<Vec<Pair>, AlignmentMeterError> {
-        let ego = scenario.load(0, tick, &LoadOptions::default())?;
+        let agents = scenario.present_agents(tick);
+        let loaded = scenario.load_tick(tick, agents, &LoadOptions::default());
+        left_out.add_tick(&loaded);
+        let [(0, ego), others @ ..] = &loaded.frames[..] else {
+            return Ok(Vec::new());
+        };
         let Some(world_from_ego) = ego.world_from_lidar else {
             return Ok(Vec::new());
         };
         let own = self.map(&ego.points)?;
         let mut pairs = Vec::new();
-        for agent in scenario.present_agents(tick).skip(1) {
-            let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+        for (_, frame) in others {
             let Some(world_from_cav) = frame.world_from_lidar else {
                 continue;
             };

@@ -1,10 +1,12 @@
 //! Exit of a program: printed errors, and the exit codes 0 to 3 and 130.
 
 use std::error::Error;
-use std::fmt::{Debug, Display};
-use std::io::{self, ErrorKind};
+use std::fmt::{self, Debug, Display};
+use std::io;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
+use crate::file_error::NoSpace;
 use crate::output;
 
 /// Error of usage or input, not of the program: exit code 2.
@@ -21,6 +23,17 @@ impl BadInput {
     /// An error from a message.
     pub fn new(message: impl Display + Debug + Send + Sync + 'static) -> Self {
         Self(anyhow::Error::msg(message))
+    }
+}
+
+/// Context of an error of writing: the place that cannot be written. No input causes it: exit code 1, also below
+/// [`BadInput`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NotWritten(pub PathBuf);
+
+impl Display for NotWritten {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} cannot be written", self.0.display())
     }
 }
 
@@ -80,7 +93,7 @@ pub fn exit_code(
             output::error(chain_of(&error));
             let is_bad =
                 |cause: &(dyn Error + 'static)| cause.is::<BadInput>() || is_bad_input(cause);
-            if error.chain().any(is_bad) && !error.chain().any(is_no_space) {
+            if error.chain().any(is_bad) && !is_of_writing(&error) {
                 ExitCode::from(2)
             } else {
                 ExitCode::FAILURE
@@ -89,16 +102,18 @@ pub fn exit_code(
     }
 }
 
-/// True for a full disk or quota, which no input causes, whatever could not be written.
+/// True for a place that cannot be written, and for a full disk or quota, which no input causes.
+fn is_of_writing(error: &anyhow::Error) -> bool {
+    let is_within = |cause: &(dyn Error + 'static)| match cause.downcast_ref() {
+        Some(BadInput(inner)) => is_of_writing(inner),
+        None => is_no_space(cause),
+    };
+    error.is::<NotWritten>() || error.chain().any(is_within)
+}
+
 fn is_no_space(cause: &(dyn Error + 'static)) -> bool {
-    if let Some(BadInput(inner)) = cause.downcast_ref() {
-        return inner.chain().any(is_no_space);
-    }
-    let kind = cause.downcast_ref::<io::Error>().map(io::Error::kind);
-    matches!(
-        kind,
-        Some(ErrorKind::StorageFull | ErrorKind::QuotaExceeded)
-    )
+    let of_system = cause.downcast_ref::<io::Error>();
+    cause.is::<NoSpace>() || of_system.is_some_and(|error| NoSpace::of(error).is_some())
 }
 
 /// The chain of causes on one line, without causes that the message above them quotes already.
@@ -115,9 +130,13 @@ fn chain_of(error: &anyhow::Error) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::io::ErrorKind;
+    use std::path::Path;
+
     use anyhow::Context;
 
     use super::*;
+    use crate::file_error::AtFile;
 
     fn code_of(result: anyhow::Result<Outcome>) -> ExitCode {
         exit_code(result, |cause| cause.is::<std::num::ParseIntError>())
@@ -155,9 +174,14 @@ mod tests {
     #[test]
     fn a_full_disk_is_no_bad_input_wherever_it_is_found() {
         let full = || anyhow::Error::from(io::Error::from(ErrorKind::StorageFull));
+        let refused = || anyhow::Error::from(io::Error::from(ErrorKind::NotFound));
+        let of_file =
+            Err::<(), _>(io::Error::from(ErrorKind::StorageFull)).at(Path::new("out/maps"));
         for error in [
             BadInput::of(full()).into(),
             anyhow::Error::from(BadInput::of(full().context("out/frames.csv"))).context("max"),
+            BadInput::of(of_file.unwrap_err()).into(),
+            BadInput::of(refused().context(NotWritten("out".into())).context("max")).into(),
         ] {
             assert_eq!(code_of(Err(error)), ExitCode::from(1));
         }

@@ -1,7 +1,9 @@
 //! File error: the path of a file and what is wrong with it.
 
+use std::any::Any;
 use std::error::Error;
 use std::fmt::{self, Display};
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 /// A file that cannot be read, written or used.
@@ -13,6 +15,21 @@ pub struct FileError {
     pub line: Option<u64>,
     /// Entry that is wrong, the value found and the values allowed; or the error of the system.
     pub problem: String,
+    /// Set where the disk is full, which no input causes.
+    pub no_space: Option<NoSpace>,
+}
+
+/// The disk or the quota is full: the cause of an error that is not one of the input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("No space left")]
+pub struct NoSpace;
+
+impl NoSpace {
+    /// The cause, if `error` is one of the system and says so.
+    pub fn of(error: &(dyn Any + 'static)) -> Option<Self> {
+        let kind = error.downcast_ref::<io::Error>()?.kind();
+        matches!(kind, ErrorKind::StorageFull | ErrorKind::QuotaExceeded).then_some(Self)
+    }
 }
 
 impl FileError {
@@ -22,6 +39,7 @@ impl FileError {
             path: path.into(),
             line: None,
             problem: problem.to_string(),
+            no_space: None,
         }
     }
 
@@ -44,7 +62,12 @@ impl Display for FileError {
     }
 }
 
-impl Error for FileError {}
+impl Error for FileError {
+    fn source(&self) -> Option<&(dyn Error + 'static)> {
+        let no_space = self.no_space.as_ref()?;
+        Some(no_space)
+    }
+}
 
 /// Results whose error gets the path of its file.
 pub trait AtFile<T> {
@@ -55,9 +78,12 @@ pub trait AtFile<T> {
     fn at(self, path: &Path) -> Result<T, FileError>;
 }
 
-impl<T, E: Display> AtFile<T> for Result<T, E> {
+impl<T, E: Display + 'static> AtFile<T> for Result<T, E> {
     fn at(self, path: &Path) -> Result<T, FileError> {
-        self.map_err(|error| FileError::new(path, error))
+        self.map_err(|error| FileError {
+            no_space: NoSpace::of(&error),
+            ..FileError::new(path, error)
+        })
     }
 }
 
@@ -69,6 +95,11 @@ mod tests {
     fn an_error_begins_with_its_file() {
         let error = "x".parse::<u8>().at(Path::new("a/b.csv")).unwrap_err();
         assert_eq!(error.to_string(), "a/b.csv: invalid digit found in string");
+        let full: io::Result<()> = Err(ErrorKind::StorageFull.into());
+        assert_eq!(
+            full.at(Path::new("a.csv")).unwrap_err().no_space,
+            Some(NoSpace)
+        );
         let error = FileError::in_line("a.csv", 3, "x is 7, must be 0");
         assert_eq!(error.to_string(), "a.csv:3: x is 7, must be 0");
     }

@@ -90,7 +90,7 @@ pub use error::ReadError;
 pub use generated_map::GeneratedMap;
 pub use layouts::{LAYOUTS, Layout, LayoutRow, layouts_text};
 pub use left_out::LeftOut;
-pub use listing::content_sha256;
+pub use listing::{content_sha256, provenance};
 pub use open::{OpenOptions, open, open_with};
 pub use points::{
     IntensityOption, IntensityScale, IntensityScaleError, LiveIntensities, Plausibility,

@@ -1,14 +1,40 @@
 //! Fingerprint of a data set: SHA-256 over its listing and the whole contents of its files.
 
 use std::collections::BTreeSet;
+use std::io;
 use std::path::PathBuf;
 
 use protocol::text::hex;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
+use support::provenance::Provenance;
 
 use super::Scenario;
+
+/// Provenance of a result that this program computes from `scenarios` and `files`; `commit` is that of its checkout.
+///
+/// # Errors
+/// The first file that cannot be read, by name.
+pub fn provenance<'a>(
+    scenarios: impl IntoIterator<Item = &'a Scenario>,
+    files: impl IntoIterator<Item = PathBuf>,
+    commit: &str,
+) -> io::Result<Provenance> {
+    let digests = FileDigests::default();
+    let files_sha256 = { files.into_iter() }
+        .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
+        .collect::<io::Result<_>>()?;
+    let provenance = Provenance {
+        version: env!("CARGO_PKG_VERSION").into(),
+        commit: commit.into(),
+        program_sha256: digests.program_sha256()?,
+        data_sha256: content_sha256(scenarios, None, &digests),
+        files_sha256,
+        ..Provenance::default()
+    };
+    Ok(provenance.with_command())
+}
 
 /// SHA-256 over the listing of scenarios (names, agents, capture times) and the whole content of every file that their
 /// frames are read from, in hexadecimal digits: independent of the path of the data set.

@@ -304,4 +304,4 @@ fn check_whole_points(len: usize, point: usize) -> Result<(), String> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

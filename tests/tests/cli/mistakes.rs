@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 22] = [
+const OF_AN_EVALUATION: [Row; 23] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -51,6 +51,7 @@ const OF_AN_EVALUATION: [Row; 22] = [
     ("--latency-ms -3", 2, "latency is -3"),
     ("--link nolink", 2, "neither a preset of a link"),
     ("--frames 0", 2, "0 is not in 1"),
+    ("--frames 1 --out /proc/none", 1, "cannot be written"),
     ("--frames -1", 2, "-1"),
     ("--map x", 2, "--map"),
     ("--method late --dtype f16", 2, "late sends none"),
@@ -197,7 +198,11 @@ const MISTAKES: [Row; 35] = [
         2,
         "--validation",
     ),
-    ("ego-fuser eval --dataset {s} --weights {w}", 2, "directory"),
+    (
+        "ego-fuser eval --dataset {s} --weights {w}",
+        2,
+        "a folder, must be one",
+    ),
     (
         "ego-fuser train --dataset {s} --method max --noise-share 0.5 --steps 1 --out {d}/new",
         2,

@@ -2,6 +2,7 @@
 
 mod damaged_inputs;
 mod failed_parts;
+mod poisoned_router;
 mod processes;
 mod receivers;
 mod shared_memory;

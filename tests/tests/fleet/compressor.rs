@@ -1,7 +1,6 @@
 //! Learnt compressor between vehicles: its code is transmitted, and the ego detects what it would from the compressor's
 //! output.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -14,20 +13,17 @@ use dataset::{self, LoadOptions};
 use ego_fuser::ego::{Content, Ego, View};
 use ego_fuser::node as ego_node;
 use fusion::Method;
-use fusion::model::CooperativeModel;
 use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
-use perception::model_config::DetectorConfig;
-use perception::weights::{self, Precision};
 use protocol::message::Bev;
 use protocol::{
     CavId, DecodedFeatures, Detection, Detections, DropReason, HEADER_LEN, Ledger, Limits, Stream,
     Topic,
 };
 use sim_replay::stream::{Replay, StreamOptions};
-use tch::{Device, Kind, Tensor, no_grad};
+use tch::Device;
 use tests::bus::{TIMEOUT, TestRouter, ego_options};
-use tests::scene;
+use tests::{networks, scene};
 
 const AGENTS: [&str; 2] = ["10", "20"];
 const TICKS: usize = 4;
@@ -45,37 +41,8 @@ fn topic(name: &str, stream: Stream) -> Topic {
     }
 }
 
-/// A weights file of a network that detects vehicles everywhere, the same in everything but its compressor.
 fn weights_file(folder: &Path, compress_ratio: Option<i64>) -> PathBuf {
-    let lidar_range_m = [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0];
-    let config = DetectorConfig {
-        lidar_range_m,
-        compress_ratio,
-        ..DetectorConfig::lean()
-    };
-    let fusion = Method::MAX.default_fusion(&config);
-    let model = CooperativeModel::with_fusion(&config, Method::MAX, &fusion, Device::Cpu).unwrap();
-    for (name, mut variable) in model.variables.variables() {
-        // Values from the shape only.
-        let count = variable.numel() as i64;
-        let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7)
-            .sin()
-            .view(variable.size().as_slice());
-        let new = match name.as_str() {
-            "cls_head.bias" => wave * 0.1 + 0.3,
-            "cls_head.weight" => wave * 0.01,
-            "reg_head.weight" | "reg_head.bias" => wave * 0.0,
-            _ if variable.dim() > 1 => {
-                wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt())
-            }
-            _ => continue,
-        };
-        no_grad(|| variable.copy_(&new));
-    }
-    let path = folder.join(format!("{}.safetensors", compress_ratio.unwrap_or(0)));
-    let about: BTreeMap<String, String> = model.about();
-    weights::save(&path, &model.variables, &about, Precision::Single).unwrap();
-    path
+    networks::write(folder, Method::MAX, compress_ratio)
 }
 
 fn agent(name: &str, weights: &Path) -> Agent {
@@ -86,11 +53,15 @@ fn agent(name: &str, weights: &Path) -> Agent {
     )
 }
 
+fn ego(weights: &Path) -> Ego {
+    Ego::load(weights, None, Device::Cpu).unwrap()
+}
+
 /// Without any network: boxes of every tick, and the bytes of a neighbour's feature map.
 fn offline(folder: &Path, weights: &Path) -> (Vec<Vec<Detection>>, u64) {
     let scenario = dataset::open(folder).unwrap().scenarios.remove(0);
     let mut agents = AGENTS.map(|name| agent(name, weights));
-    let mut ego = Ego::load(weights, None, Device::Cpu).unwrap();
+    let mut ego = ego(weights);
     let (mut results, mut bytes) = (Vec::new(), 0);
     for tick in 0..scenario.ticks.len() {
         let views: Vec<View> = (agents.iter_mut().enumerate())
@@ -143,7 +114,7 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
                 bus.leave(TIMEOUT).unwrap();
             });
         }
-        let (own_stop, ego) = (stop.clone(), Ego::load(weights, None, Device::Cpu).unwrap());
+        let (own_stop, ego) = (stop.clone(), ego(weights));
         let router = &router;
         let ego = scope.spawn(move || {
             let bus = router.join("ego-10", "10");

@@ -1,8 +1,8 @@
 //! Fleet through real zenoh sessions: replay, agents and ego in one process, each with a session of its own.
 
 use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
 use std::thread::{Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
@@ -19,8 +19,6 @@ use fusion::Exchange;
 use fusion::Method;
 use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
-use perception::model_config::DetectorConfig;
-use perception::pillars::point_pillars::PointPillars;
 use protocol::message::{Descriptor, ModelHash, SweepArrival};
 use protocol::{
     Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason,
@@ -30,10 +28,8 @@ use recording::{Recording, RecordingOptions};
 use sim_replay::recorder::{self, RecordReport, RecorderOptions};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
-use tch::nn::VarStore;
 use tests::bus::{TIMEOUT, TestRouter, ego_options, next_event};
-use tests::locks::random_generator_lock;
-use tests::scene;
+use tests::{networks, scene};
 use zenoh::Wait;
 
 const AGENTS: [&str; 3] = ["10", "20", "30"];
@@ -50,41 +46,25 @@ pub(super) fn topic(cav_id: &str, stream: Stream) -> Topic {
     }
 }
 
-/// Builds a network with the same random parameters every time.
-fn seeded<T>(build: impl FnOnce() -> T) -> T {
-    // The seed is that of the whole process: no other test may draw between it and the last parameter.
-    let _generator = random_generator_lock();
-    tch::manual_seed(5);
-    build()
+/// Weights of a method, the same every time.
+fn weights(method: Method) -> PathBuf {
+    static WRITING: Mutex<()> = Mutex::new(());
+    let _writing = WRITING.lock();
+    networks::write(Path::new(env!("CARGO_TARGET_TMPDIR")), method, None)
 }
 
-/// A network with a head that detects vehicles everywhere.
-fn network() -> Detector {
-    let config = DetectorConfig {
-        lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0],
-        ..DetectorConfig::lean()
-    };
-    let network = VarStore::new(Device::Cpu);
-    let pillars = PointPillars::new(&network.root(), &config).unwrap();
-    let _ = tch::no_grad(|| {
-        network.variables()["cls_head.bias"]
-            .shallow_clone()
-            .fill_(0.3)
-    });
-    Detector::from_network(pillars)
+fn detector(method: Method) -> Detector {
+    tch::set_num_threads(1);
+    Detector::load(&weights(method), Device::Cpu).unwrap()
 }
 
-fn detector() -> Detector {
-    seeded(network)
-}
-
-/// An ego around the same network, its fusion with the same random parameters every time.
 pub(super) fn ego(method: Method) -> Ego {
-    seeded(|| Ego::new(network(), method).unwrap())
+    tch::set_num_threads(1);
+    Ego::load(&weights(method), None, Device::Cpu).unwrap()
 }
 
-pub(super) fn agent(cav_id: &str) -> Agent {
-    Agent::new(cav(cav_id), Box::new(RecordedPose), detector())
+pub(super) fn agent(cav_id: &str, method: Method) -> Agent {
+    Agent::new(cav(cav_id), Box::new(RecordedPose), detector(method))
 }
 
 fn published(method: Method) -> Stream {
@@ -100,7 +80,7 @@ fn run_agent<'scope>(
     scope: &'scope Scope<'scope, '_>,
     router: &'scope TestRouter,
     cav_id: &'static str,
-    stream: Stream,
+    method: Method,
     rate: RateConfig,
     stop: &Stop,
 ) -> ScopedJoinHandle<'scope, Ledger> {
@@ -108,11 +88,11 @@ fn run_agent<'scope>(
     scope.spawn(move || {
         let bus = router.join(&format!("agent-{cav_id}"), cav_id);
         let options = agent_node::NodeOptions {
-            publish: vec![stream],
+            publish: vec![published(method)],
             rate,
             ..agent_node::NodeOptions::default()
         };
-        let report = agent_node::run(&bus, agent(cav_id), &options, &stop).unwrap();
+        let report = agent_node::run(&bus, agent(cav_id, method), &options, &stop).unwrap();
         assert_eq!(report.failed, 0);
         leave(bus)
     })
@@ -215,7 +195,7 @@ fn play_and_record(
             } else {
                 rate
             };
-            run_agent(scope, &router, cav_id, stream, rate, &stop)
+            run_agent(scope, &router, cav_id, method, rate, &stop)
         };
         let agents: Vec<_> = taking_part(method).iter().map(start).collect();
         let ego = scope.spawn(|| {
@@ -335,7 +315,7 @@ fn a_recorded_run_replayed_gives_the_same_detections() {
 
 /// The same pipelines without any network.
 fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>)> {
-    let mut agents: Vec<Agent> = AGENTS.iter().map(|cav_id| agent(cav_id)).collect();
+    let mut agents: Vec<Agent> = AGENTS.iter().map(|cav_id| agent(cav_id, method)).collect();
     let mut ego = ego(method);
     let mut results = Vec::new();
     for (tick_index, tick) in scenario.ticks.iter().enumerate() {
@@ -423,7 +403,7 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_ledgers_balance() {
 fn maps_within_a_limit_are_fused_and_counted_with_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
-    let values: i64 = detector().map_shape().iter().product();
+    let values: i64 = detector(Method::MAX).map_shape().iter().product();
     // Half of the bytes of the feature map at a byte per value.
     let limit = values as u64 / 2;
     let rate = RateConfig {
@@ -482,7 +462,7 @@ impl ScriptedAgent {
         Self {
             bus,
             publisher,
-            agent: agent(AGENTS[index]),
+            agent: agent(AGENTS[index], Method::MAX),
             index,
             ahead_nanos: 0,
             _presence: presence,
@@ -558,9 +538,9 @@ impl ScriptedAgent {
 /// Descriptor of an agent that runs the ego's network.
 fn own_descriptor() -> Descriptor {
     Descriptor {
-        model_hash: detector().model_hash(),
-        grid: detector().grid(),
-        channels: u32::try_from(detector().map_shape()[0]).unwrap(),
+        model_hash: detector(Method::MAX).model_hash(),
+        grid: detector(Method::MAX).grid(),
+        channels: u32::try_from(detector(Method::MAX).map_shape()[0]).unwrap(),
         dtype: protocol::Dtype::F32,
         streams: vec![Stream::Bev],
         sweeps: vec![],
@@ -832,7 +812,7 @@ fn an_agent_receives_its_own_sensors_only_and_reports_a_missing_pose() {
             scope,
             &router,
             "20",
-            Stream::Bev,
+            Method::MAX,
             RateConfig::default(),
             &stop,
         );

@@ -96,9 +96,13 @@ fn an_agent_serves_the_faster_of_two_egos_and_forgets_those_that_leave() {
     std::thread::scope(|scope| {
         let own_stop = stop.clone();
         let running = scope.spawn(move || {
-            let report =
-                agent_node::run(&agent_bus, agent("10"), &NodeOptions::default(), &own_stop)
-                    .unwrap();
+            let report = agent_node::run(
+                &agent_bus,
+                agent("10", Method::MAX),
+                &NodeOptions::default(),
+                &own_stop,
+            )
+            .unwrap();
             agent_bus.leave(TIMEOUT).unwrap();
             report
         });

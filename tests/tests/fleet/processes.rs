@@ -8,7 +8,9 @@ use protocol::{Stream, Topic};
 use recording::Recording;
 use runner::scenario::Scenario;
 use serde_json::Value;
-use tests::fleet::{TIMEOUT, Up, fused, is_running, programs, results, signal, write_scenario};
+use tests::fleet::{
+    TIMEOUT, Up, check_origin, fused, is_running, programs, results, signal, write_scenario,
+};
 use tests::locks::exclusive_lock;
 
 fn json(path: &std::path::Path) -> Value {
@@ -47,6 +49,7 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     // An f32 feature map of 8 channels on 64 x 64 cells, and a little more.
     let payload = metrics["comm"]["payload_bytes_mean"].as_f64().unwrap();
     assert!((131_072.0..140_000.0).contains(&payload), "{payload}");
+    check_origin(run, &folder.path().join("weights.safetensors"));
 
     let results = results(run);
     assert_eq!(results.len(), 6);

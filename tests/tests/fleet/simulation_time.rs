@@ -5,6 +5,9 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
+use dataset::evaluation_protocol::EvaluationProtocol;
+use dataset::ground_truth::{GroundTruth, GroundTruthRule};
+use deploy::score::FrameScores;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::ego_loop::LoopOptions;
 use ego_fuser::pairing::PairingConfig;
@@ -16,7 +19,7 @@ use protocol::{CodecConfig, DropReason, Dtype};
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use serde_json::Value;
-use tests::fleet::{programs, results, write_scenario, write_sighted_weights};
+use tests::fleet::{check_origin, programs, results, write_scenario, write_sighted_weights};
 use tests::locks::exclusive_lock;
 
 const TICKS: usize = 8;
@@ -50,27 +53,30 @@ fn evaluate(
     folder: &Path,
     stepped: Option<SteppedConfig>,
 ) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
-    evaluate_with(
-        folder,
-        stepped,
-        CodecConfig {
+    evaluate_with(folder, stepped, in_half_precision())
+}
+
+/// Settings with feature maps in half precision.
+fn in_half_precision() -> EvaluateConfig {
+    EvaluateConfig {
+        codec: CodecConfig {
             dtype: Dtype::F16,
             ..CodecConfig::default()
         },
-    )
+        ..EvaluateConfig::default()
+    }
 }
 
 fn evaluate_with(
     folder: &Path,
     stepped: Option<SteppedConfig>,
-    codec: CodecConfig,
+    settings: EvaluateConfig,
 ) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
     tch::set_num_threads(1);
     let config = EvaluateConfig {
         weights: folder.join("weights.safetensors"),
         method: Some(Method::MAX),
-        codec,
-        ..EvaluateConfig::default()
+        ..settings
     };
     let mut evaluator = Evaluator::new(config).unwrap();
     if let Some(stepped) = stepped {
@@ -137,13 +143,11 @@ fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
 #[test]
 fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
     let folder = scene();
-    let codec = CodecConfig {
-        dtype: Dtype::F16,
-        budget_bytes: Some(4000),
-        ..CodecConfig::default()
-    };
-    let (offline, _) = evaluate_with(folder.path(), None, codec);
-    let (stepped, _) = evaluate_with(folder.path(), Some(config(LinkConfig::default())), codec);
+    let mut settings = in_half_precision();
+    settings.codec.budget_bytes = Some(4000);
+    let (offline, _) = evaluate_with(folder.path(), None, settings.clone());
+    let ideal = config(LinkConfig::default());
+    let (stepped, _) = evaluate_with(folder.path(), Some(ideal), settings);
     assert_eq!(offline.len(), TICKS);
     for (offline, stepped) in offline.iter().zip(&stepped) {
         // A complete feature map has 65 kB.
@@ -157,6 +161,95 @@ fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
         assert!(!offline.result.detections.is_empty());
         assert_eq!(offline.result.detections, stepped.result.detections);
     }
+}
+
+/// A range of the ground truth that is narrower than the area of the network.
+const NARROW: GroundTruthRule = GroundTruthRule {
+    x_m: [-20.0, 20.0],
+    y_m: [-10.0, 10.0],
+    ..GroundTruthRule::OPV2V
+};
+
+/// Turns the cars of the scene by 90 degrees, the heading of all boxes that the sighted weights detect.
+fn turn_cars(folder: &Path) {
+    for agent in fs::read_dir(folder.join("scene")).unwrap() {
+        for file in fs::read_dir(agent.unwrap().path()).unwrap() {
+            let path = file.unwrap().path();
+            if path.extension().is_some_and(|name| name == "yaml") {
+                let text = fs::read_to_string(&path).unwrap();
+                let turned = text.replace("angle: [0.0, 0.0, 0.0]", "angle: [0.0, 90.0, 0.0]");
+                fs::write(&path, turned).unwrap();
+            }
+        }
+    }
+}
+
+/// Scores of the frames, each with a ground truth.
+fn judged(
+    frames: &[EvaluatedFrame],
+    truth_of: impl Fn(&EvaluatedFrame) -> GroundTruth,
+) -> FrameScores {
+    let mut scores = FrameScores::new(frames[0].result.ego.clone(), NARROW, 1);
+    for frame in frames {
+        let at = (frame.tick as u64, frame.stamp.capture_nanos);
+        let (result, truth) = (frame.result.clone(), truth_of(frame));
+        scores.judge_whole(at, None, Some(result), &truth, &[], Vec::new());
+    }
+    scores
+}
+
+/// AP at an IoU of 0.3: in both orders, and of each distance and class.
+fn all_at_30(scores: &FrameScores) -> Vec<f64> {
+    let (by_score, by_frame) = scores.average_precision();
+    let [by_distance, by_class] = scores.average_precision_by_part();
+    let parts = by_distance.values().chain(by_class.values());
+    [by_score, by_frame]
+        .into_iter()
+        .chain(parts.map(|part| part.ap))
+        .map(|ap| ap.at_30.unwrap())
+        .collect()
+}
+
+#[test]
+fn detections_beyond_the_range_of_the_protocol_count_neither_way_with_and_without_a_link() {
+    let folder = scene();
+    turn_cars(folder.path());
+    let protocol = EvaluationProtocol {
+        ground_truth: NARROW,
+        ..EvaluationProtocol::preset("opv2v").unwrap()
+    };
+    let settings = EvaluateConfig {
+        protocol: Some(protocol),
+        ..in_half_precision()
+    };
+    let (offline, _) = evaluate_with(folder.path(), None, settings.clone());
+    let ideal = config(LinkConfig::default());
+    let (stepped, _) = evaluate_with(folder.path(), Some(ideal), settings);
+    assert_eq!((offline.len(), stepped.len()), (TICKS, TICKS));
+    let [without_link, over_link] =
+        [&offline, &stepped].map(|frames| judged(frames, |frame| frame.truth.clone()));
+    assert_eq!(
+        without_link.average_precision(),
+        over_link.average_precision()
+    );
+    assert_eq!(
+        without_link.average_precision_by_part(),
+        over_link.average_precision_by_part()
+    );
+    // The same objects, and detections of the whole area of the network.
+    let of_whole_area = judged(&offline, |frame| GroundTruth {
+        area_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX],
+        ..frame.truth.clone()
+    });
+    let (cut, whole) = (all_at_30(&without_link), all_at_30(&of_whole_area));
+    assert!(
+        cut.len() == 4 && whole.len() == 4 && whole.iter().all(|ap| *ap > 0.0),
+        "one bin of distance and one class: {cut:?}, {whole:?}"
+    );
+    assert!(
+        cut.iter().zip(&whole).all(|(cut, whole)| cut > whole),
+        "{cut:?}, {whole:?}"
+    );
 }
 
 #[test]
@@ -397,6 +490,10 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
         run_up(folder.path(), &scenario, "two"),
     );
     assert_same_bytes(&one, &two);
+    check_origin(
+        one.folder.path(),
+        &folder.path().join("weights.safetensors"),
+    );
     assert!(
         one.balance.is_exact()
             && one.metrics.clock == "stepped"

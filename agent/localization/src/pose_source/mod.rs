@@ -213,10 +213,11 @@ impl NoisyPoseConfig {
                 "absent",
                 "must name the table of errors (--noise-table)",
             )),
-            (mode, Some(table)) if mode != NoiseMode::Replayed => Err(FieldError::new(
-                "noisy.table",
-                table.display(),
-                "must be left out unless mode is replayed",
+            (mode, Some(_)) if mode != NoiseMode::Replayed => Err(FieldError::new(
+                "noisy.mode",
+                { clap::ValueEnum::to_possible_value(&mode) }
+                    .map_or(String::new(), |mode| mode.get_name().into()),
+                "must be replayed where a table of errors is given (noisy.table, --noise-table)",
             )),
             _ => Ok(()),
         }

@@ -31,6 +31,7 @@ use perception::int8::InferencePrecision;
 use perception::weights::annotate;
 use protocol::config::Section;
 use serde_json::json;
+use support::provenance::Provenance;
 use support::{output, progress};
 
 use super::scene_heads::{SceneHeadFile, by_head, with_files};
@@ -209,19 +210,24 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     let tracked = args.tracked.then(|| LocalizationSummary::of(&tracked));
-    match (&tracked, args.json) {
-        (Some(tracked), true) => output::line(serde_json::to_string_pretty(
-            &json!({ "pgc": summary, "tracked": tracked }),
-        )?)?,
-        (None, true) => output::line(serde_json::to_string_pretty(&summary)?)?,
-        (Some(tracked), false) => {
+    match &tracked {
+        _ if args.json => {
+            let mut document = match &tracked {
+                Some(tracked) => json!({ "pgc": summary, "tracked": tracked }),
+                None => json!(summary),
+            };
+            let heads = groups.iter().map(|(head, _)| *head);
+            document["provenance"] = json!(args.provenance(heads)?);
+            output::line(serde_json::to_string_pretty(&document)?)?;
+        }
+        Some(tracked) => {
             output::text(format!(
                 "every sweep by itself\n{}\ntracked\n{}",
                 table(&summary),
                 table(tracked)
             ))?;
         }
-        (None, false) => output::text(table(&summary))?,
+        None => output::text(table(&summary))?,
     }
     Ok(left_out.print())
 }
@@ -241,6 +247,28 @@ impl Args {
         let map = read_map(&self.icp_map, spacing_m, &config).map_err(BadInput::of)?;
         let source = IcpMapPose::new(Arc::new(map), config);
         Ok(Subject::Source(Box::new(source)))
+    }
+
+    /// Command, and digests of the program, the networks and all data that are read.
+    fn provenance<'a>(&self, heads: impl Iterator<Item = &'a Path>) -> anyhow::Result<Provenance> {
+        let mut scenarios = Vec::new();
+        for folder in self
+            .dataset
+            .iter()
+            .chain(&self.retrieval)
+            .chain(&self.icp_map)
+        {
+            scenarios.extend(dataset::open(folder)?.scenarios);
+        }
+        let mut files: Vec<PathBuf> = self.baseline.iter().cloned().collect();
+        for head in heads.filter(|_| self.uses_head()) {
+            files.extend([self.encoder(head)?, head.to_owned()]);
+        }
+        Ok(dataset::provenance(
+            &scenarios,
+            files,
+            env!("V2VLOC_COMMIT"),
+        )?)
     }
 
     /// True unless another method takes the place of the head.

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
+use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, Scenario, findings};
 use indicatif::ProgressBar;
 use localization::pgc::head_files::encoder_or_named;
 use localization::pgc::wrong_place::wrong_place_hint;
@@ -69,6 +69,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
     let mut left_out = LeftOut::default();
+    left_out.add_findings(findings::sampled(&scenarios, IntensityScale::AUTO));
     for (scenario, head) in scenarios.iter().zip(heads) {
         found += args.localize(scenario, head, &mut left_out, &bar)?;
     }

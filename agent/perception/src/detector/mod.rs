@@ -19,7 +19,7 @@ pub use error::DetectorError;
 pub use output::{Encoded, Heads, check_values};
 
 use encoder::BevEncoder;
-use output::flat;
+use output::{check_boxes, flat};
 
 use crate::boxes::anchors::Anchors;
 use crate::boxes::decode::{Decoded, decode};
@@ -384,7 +384,8 @@ impl Detector {
     /// Boxes above a score, in the frame of the feature map's vehicle, not yet suppressed.
     ///
     /// # Errors
-    /// [`DetectorError::Decode`] if the heads are of another detector.
+    /// [`DetectorError::Decode`] if the heads are of another detector, [`DetectorError::Values`] if a box is larger or
+    /// farther away than a message may say.
     pub fn boxes(
         &self,
         heads: &Heads,
@@ -396,6 +397,7 @@ impl Detector {
             &self.anchors,
             score_threshold,
         )?;
+        check_boxes(&boxes)?;
         if self.config.y_axis == YAxis::Right {
             for found in &mut boxes {
                 found.box3d = found.box3d.mirrored_y();
@@ -548,6 +550,41 @@ mod tests {
         let mut again =
             Detector::from_weights(&weights, &weights.config().unwrap(), Device::Cpu).unwrap();
         assert!(again.encode(&cloud).unwrap().features.equal(&expected));
+    }
+
+    /// Scales of the activations of a sweep, halved so many times.
+    fn scales_of(detector: &mut Detector, cloud: &PointCloud, halvings: i64) -> ActivationScales {
+        let mut search = ScaleSearch::default();
+        detector.observe(cloud, &mut search).unwrap();
+        let mut scales = serde_json::to_value(search.scales()).unwrap();
+        for quantisation in scales.as_object_mut().unwrap().values_mut() {
+            let exponent = quantisation["scale"].as_i64().unwrap();
+            quantisation["scale"] = (exponent - halvings).into();
+        }
+        serde_json::from_value(scales).unwrap()
+    }
+
+    #[test]
+    fn a_sweep_that_far_too_small_scales_clamp_is_an_error_of_its_frame() {
+        let encoded = |halvings| {
+            let (_store, pillars) = network();
+            let mut detector = Detector::from_network(pillars);
+            let scales = scales_of(&mut detector, &cloud(), halvings);
+            let mut quantised = detector.quantised(&scales).unwrap();
+            assert!(quantised.is_quantised());
+            quantised.encode_sweep(&cloud())
+        };
+        assert!(encoded(0).is_ok());
+        let error = encoded(10).unwrap_err();
+        assert!(
+            matches!(error, DetectorError::Saturated { level: 0 }) && error.is_of_frame(),
+            "{error:?}"
+        );
+        let message = error.to_string();
+        assert!(
+            message.contains("level 0 of the backbone exceed 8 bits"),
+            "{message}"
+        );
     }
 
     #[test]

@@ -5,6 +5,7 @@ use tch::{TchError, Tensor};
 
 use super::backbone_level::BackboneLevel;
 use super::error::DetectorError;
+use crate::boxes::decode::Decoded;
 use crate::layers::head::HeadOutput;
 
 /// Output of the encoder for one sweep.
@@ -79,9 +80,62 @@ pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorE
     }
 }
 
+/// Largest size of a box in a message, metres.
+const MAX_SIZE_M: f64 = 1e3;
+
+/// Farthest centre of a box along an axis, metres: beyond any area of a detector.
+const MAX_CENTRE_M: f64 = 1e4;
+
+/// Checks that decoded boxes are boxes of vehicles near the detector, however large its offsets are.
+///
+/// # Errors
+/// [`DetectorError::Values`] with the first value that is not.
+pub(super) fn check_boxes(boxes: &[Decoded]) -> Result<(), DetectorError> {
+    let all = boxes.iter().flat_map(|Decoded { box3d, .. }| {
+        let size = ("a detected box (size, metres)", box3d.size_m, MAX_SIZE_M);
+        let centre = (
+            "a detected box (centre, metres)",
+            box3d.center_m,
+            MAX_CENTRE_M,
+        );
+        [size, centre]
+    });
+    for (what, values, limit) in all {
+        if let Some(&value) = values.iter().find(|value| value.abs() > limit) {
+            return Err(DetectorError::Values { what, value, limit });
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
+    use protocol::Box3d;
+
     use super::*;
+
+    #[test]
+    fn boxes_that_no_vehicle_has_are_an_error() {
+        let decoded = |center_m, size_m| Decoded {
+            anchor: 0,
+            score: 0.9,
+            box3d: Box3d {
+                center_m,
+                size_m,
+                heading_rad: 0.0,
+            },
+        };
+        let bus = decoded([140.0, -39.0, -1.0], [18.0, 2.5, 3.0]);
+        assert!(check_boxes(&[bus]).is_ok());
+        for wrong in [
+            decoded([1.0, 2.0, -1.0], [4.0, 11_000.0, 1.5]),
+            decoded([1.0, -3e5, -1.0], [4.0, 2.0, 1.5]),
+        ] {
+            let error = check_boxes(&[bus, wrong]).unwrap_err();
+            assert!(error.is_of_frame(), "{error}");
+            assert!(error.to_string().starts_with("a detected box"), "{error}");
+        }
+    }
 
     #[test]
     fn values_that_are_not_valid_are_stated_in_either_memory_order() {

@@ -66,6 +66,9 @@ impl Weights {
     /// # Errors
     /// [`FileError`] when the file is missing, truncated, or holds values that are no parameters.
     pub fn load(path: &Path) -> Result<Self, FileError> {
+        if path.is_dir() {
+            return Err(FileError::new(path, "a folder, must be one weights file"));
+        }
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
         let (_, header) = SafeTensors::read_metadata(&bytes)
             .map_err(|error| incomplete(path, bytes.len(), error))?;

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
@@ -12,6 +13,7 @@ use deploy::score::metrics::{self, Metrics};
 use ego_fuser_offline::evaluation::EvaluatedFrame;
 use fusion::Method;
 use support::atomic_file;
+use support::cli::NotWritten;
 
 use crate::experiment::cell::file_name;
 use crate::frame_lines::FrameLines;
@@ -35,7 +37,7 @@ impl FrameFiles {
         let lines = fs::create_dir_all(out)
             .and_then(|()| fs::create_dir(&folder))
             .and_then(|()| FrameLines::create(&folder))
-            .with_context(|| folder.display().to_string())?;
+            .map_err(|error| writing(error, &folder))?;
         Ok(Self {
             folder,
             lines,
@@ -61,6 +63,16 @@ impl FrameFiles {
             .and_then(|()| atomic_file::write(&folder.join("frames.csv"), frames))
             .and_then(|()| atomic_file::write(&folder.join("precision_recall.csv"), curve))
             .with_context(|| folder.display().to_string())
+    }
+}
+
+/// The error of creating a folder: one that exists is the user's choice, any other is not.
+fn writing(error: io::Error, folder: &Path) -> anyhow::Error {
+    match error.kind() {
+        io::ErrorKind::AlreadyExists => {
+            anyhow::Error::from(error).context(folder.display().to_string())
+        }
+        _ => anyhow::Error::from(error).context(NotWritten(folder.into())),
     }
 }
 

@@ -91,6 +91,15 @@ pub fn run_notes(result: &RunResult) -> String {
         count => format!("{count} accounts do not add up, see ledger.json"),
     };
     let _ = writeln!(text, "ledger    {verdict}");
+    let unreceived: u64 = { result.balance.unreceived.iter() }
+        .map(|topic| topic.messages)
+        .sum();
+    if unreceived > 0 {
+        let _ = writeln!(
+            text,
+            "nobody    receives {unreceived} of them, see ledger.json"
+        );
+    }
     if result.missed > 0 {
         let _ = writeln!(text, "missed    {} ticks without a result", result.missed);
     }

@@ -50,6 +50,17 @@ pub enum RunError {
     /// A run in simulation time cannot be computed.
     #[error(transparent)]
     Evaluate(Box<EvaluateError>),
+    /// The router of the run panicked.
+    #[error(
+        "the router of the run failed, and no message passed any more: {panic} (results until then: {})",
+        folder.display()
+    )]
+    Router {
+        /// Its panic.
+        panic: String,
+        /// Folder of the run.
+        folder: PathBuf,
+    },
     /// A process stays down.
     #[error("{process} {how} (log: {})", log.display())]
     Process {

@@ -1,6 +1,7 @@
 //! One run from beginning to end: plan, start, watch, end, score, write.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::mem;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
@@ -11,6 +12,7 @@ use bus::{Endpoint, MetricsPeer, Rejection};
 use dataset::findings;
 use deploy::operate::network::{Network, RouterEndpoint};
 use deploy::operate::progress::Display;
+use deploy::operate::router_panic;
 use deploy::operate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
 use deploy::operate::security::RefusalWatch;
 use deploy::operate::status::Phase;
@@ -136,6 +138,7 @@ fn go(
 ) -> Result<RunResult, RunError> {
     let stop = Stop::new();
     stop.on_signals().map_err(RunError::Signals)?;
+    router_panic::watch(&stop);
     // Before anything else of the run takes the cores.
     let capacity = announce_capacity(fleet, &options.programs);
     let fingerprint = fingerprint(fleet, &options.programs);
@@ -168,12 +171,21 @@ fn go(
         scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
     }
     let watched = watch(fleet, &context, specs, &place.endpoint, &scorer, &stop);
-    // Before the scorer closes the session.
-    let refused = refused.finish();
-    let scored = scorer.finish();
-    if let Err(overdue) = place.close() {
-        tracing::warn!("{overdue}");
-    }
+    let has_router =
+        !{ watched.as_ref() }.is_ok_and(|watched| matches!(watched.ending, Ending::RouterFailed));
+    let (scored, refused) = if has_router {
+        // Before the scorer closes the session.
+        let refused = refused.finish();
+        let scored = scorer.finish();
+        if let Err(overdue) = place.close() {
+            tracing::warn!("{overdue}");
+        }
+        (scored, refused)
+    } else {
+        // A poisoned session cannot be closed: the process would abort, and the results with it.
+        mem::forget((place, refused));
+        (scorer.abandon(), BTreeMap::new())
+    };
     let watched = watched?;
 
     let result = write(
@@ -186,6 +198,10 @@ fn go(
     );
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
+        Ending::RouterFailed => Err(RunError::Router {
+            panic: router_panic::first().unwrap_or_default().into(),
+            folder: result.folder.path().to_owned(),
+        }),
         Ending::Failed { process, how } => {
             let log = result.folder.log_dir().join(format!("{process}.log"));
             Err(RunError::Process { process, how, log })
@@ -263,7 +279,13 @@ fn watch(
         folder.log_dir().display()
     ));
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
-    let mut watch = StatusReporter::new(&fleet.scenario.timeouts, run, endpoint, folder);
+    let mut watch = StatusReporter::new(
+        &fleet.scenario.timeouts,
+        run,
+        endpoint,
+        folder,
+        fleet.applied_protocol(),
+    );
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
     let crashed = watch.fallen();
@@ -314,6 +336,11 @@ impl Limits {
             Ending::Asked => Self {
                 replay: after(timeouts.stop_s * REPLAY_SHARE),
                 drain: after(timeouts.stop_s * DRAIN_SHARE),
+                all: after(timeouts.stop_s),
+            },
+            Ending::RouterFailed => Self {
+                replay: now,
+                drain: now,
                 all: after(timeouts.stop_s),
             },
             Ending::Failed { .. } => Self {

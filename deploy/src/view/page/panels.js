@@ -13,6 +13,7 @@ function facts(frame) {
   $("answered").textContent = `${answered}/${ticks}${share}${rate === null ? "" : `, ${number(rate, 1)} Hz`}`;
   const counts = judged();
   $("judged").textContent = counts ? `${counts.hits} / ${counts.wrong} / ${counts.missed}` : "–";
+  $("precision").title = `Objects that count: protocol ${frame.protocol}`;
   $("precision").textContent = isKnown(frame.ap_50) ? number(100 * frame.ap_50, 1) + " %" : "–";
   const { of, age } = results();
   const skipped = !frame.ego;

@@ -2,7 +2,6 @@
 
 use std::fmt;
 
-use dataset::ReadError;
 use dataset::frame::Frame;
 use localization::pose_source::PoseSourceError;
 use nalgebra::Isometry3;
@@ -118,9 +117,6 @@ pub enum AlignError {
     /// A pose source cannot be set up.
     #[error(transparent)]
     PoseSource(#[from] PoseSourceError),
-    /// A frame cannot be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
     /// A message cannot be encoded.
     #[error(transparent)]
     Wire(#[from] WireError),

@@ -9,11 +9,11 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::{Context, Result};
 use bus::config_file;
 use clap::ValueEnum;
-use dataset::Scenario;
+use dataset::{LeftOut, Scenario};
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use ego_fuser_offline::evaluation::alignment::table::{Row, Tally, markdown};
-use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
+use ego_fuser_offline::evaluation::alignment::{self, BoxSource, PairOutcome};
 use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
 use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
@@ -23,8 +23,8 @@ use support::file_error::AtFile;
 use support::{output, progress};
 use tch::Device;
 
-use super::DataSets;
-use support::cli::BadInput;
+use super::{DataSets, print_left_out};
+use support::cli::{BadInput, Outcome};
 
 /// Compares methods to align the ego and a neighbour: time per pair, transmitted bytes, success.
 ///
@@ -124,16 +124,17 @@ impl FromStr for NamedSource {
 
 impl Arguments {
     /// Compares, and prints the table.
-    pub(crate) fn run(self) -> Result<()> {
+    pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = self.data.scenarios()?;
+        let mut left_out = LeftOut::default();
+        let scenarios = self.data.scenarios(&mut left_out)?;
         let mut rows = Vec::new();
         for (number, &boxes) in self.boxes.iter().enumerate() {
             let mut methods = self.methods()?;
             // What exchanges no boxes is compared once.
             methods.retain(|method| number == 0 || method.needs_boxes);
             let mut source = self.box_source(boxes, &methods)?;
-            let found = self.compare(&methods, &mut source, &scenarios)?;
+            let found = self.compare(&methods, &mut source, &scenarios, &mut left_out)?;
             for (mut row, method) in found.into_iter().zip(&methods) {
                 if self.boxes.len() > 1 && method.needs_boxes {
                     row.method += &format!(", {}", boxes.adjective());
@@ -146,7 +147,7 @@ impl Arguments {
         } else {
             output::text(markdown(&rows))?;
         }
-        Ok(())
+        Ok(print_left_out(&left_out))
     }
 
     fn methods(&self) -> Result<Vec<AlignmentSpec>> {
@@ -206,6 +207,7 @@ impl Arguments {
         methods: &[AlignmentSpec],
         boxes: &mut BoxSource,
         scenarios: &[Scenario],
+        left_out: &mut LeftOut,
     ) -> Result<Vec<Row>> {
         let bar = progress::bar(scenarios.len(), "scenes");
         let mut tallies = vec![Tally::default(); methods.len()];
@@ -213,9 +215,9 @@ impl Arguments {
             let ticks = (0..scenario.ticks.len())
                 .step_by(self.every as usize)
                 .take(self.frames.unwrap_or(usize::MAX));
-            alignment::run(methods, boxes, scenario, ticks, &mut |outcome| {
-                tallies[outcome.method].add(&outcome)
-            })?;
+            let mut add = |outcome: PairOutcome| tallies[outcome.method].add(&outcome);
+            let lost = alignment::run(methods, boxes, scenario, ticks, &mut add)?;
+            left_out.merge(&lost);
             bar.inc(1);
         }
         bar.finish_and_clear();

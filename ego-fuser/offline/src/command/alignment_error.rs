@@ -3,13 +3,14 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
+use dataset::LeftOut;
 use ego_fuser_offline::alignment_error::{AlignmentError, AlignmentMeter, Offset};
 use perception::weights::Weights;
 use support::output;
 use support::text_table::{Side, TextTable};
 
-use super::DataSets;
-use support::cli::BadInput;
+use super::{DataSets, print_left_out};
+use support::cli::{BadInput, Outcome};
 
 /// Add offsets to the true poses of neighbours and measure the part that the method's own alignment corrects.
 #[derive(Debug, clap::Args)]
@@ -38,7 +39,7 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     /// Measures and prints a line per offset.
-    pub(crate) fn run(self) -> Result<()> {
+    pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(1);
         let is_sensible = |value: &f64| (0.0..=100.0).contains(value);
         if !self.shifts_m.iter().chain(&self.turns_deg).all(is_sensible) {
@@ -55,14 +56,15 @@ impl Arguments {
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
         let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
         let mut meter = AlignmentMeter::load(&weights).map_err(BadInput::of)?;
-        let scenarios = self.data.scenarios()?;
-        let found = meter.measure(&scenarios, self.every, &offsets, self.seed)?;
+        let mut left_out = LeftOut::default();
+        let scenarios = self.data.scenarios(&mut left_out)?;
+        let found = meter.measure(&scenarios, self.every, &offsets, self.seed, &mut left_out)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&found)?)?;
-            return Ok(());
+        } else {
+            output::text(table(&found))?;
         }
-        output::text(table(&found))?;
-        Ok(())
+        Ok(print_left_out(&left_out))
     }
 }
 

@@ -1,16 +1,15 @@
 //! `ego-fuser eval`: AP of a method on recorded scenes.
 
-use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use super::DataSets;
+use super::{DataSets, print_left_out};
 use anyhow::Result;
 use dataset::average_precision::{Ordering, Scorer, THRESHOLDS};
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
-use dataset::{self, LeftOut, LoadOptions, Scenario, findings};
+use dataset::{self, LeftOut, LoadOptions, Scenario};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
@@ -18,7 +17,6 @@ use perception::int8::InferencePrecision;
 use perception::weights::{KIND_KEY, Weights};
 use serde_json::{Value, json};
 use support::cli::{BadInput, Outcome};
-use support::file_digests::FileDigests;
 use support::provenance::Provenance;
 use support::{output, progress};
 
@@ -87,24 +85,11 @@ impl Arguments {
     }
 }
 
-/// Prints the findings, and their counts where data are missing.
-fn print_left_out(left_out: &LeftOut) -> Outcome {
-    let outcome = left_out.print();
-    if outcome == Outcome::DataLost {
-        output::note(left_out);
-    }
-    outcome
-}
-
 impl Arguments {
     /// The data sets, each with the agents of its protocol.
     fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
         let mut all = Vec::with_capacity(self.data.data.len());
-        for folder in &self.data.data {
-            let opened = dataset::open_with(folder, &self.data.options()).map_err(BadInput::of)?;
-            left_out.add_files(&opened.problems);
-            let scale = self.data.intensity.scale;
-            left_out.add_findings(findings::sampled(&opened.scenarios, scale));
+        for opened in self.data.open(left_out)? {
             let protocol = self
                 .protocol
                 .resolve(opened.layout)
@@ -176,22 +161,14 @@ impl Arguments {
 
     /// Command, and digests of the program, the weights, the scripts and the evaluated data.
     fn provenance(&self, data: &[Data]) -> Result<Provenance> {
-        let digests = FileDigests::default();
         let scripts = self.method.iter().filter_map(|method| method.script_file());
-        let mut files_sha256 = BTreeMap::new();
-        for file in scripts.chain([self.weights.as_path()]) {
-            files_sha256.insert(file.to_owned(), digests.sha256(file)?);
-        }
+        let files = scripts.chain([self.weights.as_path()]).map(Path::to_owned);
         let scenarios = data.iter().flat_map(|data| &data.scenarios);
-        let provenance = Provenance {
-            version: env!("CARGO_PKG_VERSION").into(),
-            commit: "unknown".into(),
-            program_sha256: digests.program_sha256()?,
-            data_sha256: dataset::content_sha256(scenarios, None, &digests),
-            files_sha256,
-            ..Provenance::default()
-        };
-        Ok(provenance.with_command())
+        Ok(dataset::provenance(
+            scenarios,
+            files,
+            env!("V2VLOC_COMMIT"),
+        )?)
     }
 
     /// Prints rows with the protocol of each data set and the provenance, if JSON is asked for.

@@ -10,8 +10,9 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 use bus::malloc_settings;
-use dataset::{self, IntensityOption, OpenOptions, Scenario};
+use dataset::{self, Dataset, IntensityOption, LeftOut, OpenOptions, Scenario, findings};
 use support::cli::{BadInput, Outcome};
+use support::output;
 
 /// Subcommands of `ego-fuser` that read data sets.
 #[derive(Debug, clap::Subcommand)]
@@ -44,13 +45,12 @@ impl Command {
         malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
             .context("restarting with malloc settings")?;
         match self {
-            Self::Align(arguments) => arguments.run()?,
-            Self::Eval(arguments) => return arguments.run(),
-            Self::AlignmentError(arguments) => arguments.run()?,
-            Self::Quantise(arguments) => return arguments.run(),
-            Self::Train(arguments) => arguments.run()?,
+            Self::Align(arguments) => arguments.run(),
+            Self::Eval(arguments) => arguments.run(),
+            Self::AlignmentError(arguments) => arguments.run(),
+            Self::Quantise(arguments) => arguments.run(),
+            Self::Train(arguments) => arguments.run().map(|()| Outcome::Done),
         }
-        Ok(Outcome::Done)
     }
 }
 
@@ -63,12 +63,29 @@ impl DataSets {
         }
     }
 
-    fn scenarios(&self) -> Result<Vec<Scenario>, BadInput> {
-        let mut scenarios = Vec::new();
+    /// Each of them, with what is unused or implausible in it.
+    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Dataset>, BadInput> {
+        let mut all = Vec::with_capacity(self.data.len());
         for folder in &self.data {
             let opened = dataset::open_with(folder, &self.options()).map_err(BadInput::of)?;
-            scenarios.extend(opened.scenarios);
+            left_out.add_files(&opened.problems);
+            left_out.add_findings(findings::sampled(&opened.scenarios, self.intensity.scale));
+            all.push(opened);
         }
-        Ok(scenarios)
+        Ok(all)
     }
+
+    fn scenarios(&self, left_out: &mut LeftOut) -> Result<Vec<Scenario>, BadInput> {
+        let all = self.open(left_out)?;
+        Ok(all.into_iter().flat_map(|data| data.scenarios).collect())
+    }
+}
+
+/// Prints the findings, and their counts where data are missing.
+fn print_left_out(left_out: &LeftOut) -> Outcome {
+    let outcome = left_out.print();
+    if outcome == Outcome::DataLost {
+        output::note(left_out);
+    }
+    outcome
 }

@@ -30,15 +30,16 @@ impl Arguments {
     /// Searches, stores and prints a line per file.
     pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(1);
-        let scenarios = self.data.scenarios()?;
+        let mut unused = LeftOut::default();
+        let scenarios = self.data.scenarios(&mut unused)?;
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) || self.frames == 0 {
             let reason = "--dataset and --frames: no frame to search scales on";
             return Err(BadInput::new(reason).into());
         }
-        let mut left_out = LeftOut::default();
+        let mut left_out = unused.clone();
         for path in &self.weights {
             // The same sweeps for every file.
-            left_out = LeftOut::default();
+            left_out = unused.clone();
             let scales = search_scales(path, &scenarios, self.frames, &mut left_out)
                 .map_err(BadInput::of)?;
             if scales.is_empty() {

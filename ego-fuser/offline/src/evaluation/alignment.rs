@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use agent::agent::Agent;
 use dataset::class_set::ClassSet;
 use dataset::frame::Frame;
-use dataset::{LoadOptions, Scenario, ground_truth};
+use dataset::{LeftOut, LoadOptions, Scenario, ground_truth};
 use nalgebra::Isometry3;
 use protocol::message::Message;
 use protocol::{Box3d, HEADER_LEN, Stamp, wire};
@@ -58,29 +58,37 @@ impl AlignmentError {
     }
 }
 
-/// Compares methods on the ticks of a scenario in `ticks`; reports every pair when it is done.
+/// Compares methods on the ticks of a scenario in `ticks`; reports every pair when it is done. Returns the frames that
+/// cannot be read; without the ego's its tick is left out.
 ///
 /// # Errors
-/// [`AlignError`] at the first frame that cannot be read or has no true pose.
+/// [`AlignError`] at the first frame that has no true pose.
 pub fn run(
     specs: &[AlignmentSpec],
     box_source: &mut BoxSource,
     scenario: &Scenario,
     ticks: impl Iterator<Item = usize>,
     on_outcome: &mut dyn FnMut(PairOutcome),
-) -> Result<(), AlignError> {
+) -> Result<LeftOut, AlignError> {
+    let mut left_out = LeftOut::default();
     let mut methods: Vec<_> = specs.iter().map(AlignmentSpec::for_scene).collect();
     let needs_boxes = specs.iter().any(|spec| spec.needs_boxes);
     for tick in ticks {
-        let frames = (scenario.present_agents(tick))
-            .map(|agent| Ok(scenario.load(agent, tick, &LoadOptions::default())?))
-            .collect::<Result<Vec<Frame>, AlignError>>()?;
+        let agents = scenario.present_agents(tick);
+        let loaded = scenario.load_tick(tick, agents, &LoadOptions::default());
+        left_out.add_tick(&loaded);
+        if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+            continue;
+        }
+        let frames: Vec<Frame> = { loaded.frames.into_iter() }
+            .map(|(_, frame)| frame)
+            .collect();
         let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick)))
             .collect::<Result<Vec<_>, _>>()?;
         let boxes = needs_boxes.then_some(&mut *box_source);
         moment(&mut methods, boxes, &frames, &truth, on_outcome)?;
     }
-    Ok(())
+    Ok(left_out)
 }
 
 fn true_pose(

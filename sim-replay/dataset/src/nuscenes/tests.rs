@@ -1,12 +1,14 @@
 use std::fs;
 
 use proptest::prelude::*;
-use protocol::Pose;
+use protocol::{PointCloud, Pose};
 use serde_json::{Value, json};
 
 use super::*;
 use crate::LoadOptions;
 use crate::ground_truth::{GroundTruthRule, merge};
+use crate::pcd::{Encoding, IntensityField, encode};
+use crate::points::tests::turn;
 
 const RULE: GroundTruthRule = GroundTruthRule {
     x_m: [-32.0, 32.0],
@@ -121,6 +123,27 @@ impl DataSet {
             &format!("{}/{name}.json", self.version),
             rows.to_string().as_bytes(),
         );
+    }
+
+    /// The rows of a table that was written.
+    fn rows(&self, name: &str) -> Vec<Value> {
+        let path = self.dir.path().join(self.version);
+        let text = fs::read(path.join(format!("{name}.json"))).unwrap();
+        serde_json::from_slice(&text).unwrap()
+    }
+
+    /// Adds a third sample, 200 ms after the second, with a sweep of the second LiDAR in `file`.
+    fn add_sample(&self, file: &str) {
+        let mut samples = self.rows("sample");
+        samples
+            .push(json!({"token": "2", "scene_token": "scene", "timestamp": T0_MICROS + 400_000}));
+        self.table("sample", json!(samples));
+        let mut data = self.rows("sample_data");
+        data.push(json!({
+            "token": "third", "sample_token": "2", "ego_pose_token": "pose1_1", "is_key_frame": true,
+            "calibrated_sensor_token": "mount1", "filename": file, "timestamp": 0,
+        }));
+        self.table("sample_data", json!(data));
     }
 
     fn write(&self, name: &str, bytes: &[u8]) {
@@ -287,6 +310,72 @@ fn samples_are_ticks_with_poses_and_five_floats_per_point() {
     assert_eq!(frames[0].capture_nanos, 200_000_000);
 }
 
+/// The file of a sweep of vehicle 1.
+fn sweep_file(sample: usize) -> String {
+    format!("sweeps/LIDAR_TOP_id_1/scene_5_{sample:06}.pcd.bin")
+}
+
+#[test]
+fn sweeps_of_four_floats_per_point_are_read_as_such() {
+    let set = v2x_sim();
+    let four = turn(400, |index| vec![(index % 101) as f32 / 100.0]);
+    for sample in 0..2 {
+        set.write(&sweep_file(sample), &four);
+    }
+    let dataset = set.open();
+    let cloud = dataset.scenarios[0].load_points(0, 1, None).unwrap();
+    assert_eq!(
+        (cloud.form, cloud.points.len()),
+        ("4 floats per point: x y z intensity", 400)
+    );
+    assert_eq!(cloud.points.xyzi[50][3], 0.5);
+}
+
+#[test]
+fn sweeps_may_be_pcd_files() {
+    let set = v2x_sim();
+    let xyzi = vec![[4.0, 1.0, -1.0, 0.5], [6.0, -2.0, 0.5, 0.25]];
+    let cloud = PointCloud { xyzi };
+    let file = encode(&cloud, Encoding::Binary, IntensityField::Intensity);
+    let mut data = set.rows("sample_data");
+    for row in &mut data {
+        let name = row["filename"].as_str().map(str::to_owned);
+        if let Some(name) = name.as_deref().and_then(|name| name.strip_suffix(".bin")) {
+            set.write(name, &file);
+            row["filename"] = json!(name);
+        }
+    }
+    set.table("sample_data", json!(data));
+    let dataset = set.open();
+    assert!(dataset.problems.is_empty(), "{:?}", dataset.problems);
+    assert_eq!(dataset.scenarios[0].ticks[1].stem, "scene_5_000001");
+    for frame in load(&dataset.scenarios[0], 1) {
+        assert_eq!(frame.points, cloud, "{}", frame.cav);
+    }
+}
+
+#[test]
+fn a_sweep_of_four_floats_among_those_of_five_is_refused() {
+    let set = v2x_sim();
+    set.add_sample(&sweep_file(2));
+    let five = turn(400, |index| vec![0.5, (index % 32) as f32]);
+    let four = turn(400, |_| vec![0.5]);
+    for (sample, bytes) in [&five, &four, &five].into_iter().enumerate() {
+        set.write(&sweep_file(sample), bytes);
+    }
+    let dataset = set.open();
+    let read = |tick| dataset.scenarios[0].load_points(0, tick, None);
+    for tick in [0, 2] {
+        assert_eq!(read(tick).unwrap().points.len(), 400, "{tick}");
+    }
+    let message = read(1).unwrap_err().to_string();
+    let expected = format!(
+        "{}: it looks like 4 floats per point, the first sweeps of this agent have 5",
+        sweep_file(1)
+    );
+    assert!(message.ends_with(&expected), "{message}");
+}
+
 #[test]
 fn agents_list_what_their_sweeps_hit_but_not_themselves() {
     let set = v2x_sim();
@@ -438,18 +527,12 @@ fn nuscenes_is_turned_so_that_x_points_ahead() {
 #[test]
 fn rows_that_cannot_be_used_are_left_out_one_by_one() {
     let set = v2x_sim();
-    let mut rows: Vec<Value> = serde_json::from_slice(
-        &fs::read(set.dir.path().join("v1.0-mini/sample_annotation.json")).unwrap(),
-    )
-    .unwrap();
+    let mut rows = set.rows("sample_annotation");
     rows[0]["size"] = json!([2.0, 4.0, -1.5]);
     rows[1]["instance_token"] = json!("nobody");
     rows[2]["rotation"] = json!([1.0, 1.0, 0.0, 0.0]);
     set.table("sample_annotation", json!(rows));
-    let mut data: Vec<Value> = serde_json::from_slice(
-        &fs::read(set.dir.path().join("v1.0-mini/sample_data.json")).unwrap(),
-    )
-    .unwrap();
+    let mut data = set.rows("sample_data");
     data[1]["filename"] = json!("../elsewhere.pcd.bin");
     set.table("sample_data", json!(data));
     let dataset = set.open();
@@ -468,6 +551,24 @@ fn rows_that_cannot_be_used_are_left_out_one_by_one() {
         dataset.scenarios[0].ticks.len(),
         1,
         "the ego has no sweep at the first sample"
+    );
+}
+
+#[test]
+fn a_time_stamp_that_is_no_number_is_quoted() {
+    let set = v2x_sim();
+    let mut samples = set.rows("sample");
+    samples[1]["timestamp"] = json!("yesterday");
+    set.table("sample", json!(samples));
+    let dataset = set.open();
+    assert_eq!(
+        set.problems(&dataset)[0],
+        "v1.0-mini/sample.json: 1.timestamp: the text \"yesterday\", expected a finite number"
+    );
+    assert_eq!(
+        dataset.scenarios[0].ticks.len(),
+        1,
+        "the other sample is used"
     );
 }
 

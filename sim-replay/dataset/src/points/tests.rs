@@ -1,5 +1,9 @@
 use std::fs;
 
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+
 use super::*;
 use crate::pcd::Place;
 
@@ -75,7 +79,7 @@ fn a_cut_file_and_a_nan_are_named() {
 }
 
 /// Points all round like those of a LiDAR of 32 lasers, with any numbers after x, y, z.
-fn turn(points: usize, behind: impl Fn(usize) -> Vec<f32>) -> Vec<u8> {
+pub(crate) fn turn(points: usize, behind: impl Fn(usize) -> Vec<f32>) -> Vec<u8> {
     let point = |index: usize| {
         let (angle, range) = (index as f32 * 0.37, 5.0 + (index * 7919 % 400) as f32 * 0.1);
         let position = [
@@ -145,6 +149,13 @@ fn the_first_sweeps_decide_for_all() {
     );
 }
 
+/// The error of the only sweep of an agent.
+fn refusal(bytes: Vec<u8>) -> String {
+    let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", bytes)]);
+    let read = sweeps.read(&id(), &dir.path().join("0.bin"));
+    read.unwrap_err().to_string()
+}
+
 #[test]
 fn other_forms_are_refused_with_the_figure() {
     let doubles: Vec<u8> = (0..400)
@@ -154,11 +165,7 @@ fn other_forms_are_refused_with_the_figure() {
         .flat_map(|index| (index % 500).to_le_bytes())
         .collect();
     for bytes in [doubles, integers] {
-        let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", bytes)]);
-        let message = sweeps
-            .read(&id(), &dir.path().join("0.bin"))
-            .unwrap_err()
-            .to_string();
+        let message = refusal(bytes);
         assert!(
             message.contains("no sweep of x y z intensity or x y z intensity ring as f32: "),
             "{message}"
@@ -173,20 +180,46 @@ fn other_forms_are_refused_with_the_figure() {
         (6, vec![0.5, 3.0, 0.01]),
         (7, vec![0.5, 3.0, 0.01, 9.0]),
     ] {
-        let (dir, sweeps) = agent(
-            SweepStorage::ByName,
-            &[("0.bin", turn(400, |_| behind.clone()))],
-        );
-        let message = sweeps
-            .read(&id(), &dir.path().join("0.bin"))
-            .unwrap_err()
-            .to_string();
+        let message = refusal(turn(400, |_| behind.clone()));
         assert!(
             message.contains(&format!(
                 "it looks like {count} floats per point, expected 4"
             )),
             "{message}"
         );
+    }
+}
+
+/// Numbers that sensors store behind x, y, z: intensity, laser, time (s), reflectivity, ambient light, number of the
+/// return, range (m).
+fn additions(index: usize) -> [f32; 7] {
+    [
+        (index % 101) as f32 / 100.0,
+        (index % 32) as f32,
+        0.01,
+        (index * 37 % 256) as f32,
+        900.0 + (index % 50) as f32,
+        1.0,
+        5.0 + (index * 7919 % 400) as f32 * 0.1,
+    ]
+}
+
+/// The points of a file in random order.
+fn shuffled(bytes: &[u8], numbers_per_point: usize) -> Vec<u8> {
+    let mut points: Vec<&[u8]> = bytes.chunks_exact(4 * numbers_per_point).collect();
+    points.shuffle(&mut ChaCha8Rng::seed_from_u64(7));
+    points.concat()
+}
+
+#[test]
+fn six_seven_eight_and_ten_floats_are_refused_in_any_order_of_the_points() {
+    for count in [6, 7, 8, 10] {
+        let in_order = turn(400, |index| additions(index)[..count - 3].to_vec());
+        for bytes in [shuffled(&in_order, count), in_order] {
+            let message = refusal(bytes);
+            let expected = format!("it looks like {count} floats per point, expected 4");
+            assert!(message.contains(&expected), "{message}");
+        }
     }
 }
 

@@ -58,6 +58,11 @@ pub(super) fn is_bag(path: &Path) -> bool {
     is_described(path) || !in_folder(path).is_empty()
 }
 
+/// The description in the folder of a bag, if there is one.
+pub(super) fn description(path: &Path) -> Option<PathBuf> {
+    Some(path.join(METADATA)).filter(|file| file.is_file())
+}
+
 /// True for a folder with the description of a bag.
 fn is_described(dir: &Path) -> bool {
     let mut head = Vec::new();

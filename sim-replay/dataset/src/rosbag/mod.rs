@@ -59,6 +59,8 @@ const LIMITS: SweepLimits = SweepLimits {
 #[derive(Debug)]
 struct Bag {
     storage: Storage,
+    /// The file that lists those of the storage, in order.
+    description: Option<PathBuf>,
     /// By stamp.
     sweeps: BTreeMap<u64, JoinedSweep>,
     scale: IntensityScale,
@@ -93,6 +95,7 @@ fn open(
     let ticks = ticks.collect();
     let source = Bag {
         storage,
+        description: files::description(path),
         sweeps,
         scale: options.intensity_scale,
         divisor: OnceLock::new(),
@@ -150,7 +153,9 @@ impl FrameSource for Bag {
     }
 
     fn shared_files(&self, _: &CavId) -> Vec<PathBuf> {
-        self.storage.paths()
+        let mut files = self.storage.paths();
+        files.extend(self.description.clone());
+        files
     }
 
     fn points_path(&self, _: &CavId, tick: &Tick, _: Option<&str>) -> PathBuf {

@@ -51,7 +51,7 @@ impl Storage {
         Ok(Self(files))
     }
 
-    /// All files.
+    /// All files with messages.
     pub(super) fn paths(&self) -> Vec<PathBuf> {
         self.0.iter().map(|file| file.path.clone()).collect()
     }

@@ -30,6 +30,7 @@ use fusion::Exchange;
 use perception::weights::Weights;
 use serde::Serialize;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
+use support::cli::NotWritten;
 use support::file_error::FileError;
 use support::{atomic_file, output, progress};
 use training::feature_store::FeatureStore;
@@ -210,7 +211,7 @@ impl Sweep {
     /// Computes the runs of `part` that are not cached.
     fn compute_missing(&self, keys: &[CellKey], part: Range<usize>, jobs: usize) -> Result<()> {
         let cells = self.cells();
-        fs::create_dir_all(&cells).with_context(|| cells.display().to_string())?;
+        fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
         let known = self.known(keys)?;
         let missing = missing(&known, part);
         self.print_estimate(&known, &missing, jobs)?;

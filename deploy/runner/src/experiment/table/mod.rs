@@ -13,6 +13,7 @@ use anyhow::{Context, Result};
 use dataset::IntensityScale;
 use ego_fuser_offline::evaluation::EvaluateConfig;
 use support::atomic_file;
+use support::cli::NotWritten;
 
 pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
@@ -63,7 +64,7 @@ pub fn run(
     observer: &mut dyn TableObserver,
 ) -> Result<Vec<FilledTable>> {
     let cells = out.join("cells");
-    fs::create_dir_all(&cells).with_context(|| cells.display().to_string())?;
+    fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
     let part = Part {
         frames: spec.frames,
         ..Part::default()

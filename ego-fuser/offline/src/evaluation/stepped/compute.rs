@@ -95,10 +95,10 @@ struct Samples {
 
 impl Evaluator {
     /// Measures the first ticks of a scenario on this machine: medians, rounded up to whole milliseconds. In a scenario
-    /// file they make its run repeatable.
+    /// file they make its run repeatable. Sweeps that cannot be read are left out.
     ///
     /// # Errors
-    /// [`EvaluateError`] when a frame cannot be read or computed.
+    /// [`EvaluateError`] when a frame cannot be computed.
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
         let samples = self.samples(scenario, MEASURED_VEHICLES, &|ticks| ticks < MEASURED_TICKS)?;
         let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
@@ -166,7 +166,10 @@ impl Evaluator {
                 if !scenario.is_present(place, tick) {
                     continue;
                 }
-                let frame = scenario.load(place, tick, &LoadOptions::default())?;
+                // It is counted when it is evaluated.
+                let Ok(frame) = scenario.load(place, tick, &LoadOptions::default()) else {
+                    continue;
+                };
                 samples.motion = frame.motion();
                 let began = Instant::now();
                 sent.extend(view(participant, &frame, None, Some(exchange))?.into_view());
@@ -177,6 +180,10 @@ impl Evaluator {
                 samples
                     .map
                     .push(ms(all.saturating_sub(times.estimate + times.observe)));
+            }
+            let own = sent.first().map(|own: &View| &own.cav);
+            if own.is_none() || own != scenario.agents.first() {
+                continue;
             }
             let others = scenario.agents.iter().take(vehicles).skip(sent.len());
             let copies = sent.get(1).map(|neighbour: &View| {

@@ -5,6 +5,8 @@ mod bag;
 use std::fs;
 use std::path::Path;
 
+use support::file_digests::FileDigests;
+
 use self::bag::{Bag, S, T0, describe, drive, drive_at, x_at};
 use crate::{Dataset, LoadOptions};
 
@@ -111,6 +113,50 @@ fn a_bag_is_a_folder_or_a_file_of_mcap_or_sqlite_compressed_or_not() {
     fs::remove_file(single).unwrap();
     let all = crate::open(folder.path()).unwrap();
     assert_eq!(all.scenarios.len(), 4, "a folder of bags");
+}
+
+/// Digest of the data of a bag; `None` if it cannot be opened.
+fn sha256(bag: &Path) -> Option<String> {
+    let scenarios = crate::open(bag).ok()?.scenarios;
+    let digests = FileDigests::default();
+    Some(crate::content_sha256(&scenarios, None, &digests))
+}
+
+#[test]
+fn a_flipped_byte_of_any_file_of_a_bag_changes_the_digest() {
+    for ending in ["mcap", "db3"] {
+        let folder = tempfile::tempdir().unwrap();
+        let data = format!("a_0.{ending}");
+        match ending {
+            "mcap" => drive().mcap(&folder.path().join(&data)),
+            _ => drive().sqlite(&folder.path().join(&data)),
+        }
+        let bag = describe(folder.path(), &[&data]);
+        let original = sha256(&bag);
+        assert!(original.is_some(), "{ending}");
+        for name in [data.as_str(), "metadata.yaml"] {
+            let file = bag.join(name);
+            let bytes = fs::read(&file).unwrap();
+            let mut flipped = bytes.clone();
+            flipped[bytes.len() / 2] ^= 1;
+            fs::write(&file, flipped).unwrap();
+            assert_ne!(sha256(&bag), original, "{name}");
+            fs::write(&file, bytes).unwrap();
+        }
+        assert_eq!(sha256(&bag), original, "{ending}");
+    }
+}
+
+#[test]
+fn a_line_of_the_description_that_is_not_read_changes_the_digest_too() {
+    let folder = tempfile::tempdir().unwrap();
+    drive().mcap(&folder.path().join("a_0.mcap"));
+    let original = sha256(&describe(folder.path(), &["a_0.mcap"]));
+    let description = folder.path().join("metadata.yaml");
+    let text = fs::read_to_string(&description).unwrap();
+    fs::write(&description, format!("{text}  message_count: 93\n")).unwrap();
+    check_drive(folder.path());
+    assert_ne!(sha256(folder.path()), original);
 }
 
 #[test]
