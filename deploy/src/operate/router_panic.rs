@@ -23,7 +23,10 @@ pub fn watch(stop: &Stop) {
         panic::set_hook(Box::new(move |about| {
             if is_of_router(thread::current().name()) {
                 // Only the first one has no other as its cause.
-                let _ = FIRST.set(about.to_string().replace('\n', " "));
+                let text = about.payload_as_str().unwrap_or("a panic");
+                // Without the place in the code of the library.
+                let text = text.split(" at /").next().unwrap_or_default();
+                let _ = FIRST.set(text.replace('\n', " "));
                 stop.request();
             }
             usual(about);

@@ -91,7 +91,7 @@ impl RunError {
     /// True if the run was refused before any process started, so that its folder holds nothing of use.
     pub(crate) fn is_refusal(&self) -> bool {
         match self {
-            Self::Process { .. } | Self::Folder(_) => false,
+            Self::Process { .. } | Self::Router { .. } | Self::Folder(_) => false,
             Self::Evaluate(_) => self.is_bad_input(),
             _ => true,
         }
