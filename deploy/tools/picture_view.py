@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Draws the pictures of the page in monitor.md: a frame of a recorded run, or a live run after some seconds.
 
-    v2vloc up deploy/scenarios/demo.yaml --dataset scenes/v2vdet-1000-2x60 --record --name pictures
+    v2vloc up deploy/scenarios/demo.yaml --dataset scenes/v2vdet-1000-2x60 --method pastat --rate 0.35 --record --name pictures
     deploy/tools/picture_view.py runs/pictures deploy/results/view-live.png --seconds 4     # while it runs
     deploy/tools/picture_view.py runs/pictures deploy/results/view-recorded.png --at 30     # afterwards
 
