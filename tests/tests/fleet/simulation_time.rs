@@ -601,7 +601,7 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     let text = "name: e\ntitle: A < B\ndataset: scene\nweights: weights.safetensors\nframes: 4\n\
         compute: {pose_ms: 10, map_ms: 30, fuse_ms: 10}\nnoise_mode: independent\n\
         grid:\n  method: [none, late, max]\n  latency_ms: [0, 200]\n  jitter_ms: [20]\n  bandwidth_mbps: [.inf, 10]\n  \
-        codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]\n  loss: [0.2]\n  pose_noise: [{position_std_m: 0.2, heading_std_deg: 0.2}]\n  agents: [2]\n  \
+        codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]\n  loss: [0.2]\n  pose_noise: [{position_std_m: 0.2, heading_std_deg: 0.2}]\n  vehicles: [2]\n  \
         seed: [1]\n";
     fs::write(folder.path().join("experiment.yaml"), text).unwrap();
     let dry = sweep(folder.path(), "dry", "2", &["--dry-run"]);
@@ -737,8 +737,8 @@ fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
     let rest = "dataset: scene\nweights: weights.safetensors\n";
     for (text, message) in [
         (
-            "grid: {method: [max], agents: [4]}",
-            "grid.agents is 4, but scenario scene has 3 vehicles",
+            "grid: {method: [max], vehicles: [4]}",
+            "grid.vehicles is 4, but scenario scene has 3 vehicles",
         ),
         (
             "link: dsrc\ngrid: {method: [max], loss: [0.1]}",

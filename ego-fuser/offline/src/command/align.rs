@@ -9,7 +9,7 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::{Context, Result};
 use bus::config_file;
 use clap::ValueEnum;
-use dataset::{LeftOut, Scenario};
+use dataset::{self, Dataset, LeftOut, Scenario};
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use ego_fuser_offline::evaluation::alignment::table::{Row, Tally, markdown};
@@ -23,7 +23,7 @@ use support::file_error::AtFile;
 use support::{output, progress};
 use tch::Device;
 
-use super::{DataSets, print_left_out};
+use super::{DataSets, print_left_out, rows_with_provenance};
 use support::cli::{BadInput, Outcome};
 
 /// Compares methods to align the ego and a neighbour: time per pair, transmitted bytes, success.
@@ -143,7 +143,13 @@ impl Arguments {
             }
         }
         if self.json {
-            output::line(serde_json::to_string_pretty(&rows)?)?;
+            let maps = self.icp_map.iter().map(|folder| dataset::open(folder));
+            let maps: Vec<Dataset> = maps.collect::<Result<_, _>>()?;
+            let all = { maps.into_iter() }.flat_map(|data| data.scenarios);
+            let all: Vec<Scenario> = scenarios.into_iter().chain(all).collect();
+            let sources = self.pose_source.iter().map(|source| source.file.clone());
+            let files = self.weights.iter().cloned().chain(sources);
+            output::line(rows_with_provenance(&rows, &all, files)?)?;
         } else {
             output::text(markdown(&rows))?;
         }

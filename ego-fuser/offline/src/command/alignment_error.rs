@@ -9,7 +9,7 @@ use perception::weights::Weights;
 use support::output;
 use support::text_table::{Side, TextTable};
 
-use super::{DataSets, print_left_out};
+use super::{DataSets, print_left_out, rows_with_provenance};
 use support::cli::{BadInput, Outcome};
 
 /// Add offsets to the true poses of neighbours and measure the part that the method's own alignment corrects.
@@ -60,7 +60,8 @@ impl Arguments {
         let scenarios = self.data.scenarios(&mut left_out)?;
         let found = meter.measure(&scenarios, self.every, &offsets, self.seed, &mut left_out)?;
         if self.json {
-            output::line(serde_json::to_string_pretty(&found)?)?;
+            let weights = [self.weights.clone()];
+            output::line(rows_with_provenance(&found, &scenarios, weights)?)?;
         } else {
             output::text(table(&found))?;
         }

@@ -11,6 +11,8 @@ use std::path::PathBuf;
 use anyhow::Context;
 use bus::malloc_settings;
 use dataset::{self, Dataset, IntensityOption, LeftOut, OpenOptions, Scenario, findings};
+use serde::Serialize;
+use serde_json::json;
 use support::cli::{BadInput, Outcome};
 use support::output;
 
@@ -79,6 +81,20 @@ impl DataSets {
         let all = self.open(left_out)?;
         Ok(all.into_iter().flat_map(|data| data.scenarios).collect())
     }
+}
+
+/// Rows of a result as JSON, each with command and digests of what the result was made from.
+fn rows_with_provenance(
+    rows: &impl Serialize,
+    scenarios: &[Scenario],
+    files: impl IntoIterator<Item = PathBuf>,
+) -> anyhow::Result<String> {
+    let provenance = dataset::provenance(scenarios, files, env!("V2VLOC_COMMIT"))?;
+    let mut rows = json!(rows);
+    for row in rows.as_array_mut().into_iter().flatten() {
+        row["provenance"] = json!(provenance);
+    }
+    Ok(serde_json::to_string_pretty(&rows)?)
 }
 
 /// Prints the findings, and their counts where data are missing.

@@ -71,8 +71,12 @@ const DIMENSIONS: [Dimension; 7] = [
     Dimension {
         name: "ap_agents",
         label: "vehicles that take part",
-        value: |run| run.point.agents.map(|agents| agents as f64),
-        text: |point| point.agents.map(|agents| format!("{agents} vehicles")),
+        value: |run| run.point.vehicles.map(|vehicles| vehicles as f64),
+        text: |point| {
+            point
+                .vehicles
+                .map(|vehicles| format!("{vehicles} vehicles"))
+        },
     },
     Dimension {
         name: BYTES,

@@ -61,10 +61,10 @@ pub(in super::super) fn check_name(field: &str, name: &str) -> Result<(), String
 pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> Result<(), String> {
     for scenario in scenarios {
         let found = scenario.agents.len();
-        let mut asked = experiment.grid.agents.iter().flatten();
+        let mut asked = experiment.grid.vehicles.iter().flatten();
         if let Some(asked) = asked.find(|asked| **asked > found) {
             return Err(format!(
-                "grid.agents is {asked}, but scenario {} has {found} vehicles",
+                "grid.vehicles is {asked}, but scenario {} has {found} vehicles",
                 scenario.name
             ));
         }
@@ -101,8 +101,8 @@ fn axes(grid: &Grid) -> Result<(), String> {
             360.0,
         )
     })?;
-    values("grid.agents", grid.agents.as_ref(), |count| {
-        number("grid.agents", *count as f64, 1.0, 64.0)
+    values("grid.vehicles", grid.vehicles.as_ref(), |count| {
+        number("grid.vehicles", *count as f64, 1.0, 64.0)
     })?;
     values("grid.seed", grid.seed.as_ref(), |_| Ok(()))
 }
@@ -196,9 +196,8 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
             names.join(", ")
         ));
     }
-    if grid.agents.is_some() && exchanges().all(|exchange| exchange == Exchange::Nothing) {
-        let reason =
-            "grid.agents varies the transmitting vehicles, but grid.method is none: there are none";
+    if grid.vehicles.is_some() && exchanges().all(|exchange| exchange == Exchange::Nothing) {
+        let reason = "grid.vehicles varies the transmitting vehicles, but grid.method is none: there are none";
         return Err(reason.into());
     }
     let (mut loss, mut noise) = (grid.loss.iter().flatten(), grid.pose_noise.iter().flatten());

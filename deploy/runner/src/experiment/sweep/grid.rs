@@ -29,7 +29,7 @@ pub struct Point {
     /// Error of the poses.
     pub pose_noise: Option<NoiseSpec>,
     /// Number of participating vehicles; absent: all.
-    pub agents: Option<usize>,
+    pub vehicles: Option<usize>,
     /// Seed of losses, delays and pose errors.
     pub seed: u64,
 }
@@ -47,7 +47,7 @@ pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
         ),
         ("loss", grid.loss.as_ref().map_or(1, Vec::len)),
         ("pose_noise", grid.pose_noise.as_ref().map_or(1, Vec::len)),
-        ("agents", grid.agents.as_ref().map_or(1, Vec::len)),
+        ("vehicles", grid.vehicles.as_ref().map_or(1, Vec::len)),
         ("seed", grid.seed.as_ref().map_or(1, Vec::len)),
     ]
 }
@@ -70,7 +70,7 @@ pub fn points(grid: &Grid) -> Vec<Point> {
         bandwidth_mbps: None,
         loss: None,
         pose_noise: None,
-        agents: None,
+        vehicles: None,
         seed: 0,
     });
     let points = spread(methods.collect(), &grid.codec, |point, codec| {
@@ -89,8 +89,8 @@ pub fn points(grid: &Grid) -> Vec<Point> {
     let points = spread(points, &grid.pose_noise, |point, noise| {
         point.pose_noise = Some(noise)
     });
-    let points = spread(points, &grid.agents, |point, agents| {
-        point.agents = Some(agents)
+    let points = spread(points, &grid.vehicles, |point, vehicles| {
+        point.vehicles = Some(vehicles)
     });
     spread(points, &grid.seed, |point, seed| point.seed = seed)
 }

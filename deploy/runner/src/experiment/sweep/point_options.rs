@@ -41,7 +41,7 @@ pub(super) fn options(
         settings,
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
         stepped: Some(SteppedConfig {
-            crew: AgentPool::First(point.agents.unwrap_or(usize::MAX)),
+            crew: AgentPool::First(point.vehicles.unwrap_or(usize::MAX)),
             ..SteppedConfig::new(link, point.seed, ego, experiment.compute)
         }),
         part: experiment.part(),

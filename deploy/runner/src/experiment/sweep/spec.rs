@@ -118,7 +118,7 @@ pub struct Grid {
     pub pose_noise: Option<Vec<NoiseSpec>>,
     /// Number of participating vehicles, the ego included; absent: all.
     #[serde(default)]
-    pub agents: Option<Vec<usize>>,
+    pub vehicles: Option<Vec<usize>>,
     /// Seeds of losses, delays and pose errors.
     #[serde(default)]
     pub seed: Option<Vec<u64>>,

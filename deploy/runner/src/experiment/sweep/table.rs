@@ -20,7 +20,7 @@ const REASONS: [DropReason; 7] = [
 ];
 
 /// Names of the columns.
-const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbps,loss,noise_t,noise_r,agents,seed,frames,\
+const COLUMNS: &str = "method,dtype,keep,zstd,latency_ms,jitter_ms,bandwidth_mbps,loss,noise_t,noise_r,vehicles,seed,frames,\
     ap_global_30,ap_global_50,ap_global_70,ap_frame_30,ap_frame_50,ap_frame_70,payload_bytes,wire_bytes,log2_payload,\
     log2_wire,log2_frame,log2_fp32,nominal_fp32_log2,e2e_ms_p50,e2e_ms_p95,e2e_ms_p99,age_ms_p50,age_ms_p95,frames_used,\
     stale,sent,received,in_flight,dropped_link_loss,dropped_link_queue,dropped_superseded,dropped_stale,dropped_duplicate,\
@@ -111,7 +111,7 @@ fn line(experiment: &Experiment, Run { point, cell }: &Run) -> Vec<String> {
         plain(point.loss),
         plain(point.pose_noise.map(|noise| noise.position_std_m)),
         plain(point.pose_noise.map(|noise| noise.heading_std_deg)),
-        plain(point.agents),
+        plain(point.vehicles),
         point.seed.to_string(),
         metrics.frames.to_string(),
     ];
