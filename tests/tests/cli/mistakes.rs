@@ -15,7 +15,7 @@ type Row = (&'static str, i32, &'static str);
 const EVAL: &str = "v2vloc eval --dataset {s} --weights {w} --method max";
 
 /// Mistakes in options of an evaluation: what follows [`EVAL`].
-const OF_AN_EVALUATION: [Row; 23] = [
+const OF_AN_EVALUATION: [Row; 24] = [
     (
         "--noise-position-std-m 2",
         2,
@@ -52,6 +52,11 @@ const OF_AN_EVALUATION: [Row; 23] = [
     ("--link nolink", 2, "neither a preset of a link"),
     ("--frames 0", 2, "0 is not in 1"),
     ("--frames 1 --out /proc/none", 1, "cannot be written"),
+    (
+        "--frames 1 --feature-maps /proc/none",
+        1,
+        "cannot be written",
+    ),
     ("--frames -1", 2, "-1"),
     ("--map x", 2, "--map"),
     ("--method late --dtype f16", 2, "late sends none"),

@@ -1,6 +1,7 @@
 //! Offline evaluation of a method on recorded scenes: without delays, or with link emulation in simulation time.
 
 use std::collections::BTreeMap;
+use std::fs;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,6 +18,7 @@ use fusion::{Exchange, Method};
 use perception::int8::InferencePrecision;
 use perception::weights::Weights;
 use protocol::{Counts, Stream, Topic};
+use support::cli::NotWritten;
 use support::file_digests::FileDigests;
 use support::provenance::Provenance;
 use support::sampling::evenly_spread;
@@ -326,6 +328,7 @@ fn maps(
     data: &OpenedData,
 ) -> Result<MapSource> {
     let weights = Arc::new(Weights::load(weights)?.with_precision(precision));
+    fs::create_dir_all(&kept.folder).with_context(|| NotWritten(kept.folder.clone()))?;
     let (scenarios, digests) = (&data.scenarios, &data.digests);
     let store = FeatureStore::open(kept, &weights, scenarios, digests, 1, &mut |_, _| {})?;
     Ok(MapSource::new(Arc::new(store), weights))
