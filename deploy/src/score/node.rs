@@ -242,9 +242,13 @@ impl ScorerNode {
     /// When the scorer's own thread has panicked.
     #[must_use]
     pub fn finish(self) -> Scored {
-        let (scored, node) = self.scored();
-        drop((node.subscriptions, node.presence, node.offline));
-        if let Err(overdue) = node.bus.leave(LEAVE_LIMIT) {
+        let (scored, connection) = self.scored();
+        drop((
+            connection.subscriptions,
+            connection.presence,
+            connection.offline,
+        ));
+        if let Err(overdue) = connection.bus.leave(LEAVE_LIMIT) {
             tracing::warn!("{overdue}");
         }
         scored
@@ -256,12 +260,12 @@ impl ScorerNode {
     /// As [`Self::finish`].
     #[must_use]
     pub fn abandon(self) -> Scored {
-        let (scored, node) = self.scored();
-        mem::forget(node);
+        let (scored, connection) = self.scored();
+        mem::forget(connection);
         scored
     }
 
-    fn scored(self) -> (Scored, Connected) {
+    fn scored(self) -> (Scored, Connection) {
         self.inbox.close();
         let (board, stats, unwritten) = self
             .thread
@@ -296,18 +300,18 @@ impl ScorerNode {
             progress,
             unwritten,
         };
-        let node = Connected {
+        let connection = Connection {
             bus: self.bus,
             offline: self.offline,
             subscriptions: self._subscriptions,
             presence: self._presence,
         };
-        (scored, node)
+        (scored, connection)
     }
 }
 
-/// What a scorer holds of its session.
-struct Connected {
+/// Connection of a scorer: its bus, subscriptions and liveliness token.
+struct Connection {
     bus: Bus,
     offline: OfflineIntervals,
     subscriptions: Vec<Subscription>,

@@ -49,6 +49,12 @@ pub enum DetectorError {
         /// Largest valid absolute value.
         limit: f64,
     },
+    /// A detected box has a size that a message refuses.
+    #[error("a detected box has a side of {size_m} m, valid are 0.001 to 1000 m")]
+    BoxSize {
+        /// Length of the side, metres.
+        size_m: f64,
+    },
     /// Most values of a level of the backbone are the largest that 8 bits hold.
     #[error(
         "most values of level {level} of the backbone exceed 8 bits: the scales of its activations are too small"
@@ -71,7 +77,10 @@ impl DetectorError {
     pub fn is_of_frame(&self) -> bool {
         matches!(
             self,
-            Self::NoPoints { .. } | Self::Values { .. } | Self::Saturated { .. }
+            Self::NoPoints { .. }
+                | Self::Values { .. }
+                | Self::BoxSize { .. }
+                | Self::Saturated { .. }
         )
     }
 }

@@ -384,8 +384,8 @@ impl Detector {
     /// Boxes above a score, in the frame of the feature map's vehicle, not yet suppressed.
     ///
     /// # Errors
-    /// [`DetectorError::Decode`] if the heads are of another detector, [`DetectorError::Values`] if a box is larger or
-    /// farther away than a message may say.
+    /// [`DetectorError::Decode`] if the heads are of another detector, [`DetectorError::Values`] or
+    /// [`DetectorError::BoxSize`] if a box is one that a message refuses, or is farther away than 10 km.
     pub fn boxes(
         &self,
         heads: &Heads,

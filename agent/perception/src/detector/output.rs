@@ -1,5 +1,7 @@
 //! Output of a detector.
 
+use std::ops::RangeInclusive;
+
 use protocol::StageTiming;
 use tch::{TchError, Tensor};
 
@@ -80,30 +82,34 @@ pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorE
     }
 }
 
-/// Largest size of a box in a message, metres.
-const MAX_SIZE_M: f64 = 1e3;
+/// Sizes of a box that a message accepts, metres.
+const SIZES_M: RangeInclusive<f64> = 1e-3..=1e3;
+
+/// Largest absolute heading that a message accepts, radians.
+const MAX_HEADING_RAD: f64 = 1e3;
 
 /// Farthest centre of a box along an axis, metres: beyond any area of a detector.
 const MAX_CENTRE_M: f64 = 1e4;
 
-/// Checks that decoded boxes are boxes of vehicles near the detector, however large its offsets are.
+/// Checks that decoded boxes have sizes and headings that a message accepts, and centres near the detector: other ones
+/// could not be published, and would be left out without a word offline.
 ///
 /// # Errors
-/// [`DetectorError::Values`] with the first value that is not.
+/// [`DetectorError::Values`] or [`DetectorError::BoxSize`] with the first value that is not valid.
 pub(super) fn check_boxes(boxes: &[Decoded]) -> Result<(), DetectorError> {
-    let all = boxes.iter().flat_map(|Decoded { box3d, .. }| {
-        let size = ("a detected box (size, metres)", box3d.size_m, MAX_SIZE_M);
-        let centre = (
-            "a detected box (centre, metres)",
-            box3d.center_m,
-            MAX_CENTRE_M,
-        );
-        [size, centre]
-    });
-    for (what, values, limit) in all {
-        if let Some(&value) = values.iter().find(|value| value.abs() > limit) {
-            return Err(DetectorError::Values { what, value, limit });
+    let within = |what, value: f64, limit| match value.abs() <= limit {
+        true => Ok(()),
+        false => Err(DetectorError::Values { what, value, limit }),
+    };
+    for Decoded { box3d, .. } in boxes {
+        if let Some(&size_m) = box3d.size_m.iter().find(|size| !SIZES_M.contains(size)) {
+            return Err(DetectorError::BoxSize { size_m });
         }
+        for centre_m in box3d.center_m {
+            within("a detected box (centre, metres)", centre_m, MAX_CENTRE_M)?;
+        }
+        let what = "a detected box (heading, radians)";
+        within(what, box3d.heading_rad, MAX_HEADING_RAD)?;
     }
     Ok(())
 }
@@ -116,20 +122,23 @@ mod tests {
 
     #[test]
     fn boxes_that_no_vehicle_has_are_an_error() {
-        let decoded = |center_m, size_m| Decoded {
+        let turned = |center_m, size_m, heading_rad| Decoded {
             anchor: 0,
             score: 0.9,
             box3d: Box3d {
                 center_m,
                 size_m,
-                heading_rad: 0.0,
+                heading_rad,
             },
         };
+        let decoded = |center_m, size_m| turned(center_m, size_m, 0.5);
         let bus = decoded([140.0, -39.0, -1.0], [18.0, 2.5, 3.0]);
         assert!(check_boxes(&[bus]).is_ok());
         for wrong in [
             decoded([1.0, 2.0, -1.0], [4.0, 11_000.0, 1.5]),
+            decoded([1.0, 2.0, -1.0], [4.0, 1e-9, 1.5]),
             decoded([1.0, -3e5, -1.0], [4.0, 2.0, 1.5]),
+            turned([1.0, 2.0, -1.0], [4.0, 2.0, 1.5], -1e4),
         ] {
             let error = check_boxes(&[bus, wrong]).unwrap_err();
             assert!(error.is_of_frame(), "{error}");

@@ -97,7 +97,7 @@ pub fn run_notes(result: &RunResult) -> String {
     if unreceived > 0 {
         let _ = writeln!(
             text,
-            "nobody    receives {unreceived} of them, see ledger.json"
+            "topics    {unreceived} messages on topics without a receiver, see ledger.json"
         );
     }
     if result.missed > 0 {
