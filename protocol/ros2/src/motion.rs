@@ -147,12 +147,8 @@ fn read_twist<BO: ByteOrder>(
 /// The values of `motion` that are measured by their variances.
 fn measured(motion: EgoMotion, covariance: &[f64; 36]) -> Result<EgoMotion, MotionError> {
     let [speed_variance, .., yaw_rate_variance] = covariance;
-    let EgoMotion {
-        speed_mps,
-        yaw_rate_rad_s,
-    } = motion;
-    let speed_mps = speed_mps.filter(|_| *speed_variance < UNMEASURED);
-    let yaw_rate_rad_s = yaw_rate_rad_s.filter(|_| *yaw_rate_variance < UNMEASURED);
+    let speed_mps = (motion.speed_mps).filter(|_| *speed_variance < UNMEASURED);
+    let yaw_rate_rad_s = (motion.yaw_rate_rad_s).filter(|_| *yaw_rate_variance < UNMEASURED);
     if speed_mps.is_none() && yaw_rate_rad_s.is_none() {
         return Err(MotionError::Unmeasured {
             field: "twist.covariance[0]",

@@ -115,21 +115,10 @@ enum Datatype {
 }
 
 impl Datatype {
-    const ALL: [Self; 8] = [
-        Self::Int8,
-        Self::Uint8,
-        Self::Int16,
-        Self::Uint16,
-        Self::Int32,
-        Self::Uint32,
-        Self::Float32,
-        Self::Float64,
-    ];
-
     fn of(number: u8) -> Option<Self> {
-        Self::ALL
-            .into_iter()
-            .find(|datatype| *datatype as u8 == number)
+        use Datatype::{Float32, Float64, Int8, Int16, Int32, Uint8, Uint16, Uint32};
+        let all = [Int8, Uint8, Int16, Uint16, Int32, Uint32, Float32, Float64];
+        all.into_iter().find(|datatype| *datatype as u8 == number)
     }
 
     /// Bytes of a value.

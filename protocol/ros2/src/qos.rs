@@ -18,35 +18,23 @@ pub struct Qos {
 
 impl Qos {
     /// ROS's default profile: reliable, ten messages.
-    pub const DEFAULT: Self = Self {
-        is_reliable: true,
-        is_latched: false,
-        depth: 10,
-    };
+    pub const DEFAULT: Self = Self::new(true, false, 10);
     /// ROS's profile for sensor data: best effort, five messages.
-    pub const SENSOR_DATA: Self = Self {
-        is_reliable: false,
-        is_latched: false,
-        depth: 5,
-    };
+    pub const SENSOR_DATA: Self = Self::new(false, false, 5);
     /// ROS's profile for `/clock`: best effort, one message.
-    pub const CLOCK: Self = Self {
-        is_reliable: false,
-        is_latched: false,
-        depth: 1,
-    };
+    pub const CLOCK: Self = Self::new(false, false, 1);
     /// tf2's profile for `/tf`.
-    pub const TF: Self = Self {
-        is_reliable: true,
-        is_latched: false,
-        depth: 100,
-    };
+    pub const TF: Self = Self::new(true, false, 100);
     /// tf2's profile for `/tf_static`.
-    pub const TF_STATIC: Self = Self {
-        is_reliable: true,
-        is_latched: true,
-        depth: 1,
-    };
+    pub const TF_STATIC: Self = Self::new(true, true, 1);
+
+    const fn new(is_reliable: bool, is_latched: bool, depth: u32) -> Self {
+        Self {
+            is_reliable,
+            is_latched,
+            depth,
+        }
+    }
 
     /// As `offered_qos_profiles` of a channel, in the numbers that rosbag2 of every distribution reads.
     #[must_use]

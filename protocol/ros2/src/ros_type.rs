@@ -1,55 +1,47 @@
 //! ROS 2 types: names, definitions as recordings store them, and type hashes.
 
-use super::definitions as of;
-use super::definitions::Definition;
+use super::definitions::{Definition, contained, definition};
 use super::type_hash::{Distribution, type_hash};
 
-/// A ROS 2 type that this program writes or reads.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum RosType {
-    /// `sensor_msgs/msg/CameraInfo`.
-    CameraInfo,
-    /// `rosgraph_msgs/msg/Clock`.
-    Clock,
-    /// `sensor_msgs/msg/CompressedImage`.
-    CompressedImage,
-    /// `vision_msgs/msg/Detection3DArray`.
-    Detection3dArray,
-    /// `diagnostic_msgs/msg/DiagnosticArray`.
-    DiagnosticArray,
-    /// `sensor_msgs/msg/Imu`.
-    Imu,
-    /// `visualization_msgs/msg/MarkerArray`.
-    MarkerArray,
-    /// `nav_msgs/msg/Odometry`.
-    Odometry,
-    /// `sensor_msgs/msg/PointCloud2`.
-    PointCloud2,
-    /// `geometry_msgs/msg/PoseWithCovarianceStamped`.
-    PoseWithCovarianceStamped,
-    /// `tf2_msgs/msg/TFMessage`.
-    TfMessage,
-    /// `geometry_msgs/msg/TwistStamped`.
-    TwistStamped,
+/// Rows `Variant = "package/Name"`.
+macro_rules! ros_types {
+    ($($variant:ident = $name:literal,)+) => {
+        /// A ROS 2 type that this program writes or reads.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        pub enum RosType {
+            $(#[doc = concat!("`", $name, "`.")] $variant,)+
+        }
+
+        impl RosType {
+            /// Every type.
+            pub const ALL: [Self; [$($name),+].len()] = [$(Self::$variant),+];
+
+            fn definition(self) -> &'static Definition {
+                let name = match self {
+                    $(Self::$variant => $name,)+
+                };
+                definition(name).unwrap_or(&("", ""))
+            }
+        }
+    };
+}
+
+ros_types! {
+    CameraInfo = "sensor_msgs/CameraInfo",
+    Clock = "rosgraph_msgs/Clock",
+    CompressedImage = "sensor_msgs/CompressedImage",
+    Detection3dArray = "vision_msgs/Detection3DArray",
+    DiagnosticArray = "diagnostic_msgs/DiagnosticArray",
+    Imu = "sensor_msgs/Imu",
+    MarkerArray = "visualization_msgs/MarkerArray",
+    Odometry = "nav_msgs/Odometry",
+    PointCloud2 = "sensor_msgs/PointCloud2",
+    PoseWithCovarianceStamped = "geometry_msgs/PoseWithCovarianceStamped",
+    TfMessage = "tf2_msgs/TFMessage",
+    TwistStamped = "geometry_msgs/TwistStamped",
 }
 
 impl RosType {
-    /// Every type.
-    pub const ALL: [Self; 12] = [
-        Self::CameraInfo,
-        Self::Clock,
-        Self::CompressedImage,
-        Self::Detection3dArray,
-        Self::DiagnosticArray,
-        Self::Imu,
-        Self::MarkerArray,
-        Self::Odometry,
-        Self::PointCloud2,
-        Self::PoseWithCovarianceStamped,
-        Self::TfMessage,
-        Self::TwistStamped,
-    ];
-
     /// Name in ROS 2: `sensor_msgs/msg/PointCloud2`.
     #[must_use]
     pub fn name(self) -> String {
@@ -70,8 +62,8 @@ impl RosType {
         match distribution {
             Distribution::Humble => Distribution::NO_HASH.into(),
             Distribution::Jazzy => {
-                let (own, contained) = self.definitions();
-                type_hash(own, contained)
+                let own = self.definition();
+                type_hash(own, contained(own))
             }
         }
     }
@@ -80,112 +72,19 @@ impl RosType {
     /// those of the others, each after a line of 80 `=` and a line `MSG: package/Type`.
     #[must_use]
     pub fn schema(self) -> String {
-        let ((_, own), contained) = self.definitions();
+        let (_, own) = self.definition();
         let separator = "=".repeat(80);
         let with = |text: String, (name, fields): &Definition| {
             text + &format!("{separator}\nMSG: {name}\n{fields}")
         };
-        contained.iter().fold((*own).to_owned(), with)
+        let contained = contained(self.definition()).into_iter();
+        contained.fold((*own).to_owned(), with)
     }
 
     /// Package and name.
     fn parts(self) -> (&'static str, &'static str) {
-        let ((name, _), _) = self.definitions();
+        let (name, _) = self.definition();
         name.split_once('/').unwrap_or(("", name))
-    }
-
-    /// Own definition, and those of all contained types.
-    fn definitions(self) -> (&'static Definition, &'static [Definition]) {
-        match self {
-            Self::CameraInfo => (
-                &of::CAMERA_INFO,
-                &[of::HEADER, of::TIME, of::REGION_OF_INTEREST],
-            ),
-            Self::Clock => (&of::CLOCK, &[of::TIME]),
-            Self::CompressedImage => (&of::COMPRESSED_IMAGE, &[of::HEADER, of::TIME]),
-            Self::Detection3dArray => (
-                &of::DETECTION_3D_ARRAY,
-                &[
-                    of::HEADER,
-                    of::TIME,
-                    of::DETECTION_3D,
-                    of::HYPOTHESIS_WITH_POSE,
-                    of::HYPOTHESIS,
-                    of::POSE_WITH_COVARIANCE,
-                    of::POSE,
-                    of::POINT,
-                    of::QUATERNION,
-                    of::BOUNDING_BOX_3D,
-                    of::VECTOR,
-                ],
-            ),
-            Self::DiagnosticArray => (
-                &of::DIAGNOSTIC_ARRAY,
-                &[of::HEADER, of::TIME, of::DIAGNOSTIC_STATUS, of::KEY_VALUE],
-            ),
-            Self::Imu => (
-                &of::IMU,
-                &[of::HEADER, of::TIME, of::QUATERNION, of::VECTOR],
-            ),
-            Self::MarkerArray => (
-                &of::MARKER_ARRAY,
-                &[
-                    of::MARKER,
-                    of::HEADER,
-                    of::TIME,
-                    of::POSE,
-                    of::POINT,
-                    of::QUATERNION,
-                    of::VECTOR,
-                    of::COLOR,
-                    of::DURATION,
-                    of::COMPRESSED_IMAGE,
-                    of::UV_COORDINATE,
-                    of::MESH_FILE,
-                ],
-            ),
-            Self::Odometry => (
-                &of::ODOMETRY,
-                &[
-                    of::HEADER,
-                    of::TIME,
-                    of::POSE_WITH_COVARIANCE,
-                    of::POSE,
-                    of::POINT,
-                    of::QUATERNION,
-                    of::TWIST_WITH_COVARIANCE,
-                    of::TWIST,
-                    of::VECTOR,
-                ],
-            ),
-            Self::PointCloud2 => (&of::POINT_CLOUD_2, &[of::HEADER, of::TIME, of::POINT_FIELD]),
-            Self::PoseWithCovarianceStamped => (
-                &of::POSE_WITH_COVARIANCE_STAMPED,
-                &[
-                    of::HEADER,
-                    of::TIME,
-                    of::POSE_WITH_COVARIANCE,
-                    of::POSE,
-                    of::POINT,
-                    of::QUATERNION,
-                ],
-            ),
-            Self::TfMessage => (
-                &of::TF_MESSAGE,
-                &[
-                    of::TRANSFORM_STAMPED,
-                    of::HEADER,
-                    of::TIME,
-                    of::TRANSFORM,
-                    of::VECTOR,
-                    of::QUATERNION,
-                ],
-            ),
-            Self::TwistStamped => (
-                &of::TWIST_STAMPED,
-                &[of::HEADER, of::TIME, of::TWIST, of::VECTOR],
-            ),
-        }
     }
 }
 

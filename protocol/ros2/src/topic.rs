@@ -28,16 +28,26 @@ pub enum VehicleTopic {
 }
 
 impl VehicleTopic {
-    /// Its name below the vehicle's.
-    fn name(self) -> Cow<'static, str> {
+    /// Its name below the vehicle's, the type of its messages, and its quality of service.
+    fn row(self) -> (Cow<'static, str>, RosType, Qos) {
         match self {
-            Self::Pose => "pose".into(),
-            Self::Odometry => "odometry".into(),
-            Self::Points => "points".into(),
-            Self::Image(number) => format!("camera_{number}/image/compressed").into(),
-            Self::CameraInfo(number) => format!("camera_{number}/camera_info").into(),
-            Self::Detections => "detections".into(),
-            Self::Markers => "markers".into(),
+            Self::Pose => (
+                "pose".into(),
+                RosType::PoseWithCovarianceStamped,
+                Qos::DEFAULT,
+            ),
+            Self::Odometry => ("odometry".into(), RosType::Odometry, Qos::DEFAULT),
+            Self::Points => ("points".into(), RosType::PointCloud2, Qos::SENSOR_DATA),
+            Self::Image(number) => {
+                let name = format!("camera_{number}/image/compressed");
+                (name.into(), RosType::CompressedImage, Qos::SENSOR_DATA)
+            }
+            Self::CameraInfo(number) => {
+                let name = format!("camera_{number}/camera_info");
+                (name.into(), RosType::CameraInfo, Qos::SENSOR_DATA)
+            }
+            Self::Detections => ("detections".into(), RosType::Detection3dArray, Qos::DEFAULT),
+            Self::Markers => ("markers".into(), RosType::MarkerArray, Qos::DEFAULT),
         }
     }
 }
@@ -62,55 +72,47 @@ pub enum RosTopic {
 }
 
 impl RosTopic {
+    /// Its name, for a vehicle's topic below the namespace, the type of its messages, and its quality of service.
+    fn row(&self) -> (Cow<'static, str>, RosType, Qos) {
+        let (name, ros_type, qos) = match self {
+            Self::Vehicle(cav, topic) => {
+                let (name, ros_type, qos) = topic.row();
+                return (format!("/{}/{name}", vehicle(cav)).into(), ros_type, qos);
+            }
+            Self::Tf => ("/tf", RosType::TfMessage, Qos::TF),
+            Self::TfStatic => ("/tf_static", RosType::TfMessage, Qos::TF_STATIC),
+            Self::Clock => ("/clock", RosType::Clock, Qos::CLOCK),
+            Self::Diagnostics => ("/diagnostics", RosType::DiagnosticArray, Qos::DEFAULT),
+            Self::InitialPose => (
+                "/initialpose",
+                RosType::PoseWithCovarianceStamped,
+                Qos::DEFAULT,
+            ),
+            Self::Truth => ("/truth", RosType::MarkerArray, Qos::DEFAULT),
+        };
+        (name.into(), ros_type, qos)
+    }
+
     /// Its name below `namespace`; topics that a ROS network has once are never in a namespace.
     #[must_use]
     pub fn name(&self, namespace: Option<&RosName>) -> RosName {
-        RosName::known(match self {
-            Self::Vehicle(cav, topic) => {
-                let namespace = namespace.map_or("", RosName::as_str);
-                return RosName::known(&format!("{namespace}/{}/{}", vehicle(cav), topic.name()));
-            }
-            Self::Tf => "/tf",
-            Self::TfStatic => "/tf_static",
-            Self::Clock => "/clock",
-            Self::Diagnostics => "/diagnostics",
-            Self::InitialPose => "/initialpose",
-            Self::Truth => "/truth",
-        })
+        let namespace = match self {
+            Self::Vehicle(..) => namespace.map_or("", RosName::as_str),
+            _ => "",
+        };
+        RosName::known(&format!("{namespace}{}", self.row().0))
     }
 
     /// Type of its messages.
     #[must_use]
     pub fn ros_type(&self) -> RosType {
-        match self {
-            Self::Vehicle(_, VehicleTopic::Pose) | Self::InitialPose => {
-                RosType::PoseWithCovarianceStamped
-            }
-            Self::Vehicle(_, VehicleTopic::Odometry) => RosType::Odometry,
-            Self::Vehicle(_, VehicleTopic::Points) => RosType::PointCloud2,
-            Self::Vehicle(_, VehicleTopic::Image(_)) => RosType::CompressedImage,
-            Self::Vehicle(_, VehicleTopic::CameraInfo(_)) => RosType::CameraInfo,
-            Self::Vehicle(_, VehicleTopic::Detections) => RosType::Detection3dArray,
-            Self::Vehicle(_, VehicleTopic::Markers) | Self::Truth => RosType::MarkerArray,
-            Self::Tf | Self::TfStatic => RosType::TfMessage,
-            Self::Clock => RosType::Clock,
-            Self::Diagnostics => RosType::DiagnosticArray,
-        }
+        self.row().1
     }
 
     /// Quality of service that ROS users expect on it.
     #[must_use]
     pub fn qos(&self) -> Qos {
-        match self {
-            Self::Vehicle(
-                _,
-                VehicleTopic::Points | VehicleTopic::Image(_) | VehicleTopic::CameraInfo(_),
-            ) => Qos::SENSOR_DATA,
-            Self::Tf => Qos::TF,
-            Self::TfStatic => Qos::TF_STATIC,
-            Self::Clock => Qos::CLOCK,
-            Self::Vehicle(..) | Self::Diagnostics | Self::InitialPose | Self::Truth => Qos::DEFAULT,
-        }
+        self.row().2
     }
 }
 

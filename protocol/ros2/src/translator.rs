@@ -64,14 +64,12 @@ impl Translator {
     /// True if messages of `topic` have to be passed to [`Self::translate`].
     #[must_use]
     pub fn wants(topic: &Topic) -> bool {
-        let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
         match topic {
             Topic::Truth | Topic::Stats(_) => true,
-            Topic::Stream {
-                stream: Stream::Camera(_),
-                ..
-            } => true,
-            Topic::Stream { stream, .. } => streams.contains(stream),
+            Topic::Stream { stream, .. } => matches!(
+                stream,
+                Stream::Lidar | Stream::Imu | Stream::Camera(_) | Stream::Pose | Stream::Detections
+            ),
             _ => false,
         }
     }
@@ -83,69 +81,53 @@ impl Translator {
         capture_nanos: u64,
         message: &Message,
     ) -> Vec<RosMessage> {
-        let at = capture_nanos;
-        if matches!(topic, Topic::Stream { .. }) {
-            self.latest_nanos = at;
-        }
         match (topic, message) {
-            (
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Lidar,
-                },
-                Message::Lidar(lidar),
-            ) => {
-                let cdr = encode::point_cloud(at, &self.names.lidar(cav), &lidar.points);
+            (Topic::Stream { cav, stream }, message) => {
+                self.latest_nanos = capture_nanos;
+                self.stream(cav, *stream, capture_nanos, message)
+            }
+            (Topic::Truth, Message::Truth(truth)) => self.truth_messages(capture_nanos, truth),
+            (Topic::Stats(_), Message::Stats(stats)) => {
+                let status = self.status(stats);
+                vec![RosMessage {
+                    topic: RosTopic::Diagnostics,
+                    cdr: encode::diagnostics(self.latest_nanos, &[status]),
+                }]
+            }
+            _ => Vec::new(),
+        }
+    }
+
+    /// [`Self::translate`] of a message of a vehicle, captured at `at`, nanoseconds.
+    fn stream(
+        &mut self,
+        cav: &CavId,
+        stream: Stream,
+        at: u64,
+        message: &Message,
+    ) -> Vec<RosMessage> {
+        let frame = self.names.lidar(cav);
+        match (stream, message) {
+            (Stream::Lidar, Message::Lidar(lidar)) => {
+                let cdr = encode::point_cloud(at, &frame, &lidar.points);
                 vec![of_vehicle(cav, VehicleTopic::Points, cdr)]
             }
-            (
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Camera(number),
-                },
-                Message::Camera(image),
-            ) => self.image_messages(cav, *number, at, image),
-            (
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Imu,
-                },
-                Message::Imu(motion),
-            ) => {
+            (Stream::Camera(number), Message::Camera(image)) => {
+                self.image_messages(cav, number, at, image)
+            }
+            (Stream::Imu, Message::Imu(motion)) => {
                 self.motions.insert(cav.clone(), (at, *motion));
                 Vec::new()
             }
-            (
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Pose,
-                },
-                Message::Pose(estimate),
-            ) => self.pose(cav, at, estimate),
-            (
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Detections,
-                },
-                Message::Detections(result),
-            ) => {
+            (Stream::Pose, Message::Pose(estimate)) => self.pose(cav, at, estimate),
+            (Stream::Detections, Message::Detections(result)) => {
                 let boxes: Vec<Marked> = result.detections.iter().map(Marked::from).collect();
-                let frame = self.names.lidar(cav);
                 let detections = encode::detections(at, &frame, &result.detections);
                 let markers = encode::markers(at, &frame, "detections", DETECTION_RGB, &boxes);
                 vec![
                     of_vehicle(cav, VehicleTopic::Detections, detections),
                     of_vehicle(cav, VehicleTopic::Markers, markers),
                 ]
-            }
-            (Topic::Truth, Message::Truth(truth)) => self.truth_messages(at, truth),
-            (Topic::Stats(_), Message::Stats(stats)) => {
-                let status = self.status(stats);
-                let cdr = encode::diagnostics(self.latest_nanos, &[status]);
-                vec![RosMessage {
-                    topic: RosTopic::Diagnostics,
-                    cdr,
-                }]
             }
             _ => Vec::new(),
         }

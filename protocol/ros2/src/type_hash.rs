@@ -51,10 +51,9 @@ impl Distribution {
 }
 
 /// Hash of the type `own`, which contains the types `contained`, directly or not.
-pub(crate) fn type_hash(own: &Definition, contained: &[Definition]) -> String {
-    let mut references = contained.to_vec();
-    references.sort_unstable_by_key(|(name, _)| *name);
-    let references: Vec<String> = references.iter().map(description).collect();
+pub(crate) fn type_hash(own: &Definition, mut contained: Vec<&Definition>) -> String {
+    contained.sort_unstable_by_key(|(name, _)| *name);
+    let references: Vec<String> = contained.into_iter().map(description).collect();
     let text = format!(
         r#"{{"type_description": {}, "referenced_type_descriptions": [{}]}}"#,
         description(own),

@@ -18,23 +18,20 @@ pub(crate) fn detections(nanos: u64, frame_id: &str, detections: &[Detection]) -
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, frame_id);
         cdr.write_sequence_length(detections.len());
-        for Detection {
-            box3d,
-            score,
-            source,
-        } in detections
-        {
+        for detection in detections {
+            let box3d = detection.box3d;
             let pose = Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad);
             cdr::header(cdr, nanos, frame_id);
             cdr.write_sequence_length(1);
             cdr.write_string(CLASS);
-            cdr.write_f64(f64::from(*score));
+            cdr.write_f64(f64::from(detection.score));
             cdr::pose(cdr, &pose);
             // Not known: zeros, as other detectors write.
             cdr::covariance(cdr, &[[0.0; 6]; 6]);
             cdr::pose(cdr, &pose);
             cdr::xyz(cdr, box3d.size_m);
-            cdr.write_string(source.as_ref().map_or("", protocol::CavId::as_str));
+            let source = detection.source.as_ref();
+            cdr.write_string(source.map_or("", protocol::CavId::as_str));
         }
     })
 }
@@ -121,12 +118,7 @@ fn marker(
     rgb: [f32; 3],
     marked: &Marked,
 ) {
-    let Marked {
-        id: _,
-        box3d,
-        alpha,
-        text,
-    } = marked;
+    let box3d = marked.box3d;
     cdr::header(cdr, nanos, frame_id);
     cdr.write_string(ns);
     cdr.write_i32(id);
@@ -135,7 +127,7 @@ fn marker(
     cdr::pose(cdr, &Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad));
     cdr::xyz(cdr, box3d.size_m);
     rgb.into_iter()
-        .chain([*alpha])
+        .chain([marked.alpha])
         .for_each(|value| cdr.write_f32(value));
     // Lifetime: until it is deleted.
     cdr.write_i32(0);
@@ -148,7 +140,7 @@ fn marker(
     cdr.write_string("");
     cdr.write_sequence_length(0);
     cdr.write_sequence_length(0); // coordinates in it
-    cdr.write_string(text);
+    cdr.write_string(&marked.text);
     cdr.write_string(""); // mesh
     cdr.write_string("");
     cdr.write_sequence_length(0);

@@ -21,17 +21,11 @@ pub(crate) fn camera_info(
     metadata: &CameraMetadata,
     pinhole: &Pinhole,
 ) -> Vec<u8> {
-    let Pinhole {
-        fx_px,
-        fy_px,
-        cx_px,
-        cy_px,
-    } = *pinhole;
-    let intrinsic = [fx_px, 0.0, cx_px, 0.0, fy_px, cy_px, 0.0, 0.0, 1.0];
+    let [fx, fy] = [pinhole.fx_px, pinhole.fy_px];
+    let [cx, cy] = [pinhole.cx_px, pinhole.cy_px];
+    let intrinsic = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0];
     let rectification = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
-    let projection = [
-        fx_px, 0.0, cx_px, 0.0, 0.0, fy_px, cy_px, 0.0, 0.0, 0.0, 1.0, 0.0,
-    ];
+    let projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0];
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, frame_id);
         cdr.write_u32(metadata.height_px);

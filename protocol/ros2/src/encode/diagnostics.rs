@@ -27,20 +27,13 @@ pub(crate) fn diagnostics(nanos: u64, status: &[Status]) -> Vec<u8> {
     cdr::message(|cdr| {
         cdr::header(cdr, nanos, "");
         cdr.write_sequence_length(status.len());
-        for Status {
-            level,
-            name,
-            message,
-            hardware_id,
-            values,
-        } in status
-        {
-            cdr.write_u8(*level as u8);
-            [name, message, hardware_id]
-                .into_iter()
-                .for_each(|text| cdr.write_string(text));
-            cdr.write_sequence_length(values.len());
-            for (key, value) in values {
+        for one in status {
+            cdr.write_u8(one.level as u8);
+            for text in [&one.name, &one.message, &one.hardware_id] {
+                cdr.write_string(text);
+            }
+            cdr.write_sequence_length(one.values.len());
+            for (key, value) in &one.values {
                 cdr.write_string(key);
                 cdr.write_string(value);
             }

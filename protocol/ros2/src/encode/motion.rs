@@ -47,16 +47,10 @@ pub(crate) fn odometry(
 fn pose_covariance(planar: Option<&PlanarCovariance>) -> [[f64; 6]; 6] {
     let mut rows = diagonal([UNMEASURED; 6]);
     let [x, y, _, _, _, yaw] = &mut rows;
-    if let Some(PlanarCovariance {
-        xx_m2,
-        xy_m2,
-        yy_m2,
-        yaw_rad2,
-    }) = planar
-    {
-        (x[0], x[1]) = (f64::from(*xx_m2), f64::from(*xy_m2));
-        (y[0], y[1]) = (f64::from(*xy_m2), f64::from(*yy_m2));
-        yaw[5] = f64::from(*yaw_rad2);
+    if let Some(planar) = planar {
+        (x[0], x[1]) = (planar.xx_m2.into(), planar.xy_m2.into());
+        (y[0], y[1]) = (planar.xy_m2.into(), planar.yy_m2.into());
+        yaw[5] = planar.yaw_rad2.into();
     }
     rows
 }

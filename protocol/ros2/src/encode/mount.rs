@@ -44,22 +44,17 @@ impl FromStr for Mount {
         let (xyz, yaw_deg) = match numbers.as_deref() {
             Some(&[x, y, z]) => ([x, y, z], 0.0),
             Some(&[x, y, z, yaw_deg]) => ([x, y, z], yaw_deg),
-            _ => {
-                return Err(MountError {
-                    text: text.chars().take(100).collect(),
-                });
-            }
+            _ => ([f64::NAN; 3], 0.0),
         };
         // A number that is none is in no range.
         let is_place = xyz.iter().all(|value| value.abs() <= MAX_M) && yaw_deg.abs() <= 360.0;
-        match is_place {
-            true => Ok(Self {
-                base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()),
-            }),
-            false => Err(MountError {
-                text: text.chars().take(100).collect(),
-            }),
+        if !is_place {
+            let text = text.chars().take(100).collect();
+            return Err(MountError { text });
         }
+        Ok(Self {
+            base_from_lidar: Pose::from_xyz_yaw(xyz, yaw_deg.to_radians()),
+        })
     }
 }
 
