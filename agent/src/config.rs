@@ -231,8 +231,8 @@ impl Threads {
 impl AgentSettings {
     /// Settings of one vehicle of a fleet, the same on every clock and in evaluations.
     ///
-    /// Tracked vehicles measure in turn. Some pose errors spare the ego ([`spares_ego`](localization::pose_source::NoiseMode::spares_ego)). Its own agent sends
-    /// over no link: its map is neither restricted nor adapted.
+    /// Tracked vehicles measure in turn. Some pose errors spare the ego ([`PoseSourceConfig::for_ego`]). Its own agent
+    /// sends over no link: its map is neither restricted nor adapted.
     #[must_use]
     pub fn in_fleet(self, place: FleetPlace<'_>) -> Self {
         let turn = u32::try_from(place.index).unwrap_or(u32::MAX);
@@ -247,12 +247,7 @@ impl AgentSettings {
             };
         }
         Self {
-            pose: match pose {
-                PoseSourceConfig::Noisy(noisy) if noisy.mode.spares_ego() => {
-                    PoseSourceConfig::Recorded
-                }
-                pose => pose,
-            },
+            pose: pose.for_ego(),
             codec: CodecConfig {
                 gate: None,
                 budget_bytes: None,

@@ -17,10 +17,7 @@ use deploy::operate::security::RunKeys;
 use ego_fuser::ego::Ego;
 use fusion::Exchange;
 use link::{LinkConfig, LinkEmulator};
-use localization::baselines::load_baseline;
-use localization::pgc::pose_solver::PoseSolver;
-use localization::pgc::{Localizer, LocalizerError};
-use localization::pose_source::{PgcConfig, PoseSourceConfig, TrackedPoseConfig};
+use localization::pose_source::{PoseSourceConfig, PoseSourceError};
 use perception::inference::Inference;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
@@ -119,12 +116,8 @@ impl Fleet {
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
         for cav in &agents {
             let pose = scenario.settings_of(cav).pose;
-            let needs_poses = matches!(
-                pose,
-                PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_)
-            );
             let place = recorded.agents.iter().position(|known| known == cav);
-            if needs_poses
+            if pose.needs_measured_pose()
                 && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek))
             {
                 bail!(
@@ -312,17 +305,9 @@ fn texts(agents: &[CavId]) -> Vec<String> {
 }
 
 /// Loads the networks of a pose source. Every vehicle loads them for itself; errors are better reported once.
-fn load_networks(pose: &PoseSourceConfig) -> Result<(), LocalizerError> {
-    match pose {
-        PoseSourceConfig::Pgc(PgcConfig { encoder, head, .. })
-        | PoseSourceConfig::Tracked(TrackedPoseConfig { encoder, head, .. }) => {
-            Localizer::load(encoder, head, Inference::default()).map(drop)
-        }
-        PoseSourceConfig::Baseline(network) => {
-            load_baseline(&network.weights, Device::Cpu, PoseSolver::default()).map(drop)
-        }
-        PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => {
-            Ok(())
-        }
+fn load_networks(pose: &PoseSourceConfig) -> Result<(), PoseSourceError> {
+    match pose.looks_at_sweeps() {
+        true => pose.build(Inference::default()).map(drop),
+        false => Ok(()),
     }
 }

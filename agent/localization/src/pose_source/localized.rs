@@ -3,12 +3,14 @@
 use std::path::PathBuf;
 
 use perception::inference::Inference;
+use protocol::config::FieldError;
 use protocol::{NoPoseReason, PoseEstimate, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::motion_gate::{MotionGate, MotionGateConfig};
-use super::{PoseInput, PoseSource};
+use super::settings::{PoseBasis, PoseSettings, require_file};
+use super::{PoseInput, PoseSource, PoseSourceError};
 use crate::baselines::{LightLoc, load_baseline};
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, Localizer, LocalizerError};
@@ -90,6 +92,42 @@ impl LocalizedPose {
             motion_gate: MotionGate::new(motion_gate),
             times: Vec::new(),
         }
+    }
+}
+
+impl PoseSettings for PgcConfig {
+    fn basis(&self) -> PoseBasis {
+        PoseBasis::Sweep
+    }
+
+    fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(Box::new(LocalizedPose::pgc(self, inference)?))
+    }
+
+    fn validate(&self) -> Result<(), FieldError> {
+        require_file("pgc.head", "--head", &self.head)
+    }
+
+    fn networks(&mut self) -> Option<[&mut PathBuf; 2]> {
+        Some([&mut self.encoder, &mut self.head])
+    }
+}
+
+impl PoseSettings for BaselinePoseConfig {
+    fn basis(&self) -> PoseBasis {
+        PoseBasis::Sweep
+    }
+
+    fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(Box::new(LocalizedPose::baseline(self, inference)?))
+    }
+
+    fn validate(&self) -> Result<(), FieldError> {
+        require_file("baseline.weights", "--baseline", &self.weights)
+    }
+
+    fn files(&mut self) -> Vec<&mut PathBuf> {
+        vec![&mut self.weights]
     }
 }
 

@@ -11,6 +11,9 @@ mod noisy;
 mod numpy_normals;
 mod options;
 mod pose_table;
+mod recorded;
+mod settings;
+mod table;
 mod tracked;
 
 use std::path::{Path, PathBuf};
@@ -18,22 +21,22 @@ use std::path::{Path, PathBuf};
 use perception::detector::BackboneLevel;
 use perception::inference::Inference;
 use perception::weights::FileError;
-use protocol::config::{FieldError, within};
+use protocol::config::FieldError;
 use protocol::{CavId, EgoMotion, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, TableRow};
 pub use localized::{BaselinePoseConfig, LocalizedPose, PgcConfig};
 pub use noise::PlanarError;
-pub use noisy::NoisyPose;
-pub(crate) use pose_table::CachedPose;
+pub use noisy::{NoiseMode, NoisyPose, NoisyPoseConfig};
 pub use pose_table::{CachedPoseConfig, PoseRow, PoseTable};
+pub use recorded::RecordedPose;
+pub use table::PoseSourceConfig;
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
 use crate::pgc::head_files::{encoder_or_named, head_file, is_name};
 use crate::pgc::{LocalizerError, LocalizerInput};
 use crate::tracker::PoseMeasurement;
+use settings::{PoseBasis, PoseSettings};
 
 /// Inputs of a source for one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -103,153 +106,11 @@ pub trait PoseSource: std::fmt::Debug + Send {
     }
 }
 
-/// Returns the measured pose unchanged, with full confidence.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct RecordedPose;
-
-impl PoseSource for RecordedPose {
-    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
-        match input.measured {
-            Some(pose) => PoseEstimate::new(*pose, 1.0),
-            None => NO_SOURCE,
-        }
-    }
-}
-
 /// Result if there is no measured pose.
 pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose {
     reason: NoPoseReason::NoSource,
     inlier_count: 0,
 };
-
-/// A pose source and its settings.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum PoseSourceConfig {
-    /// The measured pose.
-    #[default]
-    Recorded,
-    /// The measured pose with an error.
-    Noisy(NoisyPoseConfig),
-    /// Estimated from the sweep alone, by PGC.
-    Pgc(PgcConfig),
-    /// Estimated by PGC and followed from sweep to sweep.
-    Tracked(TrackedPoseConfig),
-    /// Estimated from the sweep alone, by a baseline of the paper: SGLoc, DiffLoc or HypLiLoc.
-    Baseline(BaselinePoseConfig),
-    /// Read from a table that `agent localize` wrote.
-    Cached(CachedPoseConfig),
-}
-
-/// Error that is added to the measured pose.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
-#[serde(default, deny_unknown_fields)]
-pub struct NoisyPoseConfig {
-    /// Correlation of the errors of successive frames (pose source noisy).
-    #[arg(
-        id = "noise_mode",
-        long = "noise-mode",
-        value_name = "MODE",
-        value_enum
-    )]
-    pub mode: NoiseMode,
-    /// Standard deviation of x, y and z, metres (pose source noisy).
-    #[arg(
-        id = "noise_position_std_m",
-        long = "noise-position-std-m",
-        value_name = "M"
-    )]
-    pub position_std_m: f64,
-    /// Standard deviation of yaw, degrees (pose source noisy).
-    #[arg(
-        id = "noise_heading_std_deg",
-        long = "noise-heading-std-deg",
-        value_name = "DEG"
-    )]
-    pub heading_std_deg: f64,
-    /// Seed of the errors (pose source noisy).
-    #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]
-    pub seed: u64,
-    /// Time between two draws of the modes that depend on time, seconds (pose source noisy).
-    #[arg(id = "noise_step_s", long = "noise-step-s", value_name = "S")]
-    pub step_s: f64,
-    /// Time after which an autoregressive error has decayed to 1/e, seconds (pose source noisy).
-    #[arg(id = "noise_decay_s", long = "noise-decay-s", value_name = "S")]
-    pub decay_s: f64,
-    /// Table of errors for the replayed mode, as `agent eval --error-table` writes it (pose source noisy).
-    #[arg(id = "noise_table", long = "noise-table", value_name = "FILE")]
-    pub table: Option<PathBuf>,
-}
-
-impl Default for NoisyPoseConfig {
-    /// OpenCOOD's standard deviations, 0.2 m and 0.2 degrees, and its seed, 25; drawn anew for every agent and frame.
-    fn default() -> Self {
-        Self {
-            mode: NoiseMode::Independent,
-            position_std_m: 0.2,
-            heading_std_deg: 0.2,
-            seed: 25,
-            step_s: 0.1,
-            decay_s: 5.0,
-            table: None,
-        }
-    }
-}
-
-impl NoisyPoseConfig {
-    /// Checks the values.
-    ///
-    /// # Errors
-    /// [`FieldError`] of the first value that is out of range.
-    pub fn validate(&self) -> Result<(), FieldError> {
-        within("noisy.position_std_m", self.position_std_m, 0.0, 1e3)?;
-        within("noisy.heading_std_deg", self.heading_std_deg, 0.0, 360.0)?;
-        within("noisy.step_s", self.step_s, 1e-3, 1e3)?;
-        // The upper bound keeps the sum over past innovations short: seven decay times.
-        within("noisy.decay_s", self.decay_s, 0.0, 1e3 * self.step_s)?;
-        match (self.mode, &self.table) {
-            (NoiseMode::Replayed, None) => Err(FieldError::new(
-                "noisy.table",
-                "absent",
-                "must name the table of errors (--noise-table)",
-            )),
-            (mode, Some(_)) if mode != NoiseMode::Replayed => Err(FieldError::new(
-                "noisy.mode",
-                { clap::ValueEnum::to_possible_value(&mode) }
-                    .map_or(String::new(), |mode| mode.get_name().into()),
-                "must be replayed where a table of errors is given (noisy.table, --noise-table)",
-            )),
-            _ => Ok(()),
-        }
-    }
-}
-
-/// Kinds of pose error.
-#[derive(
-    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum,
-)]
-#[serde(rename_all = "snake_case")]
-pub enum NoiseMode {
-    /// One offset for all neighbours and frames, as in OpenCOOD's code, which resets its seed at every call. The ego has
-    /// no error, there as in every run and evaluation here; an agent that is started alone has the offset.
-    Fixed,
-    /// Drawn anew for every agent and frame.
-    #[default]
-    Independent,
-    /// First-order autoregressive per agent, as the error of a filter.
-    Autoregressive,
-    /// Measured errors of a pose generator, from a table.
-    Replayed,
-}
-
-impl NoiseMode {
-    /// True if the ego's pose has no error, as in OpenCOOD's code: with one offset on all vehicles the relative poses
-    /// would hardly change.
-    #[must_use]
-    pub fn spares_ego(self) -> bool {
-        self == Self::Fixed
-    }
-}
 
 /// Error of setting up a pose source.
 #[derive(Debug, thiserror::Error)]
@@ -266,59 +127,42 @@ pub enum PoseSourceError {
 }
 
 impl PoseSourceConfig {
-    /// Name in files and on command lines.
-    pub fn name(&self) -> &'static str {
-        match self {
-            Self::Recorded => "recorded",
-            Self::Noisy(_) => "noisy",
-            Self::Pgc(_) => "pgc",
-            Self::Tracked(_) => "tracked",
-            Self::Baseline(_) => "baseline",
-            Self::Cached(_) => "cached",
+    fn changed(mut self, change: impl FnOnce(&mut dyn PoseSettings)) -> Self {
+        if let Some(settings) = self.settings_mut() {
+            change(settings);
         }
+        self
     }
 
     /// The same for one scenario of many: only tables of poses differ between scenarios.
     pub fn for_scenario(&self, name: &str) -> Self {
-        match self {
-            Self::Cached(config) => Self::Cached(CachedPoseConfig {
-                scenario: Some(name.to_owned()),
-                ..config.clone()
-            }),
-            other => other.clone(),
-        }
+        self.clone().changed(|settings| settings.set_scenario(name))
     }
 
     /// The same for one vehicle of several on one machine: those that are tracked measure in turn.
     #[must_use]
     pub fn with_turn(self, turn: u32) -> Self {
-        match self {
-            Self::Tracked(config) => Self::Tracked(TrackedPoseConfig {
-                phase: config.phase.saturating_add(turn),
-                ..config
-            }),
-            other => other,
+        self.changed(|settings| settings.set_turn(turn))
+    }
+
+    /// The same for the ego of a fleet: the recorded pose in place of an error that spares it.
+    #[must_use]
+    pub fn for_ego(self) -> Self {
+        match self.settings().spares_ego() {
+            true => Self::Recorded,
+            false => self,
         }
     }
 
     /// The same with every sweep measured, to time a few of them.
     #[must_use]
     pub fn measuring_every_sweep(self) -> Self {
-        match self {
-            Self::Tracked(config) => Self::Tracked(TrackedPoseConfig {
-                measure_every: 1,
-                ..config
-            }),
-            other => other,
-        }
+        self.changed(|settings| settings.measure_every_sweep())
     }
 
     /// Sweeps from one that is measured after its pose was published to the next, for a vehicle with this motion.
     pub fn measuring_interval(&self, motion: &EgoMotion) -> u32 {
-        match self {
-            Self::Tracked(config) => config.interval(motion),
-            _ => 1,
-        }
+        self.settings().measuring_interval(motion)
     }
 
     /// Checks the values; files are not opened.
@@ -326,27 +170,7 @@ impl PoseSourceConfig {
     /// # Errors
     /// [`FieldError`] of the first value that is out of range, or of a file that is not named.
     pub fn validate(&self) -> Result<(), FieldError> {
-        let named = |field: &str, option: &str, file: &Path| {
-            if !file.as_os_str().is_empty() {
-                return Ok(());
-            }
-            Err(FieldError::new(
-                format!("{}.{field}", self.name()),
-                "empty",
-                format!("must name a file ({option})"),
-            ))
-        };
-        match self {
-            Self::Recorded => Ok(()),
-            Self::Noisy(noise) => noise.validate(),
-            Self::Pgc(pgc) => named("head", "--head", &pgc.head),
-            Self::Tracked(tracked) => {
-                named("head", "--head", &tracked.head)?;
-                tracked.validate()
-            }
-            Self::Baseline(network) => named("weights", "--baseline", &network.weights),
-            Self::Cached(table) => named("file", "--poses", &table.file),
-        }
+        self.settings().validate()
     }
 
     /// The same with the file of its head where it has the name of a released one, and with the encoder that the head
@@ -355,13 +179,9 @@ impl PoseSourceConfig {
     /// # Errors
     /// [`FileError`] when there is no such head, or no file is its encoder.
     pub fn with_networks(mut self) -> Result<Self, FileError> {
-        let networks = match &mut self {
-            Self::Pgc(pgc) => Some((&mut pgc.encoder, &mut pgc.head)),
-            Self::Tracked(tracked) => Some((&mut tracked.encoder, &mut tracked.head)),
-            Self::Recorded | Self::Noisy(_) | Self::Baseline(_) | Self::Cached(_) => None,
-        };
+        let networks = self.settings_mut().and_then(|settings| settings.networks());
         // A head that is not given is refused by the check of the values.
-        if let Some((encoder, head)) = networks.filter(|(_, head)| !head.as_os_str().is_empty()) {
+        if let Some([encoder, head]) = networks.filter(|[_, head]| !head.as_os_str().is_empty()) {
             *head = head_file(head)?;
             let given = Some(encoder.as_path()).filter(|file| !file.as_os_str().is_empty());
             *encoder = encoder_or_named(given, head)?;
@@ -369,18 +189,21 @@ impl PoseSourceConfig {
         Ok(self)
     }
 
+    /// The scene-specific head of PGC, if the source has one.
+    pub fn head(&self) -> Option<PathBuf> {
+        let mut source = self.clone();
+        let [_, head] = source.settings_mut()?.networks()?;
+        Some(std::mem::take(head))
+    }
+
     /// The same with the paths of its files changed. The name of a released head is no path.
     #[must_use]
     pub fn map_files(mut self, change: impl Fn(&Path) -> PathBuf) -> Self {
-        let files: Vec<&mut PathBuf> = match &mut self {
-            Self::Recorded => vec![],
-            Self::Noisy(noisy) => noisy.table.iter_mut().collect(),
-            Self::Pgc(pgc) => vec![&mut pgc.encoder, &mut pgc.head],
-            Self::Tracked(tracked) => vec![&mut tracked.encoder, &mut tracked.head],
-            Self::Baseline(network) => vec![&mut network.weights],
-            Self::Cached(cached) => vec![&mut cached.file],
-        };
-        for file in files {
+        for file in self
+            .settings_mut()
+            .into_iter()
+            .flat_map(|settings| settings.files())
+        {
             let changed = change(file);
             let is_path = changed.exists() || !is_name(file);
             if is_path && !file.as_os_str().is_empty() {
@@ -391,20 +214,20 @@ impl PoseSourceConfig {
     }
 
     /// Files that the source reads.
-    pub fn files(&self) -> Vec<&Path> {
-        match self {
-            Self::Recorded => vec![],
-            Self::Noisy(noisy) => noisy.table.iter().map(PathBuf::as_path).collect(),
-            Self::Pgc(pgc) => vec![&pgc.encoder, &pgc.head],
-            Self::Tracked(tracked) => vec![&tracked.encoder, &tracked.head],
-            Self::Baseline(network) => vec![&network.weights],
-            Self::Cached(cached) => vec![&cached.file],
-        }
+    pub fn files(&self) -> Vec<PathBuf> {
+        let mut source = self.clone();
+        let files = source.settings_mut().map(|settings| settings.files());
+        files.into_iter().flatten().map(std::mem::take).collect()
     }
 
     /// True if poses are estimated from the sweep's points.
     pub fn looks_at_sweeps(&self) -> bool {
-        matches!(self, Self::Pgc(_) | Self::Tracked(_) | Self::Baseline(_))
+        self.settings().basis() == PoseBasis::Sweep
+    }
+
+    /// True if poses are made from measured ones.
+    pub fn needs_measured_pose(&self) -> bool {
+        self.settings().basis() == PoseBasis::MeasuredPose
     }
 
     /// Sets the source up and reads its files; networks compute by `inference`.
@@ -413,14 +236,7 @@ impl PoseSourceConfig {
     /// [`PoseSourceError`] names the field or the file.
     pub fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
         self.validate()?;
-        Ok(match self {
-            Self::Recorded => Box::new(RecordedPose),
-            Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
-            Self::Pgc(config) => Box::new(LocalizedPose::pgc(config, inference)?),
-            Self::Tracked(config) => Box::new(TrackedPose::load(config, inference)?),
-            Self::Baseline(config) => Box::new(LocalizedPose::baseline(config, inference)?),
-            Self::Cached(config) => Box::new(CachedPose::new(config)?),
-        })
+        self.settings().build(inference)
     }
 }
 

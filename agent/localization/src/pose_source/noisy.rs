@@ -1,12 +1,162 @@
 //! Pose source that adds an error to the measured pose.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use clap::ValueEnum;
+use perception::inference::Inference;
+use protocol::config::{FieldError, within};
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use super::error_table::{ErrorTable, TableRow};
 use super::noise::{self, PlanarError, PoseNoise};
-use super::{NO_SOURCE, NoiseMode, NoisyPoseConfig, PoseInput, PoseSource, PoseSourceError};
+use super::settings::{PoseBasis, PoseSettings};
+use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError};
+
+/// Error that is added to the measured pose.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct NoisyPoseConfig {
+    /// Correlation of the errors of successive frames (pose source noisy).
+    #[arg(
+        id = "noise_mode",
+        long = "noise-mode",
+        value_name = "MODE",
+        value_enum
+    )]
+    pub mode: NoiseMode,
+    /// Standard deviation of x, y and z, metres (pose source noisy).
+    #[arg(
+        id = "noise_position_std_m",
+        long = "noise-position-std-m",
+        value_name = "M"
+    )]
+    pub position_std_m: f64,
+    /// Standard deviation of yaw, degrees (pose source noisy).
+    #[arg(
+        id = "noise_heading_std_deg",
+        long = "noise-heading-std-deg",
+        value_name = "DEG"
+    )]
+    pub heading_std_deg: f64,
+    /// Seed of the errors (pose source noisy).
+    #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]
+    pub seed: u64,
+    /// Time between two draws of the modes that depend on time, seconds (pose source noisy).
+    #[arg(id = "noise_step_s", long = "noise-step-s", value_name = "S")]
+    pub step_s: f64,
+    /// Time after which an autoregressive error has decayed to 1/e, seconds (pose source noisy).
+    #[arg(id = "noise_decay_s", long = "noise-decay-s", value_name = "S")]
+    pub decay_s: f64,
+    /// Table of errors for the replayed mode, as `agent eval --error-table` writes it (pose source noisy).
+    #[arg(id = "noise_table", long = "noise-table", value_name = "FILE")]
+    pub table: Option<PathBuf>,
+}
+
+impl Default for NoisyPoseConfig {
+    /// OpenCOOD's standard deviations, 0.2 m and 0.2 degrees, and its seed, 25; drawn anew for every agent and frame.
+    fn default() -> Self {
+        Self {
+            mode: NoiseMode::Independent,
+            position_std_m: 0.2,
+            heading_std_deg: 0.2,
+            seed: 25,
+            step_s: 0.1,
+            decay_s: 5.0,
+            table: None,
+        }
+    }
+}
+
+impl PoseSettings for NoisyPoseConfig {
+    fn basis(&self) -> PoseBasis {
+        PoseBasis::MeasuredPose
+    }
+
+    fn build(&self, _: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(Box::new(NoisyPose::new(self)?))
+    }
+
+    fn validate(&self) -> Result<(), FieldError> {
+        within("noisy.position_std_m", self.position_std_m, 0.0, 1e3)?;
+        within("noisy.heading_std_deg", self.heading_std_deg, 0.0, 360.0)?;
+        within("noisy.step_s", self.step_s, 1e-3, 1e3)?;
+        // The upper bound keeps the sum over past innovations short: seven decay times.
+        within("noisy.decay_s", self.decay_s, 0.0, 1e3 * self.step_s)?;
+        match (self.mode, &self.table) {
+            (NoiseMode::Replayed, None) => Err(FieldError::new(
+                "noisy.table",
+                "absent",
+                "must name the table of errors (--noise-table)",
+            )),
+            (mode, Some(_)) if mode != NoiseMode::Replayed => Err(FieldError::new(
+                "noisy.mode",
+                mode.name(),
+                "must be replayed where a table of errors is given (noisy.table, --noise-table)",
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    fn files(&mut self) -> Vec<&mut PathBuf> {
+        self.table.iter_mut().collect()
+    }
+
+    fn option_prefix() -> &'static str {
+        "noise"
+    }
+
+    fn has_use_for(&self, option: &str) -> bool {
+        match option {
+            "noise_position_std_m" | "noise_heading_std_deg" => self.mode != NoiseMode::Replayed,
+            "noise_step_s" => self.mode != NoiseMode::Fixed,
+            "noise_decay_s" => self.mode == NoiseMode::Autoregressive,
+            // A table that is not replayed is refused with the other values.
+            _ => true,
+        }
+    }
+
+    fn mode(&self) -> Option<String> {
+        Some(format!("noise mode {}", self.mode.name()))
+    }
+
+    fn spares_ego(&self) -> bool {
+        self.mode.spares_ego()
+    }
+}
+
+/// Kinds of pose error.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, ValueEnum,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum NoiseMode {
+    /// One offset for all neighbours and frames, as in OpenCOOD's code, which resets its seed at every call. The ego has
+    /// no error, there as in every run and evaluation here; an agent that is started alone has the offset.
+    Fixed,
+    /// Drawn anew for every agent and frame.
+    #[default]
+    Independent,
+    /// First-order autoregressive per agent, as the error of a filter.
+    Autoregressive,
+    /// Measured errors of a pose generator, from a table.
+    Replayed,
+}
+
+impl NoiseMode {
+    fn name(self) -> String {
+        self.to_possible_value()
+            .map_or_else(String::new, |mode| mode.get_name().into())
+    }
+
+    /// True if the ego's pose has no error, as in OpenCOOD's code: with one offset on all vehicles the relative poses
+    /// would hardly change.
+    #[must_use]
+    pub fn spares_ego(self) -> bool {
+        self == Self::Fixed
+    }
+}
 
 /// The measured pose with an error of one of four kinds.
 ///

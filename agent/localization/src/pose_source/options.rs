@@ -1,185 +1,89 @@
 //! Command-line options that choose and configure a pose source.
 
+use std::path::PathBuf;
+
+use clap::builder::EnumValueParser;
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
-use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, ValueEnum};
+use clap::{Arg, ArgMatches, Args, Command, ValueEnum};
 use protocol::config::{document, options_of};
+use serde::Serialize;
 
-use super::{
-    BaselinePoseConfig, CachedPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
-    TrackedPoseConfig,
-};
+use super::settings::PoseSettings;
 
-/// Option that chooses the source.
-#[derive(Debug, clap::Args)]
-struct Choice {
-    /// Source of the vehicle's pose [default: recorded].
-    #[arg(long, value_enum)]
-    pose_source: Option<Kind>,
+/// Identifier of the option that chooses the source.
+pub(super) const CHOICE: &str = "pose_source";
+/// Options of the networks of PGC, for every source that has them.
+const NETWORKS: [&str; 2] = ["encoder", "head"];
+
+/// The option that chooses the source.
+pub(super) fn choice<K: ValueEnum + Clone + Send + Sync + 'static>() -> Arg {
+    Arg::new(CHOICE)
+        .long("pose-source")
+        .value_name("POSE_SOURCE")
+        .value_parser(EnumValueParser::<K>::new())
+        .help("Source of the vehicle's pose [default: recorded]")
 }
 
-/// Sources without their settings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-#[value(rename_all = "snake_case")]
-enum Kind {
-    /// The recorded pose.
-    Recorded,
-    /// The recorded pose with an error.
-    Noisy,
-    /// Estimated from the LiDAR sweep alone, by PGC.
-    Pgc,
-    /// Estimated by PGC and followed from sweep to sweep.
-    Tracked,
-    /// Estimated from the LiDAR sweep alone, by a baseline of the paper: SGLoc, DiffLoc or HypLiLoc.
-    Baseline,
-    /// Read from a table that `agent localize` wrote.
-    Cached,
+/// The options of a source.
+pub(super) fn of<S: Args>() -> Vec<Arg> {
+    options_of::<S>().collect()
 }
 
-impl PoseSourceConfig {
-    fn kind(&self) -> Kind {
-        match self {
-            Self::Recorded => Kind::Recorded,
-            Self::Noisy(_) => Kind::Noisy,
-            Self::Pgc(_) => Kind::Pgc,
-            Self::Tracked(_) => Kind::Tracked,
-            Self::Baseline(_) => Kind::Baseline,
-            Self::Cached(_) => Kind::Cached,
-        }
-    }
-
-    fn new(kind: Kind) -> Self {
-        match kind {
-            Kind::Recorded => Self::Recorded,
-            Kind::Noisy => Self::Noisy(NoisyPoseConfig::default()),
-            Kind::Pgc => Self::Pgc(PgcConfig::default()),
-            Kind::Tracked => Self::Tracked(TrackedPoseConfig::default()),
-            Kind::Baseline => Self::Baseline(BaselinePoseConfig::default()),
-            Kind::Cached => Self::Cached(CachedPoseConfig::default()),
-        }
-    }
+/// Adds the options of a source, with their defaults.
+pub(super) fn augment<S: PoseSettings + Args + Default + Serialize>(command: Command) -> Command {
+    let defaults = serde_json::json!({ S::option_prefix(): S::default() });
+    let command = S::augment_args_for_update(command);
+    document(command, options_of::<S>(), &defaults)
 }
 
-impl FromArgMatches for PoseSourceConfig {
-    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let mut source = Self::default();
-        source.update_from_arg_matches(matches)?;
-        Ok(source)
-    }
-
-    /// Options of a source that is not chosen are refused.
-    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
-        let requested = Choice::from_arg_matches(matches)?.pose_source;
-        if let Some(kind) = requested.filter(|kind| *kind != self.kind()) {
-            *self = Self::new(kind);
-        }
-        self.update_chosen(matches)?;
-        let given = |option: &Arg| {
-            matches.value_source(option.get_id().as_str()) == Some(ValueSource::CommandLine)
-        };
-        match options().find(|option| given(option) && !self.has_use_for(option.get_id().as_str()))
-        {
-            Some(option) => Err(self.refused(&option)),
-            None => Ok(()),
+/// Changes settings by the options that are given. Returns the options of their source.
+pub(super) fn update<S: PoseSettings + Args>(
+    settings: &mut S,
+    matches: &ArgMatches,
+) -> Result<Vec<Arg>, clap::Error> {
+    settings.update_from_arg_matches(matches)?;
+    let mut own = of::<S>();
+    let files = settings.networks().into_iter().flatten();
+    for (file, option) in files.zip(NETWORKS) {
+        own.push(Arg::new(option));
+        if let Some(given) = matches.get_one::<PathBuf>(option) {
+            file.clone_from(given);
         }
     }
+    Ok(own)
 }
 
-/// The options of all sources.
-fn options() -> impl Iterator<Item = Arg> {
-    options_of::<NoisyPoseConfig>()
-        .chain(options_of::<PgcConfig>())
-        .chain(options_of::<TrackedPoseConfig>())
-        .chain(options_of::<BaselinePoseConfig>())
-        .chain(options_of::<CachedPoseConfig>())
-}
-
-impl PoseSourceConfig {
-    /// True if the option changes something of this source.
-    fn has_use_for(&self, option: &str) -> bool {
-        match self {
-            Self::Recorded => false,
-            Self::Noisy(noise) => match option {
-                "noise_position_std_m" | "noise_heading_std_deg" => {
-                    noise.mode != NoiseMode::Replayed
-                }
-                "noise_step_s" => noise.mode != NoiseMode::Fixed,
-                "noise_decay_s" => noise.mode == NoiseMode::Autoregressive,
-                // A table that is not replayed is refused with the other values.
-                option => option.starts_with("noise_"),
-            },
-            Self::Pgc(_) => ["encoder", "head", "lightloc"].contains(&option),
-            Self::Tracked(_) => {
-                ["encoder", "head"].contains(&option) || option.starts_with("tracking_")
-            }
-            Self::Baseline(_) => option == "baseline",
-            Self::Cached(_) => option == "poses",
-        }
-    }
-
-    fn refused(&self, option: &Arg) -> clap::Error {
-        let option = option.get_long().unwrap_or_default();
-        let mode = match self {
-            Self::Noisy(noise) => noise.mode.to_possible_value(),
-            _ => None,
-        };
-        let mode = mode.map_or_else(String::new, |mode| {
-            format!(", noise mode {}", mode.get_name())
-        });
-        let source = self.name();
-        clap::Error::raw(
-            ErrorKind::ArgumentConflict,
-            format!("--{option} has no effect on pose source {source}{mode}\n"),
-        )
-    }
-
-    fn update_chosen(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
-        match self {
-            Self::Recorded => Ok(()),
-            Self::Noisy(noise) => noise.update_from_arg_matches(matches),
-            Self::Pgc(networks) => networks.update_from_arg_matches(matches),
-            Self::Tracked(tracked) => {
-                let mut networks = PgcConfig {
-                    encoder: tracked.encoder.clone(),
-                    head: tracked.head.clone(),
-                    ..Default::default()
-                };
-                networks.update_from_arg_matches(matches)?;
-                (tracked.encoder, tracked.head) = (networks.encoder, networks.head);
-                tracked.update_from_arg_matches(matches)
-            }
-            Self::Baseline(network) => network.update_from_arg_matches(matches),
-            Self::Cached(table) => table.update_from_arg_matches(matches),
-        }
-    }
-}
-
-impl Args for PoseSourceConfig {
-    fn augment_args(command: Command) -> Command {
-        let command = NoisyPoseConfig::augment_args_for_update(Choice::augment_args(command));
-        let noise = serde_json::json!({ "noise": NoisyPoseConfig::default() });
-        let command = document(command, options_of::<NoisyPoseConfig>(), &noise);
-        let command = PgcConfig::augment_args_for_update(command);
-        let networks = serde_json::json!({ "pgc": PgcConfig::default() });
-        let command = document(command, options_of::<PgcConfig>(), &networks);
-        let command = TrackedPoseConfig::augment_args_for_update(command);
-        let tracking = serde_json::json!({ "tracking": TrackedPoseConfig::default() });
-        let command = document(command, options_of::<TrackedPoseConfig>(), &tracking);
-        let command = BaselinePoseConfig::augment_args_for_update(command);
-        CachedPoseConfig::augment_args_for_update(command)
-    }
-
-    fn augment_args_for_update(command: Command) -> Command {
-        Self::augment_args(command)
-    }
+/// Refuses an option of `all` that is given and has no effect on the source, whose options are `own`.
+pub(super) fn refuse_useless(
+    source: &str,
+    settings: &dyn PoseSettings,
+    own: &[Arg],
+    all: &[Arg],
+    matches: &ArgMatches,
+) -> Result<(), clap::Error> {
+    let is_useless = |option: &&Arg| {
+        let id = option.get_id();
+        let is_own = own.iter().any(|own| own.get_id() == id);
+        matches.value_source(id.as_str()) == Some(ValueSource::CommandLine)
+            && !(is_own && settings.has_use_for(id.as_str()))
+    };
+    let Some(option) = all.iter().find(is_useless) else {
+        return Ok(());
+    };
+    let option = option.get_long().unwrap_or_default();
+    let mode = settings.mode();
+    let mode = mode.map_or_else(String::new, |mode| format!(", {mode}"));
+    let message = format!("--{option} has no effect on pose source {source}{mode}\n");
+    Err(clap::Error::raw(ErrorKind::ArgumentConflict, message))
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::Parser;
+    use clap::{FromArgMatches as _, Parser};
     use protocol::config::Section;
 
-    use super::super::NoiseMode;
+    use super::super::{NoiseMode, NoisyPoseConfig, PoseSourceConfig};
     use super::*;
 
     #[derive(Debug, Parser)]

@@ -5,11 +5,16 @@ use std::fs::OpenOptions;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+use perception::inference::Inference;
+use protocol::config::FieldError;
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::csv_file::{CsvFile, CsvRow, CsvText};
 use support::file_error::{AtFile, FileError};
+
+use super::settings::{PoseBasis, PoseSettings, require_file};
+use super::{NO_SOURCE, PoseInput, PoseSource, PoseSourceError};
 
 /// The first line of a table.
 const HEADER: &str =
@@ -157,13 +162,35 @@ impl CachedPose {
     }
 }
 
-impl super::PoseSource for CachedPose {
+impl PoseSettings for CachedPoseConfig {
+    fn basis(&self) -> PoseBasis {
+        PoseBasis::Files
+    }
+
+    fn build(&self, _: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(Box::new(CachedPose::new(self)?))
+    }
+
+    fn validate(&self) -> Result<(), FieldError> {
+        require_file("cached.file", "--poses", &self.file)
+    }
+
+    fn files(&mut self) -> Vec<&mut PathBuf> {
+        vec![&mut self.file]
+    }
+
+    fn set_scenario(&mut self, name: &str) {
+        self.scenario = Some(name.to_owned());
+    }
+}
+
+impl PoseSource for CachedPose {
     /// Ignores sweep and measured pose; a sweep that is not in the table has no source.
-    fn estimate(&mut self, input: &super::PoseInput<'_>) -> PoseEstimate {
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.poses
             .get(&(input.cav.clone(), input.capture_nanos))
             .copied()
-            .unwrap_or(super::NO_SOURCE)
+            .unwrap_or(NO_SOURCE)
     }
 }
 

@@ -11,7 +11,8 @@ use protocol::{EgoMotion, NoPoseReason, PlanarCovariance, PoseEstimate, StageTim
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{PoseInput, PoseSource};
+use super::settings::{PoseBasis, PoseSettings, require_file};
+use super::{PoseInput, PoseSource, PoseSourceError};
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
 use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits};
 
@@ -85,7 +86,7 @@ impl TrackedPoseConfig {
 
     /// Sweeps from one measurement to the next of a vehicle with this motion: without yaw rate the prediction lags in
     /// turns.
-    pub(super) fn interval(&self, motion: &EgoMotion) -> u32 {
+    fn interval(&self, motion: &EgoMotion) -> u32 {
         if motion.yaw_rate_rad_s.is_some() {
             self.measure_every
         } else {
@@ -101,6 +102,41 @@ impl TrackedPoseConfig {
         within("tracked.measure_every", self.measure_every, 1, 100)?;
         within("tracked.global_period_s", self.global_period_s, 0.0, 3600.0)?;
         within("tracked.max_coast_s", self.max_coast_s, 0.0, 60.0)
+    }
+}
+
+impl PoseSettings for TrackedPoseConfig {
+    fn basis(&self) -> PoseBasis {
+        PoseBasis::Sweep
+    }
+
+    fn build(&self, inference: Inference) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(Box::new(TrackedPose::load(self, inference)?))
+    }
+
+    fn validate(&self) -> Result<(), FieldError> {
+        require_file("tracked.head", "--head", &self.head)?;
+        Self::validate(self)
+    }
+
+    fn networks(&mut self) -> Option<[&mut PathBuf; 2]> {
+        Some([&mut self.encoder, &mut self.head])
+    }
+
+    fn option_prefix() -> &'static str {
+        "tracking"
+    }
+
+    fn set_turn(&mut self, turn: u32) {
+        self.phase = self.phase.saturating_add(turn);
+    }
+
+    fn measure_every_sweep(&mut self) {
+        self.measure_every = 1;
+    }
+
+    fn measuring_interval(&self, motion: &EgoMotion) -> u32 {
+        self.interval(motion)
     }
 }
 

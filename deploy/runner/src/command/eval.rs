@@ -29,18 +29,13 @@ use super::left_out;
 use super::slices::SliceArgs;
 use support::cli::{BadInput, Outcome};
 
-/// Options and groups of options that a file of tables states itself.
-const OF_ONE_TABLE: [&str; 22] = [
+/// Options and groups of options, beside those of pose sources, that a file of tables states itself.
+const OF_ONE_TABLE: [&str; 17] = [
     "dataset",
     "method",
     "weights",
     "precision",
     "pose_source",
-    "NoisyPoseConfig",
-    "PgcConfig",
-    "TrackedPoseConfig",
-    "BaselinePoseConfig",
-    "CachedPoseConfig",
     "CodecConfig",
     "RateConfig",
     "emulation",
@@ -73,7 +68,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
-    #[arg(long, value_name = "FILE", conflicts_with_all = OF_ONE_TABLE, requires = "out")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = of_one_table(), requires = "out")]
     table: Option<PathBuf>,
     #[command(flatten)]
     slices: SliceArgs,
@@ -154,6 +149,13 @@ pub(crate) struct Arguments {
     /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
     #[arg(long)]
     json: bool,
+}
+
+fn of_one_table() -> impl Iterator<Item = &'static str> {
+    OF_ONE_TABLE
+        .iter()
+        .chain(PoseSourceConfig::OPTION_GROUPS)
+        .copied()
 }
 
 fn at_most(count: u64) -> usize {

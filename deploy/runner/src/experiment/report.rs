@@ -47,10 +47,8 @@ pub fn print_loss(result: &RunResult, with_method: bool) {
 
 /// Prints a hint if no sweep was localized: the head may be of another place. `scene`: folder of the data set.
 pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path) {
-    let head = match pose {
-        PoseSourceConfig::Pgc(pgc) => &pgc.head,
-        PoseSourceConfig::Tracked(tracked) => &tracked.head,
-        _ => return,
+    let Some(head) = pose.head() else {
+        return;
     };
     if metrics.pose.mean_m.is_none() && metrics.pose.no_pose > 0 {
         let dataset = dataset::open(scene).ok();
@@ -59,7 +57,11 @@ pub fn print_unlocated(metrics: &Metrics, pose: &PoseSourceConfig, scene: &Path)
             .and_then(|dataset| dataset.scenarios.first());
         let map = first.and_then(|scenario| scenario.generated_map().ok());
         let map = map.map(|map| map.to_string());
-        output::note(wrong_place_hint(metrics.pose.no_pose, head, map.as_deref()));
+        output::note(wrong_place_hint(
+            metrics.pose.no_pose,
+            &head,
+            map.as_deref(),
+        ));
     }
 }
 

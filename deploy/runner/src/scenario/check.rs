@@ -86,7 +86,7 @@ impl Scenario {
         places.extend(keys.map(|keys| ("security.keys", keys.clone())));
         for settings in self.settings() {
             let files = settings.pose.files().into_iter();
-            places.extend(files.map(|file| ("agents.pose", file.to_owned())));
+            places.extend(files.map(|file| ("agents.pose", file)));
         }
         if let Some((field, missing)) = places.iter().find(|(_, file)| !file.exists()) {
             let problem = format_args!("{field}: {} does not exist", missing.display());

@@ -48,9 +48,7 @@ pub(crate) fn files_of<'a>(
 ) -> Vec<PathBuf> {
     let mut files = vec![weights];
     files.extend(method.script_file().map(Path::to_owned));
-    for source in poses {
-        files.extend(source.files().into_iter().map(Path::to_owned));
-    }
+    files.extend(poses.into_iter().flat_map(PoseSourceConfig::files));
     let trace = link.and_then(|(link, folder)| Some(folder.join(link.trace_file()?)));
     files.extend(trace);
     files
