@@ -19,6 +19,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::stream::{StreamRow, StreamTable};
 use crate::string_enum::written_as_text;
 use crate::{CavId, IdError, KeyExpr, Limits, ProcessId, Role, RunId, Stream, Topic, Verb};
 
@@ -76,124 +77,107 @@ impl Principal {
     /// All permissions in `runs`.
     pub fn rights(&self, runs: &RunScope) -> Vec<Permission> {
         let keys = |topic: &dyn fmt::Display| KeyExpr::within(runs, topic);
-        let own = |stream| {
-            keys(&Topic::Stream {
-                cav: self.cav.clone(),
-                stream,
-            })
-        };
-        let everyones = |stream: &dyn fmt::Display| keys(&format_args!("*/{stream}"));
-        let over_link =
-            |stream: &dyn fmt::Display| keys(&format_args!("rx/{}/*/{stream}", self.cav));
         let control = |verb| keys(&Topic::Control(verb));
-        let (publish, subscribe) = match self.role {
-            Role::Agent => {
-                let sensors = SENSORS
-                    .into_iter()
-                    .map(own)
-                    .chain([keys(&format_args!("{}/camera/*", self.cav))]);
-                (
-                    SHARED.map(own).into(),
-                    sensors.chain([everyones(&Stream::Pace)]).collect(),
-                )
-            }
-            Role::Ego => {
-                let shared = SHARED
-                    .iter()
-                    .flat_map(|stream| [everyones(stream), over_link(stream)]);
-                (DETECTIONS.map(own).into(), shared.collect())
-            }
-            Role::Link => {
-                let shared = SHARED
-                    .iter()
-                    .chain([&Stream::Gnss])
-                    .map(|stream| everyones(stream));
-                (
-                    SHARED.iter().map(|stream| over_link(stream)).collect(),
-                    shared.collect(),
-                )
-            }
+        let everyones = |streams: &[Stream]| -> Vec<KeyExpr> {
+            streams
+                .iter()
+                .map(|stream| everyones(runs, *stream))
+                .collect()
+        };
+        let [mut publish, mut subscribe] = self.streams::<Stream>(runs);
+        match self.role {
+            Role::Agent | Role::Ego => {}
+            Role::Link => subscribe.extend(everyones(&[Stream::Gnss])),
             Role::Replay => {
-                let sensors = SENSORS.iter().map(|stream| everyones(stream));
-                let previews = everyones(&Stream::Preview);
-                let own = [
-                    keys(&"*/camera/*"),
-                    previews,
-                    keys(&Topic::Truth),
-                    control(Verb::End),
-                ];
-                (
-                    sensors.chain(own).collect(),
-                    vec![
-                        keys(&"control/*"),
-                        keys(&"ready/*"),
-                        everyones(&Stream::Detections),
-                    ],
-                )
+                publish.extend([keys(&Topic::Truth), control(Verb::End)]);
+                subscribe.extend(["control/*", "ready/*"].map(|topic| keys(&topic)));
+                subscribe.extend(everyones(&[Stream::Detections]));
             }
             Role::Scorer => {
-                let subscribed = [everyones(&Stream::Detections), everyones(&Stream::Pose)];
-                let own = [keys(&Topic::Truth), keys(&"stats/*"), keys(&"control/*")];
-                (
-                    vec![keys(&"control/*")],
-                    own.into_iter().chain(subscribed).collect(),
-                )
+                publish.push(keys(&"control/*"));
+                subscribe.extend(["truth", "stats/*", "control/*"].map(|topic| keys(&topic)));
+                subscribe.extend(everyones(&[Stream::Detections, Stream::Pose]));
             }
-            Role::Recorder => (Vec::new(), vec![keys(&"**")]),
+            Role::Recorder => subscribe.push(keys(&"**")),
             Role::Viewer => {
-                use Stream::{Bev, Boxes, Descriptor, Detections, Pose, Preview};
-                let shown = [Pose, Boxes, Detections, Preview, Descriptor, Bev];
-                let shown = shown.iter().map(|stream| everyones(stream));
-                let rest = ["*/camera/*", "rx/*/*/pose", "truth", "stats/*", "control/*"]
-                    .map(|topic| keys(&topic));
-                (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
+                use Stream::{Bev, Boxes, Camera, Descriptor, Detections, Pose, Preview};
+                let shown = [Pose, Boxes, Detections, Preview, Descriptor, Bev, Camera(0)];
+                subscribe.extend(everyones(&shown));
+                let rest = ["rx/*/*/pose", "truth", "stats/*", "control/*"];
+                subscribe.extend(rest.map(|topic| keys(&topic)));
             }
             Role::Ros2 => {
+                publish.extend(everyones(&[Stream::Lidar, Stream::Imu, Stream::Gnss]));
                 let streams = [Stream::Lidar, Stream::Imu, Stream::Pose, Stream::Detections];
-                let subscribed = streams
-                    .iter()
-                    .map(|stream| everyones(stream))
-                    .chain([keys(&"stats/*")]);
-                (
-                    [Stream::Lidar, Stream::Imu, Stream::Gnss]
-                        .iter()
-                        .map(|stream| everyones(stream))
-                        .collect(),
-                    subscribed.collect(),
-                )
+                subscribe.extend(everyones(&streams));
+                subscribe.push(keys(&"stats/*"));
             }
-        };
-        let right = |act| move |keys: KeyExpr| Permission { act, keys };
-        let mut rights: Vec<Permission> =
-            publish.into_iter().map(right(Operation::Publish)).collect();
-        rights.push(right(Operation::Publish)(keys(&Topic::Ready(self.name()))));
-        rights.push(right(Operation::Publish)(keys(&Topic::Stats(self.name()))));
-        rights.extend(subscribe.into_iter().map(right(Operation::Subscribe)));
+        }
+        publish.extend(
+            [Topic::Ready(self.name()), Topic::Stats(self.name())].map(|topic| keys(&topic)),
+        );
         let own_token = keys(&Topic::Alive {
             role: self.role,
             cav: self.cav.clone(),
         });
         // A process looks for its own token before it declares it: another may have its name.
-        rights.push(right(Operation::SubscribeLiveliness)(own_token.clone()));
-        rights.push(right(Operation::DeclareLiveliness)(own_token));
-        rights.extend(
-            self.watched()
-                .map(|topic| right(Operation::SubscribeLiveliness)(keys(&topic))),
-        );
-        rights.push(right(Operation::Query)(keys(&crate::key::UNDECLARED)));
-        rights
+        let watched = self.watched().map(|topic| keys(&topic));
+        let operations = [
+            (Operation::Publish, publish),
+            (Operation::Subscribe, subscribe),
+            (Operation::SubscribeLiveliness, vec![own_token.clone()]),
+            (Operation::DeclareLiveliness, vec![own_token]),
+            (
+                Operation::SubscribeLiveliness,
+                watched.into_iter().collect(),
+            ),
+            (Operation::Query, vec![keys(&crate::key::UNDECLARED)]),
+        ];
+        let permissions = |(act, keys): (Operation, Vec<KeyExpr>)| {
+            keys.into_iter().map(move |keys| Permission { act, keys })
+        };
+        operations.into_iter().flat_map(permissions).collect()
+    }
+
+    /// Keys of streams on which it publishes, and those to which it subscribes, as far as they follow from the senders:
+    /// sensors go to the vehicle's own agent, streams of agents to egos and links, and what egos repeat to all agents.
+    pub(crate) fn streams<S: StreamTable>(&self, runs: &RunScope) -> [Vec<KeyExpr>; 2] {
+        let of = |vehicle: &dyn fmt::Display, stream: S| {
+            KeyExpr::within(runs, &format_args!("{vehicle}/{}", stream.selector()))
+        };
+        let own = |stream| of(&self.cav, stream);
+        let over_link = |stream| of(&format_args!("rx/{}/*", self.cav), stream);
+        let everyones = |stream| everyones(runs, stream);
+        let [agents, egos, sensors] = [Role::Agent, Role::Ego, Role::Replay].map(sent_by::<S>);
+        match self.role {
+            Role::Agent => {
+                let sensors = sensors.into_iter().filter(|stream| stream.row().is_counted);
+                let repeated = egos.into_iter().filter(|stream| !stream.row().is_counted);
+                let subscribed = sensors.map(own).chain(repeated.map(everyones));
+                [agents.into_iter().map(own).collect(), subscribed.collect()]
+            }
+            Role::Ego => {
+                let both = |stream| [everyones(stream), over_link(stream)];
+                [
+                    egos.into_iter().map(own).collect(),
+                    agents.into_iter().flat_map(both).collect(),
+                ]
+            }
+            Role::Link => [
+                agents.iter().copied().map(over_link).collect(),
+                agents.into_iter().map(everyones).collect(),
+            ],
+            Role::Replay => [sensors.into_iter().map(everyones).collect(), Vec::new()],
+            Role::Scorer | Role::Recorder | Role::Viewer | Role::Ros2 => Default::default(),
+        }
     }
 
     /// True if it publishes messages of this topic, as far as the ledger covers them.
     pub(crate) fn publishes(&self, topic: &Topic) -> bool {
         match topic {
-            Topic::Stream { cav, stream } => match self.role {
-                Role::Agent => *cav == self.cav && SHARED.contains(stream),
-                Role::Ego => *cav == self.cav && DETECTIONS.contains(stream),
-                Role::Replay | Role::Ros2 => {
-                    !SHARED.contains(stream) && !DETECTIONS.contains(stream)
-                }
-                _ => false,
+            Topic::Stream { cav, stream } => match (self.role, stream.row().sender) {
+                (Role::Replay | Role::Ros2, sender) => sender == Role::Replay,
+                (role, sender) => role == sender && *cav == self.cav,
             },
             Topic::Received { ego, .. } => self.role == Role::Link && *ego == self.cav,
             Topic::Truth => self.role == Role::Replay,
@@ -211,52 +195,45 @@ impl Principal {
     }
 }
 
-/// Limits of message sizes, bytes, by key, in any run.
-pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
-    let small = [
-        Stream::Pose,
-        Stream::Gnss,
-        Stream::Imu,
-        Stream::Pace,
-        Stream::Preview,
-        Stream::Descriptor,
-        Stream::Boxes,
-        Stream::Detections,
-    ];
-    let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
-    let selectors = |topics: Vec<String>| {
-        topics
-            .iter()
-            .map(|topics| KeyExpr::within(&RunScope::Any, topics))
-            .collect()
-    };
-    let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
-    let small_messages = ["control/*", "ready/*", "stats/*"]
-        .map(str::to_owned)
-        .into();
-    let small_messages = (
-        selectors(small_messages),
-        2 * Limits::HARD_METADATA_BYTES as usize,
-    );
-    small
-        .into_iter()
-        .filter_map(limit)
-        .chain([small_messages])
-        .collect()
+/// Streams that a role sends: those that the ledger covers first, numbered ones last.
+fn sent_by<S: StreamTable>(sender: Role) -> Vec<S> {
+    let mut streams = S::ROWS.to_vec();
+    streams.retain(|stream| stream.row().sender == sender);
+    streams.sort_by_key(|stream| (!stream.row().is_counted, stream.selector().contains('*')));
+    streams
 }
 
-/// Streams that the replay publishes for vehicles, without cameras.
-const SENSORS: [Stream; 4] = [Stream::Lidar, Stream::Gnss, Stream::Imu, Stream::Radar];
-/// Streams of agents.
-const SHARED: [Stream; 5] = [
-    Stream::Pose,
-    Stream::Bev,
-    Stream::Boxes,
-    Stream::Points,
-    Stream::Descriptor,
-];
-/// Streams of an ego for all principals.
-const DETECTIONS: [Stream; 3] = [Stream::Detections, Stream::DetectionsJson, Stream::Pace];
+/// One stream of every vehicle, before the link.
+fn everyones<S: StreamTable>(runs: &RunScope, stream: S) -> KeyExpr {
+    KeyExpr::within(runs, &format_args!("*/{}", stream.selector()))
+}
+
+/// Limits of message sizes, bytes, by key, in any run.
+pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
+    let keys =
+        ["control/*", "ready/*", "stats/*"].map(|keys| KeyExpr::within(&RunScope::Any, &keys));
+    let metadata_only = (keys.into(), 2 * Limits::HARD_METADATA_BYTES as usize);
+    size_limits_of::<Stream>().chain([metadata_only]).collect()
+}
+
+/// Limits of the streams of a table, lowest first.
+pub(crate) fn size_limits_of<S: StreamTable>() -> impl Iterator<Item = (Vec<KeyExpr>, usize)> {
+    let mut limited: Vec<S> = S::ROWS.to_vec();
+    limited.sort_by_key(|stream| {
+        let StreamRow {
+            sender,
+            is_counted,
+            most_bytes,
+            ..
+        } = stream.row();
+        (most_bytes, sender == Role::Ego, sender, is_counted)
+    });
+    limited.into_iter().filter_map(|stream| {
+        let topics = ["*", "rx/*/*"].map(|vehicles| format!("{vehicles}/{}", stream.selector()));
+        let keys = topics.map(|topic| KeyExpr::within(&RunScope::Any, &topic));
+        Some((keys.into(), stream.row().most_bytes?))
+    })
+}
 
 impl fmt::Display for Principal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -442,5 +419,25 @@ mod tests {
                 .iter()
                 .all(|right| right.keys.as_str().starts_with("v2v/*/"))
         );
+    }
+
+    /// Every permission of every principal, and the limits of routers: a change of a line is a change of access.
+    #[test]
+    fn permissions_and_limits_are_these() {
+        let runs = RunScope::One(RunId::new("r1").unwrap());
+        let mut text = String::new();
+        for name in [
+            "agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer", "ros2",
+        ] {
+            let principal: Principal = name.parse().unwrap();
+            for Permission { act, keys } in principal.rights(&runs) {
+                text += &format!("{name} {act:?} {keys}\n");
+            }
+        }
+        for (keys, most_bytes) in size_limits() {
+            let keys: Vec<&str> = keys.iter().map(KeyExpr::as_str).collect();
+            text += &format!("{most_bytes} bytes {}\n", keys.join(" "));
+        }
+        assert_eq!(text, include_str!("../tests/access.txt"));
     }
 }

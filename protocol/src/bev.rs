@@ -4,6 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::checks::{check_limit, check_size, check_within};
 use crate::{Limits, WireError};
 
 /// Bound of the edges of a grid, metres: far beyond any sensor.
@@ -47,59 +48,25 @@ impl BevGrid {
     /// [`WireError::Value`] for an edge that is not a finite number of plausible size, [`WireError::Limit`] for more
     /// cells than permitted, [`WireError::Shape`] for none.
     pub fn check(&self, limits: &Limits) -> Result<(), WireError> {
-        let Self {
-            x_min_m,
-            y_min_m,
-            cell_m,
-            width,
-            height,
-        } = *self;
         let (cell_min, cell_max) = CELL_RANGE_M;
-        for (what, value, min, max) in [
-            ("grid x_min_m", x_min_m, -MAX_EDGE_M, MAX_EDGE_M),
-            ("grid y_min_m", y_min_m, -MAX_EDGE_M, MAX_EDGE_M),
-            ("grid cell_m", cell_m, cell_min, cell_max),
-        ] {
-            if !(min..=max).contains(&value) {
-                return Err(WireError::Value {
-                    what,
-                    index: 0,
-                    value,
-                    min,
-                    max,
-                });
-            }
-        }
-        let cells = u64::from(width) * u64::from(height);
+        check_within("grid x_min_m", self.x_min_m, -MAX_EDGE_M, MAX_EDGE_M)?;
+        check_within("grid y_min_m", self.y_min_m, -MAX_EDGE_M, MAX_EDGE_M)?;
+        check_within("grid cell_m", self.cell_m, cell_min, cell_max)?;
+        let cells = u64::from(self.width) * u64::from(self.height);
         let max = limits.max_cells.min(u32::MAX.into());
-        match cells {
-            0 => Err(WireError::Shape {
-                what: "grid cells",
-                expected: 1,
-                found: 0,
-            }),
-            _ if cells > max => Err(WireError::Limit {
-                what: "grid cells",
-                max,
-                found: cells,
-            }),
-            _ => Ok(()),
+        if cells == 0 {
+            check_size("grid cells", cells, 1)?;
         }
+        check_limit("grid cells", cells, max)
     }
 }
 
 impl fmt::Display for BevGrid {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            x_min_m,
-            y_min_m,
-            cell_m,
-            width,
-            height,
-        } = self;
         write!(
             f,
-            "{width} x {height} cells of {cell_m} m from ({x_min_m}, {y_min_m}) m"
+            "{} x {} cells of {} m from ({}, {}) m",
+            self.width, self.height, self.cell_m, self.x_min_m, self.y_min_m
         )
     }
 }

@@ -3,7 +3,8 @@
 use nalgebra::{Isometry3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::CavId;
+use crate::checks::check_within;
+use crate::{CavId, WireError};
 
 /// An upright box: centre, full sizes, heading.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -30,6 +31,25 @@ impl Box3d {
         let [bottom, top] = [-half_h, half_h].map(|h| [a, b, c, d].map(|signs| corner(signs, h)));
         let ([a, b, c, d], [e, f, g, h]) = (bottom, top);
         [a, b, c, d, e, f, g, h]
+    }
+
+    /// Checks that messages accept the box: finite, sizes of 1 mm to 1 km, bounded centre and heading.
+    ///
+    /// # Errors
+    /// [`WireError::Value`] with the first value that is not valid.
+    pub fn check(&self) -> Result<(), WireError> {
+        self.check_from(1e-3)
+    }
+
+    /// [`Self::check`] with another smallest size, metres.
+    pub(crate) fn check_from(&self, min_size_m: f64) -> Result<(), WireError> {
+        for coordinate in self.center_m {
+            check_within("box center_m", coordinate, -1e7, 1e7)?;
+        }
+        for size in self.size_m {
+            check_within("box size_m", size, min_size_m, 1e3)?;
+        }
+        check_within("box heading_rad", self.heading_rad, -1e3, 1e3)
     }
 
     /// The same box in a world whose y axis points the other way.

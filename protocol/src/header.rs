@@ -147,6 +147,20 @@ impl Header {
         })
     }
 
+    /// Checks that the message is of a kind.
+    ///
+    /// # Errors
+    /// [`WireError::Kind`] states both.
+    pub fn check_kind(&self, expected: Kind) -> Result<(), WireError> {
+        if self.kind == expected {
+            return Ok(());
+        }
+        Err(WireError::Kind {
+            expected,
+            found: self.kind,
+        })
+    }
+
     /// Checks that the sender in the header is the vehicle that owns the key.
     ///
     /// # Errors

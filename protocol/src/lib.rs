@@ -92,6 +92,7 @@ pub mod access;
 mod bev;
 mod body;
 mod box3d;
+mod checks;
 pub mod codec;
 #[cfg(feature = "config")]
 pub mod config;

@@ -92,24 +92,16 @@ impl Reconciliation {
 
 impl fmt::Display for Discrepancy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            topic,
-            to,
-            missing,
-            counts,
-        } = self;
-        let to = to
-            .as_ref()
-            .map(|to| format!(" to {to}"))
-            .unwrap_or_default();
-        let (verb, count) = if *missing > 0 {
-            ("not accounted for", *missing)
-        } else {
-            ("received but never sent", -missing)
+        let counts = &self.counts;
+        let to = (self.to.as_ref()).map_or(String::new(), |to| format!(" to {to}"));
+        let (verb, count) = match self.missing {
+            missing @ 1.. => ("not accounted for", missing),
+            missing => ("received but never sent", -missing),
         };
         write!(
             f,
-            "{topic}{to}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",
+            "{}{to}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",
+            self.topic,
             counts.sent,
             counts.received,
             counts.dropped_total(),

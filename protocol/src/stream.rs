@@ -1,4 +1,5 @@
-//! Streams of one vehicle: the last chunks of its keys.
+//! Streams of one vehicle, the last chunks of its keys: one row per stream. Keys, permissions, accounting and the
+//! limits of routers follow from it.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,137 +7,241 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::string_enum::written_as_text;
-use crate::{KeyError, Kind};
+use crate::{KeyError, Kind, Role};
 
-/// A stream of one vehicle.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-#[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
-pub enum Stream {
+/// A row: what holds for the messages of a stream.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct StreamRow {
+    /// Their kind, which is in their headers; `None`: JSON, without a header.
+    pub kind: Option<Kind>,
+    /// Process that publishes them: the vehicle's agent or ego, or the replay. [`crate::access`] derives the receivers.
+    pub sender: Role,
+    /// True if the ledger covers them: not previews, nor messages that are repeated for late joiners, whose number of
+    /// receptions is undefined.
+    pub is_counted: bool,
+    /// Limit of their size at a router, which does not read them, bytes; `None`: limited by the transport only.
+    pub most_bytes: Option<usize>,
+}
+
+/// A table of streams.
+pub(crate) trait StreamTable: Copy + fmt::Display + 'static {
+    /// One stream of each row.
+    const ROWS: &'static [Self];
+
+    /// The row of the stream.
+    fn row(self) -> StreamRow;
+
+    /// Last chunks of the keys of its row, with a wildcard in place of a number.
+    fn selector(self) -> String;
+}
+
+/// Rows `Variant = "chunks": kind, sender, is it counted, most bytes at a router`, each with its documentation. A row
+/// of several numbered streams names the number: `Variant(index: u8) = "chunks/{index}"`.
+macro_rules! streams {
+    ($(
+        $(#[$doc:meta])*
+        $variant:ident $(($index:ident: $number:ty))? = $name:literal:
+            $kind:expr, $sender:ident, $is_counted:expr, $most_bytes:expr;
+    )+) => {
+        /// A stream of one vehicle.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+        #[serde(try_from = "String", into = "String")]
+        #[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
+        pub enum Stream {
+            $($(#[$doc])* $variant $(($number))?,)+
+        }
+
+        impl StreamTable for Stream {
+            const ROWS: &'static [Self] = &[$(Self::$variant $((<$number>::MIN))?),+];
+
+            fn row(self) -> StreamRow {
+                let (kind, sender, is_counted, most_bytes) = match self {
+                    $(Self::$variant { .. } => ($kind, Role::$sender, $is_counted, $most_bytes),)+
+                };
+                StreamRow { kind, sender, is_counted, most_bytes }
+            }
+
+            fn selector(self) -> String {
+                match self {
+                    $(Self::$variant { .. } => {
+                        $(let $index = "*";)?
+                        format_args!($name).to_string()
+                    })+
+                }
+            }
+        }
+
+        impl Stream {
+            /// Reads the chunks of a key that name a stream.
+            pub(crate) fn from_chunks(chunks: &[&str]) -> Option<Self> {
+                $(if is_named(chunks, $name) {
+                    return Some(Self::$variant $((number::<$number>(chunks)?))?);
+                })+
+                None
+            }
+        }
+
+        impl fmt::Display for Stream {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                match self {
+                    $(Self::$variant $(($index))? => write!(f, $name),)+
+                }
+            }
+        }
+
+        impl FromStr for Stream {
+            type Err = KeyError;
+
+            fn from_str(text: &str) -> Result<Self, KeyError> {
+                let chunks: Vec<&str> = text.splitn(3, '/').collect();
+                Self::from_chunks(&chunks).ok_or_else(|| KeyError::unknown(text))
+            }
+        }
+
+        written_as_text!(Stream);
+    };
+}
+
+streams! {
     /// `lidar`: sweeps.
-    Lidar,
+    Lidar = "lidar": Some(Kind::Lidar), Replay, true, None;
     /// `@preview`: a few points of every sweep, for viewers. A subscription to all keys does not match a chunk that
     /// begins with `@`: a recording has whole sweeps.
-    Preview,
+    Preview = "@preview": Some(Kind::Lidar), Replay, false, Some(64 << 10);
     /// `gnss`: recorded or GNSS poses.
-    Gnss,
+    Gnss = "gnss": Some(Kind::Gnss), Replay, true, Some(16 << 10);
     /// `imu`: speed and yaw rate that the vehicle measures itself.
-    Imu,
+    Imu = "imu": Some(Kind::Imu), Replay, true, Some(16 << 10);
     /// `camera/<k>`: images of camera `k`.
-    Camera(u8),
+    Camera(index: u8) = "camera/{index}": Some(Kind::Camera), Replay, true, None;
     /// `radar`: radar sweeps.
-    Radar,
+    Radar = "radar": Some(Kind::Radar), Replay, true, None;
     /// `pose`: pose estimates.
-    Pose,
+    Pose = "pose": Some(Kind::Pose), Agent, true, Some(16 << 10);
     /// `bev`: feature maps.
-    Bev,
+    Bev = "bev": Some(Kind::Bev), Agent, true, None;
     /// `boxes`: detections of one vehicle from its own sensors.
-    Boxes,
+    Boxes = "boxes": Some(Kind::Boxes), Agent, true, Some(4 << 20);
     /// `points`: raw points, for the early-fusion baseline only.
-    Points,
+    Points = "points": Some(Kind::Points), Agent, true, None;
     /// `pace`: the sweeps that an ego has time for.
-    Pace,
+    Pace = "pace": Some(Kind::Pace), Ego, false, Some(16 << 10);
     /// `descriptor`: model and streams of the vehicle.
-    Descriptor,
+    Descriptor = "descriptor": Some(Kind::Descriptor), Agent, false, Some(4 << 20);
     /// `detections`: detections of an ego.
-    Detections,
+    Detections = "detections": Some(Kind::Detections), Ego, true, Some(4 << 20);
     /// `detections/json`: the same as JSON.
-    DetectionsJson,
+    DetectionsJson = "detections/json": None, Ego, true, None;
 }
 
 impl Stream {
     /// The kind of the messages on this stream; `None` if they do not have this wire format.
     #[must_use]
     pub fn kind(self) -> Option<Kind> {
-        Some(match self {
-            Self::Lidar | Self::Preview => Kind::Lidar,
-            Self::Gnss => Kind::Gnss,
-            Self::Imu => Kind::Imu,
-            Self::Camera(_) => Kind::Camera,
-            Self::Radar => Kind::Radar,
-            Self::Pose => Kind::Pose,
-            Self::Bev => Kind::Bev,
-            Self::Boxes => Kind::Boxes,
-            Self::Points => Kind::Points,
-            Self::Pace => Kind::Pace,
-            Self::Descriptor => Kind::Descriptor,
-            Self::Detections => Kind::Detections,
-            Self::DetectionsJson => return None,
-        })
+        self.row().kind
     }
+}
 
-    /// Limit of the size of a message of this stream, bytes; `None`: limited by the transport only. For processes that
-    /// forward messages without reading them.
-    pub(crate) fn most_bytes(self) -> Option<usize> {
-        match self {
-            Self::Pose | Self::Gnss | Self::Imu | Self::Pace => Some(16 << 10),
-            Self::Preview => Some(64 << 10),
-            Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
-            Self::Lidar
-            | Self::Camera(_)
-            | Self::Radar
-            | Self::Bev
-            | Self::Points
-            | Self::DetectionsJson => None,
+/// True if the chunks are those of a name, whose number may be any text.
+fn is_named(chunks: &[&str], name: &str) -> bool {
+    let names = name.split('/');
+    let is_chunk = |(name, chunk): (&str, &&str)| name == *chunk || name.starts_with('{');
+    names.clone().count() == chunks.len() && names.zip(chunks).all(is_chunk)
+}
+
+/// The number in the last chunk. One stream has one spelling: no sign, no leading zero.
+fn number<N: FromStr + ToString>(chunks: &[&str]) -> Option<N> {
+    let text = chunks.last()?;
+    let number: N = text.parse().ok()?;
+    (number.to_string() == *text).then_some(number)
+}
+
+#[cfg(test)]
+mod tests {
+    /// A table of its own, with streams that the protocol does not have.
+    #[allow(unreachable_pub)]
+    mod dummy {
+        use std::fmt;
+        use std::str::FromStr;
+
+        use serde::{Deserialize, Serialize};
+
+        use super::super::{StreamRow, StreamTable, is_named, number};
+        use crate::string_enum::written_as_text;
+        use crate::{KeyError, Kind, Role};
+
+        streams! {
+            /// Sound.
+            Sonar = "sonar": Some(Kind::Radar), Replay, true, None;
+            /// What an agent hears, by ear.
+            Echo(ear: u8) = "echo/{ear}": Some(Kind::Boxes), Agent, true, Some(1 << 10);
+            /// How loud an ego wants it.
+            Volume = "volume": Some(Kind::Pace), Ego, false, Some(1 << 9);
         }
     }
 
-    /// Reads the chunks of a key that name a stream.
-    pub(crate) fn from_chunks(chunks: &[&str]) -> Option<Self> {
-        Some(match chunks {
-            ["lidar"] => Self::Lidar,
-            ["@preview"] => Self::Preview,
-            ["gnss"] => Self::Gnss,
-            ["imu"] => Self::Imu,
-            ["camera", index] => Self::Camera(camera_index(index)?),
-            ["radar"] => Self::Radar,
-            ["pose"] => Self::Pose,
-            ["bev"] => Self::Bev,
-            ["boxes"] => Self::Boxes,
-            ["points"] => Self::Points,
-            ["pace"] => Self::Pace,
-            ["descriptor"] => Self::Descriptor,
-            ["detections"] => Self::Detections,
-            ["detections", "json"] => Self::DetectionsJson,
-            _ => return None,
-        })
+    use dummy::Stream;
+
+    use super::StreamTable;
+    use crate::access::size_limits_of;
+    use crate::{Kind, Principal, RunId, RunScope};
+
+    /// Keys of a run, by principal: those on which it publishes, and those to which it subscribes.
+    fn keys(principal: &str) -> [Vec<String>; 2] {
+        let runs = RunScope::One(RunId::new("r").unwrap());
+        let principal: Principal = principal.parse().unwrap();
+        let [publish, subscribe] = principal.streams::<Stream>(&runs);
+        [publish, subscribe].map(|keys| keys.iter().map(ToString::to_string).collect())
     }
-}
 
-/// One camera has one spelling: no sign, no leading zero.
-fn camera_index(text: &str) -> Option<u8> {
-    let index: u8 = text.parse().ok()?;
-    (index.to_string() == text).then_some(index)
-}
-
-impl fmt::Display for Stream {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Lidar => f.write_str("lidar"),
-            Self::Preview => f.write_str("@preview"),
-            Self::Gnss => f.write_str("gnss"),
-            Self::Imu => f.write_str("imu"),
-            Self::Camera(index) => write!(f, "camera/{index}"),
-            Self::Radar => f.write_str("radar"),
-            Self::Pose => f.write_str("pose"),
-            Self::Bev => f.write_str("bev"),
-            Self::Boxes => f.write_str("boxes"),
-            Self::Points => f.write_str("points"),
-            Self::Pace => f.write_str("pace"),
-            Self::Descriptor => f.write_str("descriptor"),
-            Self::Detections => f.write_str("detections"),
-            Self::DetectionsJson => f.write_str("detections/json"),
+    #[test]
+    fn a_new_stream_is_one_row() {
+        for (text, stream) in [
+            ("sonar", Stream::Sonar),
+            ("echo/2", Stream::Echo(2)),
+            ("volume", Stream::Volume),
+        ] {
+            assert_eq!(stream.to_string(), text);
+            assert_eq!(text.parse(), Ok(stream));
+            assert_eq!(String::from(stream), text);
         }
+        for text in ["echo", "echo/02", "echo/256", "echo/2/2", "sonar/1", ""] {
+            assert!(text.parse::<Stream>().is_err(), "{text}");
+        }
+        assert_eq!(Stream::Echo(1).row().kind, Some(Kind::Boxes));
+        assert!(Stream::Sonar.row().is_counted && !Stream::Volume.row().is_counted);
+
+        assert_eq!(
+            keys("agent-1"),
+            [
+                vec!["v2v/r/1/echo/*"],
+                vec!["v2v/r/1/sonar", "v2v/r/*/volume"]
+            ]
+        );
+        assert_eq!(
+            keys("ego-2"),
+            [
+                vec!["v2v/r/2/volume"],
+                vec!["v2v/r/*/echo/*", "v2v/r/rx/2/*/echo/*"]
+            ]
+        );
+        assert_eq!(
+            keys("link-2"),
+            [vec!["v2v/r/rx/2/*/echo/*"], vec!["v2v/r/*/echo/*"]]
+        );
+        assert_eq!(keys("replay"), [vec!["v2v/r/*/sonar"], vec![]]);
+
+        let limits = size_limits_of::<Stream>().map(|(keys, most_bytes)| {
+            let keys: Vec<String> = keys.iter().map(ToString::to_string).collect();
+            (keys.join(" "), most_bytes)
+        });
+        let expected = [
+            ("v2v/*/*/volume v2v/*/rx/*/*/volume", 512),
+            ("v2v/*/*/echo/* v2v/*/rx/*/*/echo/*", 1024),
+        ];
+        assert_eq!(
+            limits.collect::<Vec<_>>(),
+            expected.map(|(keys, most_bytes)| (keys.to_owned(), most_bytes))
+        );
     }
 }
-
-impl FromStr for Stream {
-    type Err = KeyError;
-
-    fn from_str(text: &str) -> Result<Self, KeyError> {
-        let chunks: Vec<&str> = text.splitn(3, '/').collect();
-        Self::from_chunks(&chunks).ok_or_else(|| KeyError::unknown(text))
-    }
-}
-
-written_as_text!(Stream);

@@ -6,8 +6,9 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::key::{MAX_KEY_BYTES, shown};
+use crate::stream::StreamTable as _;
 use crate::string_enum::{named, written_as_text};
-use crate::{CavId, IdError, Key, KeyError, ProcessId, RunId, Stream};
+use crate::{CavId, IdError, Key, KeyError, Kind, ProcessId, RunId, Stream};
 
 named! {
     /// Role of a process in a run, part of its liveliness token.
@@ -98,13 +99,22 @@ impl Topic {
         }
     }
 
+    /// Kind of its messages; `None` if they do not have this wire format.
+    pub fn kind(&self) -> Option<Kind> {
+        match self {
+            Self::Stream { stream, .. } | Self::Received { stream, .. } => stream.kind(),
+            Self::Truth => Some(Kind::Truth),
+            Self::Control(_) | Self::Ready(_) => Some(Kind::Control),
+            Self::Stats(_) => Some(Kind::Stats),
+            Self::Alive { .. } => None,
+        }
+    }
+
     /// True if the ledger covers it: data, but not control messages, not messages that are repeated for late joiners
     /// (their number of receptions is undefined), and not previews.
-    pub fn is_booked(&self) -> bool {
+    pub fn is_counted(&self) -> bool {
         match self {
-            Self::Stream { stream, .. } | Self::Received { stream, .. } => {
-                !matches!(stream, Stream::Descriptor | Stream::Pace | Stream::Preview)
-            }
+            Self::Stream { stream, .. } | Self::Received { stream, .. } => stream.row().is_counted,
             Self::Truth => true,
             Self::Control(_) | Self::Ready(_) | Self::Stats(_) | Self::Alive { .. } => false,
         }
@@ -112,52 +122,36 @@ impl Topic {
 
     /// True if its messages are JSON, without a header.
     pub fn is_json(&self) -> bool {
-        matches!(
-            self,
-            Self::Stream {
-                stream: Stream::DetectionsJson,
-                ..
-            } | Self::Received {
-                stream: Stream::DetectionsJson,
-                ..
-            }
-        )
+        let is_stream = matches!(self, Self::Stream { .. } | Self::Received { .. });
+        is_stream && self.kind().is_none()
     }
 
-    fn from_chunks(chunks: &[&str]) -> Result<Option<Self>, IdError> {
-        Ok(match chunks {
-            ["truth"] => Some(Self::Truth),
-            ["control", verb] => Verb::ALL
-                .into_iter()
-                .find(|known| known.as_str() == *verb)
-                .map(Self::Control),
-            ["ready", process] => Some(Self::Ready(ProcessId::new(process)?)),
-            ["stats", process] => Some(Self::Stats(ProcessId::new(process)?)),
+    fn from_chunks(chunks: &[&str]) -> Option<Result<Self, IdError>> {
+        Some(match chunks {
+            ["truth"] => Ok(Self::Truth),
+            ["control", verb] => Ok(Self::Control(
+                Verb::ALL
+                    .into_iter()
+                    .find(|known| known.as_str() == *verb)?,
+            )),
+            ["ready", process] => ProcessId::new(process).map(Self::Ready),
+            ["stats", process] => ProcessId::new(process).map(Self::Stats),
             ["alive", role, cav] => {
-                match Role::ALL.into_iter().find(|known| known.as_str() == *role) {
-                    Some(role) => Some(Self::Alive {
-                        role,
-                        cav: CavId::new(cav)?,
-                    }),
-                    None => None,
-                }
+                let role = Role::ALL
+                    .into_iter()
+                    .find(|known| known.as_str() == *role)?;
+                CavId::new(cav).map(|cav| Self::Alive { role, cav })
             }
-            ["rx", ego, cav, stream @ ..] => match Stream::from_chunks(stream) {
-                Some(stream) => Some(Self::Received {
-                    ego: CavId::new(ego)?,
-                    cav: CavId::new(cav)?,
-                    stream,
-                }),
-                None => None,
-            },
-            [cav, stream @ ..] => match Stream::from_chunks(stream) {
-                Some(stream) => Some(Self::Stream {
-                    cav: CavId::new(cav)?,
-                    stream,
-                }),
-                None => None,
-            },
-            [] => None,
+            ["rx", ego, cav, stream @ ..] => {
+                let stream = Stream::from_chunks(stream)?;
+                let ids = CavId::new(ego).and_then(|ego| Ok((ego, CavId::new(cav)?)));
+                ids.map(|(ego, cav)| Self::Received { ego, cav, stream })
+            }
+            [cav, stream @ ..] => {
+                let stream = Stream::from_chunks(stream)?;
+                CavId::new(cav).map(|cav| Self::Stream { cav, stream })
+            }
+            [] => return None,
         })
     }
 }
@@ -189,11 +183,11 @@ impl FromStr for Topic {
         }
         let chunks: Vec<&str> = text.split('/').collect();
         Self::from_chunks(&chunks)
+            .ok_or_else(|| KeyError::unknown(text))?
             .map_err(|source| KeyError::Id {
                 text: shown(text),
                 source,
-            })?
-            .ok_or_else(|| KeyError::unknown(text))
+            })
     }
 }
 

@@ -7,6 +7,7 @@
 use crc32fast::Hasher;
 
 use crate::body::{PayloadReader, check_body};
+use crate::checks::check_limit;
 use crate::header::{HEADER_LEN, Header, Stamp};
 use crate::message::{Message, MessageSource, MessageVisitor, Payload};
 use crate::{Body, Limits, WireError, metadata};
@@ -122,12 +123,7 @@ pub fn decode<'a, M: Payload>(
     limits: &Limits,
 ) -> Result<(Header, M), WireError> {
     let (header, reader) = open(pieces, limits)?;
-    if header.kind != M::KIND {
-        return Err(WireError::Kind {
-            expected: M::KIND,
-            found: header.kind,
-        });
-    }
+    header.check_kind(M::KIND)?;
     let message = decode_payload(&header, reader, limits)?;
     Ok((header, message))
 }
@@ -181,20 +177,8 @@ fn open<'a>(
         ..
     } = header;
     let max = limits.max_metadata_bytes.min(Limits::HARD_METADATA_BYTES);
-    if metadata_len > max {
-        return Err(WireError::Limit {
-            what: "metadata bytes",
-            max: max.into(),
-            found: metadata_len.into(),
-        });
-    }
-    if body_len > limits.max_body_bytes {
-        return Err(WireError::Limit {
-            what: "body bytes",
-            max: limits.max_body_bytes,
-            found: body_len,
-        });
-    }
+    check_limit("metadata bytes", metadata_len.into(), max.into())?;
+    check_limit("body bytes", body_len, limits.max_body_bytes)?;
     let expected = body_len.saturating_add(HEADER_LEN as u64 + u64::from(metadata_len));
     match found {
         _ if found < expected => Err(WireError::Truncated { expected, found }),

@@ -25,7 +25,7 @@ const MAX_PROBLEMS: usize = 16;
 /// Timings kept per stage: at 10 Hz the last three minutes.
 const KEPT_TIMINGS: usize = 2048;
 
-/// Message counters of one process. Clones share them. Topics outside the accounting ([`Topic::is_booked`]) are not
+/// Message counters of one process. Clones share them. Topics outside the accounting ([`Topic::is_counted`]) are not
 /// counted.
 #[derive(Clone)]
 pub struct MessageStats {
@@ -456,7 +456,7 @@ impl MessageStats {
     }
 
     fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {
-        if topic.is_booked() {
+        if topic.is_counted() {
             let mut state = self.lock();
             // Forged ids must not fill the memory, nor make a ledger that exceeds the limit of its receivers.
             if state.ledger.len() < MAX_ACCOUNTS || self.has_account(&state, topic) {

@@ -7,15 +7,17 @@ use std::fmt;
 use std::net::SocketAddr;
 
 use prometheus_client::collector::Collector;
-use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, text};
+use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric, text};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 
+use protocol::Account;
+
 pub use fleet::MetricsPeer;
 
-use super::{FrameStats, MessageStats, process_usage};
+use super::{FrameStats, MessageStats, PeerSummary, process_usage};
 use crate::web::{Answer, WebServer};
 
 /// Serves the counters of a process at `http://<address>/metrics` until dropped.
@@ -145,6 +147,21 @@ fn encode_frames(frames: &FrameStats, encoder: &mut DescriptorEncoder<'_>) -> fm
     )
 }
 
+/// Encodes a metric, given by name and help: a value for each set of labels.
+fn encode_series<L: EncodeLabelSet, M: EncodeMetric>(
+    encoder: &mut DescriptorEncoder<'_>,
+    (name, help): (&str, &str),
+    unit: Option<&Unit>,
+    metric_type: MetricType,
+    series: impl IntoIterator<Item = (L, M)>,
+) -> fmt::Result {
+    let mut metric = encoder.encode_descriptor(name, help, unit, metric_type)?;
+    for (labels, value) in series {
+        value.encode(metric.encode_family(&labels)?)?;
+    }
+    Ok(())
+}
+
 struct StatsCollector(MessageStats);
 
 impl fmt::Debug for StatsCollector {
@@ -156,114 +173,81 @@ impl fmt::Debug for StatsCollector {
 impl Collector for StatsCollector {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
         let ledger = self.0.ledger();
-        let topics: Vec<(String, _)> = ledger
-            .iter()
-            .map(|(account, counts)| (account.topic.to_string(), (account.to.is_some(), counts)))
-            .collect();
-        let mut sent = encoder.encode_descriptor(
-            "messages_sent",
-            "Messages published",
-            None,
-            MetricType::Counter,
-        )?;
-        for (topic, (_, counts)) in topics.iter().filter(|(_, (is_received, _))| !is_received) {
-            ConstCounter::new(counts.sent)
-                .encode(sent.encode_family(&[("topic", topic.as_str())])?)?;
-        }
-        let mut received = encoder.encode_descriptor(
-            "messages_received",
-            "Messages accepted and used",
-            None,
-            MetricType::Counter,
-        )?;
-        for (topic, (_, counts)) in topics.iter().filter(|(_, (is_received, _))| *is_received) {
-            ConstCounter::new(counts.received)
-                .encode(received.encode_family(&[("topic", topic.as_str())])?)?;
-        }
-        let mut dropped = encoder.encode_descriptor(
-            "messages_dropped",
-            "Messages lost, by reason",
-            None,
-            MetricType::Counter,
-        )?;
-        for (topic, (is_received, counts)) in &topics {
-            let side = if *is_received { "receiver" } else { "sender" };
-            for (reason, count) in &counts.dropped {
-                let labels = [
-                    ("topic", topic.as_str()),
-                    ("side", side),
-                    ("reason", reason.as_str()),
-                ];
-                ConstCounter::new(*count).encode(dropped.encode_family(&labels)?)?;
-            }
-        }
-        let mut in_flight = encoder.encode_descriptor(
-            "messages_in_flight",
-            "Messages in flight",
-            None,
-            MetricType::Gauge,
-        )?;
-        for (topic, (is_received, counts)) in &topics {
-            let side = if *is_received { "receiver" } else { "sender" };
+        let sent = ledger.iter().filter(|(account, _)| account.to.is_none());
+        let received = ledger.iter().filter(|(account, _)| account.to.is_some());
+        let topic = |account: &Account| ("topic", account.topic.to_string());
+        let topic_and_side = |account: &Account| {
+            let side = account.to.as_ref().map_or("sender", |_| "receiver");
+            [topic(account), ("side", side.to_owned())]
+        };
+        let help = ("messages_sent", "Messages published");
+        let series =
+            sent.map(|(account, counts)| ([topic(account)], ConstCounter::new(counts.sent)));
+        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        let help = ("messages_received", "Messages accepted and used");
+        let series = received
+            .map(|(account, counts)| ([topic(account)], ConstCounter::new(counts.received)));
+        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        let help = ("messages_dropped", "Messages lost, by reason");
+        let series = ledger.iter().flat_map(|(account, counts)| {
+            let [topic, side] = topic_and_side(account);
+            counts.dropped.iter().map(move |(reason, count)| {
+                let reason = ("reason", reason.to_string());
+                (
+                    [topic.clone(), side.clone(), reason],
+                    ConstCounter::new(*count),
+                )
+            })
+        });
+        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        let help = ("messages_in_flight", "Messages in flight");
+        let series = ledger.iter().map(|(account, counts)| {
             let count = i64::try_from(counts.in_flight).unwrap_or(i64::MAX);
-            let labels = [("topic", topic.as_str()), ("side", side)];
-            ConstGauge::new(count).encode(in_flight.encode_family(&labels)?)?;
-        }
-        let mut shared = encoder.encode_descriptor(
+            (topic_and_side(account), ConstGauge::new(count))
+        });
+        encode_series(&mut encoder, help, None, MetricType::Gauge, series)?;
+        let help = (
             "shared_memory_messages",
             "Large messages of a process with a pool of shared memory, by their way",
-            None,
-            MetricType::Counter,
-        )?;
-        for (way, count) in self.0.shared_memory() {
-            ConstCounter::new(count).encode(shared.encode_family(&[("way", way.as_str())])?)?;
-        }
-        let help = "Bytes of published messages, each counted once for all its receivers";
-        let mut bytes = encoder.encode_descriptor(
+        );
+        let series = self.0.shared_memory().into_iter();
+        let series = series.map(|(way, count)| ([("way", way.as_str())], ConstCounter::new(count)));
+        encode_series(&mut encoder, help, None, MetricType::Counter, series)?;
+        let help = (
             "published",
+            "Bytes of published messages, each counted once for all its receivers",
+        );
+        let series = self.0.traffic().into_iter().map(|traffic| {
+            let topic = ("topic", traffic.topic.to_string());
+            ([topic], ConstCounter::new(traffic.bytes))
+        });
+        encode_series(
+            &mut encoder,
             help,
             Some(&Unit::Bytes),
             MetricType::Counter,
+            series,
         )?;
-        for traffic in self.0.traffic() {
-            let topic = traffic.topic.to_string();
-            ConstCounter::new(traffic.bytes)
-                .encode(bytes.encode_family(&[("topic", topic.as_str())])?)?;
-        }
         encode_frames(&self.0.frames(), &mut encoder)?;
-        let seconds = Unit::Seconds;
         let peers = self.0.peers();
-        let mut clocks = encoder.encode_descriptor(
+        let of_vehicle = |peer: &PeerSummary, value: Option<f64>| {
+            Some(([("vehicle", peer.cav.to_string())], ConstGauge::new(value?)))
+        };
+        let help = (
             "clock_offset",
             "Clock of a vehicle minus ours, minus the shortest transit time",
-            Some(&seconds),
-            MetricType::Gauge,
-        )?;
-        for (cav, offset_s) in peers
+        );
+        let seconds = Some(&Unit::Seconds);
+        let series = peers
             .iter()
-            .filter_map(|peer| Some((&peer.cav, peer.clock_offset_s?)))
-        {
-            ConstGauge::new(offset_s)
-                .encode(clocks.encode_family(&[("vehicle", cav.as_str())])?)?;
-        }
-        let mut trust = encoder.encode_descriptor(
-            "trust",
-            "Trust score of a vehicle, 0 to 1",
-            None,
-            MetricType::Gauge,
-        )?;
-        for (cav, value) in peers
-            .iter()
-            .filter_map(|peer| Some((&peer.cav, peer.trust?)))
-        {
-            ConstGauge::new(value).encode(trust.encode_family(&[("vehicle", cav.as_str())])?)?;
-        }
-        let mut stages = encoder.encode_descriptor(
-            "stage",
-            "Duration of a stage for one frame",
-            Some(&seconds),
-            MetricType::Histogram,
-        )?;
+            .filter_map(|peer| of_vehicle(peer, peer.clock_offset_s));
+        encode_series(&mut encoder, help, seconds, MetricType::Gauge, series)?;
+        let help = ("trust", "Trust score of a vehicle, 0 to 1");
+        let series = peers.iter().filter_map(|peer| of_vehicle(peer, peer.trust));
+        encode_series(&mut encoder, help, None, MetricType::Gauge, series)?;
+        let help = "Duration of a stage for one frame";
+        let mut stages =
+            encoder.encode_descriptor("stage", help, seconds, MetricType::Histogram)?;
         for histogram in self.0.histograms() {
             let labels = [("stage", histogram.stage.as_str())];
             let mut family = stages.encode_family(&labels)?;

@@ -158,7 +158,7 @@ impl Publisher {
         } = options;
         let topic = key.topic.clone();
         // JSON is read by programs outside this project, which do not expect probes.
-        let is_json = matches!(&topic, Topic::Stream { stream, .. } if stream.kind().is_none());
+        let is_json = topic.is_json();
         let encoding = if is_json {
             Encoding::APPLICATION_JSON
         } else {

@@ -435,25 +435,13 @@ fn is_notice(topic: &Topic, header: &Header) -> bool {
 
 /// Checks sender and kind of a message on `topic`.
 fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
-    let expected = match topic {
-        Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
-            header.check_sender(cav)?;
-            stream.kind()
-        }
-        Topic::Truth => Some(Kind::Truth),
-        Topic::Control(_) | Topic::Ready(_) => Some(Kind::Control),
-        Topic::Stats(_) => Some(Kind::Stats),
-        Topic::Alive { .. } => None,
-    };
-    match expected {
-        Some(expected) if header.kind != expected && header.kind != Kind::Control => {
-            Err(WireError::Kind {
-                expected,
-                found: header.kind,
-            })
-        }
-        _ => Ok(header),
+    if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = topic {
+        header.check_sender(cav)?;
     }
+    if let Some(expected) = topic.kind().filter(|_| header.kind != Kind::Control) {
+        header.check_kind(expected)?;
+    }
+    Ok(header)
 }
 
 #[cfg(test)]

@@ -37,35 +37,21 @@ enum Content {
 }
 
 impl Decoded {
-    /// Decodes a message, which has to be of `kind` if one is given.
-    fn of_kind(kind: Option<Kind>, bytes: &[u8]) -> Result<Self, protocol::WireError> {
-        let header = wire::decode_header([bytes])?;
-        match kind {
-            Some(expected) if expected != header.kind => {
-                return Err(protocol::WireError::Kind {
-                    expected,
-                    found: header.kind,
-                });
-            }
-            _ => {}
-        }
+    /// Decodes a message of a kind.
+    fn of_kind(kind: Kind, bytes: &[u8]) -> Result<Self, protocol::WireError> {
+        wire::decode_header([bytes])?.check_kind(kind)?;
         let (header, message) = wire::decode_any([bytes], &Limits::DEFAULT)?;
         Self::new(header, message, bytes.len())
     }
 
     /// Decodes a message that was published on a key.
     pub(crate) fn of_key(key: &Key, bytes: &[u8]) -> Result<Self, protocol::WireError> {
-        let kind = match &key.topic {
-            Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
-                let header = wire::decode_header([bytes])?;
-                let message = decode_stream(cav, *stream, [bytes])?;
-                return Self::new(header, message, bytes.len());
-            }
-            Topic::Truth => Kind::Truth,
-            Topic::Stats(_) => Kind::Stats,
-            Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => Kind::Control,
-        };
-        Self::of_kind(Some(kind), bytes)
+        if let Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } = &key.topic {
+            let header = wire::decode_header([bytes])?;
+            let message = decode_stream(cav, *stream, [bytes])?;
+            return Self::new(header, message, bytes.len());
+        }
+        Self::of_kind(key.topic.kind().unwrap_or(Kind::Control), bytes)
     }
 
     fn new(
@@ -87,12 +73,8 @@ impl Decoded {
 
 impl Message {
     pub(crate) fn new(py: Python<'_>, key: Option<String>, decoded: Decoded) -> PyResult<Self> {
-        let Decoded {
-            header: Header { kind, stamp, .. },
-            content,
-            wire_bytes,
-        } = decoded;
-        let payload = match content {
+        let Header { kind, stamp, .. } = decoded.header;
+        let payload = match decoded.content {
             Content::Bev(bev) => Bev::new(py, bev)?.into_any(),
             Content::Other(message) => payload(py, &stamp.cav, message)?,
         };
@@ -104,7 +86,7 @@ impl Message {
             sequence: stamp.sequence,
             capture_time_ns: stamp.capture_nanos,
             publish_time_ns: stamp.publish_nanos,
-            wire_bytes,
+            wire_bytes: decoded.wire_bytes,
             payload,
         })
     }
@@ -179,7 +161,7 @@ pub(crate) fn decode(py: Python<'_>, kind_or_key: &str, data: &[u8]) -> PyResult
                 known()
             ))
         })?;
-        let decoded = py.detach(|| Decoded::of_kind(Some(kind), data));
+        let decoded = py.detach(|| Decoded::of_kind(kind, data));
         return Message::new(py, None, decoded.map_err(|cause| named(&cause))?);
     }
     let key: Key = kind_or_key

@@ -33,14 +33,7 @@ pub(crate) struct Agent {
 impl Agent {
     /// Converts all parts but the ground truth, which stays in the frame as well.
     pub(crate) fn new(py: Python<'_>, parts: AgentParts) -> PyResult<(Py<Self>, frame::Frame)> {
-        let AgentParts {
-            mut recorded,
-            has_points,
-            gnss_world_from_lidar,
-            pose,
-            bev,
-            boxes,
-        } = parts;
+        let mut recorded = parts.recorded;
         let matrix = |pose: Option<&Pose>| pose.map(|pose| arrays::pose(py, pose)).transpose();
         let cameras = PyDict::new(py);
         for (number, camera) in std::mem::take(&mut recorded.cameras) {
@@ -50,19 +43,23 @@ impl Agent {
         let points = std::mem::take(&mut recorded.points).xyzi;
         let radar = recorded.radar.take();
         let made = Self {
-            points: has_points.then(|| arrays::rows(py, points)).transpose()?,
+            points: (parts.has_points)
+                .then(|| arrays::rows(py, points))
+                .transpose()?,
             radar: radar
                 .map(|sweep| arrays::rows(py, sweep.xyzi))
                 .transpose()?,
             cameras: cameras.unbind(),
             world_from_lidar: matrix(recorded.world_from_lidar.as_ref())?,
-            gnss_world_from_lidar: matrix(gnss_world_from_lidar.as_ref())?,
+            gnss_world_from_lidar: matrix(parts.gnss_world_from_lidar.as_ref())?,
             speed_mps: recorded.speed_mps,
             yaw_rate_rad_s: recorded.yaw_rate_rad_s,
             objects: Objects::annotated(py, &recorded)?,
-            pose: pose.map(|pose| PoseEstimate::new(py, &pose)).transpose()?,
-            bev: bev.map(|bev| Bev::new(py, bev)).transpose()?,
-            boxes: boxes
+            pose: (parts.pose)
+                .map(|pose| PoseEstimate::new(py, &pose))
+                .transpose()?,
+            bev: (parts.bev).map(|bev| Bev::new(py, bev)).transpose()?,
+            boxes: (parts.boxes)
                 .map(|boxes| Detections::of_agent(py, &cav, &boxes))
                 .transpose()?,
             cav,
@@ -126,39 +123,30 @@ pub(crate) struct Frame {
 
 impl Frame {
     pub(crate) fn new(py: Python<'_>, parts: FrameParts) -> PyResult<Self> {
-        let FrameParts {
-            source,
-            tick,
-            capture_nanos,
-            agents: parts,
-            detections: results,
-            problems,
-            protocol,
-        } = parts;
         let (agents, detections) = (PyDict::new(py), PyDict::new(py));
-        let mut truth = Vec::with_capacity(parts.len());
-        for agent in parts {
+        let mut truth = Vec::with_capacity(parts.agents.len());
+        for agent in parts.agents {
             let (agent, recorded) = Agent::new(py, agent)?;
             agents.set_item(recorded.cav.as_str(), agent)?;
             truth.push(recorded);
         }
-        for result in &results {
+        for result in &parts.detections {
             detections.set_item(result.ego.as_str(), Detections::of_ego(py, result)?)?;
         }
-        let ego = results
+        let ego = (parts.detections)
             .first()
             .map(|result| &result.ego)
             .or(truth.first().map(|agent| &agent.cav));
         Ok(Self {
-            source,
-            tick,
-            capture_time_ns: capture_nanos,
+            source: parts.source,
+            tick: parts.tick,
+            capture_time_ns: parts.capture_nanos,
             agents: agents.unbind(),
             detections: detections.unbind(),
-            problems,
+            problems: parts.problems,
             ego: ego.map(ToString::to_string),
             truth,
-            protocol,
+            protocol: parts.protocol,
         })
     }
 

@@ -184,14 +184,7 @@ impl AgentParts {
 /// True for topics whose messages are part of frames. What reaches an ego over an emulated link is not: it is the same
 /// message, later or not at all.
 pub(crate) fn is_part_of_frames(topic: &Topic) -> bool {
-    match topic {
-        Topic::Truth => true,
-        Topic::Stream { stream, .. } => !matches!(
-            stream,
-            Stream::Preview | Stream::Descriptor | Stream::Pace | Stream::DetectionsJson
-        ),
-        _ => false,
-    }
+    !matches!(topic, Topic::Received { .. }) && topic.is_counted() && !topic.is_json()
 }
 
 /// Decodes a message of a vehicle's stream and checks that it is of that vehicle and of that stream's kind.
@@ -202,11 +195,8 @@ pub(crate) fn decode_stream<'a>(
 ) -> Result<Message, WireError> {
     let (header, message) = wire::decode_any(pieces, &Limits::DEFAULT)?;
     header.check_sender(cav)?;
-    match stream.kind() {
-        Some(expected) if expected != header.kind => Err(WireError::Kind {
-            expected,
-            found: header.kind,
-        }),
-        _ => Ok(message),
-    }
+    stream
+        .kind()
+        .map_or(Ok(()), |kind| header.check_kind(kind))?;
+    Ok(message)
 }

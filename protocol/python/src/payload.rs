@@ -3,7 +3,7 @@
 use dataset::frame::{Frame, Object};
 use dataset::ground_truth::{GroundTruth, upright_box};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods};
-use protocol::{BevGrid, Box3d, CameraMetadata, Codec, DecodedFeatures, Detection, Pose};
+use protocol::{Box3d, Codec, DecodedFeatures, Detection, Pose};
 use pyo3::types::{PyBytes, PyDict, PyDictMethods, PyList};
 use pyo3::{Py, PyAny, PyResult, Python, pyclass, pymethods};
 
@@ -114,42 +114,25 @@ impl DecodedBev {
 
 impl Bev {
     pub(crate) fn new(py: Python<'_>, bev: DecodedBev) -> PyResult<Py<Self>> {
-        let DecodedBev {
-            pose,
-            decoded,
-            codec,
-            payload_bytes,
-        } = bev;
-        let protocol::BevFeatures {
-            grid,
-            channels,
-            code_of,
-            values,
-        } = decoded.features;
-        let BevGrid {
-            x_min_m,
-            y_min_m,
-            cell_m,
-            width,
-            height,
-        } = grid;
-        let [channels, height, width] = [channels, height, width].map(|size| size as usize);
-        let mask = decoded
-            .sent
+        let DecodedFeatures { features, sent } = bev.decoded;
+        let grid = features.grid;
+        let shape = [features.channels, grid.height, grid.width];
+        let [channels, height, width] = shape.map(|size| size as usize);
+        let mask = sent
             .map(|sent| PyArray1::from_vec(py, sent).reshape([height, width]))
             .transpose()?;
         let made = Self {
-            features: PyArray1::from_vec(py, values)
+            features: PyArray1::from_vec(py, features.values)
                 .reshape([channels, height, width])?
                 .unbind(),
             mask: mask.map(pyo3::Bound::unbind),
-            x_min_m,
-            y_min_m,
-            cell_m,
-            code_of,
-            dtype: json::name(&codec.dtype)?,
-            payload_bytes,
-            pose: PoseEstimate::new(py, &pose)?,
+            x_min_m: grid.x_min_m,
+            y_min_m: grid.y_min_m,
+            cell_m: grid.cell_m,
+            code_of: features.code_of,
+            dtype: json::name(&bev.codec.dtype)?,
+            payload_bytes: bev.payload_bytes,
+            pose: PoseEstimate::new(py, &bev.pose)?,
         };
         Py::new(py, made)
     }
@@ -192,29 +175,18 @@ pub(crate) struct Detections {
 impl Detections {
     /// The result of an ego.
     pub(crate) fn of_ego(py: Python<'_>, found: &protocol::Detections) -> PyResult<Py<Self>> {
-        let protocol::Detections {
-            ego,
-            agent_frame,
-            method,
-            pose,
-            detections,
-            fused,
-            skipped,
-            neighbours,
-            stages,
-        } = found;
         let stages_ms = PyDict::new(py);
-        for timing in stages {
+        for timing in &found.stages {
             stages_ms.set_item(&timing.stage, timing.nanos as f64 * 1e-6)?;
         }
         let made = Self {
-            method: Some(method.clone()),
-            agent_frame: Some(*agent_frame),
-            fused: json::to_python(py, fused)?.unbind(),
-            skipped: json::to_python(py, skipped)?.unbind(),
-            neighbours: json::to_python(py, neighbours)?.unbind(),
+            method: Some(found.method.clone()),
+            agent_frame: Some(found.agent_frame),
+            fused: json::to_python(py, &found.fused)?.unbind(),
+            skipped: json::to_python(py, &found.skipped)?.unbind(),
+            neighbours: json::to_python(py, &found.neighbours)?.unbind(),
             stages_ms: stages_ms.unbind(),
-            ..Self::of_list(py, ego.as_str(), pose, detections)?
+            ..Self::of_list(py, found.ego.as_str(), &found.pose, &found.detections)?
         };
         Py::new(py, made)
     }
@@ -372,32 +344,20 @@ pub(crate) struct Camera {
 
 impl Camera {
     pub(crate) fn new(py: Python<'_>, camera: &protocol::Camera) -> PyResult<Py<Self>> {
-        let CameraMetadata {
-            format,
-            width_px,
-            height_px,
-            pinhole,
-            lidar_from_camera,
-        } = camera.metadata;
-        let intrinsics = pinhole.map(|pinhole| {
-            let protocol::Pinhole {
-                fx_px,
-                fy_px,
-                cx_px,
-                cy_px,
-            } = pinhole;
-            arrays::rows(
-                py,
-                vec![[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]],
-            )
+        let metadata = &camera.metadata;
+        let intrinsics = metadata.pinhole.map(|pinhole| {
+            let first = [pinhole.fx_px, 0.0, pinhole.cx_px];
+            let second = [0.0, pinhole.fy_px, pinhole.cy_px];
+            arrays::rows(py, vec![first, second, [0.0, 0.0, 1.0]])
         });
         let made = Self {
             image: PyBytes::new(py, &camera.image).unbind(),
-            format: format.name().to_owned(),
-            width_px,
-            height_px,
+            format: metadata.format.name().to_owned(),
+            width_px: metadata.width_px,
+            height_px: metadata.height_px,
             intrinsics: intrinsics.transpose()?,
-            lidar_from_camera: lidar_from_camera
+            lidar_from_camera: metadata
+                .lidar_from_camera
                 .map(|pose| arrays::pose(py, &pose))
                 .transpose()?,
         };

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use dataset::LoadOptions;
 use dataset::evaluation_protocol::EvaluationProtocol;
-use protocol::{Stream, Topic};
+use protocol::{Kind, Topic};
 use recording::{Entry, Recording};
 
 use crate::frame_parts::{FrameParts, is_part_of_frames};
@@ -90,19 +90,10 @@ impl RecordingFrames {
 }
 
 fn is_wanted(topic: &Topic, options: &LoadOptions) -> bool {
-    match topic {
-        Topic::Stream {
-            stream: Stream::Lidar | Stream::Points,
-            ..
-        } => options.points,
-        Topic::Stream {
-            stream: Stream::Radar,
-            ..
-        } => options.radar,
-        Topic::Stream {
-            stream: Stream::Camera(_),
-            ..
-        } => options.cameras,
+    match topic.kind() {
+        Some(Kind::Lidar | Kind::Points) => options.points,
+        Some(Kind::Radar) => options.radar,
+        Some(Kind::Camera) => options.cameras,
         _ => true,
     }
 }

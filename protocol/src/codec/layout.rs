@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use super::{Codec, Dtype, Selection};
+use crate::checks::{check_limit, check_size};
 use crate::{BevGrid, Limits, WireError};
 
 /// Byte ranges of the parts of an unpacked body, and its number of cells.
@@ -33,37 +34,27 @@ impl Layout {
     ) -> Result<Self, WireError> {
         grid.check(limits)?;
         let cells = u64::from(grid.width) * u64::from(grid.height);
-        at_most(
-            "channels",
-            u64::from(limits.max_channels),
-            u64::from(channels),
-        )?;
+        let channel_count = u64::from(channels);
+        check_limit("channels", channel_count, limits.max_channels.into())?;
         if channels == 0 {
-            return Err(WireError::Shape {
-                what: "channels",
-                expected: 1,
-                found: 0,
-            });
+            check_size("channels", 0, 1)?;
         }
         // A receiver always unpacks to the whole feature map, however few bytes claim it.
-        let map_bytes = cells.saturating_mul(u64::from(channels)).saturating_mul(4);
-        at_most(
-            "feature map bytes",
-            limits.max_body_bytes.min(isize::MAX as u64),
-            map_bytes,
-        )?;
+        let map_bytes = cells.saturating_mul(channel_count).saturating_mul(4);
+        let max_bytes = limits.max_body_bytes.min(isize::MAX as u64);
+        check_limit("feature map bytes", map_bytes, max_bytes)?;
         let (selected, mask_bytes) = match codec.selection {
             Selection::Dense => (cells, 0),
             Selection::TopK { cells: selected } => (u64::from(selected), cells.div_ceil(8)),
         };
-        at_most("selected cells", cells, selected)?;
+        check_limit("selected cells", selected, cells)?;
         let scale_bytes = if codec.dtype == Dtype::I8 {
-            4 * u64::from(channels)
+            4 * channel_count
         } else {
             0
         };
         // Below the size of the whole feature map, which fits: the products cannot overflow.
-        let value_bytes = selected * u64::from(channels) * codec.dtype.size();
+        let value_bytes = selected * channel_count * codec.dtype.size();
         let (mask, values) = (
             scale_bytes + mask_bytes,
             scale_bytes + mask_bytes + value_bytes,
@@ -82,13 +73,5 @@ impl Layout {
     /// Bytes of the unpacked body.
     pub(super) fn len(&self) -> usize {
         self.values.end
-    }
-}
-
-fn at_most(what: &'static str, max: u64, found: u64) -> Result<(), WireError> {
-    if found > max {
-        Err(WireError::Limit { what, max, found })
-    } else {
-        Ok(())
     }
 }

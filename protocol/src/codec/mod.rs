@@ -26,6 +26,7 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use crate::body::check_values;
+use crate::checks::check_size;
 use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, WireError};
 
 use layout::Layout;
@@ -167,14 +168,7 @@ pub fn encode_features(
     };
     let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
-    let found = features.values.len();
-    if found != expected {
-        return Err(WireError::Shape {
-            what: "features",
-            expected: expected as u64,
-            found: found as u64,
-        });
-    }
+    check_size("features", features.values.len() as u64, expected as u64)?;
     let budget = config
         .budget_bytes
         .filter(|budget| *budget < layout.len() as u64);
@@ -325,13 +319,7 @@ impl EncodedFeatures {
             });
         }
         let decoded = |channels: u32, code_of: Option<u32>| u64::from(code_of.unwrap_or(channels));
-        if self.channels != channels {
-            return Err(WireError::Shape {
-                what: "channels",
-                expected: channels.into(),
-                found: self.channels.into(),
-            });
-        }
+        check_size("channels", self.channels.into(), channels.into())?;
         if self.code_of != code_of {
             let (expected, found) = (
                 decoded(channels, code_of),
@@ -362,6 +350,12 @@ impl EncodedFeatures {
             body,
         } = self;
         let layout = Layout::new(&grid, channels, &codec, limits)?;
+        let features = |values| BevFeatures {
+            grid,
+            channels,
+            code_of,
+            values,
+        };
         let body = match (body, codec) {
             (
                 Body::Floats(values),
@@ -371,21 +365,10 @@ impl EncodedFeatures {
                     compression: Compression::Raw,
                 },
             ) => {
-                let (expected, found) = (layout.values.len() as u64 / 4, values.len() as u64);
-                if expected != found {
-                    return Err(WireError::Shape {
-                        what: "features",
-                        expected,
-                        found,
-                    });
-                }
+                let expected = layout.values.len() as u64 / 4;
+                check_size("features", values.len() as u64, expected)?;
                 return Ok(DecodedFeatures {
-                    features: BevFeatures {
-                        grid,
-                        channels,
-                        code_of,
-                        values,
-                    },
+                    features: features(values),
                     sent: None,
                 });
             }
@@ -419,12 +402,7 @@ impl EncodedFeatures {
             }
         };
         Ok(DecodedFeatures {
-            features: BevFeatures {
-                grid,
-                channels,
-                code_of,
-                values,
-            },
+            features: features(values),
             sent,
         })
     }
@@ -440,14 +418,8 @@ fn unpack(body: Body, compression: Compression, expected: usize) -> Result<Vec<u
         Compression::Raw => bytes,
         Compression::Zstd => compression::unpack(bytes, expected)?,
     };
-    if bytes.len() == expected {
-        return Ok(bytes);
-    }
-    Err(WireError::Shape {
-        what: "encoded map bytes",
-        expected: expected as u64,
-        found: bytes.len() as u64,
-    })
+    check_size("encoded map bytes", bytes.len() as u64, expected as u64)?;
+    Ok(bytes)
 }
 
 #[cfg(test)]

@@ -2,20 +2,14 @@
 
 use super::Dtype;
 use crate::WireError;
+use crate::checks::check_size;
 
 /// Checks that there is one finite confidence per cell.
 ///
 /// # Errors
 /// [`WireError`] states the first that is not finite, or both counts.
 pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), WireError> {
-    if confidence.len() != cells {
-        let (expected, found) = (cells as u64, confidence.len() as u64);
-        return Err(WireError::Shape {
-            what: "confidence map",
-            expected,
-            found,
-        });
-    }
+    check_size("confidence map", confidence.len() as u64, cells as u64)?;
     if let Some((index, value)) = confidence
         .iter()
         .enumerate()
@@ -118,13 +112,7 @@ pub(super) fn read_mask(
     announced: usize,
 ) -> Result<Vec<u32>, WireError> {
     let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
-    if found != announced as u64 {
-        return Err(WireError::Shape {
-            what: "cells in the mask",
-            expected: announced as u64,
-            found,
-        });
-    }
+    check_size("cells in the mask", found, announced as u64)?;
     let mut selected = Vec::with_capacity(announced);
     for (byte, first) in mask
         .iter()

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Payload, PoseEstimate, private};
+use super::{Payload, PoseEstimate, check_limit, private};
 use crate::{
     BevGrid, Body, BodyShape, Codec, EncodedFeatures, Kind, Limits, RateChoice, WireError,
 };
@@ -101,13 +101,7 @@ fn check_code(channels: u32, code_of: Option<u32>, limits: &Limits) -> Result<()
     let Some(decoded) = code_of else {
         return Ok(());
     };
-    if decoded > limits.max_channels {
-        return Err(WireError::Limit {
-            what: "channels",
-            max: limits.max_channels.into(),
-            found: decoded.into(),
-        });
-    }
+    check_limit("channels", decoded.into(), limits.max_channels.into())?;
     if channels > decoded {
         let (expected, found) = (decoded.into(), channels.into());
         return Err(WireError::Shape {

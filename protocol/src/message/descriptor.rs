@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_count, metadata_only};
+use super::{check_count, check_limit, metadata_only};
 use crate::string_enum::written_as_text;
 use crate::{BevGrid, Dtype, Limits, Stream, WireError};
 
@@ -40,14 +40,7 @@ pub struct SweepArrival {
 impl Descriptor {
     fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
         self.grid.check(limits)?;
-        let (max, found) = (limits.max_channels.into(), self.channels.into());
-        if found > max {
-            return Err(WireError::Limit {
-                what: "channels",
-                max,
-                found,
-            });
-        }
+        check_limit("channels", self.channels.into(), limits.max_channels.into())?;
         check_count("sweeps", self.sweeps.len(), limits.max_entries)?;
         check_count("streams", self.streams.len(), limits.max_entries)
     }

@@ -21,6 +21,7 @@ mod truth;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use crate::checks::{check_limit, check_within};
 use crate::{Body, BodyShape, Limits, Pose, WireError};
 
 pub use bev::{Bev, BevMetadata};
@@ -97,31 +98,8 @@ macro_rules! metadata_only {
 }
 use metadata_only;
 
-fn check_within(what: &'static str, value: f64, min: f64, max: f64) -> Result<(), WireError> {
-    // NaN is within nothing.
-    if (min..=max).contains(&value) {
-        Ok(())
-    } else {
-        Err(WireError::Value {
-            what,
-            index: 0,
-            value,
-            min,
-            max,
-        })
-    }
-}
-
 fn check_count(what: &'static str, found: usize, max: usize) -> Result<(), WireError> {
-    if found <= max {
-        Ok(())
-    } else {
-        Err(WireError::Limit {
-            what,
-            max: max as u64,
-            found: found as u64,
-        })
-    }
+    check_limit(what, found as u64, max as u64)
 }
 
 fn check_pose(what: &'static str, pose: &Pose) -> Result<(), WireError> {
@@ -152,37 +130,13 @@ fn wrong_body(shape: BodyShape, body: &Body) -> WireError {
 const MAX_NANOS: u64 = 86_400_000_000_000;
 
 fn check_nanos(what: &'static str, nanos: u64) -> Result<(), WireError> {
-    if nanos <= MAX_NANOS {
-        Ok(())
-    } else {
-        Err(WireError::Limit {
-            what,
-            max: MAX_NANOS,
-            found: nanos,
-        })
-    }
-}
-
-/// A box from outside: finite, of positive and plausible size.
-fn check_box(box3d: &crate::Box3d) -> Result<(), WireError> {
-    check_box_from(box3d, 1e-3)
-}
-
-/// [`check_box`] with another smallest size, metres.
-fn check_box_from(box3d: &crate::Box3d, min_size_m: f64) -> Result<(), WireError> {
-    for coordinate in box3d.center_m {
-        check_within("box center_m", coordinate, -1e7, 1e7)?;
-    }
-    for size in box3d.size_m {
-        check_within("box size_m", size, min_size_m, 1e3)?;
-    }
-    check_within("box heading_rad", box3d.heading_rad, -1e3, 1e3)
+    check_limit(what, nanos, MAX_NANOS)
 }
 
 fn check_detections(detections: &[crate::Detection], limits: &Limits) -> Result<(), WireError> {
     check_count("detections", detections.len(), limits.max_boxes)?;
     for detection in detections {
-        check_box(&detection.box3d)?;
+        detection.box3d.check()?;
         check_within("detection score", detection.score.into(), 0.0, 1.0)?;
     }
     Ok(())

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_within, metadata_only};
+use super::{check_limit, check_within, metadata_only};
 use crate::{Limits, WireError};
 
 /// Pace of an ego: of every `of` sweeps, `computed` are computed, evenly spaced and the same ones in every vehicle. Ego
@@ -69,15 +69,7 @@ impl Pace {
             f64::from(self.of),
         )?;
         let found = u64::try_from(self.mean_interval().as_nanos()).unwrap_or(u64::MAX);
-        if found <= MAX_INTERVAL_NANOS {
-            Ok(())
-        } else {
-            Err(WireError::Limit {
-                what: "mean interval, nanoseconds",
-                max: MAX_INTERVAL_NANOS,
-                found,
-            })
-        }
+        check_limit("mean interval, nanoseconds", found, MAX_INTERVAL_NANOS)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Payload, PoseEstimate, private, wrong_body};
+use super::{Payload, PoseEstimate, check_limit, private, wrong_body};
 use crate::{Body, BodyShape, Kind, Limits, PointCloud, WireError};
 
 /// A LiDAR sweep of one vehicle: replay to that vehicle's agent.
@@ -51,13 +51,7 @@ pub struct PointsMetadata {
 }
 
 fn check_points(count: u64, limits: &Limits) -> Result<BodyShape, WireError> {
-    if count > limits.max_points {
-        return Err(WireError::Limit {
-            what: "points",
-            max: limits.max_points,
-            found: count,
-        });
-    }
+    check_limit("points", count, limits.max_points)?;
     Ok(BodyShape::Points(count))
 }
 

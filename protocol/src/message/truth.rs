@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_box_from, check_count, check_name, check_pose, check_within, metadata_only};
+use super::{check_count, check_name, check_pose, check_within, metadata_only};
 use crate::{Box3d, CavId, Limits, Pose, WireError};
 
 /// Ground truth of one tick: replay to scorer, on a key of its own, so that no pipeline can use it by accident.
@@ -68,7 +68,7 @@ impl TrueObject {
             heading_rad: self.world_from_object.yaw_rad(),
         };
         // Data sets have objects without length, width or height: one of them must not reject the whole message.
-        check_box_from(&box3d, 0.0)?;
+        box3d.check_from(0.0)?;
         self.speed_mps
             .map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
     }

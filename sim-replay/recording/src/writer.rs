@@ -328,13 +328,9 @@ impl<S: Store> RecordingWriter<S> {
 /// Encoding of the messages of a topic. The topic alone decides: an invalid first message must not affect those after
 /// it.
 fn encoding_of(topic: &Topic) -> &'static str {
-    match topic {
-        Topic::Stream { stream, .. } | Topic::Received { stream, .. }
-            if stream.kind().is_none() =>
-        {
-            "json"
-        }
-        _ => OWN_ENCODING,
+    match topic.is_json() {
+        true => "json",
+        false => OWN_ENCODING,
     }
 }
 

@@ -1,5 +1,6 @@
 //! Errors of a detector.
 
+use protocol::WireError;
 use tch::TchError;
 
 use crate::boxes::decode::DecodeError;
@@ -49,12 +50,9 @@ pub enum DetectorError {
         /// Largest valid absolute value.
         limit: f64,
     },
-    /// A detected box has a size that a message refuses.
-    #[error("a detected box has a side of {size_m} m, valid are 0.001 to 1000 m")]
-    BoxSize {
-        /// Length of the side, metres.
-        size_m: f64,
-    },
+    /// A detected box that a message refuses.
+    #[error("a detected box: {0}")]
+    Box(WireError),
     /// Most values of a level of the backbone are the largest that 8 bits hold.
     #[error(
         "most values of level {level} of the backbone exceed 8 bits: the scales of its activations are too small"
@@ -77,10 +75,7 @@ impl DetectorError {
     pub fn is_of_frame(&self) -> bool {
         matches!(
             self,
-            Self::NoPoints { .. }
-                | Self::Values { .. }
-                | Self::BoxSize { .. }
-                | Self::Saturated { .. }
+            Self::NoPoints { .. } | Self::Values { .. } | Self::Box(_) | Self::Saturated { .. }
         )
     }
 }

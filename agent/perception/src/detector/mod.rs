@@ -385,7 +385,7 @@ impl Detector {
     ///
     /// # Errors
     /// [`DetectorError::Decode`] if the heads are of another detector, [`DetectorError::Values`] or
-    /// [`DetectorError::BoxSize`] if a box is one that a message refuses, or is farther away than 10 km.
+    /// [`DetectorError::Box`] if a box is one that a message refuses, or is farther away than 10 km.
     pub fn boxes(
         &self,
         heads: &Heads,

@@ -1,7 +1,5 @@
 //! Output of a detector.
 
-use std::ops::RangeInclusive;
-
 use protocol::StageTiming;
 use tch::{TchError, Tensor};
 
@@ -82,34 +80,25 @@ pub fn check_values(what: &'static str, tensor: &Tensor) -> Result<(), DetectorE
     }
 }
 
-/// Sizes of a box that a message accepts, metres.
-const SIZES_M: RangeInclusive<f64> = 1e-3..=1e3;
-
-/// Largest absolute heading that a message accepts, radians.
-const MAX_HEADING_RAD: f64 = 1e3;
-
 /// Farthest centre of a box along an axis, metres: beyond any area of a detector.
 const MAX_CENTRE_M: f64 = 1e4;
 
-/// Checks that decoded boxes have sizes and headings that a message accepts, and centres near the detector: other ones
-/// could not be published, and would be left out without a word offline.
+/// Checks that messages accept decoded boxes, and that their centres are near the detector: other ones could not be
+/// published, and would be left out without a word offline.
 ///
 /// # Errors
-/// [`DetectorError::Values`] or [`DetectorError::BoxSize`] with the first value that is not valid.
+/// [`DetectorError::Box`] or [`DetectorError::Values`] with the first value that is not valid.
 pub(super) fn check_boxes(boxes: &[Decoded]) -> Result<(), DetectorError> {
-    let within = |what, value: f64, limit| match value.abs() <= limit {
-        true => Ok(()),
-        false => Err(DetectorError::Values { what, value, limit }),
-    };
     for Decoded { box3d, .. } in boxes {
-        if let Some(&size_m) = box3d.size_m.iter().find(|size| !SIZES_M.contains(size)) {
-            return Err(DetectorError::BoxSize { size_m });
+        box3d.check().map_err(DetectorError::Box)?;
+        let is_far = |centre_m: &f64| centre_m.abs() > MAX_CENTRE_M;
+        if let Some(value) = box3d.center_m.into_iter().find(is_far) {
+            return Err(DetectorError::Values {
+                what: "a detected box (centre, metres)",
+                value,
+                limit: MAX_CENTRE_M,
+            });
         }
-        for centre_m in box3d.center_m {
-            within("a detected box (centre, metres)", centre_m, MAX_CENTRE_M)?;
-        }
-        let what = "a detected box (heading, radians)";
-        within(what, box3d.heading_rad, MAX_HEADING_RAD)?;
     }
     Ok(())
 }

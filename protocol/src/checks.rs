@@ -1,0 +1,43 @@
+//! Checks of single numbers of a message, with errors that name field, value and bounds.
+
+use crate::WireError;
+
+/// Refuses a number outside of `min..=max`, and NaN.
+pub(crate) fn check_within(
+    what: &'static str,
+    value: f64,
+    min: f64,
+    max: f64,
+) -> Result<(), WireError> {
+    // NaN is within nothing.
+    if (min..=max).contains(&value) {
+        return Ok(());
+    }
+    Err(WireError::Value {
+        what,
+        index: 0,
+        value,
+        min,
+        max,
+    })
+}
+
+/// Refuses more than the limit.
+pub(crate) fn check_limit(what: &'static str, found: u64, max: u64) -> Result<(), WireError> {
+    if found <= max {
+        return Ok(());
+    }
+    Err(WireError::Limit { what, max, found })
+}
+
+/// Refuses a size that is not the expected one.
+pub(crate) fn check_size(what: &'static str, found: u64, expected: u64) -> Result<(), WireError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(WireError::Shape {
+        what,
+        expected,
+        found,
+    })
+}
