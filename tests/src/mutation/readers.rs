@@ -6,6 +6,8 @@ use std::path::{Path, PathBuf};
 use dataset::cloud_files::clouds_at;
 use dataset::pcd;
 use dataset::{self, LoadOptions, Tick};
+use ego_fuser::ego_loop::Input;
+use ego_fuser::ego_loop::recorded::{KIND, Record};
 use link::{LinkConfig, Trace};
 use localization::pose_source::{ErrorTable, PoseTable};
 use perception::weights::Weights;
@@ -18,6 +20,7 @@ use runner::scenario::Scenario;
 use safetensors::tensor::{Dtype, TensorView, serialize};
 use sim_replay::stream::{Place, Schedule};
 use simulator::map;
+use support::record_log::RecordReader;
 
 use super::seeds;
 use crate::sequences;
@@ -116,6 +119,12 @@ pub fn all(root: &Path) -> Vec<Reader> {
             vec![seeds::recording(root)],
             file("mcap", "a.mcap"),
             read_recording,
+        ),
+        on_disk(
+            "ego inputs",
+            vec![seeds::ego_inputs(root)],
+            file("inputs", "a.log"),
+            read_inputs,
         ),
         on_disk(
             "scenario",
@@ -296,6 +305,11 @@ fn drives(root: &Path) -> Vec<Reader> {
         .map(|(name, bytes)| (name.as_str(), &bytes[..]))
         .collect();
     let with_poses = [&converted[..], &[("velodyne_left_False.h5", &h5[..])]].concat();
+    let robot = seeds::rosbag(root);
+    let bag: [(&str, &[u8]); 2] = [
+        ("drive_0.mcap", &robot),
+        ("metadata.yaml", seeds::ROSBAG_METADATA.as_bytes()),
+    ];
     let oxford = "2019-01-10-14-02-26-radar-oxford-10k";
     [
         (
@@ -322,6 +336,11 @@ fn drives(root: &Path) -> Vec<Reader> {
             root.join("clouds/drive"),
             &clouds[..],
             &["", "cloud poses"][..],
+        ),
+        (
+            root.join("rosbag/drive"),
+            &bag[..],
+            &["rosbag mcap", "rosbag metadata"][..],
         ),
         (
             root.join("nclt/2012-01-22"),
@@ -401,6 +420,41 @@ fn read_recording(path: &Path, _: &[u8]) -> bool {
         }
     }
     recording.damage().is_empty()
+}
+
+/// Log of the inputs of an ego as it is, then with the checksums of its records corrected, so that damage gets past
+/// them.
+fn read_inputs(path: &Path, bytes: &[u8]) -> bool {
+    let read = || {
+        RecordReader::<Record>::open(path, KIND).is_ok_and(|mut records| {
+            records.all(|record| match record {
+                Ok(Record::Input {
+                    input: Input::Message(message),
+                    ..
+                }) => wire::decode_any([&message.bytes[..]], &Limits::DEFAULT).is_ok(),
+                record => record.is_ok(),
+            })
+        })
+    };
+    let is_sound = read();
+    fs::write(path, with_checksums(bytes)).expect("a writable folder");
+    read();
+    is_sound
+}
+
+/// A record log with the right checksum of each record.
+fn with_checksums(bytes: &[u8]) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    let first_line = bytes.iter().position(|byte| *byte == b'\n');
+    let mut rest = &mut bytes[first_line.map_or(0, |end| end + 1)..];
+    while let Some((head, records)) = rest.split_first_chunk_mut::<8>() {
+        let [length @ .., _, _, _, _] = *head;
+        let length = usize::try_from(u32::from_le_bytes(length)).unwrap_or(usize::MAX);
+        let (record, others) = records.split_at_mut(length.min(records.len()));
+        head[4..].copy_from_slice(&crc32fast::hash(record).to_le_bytes());
+        rest = others;
+    }
+    bytes
 }
 
 fn weights() -> Vec<u8> {

@@ -1,11 +1,15 @@
 //! Valid inputs to damage, made by the project's own code.
 
 use std::path::Path;
+use std::time::Duration;
 
 use dataset::pcd::{Encoding, IntensityField, encode};
-use protocol::{CavId, Key, Lidar, Message, RunId, Stream, Topic, wire};
-use recording::{RecordingOptions, RecordingWriter};
-use ros2::Translator;
+use ego_fuser::ego_loop::recorded::{KIND, Record, WireMessage};
+use ego_fuser::ego_loop::{Input, Reception};
+use protocol::{CavId, Key, Lidar, Message, Pose, PoseEstimate, RunId, Stamp, Stream, Topic, wire};
+use recording::{ExportTimes, RecordingOptions, RecordingWriter, export_ros2};
+use ros2::{Mount, Translator};
+use support::record_log::RecordWriter;
 
 #[path = "../../../protocol/tests/sample/mod.rs"]
 mod sample;
@@ -183,6 +187,111 @@ pub fn recording(scratch: &Path) -> Vec<u8> {
             .expect("a writable folder");
     }
     writer.finish().expect("a writable folder");
+    std::fs::read(&path).expect("it was written")
+}
+
+/// A bag of a robot: three sweeps of its LiDAR, and its poses at their times.
+///
+/// # Panics
+/// When a file cannot be written.
+#[must_use]
+pub fn rosbag(scratch: &Path) -> Vec<u8> {
+    let [recording, bag] = ["seed-robot.mcap", "seed-bag.mcap"].map(|name| scratch.join(name));
+    for file in [&recording, &bag] {
+        let _ = std::fs::remove_file(file);
+    }
+    let run = RunId::new("test").expect("an identifier");
+    let mut writer = RecordingWriter::create(&recording, RecordingOptions::default())
+        .expect("a writable folder");
+    for tick in 0..3_u32 {
+        let stamp = Stamp {
+            sequence: tick.into(),
+            capture_nanos: 100_000_000 * u64::from(tick + 1),
+            ..sample::stamp()
+        };
+        let pose = Pose::from_xyz_yaw([f64::from(tick), -2.0, 1.9], 0.3);
+        let points = sample::points();
+        for (stream, message) in [
+            (
+                Stream::Pose,
+                wire::encode(&stamp, PoseEstimate::new(pose, 0.9)),
+            ),
+            (Stream::Lidar, wire::encode(&stamp, Lidar { points })),
+        ] {
+            let key = Key::stream(&run, &stamp.cav, stream);
+            let bytes = message.expect("a sound message").to_vec();
+            writer
+                .write(&key, stamp.capture_nanos, &bytes)
+                .expect("a writable folder");
+        }
+    }
+    writer.finish().expect("a writable folder");
+    export_ros2(
+        &recording,
+        &bag,
+        ExportTimes::Capture,
+        &Mount::default(),
+        None,
+    )
+    .expect("a sound recording");
+    std::fs::read(&bag).expect("it was written")
+}
+
+/// The description of a bag.
+pub(crate) const ROSBAG_METADATA: &str = "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n  \
+    relative_file_paths:\n    - drive_0.mcap\n";
+
+/// Log of the inputs of an ego: its beginning, a neighbour with its network and small messages, a result.
+///
+/// # Panics
+/// When a file cannot be written.
+#[must_use]
+pub fn ego_inputs(scratch: &Path) -> Vec<u8> {
+    let (stamp, all) = (sample::stamp(), sample::every_kind());
+    let descriptor = all.into_iter().find_map(|message| match message {
+        Message::Descriptor(descriptor) => Some(descriptor),
+        _ => None,
+    });
+    let descriptor = descriptor.expect("a message of every kind");
+    let cav = stamp.cav.clone();
+    let message = |bytes| {
+        let reception = Reception {
+            cav: cav.clone(),
+            arrived_nanos: 1_600_000_000,
+            transport: Some(Duration::from_millis(12)),
+            clock_offset_s: Some(-0.5),
+        };
+        Input::Message(WireMessage { reception, bytes })
+    };
+    let small = messages().into_iter().filter(|bytes| bytes.len() < 2048);
+    let inputs = [
+        Input::Joined(cav.clone()),
+        Input::Model(cav.clone(), descriptor.clone()),
+    ]
+    .into_iter()
+    .chain(small.map(message))
+    .chain([
+        Input::Wake,
+        Input::Left(cav.clone()),
+        Input::Ended(cav.clone()),
+    ]);
+    let start = Record::Start {
+        config: "{\"run\":\"test\"}".into(),
+        model_hash: descriptor.model_hash,
+        version: "0.1.0".into(),
+    };
+    let published = Record::Published {
+        stamp: stamp.clone(),
+        stages: Vec::new(),
+    };
+    let inputs = (0..)
+        .zip(inputs)
+        .map(|(now_nanos, input)| Record::Input { now_nanos, input });
+    let path = scratch.join("seed-inputs.log");
+    let mut writer = RecordWriter::create(&path, KIND).expect("a writable folder");
+    for record in std::iter::once(start).chain(inputs).chain([published]) {
+        writer.add(&record).expect("a writable folder");
+    }
     std::fs::read(&path).expect("it was written")
 }
 
