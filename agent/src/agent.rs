@@ -49,10 +49,25 @@ pub struct Perception {
 pub struct AgentOutput {
     /// Pose of the vehicle, or the reason why there is none.
     pub pose: PoseEstimate,
-    /// Duration of the pose estimation.
-    pub pose_time: Duration,
     /// Perception of the vehicle.
     pub perception: Perception,
+}
+
+/// A sweep between the steps of its computation: it is encoded once, for its pose, its feature map and the measurement
+/// after them.
+#[derive(Debug)]
+pub(crate) struct EncodedSweep {
+    /// Beginning of the first step.
+    began: Instant,
+    /// What the detector computed of it; `None`: nothing yet.
+    encoded: Option<Encoded>,
+}
+
+impl EncodedSweep {
+    /// Time since the beginning of its first step.
+    pub(crate) fn elapsed(&self) -> Duration {
+        self.began.elapsed()
+    }
 }
 
 /// One vehicle: estimates its pose and perceives its surroundings.
@@ -65,10 +80,6 @@ pub struct Agent {
     has_head: bool,
     /// True if the pose source takes the levels of this detector.
     shares_encoder: bool,
-    /// The current sweep, if it was encoded before its pose was estimated.
-    encoded: Option<Encoded>,
-    /// Levels of the current sweep, for a measurement after it was perceived.
-    levels: Option<Vec<BackboneLevel>>,
 }
 
 impl Agent {
@@ -93,8 +104,6 @@ impl Agent {
             rate: RateControl::default(),
             has_head: true,
             shares_encoder: false,
-            encoded: None,
-            levels: None,
         }
     }
 
@@ -148,27 +157,89 @@ impl Agent {
         Ok(())
     }
 
-    /// Step before the first: encodes the sweep if the pose is estimated from the detector's levels, so that it is
-    /// encoded once. Without it the pose source encodes the sweep itself, with the same result.
-    pub fn prepare(&mut self, cloud: &PointCloud) {
+    /// First step of a sweep: its pose, which goes out before anything else is computed, and the durations. The sweep is
+    /// encoded before if the pose is estimated from the detector's levels.
+    pub(crate) fn localize(
+        &mut self,
+        input: &AgentInput<'_>,
+    ) -> (PoseEstimate, Vec<StageTiming>, EncodedSweep) {
+        let began = Instant::now();
         let is_needed = self.shares_encoder && self.pose_source.computes_from_sweep();
         // An error comes again, and is returned, when the sweep is perceived.
-        self.encoded = self
-            .detector
-            .as_mut()
+        let encoded = (self.detector.as_mut())
             .filter(|_| is_needed)
-            .and_then(|detector| detector.encode_sweep(cloud).ok());
+            .and_then(|detector| detector.encode_sweep(input.cloud).ok());
+        let sweep = EncodedSweep { began, encoded };
+        let began = Instant::now();
+        let levels = self.levels(&sweep);
+        let pose = self
+            .pose_source
+            .estimate(&pose_input(&self.cav, input, levels));
+        (pose, self.pose_stages("pose", began), sweep)
     }
 
-    /// First step: the pose, which goes out before anything else is computed.
+    /// Second step: feature map, confidence and own detections.
+    ///
+    /// # Errors
+    /// See [`Self::perceive`].
+    pub(crate) fn perceive_encoded(
+        &mut self,
+        cloud: &PointCloud,
+        sweep: EncodedSweep,
+    ) -> Result<(Perception, EncodedSweep), DetectorError> {
+        let EncodedSweep { began, encoded } = sweep;
+        let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
+        let encoded = encoded.map_or_else(|| detector.encode_sweep(cloud), Ok)?;
+        let perception = self.perceive_map(&encoded.features)?;
+        let perception = Perception {
+            times: [encoded.times.as_slice(), &perception.times].concat(),
+            ..perception
+        };
+        let encoded = Some(encoded);
+        Ok((perception, EncodedSweep { began, encoded }))
+    }
+
+    /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. Returns the
+    /// durations, none if nothing was measured.
+    pub(crate) fn observe_encoded(
+        &mut self,
+        input: &AgentInput<'_>,
+        sweep: &EncodedSweep,
+    ) -> Vec<StageTiming> {
+        let began = Instant::now();
+        let levels = self.levels(sweep);
+        let is_measured = self
+            .pose_source
+            .observe(&pose_input(&self.cav, input, levels));
+        if is_measured {
+            self.pose_stages("pose measurement", began)
+        } else {
+            Vec::new()
+        }
+    }
+
+    /// Levels of an encoded sweep, if the pose source takes those of this detector.
+    fn levels<'a>(&self, sweep: &'a EncodedSweep) -> Option<&'a [BackboneLevel]> {
+        let encoded = sweep.encoded.as_ref().filter(|_| self.shares_encoder);
+        encoded.map(|encoded| encoded.levels.as_slice())
+    }
+
+    /// Duration of a step of the pose source since `began`, and of its stages if it computes.
+    fn pose_stages(&self, step: &str, began: Instant) -> Vec<StageTiming> {
+        let whole = StageTiming::new(step, began.elapsed());
+        [&[whole][..], self.pose_source.stages()].concat()
+    }
+
+    /// The pose of a sweep by itself, without the other steps.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        self.levels = None;
-        let levels = self
-            .encoded
-            .as_ref()
-            .map(|encoded| encoded.levels.as_slice());
         self.pose_source
-            .estimate(&pose_input(&self.cav, input, levels))
+            .estimate(&pose_input(&self.cav, input, None))
+    }
+
+    /// The measurement of a sweep for the poses of later ones by itself. True if it was measured.
+    pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
+        self.pose_source
+            .observe(&pose_input(&self.cav, input, None))
     }
 
     /// Starts the pose source anew at a pose that a person states, with its standard deviations. False if the source
@@ -182,16 +253,7 @@ impl Agent {
         })
     }
 
-    /// Last step, after everything of the sweep was published: measures for the poses of later sweeps. True if the
-    /// sweep was measured.
-    pub fn observe(&mut self, input: &AgentInput<'_>) -> bool {
-        self.encoded = None;
-        let levels = self.levels.take();
-        self.pose_source
-            .observe(&pose_input(&self.cav, input, levels.as_deref()))
-    }
-
-    /// Last step if there is no queue: the feature map as `codec` specifies, or smaller if a limit requires it. A live
+    /// The feature map as `codec` specifies if there is no queue, or smaller if a limit requires it. A live
     /// agent does this on its sending thread, with a `RateControl` of its own that measures the queue.
     ///
     /// # Errors
@@ -207,41 +269,23 @@ impl Agent {
             .encode(features, codec, confidence, capture_nanos, None)
     }
 
-    /// Durations of the stages of the last pose, for pose sources that compute.
-    #[must_use]
-    pub(crate) fn pose_stages(&self) -> &[StageTiming] {
-        self.pose_source.stages()
-    }
-
     /// Number of poses so far that the vehicle cannot have reached from the previous ones.
     #[must_use]
     pub(crate) fn pose_jumps(&self) -> u64 {
         self.pose_source.jumps()
     }
 
-    /// Second step: feature map, confidence and own detections.
+    /// Feature map, confidence and own detections of a sweep by itself.
     ///
     /// # Errors
     /// [`DetectorError`] if the vehicle has no detector, the sweep has no point in the area, a value is not valid, or the
     /// tensor library fails.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
-        let detector = self.detector.as_mut().ok_or(DetectorError::Absent)?;
-        let encoded = self
-            .encoded
-            .take()
-            .map_or_else(|| detector.encode_sweep(cloud), Ok)?;
-        let Encoded {
-            features,
-            levels,
-            times,
-            ..
-        } = encoded;
-        let perception = self.perceive_map(&features)?;
-        self.levels = self.shares_encoder.then_some(levels);
-        Ok(Perception {
-            times: [times, perception.times].concat(),
-            ..perception
-        })
+        let sweep = EncodedSweep {
+            began: Instant::now(),
+            encoded: None,
+        };
+        Ok(self.perceive_encoded(cloud, sweep)?.0)
     }
 
     /// The same from a feature map `[1, C, H, W]` that the encoder computed before, as the encoder returned it.
@@ -298,17 +342,10 @@ impl Agent {
     /// # Errors
     /// See [`Self::perceive`].
     pub fn process(&mut self, input: &AgentInput<'_>) -> Result<AgentOutput, DetectorError> {
-        self.prepare(input.cloud);
-        let began = Instant::now();
-        let pose = self.estimate_pose(input);
-        let pose_time = began.elapsed();
-        let perception = self.perceive(input.cloud)?;
-        self.observe(input);
-        Ok(AgentOutput {
-            pose,
-            pose_time,
-            perception,
-        })
+        let (pose, _, sweep) = self.localize(input);
+        let (perception, sweep) = self.perceive_encoded(input.cloud, sweep)?;
+        self.observe_encoded(input, &sweep);
+        Ok(AgentOutput { pose, perception })
     }
 }
 
@@ -601,8 +638,7 @@ mod tests {
             measured_pose: Some(&pose),
             motion: EgoMotion::default(),
         };
-        agent.prepare(input.cloud);
-        assert_eq!(agent.estimate_pose(&input).world_from_cav(), Some(&pose));
+        assert_eq!(agent.localize(&input).0.world_from_cav(), Some(&pose));
         assert!(matches!(
             agent.perceive(input.cloud),
             Err(DetectorError::Absent)

@@ -1,5 +1,4 @@
-//! Attacks: an output filter that falsifies a vehicle's messages, to measure the effect on its neighbours. Off unless
-//! configured.
+//! Attacks: falsify what a vehicle publishes, to measure the effect on its neighbours. Off unless configured.
 //!
 //! Every falsified message is well-formed: right sizes, finite numbers, a valid pose. Only its content is false.
 //! The same seed gives the same falsified messages, offline and live.
@@ -10,7 +9,6 @@ use serde::{Deserialize, Serialize};
 use support::random::SplitMix64;
 
 use crate::agent::Perception;
-use crate::output_filter::OutputFilter;
 
 /// Number of synthetic objects in every frame.
 const INVENTED: usize = 10;
@@ -145,11 +143,10 @@ impl Attack {
         let heading = self.random.between(-3.1, 3.1);
         vehicle([x, y, heading], self.random.between(0.3, 1.0) as f32)
     }
-}
 
-impl OutputFilter for Attack {
     /// The pose that is published instead of the vehicle's own.
-    fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
+    #[must_use]
+    pub fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
         let (Falsification::ShiftedPose, Some(own)) = (self.falsification, pose.world_from_cav())
         else {
             return pose;
@@ -166,7 +163,8 @@ impl OutputFilter for Attack {
     }
 
     /// The perception that is published instead of the true one.
-    fn perception(&mut self, truth: Perception) -> Perception {
+    #[must_use]
+    pub fn perception(&mut self, truth: Perception) -> Perception {
         let mut falsified = truth;
         match self.falsification {
             Falsification::ShiftedPose => {}
@@ -204,7 +202,8 @@ impl OutputFilter for Attack {
     }
 
     /// The points that are published instead of the measured ones.
-    fn points(&mut self, truth: PointCloud) -> PointCloud {
+    #[must_use]
+    pub fn points(&mut self, truth: PointCloud) -> PointCloud {
         match self.falsification {
             Falsification::ShiftedPose => truth,
             Falsification::Noise => {

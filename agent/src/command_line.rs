@@ -46,14 +46,19 @@ pub struct CommandLine {
 #[derive(Debug, Subcommand)]
 enum Command {
     Run(Box<command::run::Args>),
+    ReplayInputs(command::replay_inputs::Arguments),
 }
 
 impl Command {
     fn run(self) -> anyhow::Result<Outcome> {
-        let Self::Run(args) = self;
-        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
-            .context("cannot execute this program again")?;
-        command::run::run(*args)
+        match self {
+            Self::Run(args) => {
+                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY)
+                    .context("cannot execute this program again")?;
+                command::run::run(*args)
+            }
+            Self::ReplayInputs(arguments) => arguments.run(),
+        }
     }
 }
 

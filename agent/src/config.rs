@@ -10,6 +10,7 @@ use protocol::{CavId, CodecConfig, ConfidenceGate, RunId, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::agent_loop::LoopOptions;
 use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
@@ -50,6 +51,10 @@ pub struct AgentConfig {
     #[arg(long, value_name = "FILE")]
     #[serde(default)]
     pub sweep_log: Option<PathBuf>,
+    /// Record everything that enters the agent's decisions into this file, for `agent replay-inputs`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inputs: Option<PathBuf>,
     /// Detector, threads and device.
     #[command(flatten)]
     #[serde(default)]
@@ -301,17 +306,19 @@ impl AgentConfig {
     #[must_use]
     pub fn options(&self) -> NodeOptions {
         NodeOptions {
-            publish: self
-                .publish
-                .iter()
-                .filter_map(|publish| publish.stream())
-                .collect(),
-            codec: self.settings.codec,
-            rate: self.settings.rate,
-            egos: self.egos.clone(),
+            of_loop: LoopOptions {
+                publish: { self.publish.iter() }
+                    .filter_map(|publish| publish.stream())
+                    .collect(),
+                codec: self.settings.codec,
+                rate: self.settings.rate,
+                egos: self.egos.clone(),
+                falsification: self.settings.falsification,
+            },
             keeps_running: self.keep_running || self.bus.supervised,
             sweep_log: self.sweep_log.clone(),
-            ..NodeOptions::default()
+            inputs: { self.inputs.clone() }
+                .map(|path| (path, serde_json::to_string(self).unwrap_or_default())),
         }
     }
 }
@@ -393,7 +400,7 @@ mod tests {
         for publish in [&[Publish::None][..], &[]] {
             let config = config(publish);
             config.validate().unwrap();
-            assert!(config.gives_poses_only() && config.options().publish.is_empty());
+            assert!(config.gives_poses_only() && config.options().of_loop.publish.is_empty());
         }
         let error = config(&[Publish::Bev]).validate().unwrap_err().to_string();
         assert_eq!(

@@ -1,6 +1,7 @@
 //! Agent of one connected vehicle: pose and BEV features of each of its sweeps, published on the bus.
 //!
-//! - [`agent`]: the pipeline, synchronous and without a network; [`node`]: the process around it.
+//! - [`agent`]: the pipeline, synchronous and without a network; [`agent_loop`]: its decisions; [`node`]: the process
+//!   around it. [`input_log`] and [`loop_clock`]: what the processes of loops share.
 //! - [`rate`]: bytes per message under a byte budget; `sweep_pairing`: sweep and starting pose of one capture time.
 //! - [`attack`]: falsified messages, for experiments on misbehaviour detection.
 //!
@@ -30,12 +31,14 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod agent;
+pub mod agent_loop;
 pub mod attack;
 mod command;
 pub mod command_line;
 pub mod config;
+pub mod input_log;
+pub mod loop_clock;
 pub mod node;
-pub mod output_filter;
 pub mod rate;
 pub(crate) mod sweep_pairing;
 pub(crate) mod sweep_selection;

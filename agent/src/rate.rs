@@ -7,7 +7,7 @@
 //! reduction is defined in [`protocol::codec::encode_within`]: first a coarser number format, then the least confident
 //! cells are left out.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use protocol::codec::{HEAD_BYTES, encode_within, largest_message, smallest_message};
 use protocol::{
@@ -47,15 +47,15 @@ pub struct RateConfig {
     pub watch_queue: bool,
 }
 
-/// Turn of a feature map at the head of the sending queue.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Turn of a message at the head of the sending queue.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Turn {
-    /// Number of maps submitted before it. Those between the last turn and this one were superseded.
+    /// Number of messages submitted before it. Those between the last turn and this one were superseded.
     pub number: u64,
-    /// Time of submission.
-    pub submitted: Instant,
-    /// Time at which the messages before it had left.
-    pub begun: Instant,
+    /// Time of submission, nanoseconds.
+    pub submitted_nanos: u64,
+    /// Time at which the messages before it had left, nanoseconds.
+    pub begun_nanos: u64,
 }
 
 /// Limits the size of each map, given the past ones.
@@ -157,6 +157,11 @@ fn bytes_within(bytes_per_second: u64, nanos: u64) -> u64 {
     u64::try_from(bytes).unwrap_or(u64::MAX)
 }
 
+/// Time between two times in nanoseconds; zero if the second is earlier.
+fn between(from_nanos: u64, to_nanos: u64) -> Duration {
+    Duration::from_nanos(to_nanos.saturating_sub(from_nanos))
+}
+
 /// Estimates the throughput of the agent's own queue.
 ///
 /// While a map waits, the time from the last one's turn to its own is the time that the last one took to leave: the
@@ -176,13 +181,11 @@ impl QueueWatch {
         let floor = (largest as f64 * SMALLEST_SHARE).max(2.0 * smallest as f64);
         if let Some(last) = self.last.replace(*turn) {
             let submissions = turn.number.saturating_sub(last.number).max(1);
-            let period = turn
-                .submitted
-                .saturating_duration_since(last.submitted)
-                .div_f64(submissions as f64);
-            let waited = turn.begun.saturating_duration_since(turn.submitted);
+            let period = between(last.submitted_nanos, turn.submitted_nanos);
+            let period = period.div_f64(submissions as f64);
+            let waited = between(turn.submitted_nanos, turn.begun_nanos);
             self.allowed = if submissions > 1 || waited > period.mul_f64(BLOCKED_SHARE) {
-                let took = turn.begun.saturating_duration_since(last.begun);
+                let took = between(last.begun_nanos, turn.begun_nanos);
                 Some(self.backed_off(period, took).max(floor))
             } else {
                 self.allowed.map(|bytes| bytes * GROWTH)
@@ -201,6 +204,7 @@ impl QueueWatch {
 #[cfg(test)]
 mod tests {
     use protocol::{BevGrid, Dtype, RateReason, Selection};
+    use support::nanos;
 
     use super::*;
 
@@ -253,10 +257,10 @@ mod tests {
     /// Maps at 10 Hz over a sender that takes `bytes_per_second(second)`; each sent one with its waiting time.
     struct SlowLink {
         control: RateControl,
-        start: Instant,
-        free: Instant,
+        /// Time from the beginning until the sender is free.
+        free: Duration,
         number: u64,
-        waiting: Option<(u64, Instant)>,
+        waiting: Option<(u64, Duration)>,
     }
 
     impl SlowLink {
@@ -265,11 +269,9 @@ mod tests {
                 watch_queue: true,
                 ..RateConfig::default()
             });
-            let start = Instant::now();
             Self {
                 control,
-                start,
-                free: start,
+                free: Duration::ZERO,
                 number: 0,
                 waiting: None,
             }
@@ -279,7 +281,7 @@ mod tests {
         fn drive(&mut self, frames: u64, bytes_per_second: f64) -> (Vec<(u64, Duration)>, u64) {
             let (mut sent, mut superseded) = (Vec::new(), 0);
             for _ in 0..frames {
-                let submitted = self.start + Duration::from_millis(100 * self.number);
+                let submitted = Duration::from_millis(100 * self.number);
                 if self.free <= submitted {
                     self.send(bytes_per_second, &mut sent);
                 }
@@ -297,10 +299,11 @@ mod tests {
                 return;
             };
             let begun = self.free.max(submitted);
+            let [submitted_nanos, begun_nanos] = [submitted, begun].map(nanos::of);
             let turn = Turn {
                 number,
-                submitted,
-                begun,
+                submitted_nanos,
+                begun_nanos,
             };
             let bytes = HEAD_BYTES
                 + encode(&mut self.control, 100_000_000 * number, Some(&turn))

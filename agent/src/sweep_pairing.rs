@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
-use std::time::{Duration, Instant};
 
 use protocol::{EgoMotion, Pose};
 
@@ -38,8 +37,9 @@ pub(crate) struct Unused {
 /// until one arrives.
 #[derive(Debug)]
 pub(crate) struct SweepPairing<S> {
-    timeout: Duration,
-    waiting: Option<(u64, S, Instant)>,
+    timeout_nanos: u64,
+    /// Capture time, the sweep, and the time since which it waits, nanoseconds.
+    waiting: Option<(u64, S, u64)>,
     poses: CaptureBuffer<Pose>,
     motions: CaptureBuffer<EgoMotion>,
     expects_pose: bool,
@@ -47,11 +47,11 @@ pub(crate) struct SweepPairing<S> {
 }
 
 impl<S> SweepPairing<S> {
-    /// Pairing with at most `timeout` of waiting for the measurements of a sweep.
+    /// Pairing with at most `timeout_nanos` of waiting for the measurements of a sweep.
     #[must_use]
-    pub(crate) fn new(timeout: Duration) -> Self {
+    pub(crate) fn new(timeout_nanos: u64) -> Self {
         Self {
-            timeout,
+            timeout_nanos,
             waiting: None,
             poses: CaptureBuffer::default(),
             motions: CaptureBuffer::default(),
@@ -77,20 +77,27 @@ impl<S> SweepPairing<S> {
 
     /// Adds a sweep. Returns the one that it replaces.
     #[must_use]
-    pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
+    pub(crate) fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now_nanos: u64) -> Option<S> {
         // The wait goes on: with a period shorter than the time-out, none would ever be over if each sweep began anew.
-        let since = self.waiting.as_ref().map_or(now, |(_, _, since)| *since);
+        let since = self
+            .waiting
+            .as_ref()
+            .map_or(now_nanos, |(_, _, since)| *since);
         self.waiting
             .replace((capture_nanos, sweep, since))
             .map(|(_, superseded, _)| superseded)
     }
 
     /// The sweep, if there is nothing left to wait for.
-    pub(crate) fn next(&mut self, now: Instant) -> Option<PairedSweep<S>> {
-        let &(capture_nanos, _, since) = self.waiting.as_ref()?;
+    pub(crate) fn next(&mut self, now_nanos: u64) -> Option<PairedSweep<S>> {
+        let &(capture_nanos, ..) = self.waiting.as_ref()?;
         let is_awaited = self.expects_pose && self.poses.is_awaited(capture_nanos)
             || self.expects_motion && self.motions.is_awaited(capture_nanos);
-        if is_awaited && now < since + self.timeout {
+        if is_awaited
+            && self
+                .deadline_nanos()
+                .is_some_and(|deadline| now_nanos < deadline)
+        {
             return None;
         }
         let (pose, poses) = self.poses.take(capture_nanos);
@@ -107,12 +114,11 @@ impl<S> SweepPairing<S> {
         })
     }
 
-    /// Time of the next call of [`Self::next`] if nothing arrives.
+    /// Time of the next call of [`Self::next`] if nothing arrives, nanoseconds; `None`: no sweep waits.
     #[must_use]
-    pub(crate) fn deadline(&self) -> Option<Instant> {
-        self.waiting
-            .as_ref()
-            .map(|(_, _, since)| *since + self.timeout)
+    pub(crate) fn deadline_nanos(&self) -> Option<u64> {
+        let (_, _, since_nanos) = self.waiting.as_ref()?;
+        Some(since_nanos.saturating_add(self.timeout_nanos))
     }
 }
 
@@ -166,7 +172,9 @@ impl<T> CaptureBuffer<T> {
 mod tests {
     use super::*;
 
-    const TIMEOUT: Duration = Duration::from_millis(200);
+    const TIMEOUT: u64 = 200_000_000;
+    /// A time, nanoseconds.
+    const NOW: u64 = 1_000_000_000;
 
     fn without_motion() -> SweepPairing<char> {
         SweepPairing {
@@ -181,7 +189,7 @@ mod tests {
 
     fn paired(
         pairing: &mut SweepPairing<char>,
-        now: Instant,
+        now: u64,
     ) -> Option<(u64, char, Option<f64>, usize)> {
         let PairedSweep {
             capture_nanos,
@@ -200,7 +208,7 @@ mod tests {
 
     #[test]
     fn a_sweep_is_paired_with_its_pose_in_either_order() {
-        let (mut pairing, now) = (without_motion(), Instant::now());
+        let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(pairing.add_pose(10, at(1.0)), 0);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', Some(1.0), 0)));
@@ -212,7 +220,7 @@ mod tests {
 
     #[test]
     fn sweeps_of_a_vehicle_without_gnss_are_computed_although_the_next_comes_before_the_time_out() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), NOW);
         let [second, third, fourth] = [1, 2, 3].map(|period| now + period * TIMEOUT / 2);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), None);
@@ -226,13 +234,13 @@ mod tests {
 
     #[test]
     fn a_lost_pose_is_noticed_by_the_next_or_by_the_time() {
-        let (mut pairing, now) = (without_motion(), Instant::now());
+        let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_pose(20, at(2.0)), 0);
         assert_eq!(paired(&mut pairing, now), Some((10, 'a', None, 0)));
         assert_eq!(pairing.add_sweep(30, 'c', now), None);
         assert_eq!(paired(&mut pairing, now), None);
-        assert_eq!(pairing.deadline(), Some(now + TIMEOUT));
+        assert_eq!(pairing.deadline_nanos(), Some(now + TIMEOUT));
         assert_eq!(
             paired(&mut pairing, now + TIMEOUT),
             Some((30, 'c', None, 1)),
@@ -242,7 +250,7 @@ mod tests {
 
     #[test]
     fn a_restarted_scene_is_not_mistaken_for_one_with_lost_poses() {
-        let (mut pairing, now) = (without_motion(), Instant::now());
+        let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(
             pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)),
             0
@@ -266,7 +274,7 @@ mod tests {
 
     #[test]
     fn the_largest_capture_time_has_no_later_poses() {
-        let (mut pairing, now) = (without_motion(), Instant::now());
+        let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(
             pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)),
             0
@@ -282,7 +290,7 @@ mod tests {
 
     #[test]
     fn replaced_sweeps_are_returned() {
-        let (mut pairing, now) = (without_motion(), Instant::now());
+        let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
         let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();
@@ -291,7 +299,7 @@ mod tests {
 
     #[test]
     fn a_vehicle_without_a_receiver_of_poses_waits_once() {
-        let (mut pairing, now) = (without_motion(), Instant::now());
+        let (mut pairing, now) = (without_motion(), NOW);
         assert_eq!(pairing.add_sweep(10, 'a', now), None);
         assert_eq!(paired(&mut pairing, now), None, "there may be a receiver");
         assert_eq!(
@@ -307,7 +315,7 @@ mod tests {
 
     #[test]
     fn a_vehicle_with_a_motion_sensor_waits_for_it_and_one_without_does_not() {
-        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), Instant::now());
+        let (mut pairing, now) = (SweepPairing::new(TIMEOUT), NOW);
         let speed = |speed_mps| EgoMotion {
             speed_mps: Some(speed_mps),
             yaw_rate_rad_s: None,

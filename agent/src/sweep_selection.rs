@@ -1,14 +1,13 @@
 //! Sweep selection: leaves out sweeps that no ego has time for, the same in every vehicle.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::time::{Duration, Instant};
 
 use protocol::{CavId, Pace};
 
 /// Largest number of egos whose pace is followed.
 pub(crate) const MAX_EGOS: usize = 64;
-/// Silence after which the pace of an ego is forgotten: it repeats its pace every second.
-const MAX_SILENCE: Duration = Duration::from_secs(5);
+/// Silence after which the pace of an ego is forgotten, nanoseconds: it repeats its pace every second.
+const MAX_SILENCE_NANOS: u64 = 5_000_000_000;
 
 /// Paces of the egos, and the interval of the last computed sweep under each.
 #[derive(Debug, Default)]
@@ -24,7 +23,8 @@ struct Followed {
     pace: Pace,
     /// Interval of the last computed sweep.
     last: Option<i128>,
-    heard: Instant,
+    /// Time of the last message, nanoseconds.
+    heard_nanos: u64,
 }
 
 impl SweepSelection {
@@ -39,7 +39,7 @@ impl SweepSelection {
 
     /// Follows the pace of an ego from now on. False if the ego is not of the run, or there are too many already.
     #[must_use]
-    pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace, now: Instant) -> bool {
+    pub(crate) fn follow(&mut self, ego: &CavId, pace: Pace, now_nanos: u64) -> bool {
         if !self.egos.is_empty() && !self.egos.contains(ego) {
             return false;
         }
@@ -56,7 +56,7 @@ impl SweepSelection {
             Followed {
                 pace,
                 last,
-                heard: now,
+                heard_nanos: now_nanos,
             },
         );
         true
@@ -69,9 +69,9 @@ impl SweepSelection {
 
     /// True if a sweep is computed: it is the first of an interval of any ego, or there is no pace. A capture time
     /// before the last one begins anew.
-    pub(crate) fn admits(&mut self, capture_nanos: u64, now: Instant) -> bool {
+    pub(crate) fn admits(&mut self, capture_nanos: u64, now_nanos: u64) -> bool {
         self.paces.retain(|ego, followed| {
-            let is_heard = now.saturating_duration_since(followed.heard) <= MAX_SILENCE;
+            let is_heard = now_nanos.saturating_sub(followed.heard_nanos) <= MAX_SILENCE_NANOS;
             if !is_heard {
                 tracing::info!(%ego, "the ego is silent: its pace is forgotten");
             }
@@ -93,10 +93,13 @@ impl SweepSelection {
 mod tests {
     use super::*;
 
+    /// A time, nanoseconds.
+    const NOW: u64 = 1_000_000_000;
+
     fn computed(
         selection: &mut SweepSelection,
         sweeps: std::ops::Range<u64>,
-        now: Instant,
+        now: u64,
     ) -> Vec<u64> {
         sweeps
             .filter(|sweep| selection.admits(sweep * 100_000_000, now))
@@ -114,7 +117,7 @@ mod tests {
 
     #[test]
     fn vehicles_that_hear_of_a_pace_at_different_times_compute_the_same_sweeps() {
-        let (ego, now) = (CavId::new("1").unwrap(), Instant::now());
+        let (ego, now) = (CavId::new("1").unwrap(), NOW);
         let (mut early, mut late) = (SweepSelection::default(), SweepSelection::default());
         assert_eq!(computed(&mut early, 0..3, now), [0, 1, 2]);
         assert!(early.follow(&ego, every(3), now));
@@ -132,7 +135,7 @@ mod tests {
 
     #[test]
     fn the_fastest_ego_is_served_and_a_restarted_scene_too() {
-        let (mut selection, now) = (SweepSelection::default(), Instant::now());
+        let (mut selection, now) = (SweepSelection::default(), NOW);
         assert!(selection.follow(&CavId::new("1").unwrap(), every(4), now));
         assert!(selection.follow(&CavId::new("2").unwrap(), every(2), now));
         assert_eq!(computed(&mut selection, 3..12, now), [3, 5, 7, 9, 11]);
@@ -141,9 +144,9 @@ mod tests {
 
     #[test]
     fn egos_that_leave_or_are_silent_are_forgotten() {
-        let (mut selection, now) = (SweepSelection::default(), Instant::now());
+        let (mut selection, now) = (SweepSelection::default(), NOW);
         let [slow, fast, faster] = ["1", "2", "3"].map(|ego| CavId::new(ego).unwrap());
-        let later = now + MAX_SILENCE;
+        let later = now + MAX_SILENCE_NANOS;
         assert!(selection.follow(&slow, every(4), now) && selection.follow(&fast, every(2), now));
         assert!(selection.follow(&faster, Pace::EVERY_SWEEP, now));
         assert_eq!(computed(&mut selection, 3..7, now), [3, 4, 5, 6]);
@@ -154,10 +157,10 @@ mod tests {
             "it repeats its pace"
         );
         assert_eq!(computed(&mut selection, 15..19, later), [15, 17]);
-        let silent = later + Duration::from_millis(1);
+        let silent = later + 1_000_000;
         assert_eq!(computed(&mut selection, 19..27, silent), [19, 23]);
         assert_eq!(
-            computed(&mut selection, 27..30, silent + MAX_SILENCE),
+            computed(&mut selection, 27..30, silent + MAX_SILENCE_NANOS),
             [27, 28, 29]
         );
     }
@@ -165,10 +168,7 @@ mod tests {
     #[test]
     fn only_egos_of_the_run_set_the_pace() {
         let [own, stranger] = ["1", "2"].map(|ego| CavId::new(ego).unwrap());
-        let (mut selection, now) = (
-            SweepSelection::of(std::slice::from_ref(&own)),
-            Instant::now(),
-        );
+        let (mut selection, now) = (SweepSelection::of(std::slice::from_ref(&own)), NOW);
         assert!(!selection.follow(&stranger, every(100), now));
         assert_eq!(computed(&mut selection, 0..3, now), [0, 1, 2]);
         assert!(selection.follow(&own, every(3), now));
@@ -178,7 +178,7 @@ mod tests {
 
     #[test]
     fn more_egos_than_are_followed_are_refused() {
-        let (mut selection, now) = (SweepSelection::default(), Instant::now());
+        let (mut selection, now) = (SweepSelection::default(), NOW);
         let ego = |number: usize| CavId::new(&number.to_string()).unwrap();
         assert!((0..MAX_EGOS).all(|number| selection.follow(&ego(number), every(2), now)));
         assert!(!selection.follow(&ego(MAX_EGOS), every(1), now));

@@ -151,15 +151,6 @@ impl EgoSettings {
     }
 }
 
-impl EgoConfig {
-    /// The configuration as JSON, on one line.
-    #[must_use]
-    pub fn to_json(&self) -> String {
-        // Numbers, names, paths and lists have a spelling in JSON.
-        serde_json::to_string(self).unwrap_or_default()
-    }
-}
-
 impl ProcessConfig for EgoConfig {
     const REQUIRED: &'static [&'static str] = &["run", "models.weights"];
 

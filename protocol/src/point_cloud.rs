@@ -15,7 +15,7 @@ pub enum Handedness {
 /// Points of one sweep in the frame of the sensor.
 ///
 /// `xyzi` is `[N]` of x, y, z in metres (right-handed) and intensity, usually 0..1.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct PointCloud {
     /// x, y, z, intensity of every point.
     pub xyzi: Vec<[f32; 4]>,

@@ -1,10 +1,8 @@
 //! `agent run`: one vehicle of a live fleet.
 
 use crate::agent::Agent;
-use crate::attack::Attack;
 use crate::config::AgentConfig;
 use crate::node;
-use crate::output_filter::{OutputFilter, Unfiltered};
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
 use perception::detector::Detector;
@@ -32,8 +30,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let config = args.config.validated()?;
-    config.models.threads.apply();
-    let agent = agent(&config).map_err(BadInput::of)?;
+    let agent = agent(&config)?;
     let stop = config.bus.stop().context("installing signal handlers")?;
     let bus = config
         .bus
@@ -43,13 +40,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     } else {
         tracing::info!(cav = %config.cav, weights = %config.models.weights.display(), "ready");
     }
-    let report = node::run_filtered(
-        &bus,
-        agent,
-        output_filter(&config),
-        &config.options(),
-        &stop,
-    )?;
+    let report = node::run(&bus, agent, &config.options(), &stop)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
@@ -68,7 +59,13 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     Ok(Outcome::of(report.failed > 0))
 }
 
-fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
+/// Pipeline of a configuration.
+pub(super) fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
+    config.models.threads.apply();
+    load(config).map_err(|error| BadInput::of(error).into())
+}
+
+fn load(config: &AgentConfig) -> anyhow::Result<Agent> {
     let inference = config.models.inference()?;
     let pose = config.settings.pose.clone().with_networks()?;
     let pose_source = pose.build(inference)?;
@@ -79,11 +76,4 @@ fn agent(config: &AgentConfig) -> anyhow::Result<Agent> {
     let detector = Detector::from_weights(&weights, &weights.detector_config()?, inference.device)
         .context("weights")?;
     Ok(Agent::new(config.cav.clone(), pose_source, detector))
-}
-
-fn output_filter(config: &AgentConfig) -> Box<dyn OutputFilter> {
-    match config.settings.falsification {
-        Some(falsification) => Box::new(Attack::new(falsification, &config.cav, 0)),
-        None => Box::new(Unfiltered),
-    }
 }

@@ -3,18 +3,17 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use anyhow::{Context, bail, ensure};
+use agent::input_log::RecordedInputs;
+use anyhow::{Context, bail};
 use bus::log_to_stderr;
 use protocol::Limits;
 use protocol::message::{Detections, DetectionsReport};
 use serde::Deserialize;
-use support::cli::{BadInput, Outcome};
-use support::record_log::RecordReader;
+use support::cli::Outcome;
 use support::{bounded_file, output};
 
 use crate::config::EgoConfig;
-use crate::ego::Ego;
-use crate::ego_loop::recorded::{KIND, Record};
+use crate::ego_loop::recorded::{KIND, Published, Record};
 use crate::ego_loop::{EgoLoop, Output};
 use crate::node::NodeOptions;
 
@@ -48,14 +47,19 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         log_to_stderr();
         let ticks = self.ticks()?;
-        let mut records = RecordReader::<Record>::open(&self.file, KIND).map_err(BadInput::of)?;
-        let (mut ego, mut ego_loop) = self.beginning(records.next())?;
+        let (mut records, mut config) = RecordedInputs::open::<EgoConfig>(&self.file, KIND)?;
+        if let Some(weights) = &self.weights {
+            config.models.weights.clone_from(weights);
+        }
+        let (cav, mut ego) = super::run::build(&config)?;
+        records.check_model(Some(ego.detector()), &config.models.weights)?;
+        ego.warm_up(&cav)?;
+        let mut ego_loop = EgoLoop::new(&cav, &ego, NodeOptions::from(&config).of_loop);
         let mut results: BTreeMap<u64, Detections> = BTreeMap::new();
-        let mut is_whole = true;
-        for record in records {
+        for record in &mut records {
             let (now_nanos, input) = match record {
-                Ok(Record::Input { now_nanos, input }) => (now_nanos, input),
-                Ok(Record::Published { stamp, stages }) => {
+                Record::Input { now_nanos, input } => (now_nanos, input),
+                Record::Published(Published { stamp, stages }) => {
                     let capture_nanos = stamp.capture_nanos;
                     let result = results.remove(&capture_nanos).with_context(|| {
                         format!("no result of the frame captured at {capture_nanos} ns")
@@ -65,12 +69,7 @@ impl Arguments {
                     output::line(DetectionsReport::new(&stamp, tick, result).to_json())?;
                     continue;
                 }
-                Ok(Record::Start { .. }) => bail!("{}: a second beginning", self.file.display()),
-                Err(error) => {
-                    tracing::warn!("the rest is left out: {error}");
-                    is_whole = false;
-                    break;
-                }
+                Record::Start(_) => continue,
             };
             let decoded =
                 input.try_map(|message| message.decode(&ego_loop, &Limits::DEFAULT).map(Box::new));
@@ -90,42 +89,7 @@ impl Arguments {
                 }
             }
         }
-        Ok(Outcome::of(!is_whole))
-    }
-
-    /// Ego and loop at the beginning of the run.
-    fn beginning(
-        &self,
-        first: Option<Result<Record, support::file_error::FileError>>,
-    ) -> anyhow::Result<(Ego, EgoLoop)> {
-        let file = self.file.display();
-        let Some(Record::Start {
-            config,
-            model_hash,
-            version,
-        }) = first.transpose().map_err(BadInput::of)?
-        else {
-            bail!(BadInput::new(format!("{file}: the beginning is missing")));
-        };
-        let mut config: EgoConfig = serde_json::from_str(&config)
-            .with_context(|| format!("{file}: configuration of version {version}"))?;
-        if let Some(weights) = &self.weights {
-            config.models.weights.clone_from(weights);
-        }
-        let (cav, mut ego) = super::run::build(&config)?;
-        let found = ego.detector().model_hash();
-        ensure!(
-            found == model_hash,
-            "weights: {} has model_hash {found}, the run had {model_hash}",
-            config.models.weights.display()
-        );
-        let ours = env!("CARGO_PKG_VERSION");
-        if version != ours {
-            tracing::warn!("recorded by version {version}, replayed by {ours}");
-        }
-        ego.warm_up(&cav)?;
-        let ego_loop = EgoLoop::new(&cav, &ego, NodeOptions::from(&config).of_loop);
-        Ok((ego, ego_loop))
+        Ok(records.outcome())
     }
 
     /// Tick by capture time, nanoseconds.

@@ -1,10 +1,9 @@
 //! Recorded inputs of an ego's loop: everything that a run decides from, and the times that only a clock knows.
 
-use protocol::message::{ModelHash, StageTiming};
+use agent::input_log;
+use protocol::message::StageTiming;
 use protocol::{Limits, Stamp, wire};
 use serde::{Deserialize, Serialize};
-
-use crate::ego::Ego;
 
 use super::{EgoLoop, Input, Message, Reception, Refusal};
 
@@ -12,43 +11,15 @@ use super::{EgoLoop, Input, Message, Reception, Refusal};
 pub const KIND: &str = "ego inputs";
 
 /// A record of an ego's inputs.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub enum Record {
-    /// Beginning of the run.
-    Start {
-        /// Configuration of the process, as JSON.
-        config: String,
-        /// Hash of the ego's network.
-        model_hash: ModelHash,
-        /// Version of the program.
-        version: String,
-    },
-    /// Something that happened to the ego.
-    Input {
-        /// Time on the loop's clock, nanoseconds.
-        now_nanos: u64,
-        /// Input, with messages as on the wire.
-        input: Input<WireMessage>,
-    },
-    /// A result was published: its stamp, and the measured durations of its stages.
-    Published {
-        /// Stamp of the message.
-        stamp: Stamp,
-        /// Durations of the stages.
-        stages: Vec<StageTiming>,
-    },
-}
+pub type Record = input_log::Record<Input<WireMessage>, Published>;
 
-impl Record {
-    /// First record of a process with that configuration, as JSON.
-    #[must_use]
-    pub fn start(config: String, ego: &Ego) -> Self {
-        Self::Start {
-            config,
-            model_hash: ego.detector().model_hash(),
-            version: env!("CARGO_PKG_VERSION").to_owned(),
-        }
-    }
+/// A published result: its stamp, and the measured durations of its stages.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Published {
+    /// Stamp of the message.
+    pub stamp: Stamp,
+    /// Durations of the stages.
+    pub stages: Vec<StageTiming>,
 }
 
 /// A message as on the wire, header included.

@@ -2,11 +2,9 @@
 //!
 //! One thread receives, fuses and publishes; sending has threads of its own.
 
-mod input_log;
 mod receive;
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -20,11 +18,12 @@ use protocol::{Body, CavId, Detections, Encoded, Limits, Role, Stream, Topic, wi
 
 use crate::config::{EgoConfig, EgoSettings, PaceMode};
 use crate::ego::Ego;
-use crate::ego_loop::recorded::Record;
+use crate::ego_loop::recorded::{KIND, Published, Record, WireMessage};
 use crate::ego_loop::{EgoLoop, Input, LoopOptions, LoopReport, Output};
 use crate::neighbourhood::{Neighbourhood, sender_of, topic_of};
+use agent::input_log::{InputFile, InputLog};
+use agent::loop_clock::LoopClock;
 use fusion::method::Exchange;
-use input_log::InputLog;
 
 /// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period
 /// answers frames that have waited this long, so it is no more than a short pause needs.
@@ -51,9 +50,8 @@ pub struct NodeOptions {
     pub limits: Limits,
     /// Limits of the inbox, for each sender and in total.
     pub inbox: InboxLimits,
-    /// File in which the inputs of the loop are recorded, and the configuration of the process as JSON, which is its
-    /// first record; `None`: they are not recorded.
-    pub inputs: Option<(PathBuf, String)>,
+    /// File in which the inputs of the loop are recorded; `None`: they are not.
+    pub inputs: Option<InputFile>,
 }
 
 impl Default for NodeOptions {
@@ -89,7 +87,9 @@ impl From<&EgoConfig> for NodeOptions {
             neighbours: Some(neighbours).filter(|named| !named.is_empty()),
             over_link: config.over_link,
             keeps_running: config.keep_running || config.bus.supervised,
-            inputs: { config.inputs.clone() }.map(|path| (path, config.to_json())),
+            inputs: { config.inputs.clone() }
+                .map(|path| (path, serde_json::to_string(config).unwrap_or_default())),
+
             ..Self::from(&config.ego)
         }
     }
@@ -134,12 +134,11 @@ struct Node<'a> {
     options: &'a NodeOptions,
     inbox: Arc<Inbox>,
     neighbourhood: Option<Neighbourhood>,
-    /// A moment, and its time on the loop's clock: the Unix time of the beginning, which is not set back later.
-    began: (Instant, u64),
+    clock: LoopClock,
     pace: Publisher,
     detections: Publisher,
     json: Publisher,
-    log: Option<InputLog>,
+    log: Option<InputLog<Input<WireMessage>, Published>>,
     _own: Vec<Subscription>,
 }
 
@@ -152,10 +151,8 @@ impl<'a> Node<'a> {
         stop: &Stop,
     ) -> Result<Self, BusError> {
         let ego_loop = EgoLoop::new(cav, &ego, options.of_loop);
-        let log = { options.inputs.as_ref() }.and_then(|(path, config)| {
-            let start = Record::start(config.clone(), &ego);
-            InputLog::create(path, &start)
-        });
+        let log = { options.inputs.as_ref() }
+            .and_then(|file| InputLog::create(file, KIND, Some(ego.detector())));
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
@@ -183,7 +180,7 @@ impl<'a> Node<'a> {
             cav: cav.clone(),
             options,
             neighbourhood,
-            began: (Instant::now(), unix_nanos()),
+            clock: LoopClock::start(),
             pace: bus.publisher(own_topic(cav, Stream::Pace), PublisherOptions::POSE)?,
             detections: bus.publisher(
                 own_topic(cav, Stream::Detections),
@@ -240,7 +237,7 @@ impl<'a> Node<'a> {
 
     /// Records an input without a message, hands it to the loop and carries out what that decides.
     fn handle(&mut self, input: Input) {
-        let now_nanos = self.nanos(Instant::now());
+        let now_nanos = self.clock.now_nanos();
         if let Some(log) = &self.log
             && let Some(input) = input.without_message()
         {
@@ -272,12 +269,8 @@ impl<'a> Node<'a> {
 
     /// Reports what the ego waits for with the counters of the process.
     fn report_problems(&self) {
-        let now = Instant::now();
-        let now_nanos = self.nanos(now);
-        let problems = { self.ego_loop.problems(now_nanos).into_iter() }.map(|(problem, since)| {
-            let before = Duration::from_nanos(now_nanos.saturating_sub(since));
-            (problem, now.checked_sub(before).unwrap_or(now))
-        });
+        let problems = self.ego_loop.problems(self.clock.now_nanos()).into_iter();
+        let problems = problems.map(|(problem, since)| (problem, self.clock.moment(since)));
         self.bus.stats().set_problems("ego", problems);
     }
 
@@ -300,10 +293,10 @@ impl<'a> Node<'a> {
             let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
             result.stages.push(StageTiming::new("send", sending));
             if let Some(log) = log {
-                log.add(&Record::Published {
+                log.add(&Record::Published(Published {
                     stamp: stamp.clone(),
                     stages: result.stages.clone(),
-                });
+                }));
             }
             wire::encode(stamp, result)
         });
@@ -323,19 +316,10 @@ impl<'a> Node<'a> {
         topic_of(&self.cav, cav, stream, self.options.over_link)
     }
 
-    /// A moment on the loop's clock, nanoseconds.
-    fn nanos(&self, at: Instant) -> u64 {
-        let (began, began_nanos) = self.began;
-        let since = support::nanos::of(at.saturating_duration_since(began));
-        let before = support::nanos::of(began.saturating_duration_since(at));
-        began_nanos.saturating_add(since).saturating_sub(before)
-    }
-
     fn next_moment(&self) -> Instant {
-        let now = Instant::now();
-        let now_nanos = self.nanos(now);
-        let wakes_nanos = self.ego_loop.wakes_nanos().unwrap_or(u64::MAX);
-        now + LOOK_ROUND.min(Duration::from_nanos(wakes_nanos.saturating_sub(now_nanos)))
+        let look_round = Instant::now() + LOOK_ROUND;
+        let wakes = self.ego_loop.wakes_nanos();
+        wakes.map_or(look_round, |wakes| self.clock.moment(wakes).min(look_round))
     }
 }
 

@@ -25,7 +25,7 @@ impl Node<'_> {
         let transport = stats.transport(arrival, self.longest_transit_s());
         let reception = Reception {
             cav: cav.clone(),
-            arrived_nanos: self.nanos(arrival.at),
+            arrived_nanos: self.clock.nanos(arrival.at),
             transport,
             clock_offset_s: stats.measured_clock_offset_s(cav),
         };
@@ -43,7 +43,7 @@ impl Node<'_> {
             let stage = format!("{} transport", self.ego_loop.stream());
             stats.timed(&stage, transport);
         }
-        let now_nanos = self.nanos(Instant::now());
+        let now_nanos = self.clock.now_nanos();
         if let Some(log) = &self.log {
             let bytes = arrival.pieces().flatten().copied().collect();
             let input = Input::Message(WireMessage { reception, bytes });

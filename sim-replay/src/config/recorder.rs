@@ -45,7 +45,8 @@ pub struct RecordingConfig {
     /// Leave out the channels for ROS 2 tools: half the size, and still exactly the published messages.
     #[arg(long)]
     pub plain: bool,
-    /// Record what enters the ego's decisions too, in the run folder, for `ego-fuser replay-inputs`.
+    /// Record what enters the decisions of the ego and the agents too, in the run folder, for `replay-inputs` of
+    /// `ego-fuser` and `agent`.
     #[arg(skip)]
     pub inputs: bool,
     /// zstd level, 1 to 22. Absent: not compressed; clouds and feature maps hardly shrink.

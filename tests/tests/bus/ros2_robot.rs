@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use agent::agent::Agent;
+use agent::agent_loop::LoopOptions;
 use agent::node;
 use bus::shutdown::Stop;
 use deploy::ros::{MotionSource, NodeOptions};
@@ -136,7 +137,10 @@ fn a_robot_gets_map_to_odom_and_its_agent_stays_when_the_node_comes_and_goes() {
                 let bus = router.join("agent-1000", "1000");
                 let agent = Agent::without_detector(cav(), Box::new(OnePlace { stated }));
                 let options = node::NodeOptions {
-                    publish: Vec::new(),
+                    of_loop: LoopOptions {
+                        publish: Vec::new(),
+                        ..LoopOptions::default()
+                    },
                     ..node::NodeOptions::default()
                 };
                 node::run(&bus, agent, &options, &stop).unwrap()

@@ -7,6 +7,7 @@ use std::thread::{Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
 use agent::agent::{Agent, AgentInput};
+use agent::agent_loop::LoopOptions;
 use agent::node as agent_node;
 use agent::rate::RateConfig;
 use bus::bounded_queue::Pop;
@@ -88,8 +89,11 @@ fn run_agent<'scope>(
     scope.spawn(move || {
         let bus = router.join(&format!("agent-{cav_id}"), cav_id);
         let options = agent_node::NodeOptions {
-            publish: vec![published(method)],
-            rate,
+            of_loop: LoopOptions {
+                publish: vec![published(method)],
+                rate,
+                ..LoopOptions::default()
+            },
             ..agent_node::NodeOptions::default()
         };
         let report = agent_node::run(&bus, agent(cav_id, method), &options, &stop).unwrap();

@@ -1,7 +1,7 @@
 //! Processes of a fleet: one resolved configuration each, written into the run folder.
 
 use std::net::SocketAddr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use agent::config::AgentConfig;
 use bus::{BusConfig, Endpoint};
@@ -145,6 +145,7 @@ impl Fleet {
             egos: vec![self.ego.clone()],
             keep_running: false,
             sweep_log: notes_sweeps.then(|| context.folder.file(SWEEP_LOG)),
+            inputs: self.inputs(context, &format!("agent-{cav}")),
             bus,
         }
     }
@@ -159,16 +160,16 @@ impl Fleet {
             comm_range_m: self.protocol.ground_truth.comm_range_m,
             over_link: self.is_over_link(),
             keep_running: false,
-            inputs: self
-                .records_inputs()
-                .then(|| context.folder.file(&format!("inputs-ego-{}.log", self.ego))),
+            inputs: self.inputs(context, &format!("ego-{}", self.ego)),
             bus,
         }
     }
 
-    /// True if the inputs of the processes' decisions are recorded.
-    fn records_inputs(&self) -> bool {
-        { self.scenario.record.as_ref() }.is_some_and(|record| record.inputs)
+    /// File for the inputs of a process's decisions, if they are recorded.
+    fn inputs(&self, context: &SessionContext<'_>, process: &str) -> Option<PathBuf> {
+        let record = self.scenario.record.as_ref();
+        let is_recorded = record.is_some_and(|record| record.inputs);
+        is_recorded.then(|| context.folder.file(&format!("inputs-{process}.log")))
     }
 
     fn link_config(&self, context: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {

@@ -4,7 +4,6 @@ use std::time::{Duration, Instant};
 
 use agent::agent::{Agent, AgentInput, Perception};
 use agent::attack::Attack;
-use agent::output_filter::OutputFilter;
 use dataset::frame::Frame;
 use perception::detector::DetectorError;
 use protocol::{CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, WireError};

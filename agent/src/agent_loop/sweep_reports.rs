@@ -1,0 +1,94 @@
+//! Sweep reports: an agent's descriptor with the arrivals of its sweeps, for the capture clocks of egos.
+
+use std::collections::VecDeque;
+
+use perception::detector::Detector;
+use protocol::Stream;
+use protocol::message::{Descriptor, SweepArrival};
+
+use super::LoopOptions;
+
+/// Period at which an agent publishes its descriptor, for processes that join late and as a report of its sweeps,
+/// nanoseconds.
+const PERIOD_NANOS: u64 = 500_000_000;
+/// First sweeps that are reported at once: so many make an estimate of the capture clock.
+const EARLY_SWEEPS: usize = 3;
+/// Sweeps of a report at most.
+const MAX_SWEEPS: usize = 32;
+
+/// Descriptor of an agent, and the sweeps of the next report.
+#[derive(Debug)]
+pub(super) struct SweepReports {
+    /// None without a detector: no ego can use the vehicle's messages.
+    description: Option<Descriptor>,
+    /// Time of the next report, nanoseconds.
+    next_nanos: u64,
+    /// Capture and arrival times of the sweeps since the last one, nanoseconds.
+    sweeps: VecDeque<(u64, u64)>,
+    /// Sweeps that are still reported at once.
+    early: usize,
+}
+
+impl SweepReports {
+    pub(super) fn new(detector: Option<&Detector>, options: &LoopOptions) -> Self {
+        let description = detector.map(|detector| Descriptor {
+            model_hash: detector.model_hash(),
+            grid: detector.grid(),
+            channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
+            dtype: options.codec.dtype,
+            streams: std::iter::once(Stream::Pose)
+                .chain(options.publish.iter().copied())
+                .collect(),
+            sweeps: Vec::new(),
+        });
+        Self {
+            description,
+            next_nanos: 0,
+            sweeps: VecDeque::new(),
+            early: EARLY_SWEEPS,
+        }
+    }
+
+    /// Time of the next report, nanoseconds.
+    pub(super) fn next_nanos(&self) -> u64 {
+        self.next_nanos
+    }
+
+    /// Adds a sweep to the next report, which is due at once if it is one of the first.
+    pub(super) fn note(&mut self, capture_nanos: u64, arrived_nanos: u64) {
+        // The clock of the scene was set back.
+        if (self.sweeps.back()).is_some_and(|(newest, _)| capture_nanos < *newest) {
+            self.sweeps.clear();
+        }
+        self.sweeps.push_back((capture_nanos, arrived_nanos));
+        if self.sweeps.len() > MAX_SWEEPS {
+            self.sweeps.pop_front();
+        }
+        if self.early > 0 {
+            self.early -= 1;
+            self.next_nanos = 0;
+        }
+    }
+
+    /// The report, if it is due, and the capture time of its newest sweep, nanoseconds.
+    pub(super) fn take_due(&mut self, now_nanos: u64) -> Option<(u64, Descriptor)> {
+        if now_nanos < self.next_nanos {
+            return None;
+        }
+        self.next_nanos = now_nanos.saturating_add(PERIOD_NANOS);
+        let newest = self.sweeps.back().map_or(0, |(capture, _)| *capture);
+        let arrival = |(capture, arrived_nanos): (u64, u64)| SweepArrival {
+            before_nanos: newest.saturating_sub(capture),
+            arrived_nanos,
+        };
+        let sweeps = self.sweeps.drain(..).map(arrival).collect();
+        let descriptor = self.description.clone()?;
+        Some((
+            newest,
+            Descriptor {
+                sweeps,
+                ..descriptor
+            },
+        ))
+    }
+}

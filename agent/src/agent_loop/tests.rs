@@ -1,0 +1,178 @@
+use localization::pose_source::RecordedPose;
+use perception::detector::Detector;
+use perception::model_config::DetectorConfig;
+use perception::pillars::point_pillars::PointPillars;
+use protocol::{EgoMotion, PointCloud, Pose, Stamp};
+use tch::{Device, nn::VarStore};
+
+use super::*;
+use crate::rate::Turn;
+
+/// A time on the loop's clock, nanoseconds.
+const NOW: u64 = 1_000_000_000;
+
+fn cav() -> CavId {
+    CavId::new("4279").unwrap()
+}
+
+fn agent() -> Agent {
+    tch::set_num_threads(1);
+    tch::manual_seed(11);
+    let config = DetectorConfig {
+        lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
+        ..DetectorConfig::lean()
+    };
+    let network = VarStore::new(Device::Cpu);
+    let pillars = PointPillars::new(&network.root(), &config).unwrap();
+    let detector = Detector::from_network(pillars);
+    Agent::new(cav(), Box::new(RecordedPose), detector)
+}
+
+fn sweep(capture_nanos: u64) -> Input {
+    let point = |k: u64| {
+        [
+            ((k + capture_nanos) % 83) as f32 * 0.3 - 12.0,
+            (k % 41) as f32 * 0.3 - 6.0,
+            -1.5,
+            0.2,
+        ]
+    };
+    Input::Sweep(Sweep {
+        capture_nanos,
+        arrived_nanos: 7_000 + capture_nanos,
+        cloud: PointCloud {
+            xyzi: (0..500).map(point).collect(),
+        },
+    })
+}
+
+fn gnss(capture_nanos: u64, source: GnssSource) -> Input {
+    let gnss = Gnss {
+        world_from_lidar: Pose::from_xyz_yaw([capture_nanos as f64, 6.0, 0.0], 0.3),
+        position_std_m: 0.0,
+        heading_std_rad: 0.0,
+        source,
+    };
+    Input::Gnss(capture_nanos, gnss)
+}
+
+/// Hands inputs to a loop, each with all the steps that follow; returns what is published, as `(stream, number)`.
+fn published(agent_loop: &mut AgentLoop, inputs: Vec<Input>) -> Vec<(Stream, u64)> {
+    { outputs(agent_loop, inputs).into_iter() }
+        .filter_map(|output| match output {
+            Output::Publish(message) => Some((message.stream, message.number)),
+            _ => None,
+        })
+        .collect()
+}
+
+fn outputs(agent_loop: &mut AgentLoop, inputs: Vec<Input>) -> Vec<Output> {
+    let mut outputs = Vec::new();
+    for input in inputs {
+        outputs.extend(agent_loop.handle(input, NOW));
+        outputs.extend(agent_loop.handle(Input::Wake, NOW));
+        while agent_loop.is_computing() {
+            outputs.extend(agent_loop.handle(Input::Wake, NOW));
+        }
+    }
+    outputs
+}
+
+#[test]
+fn a_sweep_waits_for_its_pose_and_its_steps_are_published_one_by_one() {
+    let mut agent_loop = AgentLoop::new(agent(), LoopOptions::default());
+    // The agent does not know yet that its vehicle measures no motion.
+    let motion = Input::Motion(10, EgoMotion::default());
+    let first = published(&mut agent_loop, vec![motion, sweep(10)]);
+    assert_eq!(first, [(Stream::Descriptor, 0), (Stream::Descriptor, 1)]);
+    assert!(!agent_loop.is_computing() && agent_loop.wakes_nanos() > NOW);
+
+    let streams = |outputs: Vec<Output>| -> Vec<Stream> {
+        let stream = |output| match output {
+            Output::Publish(message) => Some(message.stream),
+            _ => None,
+        };
+        outputs.into_iter().filter_map(stream).collect()
+    };
+    let pose = gnss(10, GnssSource::Recorded);
+    assert!(streams(agent_loop.handle(pose, NOW)).is_empty());
+    for step in [&[Stream::Pose][..], &[Stream::Bev], &[]] {
+        assert_eq!(streams(agent_loop.handle(Input::Wake, NOW)), step);
+    }
+    assert!(!agent_loop.is_computing());
+    let report = agent_loop.report();
+    assert_eq!((report.sweeps, report.no_pose, report.failed), (1, 0, 0));
+}
+
+#[test]
+fn after_the_end_a_sweep_waits_for_nothing() {
+    let agent = Agent::without_detector(cav(), Box::new(RecordedPose));
+    let options = LoopOptions {
+        publish: Vec::new(),
+        ..LoopOptions::default()
+    };
+    let mut agent_loop = AgentLoop::new(agent, options);
+    assert!(published(&mut agent_loop, vec![sweep(10), sweep(20)]).is_empty());
+    assert!(!agent_loop.is_finished());
+    let last = published(&mut agent_loop, vec![Input::Ended]);
+    assert_eq!(last, [(Stream::Pose, 0)]);
+    assert!(agent_loop.is_finished());
+    assert_eq!(agent_loop.report().no_pose, 1);
+}
+
+#[test]
+fn the_same_inputs_give_the_same_bytes() {
+    let options = LoopOptions {
+        publish: vec![Stream::Bev, Stream::Boxes, Stream::Points],
+        falsification: Some(Falsification::Noise),
+        rate: RateConfig {
+            bytes_per_second: Some(1_000_000),
+            ..RateConfig::default()
+        },
+        ..LoopOptions::default()
+    };
+    let run = || {
+        let mut agent_loop = AgentLoop::new(agent(), options.clone());
+        let encoder = MessageEncoder::new(&options);
+        let inputs = vec![
+            gnss(5, GnssSource::Stated),
+            gnss(10, GnssSource::Recorded),
+            sweep(10),
+            sweep(20),
+            Input::Motion(20, EgoMotion::default()),
+            gnss(20, GnssSource::Recorded),
+            Input::Ended,
+        ];
+        let mut bytes = Vec::new();
+        for output in outputs(&mut agent_loop, inputs) {
+            let Output::Publish(message) = output else {
+                continue;
+            };
+            let turn = Turn {
+                number: message.number,
+                submitted_nanos: NOW,
+                begun_nanos: NOW,
+            };
+            let stamp = Stamp {
+                cav: cav(),
+                epoch: 1,
+                sequence: message.number,
+                capture_nanos: message.capture_nanos,
+                publish_nanos: NOW,
+            };
+            let stream = message.stream;
+            let (encoded, _) = encoder.encode(message, &stamp, &turn).unwrap();
+            bytes.push((stream, encoded.to_vec()));
+        }
+        bytes
+    };
+    let first = run();
+    let count = |stream| first.iter().filter(|(of, _)| *of == stream).count();
+    let of_sweeps = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points];
+    assert_eq!(
+        of_sweeps.map(count),
+        [1; 4],
+        "the second has superseded the first"
+    );
+    assert_eq!(first, run());
+}
