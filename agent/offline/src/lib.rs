@@ -8,7 +8,7 @@
 //! The vehicle's process does not link this crate, and with it none of the data-set readers.
 //!
 //! ```
-//! use agent_offline::evaluation::{EvaluationOptions, evaluate_source};
+//! use agent_offline::evaluation::{SweepSelection, evaluate_source};
 //! use localization::pose_source::RecordedPose;
 //! use simulator::generate::{Subset, SynthOptions, generate};
 //!
@@ -16,7 +16,7 @@
 //! let dir = std::env::temp_dir().join(format!("v2vloc-drive-{}", std::process::id()));
 //! generate(&SynthOptions { frames: 2, ..SynthOptions::new(Subset::Town1loc, 1000, dir.clone()) }, &|_frames| ())?;
 //! // The pose of the GNSS receiver against the true one.
-//! let options = EvaluationOptions { scenes: vec![dir.clone()], variant: None, every: 1, sweeps: None };
+//! let options = SweepSelection { scenes: vec![dir.clone()], variant: None, every: 1, sweeps: None };
 //! let evaluated = evaluate_source(&mut RecordedPose, &options, &mut |_done, _of| ())?;
 //! assert_eq!(evaluated.sweeps.len(), 2);
 //! # std::fs::remove_dir_all(&dir)?;

@@ -29,7 +29,7 @@ use tch::Device;
 
 pub use self::processes::SessionContext;
 use crate::scenario::Scenario;
-use crate::scenario::fingerprint::{collect, files_of};
+use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
 
 /// The program that runs fleets.
@@ -247,7 +247,8 @@ impl Fleet {
         data.ticks.truncate(scene.frames.unwrap_or(usize::MAX));
         let digests = FileDigests::default();
         let data_sha256 = dataset::content_sha256([&data], scene.variant.as_deref(), &digests);
-        collect(&Self::programs(programs), data_sha256, files, &digests)
+        let (programs, commit) = (Self::programs(programs), env!("V2VLOC_COMMIT"));
+        Provenance::collect(&programs, data_sha256, files, commit, &digests)
     }
 
     /// Executables of a fleet.

@@ -4,8 +4,7 @@ use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
 
 use link::LinkConfig;
 
-use crate::experiment::sweep::Experiment;
-use crate::experiment::table::TableSpec;
+use crate::experiment::spec::Experiment;
 use crate::scenario::Scenario;
 
 /// A kind of file with a schema.
@@ -13,20 +12,17 @@ use crate::scenario::Scenario;
 pub enum SchemaOf {
     /// `v2vloc up SCENARIO`.
     Scenario,
-    /// `v2vloc sweep EXPERIMENT`.
+    /// `v2vloc sweep EXPERIMENT` and `v2vloc eval --table EXPERIMENT`.
     Experiment,
-    /// `v2vloc eval --table FILE`.
-    Table,
     /// A file with the stages of a link.
     Link,
 }
 
 impl SchemaOf {
     /// Every kind of file, with the path of its schema below `deploy`.
-    pub const ALL: [(Self, &'static str); 4] = [
+    pub const ALL: [(Self, &'static str); 3] = [
         (Self::Scenario, "scenarios/scenario.schema.json"),
         (Self::Experiment, "experiments/experiment.schema.json"),
-        (Self::Table, "experiments/table.schema.json"),
         (Self::Link, "experiments/links/link.schema.json"),
     ];
 
@@ -36,7 +32,6 @@ impl SchemaOf {
         let text = match self {
             Self::Scenario => text_of::<Scenario>(),
             Self::Experiment => text_of::<Experiment>(),
-            Self::Table => text_of::<TableSpec>(),
             Self::Link => text_of::<LinkConfig>(),
         };
         text + "\n"

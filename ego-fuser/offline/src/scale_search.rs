@@ -9,7 +9,7 @@ use perception::int8::{ActivationScales, InferencePrecision, ScaleSearch};
 use perception::weights::Weights;
 use tch::Device;
 
-use crate::evaluation::{EvaluateConfig, EvaluateError, Evaluator};
+use crate::evaluation::{EvaluateError, Evaluator, Setup};
 
 /// Scales of the activations of a weights file, computed in floating point on the first `frames` ticks of every
 /// scenario with true poses: of the detector on the sweeps of all vehicles, of the fusion on their maps. Sweeps that
@@ -25,11 +25,10 @@ pub fn search_scales(
 ) -> Result<ActivationScales, EvaluateError> {
     let mut search = ScaleSearch::default();
     observe_detector(weights, scenarios, frames, &mut search, left_out)?;
-    let mut evaluator = Evaluator::new(EvaluateConfig {
-        precision: InferencePrecision::Float,
-        weights: weights.to_owned(),
-        ..EvaluateConfig::default()
-    })?;
+    let mut setup = Setup::default();
+    setup.models.precision = InferencePrecision::Float;
+    setup.models.weights = weights.to_owned();
+    let mut evaluator = Evaluator::new(setup)?;
     evaluator.ego_mut().fusion_mut().start_scale_search();
     for scenario in scenarios {
         let _ = evaluator.run(scenario, &mut |frame| match frame.tick + 1 < frames {

@@ -2,12 +2,15 @@
 
 use std::collections::BTreeMap;
 use std::env;
+use std::io;
 use std::path::PathBuf;
 
 use protocol::text::hex;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+
+use crate::file_digests::FileDigests;
 
 /// Everything that a result was made of besides its settings. Digests are SHA-256, in hexadecimal digits.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
@@ -30,6 +33,35 @@ pub struct Provenance {
 }
 
 impl Provenance {
+    /// Hashes programs and files, besides the data of that hash; without `programs`, the one that runs. `commit` is that
+    /// of the checkout that they were built in.
+    ///
+    /// # Errors
+    /// The first file that cannot be read, by name.
+    pub fn collect(
+        programs: &[PathBuf],
+        data_sha256: String,
+        files: impl IntoIterator<Item = PathBuf>,
+        commit: &str,
+        digests: &FileDigests,
+    ) -> io::Result<Self> {
+        let files_sha256 = files
+            .into_iter()
+            .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
+            .collect::<io::Result<_>>()?;
+        Ok(Self {
+            command: Vec::new(),
+            version: env!("CARGO_PKG_VERSION").into(),
+            commit: commit.into(),
+            program_sha256: match programs {
+                [] => digests.program_sha256()?,
+                programs => hash_programs(programs, digests)?,
+            },
+            data_sha256,
+            files_sha256,
+        })
+    }
+
     /// The same with the command line of this process.
     #[must_use]
     pub fn with_command(self) -> Self {
@@ -53,4 +85,14 @@ impl Provenance {
         hash.update(settings);
         hex(&hash.finalize())
     }
+}
+
+/// One hash over many programs: name and content of each.
+fn hash_programs(programs: &[PathBuf], digests: &FileDigests) -> io::Result<String> {
+    let mut all = Sha256::new();
+    for path in programs {
+        let name = path.file_name().unwrap_or_default().display();
+        all.update(format!("{name} {}\n", digests.sha256(path)?));
+    }
+    Ok(hex(&all.finalize()))
 }

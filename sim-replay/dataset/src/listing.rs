@@ -22,17 +22,8 @@ pub fn provenance<'a>(
     commit: &str,
 ) -> io::Result<Provenance> {
     let digests = FileDigests::default();
-    let files_sha256 = { files.into_iter() }
-        .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
-        .collect::<io::Result<_>>()?;
-    let provenance = Provenance {
-        version: env!("CARGO_PKG_VERSION").into(),
-        commit: commit.into(),
-        program_sha256: digests.program_sha256()?,
-        data_sha256: content_sha256(scenarios, None, &digests),
-        files_sha256,
-        ..Provenance::default()
-    };
+    let data_sha256 = content_sha256(scenarios, None, &digests);
+    let provenance = Provenance::collect(&[], data_sha256, files, commit, &digests)?;
     Ok(provenance.with_command())
 }
 

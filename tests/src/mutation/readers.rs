@@ -14,8 +14,7 @@ use perception::weights::Weights;
 use protocol::{Limits, wire};
 use recording::Recording;
 use ros2::{MotionType, SweepLimits, read_point_cloud};
-use runner::experiment::sweep::Experiment;
-use runner::experiment::table::TableSpec;
+use runner::experiment::spec::Experiment;
 use runner::scenario::Scenario;
 use safetensors::tensor::{Dtype, TensorView, serialize};
 use sim_replay::stream::{Place, Schedule};
@@ -147,7 +146,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
             "tables",
             text(seeds::TABLES),
             file("tables", "a.yaml"),
-            |path, _| TableSpec::read(path).is_ok(),
+            |path, _| Experiment::read(path).is_ok(),
         ),
         on_disk(
             "link",

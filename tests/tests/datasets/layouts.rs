@@ -6,10 +6,9 @@ use std::path::Path;
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::pcd::{self, Encoding, IntensityField};
 use dataset::{self, Layout, OpenOptions};
-use ego_fuser_offline::evaluation::EvaluateConfig;
 use fusion::Method;
 use protocol::PointCloud;
-use runner::experiment::evaluation::{EvaluationOptions, evaluate};
+use runner::experiment::evaluation::{OpenedData, Trial, evaluate};
 use serde_json::{Value, json};
 use sim_replay::inspect::inspect;
 use simulator::generate::{SceneLayout, Subset, SynthOptions, generate};
@@ -31,24 +30,18 @@ const WEIGHTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/weights");
 
 /// Average precision of a method, by threshold and order.
 fn average_precision(scene: &Path, method: Method) -> Value {
-    let options = EvaluationOptions {
+    let mut trial = Trial {
         dataset: scene.to_owned(),
-        settings: EvaluateConfig {
-            weights: WEIGHTS.into(),
-            ..EvaluateConfig::default()
-        },
         // One protocol for all: each layout has its own otherwise.
         protocol: ProtocolConfig {
             preset: Some("opv2v".into()),
             ..ProtocolConfig::default()
         },
-        ..EvaluationOptions::default()
+        ..Trial::default()
     };
-    let data = options
-        .part
-        .open(&options.dataset, &options.protocol)
-        .unwrap();
-    let metrics = evaluate(&options, &data, method, &mut || {}).unwrap();
+    trial.setup.models.weights = WEIGHTS.into();
+    let data = OpenedData::open(&trial).unwrap();
+    let metrics = evaluate(&trial, &data, method, &mut || {}).unwrap();
     assert_eq!(metrics.frames, 4);
     json!([metrics.ap_global, metrics.ap_frame_order])
 }

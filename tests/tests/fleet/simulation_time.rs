@@ -9,13 +9,11 @@ use dataset::evaluation_protocol::EvaluationProtocol;
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
 use deploy::score::FrameScores;
 use ego_fuser::config::EgoSettings;
-use ego_fuser::ego_loop::LoopOptions;
-use ego_fuser::pairing::PairingConfig;
-use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser_offline::evaluation::stepped::ComputeTimes;
+use ego_fuser_offline::evaluation::{AgentPool, EmulatedLink, EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
 use link::{ClockStep, DeviceClock, LatencyModel, LinkConfig, LossModel};
-use protocol::{CodecConfig, DropReason, Dtype};
+use protocol::{DropReason, Dtype};
 use runner::run::run_fleet::{RunOptions, RunResult, run_scenario};
 use runner::scenario::Scenario;
 use serde_json::Value;
@@ -30,58 +28,39 @@ const ATTENTION: &str = concat!(
 );
 const MS: u64 = 1_000_000;
 
-/// A fleet with zero compute times, over a link.
-fn config(link: LinkConfig) -> SteppedConfig {
-    SteppedConfig {
-        link,
-        link_folder: ".".into(),
-        seed: 3,
-        of_ego: LoopOptions {
-            pairing: PairingConfig::with_max_age_nanos(300 * MS),
-            ..LoopOptions::stepped(&EgoSettings::default())
+/// A fleet with feature maps in half precision and zero compute times, over a link.
+fn config(link: LinkConfig) -> Setup {
+    over(link, in_half_precision())
+}
+
+fn over(config: LinkConfig, setup: Setup) -> Setup {
+    Setup {
+        link: Some(EmulatedLink {
+            config,
+            folder: ".".into(),
+            seed: 3,
+        }),
+        ego: EgoSettings {
+            max_age_ms: 300,
+            ..EgoSettings::default()
         },
-        compute: ComputeTimes::NONE,
-        crew: AgentPool::First(usize::MAX),
-        vehicles: Default::default(),
-        ticks: 0..usize::MAX,
-        lidar_variant: None,
+        ..setup
     }
+}
+
+/// A fleet with feature maps in half precision, without a link.
+fn in_half_precision() -> Setup {
+    let mut setup = Setup::default();
+    setup.agents.codec.dtype = Dtype::F16;
+    setup
 }
 
 /// The frames of a scene in `folder`, and the ledger.
-fn evaluate(
-    folder: &Path,
-    stepped: Option<SteppedConfig>,
-) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
-    evaluate_with(folder, stepped, in_half_precision())
-}
-
-/// Settings with feature maps in half precision.
-fn in_half_precision() -> EvaluateConfig {
-    EvaluateConfig {
-        codec: CodecConfig {
-            dtype: Dtype::F16,
-            ..CodecConfig::default()
-        },
-        ..EvaluateConfig::default()
-    }
-}
-
-fn evaluate_with(
-    folder: &Path,
-    stepped: Option<SteppedConfig>,
-    settings: EvaluateConfig,
-) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
+fn evaluate(folder: &Path, mut setup: Setup) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
     tch::set_num_threads(1);
-    let config = EvaluateConfig {
-        weights: folder.join("weights.safetensors"),
-        method: Some(Method::MAX),
-        ..settings
-    };
-    let mut evaluator = Evaluator::new(config).unwrap();
-    if let Some(stepped) = stepped {
-        evaluator = evaluator.with_link(stepped);
-    }
+    setup.models.weights = folder.join("weights.safetensors");
+    setup.method = Some(Method::MAX);
+    let mut evaluator = Evaluator::new(setup).unwrap();
     let scenario = dataset::open(&folder.join("scene"))
         .unwrap()
         .scenarios
@@ -116,8 +95,8 @@ fn ages_ms(frame: &EvaluatedFrame) -> Vec<i64> {
 #[test]
 fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
     let folder = scene();
-    let (offline, nothing) = evaluate(folder.path(), None);
-    let (stepped, ledger) = evaluate(folder.path(), Some(config(LinkConfig::default())));
+    let (offline, nothing) = evaluate(folder.path(), in_half_precision());
+    let (stepped, ledger) = evaluate(folder.path(), config(LinkConfig::default()));
     assert_eq!(offline.len(), TICKS);
     for (offline, stepped) in offline.iter().zip(&stepped) {
         assert!(!offline.result.detections.is_empty());
@@ -144,10 +123,10 @@ fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
 fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
     let folder = scene();
     let mut settings = in_half_precision();
-    settings.codec.budget_bytes = Some(4000);
-    let (offline, _) = evaluate_with(folder.path(), None, settings.clone());
-    let ideal = config(LinkConfig::default());
-    let (stepped, _) = evaluate_with(folder.path(), Some(ideal), settings);
+    settings.agents.codec.budget_bytes = Some(4000);
+    let (offline, _) = evaluate(folder.path(), settings.clone());
+    let ideal = over(LinkConfig::default(), settings);
+    let (stepped, _) = evaluate(folder.path(), ideal);
     assert_eq!(offline.len(), TICKS);
     for (offline, stepped) in offline.iter().zip(&stepped) {
         // A complete feature map has 65 kB.
@@ -218,13 +197,13 @@ fn detections_beyond_the_range_of_the_protocol_count_neither_way_with_and_withou
         ground_truth: NARROW,
         ..EvaluationProtocol::preset("opv2v").unwrap()
     };
-    let settings = EvaluateConfig {
+    let settings = Setup {
         protocol: Some(protocol),
         ..in_half_precision()
     };
-    let (offline, _) = evaluate_with(folder.path(), None, settings.clone());
-    let ideal = config(LinkConfig::default());
-    let (stepped, _) = evaluate_with(folder.path(), Some(ideal), settings);
+    let (offline, _) = evaluate(folder.path(), settings.clone());
+    let ideal = over(LinkConfig::default(), settings);
+    let (stepped, _) = evaluate(folder.path(), ideal);
     assert_eq!((offline.len(), stepped.len()), (TICKS, TICKS));
     let [without_link, over_link] =
         [&offline, &stepped].map(|frames| judged(frames, |frame| frame.truth.clone()));
@@ -274,10 +253,10 @@ fn the_ego_waits_from_its_own_map_on_for_its_deadline_or_the_next_map() {
         };
         let (frames, ledger) = evaluate(
             folder.path(),
-            Some(SteppedConfig {
+            Setup {
                 compute,
                 ..config(link)
-            }),
+            },
         );
         for (tick, frame) in frames.iter().enumerate() {
             let expected = if tick < first_tick {
@@ -296,7 +275,7 @@ fn the_ego_waits_from_its_own_map_on_for_its_deadline_or_the_next_map() {
         latency: LatencyModel::ConstantMs(450.0),
         ..LinkConfig::default()
     };
-    let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
+    let (frames, ledger) = evaluate(folder.path(), config(link));
     assert!(
         frames
             .iter()
@@ -321,10 +300,10 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
         };
         let (frames, ledger) = evaluate(
             folder.path(),
-            Some(config(LinkConfig {
+            config(LinkConfig {
                 clock,
                 ..LinkConfig::default()
-            })),
+            }),
         );
         // The scene begins at 0, and no clock is below that.
         for (frame, age_ms) in frames[2..].iter().zip(ages_in_ms) {
@@ -337,7 +316,7 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
 #[test]
 fn a_constant_offset_of_capture_times_changes_no_box() {
     let folder = scene();
-    let (right, _) = evaluate(folder.path(), Some(config(LinkConfig::default())));
+    let (right, _) = evaluate(folder.path(), config(LinkConfig::default()));
     for offset_ms in [100.0, 300.0, 3000.0] {
         let clock = DeviceClock {
             offset_ms,
@@ -347,7 +326,7 @@ fn a_constant_offset_of_capture_times_changes_no_box() {
             clock,
             ..LinkConfig::default()
         };
-        let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
+        let (frames, ledger) = evaluate(folder.path(), config(link));
         for (frame, right) in frames.iter().zip(&right) {
             assert_eq!(frame.result.detections, right.result.detections);
             assert_eq!(frame.result.fused, right.result.fused);
@@ -369,10 +348,10 @@ fn a_clock_that_is_set_costs_only_its_vehicle() {
         };
         let (frames, ledger) = evaluate(
             folder.path(),
-            Some(config(LinkConfig {
+            config(LinkConfig {
                 clock,
                 ..LinkConfig::default()
-            })),
+            }),
         );
         assert!(
             frames.len() == TICKS && ledger.balance().is_exact(),
@@ -404,12 +383,12 @@ fn a_clock_that_is_set_costs_only_its_vehicle() {
 #[test]
 fn fewer_vehicles_leave_the_truth_as_it_is() {
     let folder = scene();
-    let crew = |count| SteppedConfig {
-        crew: AgentPool::First(count),
+    let crew = |count| Setup {
+        pool: AgentPool::First(count),
         ..config(LinkConfig::default())
     };
-    let (all, _) = evaluate(folder.path(), Some(crew(3)));
-    let (two, _) = evaluate(folder.path(), Some(crew(2)));
+    let (all, _) = evaluate(folder.path(), crew(3));
+    let (two, _) = evaluate(folder.path(), crew(2));
     assert!(
         all.iter()
             .zip(&two)
@@ -428,13 +407,11 @@ fn losses_are_counted_and_come_from_the_seed() {
         ..LinkConfig::default()
     };
     let run = |seed| {
-        evaluate(
-            folder.path(),
-            Some(SteppedConfig {
-                seed,
-                ..config(link.clone())
-            }),
-        )
+        let mut setup = config(link.clone());
+        if let Some(link) = &mut setup.link {
+            link.seed = seed;
+        }
+        evaluate(folder.path(), setup)
     };
     let ((frames, ledger), (again, same)) = (run(1), run(1));
     assert_eq!(ledger, same);

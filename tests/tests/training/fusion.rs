@@ -6,10 +6,10 @@ use std::sync::MutexGuard;
 
 use ::training::Error;
 use ::training::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
 use perception::train::{Length, RunConfig};
-use protocol::{CodecConfig, Dtype};
+use protocol::Dtype;
 use tempfile::TempDir;
 use tests::locks::random_generator_lock;
 use tests::scene;
@@ -44,17 +44,13 @@ fn run(config: &TrainConfig) -> (Summary, Ear) {
 }
 
 fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
-    let codec = CodecConfig {
-        dtype,
-        ..CodecConfig::default()
-    };
-    let config = EvaluateConfig {
-        weights,
+    let mut setup = Setup {
         method: Some(method),
-        codec,
-        ..EvaluateConfig::default()
+        ..Setup::default()
     };
-    let mut evaluator = Evaluator::new(config).unwrap();
+    setup.models.weights = weights;
+    setup.agents.codec.dtype = dtype;
+    let mut evaluator = Evaluator::new(setup).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {
         let _ = evaluator

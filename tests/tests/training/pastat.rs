@@ -10,7 +10,7 @@ use ::training::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use ::training::samples::{Moments, SamplePoses};
 use ::training::train::{self, TrainConfig};
 use dataset::{self, IntensityScale, LoadOptions, Scenario};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup};
 use fusion::Method;
 use fusion::pastat::{Part, ablated};
 use localization::pose_source::{
@@ -18,8 +18,9 @@ use localization::pose_source::{
 };
 use perception::inference::Inference;
 use perception::weights::Weights;
-use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
-use runner::experiment::table::{self, TableObserver, TableSpec};
+use protocol::{Dtype, NoPoseReason, PoseEstimate};
+use runner::experiment::spec::Experiment;
+use runner::experiment::table::{self, TableObserver};
 use support::file_digests::FileDigests;
 use tests::locks::random_generator_lock;
 use tests::scene;
@@ -73,22 +74,18 @@ fn evaluate(
     weights: &Path,
     data: &Path,
     poses: PoseSourceConfig,
-    delay_nanos: u64,
+    delay_ms: u64,
     maps: bool,
 ) -> Vec<EvaluatedFrame> {
-    let codec = CodecConfig {
-        dtype: Dtype::F16,
-        ..CodecConfig::default()
-    };
-    let config = EvaluateConfig {
-        weights: weights.to_owned(),
+    let mut setup = Setup {
         method: Some(Method::PASTAT),
-        pose_source: poses,
-        codec,
-        delay_nanos,
-        ..EvaluateConfig::default()
+        delay_ms,
+        ..Setup::default()
     };
-    let mut evaluator = Evaluator::new(config).unwrap();
+    setup.models.weights = weights.to_owned();
+    setup.agents.pose = poses;
+    setup.agents.codec.dtype = Dtype::F16;
+    let mut evaluator = Evaluator::new(setup).unwrap();
     let scenarios = dataset::open(data).unwrap().scenarios;
     if maps {
         let weights = Arc::new(Weights::load(weights).unwrap());
@@ -182,13 +179,7 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
         assert_eq!(frame.result.fused, kept.result.fused);
         assert_eq!(frame.result.detections.len(), kept.result.detections.len());
     }
-    let late = evaluate(
-        weights,
-        &data,
-        PoseSourceConfig::Recorded,
-        200_000_000,
-        false,
-    );
+    let late = evaluate(weights, &data, PoseSourceConfig::Recorded, 200, false);
     let ages: Vec<Vec<i64>> = late.iter().map(ages_ms).collect();
     assert_eq!(ages[..3], [vec![], vec![], vec![200, 200]]);
 }
@@ -397,7 +388,7 @@ fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
             maps.display()
         );
         fs::write(&file, text).unwrap();
-        TableSpec::read(&file).unwrap()
+        Experiment::read(&file).unwrap()
     };
     let out = folder.path().join("out");
     let mut first = Cells::default();

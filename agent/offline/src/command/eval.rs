@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use agent_offline::Error;
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, EvaluationOptions, IntegritySummary, LocalizationSummary, evaluate,
+    Evaluated, EvaluatedSweep, IntegritySummary, LocalizationSummary, SweepSelection, evaluate,
     evaluate_source, reliability_charts, write_csv, write_error_table,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
@@ -353,7 +353,7 @@ impl Args {
 
     fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {
         let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
-        let options = EvaluationOptions {
+        let options = SweepSelection {
             scenes: scenes.to_vec(),
             variant: self.variant.clone(),
             every: count(self.every),

@@ -22,7 +22,7 @@ use support::sampling::evenly_spread;
 
 /// Selection of sweeps.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct EvaluationOptions {
+pub struct SweepSelection {
     /// Data sets, splits or scenarios, all of one world.
     pub scenes: Vec<PathBuf>,
     /// A variant of the sweeps, for example `fog_0.060`.
@@ -110,7 +110,7 @@ struct Sweep<'a> {
 /// be read are left out and counted.
 pub fn evaluate(
     localizer: &mut dyn Localize,
-    options: &EvaluationOptions,
+    options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
     evaluate_with(
@@ -126,7 +126,7 @@ pub fn evaluate(
 /// As [`evaluate`].
 pub fn evaluate_source(
     source: &mut dyn PoseSource,
-    options: &EvaluationOptions,
+    options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
     let mut ask = |frame: &Frame| {
@@ -150,7 +150,7 @@ pub fn evaluate_source(
 
 fn evaluate_with(
     localize: &mut dyn FnMut(&Frame) -> Result<Localization, LocalizerError>,
-    options: &EvaluationOptions,
+    options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
     let datasets = options
@@ -299,7 +299,7 @@ pub(crate) mod tests {
     #[test]
     fn folders_without_sweeps_are_named() {
         let empty = tempfile::tempdir().unwrap();
-        let options = EvaluationOptions {
+        let options = SweepSelection {
             scenes: vec![empty.path().to_owned()],
             variant: None,
             every: 1,

@@ -3,25 +3,25 @@
 use std::path::{Path, PathBuf};
 
 use agent::attack::{AttackConfig, Falsification};
-use agent::config::Threads;
+use agent::config::{AgentSettings, ModelConfig, Threads};
 use agent::rate::RateConfig;
 use clap::ArgGroup;
 use dataset::IntensityOption;
 use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::config::EgoSettings;
-use ego_fuser::misbehaviour::MisbehaviourConfig;
-use ego_fuser_offline::evaluation::EvaluateConfig;
-use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
+use ego_fuser_offline::evaluation::stepped::ComputeTimes;
+use ego_fuser_offline::evaluation::{EmulatedLink, Setup};
 use fusion::{Exchange, Method};
 use indicatif::ProgressBar;
-use link::{CapacityConfig, LatencyModel, LinkConfig};
+use link::{CapacityConfig, LatencyModel};
 use localization::pose_source::PoseSourceConfig;
 use perception::int8::InferencePrecision;
 use protocol::CodecConfig;
 use protocol::config::{FieldError, Section};
-use runner::experiment::evaluation::{EvaluationOptions, Part, evaluate};
+use runner::experiment::evaluation::{OpenedData, Trial, evaluate};
 use runner::experiment::report;
-use runner::experiment::table::{self, TableObserver, TableSpec};
+use runner::experiment::spec::Experiment;
+use runner::experiment::table::{self, TableObserver};
 use support::{output, progress};
 use training::feature_store::KeptMaps;
 
@@ -171,15 +171,14 @@ impl Arguments {
         if let (Some(spec), Some(out)) = (&self.table, &self.out) {
             return tables(spec, out, &self.slices);
         }
-        let options = self.options()?;
-        let data = options.part.open(&options.dataset, &options.protocol);
-        let data = data.map_err(BadInput::of)?;
-        let frames = self.method.len() * options.frame_count(&data);
+        let trial = self.trial()?;
+        let data = OpenedData::open(&trial).map_err(BadInput::of)?;
+        let frames = self.method.len() * data.frame_count(trial.scenarios);
         let bar = progress::bar(frames, "frames");
         let mut all = Vec::new();
         for &method in &self.method {
             bar.set_message(method.name());
-            let metrics = evaluate(&options, &data, method, &mut || bar.inc(1));
+            let metrics = evaluate(&trial, &data, method, &mut || bar.inc(1));
             all.push(metrics.map_err(BadInput::of)?);
         }
         bar.finish_and_clear();
@@ -200,7 +199,7 @@ impl Arguments {
         Ok(left_out(all.iter().map(|metrics| &metrics.left_out)))
     }
 
-    fn options(&self) -> Result<EvaluationOptions, BadInput> {
+    fn trial(&self) -> Result<Trial, BadInput> {
         self.pose.0.validate().map_err(bad)?;
         self.codec.0.validate().map_err(bad)?;
         self.check_methods()?;
@@ -208,37 +207,43 @@ impl Arguments {
             let reason = "--watch-queue: without --link there is no queue to watch";
             return Err(BadInput::new(reason));
         }
-        let settings = EvaluateConfig {
-            weights: self.weights.clone().unwrap_or_default(),
-            precision: self.precision,
-            pose_source: self.pose.0.clone().with_networks().map_err(BadInput::of)?,
-            codec: self.codec.0,
-            rate: self.rate.0,
-            delay_nanos: self.delay_ms * 1_000_000,
-            attack: self.attack.map(|falsification| AttackConfig {
-                falsification,
-                attackers: self.attackers,
-                seed: self.attack_seed,
-            }),
-            trust: self.trust.then(MisbehaviourConfig::default),
-            ..EvaluateConfig::default()
+        let attack = |falsification| AttackConfig {
+            falsification,
+            attackers: self.attackers,
+            seed: self.attack_seed,
         };
-        Ok(EvaluationOptions {
+        let intensity_scale = self.intensity.scale;
+        Ok(Trial {
             dataset: self.dataset.clone().unwrap_or_default(),
-            settings,
+            scenarios: self.scenarios.map(at_most),
+            intensity_scale,
+            protocol: self.protocol.clone(),
+            setup: Setup {
+                models: ModelConfig {
+                    weights: self.weights.clone().unwrap_or_default(),
+                    precision: self.precision,
+                    ..ModelConfig::default()
+                },
+                agents: AgentSettings {
+                    pose: self.pose.0.clone().with_networks().map_err(BadInput::of)?,
+                    codec: self.codec.0,
+                    rate: self.rate.0,
+                    falsification: None,
+                },
+                attack: self.attack.map(attack),
+                ego: self.ego()?,
+                link: self.emulates_link().then(|| self.link()).transpose()?,
+                delay_ms: self.delay_ms,
+                compute: self.compute()?,
+                frames: self.frames.map(at_most),
+                ..Setup::default()
+            },
             maps: self.feature_maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: self.codec.0.dtype,
                 limit_bytes: u64::MAX,
-                intensity_scale: self.intensity.scale,
+                intensity_scale,
             }),
-            stepped: self.emulates_link().then(|| self.stepped()).transpose()?,
-            part: Part {
-                scenarios: self.scenarios.map(at_most),
-                frames: self.frames.map(at_most),
-                intensity_scale: self.intensity.scale,
-            },
-            protocol: self.protocol.clone(),
             out: self.out.clone(),
         })
     }
@@ -271,46 +276,45 @@ impl Arguments {
         self.link.is_some() || self.bandwidth_mbps.is_some() || self.latency_ms.is_some()
     }
 
-    fn stepped(&self) -> Result<SteppedConfig, BadInput> {
-        let (mut link, link_folder) =
-            LinkConfig::open(self.link.as_deref().unwrap_or("ideal")).map_err(BadInput::of)?;
+    fn link(&self) -> Result<EmulatedLink, BadInput> {
+        let model = self.link.as_deref().unwrap_or("ideal");
+        let mut link = EmulatedLink::open(model, self.seed).map_err(BadInput::of)?;
         if let Some(bandwidth_mbps) = self.bandwidth_mbps {
-            link.capacity = CapacityConfig::of_mbps(bandwidth_mbps);
+            link.config.capacity = CapacityConfig::of_mbps(bandwidth_mbps);
         }
         if let Some(latency_ms) = self.latency_ms {
-            link.latency = LatencyModel::ConstantMs(latency_ms);
+            link.config.latency = LatencyModel::ConstantMs(latency_ms);
         }
-        link.validate().map_err(BadInput::of)?;
+        link.config.validate().map_err(BadInput::of)?;
+        Ok(link)
+    }
+
+    fn compute(&self) -> Result<ComputeTimes, BadInput> {
         let &[pose_ms, map_ms, fuse_ms] = &self.compute_ms[..] else {
             let found = self.compute_ms.len();
             return Err(BadInput::new(format!(
                 "--compute-ms takes 3 numbers, not {found}"
             )));
         };
-        let mut times = self.compute_ms.iter();
-        if let Some(ms) = times.find(|ms| !(0.0..=60_000.0).contains(*ms)) {
-            return Err(BadInput::new(format!(
-                "--compute-ms: {ms} is not 0 to 60000 ms"
-            )));
-        }
-        let defaults = EgoSettings::default();
-        let ego = EgoSettings {
-            deadline_ms: self.deadline_ms.unwrap_or(defaults.deadline_ms),
-            max_age_ms: self.max_age_ms.unwrap_or(defaults.max_age_ms),
-            ..defaults
-        };
-        ego.validate().map_err(bad)?;
         let compute = ComputeTimes {
             pose_ms,
             map_ms,
             fuse_ms,
         };
-        Ok(SteppedConfig::new(
-            (link, link_folder),
-            self.seed,
-            &ego,
-            compute,
-        ))
+        compute.validate("--compute-ms").map_err(bad)?;
+        Ok(compute)
+    }
+
+    fn ego(&self) -> Result<EgoSettings, BadInput> {
+        let defaults = EgoSettings::default();
+        let ego = EgoSettings {
+            deadline_ms: self.deadline_ms.unwrap_or(defaults.deadline_ms),
+            max_age_ms: self.max_age_ms.unwrap_or(defaults.max_age_ms),
+            trust: self.trust,
+            ..defaults
+        };
+        ego.validate().map_err(bad)?;
+        Ok(ego)
     }
 }
 
@@ -320,17 +324,21 @@ fn bad(error: FieldError) -> BadInput {
 
 /// Fills tables and prints them.
 fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome> {
-    let spec = TableSpec::read(file).map_err(BadInput::of)?;
+    let experiment = Experiment::read(file).map_err(BadInput::of)?;
+    let Some(last) = experiment.tables.last() else {
+        let reason = format!("{}: tables is left out", file.display());
+        return Err(BadInput::new(reason).into());
+    };
     let (name, folder) = (file.to_string_lossy(), out.to_string_lossy());
     let command = ["v2vloc", "eval", "--table", &*name, "--out", &*folder];
-    let last = spec.tables.last().map_or("", |table| &table.name);
+    let last = &last.name;
     if let Some(text) = slices.engine_file(&command, &out.join(format!("{last}.csv"))) {
         output::text(&text)?;
         return Ok(Outcome::Done);
     }
     let slice = slices.slice()?;
     let mut progress = TableProgress(progress::spinner("frames"));
-    let filled = table::run(&spec, out, slice, &mut progress).map_err(BadInput::of)?;
+    let filled = table::run(&experiment, out, slice, &mut progress).map_err(BadInput::of)?;
     progress.0.finish_and_clear();
     if let Some(slice) = slice {
         output::note(format_args!(

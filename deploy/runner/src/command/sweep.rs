@@ -4,7 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use figures::FigureError;
-use runner::experiment::sweep::{Experiment, Sweep, SweepOptions, WorkerError};
+use runner::experiment::spec::Experiment;
+use runner::experiment::sweep::{Sweep, SweepOptions, WorkerError};
 use support::output;
 
 use super::left_out;

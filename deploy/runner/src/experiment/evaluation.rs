@@ -1,4 +1,4 @@
-//! Offline evaluation of a method on recorded scenes: without delays, or with link emulation in simulation time.
+//! Evaluation of one cell of an experiment: a method on recorded scenes, with or without link emulation.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,8 +12,8 @@ use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario, findings};
 use deploy::score::FrameScores;
 use deploy::score::metrics::{Messages, Metrics};
-use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
-use ego_fuser_offline::evaluation::{EvaluateConfig, Evaluator};
+use ego_fuser_offline::evaluation::stepped::ComputeTimes;
+use ego_fuser_offline::evaluation::{Evaluator, Setup};
 use fusion::{Exchange, Method};
 use perception::int8::InferencePrecision;
 use perception::weights::Weights;
@@ -27,25 +27,25 @@ use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 use crate::evaluated_frame::{judge, metrics};
 use crate::experiment::cell::{Cell, CellKey};
 use crate::experiment::frame_files::{self, FrameFiles};
-use crate::scenario::fingerprint::{collect, files_of};
+use crate::scenario::fingerprint::files_of;
 use crate::scenario::weights_choice::weights_of;
 
-/// Settings of an evaluation.
+/// A cell of an experiment: vehicles, ego and link as in a run, and the part of a data set that they see.
 #[derive(Debug, Clone, Default)]
-pub struct EvaluationOptions {
+pub struct Trial {
     /// Data set, split or scenario.
     pub dataset: PathBuf,
-    /// Settings of vehicles and ego. `weights` may be a folder with those of several methods; `method` and `protocol`
-    /// follow from the method that is evaluated and from the data set.
-    pub settings: EvaluateConfig,
-    /// Cache of the encoders' feature maps, so that each is computed once for many evaluations.
-    pub maps: Option<KeptMaps>,
-    /// Run in simulation time with link emulation; absent: no link.
-    pub stepped: Option<SteppedConfig>,
-    /// Part of the data set to evaluate.
-    pub part: Part,
+    /// Number of scenarios, evenly spread; absent: all. `setup.frames` is of each.
+    pub scenarios: Option<usize>,
+    /// Divisor of the intensities of its sweeps.
+    pub intensity_scale: IntensityScale,
     /// Participating vehicles, counted annotations and objects.
     pub protocol: ProtocolConfig,
+    /// Vehicles, ego and delivery. The weights may be a folder with those of several methods; `method` and `protocol`
+    /// follow from the method that is evaluated and from the data set.
+    pub setup: Setup,
+    /// Cache of the encoders' feature maps, so that each is computed once for many evaluations.
+    pub maps: Option<KeptMaps>,
     /// Folder for detections, ground truth, a row per frame, and precision over recall, a folder per method in it;
     /// absent: none are written.
     pub out: Option<PathBuf>,
@@ -70,51 +70,29 @@ pub struct OpenedData {
 type DataPart = (Option<usize>, Option<String>);
 
 impl OpenedData {
-    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.
-    fn sha256(&self, part: &Part, variant: Option<&str>) -> String {
-        let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
-        let place = (part.scenarios, variant.map(str::to_owned));
-        let sha256 = parts.entry(place).or_insert_with(|| {
-            dataset::content_sha256(part.chosen(&self.scenarios), variant, &self.digests)
-        });
-        sha256.clone()
-    }
-}
-
-/// A part of a data set.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Part {
-    /// Number of scenarios, evenly spread; absent: all.
-    pub scenarios: Option<usize>,
-    /// Number of frames from the start of each scenario; absent: all.
-    pub frames: Option<usize>,
-    /// Divisor of the intensities of its sweeps.
-    pub intensity_scale: IntensityScale,
-}
-
-impl Part {
-    /// Opens a data set: all its scenarios, each with the agents of the protocol and the requested frames. Feature maps
-    /// are cached for all of them, so that another selection needs no others.
+    /// Opens the data set of a trial: all its scenarios, each with the agents of the protocol and the requested frames.
+    /// Feature maps are cached for all of them, so that another selection needs no others.
     ///
     /// # Errors
     /// An error when it cannot be read, or the protocol contradicts itself.
-    pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData> {
+    pub fn open(trial: &Trial) -> Result<Self> {
         let options = OpenOptions {
-            intensity_scale: self.intensity_scale,
+            intensity_scale: trial.intensity_scale,
             ..OpenOptions::default()
         };
-        let dataset = dataset::open_with(path, &options)?;
-        let protocol = protocol.resolve(dataset.layout);
+        let dataset = dataset::open_with(&trial.dataset, &options)?;
+        let protocol = trial.protocol.resolve(dataset.layout);
         let protocol = protocol.map_err(|error| anyhow!("evaluation protocol: {error}"))?;
         let mut scenarios: Vec<Scenario> = dataset
             .scenarios
             .iter()
             .filter_map(|scenario| protocol.arrange(scenario))
             .collect();
+        let frames = trial.setup.frames.unwrap_or(usize::MAX);
         scenarios
             .iter_mut()
-            .for_each(|scenario| scenario.ticks.truncate(self.frames.unwrap_or(usize::MAX)));
-        Ok(OpenedData {
+            .for_each(|scenario| scenario.ticks.truncate(frames));
+        Ok(Self {
             scenarios,
             protocol,
             problems: dataset.problems,
@@ -123,24 +101,31 @@ impl Part {
         })
     }
 
-    /// The requested scenarios.
-    pub fn chosen<'a>(
-        &self,
-        scenarios: &'a [Scenario],
-    ) -> impl Iterator<Item = &'a Scenario> + use<'a> {
-        let all: Vec<&Scenario> = scenarios.iter().collect();
-        evenly_spread(&all, self.scenarios.unwrap_or(usize::MAX)).into_iter()
+    /// So many scenarios, evenly spread.
+    pub fn chosen(&self, scenarios: Option<usize>) -> impl Iterator<Item = &Scenario> {
+        let all: Vec<&Scenario> = self.scenarios.iter().collect();
+        evenly_spread(&all, scenarios.unwrap_or(usize::MAX)).into_iter()
     }
-}
 
-impl EvaluationOptions {
-    /// Number of frames to evaluate, over all scenarios.
+    /// Number of frames of so many scenarios.
     #[must_use]
-    pub fn frame_count(&self, data: &OpenedData) -> usize {
-        let chosen = self.part.chosen(&data.scenarios);
+    pub fn frame_count(&self, scenarios: Option<usize>) -> usize {
+        let chosen = self.chosen(scenarios);
         chosen.map(|scenario| scenario.ticks.len()).sum()
     }
 
+    /// SHA-256 of a part and of a variant of its sweeps ([`dataset::content_sha256`]), which is computed once.
+    fn sha256(&self, scenarios: Option<usize>, variant: Option<&str>) -> String {
+        let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+        let place = (scenarios, variant.map(str::to_owned));
+        let sha256 = parts.entry(place).or_insert_with(|| {
+            dataset::content_sha256(self.chosen(scenarios), variant, &self.digests)
+        });
+        sha256.clone()
+    }
+}
+
+impl Trial {
     fn metrics(
         &self,
         board: &FrameScores,
@@ -148,11 +133,11 @@ impl EvaluationOptions {
         provenance: Provenance,
         began: Instant,
     ) -> Metrics {
-        let (clock, seconds) = match self.stepped {
+        let (clock, seconds) = match self.setup.link {
             Some(_) => ("stepped", board.seconds()),
             None => ("offline", began.elapsed().as_secs_f64()),
         };
-        let poses = self.settings.pose_source.name();
+        let poses = self.setup.agents.pose.name();
         let metrics = metrics(board, evaluator, clock, poses, seconds);
         Metrics {
             provenance: Some(provenance.with_command()),
@@ -173,7 +158,7 @@ impl EvaluationOptions {
             out: None,
             ..self.clone()
         };
-        settings.settings.weights = PathBuf::new();
+        settings.setup.models.weights = PathBuf::new();
         Ok(CellKey {
             method,
             sha256: provenance.key(&format!("{method} {settings:?}")),
@@ -183,16 +168,27 @@ impl EvaluationOptions {
 
     /// Digests of all that these settings are applied to.
     fn provenance(&self, data: &OpenedData, method: Method) -> Result<Provenance> {
-        let stepped = self.stepped.as_ref();
-        let link = stepped.map(|stepped| (&stepped.link, stepped.link_folder.as_path()));
-        let variant = stepped.and_then(|stepped| stepped.lidar_variant.as_deref());
-        let vehicles = stepped.into_iter().flat_map(|stepped| &stepped.vehicles);
-        let poses = std::iter::once(&self.settings.pose_source)
-            .chain(vehicles.map(|(_, vehicle)| &vehicle.pose));
-        let weights = weights_of(&self.settings.weights, method)?;
-        let files = files_of(method, weights, poses, link);
-        let data_sha256 = data.sha256(&self.part, variant);
-        Ok(collect(&[], data_sha256, files, &data.digests)?)
+        let Setup {
+            models,
+            agents,
+            vehicles,
+            link,
+            lidar_variant,
+            ..
+        } = &self.setup;
+        let link = { link.as_ref() }.map(|link| (&link.config, link.folder.as_path()));
+        let poses = std::iter::once(agents).chain(vehicles.values());
+        let weights = weights_of(&models.weights, method)?;
+        let files = files_of(method, weights, poses.map(|settings| &settings.pose), link);
+        let data_sha256 = data.sha256(self.scenarios, lidar_variant.as_deref());
+        let commit = env!("V2VLOC_COMMIT");
+        Ok(Provenance::collect(
+            &[],
+            data_sha256,
+            files,
+            commit,
+            &data.digests,
+        )?)
     }
 }
 
@@ -202,16 +198,16 @@ impl EvaluationOptions {
 /// # Errors
 /// An error when no frame can be evaluated.
 pub fn evaluate(
-    options: &EvaluationOptions,
+    trial: &Trial,
     data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
 ) -> Result<Metrics> {
     let began = Instant::now();
-    let (board, evaluator) = judged(options, data, method, on_frame)?;
-    let provenance = options.provenance(data, method)?;
-    let metrics = options.metrics(&board, &evaluator, provenance, began);
-    if let Some(out) = &options.out {
+    let (board, evaluator) = judged(trial, data, method, on_frame)?;
+    let provenance = trial.provenance(data, method)?;
+    let metrics = trial.metrics(&board, &evaluator, provenance, began);
+    if let Some(out) = &trial.out {
         frame_files::write_metrics(out, method, &metrics)?;
     }
     Ok(metrics)
@@ -222,13 +218,13 @@ pub fn evaluate(
 /// # Errors
 /// As [`evaluate`].
 pub fn compute(
-    options: &EvaluationOptions,
+    trial: &Trial,
     data: &OpenedData,
     key: CellKey,
     on_frame: &mut dyn FnMut(),
 ) -> Result<Cell> {
     let began = Instant::now();
-    let (board, evaluator) = judged(options, data, key.method, on_frame)?;
+    let (board, evaluator) = judged(trial, data, key.method, on_frame)?;
     let mut messages = Counts::default();
     for (account, counts) in evaluator.ledger().iter() {
         match account.topic {
@@ -243,7 +239,7 @@ pub fn compute(
     let provenance = key.provenance.clone();
     Ok(Cell {
         key,
-        metrics: options.metrics(&board, &evaluator, provenance, began),
+        metrics: trial.metrics(&board, &evaluator, provenance, began),
         used: used.sum(),
         messages: Messages::of(&messages),
         wall_seconds: began.elapsed().as_secs_f64(),
@@ -252,40 +248,35 @@ pub fn compute(
 
 /// Scores of all frames, and the evaluator with its accounts.
 fn judged(
-    options: &EvaluationOptions,
+    trial: &Trial,
     data: &OpenedData,
     method: Method,
     on_frame: &mut dyn FnMut(),
 ) -> Result<(FrameScores, Evaluator)> {
-    let scenarios = &data.scenarios;
-    let (weights, precision) = (
-        weights_of(&options.settings.weights, method)?,
-        options.settings.precision,
-    );
-    let mut evaluator = Evaluator::new(EvaluateConfig {
-        weights: weights.clone(),
+    let weights = weights_of(&trial.setup.models.weights, method)?;
+    let mut setup = Setup {
         method: Some(method),
         protocol: Some(data.protocol.clone()),
-        ..options.settings.clone()
-    })?;
-    let kept = options.maps.as_ref();
+        ..trial.setup.clone()
+    };
+    setup.models.weights.clone_from(&weights);
+    let precision = setup.models.precision;
+    let mut evaluator = Evaluator::new(setup)?;
+    let kept = trial.maps.as_ref();
     if let Some(kept) = kept.filter(|_| method.exchange() != Exchange::Points) {
         evaluator = evaluator.with_maps(maps(kept, &weights, precision, data)?);
     }
-    if let Some(stepped) = &options.stepped {
-        evaluator = evaluator.with_link(stepped.clone());
-    }
-    let findings = findings::sampled(scenarios, options.part.intensity_scale);
+    let findings = findings::sampled(&data.scenarios, trial.intensity_scale);
     evaluator.add_data_set(&data.problems, findings);
     let detector = evaluator.ego().detector().config();
     let map_values = detector.feature_grid().cells() as u64 * detector.sent_channels() as u64;
     // Without a compute time, a result is as old as its sweep by definition, which is no latency.
-    let stepped = options.stepped.as_ref();
-    let is_timed = stepped.is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
+    let Setup { link, compute, .. } = &trial.setup;
+    let is_timed = link.is_some() && *compute != ComputeTimes::default();
     let mut board: Option<FrameScores> = None;
-    let out = options.out.as_ref();
+    let out = trial.out.as_ref();
     let mut files = out.map(|out| FrameFiles::create(out, method)).transpose()?;
-    for scenario in options.part.chosen(scenarios) {
+    for scenario in data.chosen(trial.scenarios) {
         let Some(ego) = scenario.agents.first() else {
             continue;
         };
@@ -313,7 +304,7 @@ fn judged(
     }
     let board = board.filter(|board| !board.records().is_empty());
     let board = board.with_context(|| {
-        let (path, reasons) = (options.dataset.display(), evaluator.left_out().reasons());
+        let (path, reasons) = (trial.dataset.display(), evaluator.left_out().reasons());
         format!("{path}: there is no frame in it that can be evaluated{reasons}")
     })?;
     files.map(|files| files.finish(&board)).transpose()?;

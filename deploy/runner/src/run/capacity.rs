@@ -18,7 +18,7 @@ use crate::fleet::{Fleet, RUNNER};
 use crate::run::RunError;
 use crate::run::loss::listed;
 use crate::run::machine::{CoreSpeed, this_machine};
-use crate::run::stepped::evaluate_config;
+use crate::run::stepped::setup;
 
 /// Time for computing frames; loading the models comes on top.
 const BUDGET: Duration = Duration::from_millis(600);
@@ -78,7 +78,7 @@ pub fn estimate(fleet: &Fleet) -> Result<Option<Capacity>, RunError> {
     let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
     fleet.scenario.models.threads.apply();
     let vehicles = fleet.agents.len();
-    let mut evaluator = Evaluator::new(evaluate_config(fleet))?;
+    let mut evaluator = Evaluator::new(setup(fleet)?)?;
     let (began, before_s) = (Instant::now(), process_cpu_s());
     let elapsed = evaluator.estimate(recorded, vehicles, BUDGET)?;
     // Share of a core that other programs leave.

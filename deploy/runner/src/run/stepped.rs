@@ -5,17 +5,16 @@
 
 use std::collections::BTreeSet;
 use std::ops::ControlFlow;
-use std::path::PathBuf;
 
 use dataset::findings;
 use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
-use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
-use link::{LinkConfig, LinkError};
-use protocol::RunId;
+use ego_fuser_offline::evaluation::{
+    AgentPool, EmulatedLink, EvaluateError, EvaluatedFrame, Evaluator, Setup,
+};
+use protocol::{CavId, RunId};
 use support::progress;
 use support::provenance::Provenance;
 
@@ -26,7 +25,7 @@ use crate::run::RunError;
 use crate::run::agent_pool::CrewProcesses;
 use crate::run::ledger_report::LedgerReport;
 use crate::run::run_fleet::{RunOptions, RunResult};
-use crate::scenario::Scenario;
+use crate::scenario::{AgentOverrides, Scenario};
 
 /// Runs a scenario in simulation time to its end.
 ///
@@ -36,17 +35,16 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     let mut fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
     fleet.scenario.models.threads.apply();
-    let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
+    let mut evaluator = Evaluator::new(setup(&fleet)?)?;
     let stepped = fleet.scenario.stepped.get_or_insert_default();
     let compute = match stepped.compute {
         Some(compute) => compute,
         None => evaluator.measure(&fleet.recorded)?,
     };
     stepped.compute = Some(compute);
+    evaluator.set_compute(compute);
     let named = fleet.scenario.run.clone();
     let run = named.unwrap_or_else(|| name_of_now(options.prefix));
-    let config = stepped_config(&fleet, compute).map_err(|error| RunError::Fleet(error.into()))?;
-    let mut evaluator = evaluator.with_link(config);
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, &mut evaluator, (&run, &folder), options);
     if result.as_ref().is_err_and(RunError::is_refusal) {
@@ -79,39 +77,38 @@ fn go(
     Ok(RunResult { killed, ..result })
 }
 
-pub(super) fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
-    let scenario = &fleet.scenario;
-    EvaluateConfig {
-        weights: scenario.models.weights.clone(),
-        precision: scenario.models.precision,
-        method: Some(scenario.method),
-        pose_source: scenario.agents.pose.clone(),
-        codec: scenario.agents.codec,
-        rate: scenario.agents.rate,
-        protocol: Some(fleet.protocol.clone()),
-        delay_nanos: 0,
-        attack: None,
-        trust: scenario.ego.trust(),
-    }
-}
-
-fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig, LinkError> {
+/// Setup of a fleet in simulation time, with the compute times of its scenario.
+pub(super) fn setup(fleet: &Fleet) -> Result<Setup, RunError> {
     let Scenario {
-        scene, ego, link, ..
+        scene,
+        models,
+        method,
+        agents,
+        vehicles,
+        ego,
+        link,
+        stepped,
+        ..
     } = &fleet.scenario;
-    let (opened, seed) = match link {
-        Some(link) => (LinkConfig::open(&link.model)?, link.seed),
-        None => ((LinkConfig::default(), PathBuf::from(".")), 0),
-    };
+    let link = link.clone().unwrap_or_default();
+    let link = EmulatedLink::open(&link.model, link.seed);
+    let own = |(cav, own): (&CavId, &AgentOverrides)| (cav.clone(), own.over(agents));
     let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
-    let vehicles = { fleet.agents.iter() }.map(|cav| (cav.clone(), fleet.settings_of(cav)));
-    let last = fleet.ticks.map_or(usize::MAX, |ticks| scene.seek + ticks);
-    Ok(SteppedConfig {
-        crew: AgentPool::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
-        vehicles: vehicles.collect(),
-        ticks: scene.seek..last,
+    Ok(Setup {
+        models: models.clone(),
+        method: Some(*method),
+        agents: agents.clone(),
+        vehicles: vehicles.iter().map(own).collect(),
+        attack: None,
+        ego: ego.clone(),
+        link: Some(link.map_err(|error| RunError::Fleet(error.into()))?),
+        delay_ms: 0,
+        compute: { stepped.and_then(|stepped| stepped.compute) }.unwrap_or_default(),
+        protocol: Some(fleet.protocol.clone()),
+        pool: AgentPool::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
+        seek: scene.seek,
+        frames: fleet.ticks,
         lidar_variant: scene.variant.clone(),
-        ..SteppedConfig::new(opened, seed, ego, compute)
     })
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use bus::Endpoint;
 use perception::compute_device::ComputeDevice;
-use protocol::config::{FieldError, above_zero, within};
+use protocol::config::{FieldError, above_zero};
 use support::file_error::{AtFile, FileError};
 
 use super::{Clock, Scenario};
@@ -168,8 +168,6 @@ impl Scenario {
         let Some(compute) = self.stepped.and_then(|stepped| stepped.compute) else {
             return Ok(());
         };
-        within("stepped.compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
-        within("stepped.compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
-        within("stepped.compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)
+        compute.validate("stepped.compute")
     }
 }

@@ -1,42 +1,10 @@
-//! Provenance of results: collects the digests of programs, data and all other files.
+//! Files that a result is made of, besides programs and data.
 
-use std::io;
 use std::path::{Path, PathBuf};
 
 use fusion::Method;
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
-use protocol::text::hex;
-use sha2::{Digest, Sha256};
-use support::file_digests::FileDigests;
-use support::provenance::Provenance;
-
-/// Hashes programs and files, besides the data of that hash; without `programs`, the one that runs.
-///
-/// # Errors
-/// The first file that cannot be read, by name.
-pub(crate) fn collect(
-    programs: &[PathBuf],
-    data_sha256: String,
-    files: impl IntoIterator<Item = PathBuf>,
-    digests: &FileDigests,
-) -> io::Result<Provenance> {
-    let files_sha256 = files
-        .into_iter()
-        .map(|file| digests.sha256(&file).map(|sha256| (file, sha256)))
-        .collect::<io::Result<_>>()?;
-    Ok(Provenance {
-        command: Vec::new(),
-        version: env!("CARGO_PKG_VERSION").into(),
-        commit: env!("V2VLOC_COMMIT").into(),
-        program_sha256: match programs {
-            [] => digests.program_sha256()?,
-            programs => hash_programs(programs, digests)?,
-        },
-        data_sha256,
-        files_sha256,
-    })
-}
 
 /// Files that a method reads beside the data: its weights, its TorchScript module, those of the pose sources, and the
 /// trace of the link, whose paths are relative to a folder.
@@ -54,22 +22,15 @@ pub(crate) fn files_of<'a>(
     files
 }
 
-/// One hash over many programs: name and content of each.
-fn hash_programs(programs: &[PathBuf], digests: &FileDigests) -> io::Result<String> {
-    let mut all = Sha256::new();
-    for path in programs {
-        let name = path.file_name().unwrap_or_default().display();
-        all.update(format!("{name} {}\n", digests.sha256(path)?));
-    }
-    Ok(hex(&all.finalize()))
-}
-
 #[cfg(test)]
 mod tests {
     use link::{CapacityConfig, TraceConfig};
     use localization::pose_source::{
         BaselinePoseConfig, CachedPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig,
     };
+
+    use support::file_digests::FileDigests;
+    use support::provenance::Provenance;
 
     use super::*;
 
@@ -134,7 +95,8 @@ mod tests {
                 Some((&link, folder)),
             );
             let digests = FileDigests::default();
-            let provenance = collect(&[], "data".into(), files, &digests).unwrap();
+            let provenance = Provenance::collect(&[], "data".into(), files, "commit", &digests);
+            let provenance = provenance.unwrap();
             assert_eq!(provenance.files_sha256.len(), names.len());
             provenance.key("settings")
         };
@@ -154,7 +116,8 @@ mod tests {
     fn a_missing_file_is_named() {
         let digests = FileDigests::default();
         let missing = [PathBuf::from("/nowhere/w")];
-        let error = collect(&[], String::new(), missing, &digests).unwrap_err();
+        let found = Provenance::collect(&[], String::new(), missing, "commit", &digests);
+        let error = found.unwrap_err();
         assert!(error.to_string().starts_with("/nowhere/w"), "{error}");
     }
 }

@@ -10,7 +10,7 @@ use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{self, LeftOut, LoadOptions, Scenario};
-use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser_offline::evaluation::{EvaluatedFrame, Evaluator, Setup};
 use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use fusion::Method;
 use perception::int8::InferencePrecision;
@@ -69,14 +69,13 @@ impl Arguments {
         };
         let mut rows = Vec::new();
         for method in methods {
-            let config = |data: &Data| EvaluateConfig {
-                protocol: Some(data.protocol.clone()),
-                weights: self.weights.clone(),
-                precision: self.precision,
+            let mut setup = Setup {
                 method,
-                ..EvaluateConfig::default()
+                ..Setup::default()
             };
-            let (row, lost) = evaluate(&config, &data, self.json)?;
+            setup.models.weights.clone_from(&self.weights);
+            setup.models.precision = self.precision;
+            let (row, lost) = evaluate(&setup, &data, self.json)?;
             left_out.merge(&lost);
             rows.push(row);
         }
@@ -208,14 +207,15 @@ fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
 }
 
 /// Results of one method over all data, and the data that were left out.
-fn evaluate(
-    config: &dyn Fn(&Data) -> EvaluateConfig,
-    data: &[Data],
-    json: bool,
-) -> Result<(Value, LeftOut)> {
+fn evaluate(setup: &Setup, data: &[Data], json: bool) -> Result<(Value, LeftOut)> {
     let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
     for data in data {
-        let mut evaluator = Evaluator::new(config(data)).map_err(BadInput::of)?;
+        let protocol = Some(data.protocol.clone());
+        let setup = Setup {
+            protocol,
+            ..setup.clone()
+        };
+        let mut evaluator = Evaluator::new(setup).map_err(BadInput::of)?;
         name = evaluator.ego().method().name();
         let frames = data.scenarios.iter().map(|scenario| scenario.ticks.len());
         let bar = progress::bar(frames.sum(), "frames").with_message(name);

@@ -32,11 +32,6 @@ pub(super) struct Sent {
 }
 
 impl Sent {
-    /// A copy as received by the ego; absent where nothing was sent.
-    pub(super) fn view(&self) -> Option<View> {
-        self.clone().into_view()
-    }
-
     /// As received by the ego; absent where nothing was sent.
     pub(super) fn into_view(self) -> Option<View> {
         Some(View {
@@ -57,11 +52,6 @@ impl Sent {
             None => {}
         }
         captured
-    }
-
-    /// The same, with payload and wire bytes.
-    pub(super) fn received(&self) -> Option<(View, (u64, u64))> {
-        Some((self.view()?, (self.payload_bytes, self.wire_bytes)))
     }
 }
 

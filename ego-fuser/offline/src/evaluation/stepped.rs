@@ -1,5 +1,5 @@
-//! Simulation time: compute times are given, the link emulation determines arrivals, and the [ego's loop](EgoLoop), the
-//! same as in the live process, decides at these times.
+//! Simulation time: compute times are given, the link determines arrivals, and the [ego's loop](EgoLoop), the same as
+//! in the live process, decides at these times.
 //!
 //! No wall clock is read, so the same inputs and seed give the same result on a busy and on an idle machine.
 
@@ -7,19 +7,14 @@ mod compute;
 mod delayed_delivery;
 mod remote;
 
-use std::collections::{BTreeMap, VecDeque};
-use std::ops::{ControlFlow, Range};
-use std::path::PathBuf;
+use std::collections::VecDeque;
+use std::ops::ControlFlow;
 use std::time::Duration;
 
-use agent::config::AgentSettings;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
-use ego_fuser::config::EgoSettings;
-use link::{LinkConfig, LinkEmulator};
 use protocol::{CavId, Detections, PoseEstimate, RateChoice, StageTiming, Stream};
-use support::random::derive_seed;
 
 pub use compute::ComputeTimes;
 pub use remote::{RemoteError, RemotePool};
@@ -30,76 +25,22 @@ use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
-use ego_fuser::ego::EgoOutput;
-use ego_fuser::ego_loop::{EgoLoop, Input, LoopOptions, Message, Output, Reception};
+use ego_fuser::ego_loop::{EgoLoop, Input, Message, Output, Reception};
 use fusion::method::Exchange;
-
-/// Configuration of a fleet in simulation time.
-#[derive(Debug, Clone)]
-pub struct SteppedConfig {
-    /// The link between the neighbours and the ego.
-    pub link: LinkConfig,
-    /// Base folder of the paths of traces in it.
-    pub link_folder: PathBuf,
-    /// Seed of losses and delays. Every scenario derives its own from it.
-    pub seed: u64,
-    /// Deadline of the ego, and pairing of messages with a frame.
-    pub of_ego: LoopOptions,
-    /// Compute times of all processes.
-    pub compute: ComputeTimes,
-    /// Vehicles that take part.
-    pub crew: AgentPool,
-    /// Vehicles with settings of their own, as [`AgentSettings::in_fleet`] gives them.
-    pub vehicles: BTreeMap<CavId, AgentSettings>,
-    /// Ticks of a scenario; clipped to the available ones.
-    pub ticks: Range<usize>,
-    /// A variant of the sweeps, see [`Scenario::lidar_variants`].
-    pub lidar_variant: Option<String>,
-}
-
-impl SteppedConfig {
-    /// All vehicles and ticks over a link, given with the folder of its trace, and an ego with these limits.
-    #[must_use]
-    pub fn new(
-        (link, link_folder): (LinkConfig, PathBuf),
-        seed: u64,
-        ego: &EgoSettings,
-        compute: ComputeTimes,
-    ) -> Self {
-        Self {
-            link,
-            link_folder,
-            seed,
-            of_ego: LoopOptions::stepped(ego),
-            compute,
-            crew: AgentPool::First(usize::MAX),
-            vehicles: BTreeMap::new(),
-            ticks: 0..usize::MAX,
-            lidar_variant: None,
-        }
-    }
-}
-
-/// Vehicles of a run in simulation time.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum AgentPool {
-    /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. Annotations of the
-    /// others count all the same, so that the ground truth does not depend on the number of senders.
-    First(usize),
-    /// These, the ego first; the others are ignored completely.
-    Named(Vec<CavId>),
-}
 
 /// Runs a scenario; `on_frame` may end it. Each frame's stamp has the time at which the ego published it.
 pub(super) fn run(
     evaluator: &mut Evaluator,
-    config: &SteppedConfig,
     scenario: &Scenario,
     on_frame: &mut dyn FnMut(EvaluatedFrame) -> ControlFlow<()>,
 ) -> Result<ControlFlow<()>, EvaluateError> {
-    let mut run = Run::open(evaluator, config, scenario)?;
+    let (places, observers) = evaluator.setup.pool.places(scenario);
+    let Some(&ego_place) = places.first() else {
+        return Ok(ControlFlow::Continue(()));
+    };
+    let mut run = Run::open(evaluator, scenario, (places, ego_place), observers)?;
     let mut flow = ControlFlow::Continue(());
-    for tick in run.next..run.end {
+    for tick in run.begin..run.end {
         let Some(frame) = run.decide(tick)? else {
             continue;
         };
@@ -110,21 +51,6 @@ pub(super) fn run(
     }
     run.close()?;
     Ok(flow)
-}
-
-/// A vehicle that takes part.
-struct Member {
-    /// Its index among the scenario's agents.
-    place: usize,
-    cav: CavId,
-    pipeline: Pipeline,
-}
-
-/// Location of a vehicle's pipeline.
-enum Pipeline {
-    Here(Box<Participant>),
-    /// In a process of its own.
-    Elsewhere,
 }
 
 /// A tick whose sweeps are computed.
@@ -138,15 +64,18 @@ struct Computed {
 
 struct Run<'a> {
     evaluator: &'a mut Evaluator,
-    config: &'a SteppedConfig,
+    compute: ComputeTimes,
     scenario: &'a Scenario,
-    /// The ego first.
-    crew: Vec<Member>,
+    /// Indices of the vehicles that take part, the ego first.
+    places: Vec<usize>,
+    /// One for each of them, unless they are in processes of their own.
+    participants: Vec<Participant>,
     /// Indices of the agents that only contribute annotations.
     observers: Vec<usize>,
-    /// The next tick to compute, and the end of the range.
-    next: usize,
+    /// The range of ticks, and the next one to compute.
+    begin: usize,
     end: usize,
+    next: usize,
     /// `None` for ticks at which the ego's sweep cannot be read.
     computed: VecDeque<Option<Computed>>,
     delivery: DelayedDelivery,
@@ -162,66 +91,48 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
+    /// A run of the agents at `places`, of which one is the ego's.
     fn open(
         evaluator: &'a mut Evaluator,
-        config: &'a SteppedConfig,
         scenario: &'a Scenario,
+        (places, ego_place): (Vec<usize>, usize),
+        observers: Vec<usize>,
     ) -> Result<Self, EvaluateError> {
-        config.compute.check(scenario)?;
-        let places = places(scenario, &config.crew);
-        let mut crew = Vec::with_capacity(places.len());
-        for &place in &places {
-            let cav = &scenario.agents[place];
-            let pipeline = if evaluator.remote.is_some() {
-                Pipeline::Elsewhere
-            } else {
-                let own = config.vehicles.get(cav).cloned();
-                let settings = own.unwrap_or_else(|| evaluator.settings(scenario, crew.len()));
-                let participant = evaluator.participant(scenario, cav, &settings)?;
-                Pipeline::Here(Box::new(participant))
-            };
-            let cav = cav.clone();
-            crew.push(Member {
-                place,
-                cav,
-                pipeline,
-            });
+        let setup = &evaluator.setup;
+        setup.compute.check(scenario)?;
+        let mut participants = Vec::with_capacity(places.len());
+        for &place in places.iter().filter(|_| evaluator.remote.is_none()) {
+            let index = places.iter().filter(|other| **other < place).count();
+            let own = setup.vehicles.get(&scenario.agents[place]);
+            let (settings, is_ego) = (own.unwrap_or(&setup.agents), place == ego_place);
+            let participant = evaluator.participant(settings, scenario, (place, index), is_ego)?;
+            participants.push(participant);
         }
-        let is_witness =
-            |place: &usize| matches!(config.crew, AgentPool::First(_)) && !places.contains(place);
-        let observers = (0..scenario.agents.len()).filter(is_witness).collect();
-        let ticks = config.ticks.start.min(scenario.ticks.len())
-            ..config.ticks.end.min(scenario.ticks.len());
-        let began_nanos = scenario
-            .ticks
-            .get(ticks.start)
-            .map_or(0, |tick| tick.capture_nanos);
-        let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
-        let link = LinkEmulator::new(
-            config.link.clone(),
-            &config.link_folder,
-            derive_seed(config.seed, &seed_words),
-        )?;
-        let ego = crew
-            .first()
-            .map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
-        let mut ego_loop = EgoLoop::new(&ego, &evaluator.ego, config.of_ego);
+        let begin = setup.seek.min(scenario.ticks.len());
+        let end = begin.saturating_add(setup.frames.unwrap_or(usize::MAX));
+        let began_nanos = { scenario.ticks.get(begin) }.map_or(0, |tick| tick.capture_nanos);
+        let ego = &scenario.agents[ego_place];
+        let delivery = DelayedDelivery::new(setup.emulator(scenario)?, ego, began_nanos);
+        let options = setup.loop_options(scenario);
+        let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, options);
         // An ego-only method needs no messages of others.
         if evaluator.ego.method().exchange() != Exchange::Nothing {
-            for member in crew.iter().skip(1) {
-                let joined = Input::Joined(member.cav.clone());
+            for &place in &places[1..] {
+                let joined = Input::Joined(scenario.agents[place].clone());
                 ego_loop.handle(&mut evaluator.ego, joined, began_nanos);
             }
         }
         Ok(Self {
-            delivery: DelayedDelivery::new(link, &ego, began_nanos),
+            delivery,
+            compute: evaluator.setup.compute,
             evaluator,
-            config,
             scenario,
-            crew,
+            places,
+            participants,
             observers,
-            next: ticks.start,
-            end: ticks.end,
+            begin,
+            end: end.min(scenario.ticks.len()),
+            next: begin,
             computed: VecDeque::new(),
             arriving: VecDeque::new(),
             own: VecDeque::new(),
@@ -236,8 +147,12 @@ impl<'a> Run<'a> {
         let tick = self.next;
         self.next += 1;
         let method = self.evaluator.ego.method();
-        let load = self.load_options();
-        let places: Vec<usize> = self.crew.iter().map(|member| member.place).collect();
+        let load = LoadOptions {
+            points: self.evaluator.needs_points(),
+            lidar_variant: self.evaluator.setup.lidar_variant.clone(),
+            ..LoadOptions::default()
+        };
+        let places = &self.places;
         let ego_place = places.first().copied();
         // Without an exchange, neighbours have nothing to encode; their poses are still needed.
         let is_needed =
@@ -246,7 +161,7 @@ impl<'a> Run<'a> {
         let with_maps = |place| is_here && is_needed(place);
         let sweeps = self
             .evaluator
-            .sweeps(self.scenario, tick, &places, &load, with_maps)?;
+            .sweeps(self.scenario, tick, places, &load, with_maps)?;
         if sweeps.first().map(|ego| ego.place) != ego_place {
             self.computed.push_back(None);
             return Ok(());
@@ -268,13 +183,7 @@ impl<'a> Run<'a> {
                 failure = self.send_own(tick, sent, own_sweep)?;
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 let distance_m = distance_m(&frames[0], &frames[place]);
-                enqueue(
-                    &mut self.delivery,
-                    &self.config.compute,
-                    tick,
-                    sent,
-                    distance_m,
-                );
+                enqueue(&mut self.delivery, &self.compute, tick, sent, distance_m);
             }
         }
         let blind = LoadOptions {
@@ -312,7 +221,7 @@ impl<'a> Run<'a> {
         self.own.push_back(Message {
             reception: exact_reception(&view.cav, self.ready_nanos(tick)),
             view,
-            sequence: (tick - self.config.ticks.start) as u64,
+            sequence: (tick - self.begin) as u64,
             payload_bytes: 0,
             wire_bytes: 0,
         });
@@ -330,29 +239,13 @@ impl<'a> Run<'a> {
         for Sweep { place, frame, map } in sweeps {
             let is_needed = all.is_empty() || method.exchange() != Exchange::Nothing;
             let exchange = is_needed.then(|| method.own_content());
-            let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else {
-                continue;
-            };
-            if let Pipeline::Here(participant) = &mut member.pipeline {
+            let index = self.places.iter().position(|it| it == place);
+            if let Some(participant) = index.and_then(|index| self.participants.get_mut(index)) {
                 participant.capture(all.last());
                 all.push(view(participant, frame, map.as_ref(), exchange)?);
             }
         }
         Ok(all)
-    }
-
-    fn load_options(&self) -> LoadOptions {
-        let own = self
-            .config
-            .vehicles
-            .values()
-            .any(|own| own.pose.looks_at_sweeps());
-        let points = own || self.evaluator.remote.is_some() || self.evaluator.needs_points();
-        LoadOptions {
-            points,
-            lidar_variant: self.config.lidar_variant.clone(),
-            ..LoadOptions::default()
-        }
     }
 
     /// Fuses a tick; `None` where the ego's sweep cannot be read.
@@ -387,7 +280,7 @@ impl<'a> Run<'a> {
     /// Time at which the ego's own map of a tick arrives, nanoseconds.
     fn ready_nanos(&self, tick: usize) -> u64 {
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
-        capture_nanos.saturating_add(self.config.compute.agent_nanos())
+        capture_nanos.saturating_add(self.compute.agent_nanos())
     }
 
     /// Goes on to the next moment at which the ego can act: a message arrives, or a frame has waited long enough. Sweeps
@@ -477,7 +370,7 @@ impl<'a> Run<'a> {
                 // The sweeps of simulation time are all computed.
                 Output::Pace(_) => continue,
             };
-            self.ego_free_nanos = now_nanos.saturating_add(self.config.compute.fuse_nanos());
+            self.ego_free_nanos = now_nanos.saturating_add(self.compute.fuse_nanos());
             self.decided.push_back((now_nanos, fused));
         }
         Ok(())
@@ -492,30 +385,30 @@ impl<'a> Run<'a> {
         fused: Result<Detections, String>,
     ) -> EvaluatedFrame {
         let Computed { frames, poses, .. } = computed;
-        let compute = self.config.compute;
+        let compute = self.compute;
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
         let ready_nanos = self.ready_nanos(tick);
         let done_nanos = decided_nanos.saturating_add(compute.fuse_nanos());
-        let (ego, pose) = (&frames[0].cav, poses[0]);
+        let ego = &frames[0].cav;
         let (mut result, failure) = match fused {
             Ok(result) => (result, None),
-            Err(reason) => {
-                let number = tick - self.config.ticks.start;
-                let own = (ego, pose, capture_nanos);
-                let empty = EgoOutput::default();
-                let empty = self.evaluator.report(number, own, &[], &[], empty);
-                (empty, Some(reason))
-            }
+            Err(reason) => (self.empty(tick, ego, poses[0]), Some(reason)),
         };
-        // Measured times would differ in every run.
-        result.stages = [
-            ("pose", compute.pose_nanos()),
-            ("map", compute.map_nanos()),
-            ("wait", decided_nanos - ready_nanos),
-            ("fuse", done_nanos - decided_nanos),
-        ]
-        .map(|(stage, nanos)| StageTiming::new(stage, Duration::from_nanos(nanos)))
-        .into();
+        if self.evaluator.setup.link.is_some() {
+            // Measured times would differ in every run.
+            result.stages = [
+                ("pose", compute.pose_nanos()),
+                ("map", compute.map_nanos()),
+                ("wait", decided_nanos - ready_nanos),
+                ("fuse", done_nanos - decided_nanos),
+            ]
+            .map(|(stage, nanos)| StageTiming::new(stage, Duration::from_nanos(nanos)))
+            .into();
+        } else {
+            // Nothing is waited for, so nothing that did not come is missing.
+            result.stages.retain(|timing| timing.stage != "wait");
+            result.skipped.retain(|skipped| skipped.reason.is_some());
+        }
         let views: Vec<&Frame> = frames.iter().collect();
         EvaluatedFrame {
             tick,
@@ -531,15 +424,34 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// The result of a tick that has failed.
+    fn empty(&self, tick: usize, ego: &CavId, pose: PoseEstimate) -> Detections {
+        Detections {
+            ego: ego.clone(),
+            agent_frame: (tick - self.begin) as u64,
+            method: self.evaluator.ego.method().name().to_owned(),
+            pose,
+            detections: Vec::new(),
+            fused: Vec::new(),
+            skipped: Vec::new(),
+            neighbours: Vec::new(),
+            stages: Vec::new(),
+        }
+    }
+
     /// Closes the accounting: messages still on the link or queued for a tick that will not come are in flight.
     fn close(&mut self) -> Result<(), EvaluateError> {
+        if self.evaluator.setup.link.is_none() {
+            return Ok(());
+        }
         while let Some(arrived) = self.arriving.pop_front() {
             let nanos = arrived.nanos.max(self.ego_free_nanos);
             self.take_in(arrived, nanos)?;
         }
-        for member in self.crew.iter().skip(1) {
-            let waiting = self.ego_loop.unused(&member.cav) as u64;
-            self.delivery.close(&member.cav, waiting);
+        for &place in &self.places[1..] {
+            let cav = &self.scenario.agents[place];
+            let waiting = self.ego_loop.unused(cav) as u64;
+            self.delivery.close(cav, waiting);
         }
         self.evaluator.ledger.merge(self.delivery.ledger());
         self.evaluator.sent_bytes += self.delivery.sent_bytes();
@@ -591,17 +503,6 @@ fn enqueue(
         };
         let bytes = wire_bytes - pose_bytes;
         delivery.enqueue(stream, sequence, bytes, sent_nanos, distance_m, envelope);
-    }
-}
-
-/// Indices of the participants, the ego first.
-fn places(scenario: &Scenario, crew: &AgentPool) -> Vec<usize> {
-    match crew {
-        AgentPool::First(count) => (0..scenario.agents.len()).take(*count).collect(),
-        AgentPool::Named(names) => names
-            .iter()
-            .filter_map(|name| scenario.agents.iter().position(|agent| agent == name))
-            .collect(),
     }
 }
 

@@ -8,7 +8,7 @@ use fusion::Exchange;
 
 use super::Run;
 use super::grid::Point;
-use super::spec::Experiment;
+use crate::experiment::spec::Experiment;
 
 /// One figure.
 #[derive(Debug, Clone, PartialEq)]

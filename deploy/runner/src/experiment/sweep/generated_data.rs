@@ -8,7 +8,7 @@ use anyhow::{Context, Result};
 use simulator::generate::{self, Subset, SynthOptions};
 use support::{output, progress};
 
-use super::Experiment;
+use crate::experiment::spec::Experiment;
 
 /// Options with which the data set of the experiment is generated.
 fn generator(experiment: &Experiment) -> Option<SynthOptions> {
@@ -29,7 +29,7 @@ pub(super) fn is_generated(experiment: &Experiment) -> Result<bool> {
 }
 
 /// Generates the data set, unless it is there.
-pub(super) fn generate(experiment: &Experiment) -> Result<()> {
+pub(in crate::experiment) fn generate(experiment: &Experiment) -> Result<()> {
     let Some(options) = generator(experiment) else {
         return Ok(());
     };

@@ -1,15 +1,20 @@
 //! Runs of a grid, in order.
 
-use std::path::PathBuf;
+use std::path::Path;
 
 use agent::rate::RateConfig;
+use anyhow::{Context, Result};
+use ego_fuser_offline::evaluation::AgentPool;
 use fusion::Method;
-use link::{CapacityConfig, LatencyModel, LinkConfig, LinkError, LossModel};
+use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
+use perception::model_config::DetectorConfig;
+use perception::weights::Weights;
 use protocol::{BevGrid, CodecConfig, Dtype};
 use serde::{Deserialize, Serialize};
 
-use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
+use crate::experiment::evaluation::Trial;
+use crate::experiment::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
 
 /// One point of a grid.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -35,7 +40,7 @@ pub struct Point {
 }
 
 /// Number of values of each axis.
-pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
+pub(in crate::experiment) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
     vec![
         ("method", grid.method.len()),
         ("codec", grid.codec.as_ref().map_or(1, Vec::len)),
@@ -53,18 +58,23 @@ pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
 }
 
 /// Number of points of the grid.
-pub(super) fn count(grid: &Grid) -> usize {
+pub(in crate::experiment) fn count(grid: &Grid) -> usize {
     sizes(grid)
         .into_iter()
         .fold(1, |product, (_, size)| product.saturating_mul(size))
 }
 
-/// Every point; the last field varies fastest.
+/// Every point of an experiment's grid; the last field varies fastest.
 #[must_use]
-pub fn points(grid: &Grid) -> Vec<Point> {
+pub fn points(experiment: &Experiment) -> Vec<Point> {
+    let grid = &experiment.grid;
+    let codec = CodecSpec {
+        dtype: experiment.dtype,
+        ..CodecSpec::default()
+    };
     let methods = grid.method.iter().map(|&method| Point {
         method,
-        codec: CodecSpec::default(),
+        codec,
         latency_ms: None,
         jitter_ms: None,
         bandwidth_mbps: None,
@@ -113,12 +123,32 @@ fn spread<T: Copy>(
 }
 
 impl Point {
-    /// The link of this point: that of the experiment with the values of the grid.
+    /// The cell of this point. Its feature maps are cached losslessly in `maps`, so that the cache changes no result.
     ///
     /// # Errors
-    /// [`LinkError`] when the experiment's is not readable.
-    pub fn link(&self, experiment: &Experiment) -> Result<(LinkConfig, PathBuf), LinkError> {
-        let (mut link, folder) = LinkConfig::open(&experiment.link)?;
+    /// An error when the weights or the link cannot be read.
+    pub(super) fn trial(&self, experiment: &Experiment, maps: &Path) -> Result<Trial> {
+        let mut trial = experiment.trial().context("link")?;
+        let weights = experiment.weights_of(self.method).context("weights")?;
+        let config: DetectorConfig = Weights::load(&weights)?.config()?;
+        let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
+        let setup = &mut trial.setup;
+        setup.models.weights = weights;
+        setup.agents.pose = self.poses(experiment);
+        setup.agents.codec = self.codec(config.feature_grid(), channels);
+        setup.agents.rate = self.rate();
+        if let Some(link) = &mut setup.link {
+            self.shape(&mut link.config);
+            link.config.validate().context("link")?;
+            link.seed = self.seed;
+        }
+        setup.pool = self.vehicles.map_or(AgentPool::All, AgentPool::First);
+        trial.maps = Some(experiment.kept_maps(maps, Dtype::F32));
+        Ok(trial)
+    }
+
+    /// Applies the values of the grid to a link.
+    fn shape(&self, link: &mut LinkConfig) {
         if let Some(mean_ms) = self.latency_ms {
             link.latency = match self.jitter_ms.unwrap_or(0.0) {
                 0.0 => LatencyModel::ConstantMs(mean_ms),
@@ -131,13 +161,10 @@ impl Point {
         if let Some(share) = self.loss {
             link.loss = LossModel::Bernoulli(share);
         }
-        link.validate()?;
-        Ok((link, folder))
     }
 
     /// Pose source of this point.
-    #[must_use]
-    pub fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
+    fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
         let Some(NoiseSpec {
             position_std_m,
             heading_std_deg,
@@ -156,8 +183,7 @@ impl Point {
     }
 
     /// Encoding of feature maps of `channels` on `grid`.
-    #[must_use]
-    pub fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
+    fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
         let CodecSpec {
             dtype,
             keep,
@@ -181,8 +207,7 @@ impl Point {
     }
 
     /// Rate that feature maps are adapted to; empty without adaptation, or if the link is unlimited.
-    #[must_use]
-    pub fn rate(&self) -> RateConfig {
+    fn rate(&self) -> RateConfig {
         let share = self.codec.fit.zip(self.bandwidth_mbps);
         RateConfig {
             bytes_per_second: share.map(|(share, mbps)| (share * mbps * 1e6 / 8.0) as u64),
@@ -201,9 +226,9 @@ mod tests {
 
     #[test]
     fn a_grid_is_every_value_with_every_other() {
-        let grid = experiment("{method: [max, late], latency_ms: [0, 100], seed: [1, 2, 3]}").grid;
+        let grid = experiment("{method: [max, late], latency_ms: [0, 100], seed: [1, 2, 3]}");
         let points = points(&grid);
-        assert_eq!((points.len(), count(&grid)), (12, 12));
+        assert_eq!((points.len(), count(&grid.grid)), (12, 12));
         assert_eq!(
             (points[0].method, points[0].latency_ms, points[0].seed),
             (Method::MAX, Some(0.0), 1)
@@ -219,13 +244,18 @@ mod tests {
     fn a_point_shapes_the_link() {
         let text = "{method: [max], latency_ms: [50], jitter_ms: [0, 10], bandwidth_mbps: [.inf, 6], loss: [0.1]}";
         let experiment = experiment(text);
-        let points = points(&experiment.grid);
-        let (first, _) = points[0].link(&experiment).unwrap();
+        let points = points(&experiment);
+        let shaped = |point: &Point| {
+            let mut link = LinkConfig::default();
+            point.shape(&mut link);
+            link
+        };
+        let first = shaped(&points[0]);
         assert_eq!(
             (first.latency, first.capacity),
             (LatencyModel::ConstantMs(50.0), CapacityConfig::Unlimited)
         );
-        let (last, _) = points[3].link(&experiment).unwrap();
+        let last = shaped(&points[3]);
         assert_eq!(
             last.latency,
             LatencyModel::Normal {
@@ -246,7 +276,7 @@ mod tests {
     #[test]
     fn a_share_of_the_link_is_a_rate_of_bytes() {
         let text = "{method: [max], codec: [{dtype: f32}, {dtype: f32, fit: 0.5}], bandwidth_mbps: [6, .inf]}";
-        let points = points(&experiment(text).grid);
+        let points = points(&experiment(text));
         let rates: Vec<_> = points
             .iter()
             .map(|point| (point.codec.name(), point.rate().bytes_per_second))
@@ -273,7 +303,7 @@ mod tests {
         };
         let experiment =
             experiment("{method: [max], codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]}");
-        let points = points(&experiment.grid);
+        let points = points(&experiment);
         assert_eq!(points[0].codec(grid, 4).budget_bytes, None);
         // Four scales, ten bytes of mask, twenty cells of four bytes.
         assert_eq!(points[1].codec(grid, 4).budget_bytes, Some(16 + 10 + 80));

@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::Run;
-use super::spec::Experiment;
 use super::table::{NOTES, rows};
 use super::varying::VaryingTable;
+use crate::experiment::spec::Experiment;
 
 const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
     color:#282c34;overflow-wrap:anywhere}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{flex:1 1 20rem;min-width:0;height:auto}figure{margin:1rem 0;display:flex;flex-wrap:wrap}\

@@ -4,12 +4,9 @@
 //! same CSV, byte for byte, with one process or with many.
 
 mod charts;
-mod check;
 mod generated_data;
-mod grid;
+pub(super) mod grid;
 mod html;
-mod point_options;
-mod spec;
 mod table;
 mod varying;
 mod workers;
@@ -28,24 +25,25 @@ use dataset::Scenario;
 use figures;
 use fusion::Exchange;
 use perception::weights::Weights;
+use protocol::Dtype;
 use serde::Serialize;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 use support::cli::NotWritten;
 use support::file_error::FileError;
 use support::{atomic_file, output, progress};
-use training::feature_store::FeatureStore;
+use training::feature_store::{FeatureStore, KeptMaps};
 
-pub(super) use check::check_name;
 pub use grid::{Point, points};
-pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
-use self::generated_data::{generate, is_generated};
+use self::generated_data::is_generated;
 use self::varying::VaryingTable;
-use crate::experiment::cell::{Cell, CellKey};
-use crate::experiment::evaluation::{OpenedData, compute, evaluate};
-use crate::experiment::slices::Slice;
-use crate::scenario::weights_choice::weights_of;
+use super::cell::{Cell, CellKey};
+use super::check;
+use super::evaluation::{OpenedData, Trial, compute, evaluate};
+use super::slices::Slice;
+use super::spec::Experiment;
+pub(super) use generated_data::generate;
 
 /// Number of ticks that are timed before a sweep begins, for its estimate.
 const PROBED_TICKS: usize = 4;
@@ -98,7 +96,7 @@ impl Sweep {
     /// # Errors
     /// An error that names the file and the field.
     pub fn open(file: &Path, out: &Path) -> Result<Self> {
-        let experiment = Experiment::read(file)?;
+        let experiment = read(file)?;
         generate(&experiment)?;
         Self::over(experiment, file, out)
     }
@@ -109,7 +107,7 @@ impl Sweep {
     /// # Errors
     /// As [`Self::open`].
     pub fn announce(file: &Path, out: &Path, jobs: usize) -> Result<()> {
-        let experiment = Experiment::read(file)?;
+        let experiment = read(file)?;
         if let Some(generate) = &experiment.generate
             && !is_generated(&experiment)?
         {
@@ -120,7 +118,7 @@ impl Sweep {
                 "{}: {} = {} runs of {} frames; the data set {} is generated first",
                 experiment.name,
                 check::product(grid),
-                points(grid).len(),
+                points(&experiment).len(),
                 generate.scenes.min(scenes) * generate.frames.min(frames),
                 experiment.dataset.display()
             ));
@@ -132,9 +130,9 @@ impl Sweep {
     }
 
     fn over(experiment: Experiment, file: &Path, out: &Path) -> Result<Self> {
-        let part = experiment.part();
-        let data = part.open(&experiment.dataset, &experiment.protocol)?;
-        let scenarios: Vec<Scenario> = part.chosen(&data.scenarios).cloned().collect();
+        let trial = experiment.trial().context("link")?;
+        let data = OpenedData::open(&trial)?;
+        let scenarios: Vec<Scenario> = data.chosen(experiment.scenarios).cloned().collect();
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {
             let dataset = experiment.dataset.display();
             let problem = format!("dataset {dataset}: there is no frame in it");
@@ -144,7 +142,7 @@ impl Sweep {
             .map_err(|problem| FileError::new(file, problem))?;
         Ok(Self {
             file: file.to_owned(),
-            points: points(&experiment.grid),
+            points: points(&experiment),
             experiment,
             data,
             out: out.to_owned(),
@@ -155,10 +153,13 @@ impl Sweep {
     fn keys(&self) -> Result<Vec<CellKey>> {
         let mut keys = Vec::with_capacity(self.points.len());
         for point in &self.points {
-            let options = point_options::options(&self.experiment, point, &self.maps())?;
-            keys.push(options.key(&self.data, point.method)?);
+            keys.push(self.trial(point)?.key(&self.data, point.method)?);
         }
         Ok(keys)
+    }
+
+    fn trial(&self, point: &Point) -> Result<Trial> {
+        point.trial(&self.experiment, &self.maps())
     }
 
     fn known(&self, keys: &[CellKey]) -> Result<Vec<Option<Cell>>> {
@@ -176,8 +177,7 @@ impl Sweep {
     }
 
     fn frames(&self) -> usize {
-        let scenarios = self.experiment.part().chosen(&self.data.scenarios);
-        scenarios.map(|scenario| scenario.ticks.len()).sum()
+        self.data.frame_count(self.experiment.scenarios)
     }
 
     /// Computes the missing runs of a slice. Feature maps stay for the other slices.
@@ -254,22 +254,26 @@ impl Sweep {
 
     /// Time of a frame, seconds, from the first few without cached feature maps: an overestimate.
     fn probe(&self, point: &Point) -> Result<f64> {
-        let mut options = point_options::options(&self.experiment, point, &self.maps())?;
-        options.maps = None;
-        options.part.scenarios = Some(1);
+        let mut trial = self.trial(point)?;
+        trial.maps = None;
+        trial.scenarios = Some(1);
         let frames = self.experiment.frames.unwrap_or(PROBED_TICKS);
-        options.part.frames = Some(frames.min(PROBED_TICKS));
-        let data = options.part.open(&options.dataset, &options.protocol)?;
+        trial.setup.frames = Some(frames.min(PROBED_TICKS));
+        let data = OpenedData::open(&trial)?;
         let began = Instant::now();
-        let metrics = evaluate(&options, &data, point.method, &mut || {})?;
+        let metrics = evaluate(&trial, &data, point.method, &mut || {})?;
         Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
+    }
+
+    fn kept_maps(&self) -> KeptMaps {
+        self.experiment.kept_maps(&self.maps(), Dtype::F32)
     }
 
     /// Computes the feature maps of all sweeps, once for each encoder that is needed.
     fn encode(&self, missing: &[usize], jobs: usize) -> Result<()> {
         for weights in self.encoders(missing)? {
             let bar = progress::bar(0, "sweeps encoded");
-            let kept = point_options::kept_maps(&self.experiment, &self.maps());
+            let kept = self.kept_maps();
             let (scenarios, digests) = (&self.data.scenarios, &self.data.digests);
             let on_sweep = &mut |done, all| {
                 bar.set_length(all as u64);
@@ -284,7 +288,7 @@ impl Sweep {
     /// Removes the feature maps of the experiment, which are most of what a sweep writes and are of no use once all runs
     /// are cached. Other files of their folder stay.
     fn remove_maps(&self) -> Result<()> {
-        let kept = point_options::kept_maps(&self.experiment, &self.maps());
+        let kept = self.kept_maps();
         // Methods that share an encoder share a file of maps.
         let mut files = BTreeSet::new();
         let all: Vec<usize> = (0..self.points.len()).collect();
@@ -305,7 +309,7 @@ impl Sweep {
         let methods = points.iter().map(|&index| self.points[index].method);
         let mut files = Vec::new();
         for method in methods.filter(|method| method.exchange() != Exchange::Points) {
-            let file = weights_of(&self.experiment.weights, method)?;
+            let file = self.experiment.weights_of(method)?;
             if !files.contains(&file) {
                 files.push(file);
             }
@@ -344,8 +348,7 @@ impl Sweep {
     /// Computes the run of a point and caches it.
     fn compute_one(&self, index: usize, key: CellKey, on_frame: &mut dyn FnMut()) -> Result<()> {
         let point = &self.points[index];
-        let options = point_options::options(&self.experiment, point, &self.maps())?;
-        compute(&options, &self.data, key, on_frame)?.write(&self.cells())
+        compute(&self.trial(point)?, &self.data, key, on_frame)?.write(&self.cells())
     }
 
     /// Runs as a worker: computes the points that the parent process requests.
@@ -397,6 +400,18 @@ impl Sweep {
         write(&self.out.join(name), &csv(&self.experiment, runs))?;
         let (columns, lines) = table::rows(&self.experiment, runs);
         Ok(VaryingTable::new(&columns, &lines).text())
+    }
+}
+
+/// An experiment with a grid.
+fn read(file: &Path) -> Result<Experiment, FileError> {
+    let experiment = Experiment::read(file)?;
+    match experiment.tables[..] {
+        [] => Ok(experiment),
+        _ => {
+            let problem = "tables are filled by `v2vloc eval --table`: a sweep has a grid";
+            Err(FileError::new(file, problem))
+        }
     }
 }
 

@@ -6,7 +6,7 @@ use protocol::DropReason;
 use support::csv_file::CsvText;
 
 use super::Run;
-use super::spec::Experiment;
+use crate::experiment::spec::Experiment;
 
 /// Reasons with a column of their own; the last column is the sum of the others.
 const REASONS: [DropReason; 7] = [

@@ -3,26 +3,22 @@
 //! Cells are cached one by one by everything that they are made of, so that an interrupted run resumes and a changed row costs only
 //! that row.
 
-mod spec;
 mod text;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
-use dataset::IntensityScale;
-use ego_fuser_offline::evaluation::EvaluateConfig;
 use support::atomic_file;
 use support::cli::NotWritten;
 
-pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
 
-use crate::experiment::cell::Cell;
-use crate::experiment::evaluation::{EvaluationOptions, OpenedData, Part, compute};
-use crate::experiment::slices::Slice;
-use ego_fuser::misbehaviour::MisbehaviourConfig;
-use training::feature_store::KeptMaps;
+use super::cell::Cell;
+use super::evaluation::{OpenedData, Trial, compute};
+use super::slices::Slice;
+use super::spec::{Column, Experiment, Row, Table};
+use super::sweep::generate;
 
 /// The cells of a row: for each column one per training.
 #[derive(Debug, Clone, PartialEq)]
@@ -58,19 +54,20 @@ pub trait TableObserver {
 /// # Errors
 /// An error at the first cell that cannot be computed; earlier cells are cached.
 pub fn run(
-    spec: &TableSpec,
+    experiment: &Experiment,
     out: &Path,
     slice: Option<Slice>,
     observer: &mut dyn TableObserver,
 ) -> Result<Vec<FilledTable>> {
     let cells = out.join("cells");
     fs::create_dir_all(&cells).with_context(|| NotWritten(cells.clone()))?;
-    let part = Part {
-        frames: spec.frames,
-        ..Part::default()
+    generate(experiment)?;
+    let data = OpenedData::open(&experiment.trial()?)?;
+    let run = Run {
+        experiment,
+        cells,
+        data,
     };
-    let data = part.open(&spec.dataset, &spec.protocol)?;
-    let run = Run { spec, cells, data };
     let places = run.places()?;
     let part = slice.map_or(0..places.len(), |slice| slice.part(places.len()));
     let mut cells = Vec::with_capacity(part.len());
@@ -81,8 +78,8 @@ pub fn run(
         return Ok(Vec::new());
     }
     let mut cells = cells.into_iter();
-    let mut filled = Vec::with_capacity(spec.tables.len());
-    for table in &spec.tables {
+    let mut filled = Vec::with_capacity(experiment.tables.len());
+    for table in &experiment.tables {
         let table = run.fill(table, &mut cells)?;
         for (ending, text) in [("md", markdown(&table)), ("csv", csv(&table))] {
             let path = out.join(format!("{}.{ending}", table.name));
@@ -94,7 +91,7 @@ pub fn run(
 }
 
 struct Run<'a> {
-    spec: &'a TableSpec,
+    experiment: &'a Experiment,
     cells: PathBuf,
     data: OpenedData,
 }
@@ -112,15 +109,20 @@ impl Run<'_> {
     /// Every cell: by table, row, column and training.
     fn places(&self) -> Result<Vec<Place<'_>>> {
         let mut places = Vec::new();
-        for table in &self.spec.tables {
+        for table in &self.experiment.tables {
             for row in &table.rows {
                 for column in &table.columns {
-                    places.extend(self.spec.weights_of(row)?.into_iter().map(|weights| Place {
-                        table,
-                        row,
-                        column,
-                        weights,
-                    }));
+                    places.extend(
+                        self.experiment
+                            .trainings_of(row)?
+                            .into_iter()
+                            .map(|weights| Place {
+                                table,
+                                row,
+                                column,
+                                weights,
+                            }),
+                    );
                 }
             }
         }
@@ -131,7 +133,7 @@ impl Run<'_> {
     fn fill(&self, table: &Table, cells: &mut impl Iterator<Item = Cell>) -> Result<FilledTable> {
         let mut rows = Vec::with_capacity(table.rows.len());
         for row in &table.rows {
-            let trainings = self.spec.weights_of(row)?.len();
+            let trainings = self.experiment.trainings_of(row)?.len();
             rows.push(FilledRow {
                 row: row.clone(),
                 cells: (table.columns.iter())
@@ -150,51 +152,37 @@ impl Run<'_> {
         let Place {
             table, row, column, ..
         } = place;
-        let options = self.options(place);
-        let key = options.key(&self.data, row.method)?;
+        let trial = self.trial(place)?;
+        let key = trial.key(&self.data, row.method)?;
         let known = Cell::read(&key, &self.cells)?;
         observer.cell(&table.name, &row.label(), &column.name, known.is_some());
         if let Some(cell) = known {
             return Ok(cell);
         }
-        let cell = compute(&options, &self.data, key, &mut || observer.frame())?;
+        let cell = compute(&trial, &self.data, key, &mut || observer.frame())?;
         cell.write(&self.cells)?;
         Ok(cell)
     }
 
-    fn options(&self, place: &Place<'_>) -> EvaluationOptions {
+    fn trial(&self, place: &Place<'_>) -> Result<Trial> {
         let Place {
             table,
             row,
             column,
             weights,
         } = place;
-        let settings = EvaluateConfig {
-            weights: weights.clone(),
-            precision: self.spec.precision,
-            pose_source: row.poses.as_ref().unwrap_or(&column.poses).clone(),
-            codec: self.spec.codec(),
-            delay_nanos: column.delay_ms.saturating_mul(1_000_000),
-            attack: column.attack,
-            trust: column.trust.then(MisbehaviourConfig::default),
-            ..EvaluateConfig::default()
-        };
-        EvaluationOptions {
-            dataset: self.spec.dataset.clone(),
-            settings,
-            maps: self.spec.feature_maps.as_ref().map(|folder| KeptMaps {
-                folder: folder.clone(),
-                dtype: self.spec.dtype,
-                limit_bytes: (self.spec.feature_maps_limit_gb.max(0.0) * 1e9) as u64,
-                intensity_scale: IntensityScale::AUTO,
-            }),
-            part: Part {
-                scenarios: table.scenarios,
-                frames: self.spec.frames,
-                ..Part::default()
-            },
-            protocol: self.spec.protocol.clone(),
-            ..EvaluationOptions::default()
+        let mut trial = self.experiment.trial()?;
+        trial.scenarios = table.scenarios.or(trial.scenarios);
+        let setup = &mut trial.setup;
+        setup.models.weights.clone_from(weights);
+        if let Some(poses) = row.poses.as_ref().or(column.poses.as_ref()) {
+            setup.agents.pose.clone_from(poses);
         }
+        setup.delay_ms = column.delay_ms;
+        setup.attack = column.attack;
+        setup.ego.trust |= column.trust;
+        let folder = self.experiment.feature_maps.as_ref();
+        trial.maps = folder.map(|folder| self.experiment.kept_maps(folder, self.experiment.dtype));
+        Ok(trial)
     }
 }

@@ -92,14 +92,13 @@ pub fn csv(table: &FilledTable) -> String {
     for FilledRow { row, cells } in &table.rows {
         for (column, trainings) in table.columns.iter().zip(cells) {
             for (training, cell) in trainings.iter().enumerate() {
-                let poses = row.poses.as_ref().unwrap_or(&column.poses);
                 let place = [
                     table.name.clone(),
                     row.label(),
                     column.name.clone(),
                     training.to_string(),
                     row.method.to_string(),
-                    poses.name().to_owned(),
+                    cell.metrics.pose_source.clone(),
                     column.delay_ms.to_string(),
                 ];
                 text.row(place.into_iter().chain(cell_fields(cell)));
@@ -177,9 +176,9 @@ fn plain(value: Option<f64>) -> String {
 mod tests {
     use fusion::Method;
 
-    use super::super::{Column, Row};
     use super::*;
     use crate::experiment::cell::CellKey;
+    use crate::experiment::spec::{Column, Row};
     use deploy::score::metrics::{Communication, Metrics};
     use support::provenance::Provenance;
 
@@ -200,6 +199,7 @@ mod tests {
             },
             frames: 60,
             method: method.name().into(),
+            pose_source: "recorded".into(),
             ..Metrics::default()
         };
         let weights = ("w.safetensors".into(), format!("{at_50}"));
@@ -225,7 +225,7 @@ mod tests {
     fn column(name: &str) -> Column {
         Column {
             name: name.into(),
-            poses: Default::default(),
+            poses: None,
             delay_ms: 0,
             attack: None,
             trust: false,

@@ -5,12 +5,14 @@ use std::time::{Duration, Instant};
 use dataset::{LoadOptions, Scenario};
 use ego_fuser::ego::View;
 use protocol::EgoMotion;
+use protocol::config::{FieldError, within};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::nanos;
 use support::statistics::median;
 
-use super::super::{EvaluateError, Evaluator, view};
+use super::super::sent::view;
+use super::super::{EvaluateError, Evaluator};
 
 /// Ticks that times are measured over.
 const MEASURED_TICKS: usize = 5;
@@ -20,7 +22,7 @@ const MEASURED_VEHICLES: usize = 2;
 const ESTIMATED_TICKS: usize = 2;
 
 /// Compute time of each step, milliseconds: the same for all vehicles and ticks.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ComputeTimes {
     /// From the capture of a sweep to the publication of the pose.
@@ -32,12 +34,20 @@ pub struct ComputeTimes {
 }
 
 impl ComputeTimes {
-    /// Computers that take no time at all.
-    pub const NONE: Self = Self {
-        pose_ms: 0.0,
-        map_ms: 0.0,
-        fuse_ms: 0.0,
-    };
+    /// Checks the values; `field` names them in errors.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first that is not 0 to 60 s.
+    pub fn validate(&self, field: &str) -> Result<(), FieldError> {
+        let stages = [
+            ("pose_ms", self.pose_ms),
+            ("map_ms", self.map_ms),
+            ("fuse_ms", self.fuse_ms),
+        ];
+        stages
+            .into_iter()
+            .try_for_each(|(stage, ms)| within(&format!("{field}.{stage}"), ms, 0.0, 60_000.0))
+    }
 
     pub(super) fn pose_nanos(&self) -> u64 {
         nanos::of_ms(self.pose_ms)
@@ -125,17 +135,17 @@ impl Evaluator {
         let goes_on =
             |ticks| ticks < ESTIMATED_TICKS || (ticks < MEASURED_TICKS && began.elapsed() < budget);
         // Few sweeps are timed, so each of them is measured.
-        let source = self.config.pose_source.clone();
-        self.config.pose_source = source.clone().measuring_every_sweep();
+        let source = self.setup.agents.pose.clone();
+        self.setup.agents.pose = source.clone().measuring_every_sweep();
         let samples = self.samples(scenario, vehicles, &goes_on);
-        self.config.pose_source = source;
+        self.setup.agents.pose = source;
         let samples = samples?;
         let warm = |per_tick: usize, sample: &[f64]| {
             let warm = sample.get(per_tick..).filter(|warm| !warm.is_empty());
             median(warm.unwrap_or(sample)).unwrap_or(0.0)
         };
         let agents = vehicles.min(MEASURED_VEHICLES);
-        let interval = f64::from(self.config.pose_source.measuring_interval(&samples.motion));
+        let interval = f64::from(self.setup.agents.pose.measuring_interval(&samples.motion));
         Ok(ComputeTimes {
             pose_ms: warm(agents, &samples.pose) + warm(agents, &samples.observe) / interval,
             map_ms: warm(agents, &samples.map),
@@ -151,12 +161,8 @@ impl Evaluator {
         goes_on: &dyn Fn(usize) -> bool,
     ) -> Result<Samples, EvaluateError> {
         let exchange = self.ego.method().own_content();
-        let mut participants = scenario
-            .agents
-            .iter()
-            .take(MEASURED_VEHICLES)
-            .enumerate()
-            .map(|(index, cav)| self.participant(scenario, cav, &self.settings(scenario, index)))
+        let mut participants = (0..scenario.agents.len().min(MEASURED_VEHICLES))
+            .map(|place| self.participant(&self.setup.agents, scenario, (place, place), place == 0))
             .collect::<Result<Vec<_>, EvaluateError>>()?;
         let mut samples = Samples::default();
         self.ego.forget();

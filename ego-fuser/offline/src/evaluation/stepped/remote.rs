@@ -22,7 +22,7 @@ use protocol::{
     Topic, WireError,
 };
 
-use super::super::Sent;
+use super::super::sent::Sent;
 use ego_fuser::ego::Content;
 
 /// Timeout of all vehicles together for a tick: for a busy machine, but not for one that has lost a process.
@@ -71,7 +71,7 @@ pub struct RemotePool {
 
 impl fmt::Debug for RemotePool {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("RemoteCrew")
+        f.debug_struct("RemotePool")
             .field("vehicles", &self.sensors.keys())
             .finish_non_exhaustive()
     }

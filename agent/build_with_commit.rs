@@ -1,6 +1,7 @@
-//! Build script: run path of libtorch, as in other packages, and the commit of the checkout.
+//! Build script of packages whose results name the commit of the checkout: that, in `V2VLOC_COMMIT`, and the run path
+//! of libtorch, as in other packages.
 
-#[path = "../../agent/build.rs"]
+#[path = "build.rs"]
 mod run_path;
 
 use std::path::Path;

@@ -1,13 +1,15 @@
-//! Checks of an experiment: values out of bounds, contradictory fields, grids that take too long.
+//! Checks of an experiment: values out of bounds, contradictory fields, grids that take too long, tables.
 
 use std::fmt::Debug;
 
 use bus::InboxConfig;
 use dataset::Scenario;
+use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::Exchange;
 use link::{CapacityConfig, LatencyModel, LinkConfig, LossModel};
 
-use super::spec::{CodecSpec, Experiment, Grid};
+use super::spec::{CodecSpec, Column, Experiment, Grid};
+use super::sweep::grid::{count, sizes};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
 /// Largest number of runs; more are a mistake.
@@ -16,7 +18,9 @@ pub(super) const MOST_RUNS: usize = 10_000;
 /// Checks everything that does not depend on the data.
 pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     let (grid, compute) = (&experiment.grid, experiment.compute);
-    check_name("name", &experiment.name)?;
+    if experiment.tables.is_empty() {
+        check_name("name", &experiment.name)?;
+    }
     for (field, value) in [
         ("scenarios", experiment.scenarios),
         ("frames", experiment.frames),
@@ -27,15 +31,18 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     }
     { experiment.ego.validate() }.map_err(|error| error.to_string())?;
     { experiment.poses.validate() }.map_err(|error| format!("poses: {error}"))?;
-    number("compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
-    number("compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
-    number("compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)?;
+    { compute.validate("compute") }.map_err(|error| error.to_string())?;
     let limit_gb = experiment.feature_maps_limit_gb;
     number("feature_maps_limit_gb", limit_gb, 0.0, 10_000.0)?;
+    of_link_alone(experiment)?;
+    let link = experiment.link().map(LinkConfig::open).transpose();
+    let link = link.map_err(|error| format!("link: {error}"))?;
+    if !experiment.tables.is_empty() {
+        return tables(experiment);
+    }
     axes(grid)?;
-    let (link, _) = LinkConfig::open(&experiment.link).map_err(|error| format!("link: {error}"))?;
-    contradictions(experiment, &link)?;
-    let runs = super::grid::count(grid);
+    contradictions(experiment, &link.unwrap_or_default().0)?;
+    let runs = count(grid);
     if runs > MOST_RUNS {
         let hours = runs as f64 / 3600.0;
         return Err(format!(
@@ -46,8 +53,52 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     Ok(())
 }
 
+/// Checks the tables, each by itself and beside the other settings.
+fn tables(experiment: &Experiment) -> Result<(), String> {
+    if experiment.grid != Grid::default() {
+        return Err("an experiment has a grid or tables, not both".into());
+    }
+    for (index, table) in experiment.tables.iter().enumerate() {
+        check_name("table name", &table.name)?;
+        let mut before = experiment.tables[..index].iter();
+        if before.any(|other| other.name == table.name) {
+            return Err(format!("two tables are called {:?}", table.name));
+        }
+        if table.rows.is_empty() || table.columns.is_empty() {
+            return Err(format!("table {:?} has no rows or no columns", table.name));
+        }
+        let delays = |column: &Column| column.delay_ms > 0;
+        if experiment.link.is_some() && table.columns.iter().any(delays) {
+            let name = &table.name;
+            return Err(format!(
+                "table {name:?}: delay_ms and link contradict each other"
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// Refuses settings that mean nothing without a link, or in an evaluation at all.
+fn of_link_alone(experiment: &Experiment) -> Result<(), String> {
+    let ego = &experiment.ego;
+    if let Some(ego) = &ego.id {
+        return Err(format!(
+            "ego.id is {ego}: choose by protocol.ego_kind instead"
+        ));
+    }
+    if ego.inbox != InboxConfig::default() {
+        return Err(
+            "ego.inbox is given, but receive limits do not apply in simulation time".into(),
+        );
+    }
+    if experiment.link().is_none() && experiment.compute != ComputeTimes::default() {
+        return Err("compute is given, but without link no time passes".into());
+    }
+    Ok(())
+}
+
 /// Refuses a name that cannot be one of files.
-pub(in super::super) fn check_name(field: &str, name: &str) -> Result<(), String> {
+fn check_name(field: &str, name: &str) -> Result<(), String> {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     match !name.is_empty() && name.chars().all(is_plain) {
         true => Ok(()),
@@ -129,14 +180,14 @@ fn numbers(field: &str, axis: &Option<Vec<f64>>, low: f64, high: f64) -> Result<
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
     let (grid, ego, poses) = (&experiment.grid, &experiment.ego, &experiment.poses);
     let exchanges = || grid.method.iter().map(|method| method.exchange());
-    if let Some(ego) = &ego.id {
-        return Err(format!(
-            "ego.id is {ego}: choose by protocol.ego_kind instead"
-        ));
-    }
-    if ego.inbox != InboxConfig::default() {
+    if experiment.weights.is_none() {
         return Err(
-            "ego.inbox is given, but receive limits do not apply in simulation time".into(),
+            "weights is left out: name a file, or a folder with one for each method".into(),
+        );
+    }
+    if experiment.feature_maps.is_some() {
+        return Err(
+            "feature_maps is of tables: a sweep keeps its maps in the folder of --out".into(),
         );
     }
     if experiment.noise_mode == NoiseMode::Replayed {
@@ -163,7 +214,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
         ),
     ] {
         if is_varied && is_set {
-            let name = &experiment.link;
+            let name = experiment.link.as_deref().unwrap_or_default();
             return Err(format!(
                 "grid.{axis} and the {field} of link {name} contradict each other"
             ));
@@ -247,9 +298,7 @@ fn number(field: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
 
 /// The axes with more than one value, multiplied: `3 method x 6 latency_ms`.
 pub(super) fn product(grid: &Grid) -> String {
-    let sizes = super::grid::sizes(grid)
-        .into_iter()
-        .filter(|(_, size)| *size > 1);
+    let sizes = sizes(grid).into_iter().filter(|(_, size)| *size > 1);
     let factors: Vec<String> = sizes.map(|(axis, size)| format!("{size} {axis}")).collect();
     if factors.is_empty() {
         "1".into()

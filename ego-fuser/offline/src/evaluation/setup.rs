@@ -1,0 +1,152 @@
+//! Setup of an evaluation: models, vehicles, ego and delivery, in the types of the processes' configurations.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use agent::attack::AttackConfig;
+use agent::config::{AgentSettings, ModelConfig};
+use dataset::Scenario;
+use dataset::evaluation_protocol::EvaluationProtocol;
+use ego_fuser::config::EgoSettings;
+use ego_fuser::ego_loop::LoopOptions;
+use ego_fuser::pairing::PairingConfig;
+use fusion::method::Method;
+use link::{LatencyModel, LinkConfig, LinkEmulator, LinkError};
+use protocol::CavId;
+use support::random::derive_seed;
+
+use super::stepped::ComputeTimes;
+
+/// Everything that an evaluation does besides the data.
+#[derive(Debug, Clone, Default)]
+pub struct Setup {
+    /// Weights of encoder and head, and their number format; everything is computed on the CPU.
+    pub models: ModelConfig,
+    /// The method; absent: that of the weights.
+    pub method: Option<Method>,
+    /// Settings of every vehicle, unless `vehicles` has others; maps without a gate have the method's own.
+    pub agents: AgentSettings,
+    /// Settings of single vehicles.
+    pub vehicles: BTreeMap<CavId, AgentSettings>,
+    /// Attacking neighbours; absent: none.
+    pub attack: Option<AttackConfig>,
+    /// Misbehaviour detection of the ego, and over a link its limits. `id` is not read.
+    pub ego: EgoSettings,
+    /// Link emulation in simulation time. Absent: all messages arrive `delay_ms` after their sweep; the ego waits for
+    /// none and fuses those of the newest tick; computing takes no time, and nothing is counted.
+    pub link: Option<EmulatedLink>,
+    /// Delay of the messages of neighbours without a link, milliseconds.
+    pub delay_ms: u64,
+    /// Compute times of all processes, over a link.
+    pub compute: ComputeTimes,
+    /// Agents whose messages and annotations count, and objects that count; absent: vehicles completely over the area
+    /// of the network, of all agents within 70 m.
+    pub protocol: Option<EvaluationProtocol>,
+    /// Vehicles that take part.
+    pub pool: AgentPool,
+    /// First tick of a scenario.
+    pub seek: usize,
+    /// Largest number of ticks of a scenario; absent: all.
+    pub frames: Option<usize>,
+    /// A variant of the sweeps, see [`Scenario::lidar_variants`].
+    pub lidar_variant: Option<String>,
+}
+
+/// The link between the neighbours and the ego.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EmulatedLink {
+    /// Its stages.
+    pub config: LinkConfig,
+    /// Base folder of the paths of traces in it.
+    pub folder: PathBuf,
+    /// Seed of losses and delays. Every scenario derives its own from it.
+    pub seed: u64,
+}
+
+/// Vehicles of an evaluation.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum AgentPool {
+    /// All of a scenario; the first is the ego.
+    #[default]
+    All,
+    /// The first so many. Annotations of the others count all the same, so that the ground truth does not depend on the
+    /// number of senders.
+    First(usize),
+    /// These, the ego first; the others are ignored completely.
+    Named(Vec<CavId>),
+}
+
+impl EmulatedLink {
+    /// The link of a preset or of a file.
+    ///
+    /// # Errors
+    /// [`LinkError`] when it is neither.
+    pub fn open(model: &str, seed: u64) -> Result<Self, LinkError> {
+        let (config, folder) = LinkConfig::open(model)?;
+        Ok(Self {
+            config,
+            folder,
+            seed,
+        })
+    }
+}
+
+impl Setup {
+    /// The link of a scenario.
+    pub(super) fn emulator(&self, scenario: &Scenario) -> Result<LinkEmulator, LinkError> {
+        let Some(EmulatedLink {
+            config,
+            folder,
+            seed,
+        }) = &self.link
+        else {
+            let latency = LatencyModel::ConstantMs(self.delay_ms as f64);
+            let config = LinkConfig {
+                latency,
+                ..LinkConfig::default()
+            };
+            return LinkEmulator::new(config, Path::new("."), 0);
+        };
+        let seed_words: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
+        LinkEmulator::new(config.clone(), folder, derive_seed(*seed, &seed_words))
+    }
+
+    /// Options of an ego's loop in a scenario.
+    pub(super) fn loop_options(&self, scenario: &Scenario) -> LoopOptions {
+        let options = LoopOptions::stepped(&self.ego);
+        if self.link.is_some() {
+            return options;
+        }
+        // Younger than the messages of the tick before the newest that has arrived.
+        let steps = scenario.ticks.windows(2);
+        let longest = steps.map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let max_age_nanos = match self.delay_ms.saturating_mul(1_000_000) {
+            0 => 0,
+            delay => delay.saturating_add(longest.max().unwrap_or(1).saturating_sub(1)),
+        };
+        LoopOptions {
+            deadline_nanos: 0,
+            pairing: PairingConfig {
+                max_lead_nanos: 0,
+                ..PairingConfig::with_max_age_nanos(max_age_nanos)
+            },
+            ..options
+        }
+    }
+}
+
+impl AgentPool {
+    /// Indices of the participants among the agents of a scenario, the ego first, and of those that only contribute
+    /// annotations.
+    pub(super) fn places(&self, scenario: &Scenario) -> (Vec<usize>, Vec<usize>) {
+        let all = 0..scenario.agents.len();
+        match self {
+            Self::All => (all.collect(), Vec::new()),
+            Self::First(count) => all.partition(|place| place < count),
+            Self::Named(names) => {
+                let place = |name| scenario.agents.iter().position(|agent| agent == name);
+                (names.iter().filter_map(place).collect(), Vec::new())
+            }
+        }
+    }
+}
