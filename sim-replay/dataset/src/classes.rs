@@ -8,24 +8,23 @@ use std::path::Path;
 use super::{Problem, ReadError};
 use crate::frame::ObjectClass;
 
+/// Two-wheelers among CARLA's blueprints of vehicles.
+const TWO_WHEELERS: [&str; 7] = [
+    "crossbike",
+    "century",
+    "omafiets",
+    "lowrider",
+    "ninja",
+    "yzf",
+    "zx125",
+];
+/// Trucks among them.
+const TRUCKS: [&str; 3] = ["carlacola", "firetruck", "europeanhgv"];
+
 /// CARLA's blueprints of the library `vehicle.*` that are no cars, by their last word.
 const BLUEPRINTS: [(ObjectClass, &[&str]); 4] = [
-    (
-        ObjectClass::TwoWheeler,
-        &[
-            "crossbike",
-            "century",
-            "omafiets",
-            "lowrider",
-            "ninja",
-            "yzf",
-            "zx125",
-        ],
-    ),
-    (
-        ObjectClass::Truck,
-        &["carlacola", "firetruck", "europeanhgv"],
-    ),
+    (ObjectClass::TwoWheeler, &TWO_WHEELERS),
+    (ObjectClass::Truck, &TRUCKS),
     (ObjectClass::Van, &["ambulance", "sprinter", "t2", "t22021"]),
     (ObjectClass::Bus, &["fusorosa"]),
 ];
@@ -77,14 +76,9 @@ pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
 
 /// The finding about an unknown type, the same for all its objects below `dir`.
 pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
-    Problem::from(&ReadError::Malformed {
-        path: dir.to_owned(),
-        line: None,
-        field: Some(field.to_owned()),
-        reason: format!(
-            "{found} is an unknown type of object: it counts as other, not as a vehicle"
-        ),
-    })
+    let reason =
+        format!("{found} is an unknown type of object: it counts as other, not as a vehicle");
+    Problem::from(&ReadError::malformed_at(dir, None, Some(field), reason))
 }
 
 /// Names with dots: nuScenes' categories and CARLA's blueprints.
@@ -98,21 +92,12 @@ fn of_library(name: &str) -> Option<ObjectClass> {
         "vehicle" => {
             let kind = rest.split('.').next().unwrap_or(rest);
             let model = plain(rest.rsplit('.').next().unwrap_or(rest));
-            let blueprint = BLUEPRINTS
-                .iter()
-                .find(|(_, models)| models.contains(&model.as_str()));
+            let mut blueprints = BLUEPRINTS.iter();
+            let blueprint = blueprints.find(|(_, models)| models.contains(&model.as_str()));
             // `vehicle.bus.rigid` and `vehicle.emergency.police` of nuScenes, or make and model.
-            let category = if kind == "emergency" {
-                of_name(&model)
-            } else {
-                of_name(kind)
-            };
-            Some(
-                blueprint
-                    .map(|(class, _)| *class)
-                    .or(category)
-                    .unwrap_or(ObjectClass::Car),
-            )
+            let category = || of_name(if kind == "emergency" { &model } else { kind });
+            let class = blueprint.map(|(class, _)| *class).or_else(category);
+            Some(class.unwrap_or(ObjectClass::Car))
         }
         _ => None,
     }

@@ -61,10 +61,28 @@ pub enum ReadError {
 impl ReadError {
     /// A [`ReadError::Malformed`] of a whole file.
     pub fn malformed(path: &Path, reason: impl Into<String>) -> Self {
+        Self::malformed_at(path, None, None, reason)
+    }
+
+    /// The same, at a line, counted from 1, or in a field.
+    pub(crate) fn malformed_at(
+        path: &Path,
+        line: Option<u64>,
+        field: Option<&str>,
+        reason: impl Into<String>,
+    ) -> Self {
         Self::Malformed {
             path: path.to_owned(),
-            line: None,
-            field: None,
+            line,
+            field: field.map(str::to_owned),
+            reason: reason.into(),
+        }
+    }
+
+    /// The error of a folder whose layout is not supported.
+    pub(crate) fn layout(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Layout {
+            path: path.to_owned(),
             reason: reason.into(),
         }
     }
@@ -106,20 +124,18 @@ impl ReadError {
     /// The line at fault, from 1.
     #[must_use]
     pub fn line(&self) -> Option<u64> {
-        if let Self::Malformed { line, .. } = self {
-            *line
-        } else {
-            None
+        match self {
+            Self::Malformed { line, .. } => *line,
+            _ => None,
         }
     }
 
     /// The field at fault.
     #[must_use]
     pub fn field(&self) -> Option<&str> {
-        if let Self::Malformed { field, .. } = self {
-            field.as_deref()
-        } else {
-            None
+        match self {
+            Self::Malformed { field, .. } => field.as_deref(),
+            _ => None,
         }
     }
 }

@@ -52,44 +52,28 @@ fn parse(
     let (stamps_shape, stamps) = numbers(path, &file, "valid_timestamps")?;
     let (poses_shape, poses) = numbers(path, &file, "poses")?;
     let [count] = stamps_shape[..] else {
-        return Err(wrong(
-            path,
-            "valid_timestamps",
-            format!("shape {stamps_shape:?}, expected [n]"),
-        ));
+        let reason = format!("shape {stamps_shape:?}, expected [n]");
+        return Err(wrong(path, "valid_timestamps", reason));
     };
     if poses_shape != [count, 12] {
-        return Err(wrong(
-            path,
-            "poses",
-            format!("shape {poses_shape:?}, expected [{count}, 12]"),
-        ));
+        let reason = format!("shape {poses_shape:?}, expected [{count}, 12]");
+        return Err(wrong(path, "poses", reason));
     }
     let (rows, _) = poses.as_chunks::<12>();
     let kept = TRIMMED..stamps.len().saturating_sub(TRIMMED);
     let mut faults = Faults::default();
     let mut by_time = BTreeMap::new();
-    for (index, (stamp, row)) in stamps
-        .iter()
-        .zip(rows)
-        .enumerate()
-        .filter(|(index, _)| kept.contains(index))
-    {
+    let entries = stamps.iter().zip(rows).enumerate();
+    for (index, (stamp, row)) in entries.filter(|(index, _)| kept.contains(index)) {
         if !(0.0..=1e18).contains(stamp) {
-            faults.push(wrong(
-                path,
-                "valid_timestamps",
-                format!("entry {index}: {stamp} are no microseconds"),
-            ));
+            let reason = format!("entry {index}: {stamp} are no microseconds");
+            faults.push(wrong(path, "valid_timestamps", reason));
             continue;
         }
         let pose = pose(row, order)
             .map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")));
-        by_time.extend(
-            faults
-                .take(pose)
-                .map(|pose| (rounding::to_u64(stamp.floor()), pose)),
-        );
+        let pose = faults.take(pose);
+        by_time.extend(pose.map(|pose| (rounding::to_u64(stamp.floor()), pose)));
     }
     faults.report("row", problems);
     Ok(by_time)
@@ -115,12 +99,7 @@ fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::InvalidPose>
 }
 
 fn wrong(path: &Path, field: &str, reason: String) -> ReadError {
-    ReadError::Malformed {
-        path: path.to_owned(),
-        line: None,
-        field: Some(field.to_owned()),
-        reason,
-    }
+    ReadError::malformed_at(path, None, Some(field), reason)
 }
 
 /// Shape and values of a dataset of numbers. Microseconds since 1970 fit a double exactly.
@@ -141,11 +120,8 @@ fn values<T: hdf5_reader::H5Type>(
     dataset: &Dataset,
     convert: fn(T) -> f64,
 ) -> Result<Vec<f64>, hdf5_reader::error::Error> {
-    Ok(dataset
-        .read_array::<T>()?
-        .into_iter()
-        .map(convert)
-        .collect())
+    let values = dataset.read_array::<T>()?;
+    Ok(values.into_iter().map(convert).collect())
 }
 
 #[cfg(test)]

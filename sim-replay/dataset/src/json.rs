@@ -1,6 +1,7 @@
 //! JSON of one frame, and values with their position for error messages.
 
 use std::path::Path;
+use std::str::FromStr;
 
 use serde_json::Value;
 
@@ -13,12 +14,7 @@ const MAX_FRAME_BYTES: u64 = 16 << 20;
 pub(super) fn read(path: &Path) -> Result<Value, ReadError> {
     parse(&files::read_limited(path, MAX_FRAME_BYTES)?).map_err(|error| {
         let line = Some(error.line() as u64).filter(|&line| line > 0);
-        ReadError::Malformed {
-            path: path.to_owned(),
-            line,
-            field: None,
-            reason: format!("no sound JSON: {error}"),
-        }
+        ReadError::malformed_at(path, line, None, format!("no sound JSON: {error}"))
     })
 }
 
@@ -41,10 +37,7 @@ pub(super) fn with_quoted_words(bytes: &[u8]) -> Vec<u8> {
             // An escaped character cannot end a string.
             true if first == b'\\' => rest.len().min(2),
             true => 1,
-            false => rest
-                .iter()
-                .position(|byte| !is_word(byte))
-                .unwrap_or(rest.len()),
+            false => rest.iter().take_while(|byte| is_word(byte)).count(),
         };
         is_string ^= first == b'"';
         let (token, after) = rest.split_at_checked(end).unwrap_or((rest, &[]));
@@ -89,13 +82,8 @@ impl<'a> Field<'a> {
 
     /// An error about this field.
     pub(super) fn error(&self, reason: impl Into<String>) -> ReadError {
-        let field = (!self.name.is_empty()).then(|| self.name.clone());
-        ReadError::Malformed {
-            path: self.path.to_owned(),
-            line: None,
-            field,
-            reason: reason.into(),
-        }
+        let field = Some(self.name.as_str()).filter(|name| !name.is_empty());
+        ReadError::malformed_at(self.path, None, field, reason)
     }
 
     fn expected(&self, what: &str) -> ReadError {
@@ -103,14 +91,9 @@ impl<'a> Field<'a> {
     }
 
     fn child(&self, key: &str, value: &'a Value) -> Self {
-        let name = if self.name.is_empty() {
-            key.to_owned()
-        } else {
-            format!("{}.{key}", self.name)
-        };
         Self {
             path: self.path,
-            name,
+            name: child_name(&self.name, key),
             value,
         }
     }
@@ -121,10 +104,8 @@ impl<'a> Field<'a> {
             .value
             .as_array()
             .ok_or_else(|| self.expected("a list"))?;
-        Ok(items
-            .iter()
-            .enumerate()
-            .map(|(index, item)| self.child(&index.to_string(), item)))
+        let items = items.iter().enumerate();
+        Ok(items.map(|(index, item)| self.child(&index.to_string(), item)))
     }
 
     /// An entry that may be missing, null or an empty text.
@@ -133,9 +114,8 @@ impl<'a> Field<'a> {
             .value
             .as_object()
             .ok_or_else(|| self.expected("a map"))?;
-        let found = map
-            .get(key)
-            .filter(|value| !value.is_null() && value.as_str() != Some(""));
+        let is_given = |value: &&Value| !value.is_null() && value.as_str() != Some("");
+        let found = map.get(key).filter(is_given);
         Ok(found.map(|value| self.child(key, value)))
     }
 
@@ -147,14 +127,19 @@ impl<'a> Field<'a> {
 
     /// A finite number, as such or as text.
     pub(super) fn number(&self) -> Result<f64, ReadError> {
-        let number = match self.value {
-            Value::Number(number) => number.as_f64(),
+        let number = self.stated(serde_json::Number::as_f64);
+        number
+            .filter(|number| number.is_finite())
+            .ok_or_else(|| self.expected("a finite number"))
+    }
+
+    /// A number as such, or as a text.
+    fn stated<T: FromStr>(&self, number: impl Fn(&serde_json::Number) -> Option<T>) -> Option<T> {
+        match self.value {
+            Value::Number(found) => number(found),
             Value::String(text) => text.trim().parse().ok(),
             _ => None,
-        };
-        number
-            .filter(|number: &f64| number.is_finite())
-            .ok_or_else(|| self.expected("a finite number"))
+        }
     }
 
     /// A time from 0, as a number or as text, in whatever unit: [`super::time_stamps`] tells it.
@@ -168,11 +153,7 @@ impl<'a> Field<'a> {
 
     /// A whole number from 0, as such or as text.
     pub(super) fn count(&self) -> Result<u64, ReadError> {
-        let count = match self.value {
-            Value::Number(number) => number.as_u64(),
-            Value::String(text) => text.trim().parse().ok(),
-            _ => None,
-        };
+        let count = self.stated(serde_json::Number::as_u64);
         count.ok_or_else(|| self.expected("a whole number from 0"))
     }
 
@@ -200,15 +181,22 @@ impl<'a> Field<'a> {
 
     fn flatten(&self, most: usize, numbers: &mut Vec<f64>) -> Result<(), ReadError> {
         if self.value.is_array() {
-            return self
-                .items()?
-                .try_for_each(|item| item.flatten(most, numbers));
+            let mut items = self.items()?;
+            return items.try_for_each(|item| item.flatten(most, numbers));
         }
         if numbers.len() == most {
             return Err(self.error(format!("more than {most} numbers, expected {most}")));
         }
         numbers.push(self.number()?);
         Ok(())
+    }
+}
+
+/// Name of a field of a map or list: `vehicles.4335.extent`.
+pub(super) fn child_name(parent: &str, key: &str) -> String {
+    match parent {
+        "" => key.to_owned(),
+        parent => format!("{parent}.{key}"),
     }
 }
 

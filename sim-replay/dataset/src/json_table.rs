@@ -29,6 +29,16 @@ pub(super) struct Keys<'a> {
     pub(super) is_key_frame: Option<bool>,
 }
 
+/// The same as [`read`], with every row.
+pub(super) fn read_all(
+    path: &Path,
+    max_bytes: u64,
+    problems: &mut Vec<ReadError>,
+    row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
+) -> Result<usize, ReadError> {
+    read(path, max_bytes, problems, |_| true, row)
+}
+
 /// Reads a table: a file of at most `max_bytes` that holds one list. Its rows are passed on one at a time; the list is
 /// never in memory as a whole. An unusable row, or a truncated file, is a problem, and the other rows are used.
 ///
@@ -78,11 +88,9 @@ pub(super) fn read(
 }
 
 fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value, ReadError> {
-    json::parse(raw).map_err(|error| ReadError::Malformed {
-        path: path.to_owned(),
-        line: None,
-        field: Some(index.to_string()),
-        reason: format!("no sound JSON: {error}"),
+    json::parse(raw).map_err(|error| {
+        let reason = format!("no sound JSON: {error}");
+        ReadError::malformed_at(path, None, Some(&index.to_string()), reason)
     })
 }
 
@@ -93,11 +101,9 @@ fn for_each_row(
     max_bytes: u64,
     mut entry: impl FnMut(usize, &[u8]),
 ) -> Result<(), ReadError> {
-    let file = bounded_file::open(path).map_err(|error| ReadError::io(path, error))?;
-    let size = file
-        .metadata()
-        .map_err(|error| ReadError::io(path, error))?
-        .len();
+    let io = |error| ReadError::io(path, error);
+    let file = bounded_file::open(path).map_err(io)?;
+    let size = file.metadata().map_err(io)?.len();
     if size > max_bytes {
         let reason = format!("{size} bytes: larger than {max_bytes} bytes, the most that is read");
         return Err(ReadError::malformed(path, reason));
@@ -106,15 +112,13 @@ fn for_each_row(
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, file.take(max_bytes));
     let mut list = RowSplitter::default();
     loop {
-        let bytes = reader
-            .fill_buf()
-            .map_err(|error| ReadError::io(path, error))?;
+        let bytes = reader.fill_buf().map_err(io)?;
         if bytes.is_empty() {
             return list.finish().map_err(|reason| list.error(path, reason));
         }
         let count = bytes.len();
-        list.push(bytes, &mut entry)
-            .map_err(|reason| list.error(path, reason))?;
+        let pushed = list.push(bytes, &mut entry);
+        pushed.map_err(|reason| list.error(path, reason))?;
         reader.consume(count);
     }
 }
@@ -170,9 +174,9 @@ impl RowSplitter {
             _ => {}
         }
         if self.entry.len() == MAX_ROW_BYTES {
+            let count = self.count;
             return Err(format!(
-                "entry {} is larger than {MAX_ROW_BYTES} bytes",
-                self.count
+                "entry {count} is larger than {MAX_ROW_BYTES} bytes"
             ));
         }
         self.entry.push(byte);
@@ -195,23 +199,17 @@ impl RowSplitter {
     }
 
     fn finish(&self) -> Result<(), String> {
-        if self.is_over {
-            Ok(())
-        } else {
-            Err(format!(
+        match self.is_over {
+            true => Ok(()),
+            false => Err(format!(
                 "ends within the list, behind {} entries",
                 self.count
-            ))
+            )),
         }
     }
 
     fn error(&self, path: &Path, reason: String) -> ReadError {
-        ReadError::Malformed {
-            path: path.to_owned(),
-            line: Some(self.lines + 1),
-            field: None,
-            reason,
-        }
+        ReadError::malformed_at(path, Some(self.lines + 1), None, reason)
     }
 }
 

@@ -66,26 +66,19 @@ pub(super) fn open(
         .collect();
     problems.extend(named_once(&velodyne, &strays));
     let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
-    let tick = |(stem, capture_nanos): (&str, u64)| Tick {
-        stem: stem.to_owned(),
-        capture_nanos,
-    };
-    let ticks: Vec<Tick> = stems.into_iter().zip(times).map(tick).collect();
+    let ticks = stems.into_iter().zip(times);
+    let ticks: Vec<Tick> = ticks.map(|(stem, nanos)| Tick::new(stem, nanos)).collect();
     let files = ticks
         .iter()
         .map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
-    let source = Split {
+    let source = Arc::new(Split {
         dir: dir.to_owned(),
         has_labels: dir.join("label_2").is_dir(),
         sweeps,
-    };
-    Ok(single_vehicle(
-        files::name_below(root, dir),
-        Layout::KITTI_OBJECT,
-        ticks,
-        Arc::new(source),
-    ))
+    });
+    let name = files::name_below(root, dir);
+    Ok(single_vehicle(name, Layout::KITTI_OBJECT, ticks, source))
 }
 
 impl FrameSource for Split {

@@ -72,10 +72,7 @@ pub(super) fn open(
         Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
         None => options.period_nanos.saturating_mul(scan as u64),
     };
-    let tick = |(scan, stem): (usize, String)| Tick {
-        stem,
-        capture_nanos: capture_nanos(scan),
-    };
+    let tick = |(scan, stem): (usize, String)| Tick::new(stem, capture_nanos(scan));
     let mut joins = Vec::new();
     for (is_joined, what) in [(poses.is_some(), "poses"), (times.is_some(), "times")] {
         let line = format!(

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::Matrix4;
 use protocol::Pose;
+use protocol::text::excerpt;
 
 use super::faults::Faults;
 use super::{ReadError, files};
@@ -29,10 +30,8 @@ pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
 /// The lines of a text file whose values belong to lines, with their numbers from 1; blank ones at the end left out.
 pub(super) fn counted_lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
     let text = files::read_text(path, MAX_BYTES)?;
-    let numbered = (1..).zip(text.trim_end().lines());
-    Ok(numbered
-        .map(|(number, line)| (number, line.to_owned()))
-        .collect())
+    let lines = text.trim_end().lines().map(str::to_owned);
+    Ok((1..).zip(lines).collect())
 }
 
 /// One value per line; a line that cannot be read, or is blank, has none and is added to `faults`.
@@ -45,29 +44,20 @@ pub(super) fn rows<T>(
     read: impl Fn(u64, &str) -> Result<T, ReadError>,
 ) -> Result<Vec<Option<T>>, ReadError> {
     let lines = counted_lines(path)?;
-    if let Some((line, _)) = lines
-        .iter()
-        .find(|(_, text)| text.trim_start().starts_with('#'))
-    {
+    let is_comment = |(_, text): &&(u64, String)| text.trim_start().starts_with('#');
+    if let Some((line, _)) = lines.iter().find(is_comment) {
         let reason = "a comment, where the number of a line is that of a scan".to_owned();
         return Err(malformed(path, *line, None, reason));
     }
-    let values = lines
-        .iter()
-        .map(|(line, text)| match text.trim().is_empty() {
-            true => Err(malformed(path, *line, None, "the line is blank".to_owned())),
-            false => read(*line, text),
-        });
+    let values = lines.iter().map(|(line, text)| match text.trim() {
+        "" => Err(malformed(path, *line, None, "the line is blank".to_owned())),
+        _ => read(*line, text),
+    });
     Ok(values.map(|value| faults.take(value)).collect())
 }
 
 pub(super) fn malformed(path: &Path, line: u64, field: Option<&str>, reason: String) -> ReadError {
-    ReadError::Malformed {
-        path: path.to_owned(),
-        line: Some(line),
-        field: field.map(str::to_owned),
-        reason,
-    }
+    ReadError::malformed_at(path, Some(line), field, reason)
 }
 
 /// Exactly `N` finite numbers, separated by blanks.
@@ -82,13 +72,8 @@ pub(super) fn numbers<const N: usize>(
     for word in text.split_ascii_whitespace() {
         let number = word.parse().ok().filter(|number: &f64| number.is_finite());
         let Some(number) = number else {
-            let word: String = word.chars().take(40).collect();
-            return Err(malformed(
-                path,
-                line,
-                field,
-                format!("{word:?} is no finite number"),
-            ));
+            let reason = format!("{:?} is no finite number", excerpt(word, 40));
+            return Err(malformed(path, line, field, reason));
         };
         if let Some(place) = numbers.get_mut(found) {
             *place = number;
@@ -96,15 +81,10 @@ pub(super) fn numbers<const N: usize>(
         found += 1;
     }
     if found == N {
-        Ok(numbers)
-    } else {
-        Err(malformed(
-            path,
-            line,
-            field,
-            format!("{found} numbers, expected {N}"),
-        ))
+        return Ok(numbers);
     }
+    let reason = format!("{found} numbers, expected {N}");
+    Err(malformed(path, line, field, reason))
 }
 
 /// A rigid transform from a row-major 3x4 matrix.
@@ -144,12 +124,12 @@ impl Calibration {
 
     fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N]), ReadError> {
         let Some((_, line, values)) = self.entries.iter().find(|(found, ..)| found == name) else {
-            return Err(ReadError::Malformed {
-                path: self.path.clone(),
-                line: None,
-                field: Some(name.to_owned()),
-                reason: "missing".into(),
-            });
+            return Err(ReadError::malformed_at(
+                &self.path,
+                None,
+                Some(name),
+                "missing",
+            ));
         };
         Ok((*line, numbers(&self.path, *line, Some(name), values)?))
     }
@@ -163,12 +143,8 @@ impl Calibration {
     /// A 3x3 rotation.
     pub(super) fn rotation(&self, name: &str) -> Result<Pose, ReadError> {
         let (line, [a, b, c, d, e, f, g, h, i]) = self.numbers::<9>(name)?;
-        rigid(
-            &self.path,
-            line,
-            Some(name),
-            &[a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0],
-        )
+        let rows = [a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0];
+        rigid(&self.path, line, Some(name), &rows)
     }
 }
 

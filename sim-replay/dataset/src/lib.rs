@@ -124,6 +124,16 @@ pub struct Tick {
     pub capture_nanos: u64,
 }
 
+impl Tick {
+    fn new(stem: impl Into<String>, capture_nanos: u64) -> Self {
+        let stem = stem.into();
+        Self {
+            stem,
+            capture_nanos,
+        }
+    }
+}
+
 /// A frame that one agent lacks.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct MissingFrame {
@@ -131,6 +141,15 @@ pub struct MissingFrame {
     pub agent: CavId,
     /// Its stem.
     pub stem: String,
+}
+
+impl MissingFrame {
+    fn new(agent: &CavId, stem: &str) -> Self {
+        Self {
+            agent: agent.clone(),
+            stem: stem.to_owned(),
+        }
+    }
 }
 
 /// Vehicles (and roadside units) driving at the same time.
@@ -180,8 +199,19 @@ pub struct LoadOptions {
 impl Default for LoadOptions {
     fn default() -> Self {
         Self {
-            lidar_variant: None,
             points: true,
+            ..Self::without_points()
+        }
+    }
+}
+
+impl LoadOptions {
+    /// Poses, motion and objects only.
+    #[must_use]
+    pub const fn without_points() -> Self {
+        Self {
+            lidar_variant: None,
+            points: false,
             radar: false,
             cameras: false,
         }
@@ -246,6 +276,33 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
 }
 
 impl Scenario {
+    /// Vehicles and roadside units with a LiDAR each, present at every tick.
+    fn new(
+        name: String,
+        layout: Layout,
+        agents: Vec<CavId>,
+        ticks: Vec<Tick>,
+        source: Arc<dyn FrameSource>,
+    ) -> Self {
+        let units = agents.iter().filter(|id| id.as_str().starts_with('-'));
+        Self {
+            name,
+            roadside_units: units.cloned().collect(),
+            agents,
+            ticks,
+            missing: Vec::new(),
+            lidar_variants: Vec::new(),
+            has_radar: false,
+            cameras: Vec::new(),
+            layout,
+            source_handedness: Handedness::Right,
+            joins: Vec::new(),
+            contradicted: BTreeSet::new(),
+            absences: Absences::default(),
+            source,
+        }
+    }
+
     /// Reads the frame of an agent at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     ///
     /// # Errors
@@ -302,9 +359,8 @@ impl Scenario {
         variant: Option<&str>,
     ) -> Result<PcdCloud, ReadError> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
-        if let Some(asked) =
-            variant.filter(|asked| !self.lidar_variants.iter().any(|known| known == asked))
-        {
+        let is_unknown = |asked: &&str| !self.lidar_variants.iter().any(|known| known == asked);
+        if let Some(asked) = variant.filter(is_unknown) {
             return Err(ReadError::NoSuch {
                 scenario: self.name.clone(),
                 what: "LiDAR variant",
@@ -334,14 +390,10 @@ impl Scenario {
         agent_index: usize,
         tick_index: usize,
     ) -> Result<(&CavId, &Tick), ReadError> {
-        let agent = self
-            .agents
-            .get(agent_index)
-            .ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
-        let tick = self
-            .ticks
-            .get(tick_index)
-            .ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        let agent = self.agents.get(agent_index);
+        let agent = agent.ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
+        let tick = self.ticks.get(tick_index);
+        let tick = tick.ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
         if !self.is_present(agent_index, tick_index) {
             return Err(ReadError::Absent {
                 scenario: self.name.clone(),
@@ -353,12 +405,11 @@ impl Scenario {
     }
 
     fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
-        let available = format!("there are {count}, counted from 0");
         ReadError::NoSuch {
             scenario: self.name.clone(),
             what,
             asked: index.to_string(),
-            available,
+            available: format!("there are {count}, counted from 0"),
         }
     }
 }
@@ -375,20 +426,5 @@ fn single_vehicle(
     ticks: Vec<Tick>,
     source: Arc<dyn FrameSource>,
 ) -> Scenario {
-    Scenario {
-        name,
-        agents: vec![single_vehicle_id()],
-        ticks,
-        missing: Vec::new(),
-        roadside_units: Vec::new(),
-        lidar_variants: Vec::new(),
-        has_radar: false,
-        cameras: Vec::new(),
-        layout,
-        source_handedness: Handedness::Right,
-        joins: Vec::new(),
-        contradicted: BTreeSet::new(),
-        absences: Absences::default(),
-        source,
-    }
+    Scenario::new(name, layout, vec![single_vehicle_id()], ticks, source)
 }

@@ -148,10 +148,7 @@ pub(super) fn open(
             ));
         }
     }
-    let tick = |(micros, stem): (u64, String)| Tick {
-        stem,
-        capture_nanos: micros.saturating_mul(1000),
-    };
+    let tick = |(micros, stem): (u64, String)| Tick::new(stem, micros.saturating_mul(1000));
     let ticks: Vec<Tick> = stamps.into_iter().map(tick).collect();
     let layout = if storage == Storage::Oxford {
         Layout::OXFORD

@@ -43,11 +43,8 @@ impl GroundTruth {
     /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and
     /// reported.
     pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
-        Ok(Self::parse(
-            path,
-            &files::read_text(path, MAX_BYTES)?,
-            problems,
-        ))
+        let text = files::read_text(path, MAX_BYTES)?;
+        Ok(Self::parse(path, &text, problems))
     }
 
     fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Self {
@@ -57,11 +54,8 @@ impl GroundTruth {
             let row = faults.take(row(path, number, &record)).flatten();
             rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
         }
-        let timed = rows
-            .iter()
-            .map(|(_, micros, pose)| (*micros, *pose))
-            .collect();
-        let (poses, out_of_order) = Trajectory::new(timed, MAX_GAP_MICROS);
+        let timed = rows.iter().map(|(_, micros, pose)| (*micros, *pose));
+        let (poses, out_of_order) = Trajectory::new(timed.collect(), MAX_GAP_MICROS);
         for index in out_of_order {
             if let Some((number, micros, _)) = rows.get(index) {
                 let reason = format!("{micros} is not between the times around it");
@@ -86,53 +80,32 @@ fn row(
 ) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
     if record.len() != COLUMNS.len() {
         let reason = format!("{} columns, expected {}", record.len(), COLUMNS.len());
-        return Err(ReadError::Malformed {
-            path: path.to_owned(),
-            line: Some(line),
-            field: None,
-            reason,
-        });
+        return Err(ReadError::malformed_at(path, Some(line), None, reason));
     }
     let mut numbers = [0.0; COLUMNS.len()];
     for (column, (number, word)) in numbers.iter_mut().zip(record).enumerate() {
         *number = word.parse::<f64>().map_err(|_| {
-            wrong(
-                path,
-                line,
-                column,
-                format!("{:?} is no number", excerpt(word, 40)),
-            )
+            let reason = format!("{:?} is no number", excerpt(word, 40));
+            wrong(path, line, column, reason)
         })?;
     }
     let [micros, x, y, z, roll, pitch, heading] = numbers;
     // Times may be written like any other number: 1.326652795e15.
     if !(0.0..=1e18).contains(&micros) {
-        return Err(wrong(
-            path,
-            line,
-            0,
-            format!("{micros} are no microseconds"),
-        ));
+        let reason = format!("{micros} are no microseconds");
+        return Err(wrong(path, line, 0, reason));
     }
     if numbers.iter().any(|number| !number.is_finite()) {
         return Ok(None);
     }
     // nalgebra's Euler angles are Rz(yaw) Ry(pitch) Rx(roll) too.
     let rotation = UnitQuaternion::from_euler_angles(roll, pitch, heading);
-    Ok(Some((
-        rounding::to_u64(micros.floor()),
-        Isometry3::from_parts(Translation3::new(x, y, z), rotation),
-    )))
+    let pose = Isometry3::from_parts(Translation3::new(x, y, z), rotation);
+    Ok(Some((rounding::to_u64(micros.floor()), pose)))
 }
 
 fn wrong(path: &Path, line: u64, column: usize, reason: String) -> ReadError {
-    let field = COLUMNS.get(column).map(|name| (*name).to_owned());
-    ReadError::Malformed {
-        path: path.to_owned(),
-        line: Some(line),
-        field,
-        reason,
-    }
+    ReadError::malformed_at(path, Some(line), COLUMNS.get(column).copied(), reason)
 }
 
 #[cfg(test)]

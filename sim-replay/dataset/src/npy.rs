@@ -3,7 +3,7 @@
 //! Columns are x, y, z and intensity; others are skipped. An organised array of rows x columns x numbers is flattened;
 //! 3 x N and 4 x N are read component by component. Points stay in the frame of the file.
 
-use protocol::{INTENSITY_FIELDS, IntensityKind};
+use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
 use crate::scalar::{Scalar, ScalarKind};
@@ -35,13 +35,12 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         Some(fields) => named(fields, &shape)?,
         None => numbered(number_of(descr)?, &shape, is_fortran(header))?,
     };
-    let stated = shape
-        .iter()
-        .try_fold(size_of_one(descr)?, |product, &size| {
-            product.checked_mul(size)
-        });
-    if stated.is_none_or(|stated| body.len() < stated) {
-        let found = body.len();
+    let size_of_one = match descr.strip_prefix('[') {
+        Some(fields) => size_of(&fields_of(fields)?),
+        None => number_of(descr)?.size,
+    };
+    let (stated, found) = (product(size_of_one, &shape), body.len());
+    if stated.is_none_or(|stated| found < stated) {
         return Err(format!(
             "shape {shape:?} stated, {found} bytes found: the file is cut off"
         ));
@@ -56,18 +55,10 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let points = (0..columns.points).map(point).collect();
     let [.., intensity] = columns.places;
     let intensity = intensity.map(|(_, scalar)| {
-        let kind = if scalar.is_byte() {
-            IntensityKind::Byte
-        } else {
-            IntensityKind::Number
-        };
-        IntensityOrigin::stored(columns.intensity.as_deref().unwrap_or("4th column"), kind)
+        let name = columns.intensity.as_deref().unwrap_or("4th column");
+        IntensityOrigin::stored(name, scalar.intensity_kind())
     });
-    Ok(PcdCloud {
-        intensity,
-        form: "NumPy array",
-        ..PcdCloud::of_finite(points, Vec::new())
-    })
+    Ok(PcdCloud::of_points(points, intensity, "NumPy array"))
 }
 
 /// Text of the header and the bytes behind it.
@@ -115,11 +106,9 @@ fn shape_of(header: &str) -> Result<Vec<usize>, String> {
         .split(',')
         .map(str::trim)
         .filter(|size| !size.is_empty());
+    let no_size = |size| format!("shape ({text}): {size:?} is no size");
     sizes
-        .map(|size| {
-            size.parse()
-                .map_err(|_| format!("shape ({text}): {size:?} is no size"))
-        })
+        .map(|size| size.parse().map_err(|_| no_size(size)))
         .collect()
 }
 
@@ -166,24 +155,24 @@ fn fields_of(text: &str) -> Result<Vec<(String, Scalar)>, String> {
             [_, name, _, code, end] if end.trim().starts_with(')') => {
                 Ok((name.to_owned(), scalar_of(code)?))
             }
-            _ => Err(format!(
-                "field ({}, expected a name and a type",
-                tuple.trim_end()
-            )),
+            _ => {
+                let tuple = tuple.trim_end();
+                Err(format!("field ({tuple}, expected a name and a type"))
+            }
         }
     });
     tuples.collect()
 }
 
 /// Bytes of one element of the array.
-fn size_of_one(descr: &str) -> Result<usize, String> {
-    match descr.strip_prefix('[') {
-        Some(fields) => Ok(fields_of(fields)?
-            .iter()
-            .map(|(_, scalar)| scalar.size)
-            .sum()),
-        None => Ok(number_of(descr)?.size),
-    }
+fn size_of(fields: &[(String, Scalar)]) -> usize {
+    fields.iter().map(|(_, scalar)| scalar.size).sum()
+}
+
+fn product(one: usize, sizes: &[usize]) -> Option<usize> {
+    sizes
+        .iter()
+        .try_fold(one, |product, &size| product.checked_mul(size))
 }
 
 fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
@@ -191,18 +180,11 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
     let is_number = |(_, scalar): &(String, Scalar)| scalar.kind != ScalarKind::Padding;
     let find = |names: &[&str]| {
         let index = names.iter().find_map(|name| {
-            fields
-                .iter()
-                .position(|field| is_number(field) && field.0.eq_ignore_ascii_case(name))
+            let is_it = |field| is_number(field) && field.0.eq_ignore_ascii_case(name);
+            fields.iter().position(is_it)
         })?;
-        let first = fields
-            .iter()
-            .take(index)
-            .map(|(_, scalar)| scalar.size)
-            .sum();
-        fields
-            .get(index)
-            .map(|(name, scalar)| (name.clone(), (first, *scalar)))
+        let (name, scalar) = fields.get(index)?;
+        Some((name.clone(), (size_of(fields.get(..index)?), *scalar)))
     };
     let coordinate = |name: &str| {
         let names: Vec<&str> = fields.iter().map(|(name, _)| name.as_str()).collect();
@@ -218,11 +200,8 @@ fn named(fields: &str, shape: &[usize]) -> Result<Columns, String> {
             Some(coordinate("z")?),
             intensity.as_ref().map(|f| f.1),
         ],
-        step: fields.iter().map(|(_, scalar)| scalar.size).sum(),
-        points: shape
-            .iter()
-            .try_fold(1_usize, |product, &size| product.checked_mul(size))
-            .unwrap_or(usize::MAX),
+        step: size_of(&fields),
+        points: product(1, shape).unwrap_or(usize::MAX),
         intensity: intensity.map(|(name, _)| name),
     })
 }
@@ -233,14 +212,9 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
     let is_by_component = matches!(before, [3 | 4]) && !COLUMNS.contains(&last);
     let (count, columns, is_planar) = match before {
         [components] if is_by_component => (last, *components, !is_fortran),
-        [_, ..] if COLUMNS.contains(&last) => (
-            before
-                .iter()
-                .try_fold(1_usize, |product, &size| product.checked_mul(size))
-                .ok_or_else(fault)?,
-            last,
-            is_fortran,
-        ),
+        [_, ..] if COLUMNS.contains(&last) => {
+            (product(1, before).ok_or_else(fault)?, last, is_fortran)
+        }
         _ => return Err(fault()),
     };
     let (column_step, point_step) = if is_planar { (count, 1) } else { (1, columns) };
@@ -258,6 +232,8 @@ fn numbered(scalar: Scalar, shape: &[usize], is_fortran: bool) -> Result<Columns
 
 #[cfg(test)]
 mod tests {
+    use protocol::IntensityKind;
+
     use super::*;
 
     fn file(header: &str, body: &[u8]) -> Vec<u8> {

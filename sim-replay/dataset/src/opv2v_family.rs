@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::{CavId, Handedness};
+use protocol::Handedness;
 
 use super::agent_folders::{self, ScenarioFolder};
 use super::layouts::{LayoutRow, Reader};
@@ -61,13 +61,11 @@ fn open(root: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError
     for dir in &folders {
         match ScenarioFolder::scan(dir, &mut problems) {
             Ok(folder) if folder.agents.is_empty() => {
-                problems.push(ReadError::malformed(
-                    dir,
-                    "no agent with a frame: the scenario is left out",
-                ));
+                let reason = "no agent with a frame: the scenario is left out";
+                problems.push(ReadError::malformed(dir, reason));
             }
             Ok(folder) => {
-                scenarios.push(agent_folder_scenario(root, folder, options, &mut problems))
+                scenarios.push(agent_folder_scenario(root, folder, options, &mut problems));
             }
             Err(error) => problems.push(error),
         }
@@ -86,73 +84,55 @@ fn agent_folder_scenario(
     }
     let layout = family_layout(&folder);
     let sweeps = folder.sweeps(options);
-    let source_handedness = if layout == Layout::OPV2V {
-        Handedness::Left
-    } else {
-        Handedness::Right
+    let handedness = match layout == Layout::OPV2V {
+        true => Handedness::Left,
+        false => Handedness::Right,
     };
     let moments = folder.ticks(options.period_nanos, problems);
+    let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
     let ego_lacks = |tick: &Tick| {
-        folder
-            .missing
+        let of_ego = missing
             .iter()
-            .any(|frame| Some(&frame.agent) == folder.agents.first() && frame.stem == tick.stem)
+            .filter(|frame| Some(&frame.agent) == agents.first());
+        of_ego.into_iter().any(|frame| frame.stem == tick.stem)
     };
-    let ticks: Vec<Tick> = moments
-        .iter()
-        .filter(|tick| !ego_lacks(tick))
-        .cloned()
-        .collect();
-    let is_unit = |id: &&CavId| id.as_str().starts_with('-');
-    Scenario {
-        name: files::name_below(root, &folder.dir),
-        agents: folder.agents.clone(),
-        absences: Absences::new(&folder.agents, &ticks, &folder.missing).among(moments),
-        ticks,
-        missing: folder.missing.clone(),
-        roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
-        lidar_variants: folder.variants.clone(),
-        has_radar: folder.has_radar,
-        cameras: if layout == Layout::V2V4REAL {
-            Vec::new()
-        } else {
-            all_cameras(&folder)
-        },
-        layout,
-        source_handedness,
-        joins: Vec::new(),
-        contradicted: BTreeSet::new(),
-        source: if layout == Layout::V2V4REAL {
-            Arc::new(V2v4Real { folder, sweeps }) as Arc<dyn FrameSource>
-        } else {
-            Arc::new(Opv2v {
+    let ticks = moments.iter().filter(|tick| !ego_lacks(tick));
+    let ticks: Vec<Tick> = ticks.cloned().collect();
+    let absences = Absences::new(&agents, &ticks, &missing).among(moments);
+    let name = files::name_below(root, &folder.dir);
+    let (lidar_variants, has_radar) = (folder.variants.clone(), folder.has_radar);
+    let (cameras, source): (_, Arc<dyn FrameSource>) = match layout == Layout::V2V4REAL {
+        true => (BTreeSet::new(), Arc::new(V2v4Real { folder, sweeps })),
+        false => {
+            let cameras = folder.cameras.values().flatten().copied().collect();
+            let source = Opv2v {
                 folder,
                 sweeps,
-                handedness: source_handedness,
-            })
-        },
+                handedness,
+            };
+            (cameras, Arc::new(source))
+        }
+    };
+    Scenario {
+        absences,
+        missing,
+        lidar_variants,
+        has_radar,
+        cameras: cameras.into_iter().collect(),
+        source_handedness: handedness,
+        ..Scenario::new(name, layout, agents, ticks, source)
     }
-}
-
-/// Numbers of the cameras of any agent.
-fn all_cameras(folder: &ScenarioFolder) -> Vec<u8> {
-    let all: BTreeSet<u8> = folder.cameras.values().flatten().copied().collect();
-    all.into_iter().collect()
 }
 
 /// The layout by the shape of the first pose that can be read, and then by the kind of sweeps. Frames with another
 /// shape are reported when they are loaded.
 fn family_layout(folder: &ScenarioFolder) -> Layout {
     let frames = folder.stems.iter().flat_map(|stem| {
-        folder
-            .agents
-            .iter()
-            .map(move |agent| folder.yaml(agent, stem))
+        let agents = folder.agents.iter();
+        agents.map(move |agent| folder.yaml(agent, stem))
     });
-    match frames
-        .take(FRAMES_TO_TRY)
-        .find_map(|path| lidar_pose(&path).ok())
-    {
+    let mut tried = frames.take(FRAMES_TO_TRY);
+    match tried.find_map(|path| lidar_pose(&path).ok()) {
         Some(WrittenPose::Matrix(_)) => Layout::V2V4REAL,
         _ if folder.has_bare_floats() => Layout::V2XREAL,
         _ => Layout::OPV2V,

@@ -3,7 +3,7 @@
 //! The element `vertex` holds the points: properties `x`, `y`, `z`, and an intensity by any of its usual names. Other
 //! properties and elements are skipped. Points stay in the frame of the file.
 
-use protocol::{INTENSITY_FIELDS, IntensityKind};
+use protocol::INTENSITY_FIELDS;
 
 use crate::pcd::{IntensityOrigin, PcdCloud};
 use crate::scalar::{Scalar, ScalarKind};
@@ -56,10 +56,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
     let (before, vertex) = place
         .and_then(|place| Some((elements.get(..place)?, elements.get(place)?)))
         .ok_or_else(|| {
-            let names: Vec<&str> = elements
-                .iter()
-                .map(|element| element.name.as_str())
-                .collect();
+            let names = elements.iter().map(|element| element.name.as_str());
+            let names: Vec<&str> = names.collect();
             format!("no element vertex, there are {names:?}")
         })?;
     if let Some(list) = &vertex.list {
@@ -68,9 +66,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         ));
     }
     let coordinate = |name: &str| {
-        vertex
-            .find(&[name])
-            .ok_or_else(|| format!("element vertex has no property {name}"))
+        let found = vertex.find(&[name]);
+        found.ok_or_else(|| format!("element vertex has no property {name}"))
     };
     let columns = [
         Some(coordinate("x")?),
@@ -78,33 +75,15 @@ pub(super) fn decode(bytes: &[u8]) -> Result<PcdCloud, String> {
         Some(coordinate("z")?),
         vertex.find(&INTENSITY_FIELDS),
     ];
-    let points = match storage {
-        Storage::Ascii => ascii(vertex, before, body, &columns)?,
-        Storage::LittleEndian | Storage::BigEndian => binary(vertex, before, body, &columns)?,
+    let (points, form) = match storage {
+        Storage::Ascii => (ascii(vertex, before, body, &columns)?, "PLY, ascii"),
+        _ => (binary(vertex, before, body, &columns)?, "PLY, binary"),
     };
     let [.., intensity] = columns;
     let intensity = intensity
         .and_then(|index| vertex.properties.get(index))
-        .map(|(name, scalar)| {
-            IntensityOrigin::stored(
-                name,
-                if scalar.is_byte() {
-                    IntensityKind::Byte
-                } else {
-                    IntensityKind::Number
-                },
-            )
-        });
-    let form = if storage == Storage::Ascii {
-        "PLY, ascii"
-    } else {
-        "PLY, binary"
-    };
-    Ok(PcdCloud {
-        intensity,
-        form,
-        ..PcdCloud::of_finite(points, Vec::new())
-    })
+        .map(|(name, scalar)| IntensityOrigin::stored(name, scalar.intensity_kind()));
+    Ok(PcdCloud::of_points(points, intensity, form))
 }
 
 /// Storage, elements, and the bytes behind the header.
@@ -128,12 +107,12 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
     for (number, line) in (1..).zip(text.lines()) {
         let words: Vec<&str> = line.split_ascii_whitespace().collect();
         let fault = |reason: String| format!("line {number}: {reason}");
+        let too_early = || fault("a property before the first element".to_owned());
         match *words {
             ["format", name, _] => storage = Some((name.to_owned(), number)),
             ["element", name, count] => {
-                let count = count
-                    .parse()
-                    .map_err(|_| fault(format!("{count:?} is no number of elements")))?;
+                let no_count = |_| fault(format!("{count:?} is no number of elements"));
+                let count = count.parse().map_err(no_count)?;
                 elements.push(Element {
                     name: name.to_owned(),
                     count,
@@ -141,16 +120,14 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
                     list: None,
                 });
             }
-            ["property", "list", _, _, name] => match elements.last_mut() {
-                Some(element) => drop(element.list.get_or_insert_with(|| name.to_owned())),
-                None => return Err(fault("a property before the first element".to_owned())),
-            },
+            ["property", "list", _, _, name] => {
+                let element = elements.last_mut().ok_or_else(too_early)?;
+                element.list.get_or_insert_with(|| name.to_owned());
+            }
             ["property", kind, name] => {
-                let scalar = scalar_of(kind)
-                    .ok_or_else(|| fault(format!("{kind:?} is no type of a number")))?;
-                let element = elements
-                    .last_mut()
-                    .ok_or_else(|| fault("a property before the first element".into()))?;
+                let no_type = || fault(format!("{kind:?} is no type of a number"));
+                let scalar = scalar_of(kind).ok_or_else(no_type)?;
+                let element = elements.last_mut().ok_or_else(too_early)?;
                 if element.properties.len() >= MAX_PROPERTIES {
                     return Err(fault(format!("more than {MAX_PROPERTIES} properties")));
                 }
@@ -170,10 +147,12 @@ fn header(bytes: &[u8]) -> Result<(Storage, Vec<Element>, &[u8]), String> {
         }
         None => return Err("no line format".to_owned()),
     };
-    let properties = elements
+    for (_, scalar) in elements
         .iter_mut()
-        .flat_map(|element| &mut element.properties);
-    properties.for_each(|(_, scalar)| scalar.is_big_endian = storage == Storage::BigEndian);
+        .flat_map(|element| &mut element.properties)
+    {
+        scalar.is_big_endian = storage == Storage::BigEndian;
+    }
     Ok((storage, elements, body))
 }
 
@@ -203,9 +182,8 @@ fn ascii(
     body: &[u8],
     columns: &[Option<usize>; 4],
 ) -> Result<Vec<[f32; 4]>, String> {
-    let skipped = before
-        .iter()
-        .fold(0_usize, |sum, element| sum.saturating_add(element.count));
+    let counts = before.iter().map(|element| element.count);
+    let skipped = counts.fold(0, usize::saturating_add);
     let text = String::from_utf8_lossy(body);
     let lines = text
         .lines()
@@ -218,16 +196,11 @@ fn ascii(
         for (value, column) in point.iter_mut().zip(columns) {
             let Some(column) = column else { continue };
             let word = words.get(*column).ok_or_else(|| {
-                format!(
-                    "vertex {index}: {} numbers, expected {}",
-                    words.len(),
-                    vertex.properties.len()
-                )
+                let (found, expected) = (words.len(), vertex.properties.len());
+                format!("vertex {index}: {found} numbers, expected {expected}")
             })?;
-            *value = word
-                .parse::<f64>()
-                .map_err(|_| format!("vertex {index}: {word:?} is no number"))?
-                as f32;
+            let number = word.parse::<f64>();
+            *value = number.map_err(|_| format!("vertex {index}: {word:?} is no number"))? as f32;
         }
         points.push(point);
     }
@@ -259,23 +232,16 @@ fn binary(
     }
     let stride = vertex.stride();
     let body = body.get(skipped..).unwrap_or_default();
-    let Some(body) = vertex
-        .count
-        .checked_mul(stride)
-        .and_then(|length| body.get(..length))
-    else {
+    let length = vertex.count.checked_mul(stride);
+    let Some(body) = length.and_then(|length| body.get(..length)) else {
         let (count, found) = (vertex.count, body.len());
         return Err(format!(
             "{count} vertices of {stride} bytes stated, {found} bytes found: the file is cut off"
         ));
     };
     let column = |index: usize| {
-        let first: usize = vertex
-            .properties
-            .iter()
-            .take(index)
-            .map(|(_, scalar)| scalar.size)
-            .sum();
+        let before = vertex.properties.iter().take(index);
+        let first: usize = before.map(|(_, scalar)| scalar.size).sum();
         vertex
             .properties
             .get(index)

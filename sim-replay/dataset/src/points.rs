@@ -75,13 +75,11 @@ impl Sweeps {
         files: impl IntoIterator<Item = PathBuf>,
     ) -> Self {
         let files = files.into_iter().take(Self::MOST_TRIED).collect();
-        self.agents.insert(
-            agent,
-            AgentSweeps {
-                files,
-                ..AgentSweeps::default()
-            },
-        );
+        let sweeps = AgentSweeps {
+            files,
+            ..AgentSweeps::default()
+        };
+        self.agents.insert(agent, sweeps);
         self
     }
 
@@ -96,9 +94,8 @@ impl Sweeps {
 
     /// Files of an agent that may determine how its others are read.
     pub(super) fn samples(&self, agent: &CavId) -> Vec<PathBuf> {
-        self.agents
-            .get(agent)
-            .map_or_else(Vec::new, |agent| agent.files.clone())
+        let agent = self.agents.get(agent);
+        agent.map_or_else(Vec::new, |agent| agent.files.clone())
     }
 
     /// Reads a sweep of an agent: plain or a variant, in the frame and handedness of the file, intensities 0 to 1.
@@ -124,10 +121,8 @@ impl AgentSweeps {
     /// Divisor of intensities whose type does not determine their scale.
     fn divisor(&self, storage: SweepStorage) -> f32 {
         *self.divisor.get_or_init(|| {
-            let clouds = self
-                .files
-                .iter()
-                .filter_map(|path| self.read_stored(storage, path).ok());
+            let files = self.files.iter();
+            let clouds = files.filter_map(|path| self.read_stored(storage, path).ok());
             let first = self.files.first().map(PathBuf::as_path);
             divisor_of_first(clouds, first.unwrap_or(Path::new("")))
         })
@@ -139,12 +134,8 @@ impl AgentSweeps {
             let is_floats = |path: &&PathBuf| matches!(FileKind::of(path), Ok(FileKind::Floats));
             let files = self.files.iter().filter(is_floats);
             let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
-            FloatForm::of(
-                &samples
-                    .filter(|bytes| !bytes.is_empty())
-                    .take(SAMPLES)
-                    .collect::<Vec<_>>(),
-            )
+            let samples = samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES);
+            FloatForm::of(&samples.collect::<Vec<_>>())
         });
         form.clone()
             .map_err(|reason| ReadError::malformed(path, reason))
@@ -173,10 +164,8 @@ pub(super) fn divisor_of_first(clouds: impl Iterator<Item = PcdCloud>, path: &Pa
     let clouds = clouds
         .filter(|cloud| !cloud.points.is_empty())
         .take(SAMPLES);
-    let largest = clouds
-        .flat_map(|cloud| cloud.points.xyzi)
-        .map(|point| point[3])
-        .fold(0.0, f32::max);
+    let points = clouds.flat_map(|cloud| cloud.points.xyzi);
+    let largest = points.map(|point| point[3]).fold(0.0, f32::max);
     let divisor = intensity_divisor(largest);
     if let Some(finding) = IntensityScale::AUTO.unusual(divisor, largest) {
         tracing::warn!("{} and those after it: {finding}", path.display());
@@ -235,11 +224,8 @@ fn read_with(
     decode: fn(&[u8]) -> Result<PcdCloud, pcd::PcdError>,
 ) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
-    decode(&bytes).map_err(|error| ReadError::Malformed {
-        path: path.to_owned(),
-        line: error.line,
-        field: error.field,
-        reason: error.reason,
+    decode(&bytes).map_err(|error| {
+        ReadError::malformed_at(path, error.line, error.field.as_deref(), error.reason)
     })
 }
 
@@ -251,15 +237,9 @@ fn planar(bytes: &[u8]) -> Result<PcdCloud, String> {
     let points = x.iter().zip(y).zip(z.iter().zip(i));
     let points =
         points.map(|((x, y), (z, i))| [x, y, z, i].map(|number| f32::from_le_bytes(*number)));
-    let intensity = Some(IntensityOrigin::stored(
-        "4th block of floats",
-        IntensityKind::Number,
-    ));
-    Ok(PcdCloud {
-        intensity,
-        form: "floats by component: x, y, z, intensity",
-        ..PcdCloud::of_finite(points.collect(), Vec::new())
-    })
+    let origin = IntensityOrigin::stored("4th block of floats", IntensityKind::Number);
+    let form = "floats by component: x, y, z, intensity";
+    Ok(PcdCloud::of_points(points.collect(), Some(origin), form))
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "rounded to f32")]
@@ -268,23 +248,15 @@ fn nclt_raw(bytes: &[u8]) -> Result<PcdCloud, String> {
     const OFFSET_M: f64 = -100.0;
     check_whole_points(bytes.len(), 8)?;
     let (points, _) = bytes.as_chunks::<8>();
-    let points = points
-        .iter()
-        .map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
-            let metres = |bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32;
-            [
-                metres([x0, x1]),
-                metres([y0, y1]),
-                metres([z0, z1]),
-                f32::from(intensity),
-            ]
-        });
-    let intensity = Some(IntensityOrigin::stored("7th byte", IntensityKind::Byte));
-    Ok(PcdCloud {
-        intensity,
-        form: "8 bytes per point, as NCLT records them",
-        ..PcdCloud::of_finite(points.collect(), Vec::new())
-    })
+    let metres = |bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32;
+    let point = |&[x0, x1, y0, y1, z0, z1, intensity, _laser]: &[u8; 8]| {
+        let [x, y, z] = [[x0, x1], [y0, y1], [z0, z1]].map(metres);
+        [x, y, z, f32::from(intensity)]
+    };
+    let origin = IntensityOrigin::stored("7th byte", IntensityKind::Byte);
+    let form = "8 bytes per point, as NCLT records them";
+    let points = points.iter().map(point).collect();
+    Ok(PcdCloud::of_points(points, Some(origin), form))
 }
 
 /// Negates y: left-handed points become right-handed ones.

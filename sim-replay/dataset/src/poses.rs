@@ -9,10 +9,7 @@ impl Scenario {
     /// True if the recording gives the pose of an agent's LiDAR, according to the first readable frame from `tick` on.
     #[must_use]
     pub fn has_poses(&self, agent: usize, tick: usize) -> bool {
-        let blind = LoadOptions {
-            points: false,
-            ..LoadOptions::default()
-        };
+        let blind = LoadOptions::without_points();
         let ticks = (tick..self.ticks.len()).take(FRAMES_TO_TRY);
         let mut frames = ticks.filter_map(|tick| self.load(agent, tick, &blind).ok());
         // If nothing can be read, that is reported instead.

@@ -67,28 +67,13 @@ fn open(file: &Path, recording: Recording) -> Result<Dataset, ReadError> {
     let source = Recorded::new(recording, &mut problems)?;
     let agents = source.agents.clone();
     let (ticks, missing) = source.ticks();
+    let mut streams = source.sensors.keys().map(|(_, _, stream)| *stream);
     let scenario = Scenario {
-        name,
         absences: Absences::new(&agents, &ticks, &missing),
-        roadside_units: agents
-            .iter()
-            .filter(|id| id.as_str().starts_with('-'))
-            .cloned()
-            .collect(),
         cameras: source.cameras(),
-        has_radar: source
-            .sensors
-            .keys()
-            .any(|(_, _, stream)| *stream == Stream::Radar),
-        agents,
-        ticks,
+        has_radar: streams.any(|stream| stream == Stream::Radar),
         missing,
-        lidar_variants: Vec::new(),
-        layout: Layout::RECORDING,
-        source_handedness: Handedness::Right,
-        joins: Vec::new(),
-        contradicted: BTreeSet::new(),
-        source: Arc::new(source),
+        ..Scenario::new(name, Layout::RECORDING, agents, ticks, Arc::new(source))
     };
     Ok(Dataset {
         layout: Layout::RECORDING,
@@ -159,11 +144,9 @@ impl Recorded {
         };
         recorded.agents = recorded.in_order();
         if recorded.agents.is_empty() {
-            let reason = match recorded.recording.entries().is_empty() {
-                true => {
-                    "none of its messages can be read: it is of another version of this program"
-                }
-                false => "no sweep of any vehicle in it: recorded --without lidar?",
+            let reason = match recorded.recording.entries() {
+                [] => "none of its messages can be read: it is of another version of this program",
+                _ => "no sweep of any vehicle in it: recorded --without lidar?",
             };
             return Err(ReadError::malformed(recorded.recording.path(), reason));
         }
@@ -173,14 +156,11 @@ impl Recorded {
     /// All agents with sweeps, in the order of the scene, which is that of the ground truth: the ego comes first.
     fn in_order(&self) -> Vec<CavId> {
         let has_sweeps = |cav: &CavId| {
-            self.sensors
-                .keys()
-                .any(|(_, known, stream)| known == cav && *stream == Stream::Lidar)
+            let mut keys = self.sensors.keys();
+            keys.any(|(_, known, stream)| known == cav && *stream == Stream::Lidar)
         };
-        let listed = self
-            .truth
-            .values()
-            .flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
+        let truths = self.truth.values();
+        let listed = truths.flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
         let unlisted = self.sensors.keys().map(|(_, cav, _)| cav);
         let mut agents: Vec<CavId> = Vec::new();
         for cav in listed.chain(unlisted) {
@@ -193,32 +173,18 @@ impl Recorded {
 
     /// The ticks at which the ego's sweep was recorded, and the missing sweeps at any capture time.
     fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
-        let mut captures: Vec<u64> = self
-            .sensors
-            .keys()
-            .filter(|(_, _, stream)| *stream == Stream::Lidar)
-            .map(|(at, _, _)| *at)
-            .collect();
+        let keys = self.sensors.keys();
+        let sweeps = keys.filter(|(_, _, stream)| *stream == Stream::Lidar);
+        let mut captures: Vec<u64> = sweeps.map(|(at, _, _)| *at).collect();
         captures.dedup();
         let (mut ticks, mut missing) = (Vec::new(), Vec::new());
         for capture_nanos in captures {
             let stem = capture_nanos.to_string();
-            let lacks = |cav: &&CavId| {
-                !self
-                    .sensors
-                    .contains_key(&(capture_nanos, (*cav).clone(), Stream::Lidar))
-            };
+            let lacks = |cav: &&CavId| !self.has(cav, capture_nanos, Stream::Lidar);
             let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
-            let frame = |cav: &&CavId| MissingFrame {
-                agent: (*cav).clone(),
-                stem: stem.clone(),
-            };
-            missing.extend(lacking.iter().map(frame));
+            missing.extend(lacking.iter().map(|cav| MissingFrame::new(cav, &stem)));
             if lacking.first() != self.agents.first().as_ref() {
-                ticks.push(Tick {
-                    stem,
-                    capture_nanos,
-                });
+                ticks.push(Tick::new(stem, capture_nanos));
             }
         }
         (ticks, missing)
@@ -236,6 +202,11 @@ impl Recorded {
         numbers.collect::<BTreeSet<u8>>().into_iter().collect()
     }
 
+    fn has(&self, agent: &CavId, capture_nanos: u64, stream: Stream) -> bool {
+        let key = (capture_nanos, agent.clone(), stream);
+        self.sensors.contains_key(&key)
+    }
+
     fn sensor<M: Payload>(
         &self,
         agent: &CavId,
@@ -244,10 +215,8 @@ impl Recorded {
     ) -> Result<M, ReadError> {
         let key = (tick.capture_nanos, agent.clone(), stream);
         let lacks = || {
-            ReadError::malformed(
-                self.recording.path(),
-                format!("no {agent}/{stream} at {}", tick.stem),
-            )
+            let reason = format!("no {agent}/{stream} at {}", tick.stem);
+            ReadError::malformed(self.recording.path(), reason)
         };
         message(&self.recording, self.sensors.get(&key).ok_or_else(lacks)?)
     }
@@ -257,23 +226,16 @@ impl FrameSource for Recorded {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         let truth = self.truth.get(&tick.capture_nanos);
-        if let Some(truth) =
-            truth.and_then(|truth| truth.agents.iter().find(|known| known.cav == *agent))
-        {
+        let mut truths = truth.into_iter().flat_map(|truth| &truth.agents);
+        if let Some(truth) = truths.find(|known| known.cav == *agent) {
             frame.world_from_lidar = Some(truth.world_from_lidar);
             frame.objects = truth.objects.iter().map(Object::from).collect();
         }
-        if self
-            .sensors
-            .contains_key(&(tick.capture_nanos, agent.clone(), Stream::Gnss))
-        {
+        if self.has(agent, tick.capture_nanos, Stream::Gnss) {
             let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
             frame.world_from_lidar = Some(gnss.world_from_lidar);
         }
-        if self
-            .sensors
-            .contains_key(&(tick.capture_nanos, agent.clone(), Stream::Imu))
-        {
+        if self.has(agent, tick.capture_nanos, Stream::Imu) {
             let motion: EgoMotion = self.sensor(agent, tick, Stream::Imu)?;
             (frame.speed_mps, frame.yaw_rate_rad_s) = (motion.speed_mps, motion.yaw_rate_rad_s);
         }
@@ -303,10 +265,7 @@ impl FrameSource for Recorded {
         let mut found = CameraImages::default();
         for &number in numbers {
             let stream = Stream::Camera(number);
-            if self
-                .sensors
-                .contains_key(&(tick.capture_nanos, agent.clone(), stream))
-            {
+            if self.has(agent, tick.capture_nanos, stream) {
                 found.add(number, self.sensor(agent, tick, stream));
             }
         }

@@ -112,10 +112,7 @@ fn stretches(scenario: &Scenario, agent: usize) -> Vec<[usize; 3]> {
 
 /// `None` if a frame cannot be read, or has no pose or no speed.
 fn speeds(scenario: &Scenario, agent: usize, ticks: [usize; 3]) -> Option<Speeds> {
-    let options = LoadOptions {
-        points: false,
-        ..LoadOptions::default()
-    };
+    let options = LoadOptions::without_points();
     let mut frames = Vec::with_capacity(ticks.len());
     for tick in ticks {
         let frame = scenario.load(agent, tick, &options).ok()?;

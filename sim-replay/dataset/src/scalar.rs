@@ -1,5 +1,7 @@
 //! Numbers of binary point files: type, size and byte order.
 
+use protocol::IntensityKind;
+
 /// Type of one stored number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ScalarKind {
@@ -7,7 +9,7 @@ pub(super) enum ScalarKind {
     Signed,
     /// Without a sign, 1, 2, 4 or 8 bytes.
     Unsigned,
-    /// IEEE, 4 or 8 bytes.
+    /// IEEE, 2, 4 or 8 bytes.
     Float,
     /// Bytes that are skipped.
     Padding,
@@ -38,6 +40,7 @@ impl Scalar {
         }
         let bits = u64::from_le_bytes(little);
         match (self.kind, self.size) {
+            (ScalarKind::Float, 2) => Some(half(bits as u16)),
             (ScalarKind::Float, 4) => Some(f64::from(f32::from_bits(bits as u32))),
             (ScalarKind::Float, 8) => Some(f64::from_bits(bits)),
             (ScalarKind::Unsigned, 1 | 2 | 4 | 8) => Some(bits as f64),
@@ -49,9 +52,24 @@ impl Scalar {
         }
     }
 
-    /// True for a byte without a sign, whose largest value is 255.
-    pub(super) fn is_byte(self) -> bool {
-        self.kind == ScalarKind::Unsigned && self.size == 1
+    /// How intensities stored so are scaled: the largest value of a byte without a sign is 255.
+    pub(super) fn intensity_kind(self) -> IntensityKind {
+        match (self.kind, self.size) {
+            (ScalarKind::Unsigned, 1) => IntensityKind::Byte,
+            _ => IntensityKind::Number,
+        }
+    }
+}
+
+/// IEEE 754 binary16.
+fn half(bits: u16) -> f64 {
+    let sign = if bits >> 15 == 1 { -1.0 } else { 1.0 };
+    let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f64::from(bits & 0x3ff));
+    sign * match exponent {
+        0 => fraction * 2f64.powi(-24),
+        0x1f if fraction == 0.0 => f64::INFINITY,
+        0x1f => f64::NAN,
+        _ => (1.0 + fraction / 1024.0) * 2f64.powi(exponent - 15),
     }
 }
 
@@ -88,7 +106,59 @@ mod tests {
             Some(-1e300)
         );
         assert_eq!(read(ScalarKind::Float, 8, false, &[0; 7]), None);
-        assert_eq!(read(ScalarKind::Float, 2, false, &[0; 8]), None);
+        assert_eq!(read(ScalarKind::Float, 3, false, &[0; 8]), None);
         assert_eq!(read(ScalarKind::Padding, 4, false, &[0; 8]), None);
+    }
+
+    fn number(kind: ScalarKind, bytes: &[u8], is_big_endian: bool) -> f64 {
+        Scalar {
+            kind,
+            size: bytes.len(),
+            is_big_endian,
+        }
+        .read(bytes)
+        .unwrap()
+    }
+
+    #[test]
+    fn numbers_of_every_format_and_order() {
+        assert_eq!(number(ScalarKind::Signed, &[0xfe], false), -2.0);
+        assert_eq!(number(ScalarKind::Unsigned, &[0xfe], false), 254.0);
+        assert_eq!(
+            number(ScalarKind::Signed, &(-300i16).to_be_bytes(), true),
+            -300.0
+        );
+        assert_eq!(
+            number(ScalarKind::Signed, &(-70_000i32).to_le_bytes(), false),
+            -70_000.0
+        );
+        assert_eq!(
+            number(ScalarKind::Signed, &i64::MIN.to_be_bytes(), true),
+            i64::MIN as f64
+        );
+        assert_eq!(
+            number(ScalarKind::Unsigned, &u64::MAX.to_le_bytes(), false),
+            u64::MAX as f64
+        );
+        assert_eq!(number(ScalarKind::Float, &1.5f32.to_be_bytes(), true), 1.5);
+        assert_eq!(
+            number(ScalarKind::Float, &(-0.1f64).to_be_bytes(), true),
+            -0.1
+        );
+    }
+
+    #[test]
+    fn halves_are_those_of_ieee() {
+        for (bits, expected) in [
+            (0x3c00, 1.0),
+            (0xc000, -2.0),
+            (0x7bff, 65504.0),
+            (0x0001, 2f64.powi(-24)),
+            (0x3555, 0.333_251_953_125),
+        ] {
+            assert_eq!(half(bits), expected);
+        }
+        assert_eq!(half(0xfc00), f64::NEG_INFINITY);
+        assert!(half(0x7e00).is_nan());
     }
 }

@@ -141,12 +141,9 @@ fn scenario(
     (poses, by): (PathBuf, &str),
     options: &OpenOptions,
 ) -> Scenario {
-    let ticks = timed
-        .iter()
-        .map(|((nanos, _), (stem, _))| Tick {
-            stem: stem.clone(),
-            capture_nanos: *nanos,
-        })
+    let ticks = timed.iter();
+    let ticks = ticks
+        .map(|((nanos, _), (stem, _))| Tick::new(stem.clone(), *nanos))
         .collect();
     let used = timed.values().map(|(_, (file, _))| file.clone());
     let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, used, options);

@@ -37,7 +37,7 @@ impl VehiclePoses {
 /// Reads the poses of the vehicle.
 pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses, ReadError> {
     let [novatel_from_lidar, world_from_novatel] =
-        VEHICLE.map(|folder| sides.calibration(folder, &pair.vehicle));
+        VEHICLE.map(|folder| sides.json(folder, &pair.vehicle));
     Ok(VehiclePoses {
         world_from_novatel: read_transform(&world_from_novatel)?.0,
         novatel_from_lidar: read_transform(&novatel_from_lidar)?.0,
@@ -50,7 +50,7 @@ pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses, ReadEr
 /// vehicle's LiDAR frame (`Coord_transformation` and `Coord_transformation_spd` of the data sets' own code). Without an
 /// offset of the pair that of the calibration file is used (`relative_error`), as in early releases.
 pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64>, ReadError> {
-    let path = sides.calibration(INFRASTRUCTURE, &pair.infrastructure);
+    let path = sides.json(INFRASTRUCTURE, &pair.infrastructure);
     let (world_from_lidar, own_offset_m) = read_transform(&path)?;
     let [x_m, y_m] = pair.offset_m.unwrap_or(own_offset_m);
     let offset = Translation3::new(x_m, y_m, 0.0);

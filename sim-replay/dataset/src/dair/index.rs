@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::Path;
 
-use super::Side;
 use super::calibration::offset_m;
 use crate::faults::Faults;
 use crate::json::Field;
@@ -82,10 +81,9 @@ impl Index {
         let path = root.join(COOPERATIVE);
         let (kind, pairs) = read_pairs(&path, problems)?;
         if pairs.is_empty() {
-            return Err(ReadError::malformed(
-                &path,
-                "lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)",
-            ));
+            let reason =
+                "lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)";
+            return Err(ReadError::malformed(&path, reason));
         }
         let captures = read_captures(root, kind, problems);
         let has_times = captures.values().any(|capture| capture.micros.is_some());
@@ -103,22 +101,19 @@ impl Index {
                     group.push((micros, pair));
                 }
                 None => {
-                    let reason = format!(
-                        "no time stamp of vehicle frame {}: the pair is left out",
-                        pair.vehicle
-                    );
+                    let vehicle = pair.vehicle;
+                    let reason =
+                        format!("no time stamp of vehicle frame {vehicle}: the pair is left out");
                     problems.push(ReadError::malformed(&root.join(CAPTURES), reason));
                 }
             }
         }
         groups.retain(|_, pairs| !pairs.is_empty());
-        Ok(Self {
-            kind,
-            groups: groups
-                .into_iter()
-                .map(|(name, group)| (name, in_order(group)))
-                .collect(),
-        })
+        let groups = groups
+            .into_iter()
+            .map(|(name, group)| (name, in_order(group)));
+        let groups = groups.collect();
+        Ok(Self { kind, groups })
     }
 }
 
@@ -133,13 +128,7 @@ fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
     let start = pairs.first().map_or(0, |(micros, _)| *micros);
     let tick = |(micros, pair): (u64, Pair)| {
         let capture_nanos = (micros - start).saturating_mul(1000);
-        (
-            Tick {
-                stem: pair.vehicle.clone(),
-                capture_nanos,
-            },
-            pair,
-        )
+        (Tick::new(pair.vehicle.clone(), capture_nanos), pair)
     };
     pairs.into_iter().map(tick).collect()
 }
@@ -148,58 +137,39 @@ fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<P
     let mut kind = None;
     let mut pairs: Vec<Pair> = Vec::new();
     let mut seen = HashSet::new();
-    json_table::read(
-        path,
-        MAX_BYTES,
-        problems,
-        |_| true,
-        |entry| {
-            let pair = pair(entry, &mut kind)?;
-            if !seen.insert(pair.vehicle.clone()) {
-                return Err(entry.error(format!(
-                    "vehicle frame {} is in a pair already",
-                    pair.vehicle
-                )));
-            }
-            pairs.push(pair);
-            Ok(())
-        },
-    )?;
+    json_table::read_all(path, MAX_BYTES, problems, |entry| {
+        let pair = pair(entry, &mut kind)?;
+        let vehicle = &pair.vehicle;
+        if !seen.insert(vehicle.clone()) {
+            return Err(entry.error(format!("vehicle frame {vehicle} is in a pair already")));
+        }
+        pairs.push(pair);
+        Ok(())
+    })?;
     Ok((kind.unwrap_or(Kind::Dair), pairs))
 }
 
 /// The first entry decides which of the two data sets it is.
 fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair, ReadError> {
     let is_sequence = entry.optional("vehicle_frame")?.is_some();
-    let kind = *kind.get_or_insert(if is_sequence {
-        Kind::V2xSeq
-    } else {
-        Kind::Dair
+    let kind = *kind.get_or_insert(match is_sequence {
+        true => Kind::V2xSeq,
+        false => Kind::Dair,
     });
-    let id = |side: Side| {
-        let name = if side == Side::Vehicle {
-            "vehicle"
-        } else {
-            "infrastructure"
-        };
-        match kind {
-            Kind::V2xSeq => frame_id(&entry.required(&format!("{name}_frame"))?),
-            Kind::Dair => match entry.optional(&format!("{name}_image_path"))? {
-                // Points are read by the same id.
-                Some(image)
-                    if entry
-                        .optional(&format!("{name}_pointcloud_path"))?
-                        .is_none() =>
-                {
-                    stem(&image)
-                }
-                _ => stem(&entry.required(&format!("{name}_pointcloud_path"))?),
-            },
+    let id = |name: &str| {
+        if kind == Kind::V2xSeq {
+            return frame_id(&entry.required(&format!("{name}_frame"))?);
+        }
+        let points = format!("{name}_pointcloud_path");
+        match entry.optional(&format!("{name}_image_path"))? {
+            // Points are read by the same id.
+            Some(image) if entry.optional(&points)?.is_none() => stem(&image),
+            _ => stem(&entry.required(&points)?),
         }
     };
     Ok(Pair {
-        vehicle: id(Side::Vehicle)?,
-        infrastructure: id(Side::Infrastructure)?,
+        vehicle: id("vehicle")?,
+        infrastructure: id("infrastructure")?,
         offset_m: entry
             .optional("system_error_offset")?
             .map(|offset| offset_m(&offset))
@@ -243,21 +213,15 @@ fn read_captures(
 ) -> HashMap<String, Capture> {
     let path = root.join(CAPTURES);
     let (mut stamps, mut faults, mut groups) = (HashMap::new(), Faults::default(), Vec::new());
-    let read = json_table::read(
-        &path,
-        MAX_BYTES,
-        problems,
-        |_| true,
-        |entry| {
-            let (id, group) = frame_and_group(entry, kind)?;
-            let stamp = entry.required("pointcloud_timestamp");
-            if let Some(stamp) = faults.take(stamp.and_then(|stamp| stamp.time())) {
-                stamps.insert(id.clone(), stamp);
-            }
-            groups.push((id, group));
-            Ok(())
-        },
-    );
+    let read = json_table::read_all(&path, MAX_BYTES, problems, |entry| {
+        let (id, group) = frame_and_group(entry, kind)?;
+        let stamp = entry.required("pointcloud_timestamp");
+        if let Some(stamp) = faults.take(stamp.and_then(|stamp| stamp.time())) {
+            stamps.insert(id.clone(), stamp);
+        }
+        groups.push((id, group));
+        Ok(())
+    });
     problems.extend(read.err());
     faults.report("time stamp", problems);
     if stamps.is_empty() {
@@ -266,9 +230,8 @@ fn read_captures(
     }
     let unit = time_stamps::micros_per_unit(stamps.values().copied());
     let capture = |(id, group): (String, Option<String>)| {
-        let micros = stamps
-            .get(&id)
-            .map(|&stamp| time_stamps::micros(stamp, unit));
+        let stamp = stamps.get(&id);
+        let micros = stamp.map(|&stamp| time_stamps::micros(stamp, unit));
         (id, Capture { micros, group })
     };
     groups.into_iter().map(capture).collect()

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::Pose;
+use protocol::text::excerpt;
 
 use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
@@ -72,22 +73,15 @@ pub(super) fn in_frame(
         let location = label.required("3d_location")?;
         let axis = |key| location.required(key)?.number();
         let center = Translation3::new(axis("x")?, axis("y")?, axis("z")?);
-        let yaw = UnitQuaternion::from_axis_angle(
-            &Vector3::z_axis(),
-            label.required("rotation")?.number()?,
-        );
+        let yaw_rad = label.required("rotation")?.number()?;
+        let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad);
         let world_from_object: Pose =
             (world_from_lidar * Isometry3::from_parts(center, yaw)).into();
-        world_from_object
-            .validate()
-            .map_err(|error| location.error(error.to_string()))?;
-        let track = label
-            .optional("track_id")?
-            .and_then(|track| track.count().ok());
-        let number = track
-            .and_then(|track| i64::try_from(track).ok())
-            .filter(|track| *track < BLOCK)
-            .unwrap_or(number);
+        let valid = world_from_object.validate();
+        valid.map_err(|error| location.error(error.to_string()))?;
+        let track = label.optional("track_id")?;
+        let track = track.and_then(|track| i64::try_from(track.count().ok()?).ok());
+        let number = track.filter(|track| *track < BLOCK).unwrap_or(number);
         Ok(Some(Object {
             id: block.id(number),
             class: class(label)?,
@@ -106,10 +100,8 @@ fn read(
     let labels = Field::root(path, &value);
     let labels = labels.items()?;
     if labels.len() > MAX_BOXES {
-        return Err(ReadError::malformed(
-            path,
-            format!("{} boxes, expected at most {MAX_BOXES}", labels.len()),
-        ));
+        let reason = format!("{} boxes, expected at most {MAX_BOXES}", labels.len());
+        return Err(ReadError::malformed(path, reason));
     }
     let (mut objects, mut problems) = (Vec::with_capacity(labels.len()), Vec::new());
     for (number, label) in (0..).zip(labels) {
@@ -133,18 +125,12 @@ fn class(label: &Field<'_>) -> Result<ObjectClass, ReadError> {
 }
 
 fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
-    let kind = label
-        .required("type")
-        .ok()?
-        .text()
-        .ok()
-        .filter(|kind| classes::of_name(kind).is_none())?;
-    let shown: String = kind.chars().take(40).collect();
-    Some(classes::unknown(
-        path.parent().unwrap_or(path),
-        "type",
-        &format!("{shown:?}"),
-    ))
+    let kind = label.required("type").ok()?.text().ok()?;
+    let shown = format!("{:?}", excerpt(kind, 40));
+    let dir = path.parent().unwrap_or(path);
+    classes::of_name(kind)
+        .is_none()
+        .then(|| classes::unknown(dir, "type", &shown))
 }
 
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
@@ -175,11 +161,8 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
     let (corners, _) = numbers.as_chunks::<3>();
     let corner = |index: usize| Vector3::from(corners[index]);
     let mean = |pairs: [(usize, usize); 4]| {
-        pairs
-            .iter()
-            .map(|&(to, from)| corner(to) - corner(from))
-            .sum::<Vector3<f64>>()
-            / 4.0
+        let edges = pairs.iter().map(|&(to, from)| corner(to) - corner(from));
+        edges.sum::<Vector3<f64>>() / 4.0
     };
     let ahead = mean([(0, 3), (1, 2), (4, 7), (5, 6)]);
     let aside = mean([(0, 1), (3, 2), (4, 5), (7, 6)]);
@@ -200,13 +183,10 @@ fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError
     let y = above.cross(&x).normalize();
     let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
     let center = (0..8).map(corner).sum::<Vector3<f64>>() / 8.0;
-    let pose: Pose = Isometry3::from_parts(
-        center.into(),
-        UnitQuaternion::from_rotation_matrix(&rotation),
-    )
-    .into();
-    pose.validate()
-        .map_err(|error| field.error(error.to_string()))?;
+    let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
+    let pose: Pose = Isometry3::from_parts(center.into(), rotation).into();
+    let valid = pose.validate();
+    valid.map_err(|error| field.error(error.to_string()))?;
     Ok(Some((pose, size_m)))
 }
 

@@ -15,7 +15,7 @@ mod labels;
 #[cfg(test)]
 mod tests;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -62,18 +62,11 @@ const INFRASTRUCTURE: &str = "infrastructure";
 
 /// Opens the data sets at or below `dir`; `None` where there are none.
 pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
-    if let Some(root) = files::above(dir)
-        .find(|above| is_root(above))
-        .filter(|_| is_side(dir))
-    {
-        let reason = format!(
-            "this is a part of a DAIR-V2X data set: open {}",
-            root.display()
-        );
-        return Err(ReadError::Layout {
-            path: dir.to_owned(),
-            reason,
-        });
+    let root = files::above(dir).find(|above| is_root(above));
+    if let Some(root) = root.filter(|_| is_side(dir)) {
+        let root = root.display();
+        let reason = format!("this is a part of a DAIR-V2X data set: open {root}");
+        return Err(ReadError::layout(dir, reason));
     }
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for root in &roots::find(dir, is_root) {
@@ -86,10 +79,8 @@ pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>,
 }
 
 fn is_root(dir: &Path) -> bool {
-    dir.join(index::COOPERATIVE).is_file()
-        && [VEHICLE_SIDE, INFRASTRUCTURE_SIDE]
-            .iter()
-            .all(|side| dir.join(side).is_dir())
+    let mut sides = [VEHICLE_SIDE, INFRASTRUCTURE_SIDE].iter();
+    dir.join(index::COOPERATIVE).is_file() && sides.all(|side| dir.join(side).is_dir())
 }
 
 fn is_side(dir: &Path) -> bool {
@@ -106,21 +97,12 @@ fn open_root(
 ) -> Result<Vec<Scenario>, ReadError> {
     let Index { kind, groups } = Index::read(root, options.period_nanos, problems)?;
     let scenarios = groups.into_iter().map(|(group, pairs)| {
-        let name = if root == opened {
-            group
-        } else {
-            format!("{}/{group}", files::name_below(opened, root))
+        let name = match root == opened {
+            true => group,
+            false => format!("{}/{group}", files::name_below(opened, root)),
         };
-        scenario(
-            name,
-            Sides {
-                root: root.to_owned(),
-                kind,
-            },
-            pairs,
-            options,
-            problems,
-        )
+        let root = root.to_owned();
+        scenario(name, Sides { root, kind }, pairs, options, problems)
     });
     Ok(scenarios.collect())
 }
@@ -137,70 +119,43 @@ fn scenario(
         [VEHICLE, INFRASTRUCTURE].map(|name| CavId::new(name).expect("a word is an identifier"));
     let (mut moments, mut missing, mut kept) = (Vec::<Tick>::new(), Vec::new(), HashMap::new());
     for (tick, pair) in pairs {
-        if moments
-            .last()
-            .is_some_and(|last| last.capture_nanos == tick.capture_nanos)
-        {
-            let reason = format!(
-                "vehicle frame {} has the time stamp of the one before: left out",
-                tick.stem
-            );
-            problems.push(ReadError::malformed(
-                &sides.root.join(index::COOPERATIVE),
-                reason,
-            ));
+        let last = moments.last().map(|last| last.capture_nanos);
+        if last == Some(tick.capture_nanos) {
+            let stem = tick.stem;
+            let reason =
+                format!("vehicle frame {stem} has the time stamp of the one before: left out");
+            let path = sides.root.join(index::COOPERATIVE);
+            problems.push(ReadError::malformed(&path, reason));
             continue;
         }
         for agent in &agents {
             if let Some(path) = sides.missing_file(&pair, Side::of(agent)) {
                 let reason = format!("does not exist: {agent} is absent at {}", tick.stem);
                 problems.push(ReadError::malformed(&path, reason));
-                missing.push(MissingFrame {
-                    agent: agent.clone(),
-                    stem: tick.stem.clone(),
-                });
+                missing.push(MissingFrame::new(agent, &tick.stem));
             }
         }
         kept.insert(tick.stem.clone(), pair);
         moments.push(tick);
     }
-    let lacks_vehicle = |tick: &&Tick| {
-        missing.contains(&MissingFrame {
-            agent: agents[0].clone(),
-            stem: tick.stem.clone(),
-        })
-    };
-    let ticks: Vec<Tick> = moments
-        .iter()
-        .filter(|tick| !lacks_vehicle(tick))
-        .cloned()
-        .collect();
-    let sweeps = agents.iter().fold(
-        Sweeps::new(SweepStorage::ByName, options),
-        |sweeps, agent| {
-            let file = |tick: &Tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent)));
-            sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
-        },
-    );
+    let has_vehicle = |tick: &&Tick| !missing.contains(&MissingFrame::new(&agents[0], &tick.stem));
+    let ticks: Vec<Tick> = moments.iter().filter(has_vehicle).cloned().collect();
+    let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
+    for agent in &agents {
+        let file = |tick: &Tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent)));
+        sweeps = sweeps.with_agent(agent.clone(), moments.iter().filter_map(file));
+    }
+    let layout = sides.kind.layout();
+    let source = Arc::new(Source {
+        sides,
+        pairs: kept,
+        sweeps,
+    });
     Scenario {
-        name,
         absences: Absences::new(&agents, &ticks, &missing).among(moments),
         roadside_units: vec![agents[1].clone()],
-        agents: agents.to_vec(),
-        ticks,
         missing,
-        lidar_variants: Vec::new(),
-        has_radar: false,
-        cameras: Vec::new(),
-        layout: sides.kind.layout(),
-        source_handedness: Handedness::Right,
-        joins: Vec::new(),
-        contradicted: BTreeSet::new(),
-        source: Arc::new(Source {
-            sides,
-            pairs: kept,
-            sweeps,
-        }),
+        ..Scenario::new(name, layout, agents.to_vec(), ticks, source)
     }
 }
 
@@ -213,10 +168,9 @@ enum Side {
 
 impl Side {
     fn of(agent: &CavId) -> Self {
-        if agent.as_str() == VEHICLE {
-            Self::Vehicle
-        } else {
-            Self::Infrastructure
+        match agent.as_str() {
+            VEHICLE => Self::Vehicle,
+            _ => Self::Infrastructure,
         }
     }
 }
@@ -234,22 +188,19 @@ impl Sides {
             Side::Vehicle => (VEHICLE_SIDE, &pair.vehicle),
             Side::Infrastructure => (INFRASTRUCTURE_SIDE, &pair.infrastructure),
         };
-        self.root
-            .join(folder)
-            .join("velodyne")
-            .join(format!("{id}.pcd"))
+        let folder = self.root.join(folder).join("velodyne");
+        folder.join(format!("{id}.pcd"))
     }
 
     /// Labels of a side's own sweep.
     fn labels(&self, pair: &Pair, side: Side) -> PathBuf {
-        let (folder, id) = match side {
-            Side::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
-            Side::Infrastructure => (
-                "infrastructure-side/label/virtuallidar",
-                &pair.infrastructure,
-            ),
-        };
-        self.root.join(folder).join(format!("{id}.json"))
+        match side {
+            Side::Vehicle => self.json("vehicle-side/label/lidar", &pair.vehicle),
+            Side::Infrastructure => {
+                let folder = "infrastructure-side/label/virtuallidar";
+                self.json(folder, &pair.infrastructure)
+            }
+        }
     }
 
     fn cooperative_labels(&self, pair: &Pair) -> PathBuf {
@@ -257,31 +208,32 @@ impl Sides {
             Kind::Dair => "cooperative/label_world",
             Kind::V2xSeq => "cooperative/label",
         };
-        self.root
-            .join(folder)
-            .join(format!("{}.json", pair.vehicle))
+        self.json(folder, &pair.vehicle)
     }
 
-    fn calibration(&self, folder: &str, id: &str) -> PathBuf {
+    fn json(&self, folder: &str, id: &str) -> PathBuf {
         self.root.join(folder).join(format!("{id}.json"))
     }
 
     fn calibrations(&self, pair: &Pair, side: Side) -> Vec<PathBuf> {
         match side {
-            Side::Vehicle => calibration::VEHICLE
-                .map(|folder| self.calibration(folder, &pair.vehicle))
-                .to_vec(),
+            Side::Vehicle => {
+                let folders = calibration::VEHICLE;
+                folders
+                    .map(|folder| self.json(folder, &pair.vehicle))
+                    .to_vec()
+            }
             Side::Infrastructure => {
-                vec![self.calibration(calibration::INFRASTRUCTURE, &pair.infrastructure)]
+                vec![self.json(calibration::INFRASTRUCTURE, &pair.infrastructure)]
             }
         }
     }
 
     /// The first required file of a side that does not exist.
     fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
-        std::iter::once(self.points(pair, side))
-            .chain(self.calibrations(pair, side))
-            .find(|path| !path.is_file())
+        let mut files = self.calibrations(pair, side);
+        files.insert(0, self.points(pair, side));
+        files.into_iter().find(|path| !path.is_file())
     }
 }
 
@@ -297,10 +249,8 @@ struct Source {
 impl Source {
     fn pair(&self, tick: &Tick) -> Result<&Pair, ReadError> {
         let unknown = || {
-            ReadError::malformed(
-                &self.sides.root,
-                format!("no pair of vehicle frame {}", tick.stem),
-            )
+            let reason = format!("no pair of vehicle frame {}", tick.stem);
+            ReadError::malformed(&self.sides.root, reason)
         };
         self.pairs.get(&tick.stem).ok_or_else(unknown)
     }
@@ -334,18 +284,11 @@ impl Source {
         frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
         // Faults of the vehicle's labels are problems of its frame.
         let vehicle = calibration::vehicle(&self.sides, pair).and_then(|poses| {
-            labels::in_frame(
-                &self.sides.labels(pair, Side::Vehicle),
-                &poses.world_from_lidar(),
-                Block::Vehicle,
-            )
+            let path = self.sides.labels(pair, Side::Vehicle);
+            labels::in_frame(&path, &poses.world_from_lidar(), Block::Vehicle)
         });
-        if let Ok((vehicle_objects, _)) = vehicle {
-            labels::share_ids(
-                &mut frame.objects,
-                &vehicle_objects,
-                &world_from_lidar.inverse(),
-            );
+        if let Ok((others, _)) = vehicle {
+            labels::share_ids(&mut frame.objects, &others, &world_from_lidar.inverse());
         }
         Ok(frame)
     }
@@ -404,9 +347,9 @@ impl FrameSource for Source {
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
         // A tick of another scenario has no file here.
-        self.pairs.get(&tick.stem).map_or_else(
-            || self.sides.root.clone(),
-            |pair| self.sides.points(pair, Side::of(agent)),
-        )
+        match self.pairs.get(&tick.stem) {
+            Some(pair) => self.sides.points(pair, Side::of(agent)),
+            None => self.sides.root.clone(),
+        }
     }
 }

@@ -171,10 +171,7 @@ pub fn sampled(scenarios: &[Scenario], scale: IntensityScale) -> Vec<Problem> {
 }
 
 fn read(scenario: &Scenario, agent: usize, tick: usize) -> Option<FrameFindings> {
-    let without_points = LoadOptions {
-        points: false,
-        ..LoadOptions::default()
-    };
+    let without_points = LoadOptions::without_points();
     let frame = scenario.load(agent, tick, &without_points).ok();
     let sweep = scenario.load_points(agent, tick, None).ok();
     (frame.is_some() || sweep.is_some()).then(|| FrameFindings::of(frame.as_ref(), sweep.as_ref()))

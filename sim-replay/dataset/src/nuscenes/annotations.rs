@@ -6,7 +6,7 @@ use std::path::Path;
 use nalgebra::{Isometry3, Point3};
 use protocol::{PointCloud, Pose};
 
-use super::tables::{read_rows, referred, transform};
+use super::tables::{read_all, referred, transform};
 use crate::frame::{Object, ObjectClass};
 use crate::json::Field;
 use crate::{ReadError, classes};
@@ -33,20 +33,14 @@ pub(super) fn read(
         return objects;
     }
     let read = read_instances(version, problems).and_then(|instances| {
-        read_rows(
-            version,
-            "sample_annotation.json",
-            problems,
-            |_| true,
-            |row| {
-                let sample = referred(row, "sample_token", samples)?;
-                let object = object(row, &instances)?;
-                if let Some(objects) = objects.get_mut(sample) {
-                    objects.push(object);
-                }
-                Ok(())
-            },
-        )
+        read_all(version, "sample_annotation.json", problems, |row| {
+            let sample = referred(row, "sample_token", samples)?;
+            let object = object(row, &instances)?;
+            if let Some(objects) = objects.get_mut(sample) {
+                objects.push(object);
+            }
+            Ok(())
+        })
     });
     problems.extend(read.err());
     objects
@@ -63,38 +57,25 @@ fn read_instances(
     problems: &mut Vec<ReadError>,
 ) -> Result<HashMap<String, Instance>, ReadError> {
     let (mut names, mut unknown) = (HashMap::new(), Vec::new());
-    read_rows(
-        version,
-        "category.json",
-        problems,
-        |_| true,
-        |row| {
-            let name = row.required("name")?;
-            if classes::of_name(name.text()?).is_none() && unknown.len() < MAX_UNKNOWN {
-                unknown.push(unknown_type(&name));
-            }
-            names.insert(row.required("token")?.id()?, name.text()?.to_owned());
-            Ok(())
-        },
-    )?;
+    read_all(version, "category.json", problems, |row| {
+        let name = row.required("name")?;
+        if classes::of_name(name.text()?).is_none() && unknown.len() < MAX_UNKNOWN {
+            unknown.push(unknown_type(&name));
+        }
+        names.insert(row.required("token")?.id()?, name.text()?.to_owned());
+        Ok(())
+    })?;
     problems.append(&mut unknown);
     let mut instances = HashMap::new();
-    read_rows(
-        version,
-        "instance.json",
-        problems,
-        |_| true,
-        |row| {
-            let category = row.required("category_token")?;
-            let name = names
-                .get(&category.id()?)
-                .ok_or_else(|| category.error("no row of category.json has this token"))?;
-            let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
-            let id = instances.len() as i64;
-            instances.insert(row.required("token")?.id()?, Instance { id, class });
-            Ok(())
-        },
-    )?;
+    read_all(version, "instance.json", problems, |row| {
+        let category = row.required("category_token")?;
+        let no_name = || category.error("no row of category.json has this token");
+        let name = names.get(&category.id()?).ok_or_else(no_name)?;
+        let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
+        let id = instances.len() as i64;
+        instances.insert(row.required("token")?.id()?, Instance { id, class });
+        Ok(())
+    })?;
     Ok(instances)
 }
 
@@ -107,21 +88,16 @@ fn unknown_type(name: &Field<'_>) -> ReadError {
 
 fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object, ReadError> {
     let token = row.required("instance_token")?;
-    let Instance { id, class } = instances
-        .get(&token.id()?)
-        .ok_or_else(|| token.error("no row of instance.json has this token"))?;
+    let no_instance = || token.error("no row of instance.json has this token");
+    let Instance { id, class } = instances.get(&token.id()?).ok_or_else(no_instance)?;
     let size = row.required("size")?;
-    let [width, length, height] = size.numbers::<3>()?;
-    if ![width, length, height]
-        .iter()
-        .all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M)
-    {
-        let reason = format!(
-            "{:?} are no sizes in metres, expected up to {MAX_SIZE_M}",
-            [width, length, height]
-        );
-        return Err(size.error(reason));
+    let edges = size.numbers::<3>()?;
+    if !edges.iter().all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M) {
+        return Err(size.error(format!(
+            "{edges:?} are no sizes in metres, expected up to {MAX_SIZE_M}"
+        )));
     }
+    let [width, length, height] = edges;
     let world_from_object: Pose = transform(row)?.into();
     Ok(Object {
         id: *id,
@@ -142,20 +118,14 @@ pub(super) fn seen<'a>(
 ) -> impl Iterator<Item = &'a Object> {
     let (points, world_from_lidar) = (points.xyzi.as_slice(), *world_from_lidar);
     objects.iter().filter(move |object| {
-        let object_from_lidar = object
-            .world_from_object
-            .isometry()
-            .inv_mul(&world_from_lidar);
+        let world_from_object = object.world_from_object.isometry();
+        let object_from_lidar = world_from_object.inv_mul(&world_from_lidar);
         let lidar = object_from_lidar.translation.vector;
         let half_m = object.size_m.map(|size| size / 2.0);
         let roof_m = [0.0, 0.0, MAX_MOUNT_M];
         let carries_lidar = (0..3).all(|axis| lidar[axis].abs() <= half_m[axis] + roof_m[axis]);
-        !carries_lidar
-            && is_hit(
-                points,
-                &object_from_lidar,
-                half_m.map(|half| half + HIT_MARGIN_M),
-            )
+        let reach_m = half_m.map(|half| half + HIT_MARGIN_M);
+        !carries_lidar && is_hit(points, &object_from_lidar, reach_m)
     })
 }
 

@@ -111,16 +111,14 @@ fn open_version(
         if !taken.insert(name.clone()) {
             name = format!("{name}_{index}");
         }
-        scenarios.extend(
-            Builder {
-                root: &root,
-                version,
-                layout,
-                scene,
-                name,
-            }
-            .build(moments, options, problems)?,
-        );
+        let builder = Builder {
+            root: &root,
+            version,
+            layout,
+            scene,
+            name,
+        };
+        scenarios.extend(builder.build(moments, options, problems)?);
     }
     scenarios.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(scenarios)
@@ -128,16 +126,14 @@ fn open_version(
 
 /// The layout of the first supported channel.
 fn layout(version: &Path, samples: &[Sample]) -> Result<Layout, ReadError> {
-    let channels: BTreeSet<&str> = samples
-        .iter()
-        .flat_map(|sample| sample.sweeps.keys().map(String::as_str))
-        .collect();
+    let channels = samples.iter().flat_map(|sample| sample.sweeps.keys());
+    let channels: BTreeSet<&str> = channels.map(String::as_str).collect();
     channels.iter().find_map(|channel| Some(rig::agent_of(channel)?.0)).ok_or_else(|| {
         let reason = format!(
             "nuScenes tables without a supported LiDAR: {channels:?}, expected LIDAR_TOP_id_<agent> (V2X-Sim), \
              LIDAR_FRONT_CENTER_<vehicle> (Open MARS), LIDAR_TOP (nuScenes) or LIDAR_CONCAT (T4)"
         );
-        ReadError::Layout { path: version.to_owned(), reason }
+        ReadError::layout(version, reason)
     })
 }
 
@@ -173,26 +169,19 @@ impl Builder<'_> {
         samples.sort_by_key(|(sample, _)| sample.micros);
         let agents = self.agents(&samples)?;
         let Some((ego, _)) = agents.first() else {
-            let reason = format!(
-                "scene {}: no sweep of a supported LiDAR: left out",
-                self.scene.name
-            );
-            problems.push(ReadError::malformed(
-                &self.version.join("sample_data.json"),
-                reason,
-            ));
+            let scene = &self.scene.name;
+            let reason = format!("scene {scene}: no sweep of a supported LiDAR: left out");
+            let path = self.version.join("sample_data.json");
+            problems.push(ReadError::malformed(&path, reason));
             return Ok(None);
         };
         let capture_nanos = self.capture_times(&samples, options, problems);
         let mut scenario = Parts::default();
         for ((sample, objects), capture_nanos) in samples.into_iter().zip(capture_nanos) {
-            let stem = agents
-                .iter()
-                .find_map(|(_, channel)| Some(sample.sweeps.get(channel)?.stem()));
-            let tick = Tick {
-                stem: stem.unwrap_or_else(|| sample.micros.to_string()),
-                capture_nanos,
-            };
+            let mut channels = agents.iter().map(|(_, channel)| channel);
+            let stem = channels.find_map(|channel| Some(sample.sweeps.get(channel)?.stem()));
+            let stem = stem.unwrap_or_else(|| sample.micros.to_string());
+            let tick = Tick::new(stem, capture_nanos);
             let mut sweeps = HashMap::new();
             for (agent, channel) in &agents {
                 match sample.sweeps.get(channel) {
@@ -207,10 +196,7 @@ impl Builder<'_> {
                     }
                     None => {}
                 }
-                scenario.missing.push(MissingFrame {
-                    agent: agent.clone(),
-                    stem: tick.stem.clone(),
-                });
+                scenario.missing.push(MissingFrame::new(agent, &tick.stem));
             }
             if sweeps.contains_key(ego) {
                 scenario.ticks.push(tick.clone());
@@ -232,54 +218,37 @@ impl Builder<'_> {
             contents,
         } = parts;
         let is_unit = |agent: &&CavId| rig::is_roadside_unit(self.layout, agent.as_str());
-        let sweeps = agents.iter().fold(
-            Sweeps::new(SweepStorage::ByName, options),
-            |sweeps, agent| {
-                let file = |tick: &Tick| {
-                    Some(
-                        self.root
-                            .join(&contents.get(&tick.stem)?.sweeps.get(agent)?.file),
-                    )
-                };
-                sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
-            },
-        );
+        let mut sweeps = Sweeps::new(SweepStorage::ByName, options);
+        for agent in &agents {
+            let file = |tick: &Tick| {
+                let sweep = contents.get(&tick.stem)?.sweeps.get(agent)?;
+                Some(self.root.join(&sweep.file))
+            };
+            sweeps = sweeps.with_agent(agent.clone(), moments.iter().filter_map(file));
+        }
+        let source = Arc::new(Source {
+            root: self.root.to_owned(),
+            version: self.version.to_owned(),
+            layout: self.layout,
+            moments: contents,
+            sweeps,
+        });
         Scenario {
             absences: Absences::new(&agents, &ticks, &missing).among(moments),
             roadside_units: agents.iter().filter(is_unit).cloned().collect(),
-            name: self.name,
-            agents,
-            ticks,
             missing,
-            lidar_variants: Vec::new(),
-            has_radar: false,
-            cameras: Vec::new(),
-            layout: self.layout,
-            source_handedness: Handedness::Right,
-            joins: Vec::new(),
-            contradicted: BTreeSet::new(),
-            source: Arc::new(Source {
-                root: self.root.to_owned(),
-                version: self.version.to_owned(),
-                layout: self.layout,
-                moments: contents,
-                sweeps,
-            }),
+            ..Scenario::new(self.name, self.layout, agents, ticks, source)
         }
     }
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a
     /// roadside unit last.
     fn agents(&self, moments: &[(Sample, Vec<Object>)]) -> Result<Vec<(CavId, String)>, ReadError> {
-        let channels: BTreeSet<&String> = moments
-            .iter()
-            .flat_map(|(sample, _)| sample.sweeps.keys())
-            .collect();
+        let channels = moments.iter().flat_map(|(sample, _)| sample.sweeps.keys());
         let mut agents = Vec::new();
-        for channel in channels {
-            let Some((_, name)) =
-                rig::agent_of(channel).filter(|(layout, _)| *layout == self.layout)
-            else {
+        for channel in channels.collect::<BTreeSet<&String>>() {
+            let agent = rig::agent_of(channel);
+            let Some((_, name)) = agent.filter(|(layout, _)| *layout == self.layout) else {
                 continue;
             };
             let id = CavId::new(name).map_err(|error| {
@@ -291,21 +260,13 @@ impl Builder<'_> {
                 agents.push((id, channel.clone()));
             }
         }
-        let listed = |name: &str| {
-            self.scene
-                .vehicles
-                .iter()
-                .position(|vehicle| vehicle == name)
-                .unwrap_or(usize::MAX)
-        };
+        let vehicles = &self.scene.vehicles;
         agents.sort_by_key(|(id, _)| {
             let name = id.as_str();
-            (
-                rig::is_roadside_unit(self.layout, name),
-                listed(name),
-                name.parse::<u64>().unwrap_or(u64::MAX),
-                name.to_owned(),
-            )
+            let listed = vehicles.iter().position(|vehicle| vehicle == name);
+            let number = name.parse::<u64>().unwrap_or(u64::MAX);
+            let is_unit = rig::is_roadside_unit(self.layout, name);
+            (is_unit, listed.unwrap_or(usize::MAX), number, id.clone())
         });
         Ok(agents)
     }
@@ -320,20 +281,17 @@ impl Builder<'_> {
         let micros: Vec<u64> = moments.iter().map(|(sample, _)| sample.micros).collect();
         if micros.array_windows().all(|[a, b]| a < b) {
             let start = micros.first().copied().unwrap_or(0);
-            return micros
-                .iter()
-                .map(|micros| (micros - start).saturating_mul(1000))
-                .collect();
+            let since = micros.iter().map(|micros| micros - start);
+            return since.map(|micros| micros.saturating_mul(1000)).collect();
         }
+        let scene = &self.scene.name;
         let reason = format!(
-            "scene {}: time stamps that repeat: its moments are taken as evenly spaced",
-            self.scene.name
+            "scene {scene}: time stamps that repeat: its moments are taken as evenly spaced"
         );
-        problems.push(ReadError::malformed(
-            &self.version.join("sample.json"),
-            reason,
-        ));
-        (0..moments.len() as u64)
+        let path = self.version.join("sample.json");
+        problems.push(ReadError::malformed(&path, reason));
+        let indices = 0..moments.len() as u64;
+        indices
             .map(|index| index.saturating_mul(options.period_nanos))
             .collect()
     }
@@ -343,9 +301,8 @@ impl Sweep {
     /// The name of its file without suffixes.
     fn stem(&self) -> String {
         let name = self.file.rsplit('/').next().unwrap_or(&self.file);
-        name.trim_end_matches(".bin")
-            .trim_end_matches(".pcd")
-            .to_owned()
+        let name = name.trim_end_matches(".bin");
+        name.trim_end_matches(".pcd").to_owned()
     }
 
     fn turns(&self) -> QuarterTurns {
@@ -379,30 +336,22 @@ struct Source {
 
 impl Source {
     fn sweep(&self, agent: &CavId, tick: &Tick) -> Result<(&Moment, &Sweep), ReadError> {
-        let found = self
-            .moments
-            .get(&tick.stem)
-            .and_then(|moment| Some((moment, moment.sweeps.get(agent)?)));
+        let moment = self.moments.get(&tick.stem);
+        let found = moment.and_then(|moment| Some((moment, moment.sweeps.get(agent)?)));
         found.ok_or_else(|| {
-            ReadError::malformed(
-                &self.root,
-                format!("no sweep of agent {agent} at {}", tick.stem),
-            )
+            let reason = format!("no sweep of agent {agent} at {}", tick.stem);
+            ReadError::malformed(&self.root, reason)
         })
     }
 
     /// V2X-Sim classifies all wheeled objects as vehicles.
     fn with_class(&self, object: &Object) -> Object {
         let is_narrow = self.layout == Layout::V2XSIM && object.size_m[1] <= TWO_WHEELER_WIDTH_M;
-        let class = if is_narrow && object.class.is_vehicle() {
-            ObjectClass::TwoWheeler
-        } else {
-            object.class
-        };
-        Object {
-            class,
-            ..object.clone()
+        let mut object = object.clone();
+        if is_narrow && object.class.is_vehicle() {
+            object.class = ObjectClass::TwoWheeler;
         }
+        object
     }
 }
 
@@ -441,9 +390,9 @@ impl FrameSource for Source {
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
-        self.sweep(agent, tick).map_or_else(
-            |_| self.root.clone(),
-            |(_, sweep)| self.root.join(&sweep.file),
-        )
+        match self.sweep(agent, tick) {
+            Ok((_, sweep)) => self.root.join(&sweep.file),
+            Err(_) => self.root.clone(),
+        }
     }
 }

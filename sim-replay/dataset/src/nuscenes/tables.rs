@@ -6,6 +6,7 @@ use std::path::{Component, Path};
 
 use nalgebra::Isometry3;
 use protocol::Pose;
+use protocol::text::excerpt;
 
 use super::annotations;
 use crate::ReadError;
@@ -100,7 +101,7 @@ pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tabl
 }
 
 /// Reads the rows of a table that are needed.
-pub(super) fn read_rows(
+fn read_rows(
     version: &Path,
     name: &str,
     problems: &mut Vec<ReadError>,
@@ -110,49 +111,44 @@ pub(super) fn read_rows(
     json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
 }
 
+/// The same with all rows.
+pub(super) fn read_all(
+    version: &Path,
+    name: &str,
+    problems: &mut Vec<ReadError>,
+    row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
+) -> Result<usize, ReadError> {
+    read_rows(version, name, problems, |_| true, row)
+}
+
 /// LiDARs by the token of their calibration.
 fn read_mounts(
     version: &Path,
     problems: &mut Vec<ReadError>,
 ) -> Result<HashMap<String, Mount>, ReadError> {
     let mut channels = HashMap::new();
-    read_rows(
-        version,
-        "sensor.json",
-        problems,
-        |_| true,
-        |row| {
-            let channel = row.required("channel")?.text()?;
-            let modality = row
-                .optional("modality")?
-                .map(|modality| modality.text())
-                .transpose()?;
-            if modality.map_or_else(
-                || channel.starts_with("LIDAR"),
-                |modality| modality.eq_ignore_ascii_case("lidar"),
-            ) {
-                channels.insert(row.required("token")?.id()?, channel.to_owned());
-            }
-            Ok(())
-        },
-    )?;
+    read_all(version, "sensor.json", problems, |row| {
+        let channel = row.required("channel")?.text()?;
+        let is_lidar = match row.optional("modality")? {
+            Some(modality) => modality.text()?.eq_ignore_ascii_case("lidar"),
+            None => channel.starts_with("LIDAR"),
+        };
+        if is_lidar {
+            channels.insert(row.required("token")?.id()?, channel.to_owned());
+        }
+        Ok(())
+    })?;
     let mut mounts = HashMap::new();
-    read_rows(
-        version,
-        "calibrated_sensor.json",
-        problems,
-        |_| true,
-        |row| {
-            if let Some(channel) = channels.get(&row.required("sensor_token")?.id()?) {
-                let mount = Mount {
-                    channel: channel.clone(),
-                    vehicle_from_lidar: transform(row)?,
-                };
-                mounts.insert(row.required("token")?.id()?, mount);
-            }
-            Ok(())
-        },
-    )?;
+    read_all(version, "calibrated_sensor.json", problems, |row| {
+        if let Some(channel) = channels.get(&row.required("sensor_token")?.id()?) {
+            let mount = Mount {
+                channel: channel.clone(),
+                vehicle_from_lidar: transform(row)?,
+            };
+            mounts.insert(row.required("token")?.id()?, mount);
+        }
+        Ok(())
+    })?;
     Ok(mounts)
 }
 
@@ -163,25 +159,18 @@ fn read_scenes(
     problems: &mut Vec<ReadError>,
 ) -> Result<(Vec<Scene>, Indices), ReadError> {
     let (mut scenes, mut indices) = (Vec::new(), Indices::new());
-    read_rows(
-        version,
-        "scene.json",
-        problems,
-        |_| true,
-        |row| {
-            let vehicles = match row.optional("vehicle_list")? {
-                Some(list) => list
-                    .items()?
-                    .map(|vehicle| vehicle.id())
-                    .collect::<Result<_, _>>()?,
-                None => Vec::new(),
-            };
-            let name = row.required("name")?.id()?;
-            indices.insert(row.required("token")?.id()?, scenes.len());
-            scenes.push(Scene { name, vehicles });
-            Ok(())
-        },
-    )?;
+    read_all(version, "scene.json", problems, |row| {
+        let mut vehicles = Vec::new();
+        if let Some(list) = row.optional("vehicle_list")? {
+            for vehicle in list.items()? {
+                vehicles.push(vehicle.id()?);
+            }
+        }
+        let name = row.required("name")?.id()?;
+        indices.insert(row.required("token")?.id()?, scenes.len());
+        scenes.push(Scene { name, vehicles });
+        Ok(())
+    })?;
     Ok((scenes, indices))
 }
 
@@ -191,24 +180,18 @@ fn read_samples(
     problems: &mut Vec<ReadError>,
 ) -> Result<(Vec<Sample>, Indices), ReadError> {
     let (mut samples, mut stamps, mut indices) = (Vec::new(), Vec::new(), Indices::new());
-    read_rows(
-        version,
-        "sample.json",
-        problems,
-        |_| true,
-        |row| {
-            let scene = referred(row, "scene_token", scenes)?;
-            let stamp = row.required("timestamp")?.time()?;
-            indices.insert(row.required("token")?.id()?, samples.len());
-            stamps.push(stamp);
-            samples.push(Sample {
-                scene,
-                micros: 0,
-                sweeps: HashMap::new(),
-            });
-            Ok(())
-        },
-    )?;
+    read_all(version, "sample.json", problems, |row| {
+        let scene = referred(row, "scene_token", scenes)?;
+        let stamp = row.required("timestamp")?.time()?;
+        indices.insert(row.required("token")?.id()?, samples.len());
+        stamps.push(stamp);
+        samples.push(Sample {
+            scene,
+            micros: 0,
+            sweeps: HashMap::new(),
+        });
+        Ok(())
+    })?;
     let unit = time_stamps::micros_per_unit(stamps.iter().copied());
     for (sample, stamp) in samples.iter_mut().zip(stamps) {
         sample.micros = time_stamps::micros(stamp, unit);
@@ -229,29 +212,21 @@ fn read_sweeps(
     };
     read_rows(version, "sample_data.json", problems, is_needed, |row| {
         let token = row.required("calibrated_sensor_token")?;
-        let mount = mounts
-            .get(&token.id()?)
-            .ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
+        let no_mount = || token.error("no row of calibrated_sensor.json has it");
+        let mount = mounts.get(&token.id()?).ok_or_else(no_mount)?;
         let file = row.required("filename")?;
-        let is_below = Path::new(file.text()?)
-            .components()
-            .all(|part| matches!(part, Component::Normal(_)));
-        if !is_below {
-            return Err(file.error(format!(
-                "{:?}, expected a path below the data set",
-                file.text()?
-            )));
+        let name = file.text()?;
+        let mut parts = Path::new(name).components();
+        if !parts.all(|part| matches!(part, Component::Normal(_))) {
+            return Err(file.error(format!("{name:?}, expected a path below the data set")));
         }
-        let sample = referred(row, "sample_token", samples)?;
         let sweep = SweepRow {
-            sample,
-            file: file.text()?.to_owned(),
+            sample: referred(row, "sample_token", samples)?,
+            file: name.to_owned(),
             mount: mount.clone(),
         };
-        sweeps
-            .entry(row.required("ego_pose_token")?.id()?)
-            .or_default()
-            .push(sweep);
+        let pose = row.required("ego_pose_token")?.id()?;
+        sweeps.entry(pose).or_default().push(sweep);
         Ok(())
     })?;
     Ok(sweeps)
@@ -268,36 +243,23 @@ fn place(
     let is_needed = |keys: &Keys<'_>| tokens.contains(&*keys.token);
     read_rows(version, "ego_pose.json", problems, is_needed, |row| {
         let world_from_vehicle = transform(row)?;
-        for SweepRow {
-            sample,
-            file,
-            mount,
-        } in rows
-            .remove(&row.required("token")?.id()?)
-            .unwrap_or_default()
-        {
+        let token = row.required("token")?.id()?;
+        for row in rows.remove(&token).unwrap_or_default() {
             let sweep = Sweep {
-                file,
+                file: row.file,
                 world_from_vehicle,
-                vehicle_from_lidar: mount.vehicle_from_lidar,
+                vehicle_from_lidar: row.mount.vehicle_from_lidar,
             };
-            if let Some(sample) = samples.get_mut(sample) {
-                sample.sweeps.insert(mount.channel, sweep);
+            if let Some(sample) = samples.get_mut(row.sample) {
+                sample.sweeps.insert(row.mount.channel, sweep);
             }
         }
         Ok(())
     })?;
-    let mut without_pose: Vec<&str> = rows
-        .values()
-        .flatten()
-        .map(|row| row.file.as_str())
-        .collect();
-    without_pose.sort_unstable();
-    if let Some(first) = without_pose.first() {
-        let reason = format!(
-            "no pose for {} sweeps, the first {first}: left out",
-            without_pose.len()
-        );
+    let without_pose = || rows.values().flatten().map(|row| row.file.as_str());
+    if let Some(first) = without_pose().min() {
+        let count = without_pose().count();
+        let reason = format!("no pose for {count} sweeps, the first {first}: left out");
         problems.push(ReadError::malformed(&version.join("ego_pose.json"), reason));
     }
     Ok(())
@@ -307,12 +269,7 @@ fn place(
 pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize, ReadError> {
     let token = row.required(key)?;
     let text = token.id()?;
-    let unknown = || {
-        token.error(format!(
-            "no row has the token {:?}",
-            text.chars().take(40).collect::<String>()
-        ))
-    };
+    let unknown = || token.error(format!("no row has the token {:?}", excerpt(&text, 40)));
     indices.get(&text).copied().ok_or_else(unknown)
 }
 
@@ -321,11 +278,8 @@ pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>, ReadError> {
     let translation_m = row.required("translation")?.numbers::<3>()?;
     let rotation = row.required("rotation")?;
     let rotation_wxyz = rotation.numbers::<4>()?;
-    let length = rotation_wxyz
-        .iter()
-        .map(|part| part * part)
-        .sum::<f64>()
-        .sqrt();
+    let squares = rotation_wxyz.iter().map(|part| part * part);
+    let length = squares.sum::<f64>().sqrt();
     let is_unit = (length - 1.0).abs() <= QUATERNION_TOLERANCE;
     if !is_unit {
         return Err(rotation.error(format!("a quaternion of length {length}, expected 1")));
@@ -334,7 +288,7 @@ pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>, ReadError> {
         translation_m,
         rotation_wxyz: rotation_wxyz.map(|part| part / length),
     };
-    pose.validate()
-        .map_err(|error| row.error(error.to_string()))?;
+    let valid = pose.validate();
+    valid.map_err(|error| row.error(error.to_string()))?;
     Ok(pose.isometry())
 }

@@ -151,10 +151,7 @@ fn pair(scenario: &Scenario, agent: usize, ticks: &[usize], first: usize) -> Opt
 }
 
 fn pair_of(scenario: &Scenario, agent: usize, ticks: [usize; 2]) -> Option<Pair> {
-    let blind = LoadOptions {
-        points: false,
-        ..LoadOptions::default()
-    };
+    let blind = LoadOptions::without_points();
     let [start, end] = ticks.map(|tick| scenario.ticks.get(tick).map(|tick| tick.capture_nanos));
     if end?.abs_diff(start?) > SOON_NANOS {
         return None;

@@ -156,6 +156,19 @@ impl IntensityOrigin {
 }
 
 impl PcdCloud {
+    /// The cloud of finite points that a file of this form holds.
+    pub(crate) fn of_points(
+        points: Vec<[f32; 4]>,
+        intensity: Option<IntensityOrigin>,
+        form: &'static str,
+    ) -> Self {
+        Self {
+            intensity,
+            form,
+            ..Self::of_finite(points, Vec::new())
+        }
+    }
+
     /// Removes points that are not finite. `labels`: one for each point, or none.
     pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
         let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());

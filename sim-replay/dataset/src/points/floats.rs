@@ -54,10 +54,8 @@ impl FloatForm {
     /// # Errors
     /// If no sample has either form, with the fault of the first.
     pub(super) fn of(samples: &[Vec<u8>]) -> Result<Self, String> {
-        let votes: Vec<Result<Self, String>> = samples
-            .iter()
-            .filter_map(|bytes| Self::of_sample(bytes))
-            .collect();
+        let votes = samples.iter().filter_map(|bytes| Self::of_sample(bytes));
+        let votes: Vec<Result<Self, String>> = votes.collect();
         let count = |form| votes.iter().filter(|vote| **vote == Ok(form)).count();
         let fits = |form: &Self| {
             (samples.first()).is_some_and(|bytes| bytes.len().is_multiple_of(4 * form.numbers()))
@@ -127,12 +125,8 @@ impl FloatForm {
             .chunks_exact(self.numbers())
             .filter_map(|point| Some(point.first_chunk()?.map(f32::from_le_bytes)))
             .collect();
-        let intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
-        Ok(PcdCloud {
-            intensity,
-            form: self.name(),
-            ..PcdCloud::of_finite(points, Vec::new())
-        })
+        let origin = IntensityOrigin::stored("4th float", IntensityKind::Number);
+        Ok(PcdCloud::of_points(points, Some(origin), self.name()))
     }
 }
 
@@ -141,12 +135,9 @@ fn absurd(numbers: &[f32]) -> Option<String> {
     let is_absurd = |number: f32| number.abs() > LARGEST || (number != 0.0 && number.abs() < TINY);
     let share =
         numbers.iter().filter(|&&number| is_absurd(number)).count() as f64 / numbers.len() as f64;
-    let fault = || {
-        format!(
-            "{:.1} % of the numbers are beyond 1e7 or below 1e-30, usual is none",
-            100.0 * share
-        )
-    };
+    let percent = 100.0 * share;
+    let fault =
+        || format!("{percent:.1} % of the numbers are beyond 1e7 or below 1e-30, usual is none");
     (share > ABSURD_SHARE).then(fault)
 }
 
@@ -162,10 +153,9 @@ fn column_entropy(numbers: &[f32], step: usize) -> f64 {
             .filter_map(|point| point.get(column))
         {
             let bin = (number.to_bits() >> 23) as usize;
-            counts
-                .get_mut(bin)
-                .into_iter()
-                .for_each(|count| *count += 1);
+            if let Some(count) = counts.get_mut(bin) {
+                *count += 1;
+            }
         }
         let shares = counts.into_iter().filter(|&count| count > 0);
         let shares: Vec<f64> = shares.map(|count| f64::from(count) / points).collect();

@@ -88,10 +88,9 @@ fn open(
         .into_iter()
         .map(|sweep| (sweep.nanos, sweep))
         .collect();
-    let ticks = sweeps.keys().map(|nanos| Tick {
-        stem: nanos.to_string(),
-        capture_nanos: *nanos,
-    });
+    let ticks = sweeps
+        .keys()
+        .map(|nanos| Tick::new(nanos.to_string(), *nanos));
     let ticks = ticks.collect();
     let source = Bag {
         storage,
@@ -100,14 +99,11 @@ fn open(
         scale: options.intensity_scale,
         divisor: OnceLock::new(),
     };
-    let mut scenario = single_vehicle(
-        name_below(root, path),
-        Layout::ROSBAG,
-        ticks,
-        Arc::new(source),
-    );
-    scenario.joins = vec![joined.text];
-    Ok(scenario)
+    let name = name_below(root, path);
+    Ok(Scenario {
+        joins: vec![joined.text],
+        ..single_vehicle(name, Layout::ROSBAG, ticks, Arc::new(source))
+    })
 }
 
 impl Bag {

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::{Node, Value};
 use crate::ReadError;
+use crate::json::child_name;
 use crate::numpy_tags::{self, NumpyArray};
 
 /// A node with its position in the document; readers take values from it.
@@ -43,12 +44,8 @@ impl<'a> Field<'a> {
 
     /// An error about this field.
     pub(crate) fn error(&self, reason: impl Into<String>) -> ReadError {
-        ReadError::Malformed {
-            path: self.path.to_owned(),
-            line: Some(self.node.line),
-            field: (!self.name.is_empty()).then(|| self.name.clone()),
-            reason: reason.into(),
-        }
+        let field = Some(self.name.as_str()).filter(|name| !name.is_empty());
+        ReadError::malformed_at(self.path, Some(self.node.line), field, reason)
     }
 
     /// An error with the found and the expected value.
@@ -57,14 +54,9 @@ impl<'a> Field<'a> {
     }
 
     fn child(&self, key: &str, node: &'a Node) -> Self {
-        let name = if self.name.is_empty() {
-            key.to_owned()
-        } else {
-            format!("{}.{key}", self.name)
-        };
         Self {
             path: self.path,
-            name,
+            name: child_name(&self.name, key),
             node,
         }
     }
@@ -130,13 +122,10 @@ impl<'a> Field<'a> {
         if let Value::Integer(value) = self.node.value {
             return Ok(value);
         }
-        let number = self
-            .number()
-            .ok()
-            .filter(|number| number.fract() == 0.0 && number.abs() < 1e15);
-        number
-            .map(|number| number as i64)
-            .ok_or_else(|| self.expected("an integer"))
+        match self.number() {
+            Ok(number) if number.fract() == 0.0 && number.abs() < 1e15 => Ok(number as i64),
+            _ => Err(self.expected("an integer")),
+        }
     }
 
     pub(crate) fn text(&self) -> Result<&'a str, ReadError> {
@@ -184,11 +173,11 @@ impl<'a> Field<'a> {
             _ if numpy_tags::is_python(self.node) => return numpy_tags::array(self),
             _ => return Err(self.expected("numbers")),
         };
-        let rows: Vec<NumpyArray> = self
+        let rows = self
             .items()?
             .iter()
             .map(Self::row)
-            .collect::<Result<_, _>>()?;
+            .collect::<Result<Vec<_>, _>>()?;
         let inner = rows
             .first()
             .map(|row| row.shape.clone())

@@ -11,6 +11,8 @@ use std::path::Path;
 
 pub(super) use field::Field;
 
+use tree::Unsound;
+
 use super::ReadError;
 use super::files;
 
@@ -47,27 +49,15 @@ pub(super) fn read(path: &Path) -> Result<Node, ReadError> {
 
 /// Parses a document; `path` is for messages.
 pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node, ReadError> {
-    let malformed = |line, reason: String| ReadError::Malformed {
-        path: path.to_owned(),
-        line,
-        field: None,
-        reason,
-    };
+    let malformed =
+        |line: u64, reason: String| ReadError::malformed_at(path, Some(line), None, reason);
     let text = std::str::from_utf8(bytes).map_err(|error| {
-        let line = bytes
-            .iter()
-            .take(error.valid_up_to())
-            .filter(|&&byte| byte == b'\n')
-            .count() as u64
-            + 1;
-        malformed(Some(line), "the text is not UTF-8".into())
+        let valid = bytes.iter().take(error.valid_up_to());
+        let breaks = valid.filter(|&&byte| byte == b'\n').count();
+        malformed(breaks as u64 + 1, "the text is not UTF-8".into())
     })?;
-    tree::build(text).map_err(|unsound| {
-        malformed(
-            Some(unsound.line),
-            format!("no sound YAML: {}", unsound.reason),
-        )
-    })
+    tree::build(text)
+        .map_err(|Unsound { line, reason }| malformed(line, format!("no sound YAML: {reason}")))
 }
 
 impl Value {

@@ -1,13 +1,13 @@
 //! Scene cache: reuses generated scenes if they are complete and match the options.
 
+use std::fs;
 use std::path::Path;
-use std::{fs, io};
 
 use serde::Deserialize;
 
 use super::data_protocol::FILE_NAME;
 use super::error::SynthError;
-use super::layout::SceneLayout;
+use super::layout::{SceneLayout, remove_folder};
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
 use crate::map::RoadMapSource;
@@ -76,32 +76,20 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
             weather,
             layout,
         } = made;
-        let settings = [
-            ("subset", subset.clone(), options.subset.name().to_owned()),
-            ("seed", seed.to_string(), options.seed.to_string()),
-            ("frames", frames.to_string(), options.frames.to_string()),
-            (
-                "period_seconds",
-                period_seconds.to_string(),
-                options.period_s.to_string(),
-            ),
-            (
-                "weather",
-                weather.clone(),
-                options.weather.name().to_owned(),
-            ),
-            (
-                "map_seed",
-                map_seed.to_string(),
-                options.map_seed.to_string(),
-            ),
-            ("layout", layout.clone(), options.layout.name().to_owned()),
+        let settings: [(&str, &dyn ToString, &dyn ToString); 7] = [
+            ("subset", subset, &options.subset.name()),
+            ("seed", seed, &options.seed),
+            ("frames", frames, &options.frames),
+            ("period_seconds", period_seconds, &options.period_s),
+            ("weather", weather, &options.weather.name()),
+            ("map_seed", map_seed, &options.map_seed),
+            ("layout", layout, &options.layout.name()),
         ];
-        if let Some((setting, found, wanted)) = settings
-            .into_iter()
-            .find(|(_, found, wanted)| found != wanted)
-        {
-            return differs(setting, found, wanted);
+        for (setting, found, wanted) in settings {
+            let (found, wanted) = (found.to_string(), wanted.to_string());
+            if found != wanted {
+                return differs(setting, found, wanted);
+            }
         }
         if !maps.contains(map) {
             return differs("map", map.clone(), maps.join(" or "));
@@ -111,12 +99,9 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
             return differs("agents", agents.to_string(), wanted);
         }
     }
-    if scenarios.len() != options.scenes {
-        return differs(
-            "scenarios",
-            scenarios.len().to_string(),
-            options.scenes.to_string(),
-        );
+    let (found, wanted) = (scenarios.len(), options.scenes);
+    if found != wanted {
+        return differs("scenarios", found.to_string(), wanted.to_string());
     }
     Ok(true)
 }
@@ -131,19 +116,12 @@ pub fn generate_whole(
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<Summary, SynthError> {
     let unfinished = options.out.with_added_extension("unfinished");
-    match fs::remove_dir_all(&unfinished) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            return Err(SynthError::Write(FileError::new(unfinished, error)));
-        }
-        Ok(()) | Err(_) => {}
-    }
-    let summary = generate(
-        &SynthOptions {
-            out: unfinished.clone(),
-            ..options.clone()
-        },
-        progress,
-    )?;
+    remove_folder(&unfinished)?;
+    let aside = SynthOptions {
+        out: unfinished.clone(),
+        ..options.clone()
+    };
+    let summary = generate(&aside, progress)?;
     fs::rename(&unfinished, &options.out)
         .at(&options.out)
         .map_err(SynthError::Write)?;

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use protocol::CavId;
 use rayon::prelude::*;
 
 use super::data_protocol::converted_yaml;
@@ -15,6 +14,7 @@ use super::layout::{
     Unfinished, locked,
 };
 use super::scenes::check_folder;
+use dataset::frame::Frame;
 use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
 /// Candidate lengths of a tick, nanoseconds: the step of a simulator, and resolutions of sensor clocks.
@@ -61,24 +61,18 @@ pub fn convert(
     let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
     locked(&left_out).add_files(&dataset.problems);
     let mut converted = Converted::default();
-    let total = dataset
+    let ticks = dataset
         .scenarios
         .iter()
-        .map(|scenario| scenario.ticks.len())
-        .sum();
+        .map(|scenario| scenario.ticks.len());
+    let total = ticks.sum();
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
         let holds_images = options.layout == SceneLayout::Opv2v;
-        let frames = write_moments(
-            scenario,
-            writer.as_ref(),
-            holds_images,
-            (&omitted, &left_out),
-            &|| {
-                progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
-            },
-        )?;
+        let count = || progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+        let losses = (&omitted, &left_out);
+        let frames = write_moments(scenario, writer.as_ref(), holds_images, losses, &count)?;
         writer.end()?;
         converted.scenarios += 1;
         converted.agent_frames += frames;
@@ -91,33 +85,23 @@ pub fn convert(
 }
 
 fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthError> {
-    let capture_nanos: Vec<u64> = scenario
-        .ticks
-        .iter()
-        .map(|tick| tick.capture_nanos)
-        .collect();
+    let capture_nanos = scenario.ticks.iter().map(|tick| tick.capture_nanos);
+    let capture_nanos: Vec<u64> = capture_nanos.collect();
     let divides = |tick: &u64| capture_nanos.iter().all(|nanos| nanos % tick == 0);
-    let tick_nanos = TICKS_NANOS
-        .into_iter()
-        .find(divides)
-        .unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
-    if let Some(pair) = capture_nanos
-        .windows(2)
-        .find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos)
-    {
+    let tick_nanos = TICKS_NANOS.into_iter().find(divides);
+    let tick_nanos = tick_nanos.unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
+    let mut pairs = capture_nanos.windows(2);
+    if let Some(pair) = pairs.find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos) {
         let reason = format!(
             "scenario {}: two moments at {} and {} ns: times do not rise",
             scenario.name, pair[0], pair[1]
         );
-        return Err(SynthError::Layout {
-            layout: "of the input",
-            reason,
-        });
+        let layout = "of the input";
+        return Err(SynthError::Layout { layout, reason });
     }
-    let is_roadside = |id: &CavId| scenario.roadside_units.contains(id);
     let agents = scenario.agents.iter().map(|id| SceneAgent {
         id: id.clone(),
-        is_roadside: is_roadside(id),
+        is_roadside: scenario.roadside_units.contains(id),
     });
     Ok(SceneHeader {
         name: scenario.name.clone(),
@@ -157,12 +141,11 @@ fn write_moments(
             frames: frames.collect(),
         };
         if !holds_images {
-            let images = moment
-                .frames
-                .iter()
-                .map(|agent| agent.frame.cameras.len())
-                .sum();
-            omitted.add("camera images, which the layout does not have", images);
+            let images = moment.frames.iter().map(|agent| agent.frame.cameras.len());
+            omitted.add(
+                "camera images, which the layout does not have",
+                images.sum(),
+            );
         }
         writer.write(&moment, omitted)?;
         Ok(moment.frames.len())
@@ -179,10 +162,8 @@ fn read(scenario: &Scenario, index: usize) -> LoadedTick {
         cameras: true,
     };
     let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
-    for (agent, _) in loaded
-        .frames
-        .extract_if(.., |(_, frame)| frame.world_from_lidar.is_none())
-    {
+    let lacks_pose = |(_, frame): &mut (usize, Frame)| frame.world_from_lidar.is_none();
+    for (agent, _) in loaded.frames.extract_if(.., lacks_pose) {
         let path = scenario.points_path(agent, index, None).unwrap_or_default();
         let error = ReadError::malformed(&path, "there is no pose for this sweep");
         loaded.unreadable.push((agent, Problem::from(&error)));
@@ -198,13 +179,10 @@ fn variants(
     left_out: &Mutex<LeftOut>,
 ) -> Vec<SweepVariant> {
     let read = |name: &String| {
-        let cloud = scenario
-            .load_points(agent, index, Some(name))
-            .map_err(|error| {
-                // Counted as a file, since a copy is part of its frame.
-                locked(left_out).add_files([&error]);
-            });
-        let cloud = cloud.ok()?;
+        let cloud = scenario.load_points(agent, index, Some(name));
+        // Counted as a file, since a copy is part of its frame.
+        let count = |error| locked(left_out).add_files([&error]);
+        let cloud = cloud.map_err(count).ok()?;
         let labels = cloud.labels.unwrap_or_else(|| vec![0; cloud.points.len()]);
         Some(SweepVariant {
             name: name.clone(),

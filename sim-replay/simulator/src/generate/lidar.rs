@@ -108,18 +108,15 @@ impl Lidar {
         self.hits.resize(bodies.len(), 0);
         let mut random = SplitMix64::new(seed);
         let image = self.caster.image();
-        let rows = image
-            .depths_m
-            .chunks_exact(CHANNELS)
-            .zip(image.hits.chunks_exact(CHANNELS));
+        let depths = image.depths_m.chunks_exact(CHANNELS);
+        let rows = depths.zip(image.hits.chunks_exact(CHANNELS));
         for (column, (depths, hits)) in self.caster.columns_at_end(sensor).zip(rows) {
             for ((elevation, &depth), &hit) in self.caster.elevations().zip(depths).zip(hits) {
                 if hit == MISS && weather == Weather::Sunny {
                     continue;
                 }
-                let Some((range_m, intensity, hit)) =
-                    measure(depth, hit, bodies, weather, &mut random)
-                else {
+                let measured = measure(depth, hit, bodies, weather, &mut random);
+                let Some((range_m, intensity, hit)) = measured else {
                     continue;
                 };
                 let [x, y, z] = column.point_m(elevation, range_m);

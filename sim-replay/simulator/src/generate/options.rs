@@ -112,77 +112,54 @@ impl SynthOptions {
     pub fn validate(&self) -> Result<(), FieldError> {
         let steps = self.period_s / STEP_S;
         let is_multiple = (1.0..=1e4).contains(&steps) && (steps - steps.round()).abs() < 1e-6;
-        require(
-            is_multiple,
-            "--period-s",
-            self.period_s,
-            "must be a multiple of 0.05 s up to 500 s",
-        )?;
+        let rule = "must be a multiple of 0.05 s up to 500 s";
+        require(is_multiple, "--period-s", self.period_s, rule)?;
         within("--frames", self.frames, 1, 100_000)?;
         within("--scenes", self.scenes, 1, 10_000)?;
         let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
+        let copies = copies.join(",");
+        let is_opv2v = self.layout == SceneLayout::Opv2v;
         let have_names = self
             .copies
             .iter()
             .all(|weather| weather.variant().is_some());
+        let rule = "must be fog, snow or both";
+        require(have_names, "--weather-copies", &copies, rule)?;
+        let rule = "must be none, as the layout opv2v alone has copies of sweeps";
         require(
-            have_names,
+            copies.is_empty() || is_opv2v,
             "--weather-copies",
-            copies.join(","),
-            "must be fog, snow or both",
-        )?;
-        let have_place = self.copies.is_empty() || self.layout == SceneLayout::Opv2v;
-        require(
-            have_place,
-            "--weather-copies",
-            copies.join(","),
-            "must be none, as the layout opv2v alone has copies of sweeps",
+            &copies,
+            rule,
         )?;
         let images = self
             .cameras
             .map_or("none".to_owned(), |size| size.to_string());
-        let are_small = self.cameras.is_none_or(|size| {
-            size.edges_px()
-                .iter()
-                .all(|edge| (16..=4096).contains(edge))
-        });
+        let is_small = |edge: &u32| (16..=4096).contains(edge);
+        let are_small = self
+            .cameras
+            .is_none_or(|size| size.edges_px().iter().all(is_small));
+        let rule = "must be 16 to 4096 pixels along each edge";
+        require(are_small, "--cameras", &images, rule)?;
+        let rule = "must be none, as images are written in the layout opv2v alone";
         require(
-            are_small,
-            "--cameras",
-            &images,
-            "must be 16 to 4096 pixels along each edge",
-        )?;
-        let have_place = self.cameras.is_none() || self.layout == SceneLayout::Opv2v;
-        require(
-            have_place,
+            self.cameras.is_none() || is_opv2v,
             "--cameras",
             images,
-            "must be none, as images are written in the layout opv2v alone",
+            rule,
         )?;
-        let agents = format!("{}-{}", self.agents.start(), self.agents.end());
-        let is_range = *self.agents.start() >= 1
-            && self.agents.start() <= self.agents.end()
-            && *self.agents.end() <= 7;
-        require(
-            is_range,
-            "--vehicles",
-            &agents,
-            "must be a number or a range within 1-7",
-        )?;
+        let (low, high) = (*self.agents.start(), *self.agents.end());
+        let agents = format!("{low}-{high}");
+        let is_range = low >= 1 && low <= high && high <= 7;
+        let rule = "must be a number or a range within 1-7";
+        require(is_range, "--vehicles", &agents, rule)?;
         if !self.layout.needs_two_agents() {
             return Ok(());
         }
-        require(
-            self.subset == Subset::V2vdet,
-            "--subset",
-            self.subset.name(),
-            "must be v2vdet, as the layout needs two agents",
-        )?;
-        require(
-            *self.agents.start() >= 2,
-            "--vehicles",
-            agents,
-            "must be 2 or more, as the layout needs two agents",
-        )
+        let (is_detection, subset) = (self.subset == Subset::V2vdet, self.subset.name());
+        let rule = "must be v2vdet, as the layout needs two agents";
+        require(is_detection, "--subset", subset, rule)?;
+        let rule = "must be 2 or more, as the layout needs two agents";
+        require(low >= 2, "--vehicles", agents, rule)
     }
 }

@@ -19,6 +19,13 @@ pub(crate) struct ParkedVehicle {
     pub(crate) placement: Placement,
 }
 
+impl ParkedVehicle {
+    /// Its outline on the ground.
+    pub(crate) fn rectangle(&self) -> Rectangle {
+        Rectangle::new(&self.placement, &self.vehicle.size_m)
+    }
+}
+
 /// Parks vehicles on the spots of a map; the occupancy differs from seed to seed.
 pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<ParkedVehicle> {
     let mut random = SplitMix64::new(seed);
@@ -34,20 +41,20 @@ pub(crate) fn park(map_model: &MapModel, lanes: &LaneIndex, seed: u64) -> Vec<Pa
             continue;
         };
         let placement = place(spot, &vehicle, &mut random);
-        let rectangle = Rectangle::new(&placement, &vehicle.size_m);
-        let touches = |other: &ParkedVehicle| {
-            rectangle
-                .grown(0.1)
-                .overlaps(&Rectangle::new(&other.placement, &other.vehicle.size_m))
-        };
-        if stands_on_a_lane(map_model, lanes, &rectangle) || parked.iter().any(touches) {
-            continue;
-        }
-        parked.push(ParkedVehicle {
-            id: FIRST_ID + number as i64,
+        let id = FIRST_ID + number as i64;
+        let candidate = ParkedVehicle {
+            id,
             vehicle,
             placement,
-        });
+        };
+        let rectangle = candidate.rectangle();
+        let room = rectangle.grown(0.1);
+        if stands_on_a_lane(map_model, lanes, &rectangle)
+            || parked.iter().any(|other| room.overlaps(&other.rectangle()))
+        {
+            continue;
+        }
+        parked.push(candidate);
     }
     parked
 }
@@ -62,11 +69,7 @@ fn fitting(spot: &ParkingSpot, random: &mut SplitMix64) -> Option<Vehicle> {
 fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Placement {
     let along = (spot.length_m - vehicle.size_m[0]) * 0.4 * random.between(-1.0, 1.0);
     let aside = (spot.width_m - vehicle.size_m[1]).min(0.4) * 0.5 * random.between(-1.0, 1.0);
-    let reversed = if random.chance(0.15) {
-        std::f64::consts::PI
-    } else {
-        0.0
-    };
+    let is_reversed = random.chance(0.15);
     let yaw = spot.yaw_rad + random.between(-0.03, 0.03);
     let (sin, cos) = spot.yaw_rad.sin_cos();
     let [x, y, z] = spot.center_m;
@@ -75,39 +78,26 @@ fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Plac
         y + along * sin + aside * cos,
         z + aside * spot.roll_rad.tan(),
     ];
-    let roll_rad = if reversed > 0.0 {
-        -spot.roll_rad
-    } else {
-        spot.roll_rad
+    let (turn, roll_rad) = match is_reversed {
+        true => (std::f64::consts::PI, -spot.roll_rad),
+        false => (0.0, spot.roll_rad),
     };
     Placement {
         roll_rad,
-        ..Placement::level(position_m, wrapped(yaw + reversed))
+        ..Placement::level(position_m, wrapped(yaw + turn))
     }
 }
 
 fn stands_on_a_lane(map_model: &MapModel, lanes: &LaneIndex, rectangle: &Rectangle) -> bool {
     let ([x, y], [c, s], [length, width]) = (rectangle.center_m, rectangle.axis, rectangle.half_m);
-    let outline = [
-        (-1.0, -1.0),
-        (-1.0, 1.0),
-        (1.0, -1.0),
-        (1.0, 1.0),
-        (0.0, -1.0),
-        (0.0, 1.0),
-        (0.0, 0.0),
-    ];
-    outline.iter().any(|&(along, aside)| {
+    let ends = [-1.0, 1.0, 0.0].into_iter();
+    let outline = ends.flat_map(|along| [-1.0, 1.0].map(|aside| (along, aside)));
+    outline.chain([(0.0, 0.0)]).any(|(along, aside)| {
         let (dx, dy) = (along * length, aside * width);
         let point = [x + dx * c - dy * s, y + dx * s + dy * c];
+        let (graph, z_m) = (&map_model.lanes, Some(rectangle.z_m));
         lanes
-            .nearest(
-                &map_model.lanes,
-                point,
-                LANE_ROOM_M,
-                None,
-                Some(rectangle.z_m),
-            )
+            .nearest(graph, point, LANE_ROOM_M, None, z_m)
             .is_some()
     })
 }

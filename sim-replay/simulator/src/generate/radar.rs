@@ -98,12 +98,8 @@ impl Radar {
                     * exact.norm();
                 let point = exact + direction * noise(RANGE_NOISE_M) + aside + shift;
                 let radial = radial + noise(VELOCITY_NOISE_MPS);
-                self.points.push([
-                    point.x as f32,
-                    point.y as f32,
-                    point.z as f32,
-                    radial as f32,
-                ]);
+                let [x, y, z]: [f32; 3] = point.map(|metres| metres as f32).into();
+                self.points.push([x, y, z, radial as f32]);
             }
         }
         &self.points

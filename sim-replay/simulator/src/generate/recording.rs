@@ -4,7 +4,7 @@ use super::error::SynthError;
 use super::parking::{ParkedVehicle, park};
 use super::raycast::{Placement, Sweep};
 use super::traffic::{Rectangle, STEP_S, Traffic, TrafficOptions};
-use super::vehicle::{Vehicle, VehicleKind};
+use super::vehicle::Vehicle;
 use super::world::World;
 use support::random::{SplitMix64, derive_seed};
 
@@ -69,59 +69,49 @@ impl RecordedFrame {
     pub(crate) fn of(&self, vehicle: usize) -> Option<&Moving> {
         let place = self
             .moving
-            .binary_search_by_key(&vehicle, |moving| moving.vehicle)
-            .ok()?;
-        Some(&self.moving[place])
+            .binary_search_by_key(&vehicle, |moving| moving.vehicle);
+        Some(&self.moving[place.ok()?])
     }
 }
 
 /// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
 pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
-    let parked = park(
-        world.map_model,
-        &world.lane_index,
-        derive_seed(spec.seed, &[1]),
-    );
-    let mut best: Option<(f64, Recording)> = None;
+    let seed = derive_seed(spec.seed, &[1]);
+    let parked = park(world.map_model, &world.lane_index, seed);
+    let mut best: Option<(f64, Vec<Vehicle>, Vec<RecordedFrame>, Vec<usize>)> = None;
     for attempt in 0..ATTEMPTS {
-        let (vehicles, frames) =
-            simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
+        let seed = derive_seed(spec.seed, &[2, attempt]);
+        let (vehicles, frames) = simulate(world, spec, &parked, seed)?;
         let mut random = SplitMix64::derived(spec.seed, &[3, attempt]);
         let (together, agents) = choose_agents(&vehicles, &frames, spec.agents, &mut random);
         // A drive that ends in a permanent jam shows one place again and again.
         let standing_s = longest_stand_s(&frames);
-        let quality = if standing_s > LONGEST_STAND_S {
-            together.min(0.0) - standing_s
-        } else {
-            together
+        let quality = match standing_s > LONGEST_STAND_S {
+            true => together.min(0.0) - standing_s,
+            false => together,
         };
-        if best.as_ref().is_none_or(|(least, _)| quality > *least) {
-            best = Some((
-                quality,
-                Recording {
-                    vehicles,
-                    parked: Vec::new(),
-                    frames,
-                    agents,
-                },
-            ));
+        if best.as_ref().is_none_or(|(least, ..)| quality > *least) {
+            best = Some((quality, vehicles, frames, agents));
         }
         if quality >= TOGETHER {
             break;
         }
     }
-    let (_, recording) = best.ok_or_else(|| SynthError::NoRoad(world.map_model.name.clone()))?;
-    if recording.agents.len() < spec.agents {
+    let no_road = || SynthError::NoRoad(world.map_model.name.clone());
+    let (_, vehicles, frames, agents) = best.ok_or_else(no_road)?;
+    if agents.len() < spec.agents {
         return Err(SynthError::TooFewCompanions {
             scenario: spec.name.clone(),
-            found: recording.agents.len() - 1,
+            found: agents.len() - 1,
             wanted: spec.agents - 1,
             range_m: COMM_RANGE_M,
         });
     }
     Ok(Recording {
+        vehicles,
         parked,
-        ..recording
+        frames,
+        agents,
     })
 }
 
@@ -136,23 +126,15 @@ fn simulate(
     if spawns.is_empty() {
         return Err(SynthError::NoRoad(world.map_model.name.clone()));
     }
-    let footprints: Vec<Rectangle> = parked
-        .iter()
-        .map(|parked| Rectangle::new(&parked.placement, &parked.vehicle.size_m))
-        .collect();
+    let footprints: Vec<Rectangle> = parked.iter().map(ParkedVehicle::rectangle).collect();
     let options = TrafficOptions {
         vehicles_per_km: random.between(7.0, 21.0),
         radius_m: TRAFFIC_RADIUS_M,
         focus_explores: spec.explores,
     };
     let start = spawns[random.below(spawns.len())];
-    let mut traffic = Traffic::new(
-        &world.roads,
-        &footprints,
-        options,
-        start,
-        derive_seed(seed, &[1]),
-    );
+    let seed = derive_seed(seed, &[1]);
+    let mut traffic = Traffic::new(&world.roads, &footprints, options, start, seed);
     // Until gaps and speeds are those of traffic rather than of the random initial state.
     let settling_steps = (random.between(6.0, 12.0) / STEP_S) as usize;
     (0..settling_steps).for_each(|_| traffic.step());
@@ -161,26 +143,19 @@ fn simulate(
         let steps = if frame == 0 { 1 } else { spec.steps_per_frame };
         (0..steps).for_each(|_| traffic.step());
         let tick = FIRST_TICK + (frame * spec.steps_per_frame) as u64;
-        let present = traffic
-            .cars
-            .iter()
-            .enumerate()
-            .filter(|(_, car)| car.is_present);
+        let cars = traffic.cars.iter().enumerate();
+        let present = cars.filter(|(_, car)| car.is_present);
         let moving = present.map(|(vehicle, car)| Moving {
             vehicle,
             id: car.id,
             motion: car.motion,
             speed_mps: car.speed_mps,
         });
-        frames.push(RecordedFrame {
-            tick,
-            moving: moving.collect(),
-        });
+        let moving = moving.collect();
+        frames.push(RecordedFrame { tick, moving });
     }
-    Ok((
-        traffic.cars.into_iter().map(|car| car.vehicle).collect(),
-        frames,
-    ))
+    let vehicles = traffic.cars.into_iter().map(|car| car.vehicle);
+    Ok((vehicles.collect(), frames))
 }
 
 /// Chooses the ego's companions at random among those that stay near it. Also returns the smallest share of frames in
@@ -191,14 +166,8 @@ fn choose_agents(
     count: usize,
     random: &mut SplitMix64,
 ) -> (f64, Vec<usize>) {
-    let carries_a_lidar = |vehicle: usize| {
-        matches!(
-            vehicles[vehicle].kind,
-            VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv
-        )
-    };
     let mut together: Vec<(f64, usize)> = (1..vehicles.len())
-        .filter(|&vehicle| carries_a_lidar(vehicle))
+        .filter(|&vehicle| vehicles[vehicle].kind.is_low())
         .map(|vehicle| (share_together(frames, vehicle), vehicle))
         .filter(|(share, _)| *share > 0.0)
         .collect();
@@ -211,19 +180,16 @@ fn choose_agents(
     } else {
         together.iter().map(|(share, _)| *share).fold(1.0, f64::min)
     };
-    let mut agents: Vec<usize> = std::iter::once(0)
-        .chain(together.into_iter().map(|(_, vehicle)| vehicle))
-        .collect();
+    let mut agents: Vec<usize> = together.into_iter().map(|(_, vehicle)| vehicle).collect();
+    agents.push(0);
     agents.sort_unstable();
     (quality, agents)
 }
 
 /// Share of the frames in which a vehicle is near the ego; 0 for one that was replaced by another on the way.
 fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
-    let id = frames
-        .first()
-        .and_then(|frame| frame.of(vehicle))
-        .map(|moving| moving.id);
+    let first = frames.first().and_then(|frame| frame.of(vehicle));
+    let id = first.map(|moving| moving.id);
     let mut near = 0;
     for frame in frames {
         let (Some(ego), Some(other)) = (frame.of(0), frame.of(vehicle)) else {
@@ -241,10 +207,10 @@ fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
 fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
     let mut since: Option<(&Moving, u64)> = None;
     let mut longest = 0;
-    for (frame, own) in frames
+    let own = frames
         .iter()
-        .filter_map(|frame| Some((frame, frame.of(0)?)))
-    {
+        .filter_map(|frame| Some((frame, frame.of(0)?)));
+    for (frame, own) in own {
         match since {
             Some((before, tick)) if distance_m(&before.motion.end, &own.motion.end) < 0.1 => {
                 longest = longest.max(frame.tick - tick);

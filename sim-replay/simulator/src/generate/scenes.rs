@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
 use support::file_error::AtFile;
 
 use protocol::CavId;
@@ -11,7 +11,8 @@ use protocol::CavId;
 use super::data_protocol::protocol_yaml;
 use super::error::SynthError;
 use super::layout::{
-    Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, make_folder,
+    Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, locked,
+    make_folder,
 };
 use super::options::{Subset, SynthOptions};
 use super::positioning::{Fix, Positioning};
@@ -78,11 +79,10 @@ pub fn generate(
         let places = sources(options).len();
         for number in (place..options.scenes).step_by(places) {
             let before = total.scenarios as u64 * 1000;
-            let spec = spec(options, &map_model, number);
             let scene = Scene {
                 options,
                 world: &world,
-                spec,
+                spec: spec(options, &map_model, number),
             };
             let progress = |thousandths| progress(before + thousandths);
             total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
@@ -109,14 +109,10 @@ fn spec(options: &SynthOptions, map_model: &MapModel, number: usize) -> SceneSpe
     let seed = derive_seed(options.seed, &[options.subset as u64, number as u64]);
     let (low, high) = (*options.agents.start(), *options.agents.end());
     let is_detection = options.subset == Subset::V2vdet;
+    let (subset, map_name) = (options.subset.name(), map_model.name.to_lowercase());
     let choice = (derive_seed(seed, &[0]) % (high - low + 1) as u64) as usize;
     SceneSpec {
-        name: format!(
-            "{}_{}_s{}_{number:04}",
-            options.subset.name(),
-            map_model.name.to_lowercase(),
-            options.seed
-        ),
+        name: format!("{subset}_{map_name}_s{}_{number:04}", options.seed),
         seed,
         agents: if is_detection { low + choice } else { 1 },
         frames: options.frames,
@@ -169,15 +165,13 @@ impl Scene<'_, '_> {
     }
 
     fn header(&self, recording: &Recording, agents: &[Agent]) -> SceneHeader {
+        let agents = agents.iter().map(|agent| SceneAgent {
+            id: agent.cav.clone(),
+            is_roadside: false,
+        });
         SceneHeader {
             name: self.spec.name.clone(),
-            agents: agents
-                .iter()
-                .map(|agent| SceneAgent {
-                    id: agent.cav.clone(),
-                    is_roadside: false,
-                })
-                .collect(),
+            agents: agents.collect(),
             capture_nanos: recording.frames.iter().map(capture_nanos).collect(),
             tick_nanos: STEP_NANOS,
             origin: protocol_yaml(self.options, &self.spec, self.world.map_model),
@@ -188,9 +182,8 @@ impl Scene<'_, '_> {
         let mut agents = Vec::new();
         for &vehicle in &recording.agents {
             // Agents are chosen among those that are present from the first frame to the last.
-            let id = recording.frames[0]
-                .of(vehicle)
-                .map_or(0, |moving| moving.id);
+            let first = recording.frames[0].of(vehicle);
+            let id = first.map_or(0, |moving| moving.id);
             let mut positioning = Positioning::new(derive_seed(self.spec.seed, &[4, id as u64]));
             let moving = recording
                 .frames
@@ -234,9 +227,7 @@ impl Scene<'_, '_> {
                 }
                 let moment = self.moment(recording, agents, index, &mut bench);
                 let result = writer.write(&moment, omitted).map(|()| counts(&moment));
-                let mut total = total
-                    .lock()
-                    .unwrap_or_else(std::sync::PoisonError::into_inner);
+                let mut total = locked(&total);
                 match (&mut *total, result) {
                     (Ok(total), Ok(summary)) => total.add(&summary),
                     (Ok(_), Err(error)) => *total = Err(error),
@@ -252,9 +243,7 @@ impl Scene<'_, '_> {
             }
             work();
         });
-        total
-            .into_inner()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
+        total.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

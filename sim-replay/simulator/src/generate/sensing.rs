@@ -47,13 +47,6 @@ impl<'w> Bench<'w> {
     }
 }
 
-/// Points of the LiDAR, copies of them in other weather, and the number of points on each body.
-struct LidarSweeps {
-    points: PointCloud,
-    variants: Vec<SweepVariant>,
-    hits: Vec<u32>,
-}
-
 impl Scene<'_, '_> {
     /// The frames of all agents at a capture time.
     pub(super) fn moment(
@@ -83,16 +76,11 @@ impl Scene<'_, '_> {
         let moment = &recording.frames[index];
         let (mut bodies, seen) = vehicles_around(recording, moment, agent.vehicle);
         let here = own.motion.end.position_m;
-        self.world
-            .standing_near(here.x, here.y, SIGHT_M, &mut bodies);
+        bodies.extend(self.world.standing_near([here.x, here.y], SIGHT_M));
 
         let noise =
             |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, moment.tick]);
-        let LidarSweeps {
-            points,
-            variants,
-            hits,
-        } = self.lidar_sweeps(&own.motion, &bodies, bench, &noise);
+        let (points, variants, hits) = self.lidar_sweeps(&own.motion, &bodies, bench, &noise);
         let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
         // No other layout can hold radar.
         let has_radar = self.options.layout == SceneLayout::Opv2v;
@@ -101,13 +89,9 @@ impl Scene<'_, '_> {
 
         let cameras = self.images(&own.motion.end, &bodies, &seen, bench, noise(8));
 
-        let is_hit = |(_, hits): &(Annotation<'_>, &u32)| **hits > 0;
-        let mut annotations: Vec<Annotation<'_>> = seen
-            .into_iter()
-            .zip(&hits)
-            .filter(is_hit)
-            .map(|(annotation, _)| annotation)
-            .collect();
+        let mut hits = hits.iter();
+        let mut annotations = seen;
+        annotations.retain(|_| hits.next().is_some_and(|hits| *hits > 0));
         annotations.sort_unstable_by_key(|annotation| annotation.id);
         let fix = agent.fixes[index];
         let frame = Frame {
@@ -136,41 +120,25 @@ impl Scene<'_, '_> {
         bodies: &[Body<'_>],
         bench: &mut Bench<'_>,
         noise: &dyn Fn(u64) -> u64,
-    ) -> LidarSweeps {
+    ) -> (PointCloud, Vec<SweepVariant>, Vec<u32>) {
         let sensor = lidar_motion(vehicle);
-        let sweep = bench.lidar.sweep(
-            &sensor,
-            self.world.ground(),
-            bodies,
-            self.options.weather,
-            noise(5),
-        );
-        let (points, hits) = (
-            PointCloud {
-                xyzi: sweep.points.to_vec(),
-            },
-            sweep.hits.to_vec(),
-        );
-        let named = self
-            .options
-            .copies
-            .iter()
-            .filter_map(|weather| Some((*weather, weather.variant()?)));
+        let (ground, weather) = (self.world.ground(), self.options.weather);
+        let sweep = bench
+            .lidar
+            .sweep(&sensor, ground, bodies, weather, noise(5));
+        let (points, hits) = (sweep.points.to_vec(), sweep.hits.to_vec());
+        let copies = self.options.copies.iter();
+        let named = copies.filter_map(|weather| Some((*weather, weather.variant()?)));
         let variants = named.map(|(weather, name)| {
-            let copy = bench
-                .lidar
-                .again(&sensor, bodies, weather, noise(7 + weather as u64));
+            let seed = noise(7 + weather as u64);
+            let copy = bench.lidar.again(&sensor, bodies, weather, seed);
             SweepVariant {
                 name: name.to_owned(),
                 points: copy.points.to_vec(),
                 labels: copy.labels.to_vec(),
             }
         });
-        LidarSweeps {
-            points,
-            variants: variants.collect(),
-            hits,
-        }
+        (PointCloud { xyzi: points }, variants.collect(), hits)
     }
 
     /// The images of the cameras; `seen` are the annotations of the first bodies.
@@ -186,27 +154,21 @@ impl Scene<'_, '_> {
             return Vec::new();
         };
         let standing = bodies.iter().skip(seen.len()).map(|body| {
-            let [x, y] =
-                [body.motion.end.position_m.x, body.motion.end.position_m.y].map(f64::to_bits);
+            let place = body.motion.end.position_m;
+            let [x, y] = [place.x, place.y].map(f64::to_bits);
             camera::of_shape(body.shape, x ^ y.rotate_left(17))
         });
-        let paints: Vec<_> = seen
+        let vehicles = seen
             .iter()
-            .map(|annotation| camera::of_vehicle(annotation.id))
-            .chain(standing)
-            .collect();
-        let (ground, weather) = (self.world.ground(), self.options.weather);
-        rig.images(
-            vehicle,
-            &Surroundings {
-                ground,
-                bodies,
-                paints: &paints,
-                weather,
-            },
-            ground_paint,
-            noise,
-        )
+            .map(|annotation| camera::of_vehicle(annotation.id));
+        let paints: Vec<_> = vehicles.chain(standing).collect();
+        let surroundings = Surroundings {
+            ground: self.world.ground(),
+            bodies,
+            paints: &paints,
+            weather: self.options.weather,
+        };
+        rig.images(vehicle, &surroundings, ground_paint, noise)
     }
 
     /// The radar's points; the fourth value is the radial velocity as stored in the red channel.
@@ -237,8 +199,8 @@ impl Scene<'_, '_> {
 
 /// The origin of a vehicle, and the offset from there to the centre of its box.
 fn anchor(annotation: &Annotation<'_>) -> BoxAnchor {
-    let up = annotation.placement.rotation()
-        * Vector3::new(0.0, 0.0, annotation.vehicle.size_m[2] / 2.0);
+    let half_m = annotation.vehicle.size_m[2] / 2.0;
+    let up = annotation.placement.rotation() * Vector3::new(0.0, 0.0, half_m);
     BoxAnchor {
         location_m: annotation.placement.position_m.into(),
         center_offset_m: up.into(),
@@ -246,12 +208,10 @@ fn anchor(annotation: &Annotation<'_>) -> BoxAnchor {
 }
 
 fn object(annotation: &Annotation<'_>) -> Object {
-    let BoxAnchor {
-        location_m,
-        center_offset_m,
-    } = anchor(annotation);
+    let anchor = anchor(annotation);
     let pose: Pose = annotation.placement.isometry().into();
-    let translation_m = std::array::from_fn(|axis| location_m[axis] + center_offset_m[axis]);
+    let translation_m =
+        std::array::from_fn(|axis| anchor.location_m[axis] + anchor.center_offset_m[axis]);
     Object {
         id: annotation.id,
         class: class(annotation.vehicle.kind),
@@ -281,28 +241,21 @@ fn vehicles_around<'a>(
     frame: &'a RecordedFrame,
     own: usize,
 ) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
-    let here = frame
-        .of(own)
-        .map_or_else(Default::default, |moving| moving.motion.end.position_m);
+    let here = frame.of(own).map(|moving| moving.motion.end.position_m);
+    let here = here.unwrap_or_default();
     let near = |motion: &Sweep| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0;
-    let moving = frame
-        .moving
-        .iter()
-        .filter(|moving| moving.vehicle != own && near(&moving.motion));
+    let moving = frame.moving.iter();
+    let moving = moving.filter(|moving| moving.vehicle != own && near(&moving.motion));
     let moving = moving.map(|moving| {
         let vehicle: &Vehicle = &recording.vehicles[moving.vehicle];
         (vehicle, moving.motion, moving.id, moving.speed_mps)
     });
     let parked = recording.parked.iter().map(|parked| {
-        (
-            &parked.vehicle,
-            Sweep::still(parked.placement),
-            parked.id,
-            0.0,
-        )
+        let motion = Sweep::still(parked.placement);
+        (&parked.vehicle, motion, parked.id, 0.0)
     });
     let parked = parked.filter(|(_, motion, ..)| near(motion));
-    moving
+    let all = moving
         .chain(parked)
         .map(|(vehicle, motion, id, speed_mps)| {
             let annotation = Annotation {
@@ -311,13 +264,8 @@ fn vehicles_around<'a>(
                 placement: motion.end,
                 speed_mps,
             };
-            (
-                Body {
-                    shape: &vehicle.shape,
-                    motion,
-                },
-                annotation,
-            )
-        })
-        .unzip()
+            let shape = &vehicle.shape;
+            (Body { shape, motion }, annotation)
+        });
+    all.unzip()
 }

@@ -52,9 +52,8 @@ impl Tops {
         let top = |square: usize| {
             let (column, row) = (square % columns * cells, square / columns * cells);
             let nodes = (0..=cells).flat_map(|v| (0..=cells).map(move |u| (column + u, row + v)));
-            nodes
-                .map(|(i, j)| grid.node_m(i, j))
-                .fold(f64::MIN, f64::max)
+            let heights = nodes.map(|(i, j)| grid.node_m(i, j));
+            heights.fold(f64::MIN, f64::max)
         };
         let values = (0..columns * rows).map(top).collect();
         Self {
@@ -70,9 +69,8 @@ impl Tops {
         let around = |square: i64| {
             let (column, row) = (square % self.columns, square / self.columns);
             let squares = (-1..=1).flat_map(|v| (-1..=1).map(move |u| (column + u, row + v)));
-            squares
-                .map(|(column, row)| self.at(column, row))
-                .fold(f64::MIN, f64::max)
+            let heights = squares.map(|(column, row)| self.at(column, row));
+            heights.fold(f64::MIN, f64::max)
         };
         Self {
             values: (0..self.columns * self.rows).map(around).collect(),
@@ -82,19 +80,15 @@ impl Tops {
 
     /// Beyond its edge the ground goes on at the height of the edge, which the outermost squares hold.
     fn at(&self, column: i64, row: i64) -> f64 {
-        let (column, row) = (
-            column.clamp(0, self.columns - 1),
-            row.clamp(0, self.rows - 1),
-        );
+        let column = column.clamp(0, self.columns - 1);
+        let row = row.clamp(0, self.rows - 1);
         self.values[(row * self.columns + column) as usize]
     }
 
     /// The square under a place given in cells.
     fn under(&self, [x, y]: [f64; 2]) -> f64 {
-        self.at(
-            (x / self.cells).floor() as i64,
-            (y / self.cells).floor() as i64,
-        )
+        let [column, row] = [x, y].map(|place| (place / self.cells).floor() as i64);
+        self.at(column, row)
     }
 }
 
@@ -201,11 +195,8 @@ impl Surface for TerrainSurface {
     /// The elevations must grow from ray to ray, as they do in every column of a caster.
     fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]) {
         let cell_m = self.grid.cell_m;
-        let start = [
-            rays.origin.x - self.grid.origin_m[0],
-            rays.origin.y - self.grid.origin_m[1],
-        ];
-        let origin = start.map(|metres| metres / cell_m);
+        let [x, y] = self.grid.origin_m;
+        let origin = [rays.origin.x - x, rays.origin.y - y].map(|metres| metres / cell_m);
         let range_m = depth.iter().copied().fold(0.0, f32::max);
         let mut strip = Strip::new(self, rays, origin, f64::from(range_m));
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
@@ -252,11 +243,8 @@ impl<'a> Strip<'a> {
         let step = along.xy() / along.xy().norm().max(1e-6) / surface.grid.cell_m;
         let tilt = f64::from(rays.up.xy().norm());
         let aside_m = 0.5 * PIECE_M + range_m * tilt * STEEPEST;
-        let is_steep = rays
-            .sin
-            .iter()
-            .zip(rays.cos)
-            .any(|(sin, cos)| f64::from(sin.abs()) > STEEPEST * f64::from(*cos));
+        let mut angles = rays.sin.iter().zip(rays.cos);
+        let is_steep = angles.any(|(sin, cos)| f64::from(sin.abs()) > STEEPEST * f64::from(*cos));
         let mut strip = Self {
             surface,
             origin,
@@ -308,12 +296,8 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
         .try_normalize(1e-9)?;
     let normal = if normal.z < 0.0 { -normal } else { normal };
     let plane = |normal: &Vector3<f64>, point: &Vector3<f64>| {
-        [
-            normal.x as f32,
-            normal.y as f32,
-            normal.z as f32,
-            normal.dot(point) as f32,
-        ]
+        let [x, y, z]: [f32; 3] = normal.map(|part| part as f32).into();
+        [x, y, z, normal.dot(point) as f32]
     };
     let top = plane(&normal, &local[0]);
     let mut planes = vec![top, [-top[0], -top[1], -top[2], DECK_M - top[3]]];
@@ -321,32 +305,17 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
         let outward = (local[to] - local[from])
             .cross(&Vector3::z())
             .try_normalize(1e-9)?;
-        let outward = if outward.dot(&(local[opposite] - local[from])) > 0.0 {
-            -outward
-        } else {
-            outward
-        };
+        let is_inward = outward.dot(&(local[opposite] - local[from])) > 0.0;
+        let outward = if is_inward { -outward } else { outward };
         planes.push(plane(&outward, &local[from]));
     }
     let corners = local.map(|corner| corner.map(|metres| metres as f32));
-    let mut bounds = corners.iter().fold(
-        Bounds {
-            min_m: [f32::MAX; 3],
-            max_m: [f32::MIN; 3],
-        },
-        |bounds, corner| {
-            bounds.union(&Bounds {
-                min_m: (*corner).into(),
-                max_m: (*corner).into(),
-            })
-        },
-    );
+    let [a, b, c] = corners.map(|corner| Bounds::centered(corner.into(), [0.0; 3]));
+    let mut bounds = a.union(&b).union(&c);
     // Below a steep face the slab reaches a little deeper than its thickness.
     bounds.min_m[2] -= DECK_M / (normal.z as f32).max(0.2);
-    Some((
-        BodyShape::new(vec![Part::Hull { planes, bounds }], 0.25),
-        center,
-    ))
+    let shape = BodyShape::new(vec![Part::Hull { planes, bounds }], 0.25);
+    Some((shape, center))
 }
 
 #[cfg(test)]

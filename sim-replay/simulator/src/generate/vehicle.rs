@@ -48,57 +48,45 @@ struct Stock {
 
 /// Sizes after the vehicles of CARLA. All stay under 2.9 m, so that a box stands within -3..1 m of a LiDAR at 1.95 m.
 /// Trucks and buses are rare: the clean-up of detections in OpenCOOD's protocol drops boxes longer than 6 m.
-const STOCK: [Stock; 7] = [
+const STOCK: [Stock; 7] = {
+    use VehicleKind::{Bus, Hatchback, Pickup, Sedan, Suv, Truck, Van};
+    [
+        stock(Sedan, [4.65, 1.95, 1.48], [0.07, 0.05, 0.04], [0.36, 0.38]),
+        stock(
+            Hatchback,
+            [3.95, 1.85, 1.52],
+            [0.08, 0.05, 0.04],
+            [0.21, 0.26],
+        ),
+        stock(Suv, [4.65, 2.05, 1.75], [0.07, 0.04, 0.06], [0.25, 0.24]),
+        stock(Pickup, [5.30, 2.05, 1.88], [0.05, 0.04, 0.04], [0.05; 2]),
+        stock(Van, [5.15, 2.05, 2.15], [0.08, 0.04, 0.12], [0.085, 0.07]),
+        stock(Truck, [7.10, 2.40, 2.65], [0.12, 0.03, 0.05], [0.03, 0.0]),
+        stock(Bus, [10.2, 2.50, 2.82], [0.10, 0.02, 0.015], [0.015, 0.0]),
+    ]
+};
+
+const fn stock(
+    kind: VehicleKind,
+    size_m: [f64; 3],
+    spread: [f64; 3],
+    [driving, parked]: [f64; 2],
+) -> Stock {
     Stock {
-        kind: VehicleKind::Sedan,
-        size_m: [4.65, 1.95, 1.48],
-        spread: [0.07, 0.05, 0.04],
-        driving: 0.36,
-        parked: 0.38,
-    },
-    Stock {
-        kind: VehicleKind::Hatchback,
-        size_m: [3.95, 1.85, 1.52],
-        spread: [0.08, 0.05, 0.04],
-        driving: 0.21,
-        parked: 0.26,
-    },
-    Stock {
-        kind: VehicleKind::Suv,
-        size_m: [4.65, 2.05, 1.75],
-        spread: [0.07, 0.04, 0.06],
-        driving: 0.25,
-        parked: 0.24,
-    },
-    Stock {
-        kind: VehicleKind::Pickup,
-        size_m: [5.30, 2.05, 1.88],
-        spread: [0.05, 0.04, 0.04],
-        driving: 0.05,
-        parked: 0.05,
-    },
-    Stock {
-        kind: VehicleKind::Van,
-        size_m: [5.15, 2.05, 2.15],
-        spread: [0.08, 0.04, 0.12],
-        driving: 0.085,
-        parked: 0.07,
-    },
-    Stock {
-        kind: VehicleKind::Truck,
-        size_m: [7.10, 2.40, 2.65],
-        spread: [0.12, 0.03, 0.05],
-        driving: 0.03,
-        parked: 0.0,
-    },
-    Stock {
-        kind: VehicleKind::Bus,
-        size_m: [10.2, 2.50, 2.82],
-        spread: [0.10, 0.02, 0.015],
-        driving: 0.015,
-        parked: 0.0,
-    },
-];
+        kind,
+        size_m,
+        spread,
+        driving,
+        parked,
+    }
+}
+
+impl VehicleKind {
+    /// True for cars with a low roof, on which a LiDAR is mounted.
+    pub(crate) fn is_low(self) -> bool {
+        matches!(self, Self::Sedan | Self::Hatchback | Self::Suv)
+    }
+}
 
 impl Vehicle {
     /// A random vehicle with the frequencies of moving traffic.
@@ -113,16 +101,10 @@ impl Vehicle {
 
     /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
     pub(crate) fn random_connected(random: &mut SplitMix64) -> Self {
-        let low = |kind| {
-            matches!(
-                kind,
-                VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv
-            )
-        };
-        Self::random(
-            random,
-            |stock| if low(stock.kind) { stock.driving } else { 0.0 },
-        )
+        Self::random(random, |stock| match stock.kind.is_low() {
+            true => stock.driving,
+            false => 0.0,
+        })
     }
 
     fn random(random: &mut SplitMix64, weight: impl Fn(&Stock) -> f64) -> Self {
@@ -218,41 +200,25 @@ struct Profile {
 
 impl Form {
     fn car(&self, profile: &Profile) -> Vec<Part> {
-        let (length, side, height) = (2.0 * self.half, self.side, self.height);
+        let Self { half, side, height } = *self;
+        let length = 2.0 * half;
         let (floor, bumper, belt) = (0.14 * height, 0.40 * height, profile.belt * height);
+        let below = [0.05 - half, half - 0.08, side - 0.07];
+        let widest = [-half, half, side];
+        let [boot, bonnet] = [profile.boot, profile.bonnet].map(|share| share * length);
+        let [rear, front] = profile.cabin.map(|place| place * length);
+        let [roof_rear, roof_front] = profile.roof.map(|place| place * length);
         let mut parts = vec![
-            frustum(
-                [floor, bumper],
-                [
-                    [0.05 - self.half, self.half - 0.08, side - 0.07],
-                    [-self.half, self.half, side],
-                ],
-            ),
+            frustum([floor, bumper], below, widest),
             frustum(
                 [bumper, belt],
-                [
-                    [-self.half, self.half, side],
-                    [
-                        profile.boot * length - self.half,
-                        self.half - profile.bonnet * length,
-                        side - 0.05,
-                    ],
-                ],
+                widest,
+                [boot - half, half - bonnet, side - 0.05],
             ),
             frustum(
                 [belt, height],
-                [
-                    [
-                        profile.cabin[0] * length,
-                        profile.cabin[1] * length,
-                        side - 0.07,
-                    ],
-                    [
-                        profile.roof[0] * length,
-                        profile.roof[1] * length,
-                        side - 0.26,
-                    ],
-                ],
+                [rear, front, side - 0.07],
+                [roof_rear, roof_front, side - 0.26],
             ),
         ];
         parts.extend(self.wheels(0.33, 0.30 * length, -0.29 * length));
@@ -261,59 +227,31 @@ impl Form {
 
     /// `cab` is the share of the length before the cargo, `cab_height` of the height.
     fn truck(&self, cab: f32, cab_height: f32) -> Vec<Part> {
-        let (length, side, height) = (2.0 * self.half, self.side, self.height);
-        let front = self.half - cab * length;
+        let Self { half, side, height } = *self;
+        let length = 2.0 * half;
+        let front = half - cab * length;
+        let (frame, cargo) = ([-half, front, side * 0.5], [-half, front - 0.15, side]);
+        let cab_top = [front, half, side - 0.05];
+        let windscreen = [0.5 * height, cab_height * height];
         let mut parts = vec![
-            // Frame, cargo, cab, windscreen.
-            frustum(
-                [0.55, 0.95],
-                [
-                    [-self.half, front, side * 0.5],
-                    [-self.half, front, side * 0.5],
-                ],
-            ),
-            frustum(
-                [0.95, height],
-                [
-                    [-self.half, front - 0.15, side],
-                    [-self.half, front - 0.15, side],
-                ],
-            ),
-            frustum(
-                [0.35, 0.5 * height],
-                [
-                    [front, self.half, side - 0.08],
-                    [front, self.half, side - 0.05],
-                ],
-            ),
-            frustum(
-                [0.5 * height, cab_height * height],
-                [
-                    [front, self.half, side - 0.05],
-                    [front, self.half - 0.45, side - 0.2],
-                ],
-            ),
+            frustum([0.55, 0.95], frame, frame),
+            frustum([0.95, height], cargo, cargo),
+            frustum([0.35, 0.5 * height], [front, half, side - 0.08], cab_top),
+            frustum(windscreen, cab_top, [front, half - 0.45, side - 0.2]),
         ];
         parts.extend(self.wheels(0.48, self.half - 0.55 * cab * length, -0.32 * length));
         parts
     }
 
     fn bus(&self) -> Vec<Part> {
-        let (side, height) = (self.side, self.height);
+        let Self { half, side, height } = *self;
+        let widest = [-half, half, side];
         let mut parts = vec![
-            frustum(
-                [0.30, 1.10],
-                [
-                    [-self.half, self.half, side - 0.03],
-                    [-self.half, self.half, side],
-                ],
-            ),
+            frustum([0.30, 1.10], [-half, half, side - 0.03], widest),
             frustum(
                 [1.10, height],
-                [
-                    [-self.half, self.half, side],
-                    [0.1 - self.half, self.half - 0.25, side - 0.12],
-                ],
+                widest,
+                [0.1 - half, half - 0.25, side - 0.12],
             ),
         ];
         parts.extend(self.wheels(0.48, 0.30 * 2.0 * self.half, -0.26 * 2.0 * self.half));
@@ -322,40 +260,31 @@ impl Form {
 
     fn wheels(&self, radius: f32, front: f32, rear: f32) -> Vec<Part> {
         let at = |x, side: f32| wheel([x, side * (self.side - 0.14), radius], radius, 0.12);
-        vec![
-            at(front, 1.0),
-            at(front, -1.0),
-            at(rear, 1.0),
-            at(rear, -1.0),
-        ]
+        [(front, 1.0), (front, -1.0), (rear, 1.0), (rear, -1.0)]
+            .map(|(x, side)| at(x, side))
+            .into()
     }
 }
 
 /// A solid between two level rectangles: heights `[bottom, top]`, and for each `[rear x, front x, half width]`.
 fn frustum(
     [bottom, top]: [f32; 2],
-    [[rear0, front0, side0], [rear1, front1, side1]]: [[f32; 3]; 2],
+    [rear0, front0, side0]: [f32; 3],
+    [rear1, front1, side1]: [f32; 3],
 ) -> Part {
     let rise = top - bottom;
     // A face through (at0, bottom) and (at1, top), with its normal towards growing `at`.
     let slant = |at0: f32, at1: f32| {
-        let norm = rise.hypot(at0 - at1);
-        (
-            rise / norm,
-            (at0 - at1) / norm,
-            (rise * at0 + (at0 - at1) * bottom) / norm,
-        )
+        let (norm, back) = (rise.hypot(at0 - at1), at0 - at1);
+        [rise, back, rise * at0 + back * bottom].map(|value| value / norm)
     };
-    let (front, rear, left) = (
-        slant(front0, front1),
-        slant(-rear0, -rear1),
-        slant(side0, side1),
-    );
+    let [front, rear] = [slant(front0, front1), slant(-rear0, -rear1)];
+    let left = slant(side0, side1);
     let planes = vec![
-        [front.0, 0.0, front.1, front.2],
-        [-rear.0, 0.0, rear.1, rear.2],
-        [0.0, left.0, left.1, left.2],
-        [0.0, -left.0, left.1, left.2],
+        [front[0], 0.0, front[1], front[2]],
+        [-rear[0], 0.0, rear[1], rear[2]],
+        [0.0, left[0], left[1], left[2]],
+        [0.0, -left[0], left[1], left[2]],
         [0.0, 0.0, 1.0, top],
         [0.0, 0.0, -1.0, -bottom],
     ];
@@ -429,7 +358,7 @@ mod tests {
 
     #[test]
     fn a_frustum_is_bounded_by_its_rectangles() {
-        let Part::Hull { planes, .. } = frustum([0.5, 1.5], [[-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7]])
+        let Part::Hull { planes, .. } = frustum([0.5, 1.5], [-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7])
         else {
             panic!("a frustum is a hull");
         };

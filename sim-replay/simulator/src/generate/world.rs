@@ -24,28 +24,19 @@ struct Standing {
 
 impl<'t> World<'t> {
     pub(crate) fn new(map_model: &'t MapModel) -> Self {
+        let decks = map_model.ground.decks.iter().filter_map(deck_shape);
         let decks =
-            map_model
-                .ground
-                .decks
-                .iter()
-                .filter_map(deck_shape)
-                .map(|(shape, center_m)| Standing {
-                    radius_m: shape.bounds.radius_m(),
-                    shape,
-                    placement: Placement::level(center_m, 0.0),
-                });
+            decks.map(|(shape, center_m)| Standing::new(shape, Placement::level(center_m, 0.0)));
+        let solids = map_model.solids.iter().map(|solid| {
+            let placement = Placement::level(solid.center_m, solid.yaw_rad);
+            Standing::new(BodyShape::from(solid), placement)
+        });
         Self {
             map_model,
             roads: Roads::new(&map_model.lanes),
             lane_index: LaneIndex::new(&map_model.lanes),
             ground: ground_surface(map_model),
-            standing: map_model
-                .solids
-                .iter()
-                .map(Standing::from)
-                .chain(decks)
-                .collect(),
+            standing: solids.chain(decks).collect(),
         }
     }
 
@@ -54,26 +45,21 @@ impl<'t> World<'t> {
     }
 
     /// Appends static objects within `radius_m` of a position.
-    pub(crate) fn standing_near<'a>(
-        &'a self,
-        x_m: f64,
-        y_m: f64,
+    pub(crate) fn standing_near(
+        &self,
+        [x_m, y_m]: [f64; 2],
         radius_m: f64,
-        bodies: &mut Vec<Body<'a>>,
-    ) {
-        bodies.extend(self.standing.iter().filter_map(|standing| {
+    ) -> impl Iterator<Item = Body<'_>> {
+        self.standing.iter().filter_map(move |standing| {
             let position = standing.placement.position_m;
-            let (dx, dy, reach) = (
-                position.x - x_m,
-                position.y - y_m,
-                radius_m + standing.radius_m,
-            );
+            let (dx, dy) = (position.x - x_m, position.y - y_m);
+            let reach = radius_m + standing.radius_m;
             let is_near = dx * dx + dy * dy < reach * reach;
             is_near.then(|| Body {
                 shape: &standing.shape,
                 motion: Sweep::still(standing.placement),
             })
-        }));
+        })
     }
 }
 
@@ -108,10 +94,8 @@ impl From<&Solid> for BodyShape {
     }
 }
 
-impl From<&Solid> for Standing {
-    fn from(solid: &Solid) -> Self {
-        let shape = BodyShape::from(solid);
-        let placement = Placement::level(solid.center_m, solid.yaw_rad);
+impl Standing {
+    fn new(shape: BodyShape, placement: Placement) -> Self {
         Self {
             radius_m: shape.bounds.radius_m(),
             shape,

@@ -1,6 +1,7 @@
 //! Clearance check: finds solids that reach into the space of a lane.
 
 use super::convex::{CellIndex, Rectangle, bounds, overlap};
+use super::curve::Pose2;
 use super::{LaneId, MapModel, Shape, Solid};
 
 /// Height over a lane that stays free of solids, metres.
@@ -14,13 +15,11 @@ const CELL_M: f64 = 10.0;
 pub(crate) fn outline(solid: &Solid) -> Rectangle {
     let half_m = solid.shape.half_footprint_m();
     // A round outline needs no turning.
-    let yaw_rad = if matches!(solid.shape, Shape::Cylinder { .. }) {
-        0.0
-    } else {
-        solid.yaw_rad
-    };
+    let is_round = matches!(solid.shape, Shape::Cylinder { .. });
+    let [x, y, _] = solid.center_m;
+    let yaw_rad = if is_round { 0.0 } else { solid.yaw_rad };
     Rectangle {
-        center_m: [solid.center_m[0], solid.center_m[1]],
+        center_m: [x, y],
         half_m,
         yaw_rad,
     }
@@ -48,15 +47,11 @@ impl MapModel {
             for (pair, width) in lane.centerline.windows(2).zip(&lane.widths_m) {
                 let [from, to] = [pair[0], pair[1]];
                 let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
-                let center_m = [(from[0] + to[0]) / 2.0, (from[1] + to[1]) / 2.0];
+                let [x, y] = [0, 1].map(|axis| (from[axis] + to[axis]) / 2.0);
                 // Two centimetres of tolerance at the edges: lanes are sampled.
                 let half_m = [dx.hypot(dy) / 2.0, (width / 2.0 - 0.02).max(0.01)];
-                let piece = Rectangle {
-                    center_m,
-                    half_m,
-                    yaw_rad: dy.atan2(dx),
-                }
-                .corners();
+                let middle = Pose2::new(x, y, dy.atan2(dx));
+                let piece = Rectangle::around(middle, half_m).corners();
                 index.any(bounds(&piece), |number| {
                     let solid = &self.solids[number as usize];
                     let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M
@@ -86,7 +81,13 @@ mod tests {
         let shape = Shape::Box {
             half_m: [0.3, 0.3, 0.5],
         };
-        let solid = |y: f64, z: f64| Solid::new(SolidKind::Sign, shape, [10.0, y, z], 0.3, 0.5);
+        let solid = |y: f64, z: f64| Solid {
+            kind: SolidKind::Sign,
+            shape,
+            center_m: [10.0, y, z],
+            yaw_rad: 0.3,
+            reflectivity: 0.5,
+        };
         let solids = vec![
             solid(0.0, 5.6),
             solid(1.5, 1.0),

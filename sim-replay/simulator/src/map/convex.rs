@@ -1,5 +1,7 @@
 //! Convex outlines in the plane, and a grid index over them.
 
+use super::curve::Pose2;
+
 /// Corners of a convex quadrilateral, in order around it, metres.
 pub(crate) type Quad = [[f64; 2]; 4];
 
@@ -12,6 +14,24 @@ pub(crate) struct Rectangle {
 }
 
 impl Rectangle {
+    /// The rectangle in the middle of which a pose lies, along its heading.
+    pub(crate) fn around(pose: Pose2, half_m: [f64; 2]) -> Self {
+        Self {
+            center_m: [pose.x, pose.y],
+            half_m,
+            yaw_rad: pose.heading_rad,
+        }
+    }
+
+    /// The square around a point, along the axes of the map.
+    pub(crate) fn square(center_m: [f64; 2], half_m: f64) -> Self {
+        Self {
+            center_m,
+            half_m: [half_m; 2],
+            yaw_rad: 0.0,
+        }
+    }
+
     /// The same rectangle, larger by `margin_m` on every side.
     pub(crate) fn grown(&self, margin_m: f64) -> Self {
         Self {

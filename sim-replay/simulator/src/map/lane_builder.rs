@@ -2,7 +2,7 @@
 
 use super::conflicts;
 use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
-use super::lane_links::{self, LinkCounts};
+use super::lane_links::{LinkCounts, Linker};
 use super::road::{Contact, LaneKind, Road, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
@@ -28,6 +28,17 @@ pub(super) struct Origin {
     pub(super) road: usize,
     pub(super) section: usize,
     pub(super) lane: i32,
+}
+
+impl Origin {
+    /// The section that follows along the road, or against it.
+    pub(super) fn next_section(self, forward: bool) -> Option<usize> {
+        if forward {
+            Some(self.section + 1)
+        } else {
+            self.section.checked_sub(1)
+        }
+    }
 }
 
 /// Builds the driving lanes of `network` and their links. `Road::leads_along` gives the direction of each lane:
@@ -61,8 +72,13 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
         }
     }
     let mut graph = LaneGraph::new(lanes);
-    lane_links::link_neighbours(&mut graph, network, &origins, &table);
-    let counts = lane_links::link_successors(&mut graph, network, &origins, &table);
+    let linker = Linker {
+        network,
+        origins: &origins,
+        table: &table,
+    };
+    linker.link_neighbours(&mut graph);
+    let counts = linker.link_successors(&mut graph);
     conflicts::find(&mut graph);
     (graph, counts)
 }
@@ -80,11 +96,8 @@ impl LaneTable {
     }
 
     fn section_count(&self, road: usize) -> usize {
-        self.first_section
-            .get(road + 1)
-            .copied()
-            .unwrap_or(self.ids.len())
-            - self.first_section[road]
+        let next = self.first_section.get(road + 1).copied();
+        next.unwrap_or(self.ids.len()) - self.first_section[road]
     }
 
     /// The section of a road at one of its ends.
@@ -102,30 +115,25 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     if source.kind != LaneKind::Driving {
         return None;
     }
-    let (from, to) = (
-        section.s_m.min(road.length_m),
-        road.section_end_m(origin.section),
-    );
+    let from = section.s_m.min(road.length_m);
+    let to = road.section_end_m(origin.section);
     let CenterLine {
         points,
         widths_m,
         banks_rad,
         length_m,
     } = center_line(road, origin, from, to)?;
-    let middle = (from + to) / 2.0;
     let limit = source
         .speed_limit_mps
-        .or_else(|| road.speed_limit_mps(middle))
-        .unwrap_or(DEFAULT_LIMIT_MPS);
+        .or_else(|| road.speed_limit_mps((from + to) / 2.0));
+    let limit = limit.unwrap_or(DEFAULT_LIMIT_MPS);
     let mut sorted = widths_m.clone();
     sorted.sort_unstable_by(f64::total_cmp);
     let mut lane = Lane::new(id, points, sorted[sorted.len() / 2], limit);
     (lane.widths_m, lane.length_m) = (widths_m, length_m);
-    lane.banks_rad = if road.lateral.is_level() {
-        Vec::new()
-    } else {
-        banks_rad
-    };
+    if !road.lateral.is_level() {
+        lane.banks_rad = banks_rad;
+    }
     lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
     lane.in_junction = road.junction.is_some();
     if lane.in_junction {

@@ -1,5 +1,7 @@
 //! Links between the lanes of a map: neighbours, successors, and links that are refused.
 
+use std::fmt;
+
 use super::finding::{Finding, FindingLog};
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 use super::lane_builder::{LaneTable, Origin};
@@ -25,275 +27,222 @@ pub struct LinkCounts {
     pub findings: Vec<Finding>,
 }
 
-/// Fills [`Lane::left`] and [`Lane::right`].
-pub(super) fn link_neighbours(
-    graph: &mut LaneGraph,
-    network: &RoadNetwork,
-    origins: &[Origin],
-    table: &LaneTable,
-) {
-    for (
-        lane,
-        &Origin {
-            road: index,
-            section,
-            lane: id,
-        },
-    ) in graph.lanes.iter_mut().zip(origins)
-    {
-        let road = &network.roads[index];
-        let along = road.leads_along(section, id);
-        let beside = |other: i32| {
-            table
-                .get(index, section, other)
-                .filter(|_| road.leads_along(section, other) == along)
-        };
-        let (inner, outer) = (beside(id - id.signum()), beside(id + id.signum()));
-        // Seen along the road, the reference line is to the left of lanes with negative ids.
-        (lane.left, lane.right) = if (id < 0) == along {
-            (inner, outer)
-        } else {
-            (outer, inner)
-        };
-    }
+/// Sections and lanes of the roads that the lanes of a graph were made from.
+pub(super) struct Linker<'a> {
+    pub(super) network: &'a RoadNetwork,
+    pub(super) origins: &'a [Origin],
+    pub(super) table: &'a LaneTable,
 }
 
-/// Fills [`Lane::successors`] and [`Lane::predecessors`].
-pub(super) fn link_successors(
-    graph: &mut LaneGraph,
-    network: &RoadNetwork,
-    origins: &[Origin],
-    table: &LaneTable,
-) -> LinkCounts {
-    let mut counts = LinkCounts::default();
-    let mut log = FindingLog::default();
-    for (index, &origin) in origins.iter().enumerate() {
-        log.enter("road", &network.roads[origin.road].id);
-        let mut successors: Vec<LaneId> = Vec::new();
-        for next in candidates(network, origin, table) {
-            if successors.contains(&next) {
-                continue;
+impl Linker<'_> {
+    /// Fills [`Lane::left`] and [`Lane::right`].
+    pub(super) fn link_neighbours(&self, graph: &mut LaneGraph) {
+        for (lane, origin) in graph.lanes.iter_mut().zip(self.origins) {
+            let (section, id) = (origin.section, origin.lane);
+            let road = &self.network.roads[origin.road];
+            let along = road.leads_along(section, id);
+            let beside = |other: i32| {
+                let found = self.table.get(origin.road, section, other);
+                found.filter(|_| road.leads_along(section, other) == along)
+            };
+            let (inner, outer) = (beside(id - id.signum()), beside(id + id.signum()));
+            // Seen along the road, the reference line is to the left of lanes with negative ids.
+            (lane.left, lane.right) = match (id < 0) == along {
+                true => (inner, outer),
+                false => (outer, inner),
+            };
+        }
+    }
+
+    /// Fills [`Lane::successors`] and [`Lane::predecessors`].
+    pub(super) fn link_successors(&self, graph: &mut LaneGraph) -> LinkCounts {
+        let roads = &self.network.roads;
+        let mut counts = LinkCounts::default();
+        let mut log = FindingLog::default();
+        for (index, &origin) in self.origins.iter().enumerate() {
+            log.enter("road", &roads[origin.road].id);
+            let mut successors: Vec<LaneId> = Vec::new();
+            for next in self.candidates(origin) {
+                if successors.contains(&next) {
+                    continue;
+                }
+                let joint = Joint::of(&graph.lanes[index], graph.lane(next));
+                if joint.meets() {
+                    counts.made += 1;
+                    successors.push(next);
+                } else {
+                    counts.refused += 1;
+                    let onto = self.origins[next.0 as usize];
+                    let found = format!(
+                        "leads from lane {} onto lane {} of road {}, {joint}",
+                        origin.lane, onto.lane, roads[onto.road].id
+                    );
+                    log.add(0, "laneLink", &found, "link left out");
+                }
             }
-            if meets(&graph.lanes[index], graph.lane(next)) {
+            if successors.is_empty()
+                && let Some(next) = self.same_lane_on(graph, origin)
+            {
+                let found = format!(
+                    "leads from lane {} to no lane, though lane {} continues",
+                    origin.lane, origin.lane
+                );
+                log.add(0, "link", &found, "lanes of one id linked");
                 counts.made += 1;
                 successors.push(next);
-            } else {
-                counts.refused += 1;
-                let onto = origins[next.0 as usize];
-                let apart = apart(&graph.lanes[index], graph.lane(next));
-                let onto = format!(
-                    "lane {} of road {}, {apart}",
-                    onto.lane, network.roads[onto.road].id
-                );
-                log.add(
-                    0,
-                    "laneLink",
-                    &format!("leads from lane {} onto {onto}", origin.lane),
-                    "link left out",
-                );
             }
+            for &next in &successors {
+                let predecessors = &mut graph.lanes[next.0 as usize].predecessors;
+                predecessors.push(LaneId(index as u32));
+            }
+            graph.lanes[index].successors = successors;
         }
-        if let Some(next) = successors
-            .is_empty()
-            .then(|| same_lane_on(graph, network, origin, table))
-            .flatten()
-        {
-            let found = format!(
-                "leads from lane {} to no lane, though lane {} continues",
-                origin.lane, origin.lane
-            );
-            log.add(0, "link", &found, "lanes of one id linked");
-            counts.made += 1;
-            successors.push(next);
-        }
-        for &next in &successors {
-            graph.lanes[next.0 as usize]
-                .predecessors
-                .push(LaneId(index as u32));
-        }
-        graph.lanes[index].successors = successors;
+        counts.findings = log.into_list();
+        counts
     }
-    counts.findings = log.into_list();
-    counts
-}
 
-/// The lane of the same id in the road's next section, where neither is linked to any lane and both are one.
-fn same_lane_on(
-    graph: &LaneGraph,
-    network: &RoadNetwork,
-    origin: Origin,
-    table: &LaneTable,
-) -> Option<LaneId> {
-    let road = &network.roads[origin.road];
-    let forward = road.leads_along(origin.section, origin.lane);
-    let section = if forward {
-        origin.section + 1
-    } else {
-        origin.section.checked_sub(1)?
-    };
-    let (own, next) = (
-        road.sections[origin.section].lane(origin.lane)?,
-        road.sections.get(section)?.lane(origin.lane)?,
-    );
-    let links = if forward {
-        [own.successor, next.predecessor]
-    } else {
-        [own.predecessor, next.successor]
-    };
-    let (own, next) = (
-        table.get(origin.road, origin.section, origin.lane)?,
-        table.get(origin.road, section, origin.lane)?,
-    );
-    let (own, onto) = (graph.lane(own), graph.lane(next));
-    let widths = [own.widths_m[own.widths_m.len() - 1], onto.widths_m[0]];
-    // A lane that ends in a point and one that begins in a point are two.
-    let is_one = widths.iter().all(|&width| width > LEAST_WIDTH_M)
-        && (widths[0] - widths[1]).abs() < LINK_GAP_M;
-    (links == [None, None] && is_one && meets(own, onto)).then_some(next)
-}
-
-/// Lanes that the map's links name as continuing the lane of `origin`.
-fn candidates(network: &RoadNetwork, origin: Origin, table: &LaneTable) -> Vec<LaneId> {
-    let road = &network.roads[origin.road];
-    let Some(lane) = road.sections[origin.section].lane(origin.lane) else {
-        return Vec::new();
-    };
-    let forward = road.leads_along(origin.section, origin.lane);
-    let link = if forward {
-        lane.successor
-    } else {
-        lane.predecessor
-    };
-    let next_section = if forward {
-        Some(origin.section + 1)
-    } else {
-        origin.section.checked_sub(1)
-    };
-    if let Some(section) = next_section.filter(|&section| section < road.sections.len()) {
-        return link
-            .and_then(|lane| table.get(origin.road, section, lane))
-            .into_iter()
-            .collect();
+    /// The lane of the same id in the road's next section, where neither is linked to any lane and both are one.
+    fn same_lane_on(&self, graph: &LaneGraph, origin: Origin) -> Option<LaneId> {
+        let road = &self.network.roads[origin.road];
+        let forward = road.leads_along(origin.section, origin.lane);
+        let section = origin.next_section(forward)?;
+        let own = road.sections[origin.section].lane(origin.lane)?;
+        let next = road.sections.get(section)?.lane(origin.lane)?;
+        let links = [own.linked(forward), next.linked(!forward)];
+        let own = self.table.get(origin.road, origin.section, origin.lane)?;
+        let next = self.table.get(origin.road, section, origin.lane)?;
+        let (own, onto) = (graph.lane(own), graph.lane(next));
+        let widths = [own.widths_m[own.widths_m.len() - 1], onto.widths_m[0]];
+        // A lane that ends in a point and one that begins in a point are two.
+        let is_one = widths.iter().all(|&width| width > LEAST_WIDTH_M)
+            && (widths[0] - widths[1]).abs() < LINK_GAP_M;
+        (links == [None, None] && is_one && Joint::of(own, onto).meets()).then_some(next)
     }
-    match if forward {
-        road.successor
-    } else {
-        road.predecessor
-    } {
-        None => Vec::new(),
-        Some(RoadLink::Road { road, contact }) => {
-            let section = table.end_section(road, contact);
-            link.and_then(|lane| table.get(road, section, lane))
+
+    /// Lanes that the map's links name as continuing the lane of `origin`.
+    fn candidates(&self, origin: Origin) -> Vec<LaneId> {
+        let road = &self.network.roads[origin.road];
+        let Some(lane) = road.sections[origin.section].lane(origin.lane) else {
+            return Vec::new();
+        };
+        let forward = road.leads_along(origin.section, origin.lane);
+        let linked = |road: usize, section: usize| {
+            let lane = lane.linked(forward);
+            lane.and_then(|lane| self.table.get(road, section, lane))
                 .into_iter()
                 .collect()
+        };
+        let next_section = origin.next_section(forward);
+        if let Some(section) = next_section.filter(|&section| section < road.sections.len()) {
+            return linked(origin.road, section);
         }
-        Some(RoadLink::Junction(junction)) => {
-            let end = if forward {
-                Contact::End
-            } else {
-                Contact::Start
-            };
-            through_junction(network, junction, origin, end, table)
-        }
-    }
-}
-
-/// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
-fn through_junction(
-    network: &RoadNetwork,
-    place: usize,
-    origin: Origin,
-    end: Contact,
-    table: &LaneTable,
-) -> Vec<LaneId> {
-    let junction = &network.junctions[place];
-    let mut lanes = Vec::new();
-    for connection in junction
-        .connections
-        .iter()
-        .filter(|connection| connection.incoming == origin.road)
-    {
-        let section = table.end_section(connection.connecting, connection.contact);
-        let onto = |to| table.get(connection.connecting, section, to);
-        lanes.extend(
-            linked(
-                connection,
-                |&(from, to)| (from == origin.lane).then_some(to),
-                origin.lane,
-            )
-            .filter_map(onto),
-        );
-    }
-    // A direct junction is passed both ways: from the linked road onto the incoming one too.
-    let back = junction.connections.iter().filter(|connection| {
-        junction.direct && connection.connecting == origin.road && connection.contact == end
-    });
-    for connection in back {
-        for contact in [Contact::Start, Contact::End] {
-            let road = &network.roads[connection.incoming];
-            let link = if contact == Contact::Start {
-                road.predecessor
-            } else {
-                road.successor
-            };
-            if link != Some(RoadLink::Junction(place)) {
-                continue;
+        let end = if forward {
+            Contact::End
+        } else {
+            Contact::Start
+        };
+        match road.link(end) {
+            None => Vec::new(),
+            Some(RoadLink::Road { road, contact }) => {
+                linked(road, self.table.end_section(road, contact))
             }
-            let section = table.end_section(connection.incoming, contact);
-            let onto = |to| table.get(connection.incoming, section, to);
-            lanes.extend(
-                linked(
-                    connection,
-                    |&(to, from)| (from == origin.lane).then_some(to),
-                    origin.lane,
-                )
-                .filter_map(onto),
+            Some(RoadLink::Junction(junction)) => self.through_junction(junction, origin, end),
+        }
+    }
+
+    /// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
+    fn through_junction(&self, place: usize, origin: Origin, end: Contact) -> Vec<LaneId> {
+        let junction = &self.network.junctions[place];
+        let mut lanes = Vec::new();
+        let mut add = |road: usize, contact: Contact, ids: &mut dyn Iterator<Item = i32>| {
+            let section = self.table.end_section(road, contact);
+            lanes.extend(ids.filter_map(|id| self.table.get(road, section, id)));
+        };
+        // Without links, lanes of one id are linked.
+        let same =
+            |connection: &Connection| connection.lane_links.is_empty().then_some(origin.lane);
+        let connections = junction.connections.iter();
+        for connection in connections
+            .clone()
+            .filter(|one| one.incoming == origin.road)
+        {
+            let links = connection.lane_links.iter();
+            let onto = links
+                .filter(|(from, _)| *from == origin.lane)
+                .map(|&(_, to)| to);
+            add(
+                connection.connecting,
+                connection.contact,
+                &mut onto.chain(same(connection)),
             );
         }
+        // A direct junction is passed both ways: from the linked road onto the incoming one too.
+        let back = connections.filter(|connection| {
+            junction.direct && connection.connecting == origin.road && connection.contact == end
+        });
+        for connection in back {
+            for contact in [Contact::Start, Contact::End] {
+                let link = self.network.roads[connection.incoming].link(contact);
+                if link == Some(RoadLink::Junction(place)) {
+                    let links = connection.lane_links.iter();
+                    let onto = links
+                        .filter(|(_, to)| *to == origin.lane)
+                        .map(|&(from, _)| from);
+                    add(
+                        connection.incoming,
+                        contact,
+                        &mut onto.chain(same(connection)),
+                    );
+                }
+            }
+        }
+        lanes
     }
-    lanes
 }
 
-/// The lanes of one end of a connection that `pick` finds for a lane of the other; the same id where it has no links.
-fn linked<'a>(
-    connection: &'a Connection,
-    pick: impl FnMut(&(i32, i32)) -> Option<i32> + 'a,
-    same: i32,
-) -> impl Iterator<Item = i32> + 'a {
-    let same = connection.lane_links.is_empty().then_some(same);
-    connection.lane_links.iter().filter_map(pick).chain(same)
+/// How the end of a lane and the start of the next one lie to each other.
+struct Joint {
+    beside_m: f64,
+    step_m: f64,
+    turn_rad: f64,
+    is_banked: bool,
 }
 
-/// Gap between the end of one lane and the beginning of the other, as text.
-fn apart(lane: &Lane, next: &Lane) -> String {
-    let (end, start) = (
-        lane.centerline[lane.centerline.len() - 1],
-        next.centerline[0],
-    );
-    let (beside, step) = (
-        (end[0] - start[0]).hypot(end[1] - start[1]),
-        (end[2] - start[2]).abs(),
-    );
-    let turn = wrap_angle(next.start_heading_rad() - lane.end_heading_rad());
-    format!("{beside:.2} m away, {step:.2} m in height, turned by {turn:.2} rad")
+impl Joint {
+    fn of(lane: &Lane, next: &Lane) -> Self {
+        let (end, start) = (
+            lane.centerline[lane.centerline.len() - 1],
+            next.centerline[0],
+        );
+        Self {
+            beside_m: (end[0] - start[0]).hypot(end[1] - start[1]),
+            step_m: (end[2] - start[2]).abs(),
+            turn_rad: wrap_angle(next.start_heading_rad() - lane.end_heading_rad()),
+            is_banked: !(lane.banks_rad.is_empty() && next.banks_rad.is_empty()),
+        }
+    }
+
+    /// True if the lanes are one behind the other.
+    fn meets(&self) -> bool {
+        let near = match self.is_banked {
+            true => self.beside_m < LINK_GAP_M && self.step_m < BANKED_STEP_M,
+            false => self.beside_m.hypot(self.step_m) < LINK_GAP_M,
+        };
+        near && self.turn_rad.abs() < LINK_TURN_RAD
+    }
 }
 
-/// True if one lane ends where the other begins, in place and heading.
-fn meets(lane: &Lane, next: &Lane) -> bool {
-    let (end, start) = (
-        lane.centerline[lane.centerline.len() - 1],
-        next.centerline[0],
-    );
-    let (beside, step) = (
-        (end[0] - start[0]).hypot(end[1] - start[1]),
-        (end[2] - start[2]).abs(),
-    );
-    let turn = wrap_angle(next.start_heading_rad() - lane.end_heading_rad());
-    let is_banked = !(lane.banks_rad.is_empty() && next.banks_rad.is_empty());
-    let near = if is_banked {
-        beside < LINK_GAP_M && step < BANKED_STEP_M
-    } else {
-        beside.hypot(step) < LINK_GAP_M
-    };
-    near && turn.abs() < LINK_TURN_RAD
+impl fmt::Display for Joint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            beside_m,
+            step_m,
+            turn_rad,
+            ..
+        } = self;
+        write!(
+            f,
+            "{beside_m:.2} m away, {step_m:.2} m in height, turned by {turn_rad:.2} rad"
+        )
+    }
 }

@@ -43,7 +43,7 @@ impl Profile {
         })
     }
 
-    fn record_at(&self, s: f64) -> Option<(f64, [f64; 4])> {
+    pub(crate) fn record_at(&self, s: f64) -> Option<(f64, [f64; 4])> {
         let after = self.records.partition_point(|&(start, _)| start <= s);
         self.records.get(after.saturating_sub(1)).copied()
     }

@@ -113,6 +113,15 @@ pub struct RoadLane {
 }
 
 impl RoadLane {
+    /// The lane that the map links to the end of this one, or to its start, seen along the road.
+    pub(crate) fn linked(&self, at_end: bool) -> Option<i32> {
+        if at_end {
+            self.successor
+        } else {
+            self.predecessor
+        }
+    }
+
     /// A lane without links and speed limit of its own.
     pub fn new(kind: LaneKind, width: Profile) -> Self {
         Self {
@@ -218,8 +227,13 @@ pub struct RoadStructure {
 impl LaneSection {
     /// The lane of an id, if the section has it; there is none for the centre, 0.
     pub fn lane(&self, id: i32) -> Option<&RoadLane> {
-        let side = if id > 0 { &self.left } else { &self.right };
-        side.get((id.unsigned_abs() as usize).checked_sub(1)?)
+        let place = (id.unsigned_abs() as usize).checked_sub(1)?;
+        self.side(id > 0).get(place)
+    }
+
+    /// The lanes left or right of the reference line, from the inside out.
+    pub(crate) fn side(&self, left: bool) -> &[RoadLane] {
+        if left { &self.left } else { &self.right }
     }
 
     /// True if lanes are kept level where the road is not.
@@ -235,6 +249,14 @@ impl LaneSection {
 }
 
 impl Road {
+    /// What an end of the road is linked to.
+    pub(crate) fn link(&self, end: Contact) -> Option<RoadLink> {
+        match end {
+            Contact::Start => self.predecessor,
+            Contact::End => self.successor,
+        }
+    }
+
     /// Place and heading of the reference line at `s_m`.
     pub fn pose_at(&self, s_m: f64) -> Pose2 {
         let after = self.plan_view.partition_point(|curve| curve.s_m <= s_m);
@@ -273,10 +295,7 @@ impl Road {
 
     /// Inner border of the lanes of one side that stay level, metres.
     fn level_from_m(&self, section: usize, s_m: f64, left: bool) -> Option<f64> {
-        let lanes = self
-            .sections
-            .get(section)
-            .map(|section| if left { &section.left } else { &section.right })?;
+        let lanes = self.sections.get(section)?.side(left);
         let place = lanes.iter().position(|lane| lane.level)? as i32 + 1;
         let [low, high] = self.lane_span_m(section, if left { place } else { -place }, s_m);
         Some(if left { low } else { high })
@@ -298,11 +317,11 @@ impl Road {
 
     /// True if traffic on lane `id` of section `section` leads along the road.
     pub(crate) fn leads_along(&self, section: usize, id: i32) -> bool {
-        let reversed = self
+        let lane = self
             .sections
             .get(section)
-            .and_then(|section| section.lane(id))
-            .is_some_and(|lane| lane.reversed);
+            .and_then(|section| section.lane(id));
+        let reversed = lane.is_some_and(|lane| lane.reversed);
         ((id < 0) != self.left_hand) != reversed
     }
 
@@ -315,9 +334,8 @@ impl Road {
 
     /// Index of the section at `s_m` in [`Road::sections`].
     pub(crate) fn section_at(&self, s_m: f64) -> usize {
-        self.sections
-            .partition_point(|section| section.s_m <= s_m)
-            .saturating_sub(1)
+        let after = self.sections.partition_point(|section| section.s_m <= s_m);
+        after.saturating_sub(1)
     }
 
     /// Shift of the lanes' origin across the road at `s_m`, metres, clamped to the limits of a road since cubics of a
@@ -329,11 +347,7 @@ impl Road {
     /// Lower and upper `t` of lane `id` of section `section` at `s_m`, metres.
     pub(crate) fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
-        let side = if id > 0 {
-            &section.left
-        } else {
-            &section.right
-        };
+        let side = section.side(id > 0);
         let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M);
         let place = id.unsigned_abs() as usize;
         let inner: f64 = side.iter().take(place - 1).map(width).sum();
@@ -351,9 +365,8 @@ impl Road {
         let after = self
             .speed_limits
             .partition_point(|&(start, _)| start <= s_m);
-        self.speed_limits
-            .get(after.saturating_sub(1))
-            .map(|&(_, limit)| limit)
+        let limit = self.speed_limits.get(after.saturating_sub(1));
+        limit.map(|&(_, limit)| limit)
     }
 }
 

@@ -63,13 +63,10 @@ impl Shape {
             Self::Box {
                 half_m: [_, _, half],
             }
-            | Self::Cylinder {
-                half_height_m: half,
-                ..
+            | Self::Ellipsoid {
+                radii_m: [_, _, half],
             } => half,
-            Self::Ellipsoid {
-                radii_m: [_, _, radius],
-            } => radius,
+            Self::Cylinder { half_height_m, .. } => half_height_m,
         }
     }
 
@@ -98,23 +95,6 @@ pub struct Solid {
 }
 
 impl Solid {
-    /// A solid by its parts.
-    pub fn new(
-        kind: SolidKind,
-        shape: Shape,
-        center_m: [f64; 3],
-        yaw_rad: f64,
-        reflectivity: f32,
-    ) -> Self {
-        Self {
-            kind,
-            shape,
-            center_m,
-            yaw_rad,
-            reflectivity,
-        }
-    }
-
     /// Height of its lowest point, metres in the world frame.
     pub(crate) fn bottom_m(&self) -> f64 {
         self.center_m[2] - self.shape.half_height_m()
@@ -124,47 +104,48 @@ impl Solid {
     pub(crate) fn top_m(&self) -> f64 {
         self.center_m[2] + self.shape.half_height_m()
     }
-
-    /// Axis-aligned bounds in the world frame: lowest and highest corner, metres.
-    #[cfg(test)]
-    pub(crate) fn bounds_m(&self) -> ([f64; 3], [f64; 3]) {
-        let [half_x, half_y] = self.shape.half_footprint_m();
-        let (sin, cos) = self.yaw_rad.sin_cos();
-        let half = match self.shape {
-            Shape::Box { .. } => [
-                (half_x * cos).abs() + (half_y * sin).abs(),
-                (half_x * sin).abs() + (half_y * cos).abs(),
-            ],
-            Shape::Cylinder { radius_m, .. } => [radius_m, radius_m],
-            Shape::Ellipsoid { .. } => [
-                (half_x * cos).hypot(half_y * sin),
-                (half_x * sin).hypot(half_y * cos),
-            ],
-        };
-        let half = [half[0], half[1], self.shape.half_height_m()];
-        (
-            std::array::from_fn(|axis| self.center_m[axis] - half[axis]),
-            std::array::from_fn(|axis| self.center_m[axis] + half[axis]),
-        )
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    impl Solid {
+        /// Axis-aligned bounds in the world frame: lowest and highest corner, metres.
+        pub(crate) fn bounds_m(&self) -> ([f64; 3], [f64; 3]) {
+            let [half_x, half_y] = self.shape.half_footprint_m();
+            let (sin, cos) = self.yaw_rad.sin_cos();
+            let half = match self.shape {
+                Shape::Box { .. } => [
+                    (half_x * cos).abs() + (half_y * sin).abs(),
+                    (half_x * sin).abs() + (half_y * cos).abs(),
+                ],
+                Shape::Cylinder { radius_m, .. } => [radius_m, radius_m],
+                Shape::Ellipsoid { .. } => [
+                    (half_x * cos).hypot(half_y * sin),
+                    (half_x * sin).hypot(half_y * cos),
+                ],
+            };
+            let half = [half[0], half[1], self.shape.half_height_m()];
+            (
+                std::array::from_fn(|axis| self.center_m[axis] - half[axis]),
+                std::array::from_fn(|axis| self.center_m[axis] + half[axis]),
+            )
+        }
+    }
+
     #[test]
     fn bounds_of_a_turned_box_and_of_an_ellipsoid() {
         let shape = Shape::Box {
             half_m: [2.0, 1.0, 3.0],
         };
-        let solid = Solid::new(
-            SolidKind::Building,
+        let solid = Solid {
+            kind: SolidKind::Building,
             shape,
-            [10.0, 0.0, 3.0],
-            std::f64::consts::FRAC_PI_2,
-            0.4,
-        );
+            center_m: [10.0, 0.0, 3.0],
+            yaw_rad: std::f64::consts::FRAC_PI_2,
+            reflectivity: 0.4,
+        };
         let (low, high) = solid.bounds_m();
         let expected = ([9.0, -2.0, 0.0], [11.0, 2.0, 6.0]);
         for axis in 0..3 {
@@ -176,7 +157,13 @@ mod tests {
         let shape = Shape::Ellipsoid {
             radii_m: [2.0, 2.0, 1.0],
         };
-        let (low, _) = Solid::new(SolidKind::TreeCrown, shape, [0.0; 3], 0.7, 0.3).bounds_m();
+        let crown = Solid {
+            shape,
+            center_m: [0.0; 3],
+            yaw_rad: 0.7,
+            ..solid
+        };
+        let (low, _) = crown.bounds_m();
         assert!((low[0] + 2.0).abs() < 1e-12 && (low[1] + 2.0).abs() < 1e-12);
     }
 }

@@ -122,12 +122,7 @@ fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f6
                 grid.origin_m[0] + column as f64 * grid.cell_m,
                 grid.origin_m[1] + row as f64 * grid.cell_m,
             ];
-            let around = Rectangle {
-                center_m: node,
-                half_m: [reach_m; 2],
-                yaw_rad: 0.0,
-            };
-            if overlap(&around.corners(), quad) {
+            if overlap(&Rectangle::square(node, reach_m).corners(), quad) {
                 nodes.push((row * grid.columns + column, node));
             }
         }

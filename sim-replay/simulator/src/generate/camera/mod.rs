@@ -19,7 +19,7 @@ pub(super) use paint::{Paint, of_shape, of_vehicle};
 use super::lidar::LIDAR_MOUNT_M;
 use super::raycast::{Body, Caster, Placement, RayPattern, Surface, Sweep};
 use super::weather::Weather;
-use shading::{Rendered, Shader};
+use shading::Shader;
 
 /// Field of view along the rows, degrees: that of OPV2V's cameras.
 const FIELD_OF_VIEW_DEG: f64 = 100.0;
@@ -67,30 +67,12 @@ impl FromStr for ImageSize {
     }
 }
 
-/// Mount of a camera on its vehicle: x forward, y left, z up from the ground under the centre.
-struct Mount {
-    position_m: [f64; 3],
-    yaw_deg: f64,
-}
-
 /// The mounts of OPV2V and V2VLoc, by number.
-const MOUNTS: [Mount; 4] = [
-    Mount {
-        position_m: [2.5, 0.0, 1.0],
-        yaw_deg: 0.0,
-    },
-    Mount {
-        position_m: [0.0, -0.3, 1.8],
-        yaw_deg: -100.0,
-    },
-    Mount {
-        position_m: [0.0, 0.3, 1.8],
-        yaw_deg: 100.0,
-    },
-    Mount {
-        position_m: [-2.0, 0.0, 1.5],
-        yaw_deg: 180.0,
-    },
+const MOUNTS: [([f64; 3], f64); 4] = [
+    ([2.5, 0.0, 1.0], 0.0),
+    ([0.0, -0.3, 1.8], -100.0),
+    ([0.0, 0.3, 1.8], 100.0),
+    ([-2.0, 0.0, 1.5], 180.0),
 ];
 
 /// A camera that keeps its buffers from one image to the next.
@@ -122,10 +104,7 @@ pub(super) struct Surroundings<'a> {
 impl CameraRig {
     pub(super) fn new(size: ImageSize) -> Self {
         Self {
-            cameras: MOUNTS
-                .iter()
-                .map(|mount| MountedCamera::new(mount, size))
-                .collect(),
+            cameras: MOUNTS.map(|mount| MountedCamera::new(mount, size)).into(),
             size,
         }
     }
@@ -140,26 +119,18 @@ impl CameraRig {
     ) -> Vec<(u8, Camera)> {
         let size = self.size;
         let images = self.cameras.iter_mut().zip(0u8..).map(|(camera, number)| {
-            let rendered = camera.render(
-                vehicle,
-                surroundings,
-                ground_paint,
-                seed.wrapping_add(number.into()),
-            );
-            (
-                number,
-                Camera {
-                    metadata: camera.metadata,
-                    image: png_image::encode(&rendered.rgb, size),
-                },
-            )
+            let seed = seed.wrapping_add(number.into());
+            let rgb = camera.render(vehicle, surroundings, ground_paint, seed);
+            let image = png_image::encode(&rgb, size);
+            let metadata = camera.metadata;
+            (number, Camera { metadata, image })
         });
         images.collect()
     }
 }
 
 impl MountedCamera {
-    fn new(mount: &Mount, size: ImageSize) -> Self {
+    fn new((position_m, yaw_deg): ([f64; 3], f64), size: ImageSize) -> Self {
         let (width, height) = (f64::from(size.width_px), f64::from(size.height_px));
         let focal_px = width / 2.0 / (FIELD_OF_VIEW_DEG.to_radians() / 2.0).tan();
         let pinhole = Pinhole {
@@ -168,7 +139,7 @@ impl MountedCamera {
             cx_px: width / 2.0,
             cy_px: height / 2.0,
         };
-        let yaw_rad = mount.yaw_deg.to_radians();
+        let yaw_rad = yaw_deg.to_radians();
         let step_rad = 1.0 / (RAYS_PER_PIXEL * focal_px);
         let half_rad = [width, height].map(|edge| (edge / 2.0 / focal_px).atan() + 2.0 * step_rad);
         let count = |half_rad: f64| (2.0 * half_rad / step_rad).ceil() as usize + 1;
@@ -192,12 +163,10 @@ impl MountedCamera {
             let left = -(f64::from(column) + 0.5 - pinhole.cx_px) / focal_px;
             let up = -(f64::from(row) + 0.5 - pinhole.cy_px) / focal_px;
             let (azimuth, elevation) = (left.atan(), (up / left.hypot(1.0)).atan());
-            (
-                nearest(-azimuth, -half_rad[0]),
-                nearest(elevation, -half_rad[1]),
-            )
+            let column = nearest(-azimuth, -half_rad[0]);
+            (column, nearest(elevation, -half_rad[1]))
         });
-        let position_m = Vector3::from(mount.position_m);
+        let position_m = Vector3::from(position_m);
         Self {
             rays: rays.collect(),
             metadata: CameraMetadata {
@@ -218,24 +187,15 @@ impl MountedCamera {
         surroundings: &Surroundings<'_>,
         ground_paint: &mut GroundPaint<'_>,
         seed: u64,
-    ) -> Rendered {
+    ) -> Vec<u8> {
         let sensor = Sweep::still(vehicle.mounted(self.position_m.into()));
         // At the end of the sweep, the capture time, everything stands where it is then.
-        let bodies: Vec<Body<'_>> = surroundings
-            .bodies
-            .iter()
-            .map(|body| Body {
-                motion: Sweep::still(body.motion.end),
-                ..*body
-            })
-            .collect();
+        let mut bodies = surroundings.bodies.to_vec();
+        for body in &mut bodies {
+            body.motion = Sweep::still(body.motion.end);
+        }
         self.caster.cast(&sensor, surroundings.ground, &bodies);
-        let shader = Shader::new(
-            &self.caster,
-            &sensor,
-            surroundings.paints,
-            surroundings.weather,
-        );
+        let shader = Shader::new(&self.caster, &sensor, surroundings);
         shader.render(&self.rays, ground_paint, seed)
     }
 }

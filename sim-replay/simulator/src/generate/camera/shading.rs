@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
+use super::Surroundings;
 use super::ground_paint::GroundPaint;
 use super::paint::{Colour, Paint, SNOW, mix};
 use crate::generate::raycast::{Caster, GROUND, MISS, RangeImage, SkewedColumn, Sweep};
@@ -22,15 +23,6 @@ const WINDOW_ROWS: [f32; 2] = [0.35, 0.8];
 /// Share of pixels with a flake before it, in snow.
 const FLAKES: f64 = 0.01;
 
-/// A rendered image.
-pub(super) struct Rendered {
-    /// Three bytes a pixel, row by row.
-    pub(super) rgb: Vec<u8>,
-    /// Distance of the first hit along the ray of each pixel, metres.
-    #[cfg(test)]
-    pub(super) depths_m: Vec<f32>,
-}
-
 /// Light of one exposure.
 pub(super) struct Shader<'a> {
     image: &'a RangeImage,
@@ -44,12 +36,7 @@ pub(super) struct Shader<'a> {
 }
 
 impl<'a> Shader<'a> {
-    pub(super) fn new(
-        caster: &'a Caster,
-        sensor: &Sweep,
-        paints: &'a [Paint],
-        weather: Weather,
-    ) -> Self {
+    pub(super) fn new(caster: &'a Caster, sensor: &Sweep, surroundings: &Surroundings<'a>) -> Self {
         Self {
             image: caster.image(),
             channels: caster.pattern().channels,
@@ -57,8 +44,8 @@ impl<'a> Shader<'a> {
             elevations: caster.elevations().collect(),
             world_from_sensor: sensor.end.rotation().cast(),
             origin_m: sensor.end.position_m,
-            paints,
-            weather,
+            paints: surroundings.paints,
+            weather: surroundings.weather,
         }
     }
 
@@ -68,7 +55,7 @@ impl<'a> Shader<'a> {
         rays: &[(u32, u32)],
         ground: &mut GroundPaint<'_>,
         seed: u64,
-    ) -> Rendered {
+    ) -> Vec<u8> {
         let mut random = SplitMix64::new(seed);
         let mut rgb = Vec::with_capacity(3 * rays.len());
         for &(column, channel) in rays {
@@ -76,20 +63,10 @@ impl<'a> Shader<'a> {
             if self.weather == Weather::Snow && random.chance(FLAKES) {
                 colour = mix(colour, SNOW, 0.7);
             }
-            rgb.extend(
-                colour.map(|part| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8),
-            );
+            let byte = |part: f32| (255.0 * part.clamp(0.0, 1.0).powf(1.0 / 1.8)).round() as u8;
+            rgb.extend(colour.map(byte));
         }
-        Rendered {
-            rgb,
-            #[cfg(test)]
-            depths_m: rays
-                .iter()
-                .map(|&(column, channel)| {
-                    self.image.depths_m[self.ray(column as usize, channel as usize)]
-                })
-                .collect(),
-        }
+        rgb
     }
 
     fn ray(&self, column: usize, channel: usize) -> usize {

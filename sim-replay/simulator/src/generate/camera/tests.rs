@@ -41,7 +41,7 @@ fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
             weather: Weather::Sunny,
         };
         let camera = &mut rig.cameras[number];
-        let rendered = camera.render(&vehicle, &surroundings, &mut GroundPaint::new(&world), 1);
+        camera.render(&vehicle, &surroundings, &mut GroundPaint::new(&world), 1);
         let metadata = camera.metadata;
         let world_from_lidar = vehicle.mounted(LIDAR_MOUNT_M).isometry();
         let camera_from_world =
@@ -53,7 +53,12 @@ fn a_box_is_where_the_calibration_projects_it_in_every_camera() {
             .project(middle.coords.into())
             .unwrap();
         let depth_m = |column: f64, row: f64| {
-            rendered.depths_m[row as usize * SIZE.width_px as usize + column as usize]
+            let pixel = row as usize * SIZE.width_px as usize + column as usize;
+            let (column, channel) = camera.rays[pixel];
+            let pattern = camera.caster.pattern();
+            let column = (column as usize).min(pattern.columns - 1);
+            let channel = (channel as usize).min(pattern.channels - 1);
+            camera.caster.image().depths_m[column * pattern.channels + channel]
         };
         let distance_m = middle.coords.norm() as f32;
         assert!(

@@ -1,5 +1,6 @@
 //! Layouts of the OPV2V family: a folder per agent, several files per frame.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use super::disk::{Unfinished, make_folder, make_fresh_folder, scene_path, write_file};
@@ -25,33 +26,20 @@ impl AgentFolders {
         make_fresh_folder(&folder)?;
         let mark = Unfinished::mark(&folder)?;
         write_file(&folder.join(FILE_NAME), &scene.origin)?;
-        let agents: Vec<PathBuf> = agent_folders(scene)
-            .iter()
-            .map(|name| folder.join(name))
-            .collect();
+        let names = agent_folders(scene);
+        let agents: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
         agents.iter().try_for_each(|folder| make_folder(folder))?;
         let ticks = scene
             .capture_nanos
             .iter()
-            .map(|nanos| nanos / scene.tick_nanos)
-            .collect();
+            .map(|nanos| nanos / scene.tick_nanos);
         let is_roadside = scene.agents.iter().map(|agent| agent.is_roadside).collect();
         Ok(Self {
             agents,
             is_roadside,
-            ticks,
+            ticks: ticks.collect(),
             mark,
         })
-    }
-
-    /// True if an agent is a roadside unit.
-    pub(super) fn is_roadside(&self, frame: &AgentFrame) -> bool {
-        self.is_roadside[frame.agent]
-    }
-
-    /// A file of an agent's frame: `suffix` follows the tick number.
-    pub(super) fn file(&self, moment: &Moment, frame: &AgentFrame, suffix: &str) -> PathBuf {
-        self.agents[frame.agent].join(format!("{:06}{suffix}", self.ticks[moment.index]))
     }
 
     /// Finishes the folders: all files are written.
@@ -61,7 +49,32 @@ impl AgentFolders {
 }
 
 /// Writes the files of one frame of one agent.
-type WriteFrame = fn(&AgentFolders, &Moment, &AgentFrame) -> Result<(), SynthError>;
+type WriteFrame = fn(&FrameFiles<'_>, &AgentFrame) -> Result<(), SynthError>;
+
+/// The files of one frame, which differ in what follows the number of the tick.
+pub(super) struct FrameFiles<'a> {
+    folder: &'a Path,
+    tick: u64,
+    pub(super) is_roadside: bool,
+}
+
+impl FrameFiles<'_> {
+    pub(super) fn write(&self, suffix: &str, bytes: impl AsRef<[u8]>) -> Result<(), SynthError> {
+        let name = format!("{:06}{suffix}", self.tick);
+        write_file(&self.folder.join(name), bytes)
+    }
+
+    /// Writes the YAML of a frame.
+    pub(super) fn write_yaml(
+        &self,
+        frame: &AgentFrame,
+        write: impl FnOnce(&mut String) -> fmt::Result,
+    ) -> Result<(), SynthError> {
+        let mut yaml = String::with_capacity(2048 + 400 * frame.frame.objects.len());
+        write(&mut yaml).expect("writing to a String cannot fail");
+        self.write(".yaml", yaml)
+    }
+}
 
 /// The writer of these layouts, which differ in the files of a frame.
 #[derive(Debug)]
@@ -91,10 +104,14 @@ impl SceneWriter for AgentFolderWriter {
         let Some(folders) = &self.folders else {
             return Ok(());
         };
-        moment
-            .frames
-            .iter()
-            .try_for_each(|frame| (self.write_frame)(folders, moment, frame))
+        moment.frames.iter().try_for_each(|frame| {
+            let files = FrameFiles {
+                folder: &folders.agents[frame.agent],
+                tick: folders.ticks[moment.index],
+                is_roadside: folders.is_roadside[frame.agent],
+            };
+            (self.write_frame)(&files, frame)
+        })
     }
 
     fn end(&mut self) -> Result<(), SynthError> {

@@ -18,10 +18,10 @@ const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
 pub(super) fn of_255(intensity: f32) -> f32 {
     let nearest = intensity * FULL_BYTE;
     let candidates = [nearest, nearest.next_down(), nearest.next_up()];
-    candidates
+    let exact = candidates
         .into_iter()
-        .find(|candidate| candidate / FULL_BYTE == intensity)
-        .unwrap_or(nearest)
+        .find(|candidate| candidate / FULL_BYTE == intensity);
+    exact.unwrap_or(nearest)
 }
 
 /// An intensity of 0 to 1 as a sensor's byte.
@@ -49,10 +49,8 @@ pub(super) fn float_bytes<const N: usize>(
 
 /// The cloud with intensities of 0 to 255.
 pub(super) fn with_byte_intensities(points: &PointCloud) -> PointCloud {
-    let scaled = points
-        .xyzi
-        .iter()
-        .map(|&[x, y, z, intensity]| [x, y, z, of_255(intensity)]);
+    let points = points.xyzi.iter();
+    let scaled = points.map(|&[x, y, z, intensity]| [x, y, z, of_255(intensity)]);
     PointCloud {
         xyzi: scaled.collect(),
     }
@@ -90,14 +88,8 @@ pub(super) fn points_in(frame: &AgentFrame, object: &Object) -> usize {
         let local = object_from_lidar * Point3::new(x, y, z);
         (0..3).all(|axis| local[axis].abs() <= half[axis])
     };
-    frame
-        .frame
-        .points
-        .xyzi
-        .iter()
-        .filter(near)
-        .filter(inside)
-        .count()
+    let points = frame.frame.points.xyzi.iter();
+    points.filter(near).filter(inside).count()
 }
 
 /// The name of a class in the types of V2V4Real and V2X-Real.

@@ -86,14 +86,13 @@ struct Rows {
 
 impl Dair {
     pub(super) fn new(root: &Path, edition: Edition) -> Self {
-        let rows = Mutex::new(Vec::new());
         Self {
             root: root.to_owned(),
             edition,
             scenes: 0,
             next_frame: 0,
             scene: None,
-            rows,
+            rows: Mutex::default(),
         }
     }
 
@@ -145,10 +144,8 @@ impl Dair {
     ) -> Result<(), SynthError> {
         let points = with_byte_intensities(&frame.frame.points);
         let cloud = pcd::encode(&points, Encoding::Binary, IntensityField::Intensity);
-        write_file(
-            &self.root.join(format!("{}/velodyne/{id}.pcd", side.folder)),
-            cloud,
-        )?;
+        let path = format!("{}/velodyne/{id}.pcd", side.folder);
+        write_file(&self.root.join(path), cloud)?;
         let mut labels = Vec::new();
         for object in &frame.frame.objects {
             match side_type(object.class) {
@@ -158,39 +155,28 @@ impl Dair {
                 None => omitted.add("objects of a class without a name in the labels", 1),
             }
         }
-        self.write_json(
-            &format!("{}/label/{}/{id}.json", side.folder, side.labels),
-            &Value::Array(labels),
-        )
+        let path = format!("{}/label/{}/{id}.json", side.folder, side.labels);
+        self.write_json(&path, &Value::Array(labels))
     }
 
     /// Writes the pose of the vehicle's LiDAR, in the two steps of the data set.
     fn write_vehicle_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
         let world_from_lidar = frame.world_from_lidar();
-        let world_from_novatel = frame
-            .frame
-            .world_from_vehicle
-            .map_or(world_from_lidar, |vehicle| vehicle.isometry());
+        let vehicle = frame.frame.world_from_vehicle;
+        let world_from_novatel = vehicle.map_or(world_from_lidar, |pose| pose.isometry());
         let novatel_from_lidar: Pose = world_from_novatel.inv_mul(&world_from_lidar).into();
         let mount = json!({ "transform": transform(&novatel_from_lidar) });
-        self.write_json(
-            &format!("vehicle-side/calib/lidar_to_novatel/{id}.json"),
-            &mount,
-        )?;
-        let pose = transform(&world_from_novatel.into());
-        self.write_json(
-            &format!("vehicle-side/calib/novatel_to_world/{id}.json"),
-            &pose,
-        )
+        let path = format!("vehicle-side/calib/lidar_to_novatel/{id}.json");
+        self.write_json(&path, &mount)?;
+        let path = format!("vehicle-side/calib/novatel_to_world/{id}.json");
+        self.write_json(&path, &transform(&world_from_novatel.into()))
     }
 
     fn write_unit_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
         let mut pose = transform(&frame.world_from_lidar().into());
         pose["relative_error"] = json!({ "delta_x": 0.0, "delta_y": 0.0 });
-        self.write_json(
-            &format!("infrastructure-side/calib/virtuallidar_to_world/{id}.json"),
-            &pose,
-        )
+        let path = format!("infrastructure-side/calib/virtuallidar_to_world/{id}.json");
+        self.write_json(&path, &pose)
     }
 
     /// The label of an object that either side lists.
@@ -207,12 +193,8 @@ impl Dair {
 
 impl SceneWriter for Dair {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        let refused = |reason: String| {
-            Err(SynthError::Layout {
-                layout: self.layout(),
-                reason,
-            })
-        };
+        let layout = self.layout();
+        let refused = |reason: String| Err(SynthError::Layout { layout, reason });
         if scene.agents.len() < 2 {
             return refused(format!(
                 "scene {} has one agent; a vehicle and a roadside unit are needed",
@@ -230,14 +212,11 @@ impl SceneWriter for Dair {
         }
         write_origin(&self.root, scene)?;
         // A roadside unit if there is one, else the second agent.
-        let unit = (1..scene.agents.len())
-            .find(|&agent| scene.agents[agent].is_roadside)
-            .unwrap_or(1);
-        let (number, first_frame) = (self.scenes, self.next_frame);
+        let unit = (1..scene.agents.len()).find(|&agent| scene.agents[agent].is_roadside);
         self.scene = Some(Batch {
-            number,
-            first_frame,
-            unit,
+            number: self.scenes,
+            first_frame: self.next_frame,
+            unit: unit.unwrap_or(1),
             capture_nanos: scene.capture_nanos.clone(),
         });
         self.scenes += 1;
@@ -249,17 +228,13 @@ impl SceneWriter for Dair {
         let Some(batch) = &self.scene else {
             return Ok(());
         };
+        let frames = moment.frames.len();
         let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
-            omitted.add(
-                "frames of moments without vehicle or roadside unit",
-                moment.frames.len(),
-            );
+            omitted.add("frames of moments without vehicle or roadside unit", frames);
             return Ok(());
         };
-        omitted.add(
-            "frames of agents beyond one vehicle and one roadside unit",
-            moment.frames.len() - 2,
-        );
+        let what = "frames of agents beyond one vehicle and one roadside unit";
+        omitted.add(what, frames - 2);
         let number = batch.first_frame + moment.index;
         let [id, unit_id] =
             [number, FIRST_UNIT_FRAME + number].map(|number| format!("{number:06}"));
@@ -295,10 +270,8 @@ impl SceneWriter for Dair {
             Value::Array(rows.iter().map(|(_, rows)| of(rows).clone()).collect())
         };
         self.write_json("vehicle-side/data_info.json", &list(|rows| &rows.vehicle))?;
-        self.write_json(
-            "infrastructure-side/data_info.json",
-            &list(|rows| &rows.unit),
-        )?;
+        let units = list(|rows| &rows.unit);
+        self.write_json("infrastructure-side/data_info.json", &units)?;
         self.write_json("cooperative/data_info.json", &list(|rows| &rows.pair))
     }
 }
@@ -306,11 +279,10 @@ impl SceneWriter for Dair {
 impl Dair {
     /// The rows of a capture time in the lists.
     fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> Rows {
-        let micros = EPOCH_MICROS
-            + batch.number as u64 * DAY_MICROS
-            + batch.capture_nanos[moment.index] / 1000;
-        let last_frame = batch.first_frame + batch.capture_nanos.len() - 1;
-        let [first, last] = [batch.first_frame, last_frame];
+        let begin_micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS;
+        let micros = begin_micros + batch.capture_nanos[moment.index] / 1000;
+        let first = batch.first_frame;
+        let last = first + batch.capture_nanos.len() - 1;
         let span = |offset: usize| [first, last].map(|number| format!("{:06}", offset + number));
         let vehicle = self.side_row(&VEHICLE, id, micros, batch, span(0));
         let unit = self.side_row(&UNIT, unit_id, micros, batch, span(FIRST_UNIT_FRAME));

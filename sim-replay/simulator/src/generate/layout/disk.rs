@@ -20,13 +20,18 @@ pub(crate) fn make_folder(path: &Path) -> Result<(), SynthError> {
 
 /// Creates a folder; an existing one is removed with its contents.
 pub(super) fn make_fresh_folder(path: &Path) -> Result<(), SynthError> {
+    remove_folder(path)?;
+    make_folder(path)
+}
+
+/// Removes a folder with all it holds, if there is one.
+pub(crate) fn remove_folder(path: &Path) -> Result<(), SynthError> {
     match fs::remove_dir_all(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            return Err(SynthError::Write(FileError::new(path, error)));
+            Err(SynthError::Write(FileError::new(path, error)))
         }
-        Ok(()) | Err(_) => {}
+        Ok(()) | Err(_) => Ok(()),
     }
-    make_folder(path)
 }
 
 /// The folder of a scene below `root`; no name leads outside `root`.
@@ -39,10 +44,8 @@ pub(crate) fn scene_path(root: &Path, name: &str) -> PathBuf {
 
 /// Writes the origin of a scene, in a file that no reader takes for a frame.
 pub(super) fn write_origin(folder: &Path, scene: &SceneHeader) -> Result<(), SynthError> {
-    write_file(
-        &folder.join(format!("{}.origin.txt", flat_name(&scene.name))),
-        &scene.origin,
-    )
+    let name = format!("{}.origin.txt", flat_name(&scene.name));
+    write_file(&folder.join(name), &scene.origin)
 }
 
 /// The name of a scene as one part of a path.
@@ -63,18 +66,15 @@ impl Unfinished {
     /// Marks a folder, which exists.
     pub(crate) fn mark(folder: &Path) -> Result<Self, SynthError> {
         let mark = folder.join(UNFINISHED);
-        write_file(
-            &mark,
-            "This folder is being written, or the run that wrote it was interrupted.\n",
-        )?;
+        let text = "This folder is being written, or the run that wrote it was interrupted.\n";
+        write_file(&mark, text)?;
         Ok(Self(mark))
     }
 
     /// Removes the marker: all files are written.
     pub(crate) fn clear(self) -> Result<(), SynthError> {
-        fs::remove_file(&self.0)
-            .at(&self.0)
-            .map_err(SynthError::Write)
+        let mark = &self.0;
+        fs::remove_file(mark).at(mark).map_err(SynthError::Write)
     }
 }
 

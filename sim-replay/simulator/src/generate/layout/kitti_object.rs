@@ -6,7 +6,6 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use nalgebra::Point3;
-use protocol::Box3d;
 
 use super::boxes::{float_bytes, upright_in};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
@@ -49,10 +48,8 @@ impl KittiObject {
     }
 
     fn file(&self, folder: &str, number: usize, suffix: &str) -> PathBuf {
-        self.root
-            .join(SPLIT)
-            .join(folder)
-            .join(format!("{number:06}{suffix}"))
+        let folder = self.root.join(SPLIT).join(folder);
+        folder.join(format!("{number:06}{suffix}"))
     }
 }
 
@@ -84,50 +81,24 @@ impl SceneWriter for KittiObject {
     }
 }
 
+/// The label of each object: type, truncation, occlusion, alpha, image box, sizes, bottom centre, rotation.
 fn labels(frame: &AgentFrame) -> String {
     let mut text = String::with_capacity(200 * frame.frame.objects.len());
     for object in &frame.frame.objects {
-        let label = Label::of(&upright_in(frame, object));
-        let ([height, width, length], [x, y, z]) = (label.size_m, label.bottom_m);
-        // Writing to a String does not fail.
-        let _ = writeln!(
-            text,
-            "{} 0 0 {} 0 0 0 0 {height} {width} {length} {x} {y} {z} {}",
-            kind(object.class),
-            label.alpha_rad,
-            label.rotation_y_rad
-        );
-    }
-    text
-}
-
-/// A box in the terms of a label.
-#[derive(Debug, Clone, Copy)]
-struct Label {
-    /// Height, width, length.
-    size_m: [f64; 3],
-    /// The centre of the bottom face in the frame of the camera.
-    bottom_m: [f64; 3],
-    /// Turn of the length about y from x towards -z.
-    rotation_y_rad: f64,
-    /// The same seen along the ray to the box.
-    alpha_rad: f64,
-}
-
-impl Label {
-    fn of(upright: &Box3d) -> Self {
+        let upright = upright_in(frame, object);
         let ([length, width, height], [x, y, z]) = (upright.size_m, upright.center_m);
         let bottom = camera_from_lidar() * Point3::new(x, y, z - height / 2.0);
         // The camera's x points to the right of the LiDAR's x.
         let rotation_y_rad = -upright.heading_rad - std::f64::consts::FRAC_PI_2;
         let alpha_rad = rotation_y_rad - bottom.x.atan2(bottom.z);
-        Self {
-            size_m: [height, width, length],
-            bottom_m: bottom.into(),
-            rotation_y_rad,
-            alpha_rad,
-        }
+        let ([x, y, z], kind): ([f64; 3], &str) = (bottom.into(), kind(object.class));
+        // Writing to a String does not fail.
+        let _ = writeln!(
+            text,
+            "{kind} 0 0 {alpha_rad} 0 0 0 0 {height} {width} {length} {x} {y} {z} {rotation_y_rad}"
+        );
     }
+    text
 }
 
 fn kind(class: ObjectClass) -> &'static str {

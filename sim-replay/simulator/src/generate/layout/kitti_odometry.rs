@@ -61,10 +61,8 @@ impl Style for KittiOdometry {
         write_file(&folder.join("times.txt"), times(sequence.capture_nanos))?;
         let poses = root.join("poses");
         make_folder(&poses)?;
-        write_file(
-            &poses.join(format!("{:02}.txt", sequence.number)),
-            pose_lines(sequence),
-        )
+        let file = poses.join(format!("{:02}.txt", sequence.number));
+        write_file(&file, pose_lines(sequence))
     }
 }
 
@@ -96,12 +94,9 @@ fn pose_lines(sequence: &Sequence<'_>) -> String {
         let first_from_lidar = first_from_world * sweep.world_from_lidar.isometry();
         let pose =
             (camera_from_lidar * first_from_lidar * camera_from_lidar.inverse()).to_homogeneous();
-        let row = (0..12)
-            .map(|place| format!("{:e}", pose[(place / 4, place % 4)]))
-            .collect::<Vec<_>>()
-            .join(" ");
-        text.push_str(&row);
-        text.push('\n');
+        let row: [String; 12] =
+            std::array::from_fn(|place| format!("{:e}", pose[(place / 4, place % 4)]));
+        text += &(row.join(" ") + "\n");
     }
     text
 }

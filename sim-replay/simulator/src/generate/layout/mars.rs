@@ -2,9 +2,9 @@
 
 use serde_json::{Map, Value, json};
 
-use super::SceneHeader;
 use super::boxes::of_255;
 use super::nuscenes::Style;
+use super::{SceneAgent, SceneHeader};
 
 /// The style.
 #[derive(Debug)]
@@ -16,11 +16,8 @@ impl Style for Mars {
     }
 
     fn channels(&self, scene: &SceneHeader) -> Vec<String> {
-        scene
-            .agents
-            .iter()
-            .map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id))
-            .collect()
+        let channel = |agent: &SceneAgent| format!("LIDAR_FRONT_CENTER_{}", agent.id);
+        scene.agents.iter().map(channel).collect()
     }
 
     fn file_name(&self, _: usize, _: usize, micros: u64) -> String {

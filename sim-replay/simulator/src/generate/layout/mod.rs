@@ -28,16 +28,17 @@ mod tests;
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use clap::ValueEnum;
-use protocol::CavId;
+use protocol::{CavId, Pose};
 
 use super::error::SynthError;
 use super::positioning::Fix;
 use dataset::frame::{Frame, Object};
 
-pub(crate) use disk::{Unfinished, make_folder};
+pub(crate) use disk::{Unfinished, make_folder, remove_folder};
+use sequences::Sequences;
 
 /// The layouts that scenes are written in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
@@ -108,12 +109,9 @@ impl SceneLayout {
             Self::V2xreal => Box::new(v2xreal::writer(root)),
             Self::V2xsim => Box::new(nuscenes::NuScenes::new(root, &v2xsim::V2xSim)),
             Self::Mars => Box::new(nuscenes::NuScenes::new(root, &mars::Mars)),
-            Self::Nclt => Box::new(sequences::Sequences::new(root, &nclt::Nclt)),
-            Self::Oxford => Box::new(sequences::Sequences::new(root, &oxford::Oxford)),
-            Self::KittiOdometry => Box::new(sequences::Sequences::new(
-                root,
-                &kitti_odometry::KittiOdometry,
-            )),
+            Self::Nclt => Box::new(Sequences::new(root, &nclt::Nclt)),
+            Self::Oxford => Box::new(Sequences::new(root, &oxford::Oxford)),
+            Self::KittiOdometry => Box::new(Sequences::new(root, &kitti_odometry::KittiOdometry)),
             Self::KittiObject => Box::new(kitti_object::KittiObject::new(root)),
         }
     }
@@ -214,10 +212,8 @@ pub(crate) struct BoxAnchor {
 impl AgentFrame {
     /// The pose of the LiDAR in the world. Writers get no frames without a pose.
     pub(crate) fn world_from_lidar(&self) -> nalgebra::Isometry3<f64> {
-        self.frame
-            .world_from_lidar
-            .unwrap_or(protocol::Pose::IDENTITY)
-            .isometry()
+        let pose = self.frame.world_from_lidar.unwrap_or(Pose::IDENTITY);
+        pose.isometry()
     }
 }
 
@@ -248,15 +244,11 @@ impl Omissions {
     }
 
     pub(crate) fn into_counts(self) -> BTreeMap<&'static str, u64> {
-        self.0
-            .into_inner()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.0.into_inner().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 /// The content of a lock, also after a panic of a thread that held it, since such a panic ends the program.
-pub(crate) fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    mutex
-        .lock()
-        .unwrap_or_else(std::sync::PoisonError::into_inner)
+pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -55,10 +55,8 @@ impl Style for Nclt {
             bytes.extend([x, y, z].into_iter().flat_map(u16::to_le_bytes));
             bytes.extend([byte(intensity), ring(point)]);
         }
-        omitted.add(
-            "points beyond the coordinates that can be written (-100 m to 227 m)",
-            outside,
-        );
+        let what = "points beyond the coordinates that can be written (-100 m to 227 m)";
+        omitted.add(what, outside);
         bytes
     }
 
@@ -71,25 +69,19 @@ impl Style for Nclt {
             let [x, y, z] = pose.translation_m;
             let (roll, pitch, heading) = pose.isometry().rotation.euler_angles();
             // Writing to a String does not fail.
-            let _ = writeln!(
-                rows,
-                "{},{x},{y},{z},{roll},{pitch},{heading}",
-                sweep.micros
-            );
+            let micros = sweep.micros;
+            let _ = writeln!(rows, "{micros},{x},{y},{z},{roll},{pitch},{heading}");
         }
-        write_file(
-            &folder.join(format!("groundtruth_{}.csv", Self::day(sequence.number))),
-            rows,
-        )
+        let name = format!("groundtruth_{}.csv", Self::day(sequence.number));
+        write_file(&folder.join(name), rows)
     }
 }
 
 /// A coordinate as a number of steps, if it is in range.
 fn steps(metres: f32) -> Option<u16> {
     let steps = ((f64::from(metres) - LEAST_M) / STEP_M).round();
-    (0.0..=f64::from(u16::MAX))
-        .contains(&steps)
-        .then_some(steps as u16)
+    let fits = (0.0..=f64::from(u16::MAX)).contains(&steps);
+    fits.then_some(steps as u16)
 }
 
 #[cfg(test)]

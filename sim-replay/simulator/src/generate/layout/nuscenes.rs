@@ -59,27 +59,21 @@ struct Current {
 
 impl NuScenes {
     pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
-        let (samples, tables) = (Mutex::new(Vec::new()), Tables::default());
         Self {
             root: root.to_owned(),
             style,
             scenes: 0,
             scene: None,
-            samples,
-            tables,
+            samples: Mutex::default(),
+            tables: Tables::default(),
         }
     }
 
     fn sweep_bytes(&self, frame: &AgentFrame) -> Vec<u8> {
         let row = |&point: &[f32; 4]| {
             let [x, y, z, intensity] = point;
-            [
-                x,
-                y,
-                z,
-                self.style.intensity(intensity),
-                f32::from(ring(point)),
-            ]
+            let intensity = self.style.intensity(intensity);
+            [x, y, z, intensity, f32::from(ring(point))]
         };
         float_bytes(frame.frame.points.xyzi.iter().map(row))
     }
@@ -116,24 +110,18 @@ impl SceneWriter for NuScenes {
         for frame in &moment.frames {
             let file = format!("{SWEEPS}/{}/{name}", scene.channels[frame.agent]);
             write_file(&self.root.join(&file), self.sweep_bytes(frame))?;
-            let (world_from_lidar, vehicle) =
-                (frame.world_from_lidar(), frame.frame.world_from_vehicle);
             sweeps.push(SweepRecord {
                 agent: frame.agent,
                 file,
-                world_from_lidar,
-                world_from_vehicle: vehicle,
+                world_from_lidar: frame.world_from_lidar(),
+                world_from_vehicle: frame.frame.world_from_vehicle,
             });
         }
         let annotations = Moment::union(&moment.frames).into_iter().map(|object| {
-            let lidar_points = moment
-                .frames
-                .iter()
-                .map(|frame| points_in(frame, object))
-                .sum();
+            let points = moment.frames.iter().map(|frame| points_in(frame, object));
             AnnotationRecord {
                 object: object.clone(),
-                lidar_points,
+                lidar_points: points.sum(),
             }
         });
         let annotations = annotations.collect();
@@ -150,17 +138,11 @@ impl SceneWriter for NuScenes {
         let mut samples = std::mem::take(&mut *locked(&self.samples));
         samples.sort_by_key(|sample| sample.moment);
         if let Some(scene) = self.scene.take() {
-            let Current {
-                number,
-                header,
-                channels,
-            } = &scene;
-            let fields = self.style.scene_fields(header);
             self.tables.add(SceneTables {
-                number: *number,
-                name: &header.name,
-                channels,
-                fields,
+                number: scene.number,
+                name: &scene.header.name,
+                channels: &scene.channels,
+                fields: self.style.scene_fields(&scene.header),
                 samples: &samples,
             });
         }
@@ -171,10 +153,8 @@ impl SceneWriter for NuScenes {
         let folder = self.root.join(self.style.version());
         let tables = std::mem::take(&mut self.tables).into_tables();
         tables.into_iter().try_for_each(|(name, rows)| {
-            write_file(
-                &folder.join(format!("{name}.json")),
-                Value::Array(rows).to_string(),
-            )
+            let rows = Value::Array(rows).to_string();
+            write_file(&folder.join(format!("{name}.json")), rows)
         })
     }
 }

@@ -15,7 +15,14 @@ use dataset::frame::{Object, ObjectClass};
 /// Bytes of a token: 32 digits.
 const TOKEN_BYTES: usize = 16;
 /// Tables that readers require, though they are empty.
-const EMPTY_TABLES: [&str; 2] = ["attribute", "visibility"];
+const EMPTY_TABLES: [&str; 6] = [
+    "attribute",
+    "visibility",
+    "instance",
+    "sample_annotation",
+    "category",
+    "map",
+];
 
 /// A sweep that was written.
 #[derive(Debug)]
@@ -74,11 +81,7 @@ impl Tables {
 
     /// All tables, empty ones included.
     pub(super) fn into_tables(mut self) -> BTreeMap<&'static str, Vec<Value>> {
-        for name in
-            EMPTY_TABLES
-                .into_iter()
-                .chain(["instance", "sample_annotation", "category", "map"])
-        {
+        for name in EMPTY_TABLES {
             self.0.entry(name).or_default();
         }
         self.0
@@ -92,15 +95,11 @@ impl Tables {
             .collect();
         self.add_scene(&scene, &tokens);
         let scene_token = scene_token(&scene, "scene", &[]);
-        for ((sample, token), (prev, next)) in
-            scene.samples.iter().zip(&tokens).zip(neighbours(&tokens))
-        {
-            self.push(
-                "sample",
-                json!({
-                    "token": token, "timestamp": sample.micros, "prev": prev, "next": next, "scene_token": scene_token,
-                }),
-            );
+        for (sample, (token, prev, next)) in scene.samples.iter().zip(linked(&tokens)) {
+            let row = json!({
+                "token": token, "timestamp": sample.micros, "prev": prev, "next": next, "scene_token": scene_token,
+            });
+            self.push("sample", row);
         }
         self.add_sweeps(&scene, &tokens);
         self.add_annotations(&scene, &tokens);
@@ -109,13 +108,12 @@ impl Tables {
     /// The scene, its log and its map.
     fn add_scene(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
         let [log, map, token] = ["log", "map", "scene"].map(|kind| scene_token(scene, kind, &[]));
-        self.push(
-            "log",
-            json!({
-                "token": log, "logfile": "", "vehicle": "", "date_captured": "", "location": "",
-            }),
-        );
-        self.push("map", json!({ "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "" }));
+        let row = json!({
+            "token": log, "logfile": "", "vehicle": "", "date_captured": "", "location": "",
+        });
+        self.push("log", row);
+        let row = json!({ "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "" });
+        self.push("map", row);
         let end = |token: Option<&String>| token.cloned().unwrap_or_default();
         let mut row = json!({
             "token": token,
@@ -134,49 +132,37 @@ impl Tables {
     /// Sensors, their mounts, the sweeps and the poses of the vehicles: a chain of sweeps per channel.
     fn add_sweeps(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
         for (agent, channel) in scene.channels.iter().enumerate() {
-            let chain: Vec<(&Sample, &SweepRecord, &String)> = scene
-                .samples
-                .iter()
-                .zip(sample_tokens)
-                .filter_map(|(sample, token)| {
-                    Some((
-                        sample,
-                        sample.sweeps.iter().find(|sweep| sweep.agent == agent)?,
-                        token,
-                    ))
-                })
-                .collect();
+            let samples = scene.samples.iter().zip(sample_tokens);
+            let chain = samples.filter_map(|(sample, token)| {
+                let mut sweeps = sample.sweeps.iter();
+                Some((sample, sweeps.find(|sweep| sweep.agent == agent)?, token))
+            });
+            let chain: Vec<(&Sample, &SweepRecord, &String)> = chain.collect();
             let Some((_, first, _)) = chain.first() else {
                 continue;
             };
             let mount = self.add_mount(scene, channel, first);
-            let tokens: Vec<String> = chain
-                .iter()
-                .map(|(sample, ..)| {
-                    scene_token(scene, "sample_data", &[channel, &sample.moment.to_string()])
-                })
-                .collect();
-            for (((sample, sweep, sample_token), token), (prev, next)) in
-                chain.iter().zip(&tokens).zip(neighbours(&tokens))
+            let moments = chain.iter().map(|(sample, ..)| sample.moment.to_string());
+            let tokens =
+                moments.map(|moment| scene_token(scene, "sample_data", &[channel, &moment]));
+            let tokens: Vec<String> = tokens.collect();
+            for ((sample, sweep, sample_token), (token, prev, next)) in
+                chain.iter().zip(linked(&tokens))
             {
                 // The mount is that of the first sweep, so that one row serves the whole scene.
                 let world_from_vehicle: Pose =
                     (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
-                self.push(
-                    "ego_pose",
-                    json!({
-                        "token": token, "timestamp": sample.micros,
-                        "rotation": world_from_vehicle.rotation_wxyz, "translation": world_from_vehicle.translation_m,
-                    }),
-                );
-                self.push(
-                    "sample_data",
-                    json!({
-                        "token": token, "sample_token": sample_token, "ego_pose_token": token,
-                        "calibrated_sensor_token": mount.token, "timestamp": sample.micros, "fileformat": "bin",
-                        "is_key_frame": true, "height": 0, "width": 0, "filename": sweep.file, "prev": prev, "next": next,
-                    }),
-                );
+                let row = json!({
+                    "token": token, "timestamp": sample.micros,
+                    "rotation": world_from_vehicle.rotation_wxyz, "translation": world_from_vehicle.translation_m,
+                });
+                self.push("ego_pose", row);
+                let row = json!({
+                    "token": token, "sample_token": sample_token, "ego_pose_token": token,
+                    "calibrated_sensor_token": mount.token, "timestamp": sample.micros, "fileformat": "bin",
+                    "is_key_frame": true, "height": 0, "width": 0, "filename": sweep.file, "prev": prev, "next": next,
+                });
+                self.push("sample_data", row);
             }
         }
     }
@@ -184,29 +170,21 @@ impl Tables {
     fn add_mount(&mut self, scene: &SceneTables<'_>, channel: &str, first: &SweepRecord) -> Mount {
         // A sensor is one row, also if several scenes use it.
         let sensor = token(&["sensor", channel]);
-        let known = self
-            .0
-            .get("sensor")
-            .is_some_and(|rows| rows.iter().any(|row| row["token"] == sensor.as_str()));
-        if !known {
-            self.push(
-                "sensor",
-                json!({ "token": sensor, "channel": channel, "modality": "lidar" }),
-            );
+        let sensors = self.0.entry("sensor").or_default();
+        if !sensors.iter().any(|row| row["token"] == sensor.as_str()) {
+            let row = json!({ "token": sensor, "channel": channel, "modality": "lidar" });
+            self.push("sensor", row);
         }
-        let world_from_vehicle = first
-            .world_from_vehicle
-            .map_or(first.world_from_lidar, |pose| pose.isometry());
+        let world_from_vehicle = first.world_from_vehicle.map(|pose| pose.isometry());
+        let world_from_vehicle = world_from_vehicle.unwrap_or(first.world_from_lidar);
         let vehicle_from_lidar = world_from_vehicle.inv_mul(&first.world_from_lidar);
         let pose: Pose = vehicle_from_lidar.into();
         let token = scene_token(scene, "calibrated_sensor", &[channel]);
-        self.push(
-            "calibrated_sensor",
-            json!({
-                "token": token, "sensor_token": sensor, "translation": pose.translation_m,
-                "rotation": pose.rotation_wxyz, "camera_intrinsic": [],
-            }),
-        );
+        let row = json!({
+            "token": token, "sensor_token": sensor, "translation": pose.translation_m,
+            "rotation": pose.rotation_wxyz, "camera_intrinsic": [],
+        });
+        self.push("calibrated_sensor", row);
         Mount {
             token,
             vehicle_from_lidar,
@@ -215,51 +193,38 @@ impl Tables {
 
     /// Objects by id, and their boxes at each sample: a chain of boxes per object.
     fn add_annotations(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
-        let mut by_object: BTreeMap<i64, Vec<(&Sample, &String, &AnnotationRecord)>> =
-            BTreeMap::new();
+        let mut by_object: BTreeMap<i64, Vec<_>> = BTreeMap::new();
         for (sample, token) in scene.samples.iter().zip(sample_tokens) {
             for annotation in &sample.annotations {
-                by_object
-                    .entry(annotation.object.id)
-                    .or_default()
-                    .push((sample, token, annotation));
+                let chain = by_object.entry(annotation.object.id).or_default();
+                chain.push((sample, token, annotation));
             }
         }
         for (id, chain) in &by_object {
             let id = id.to_string();
             let instance = scene_token(scene, "instance", &[&id]);
-            let tokens: Vec<String> = chain
-                .iter()
-                .map(|(sample, ..)| {
-                    scene_token(scene, "annotation", &[&id, &sample.moment.to_string()])
-                })
-                .collect();
+            let moments = chain.iter().map(|(sample, ..)| sample.moment.to_string());
+            let tokens = moments.map(|moment| scene_token(scene, "annotation", &[&id, &moment]));
+            let tokens: Vec<String> = tokens.collect();
             let category = self.category(chain[0].2.object.class);
-            self.push(
-                "instance",
-                json!({
-                    "token": instance, "category_token": category, "nbr_annotations": tokens.len(),
-                    "first_annotation_token": tokens.first(), "last_annotation_token": tokens.last(),
-                }),
-            );
-            for (((_, sample_token, annotation), token), (prev, next)) in
-                chain.iter().zip(&tokens).zip(neighbours(&tokens))
+            let row = json!({
+                "token": instance, "category_token": category, "nbr_annotations": tokens.len(),
+                "first_annotation_token": tokens.first(), "last_annotation_token": tokens.last(),
+            });
+            self.push("instance", row);
+            for ((_, sample_token, annotation), (token, prev, next)) in
+                chain.iter().zip(linked(&tokens))
             {
-                let Object {
-                    world_from_object,
-                    size_m: [length, width, height],
-                    ..
-                } = &annotation.object;
-                self.push(
-                    "sample_annotation",
-                    json!({
-                        "token": token, "sample_token": sample_token, "instance_token": instance,
-                        "visibility_token": "", "attribute_tokens": [],
-                        "translation": world_from_object.translation_m, "size": [width, length, height],
-                        "rotation": world_from_object.rotation_wxyz, "prev": prev, "next": next,
-                        "num_lidar_pts": annotation.lidar_points, "num_radar_pts": 0,
-                    }),
-                );
+                let pose = &annotation.object.world_from_object;
+                let [length, width, height] = annotation.object.size_m;
+                let row = json!({
+                    "token": token, "sample_token": sample_token, "instance_token": instance,
+                    "visibility_token": "", "attribute_tokens": [],
+                    "translation": pose.translation_m, "size": [width, length, height],
+                    "rotation": pose.rotation_wxyz, "prev": prev, "next": next,
+                    "num_lidar_pts": annotation.lidar_points, "num_radar_pts": 0,
+                });
+                self.push("sample_annotation", row);
             }
         }
     }
@@ -277,13 +242,19 @@ impl Tables {
 }
 
 /// The tokens before and after each, empty at the ends.
-fn neighbours(tokens: &[String]) -> impl Iterator<Item = (&str, &str)> {
+fn linked(tokens: &[String]) -> impl Iterator<Item = (&str, &str, &str)> {
     let at = |place: Option<usize>| {
         place
             .and_then(|place| tokens.get(place))
             .map_or("", String::as_str)
     };
-    (0..tokens.len()).map(move |place| (at(place.checked_sub(1)), at(place.checked_add(1))))
+    (0..tokens.len()).map(move |place| {
+        (
+            at(Some(place)),
+            at(place.checked_sub(1)),
+            at(place.checked_add(1)),
+        )
+    })
 }
 
 fn scene_token(scene: &SceneTables<'_>, kind: &str, parts: &[&str]) -> String {

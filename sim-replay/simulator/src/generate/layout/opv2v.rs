@@ -6,69 +6,43 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use dataset::camera_files::body_from_optical;
-use protocol::{Camera, CameraMetadata, EgoMotion, Pinhole, PointCloud, Pose};
+use protocol::{Camera, CameraMetadata, EgoMotion, PointCloud, Pose};
 
-use super::agent_folders::{AgentFolderWriter, AgentFolders};
-use super::disk::write_file;
-use super::yaml_text::{KMH_PER_MPS, ObjectEntry, anchors, write_list};
-use super::{AgentFrame, Moment, SweepVariant};
+use super::agent_folders::{AgentFolderWriter, FrameFiles};
+use super::boxes::real_type;
+use super::yaml_text::{ObjectEntry, write_list, write_speed, write_vehicles};
+use super::{AgentFrame, BoxAnchor};
 use crate::generate::error::SynthError;
 use crate::generate::positioning::Fix;
 use dataset::carla_pose::{CarlaPose, mirrored_point};
-use dataset::frame::ObjectClass;
+use dataset::frame::{Object, ObjectClass};
 use dataset::pcd::{self, Encoding, IntensityField};
 
 pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }
 
-fn write_files(
-    folders: &AgentFolders,
-    moment: &Moment,
-    frame: &AgentFrame,
-) -> Result<(), SynthError> {
+fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
     let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
-    write_file(&folders.file(moment, frame, ".pcd"), points)?;
-    for SweepVariant {
-        name,
-        points,
-        labels,
-    } in &frame.variants
-    {
-        let bytes = pcd_of(points, IntensityField::RedAndLabel(labels));
-        write_file(&folders.file(moment, frame, &format!("_{name}.pcd")), bytes)?;
+    files.write(".pcd", points)?;
+    for copy in &frame.variants {
+        let bytes = pcd_of(&copy.points, IntensityField::RedAndLabel(&copy.labels));
+        files.write(&format!("_{}.pcd", copy.name), bytes)?;
     }
     if let Some(radar) = &frame.frame.radar {
-        write_file(
-            &folders.file(moment, frame, "_radar.pcd"),
-            pcd_of(&radar.xyzi, IntensityField::Red),
-        )?;
+        files.write("_radar.pcd", pcd_of(&radar.xyzi, IntensityField::Red))?;
     }
     for (number, Camera { metadata, image }) in &frame.frame.cameras {
         let ending = metadata.format.name();
-        write_file(
-            &folders.file(moment, frame, &format!("_camera{number}.{ending}")),
-            image,
-        )?;
+        files.write(&format!("_camera{number}.{ending}"), image)?;
     }
-    write_file(
-        &folders.file(moment, frame, ".yaml"),
-        frame_yaml(frame, folders.is_roadside(frame)),
-    )
+    files.write_yaml(frame, |yaml| write_frame(yaml, frame, files.is_roadside))
 }
 
 fn pcd_of(points: &[[f32; 4]], intensity: IntensityField<'_>) -> Vec<u8> {
-    let xyzi = points
-        .iter()
-        .map(|&[x, y, z, fourth]| [x, -y, z, fourth])
-        .collect();
+    let mirrored = points.iter().map(|&[x, y, z, fourth]| [x, -y, z, fourth]);
+    let xyzi = mirrored.collect();
     pcd::encode(&PointCloud { xyzi }, Encoding::Binary, intensity)
-}
-
-fn frame_yaml(frame: &AgentFrame, is_roadside: bool) -> String {
-    let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
-    write_frame(&mut yaml, frame, is_roadside).expect("writing to a String cannot fail");
-    yaml
 }
 
 fn six(pose: &Pose) -> [f64; 6] {
@@ -81,9 +55,7 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
     for (number, camera) in &frame.cameras {
         write_camera(yaml, *number, camera, frame.world_from_lidar.as_ref())?;
     }
-    if let Some(speed_mps) = frame.speed_mps {
-        writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
-    }
+    write_speed(yaml, frame)?;
     match &agent.simulated {
         Some(simulated) => write_receivers(yaml, &simulated.fix)?,
         None => write_motion(yaml, &frame.motion())?,
@@ -93,16 +65,14 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std:
         ("predicted_ego_pos", frame.gnss_world_from_vehicle),
         ("true_ego_pos", frame.world_from_vehicle),
     ];
-    for (key, pose) in poses
-        .iter()
-        .filter_map(|(key, pose)| Some((key, pose.as_ref()?)))
-    {
-        write_list(yaml, "", key, &six(pose))?;
-        if *key == "lidar_pose" {
+    for (key, pose) in poses {
+        let Some(pose) = pose else { continue };
+        write_list(yaml, "", key, &six(&pose))?;
+        if key == "lidar_pose" {
             writeln!(yaml, "plan_trajectory: []")?;
         }
     }
-    write_vehicles(yaml, agent)
+    write_vehicles(yaml, agent, write_object)
 }
 
 /// Calibration of a camera: its pose in the world, `extrinsic` from the LiDAR to the camera, both left-handed with x
@@ -124,8 +94,8 @@ fn write_camera(
         return Ok(());
     };
     let lidar_from_body = lidar_from_camera.isometry() * body_from_optical().inverse();
-    let world_from_body =
-        CarlaPose::from_pose(&(world_from_lidar.isometry() * lidar_from_body).into());
+    let world_from_body = (world_from_lidar.isometry() * lidar_from_body).into();
+    let world_from_body = CarlaPose::from_pose(&world_from_body);
     let [world_from_body_left, world_from_lidar_left] =
         [&world_from_body, &CarlaPose::from_pose(world_from_lidar)]
             .map(CarlaPose::left_handed_matrix);
@@ -133,29 +103,14 @@ fn write_camera(
     writeln!(yaml, "camera{number}:")?;
     let cords: [f64; 6] = world_from_body.into();
     write_list(yaml, "  ", "cords", &cords)?;
-    write_rows(
-        yaml,
-        "extrinsic",
-        extrinsic
-            .row_iter()
-            .map(|row| row.iter().copied().collect()),
-    )?;
-    let Pinhole {
-        fx_px,
-        fy_px,
-        cx_px,
-        cy_px,
-    } = pinhole;
-    write_rows(
-        yaml,
-        "intrinsic",
-        [
-            vec![fx_px, 0.0, cx_px],
-            vec![0.0, fy_px, cy_px],
-            vec![0.0, 0.0, 1.0],
-        ]
-        .into_iter(),
-    )
+    let rows = extrinsic
+        .row_iter()
+        .map(|row| row.iter().copied().collect());
+    write_rows(yaml, "extrinsic", rows)?;
+    let first = vec![pinhole.fx_px, 0.0, pinhole.cx_px];
+    let second = vec![0.0, pinhole.fy_px, pinhole.cy_px];
+    let rows = [first, second, vec![0.0, 0.0, 1.0]];
+    write_rows(yaml, "intrinsic", rows.into_iter())
 }
 
 fn write_rows(
@@ -174,10 +129,8 @@ fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
         "gnss:\n  altitude: {altitude}\n  latitude: {latitude}\n  longitude: {longitude}"
     )?;
     // Left-handed like everything in these files.
-    let (heading, rate) = (
-        -fix.heading_rad.to_degrees(),
-        -fix.yaw_rate_radps.to_degrees(),
-    );
+    let heading = -fix.heading_rad.to_degrees();
+    let rate = -fix.yaw_rate_radps.to_degrees();
     writeln!(
         yaml,
         "imu:\n  heading_deg: {heading}\n  speed_mps: {}\n  yaw_rate_degps: {rate}",
@@ -197,41 +150,19 @@ fn write_motion(yaml: &mut String, motion: &EgoMotion) -> std::fmt::Result {
     )
 }
 
-fn write_vehicles(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
-    if agent.frame.objects.is_empty() {
-        return writeln!(yaml, "vehicles: {{}}");
+fn write_object(yaml: &mut String, object: &Object, anchor: &BoxAnchor) -> std::fmt::Result {
+    let mut more = vec![("class", object.class.name().to_owned())];
+    // Objects that are not vehicles must not count as vehicles.
+    if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class {
+        more.push(("obj_type", real_type(object.class).to_owned()));
     }
-    writeln!(yaml, "vehicles:")?;
-    for (object, anchor) in agent.frame.objects.iter().zip(anchors(agent)) {
-        let mut more = vec![("class", class(object.class).to_owned())];
-        // Objects that are not vehicles must not count as vehicles.
-        if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class
-        {
-            more.push(("obj_type", super::boxes::real_type(object.class).to_owned()));
-        }
-        let entry = ObjectEntry {
-            id: object.id,
-            angle_deg: CarlaPose::from_pose(&object.world_from_object).roll_yaw_pitch_deg,
-            // Readers add the offset of the centre without rotating it, so it is rotated here.
-            location_m: mirrored_point(anchor.location_m),
-            center_m: mirrored_point(anchor.center_offset_m),
-            size_m: object.size_m,
-            speed_mps: object.speed_mps,
-            more: &more,
-        };
-        entry.write(yaml)?;
-    }
-    Ok(())
-}
-
-fn class(class: ObjectClass) -> &'static str {
-    match class {
-        ObjectClass::Car => "car",
-        ObjectClass::Van => "van",
-        ObjectClass::Truck => "truck",
-        ObjectClass::Bus => "bus",
-        ObjectClass::TwoWheeler => "two_wheeler",
-        ObjectClass::Pedestrian => "pedestrian",
-        ObjectClass::Other => "other",
-    }
+    let entry = ObjectEntry {
+        object,
+        angle_deg: CarlaPose::from_pose(&object.world_from_object).roll_yaw_pitch_deg,
+        // Readers add the offset of the centre without rotating it, so it is rotated here.
+        location_m: mirrored_point(anchor.location_m),
+        center_m: mirrored_point(anchor.center_offset_m),
+        more: &more,
+    };
+    entry.write(yaml)
 }

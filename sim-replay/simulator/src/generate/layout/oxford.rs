@@ -42,10 +42,8 @@ impl Style for Oxford {
                 [x, y, z, of_255(intensity)][index]
             })
         };
-        (0..4)
-            .flat_map(component)
-            .flat_map(f32::to_le_bytes)
-            .collect()
+        let numbers = (0..4).flat_map(component);
+        numbers.flat_map(f32::to_le_bytes).collect()
     }
 
     fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
@@ -60,24 +58,18 @@ impl Style for Oxford {
 
 /// Time stamps and rows of 3x4 matrices. The entries that readers drop are copies of the first and of the last pose.
 fn padded(first: &SweepPose, sweeps: &[SweepPose], last: &SweepPose) -> (Vec<i64>, Vec<[f64; 12]>) {
-    let before = (1..=TRIMMED as u64).rev().map(|step| SweepPose {
-        micros: first.micros - step,
-        ..*first
-    });
-    let after = (1..=TRIMMED as u64).map(|step| SweepPose {
-        micros: last.micros + step,
-        ..*last
-    });
-    before
-        .chain(sweeps.iter().copied())
-        .chain(after)
-        .map(|sweep| (sweep.micros as i64, row(&sweep)))
+    let before = (1..=TRIMMED as u64)
+        .rev()
+        .map(|step| (first.micros - step, first));
+    let own = sweeps.iter().map(|sweep| (sweep.micros, sweep));
+    let after = (1..=TRIMMED as u64).map(|step| (last.micros + step, last));
+    let all = before.chain(own).chain(after);
+    all.map(|(micros, sweep)| (micros as i64, row(sweep)))
         .unzip()
 }
 
 fn row(sweep: &SweepPose) -> [f64; 12] {
-    let matrix = pose_z_down(&sweep.world_from_lidar)
-        .isometry()
-        .to_homogeneous();
+    let pose = pose_z_down(&sweep.world_from_lidar);
+    let matrix = pose.isometry().to_homogeneous();
     std::array::from_fn(|place| matrix[(place / 4, place % 4)])
 }

@@ -78,15 +78,18 @@ struct Current {
 
 impl Sequences {
     pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
-        let sweeps = Mutex::new(Vec::new());
         Self {
             root: root.to_owned(),
             style,
             scenes: 0,
             next_sequence: 0,
             scene: None,
-            sweeps,
+            sweeps: Mutex::default(),
         }
+    }
+
+    fn folder(&self, sequence: usize) -> PathBuf {
+        self.root.join(self.style.folder(sequence))
     }
 }
 
@@ -94,20 +97,16 @@ impl SceneWriter for Sequences {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
         let mut marks = Vec::with_capacity(scene.agents.len());
         for agent in 0..scene.agents.len() {
-            let folder = self
-                .root
-                .join(self.style.folder(self.next_sequence + agent));
+            let folder = self.folder(self.next_sequence + agent);
             make_fresh_folder(&folder)?;
             marks.push(Unfinished::mark(&folder)?);
             write_origin(&folder, scene)?;
             make_folder(&folder.join(self.style.sweeps_folder()))?;
         }
-        let offset_micros = self.style.epoch_micros() + self.scenes as u64 * DAY_MICROS;
-        let (first_sequence, capture_nanos) = (self.next_sequence, scene.capture_nanos.clone());
         self.scene = Some(Current {
-            first_sequence,
-            offset_micros,
-            capture_nanos,
+            first_sequence: self.next_sequence,
+            offset_micros: self.style.epoch_micros() + self.scenes as u64 * DAY_MICROS,
+            capture_nanos: scene.capture_nanos.clone(),
             marks,
         });
         self.scenes += 1;
@@ -121,22 +120,16 @@ impl SceneWriter for Sequences {
         };
         let micros = scene.offset_micros + scene.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
-            let folder = self
-                .root
-                .join(self.style.folder(scene.first_sequence + frame.agent));
-            let file = folder
-                .join(self.style.sweeps_folder())
-                .join(self.style.file_name(moment.index, micros));
+            let folder = self.folder(scene.first_sequence + frame.agent);
+            let folder = folder.join(self.style.sweeps_folder());
+            let file = folder.join(self.style.file_name(moment.index, micros));
             write_file(&file, self.style.points(&frame.frame.points.xyzi, omitted))?;
-            omitted.add(
-                "boxes, which the layout does not have",
-                frame.frame.objects.len(),
-            );
-            let world_from_lidar = frame.world_from_lidar().into();
+            let boxes = frame.frame.objects.len();
+            omitted.add("boxes, which the layout does not have", boxes);
             let sweep = SweepPose {
                 moment: moment.index,
                 micros,
-                world_from_lidar,
+                world_from_lidar: frame.world_from_lidar().into(),
             };
             locked(&self.sweeps).push((frame.agent, sweep));
         }
@@ -151,14 +144,10 @@ impl SceneWriter for Sequences {
         };
         for (agent, mark) in scene.marks.into_iter().enumerate() {
             let number = scene.first_sequence + agent;
-            let own: Vec<SweepPose> = sweeps
-                .iter()
-                .filter(|(of, _)| *of == agent)
-                .map(|(_, sweep)| *sweep)
-                .collect();
-            let folder = self.style.folder(number);
+            let own = sweeps.iter().filter(|(of, _)| *of == agent);
+            let own: Vec<SweepPose> = own.map(|(_, sweep)| *sweep).collect();
             let sequence = Sequence {
-                folder,
+                folder: self.style.folder(number),
                 number,
                 capture_nanos: &scene.capture_nanos,
                 sweeps: &own,
@@ -172,11 +161,8 @@ impl SceneWriter for Sequences {
 
 /// A date by number, of months of 28 days each: year, month, day.
 pub(super) fn date(first_year: usize, number: usize) -> [usize; 3] {
-    [
-        first_year + number / (12 * 28),
-        1 + number / 28 % 12,
-        1 + number % 28,
-    ]
+    let months = number / 28;
+    [first_year + months / 12, 1 + months % 12, 1 + number % 28]
 }
 
 /// Points in axes with y to the right and z down, as in NCLT and Oxford.

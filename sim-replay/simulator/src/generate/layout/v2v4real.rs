@@ -8,14 +8,13 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use protocol::Pose;
 
-use super::agent_folders::{AgentFolderWriter, AgentFolders};
+use super::AgentFrame;
+use super::agent_folders::{AgentFolderWriter, FrameFiles};
 use super::boxes::real_type;
-use super::disk::write_file;
-use super::yaml_text::{KMH_PER_MPS, ObjectEntry};
-use super::{AgentFrame, Moment};
+use super::yaml_text::{ObjectEntry, write_speed, write_vehicles};
 use crate::generate::error::SynthError;
 use dataset::carla_pose::CarlaPose;
-use dataset::frame::Object;
+
 use dataset::pcd::{self, Encoding, IntensityField};
 
 /// A pickled 4x4 matrix up to its numbers; anchors are numbered, as PyYAML numbers them.
@@ -55,27 +54,16 @@ pub(super) fn writer(root: &Path) -> AgentFolderWriter {
     AgentFolderWriter::new(root, write_files)
 }
 
-fn write_files(
-    folders: &AgentFolders,
-    moment: &Moment,
-    frame: &AgentFrame,
-) -> Result<(), SynthError> {
-    let points = pcd::encode(
-        &frame.frame.points,
-        Encoding::Binary,
-        IntensityField::Intensity,
-    );
-    write_file(&folders.file(moment, frame, ".pcd"), points)?;
-    let mut yaml = String::with_capacity(2048 + 400 * frame.frame.objects.len());
-    write_frame(&mut yaml, frame).expect("writing to a String cannot fail");
-    write_file(&folders.file(moment, frame, ".yaml"), yaml)
+fn write_files(files: &FrameFiles<'_>, frame: &AgentFrame) -> Result<(), SynthError> {
+    let points = &frame.frame.points;
+    let points = pcd::encode(points, Encoding::Binary, IntensityField::Intensity);
+    files.write(".pcd", points)?;
+    files.write_yaml(frame, |yaml| write_frame(yaml, frame))
 }
 
 fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
     let frame = &agent.frame;
-    if let Some(speed_mps) = frame.speed_mps {
-        writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
-    }
+    write_speed(yaml, frame)?;
     for (key, pose) in [
         ("lidar_pose", frame.world_from_lidar),
         ("true_ego_pos", frame.world_from_vehicle),
@@ -84,43 +72,31 @@ fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
             writeln!(yaml, "{key}: {}", pickled_matrix(&pose))?;
         }
     }
-    if frame.objects.is_empty() {
-        return writeln!(yaml, "vehicles: {{}}");
-    }
-    writeln!(yaml, "vehicles:")?;
     let lidar_from_world = agent.world_from_lidar().inverse();
-    frame.objects.iter().try_for_each(|object| {
-        let lidar_from_object = (lidar_from_world * object.world_from_object.isometry()).into();
-        write_object(yaml, object, &lidar_from_object)
+    write_vehicles(yaml, agent, |yaml, object, _| {
+        let lidar_from_object: Pose =
+            (lidar_from_world * object.world_from_object.isometry()).into();
+        let more = [
+            ("ass_id", object.id.to_string()),
+            ("obj_type", real_type(object.class).to_owned()),
+        ];
+        let entry = ObjectEntry {
+            object,
+            angle_deg: CarlaPose::from_right_handed(&lidar_from_object).roll_yaw_pitch_deg,
+            location_m: lidar_from_object.translation_m,
+            center_m: [0.0; 3],
+            more: &more,
+        };
+        entry.write(yaml)
     })
-}
-
-fn write_object(yaml: &mut String, object: &Object, lidar_from_object: &Pose) -> std::fmt::Result {
-    let more = [
-        ("ass_id", object.id.to_string()),
-        ("obj_type", real_type(object.class).to_owned()),
-    ];
-    let entry = ObjectEntry {
-        id: object.id,
-        angle_deg: CarlaPose::from_right_handed(lidar_from_object).roll_yaw_pitch_deg,
-        location_m: lidar_from_object.translation_m,
-        center_m: [0.0; 3],
-        size_m: object.size_m,
-        speed_mps: object.speed_mps,
-        more: &more,
-    };
-    entry.write(yaml)
 }
 
 /// The value of a key: the matrix with every bit of its numbers.
 fn pickled_matrix(pose: &Pose) -> String {
     let matrix = pose.isometry().to_homogeneous();
     // nalgebra keeps columns together, NumPy rows.
-    let bytes: Vec<u8> = matrix
-        .transpose()
-        .iter()
-        .flat_map(|value| value.to_le_bytes())
-        .collect();
+    let rows = matrix.transpose();
+    let bytes: Vec<u8> = rows.iter().flat_map(|value| value.to_le_bytes()).collect();
     let mut text = MATRIX_HEAD.to_owned();
     let digits = STANDARD.encode(bytes);
     let mut rest = digits.as_str();

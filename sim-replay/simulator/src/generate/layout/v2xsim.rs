@@ -17,12 +17,9 @@ impl Style for V2xSim {
     fn channels(&self, scene: &SceneHeader) -> Vec<String> {
         let unit = scene.agents.iter().position(|agent| agent.is_roadside);
         let mut numbers = 1..;
-        let mut number = |agent: usize| {
-            if Some(agent) == unit {
-                0
-            } else {
-                numbers.next().unwrap_or_default()
-            }
+        let mut number = |agent: usize| match Some(agent) == unit {
+            true => 0,
+            false => numbers.next().unwrap_or_default(),
         };
         (0..scene.agents.len())
             .map(|agent| format!("LIDAR_TOP_id_{}", number(agent)))

@@ -3,13 +3,12 @@
 use std::fmt::{self, Write as _};
 
 use nalgebra::Vector3;
-use protocol::Pose;
 
 use super::{AgentFrame, BoxAnchor, SceneAgent, SceneHeader};
-use dataset::frame::Object;
+use dataset::frame::{Frame, Object};
 
 /// Kilometres per hour in a metre per second.
-pub(super) const KMH_PER_MPS: f64 = 3.6;
+const KMH_PER_MPS: f64 = 3.6;
 /// First number for vehicles that need a new name.
 const FIRST_VEHICLE: usize = 1001;
 
@@ -29,14 +28,12 @@ pub(super) fn write_list(
 
 /// An object of the map of vehicles, in the numbers of the file.
 pub(super) struct ObjectEntry<'a> {
-    pub(super) id: i64,
+    pub(super) object: &'a Object,
     /// Roll, yaw, pitch, degrees.
     pub(super) angle_deg: [f64; 3],
     pub(super) location_m: [f64; 3],
     /// Offset from the location to the centre of the box, added without rotation.
     pub(super) center_m: [f64; 3],
-    pub(super) size_m: [f64; 3],
-    pub(super) speed_mps: Option<f64>,
     /// Keys and values of one layout only, in alphabetical order after `angle`.
     pub(super) more: &'a [(&'static str, String)],
 }
@@ -45,30 +42,57 @@ impl ObjectEntry<'_> {
     /// Writes the entry, with keys in alphabetical order.
     pub(super) fn write(&self, yaml: &mut String) -> fmt::Result {
         let more = |yaml: &mut String, after: &str, until: &str| {
-            let mut between = self
-                .more
-                .iter()
-                .filter(|(key, _)| after < *key && *key < until);
+            let more = self.more.iter();
+            let mut between = more.filter(|(key, _)| after < *key && *key < until);
             between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
         };
-        writeln!(yaml, "  {}:", self.id)?;
+        let Object {
+            id,
+            size_m,
+            speed_mps,
+            ..
+        } = self.object;
+        writeln!(yaml, "  {id}:")?;
         write_list(yaml, "    ", "angle", &self.angle_deg)?;
         more(yaml, "angle", "center")?;
         write_list(yaml, "    ", "center", &self.center_m)?;
         more(yaml, "center", "extent")?;
-        write_list(yaml, "    ", "extent", &self.size_m.map(|size| size / 2.0))?;
+        write_list(yaml, "    ", "extent", &size_m.map(|size| size / 2.0))?;
         more(yaml, "extent", "location")?;
         write_list(yaml, "    ", "location", &self.location_m)?;
         more(yaml, "location", "speed")?;
-        match self.speed_mps {
+        match speed_mps {
             Some(speed_mps) => writeln!(yaml, "    speed: {}", KMH_PER_MPS * speed_mps),
             None => Ok(()),
         }
     }
 }
 
+/// Writes the speed of the agent, where it is known.
+pub(super) fn write_speed(yaml: &mut String, frame: &Frame) -> fmt::Result {
+    match frame.speed_mps {
+        Some(speed_mps) => writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps),
+        None => Ok(()),
+    }
+}
+
+/// Writes the objects of a frame, each with the anchor of its box.
+pub(super) fn write_vehicles(
+    yaml: &mut String,
+    agent: &AgentFrame,
+    mut write: impl FnMut(&mut String, &Object, &BoxAnchor) -> fmt::Result,
+) -> fmt::Result {
+    let objects = &agent.frame.objects;
+    if objects.is_empty() {
+        return writeln!(yaml, "vehicles: {{}}");
+    }
+    writeln!(yaml, "vehicles:")?;
+    let mut anchored = objects.iter().zip(anchors(agent));
+    anchored.try_for_each(|(object, anchor)| write(yaml, object, &anchor))
+}
+
 /// Reference points of the objects of a frame: from the simulation if known, else the centre of the box's bottom face.
-pub(super) fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
+fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
     match &frame.simulated {
         Some(simulated) => simulated.anchors.clone(),
         None => frame.frame.objects.iter().map(bottom_anchor).collect(),
@@ -76,12 +100,11 @@ pub(super) fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
 }
 
 fn bottom_anchor(object: &Object) -> BoxAnchor {
-    let Pose { translation_m, .. } = object.world_from_object;
-    let up = object.world_from_object.isometry().rotation
-        * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
+    let pose = object.world_from_object;
+    let up = pose.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
     let center_offset_m: [f64; 3] = up.into();
     BoxAnchor {
-        location_m: std::array::from_fn(|axis| translation_m[axis] - center_offset_m[axis]),
+        location_m: std::array::from_fn(|axis| pose.translation_m[axis] - center_offset_m[axis]),
         center_offset_m,
     }
 }
@@ -89,17 +112,11 @@ fn bottom_anchor(object: &Object) -> BoxAnchor {
 /// The folders of a scene's agents. Readers sort them as text, roadside units (negative numbers) last: where the
 /// agents' own names are not such numbers, they are numbered.
 pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
-    let own: Vec<String> = scene
-        .agents
-        .iter()
-        .map(|agent| agent.id.as_str().to_owned())
-        .collect();
+    let agents = &scene.agents;
+    let own: Vec<String> = agents.iter().map(|agent| agent.id.to_string()).collect();
     let is_number = |agent: &SceneAgent| {
-        agent
-            .id
-            .as_str()
-            .parse::<i64>()
-            .is_ok_and(|number| (number < 0) == agent.is_roadside)
+        let number = agent.id.as_str().parse::<i64>();
+        number.is_ok_and(|number| (number < 0) == agent.is_roadside)
     };
     let key = |name: &String| (name.starts_with('-'), name.clone());
     if scene.agents.iter().all(is_number) && own.is_sorted_by_key(key) {
@@ -115,7 +132,8 @@ pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use protocol::CavId;
+    use dataset::frame::ObjectClass;
+    use protocol::{CavId, Pose};
 
     use super::*;
 
@@ -161,13 +179,18 @@ mod tests {
     #[test]
     fn keys_of_an_object_are_in_alphabetical_order() {
         let more = [("ass_id", "7".to_owned()), ("obj_type", "Car".to_owned())];
-        let entry = ObjectEntry {
+        let object = Object {
             id: 7,
+            class: ObjectClass::Car,
+            world_from_object: Pose::IDENTITY,
+            size_m: [4.0, 2.0, 1.5],
+            speed_mps: Some(10.0),
+        };
+        let entry = ObjectEntry {
+            object: &object,
             angle_deg: [0.0, 90.0, -0.0],
             location_m: [1.0, 2.5, 0.0],
             center_m: [0.0; 3],
-            size_m: [4.0, 2.0, 1.5],
-            speed_mps: Some(10.0),
             more: &more,
         };
         let mut yaml = String::new();

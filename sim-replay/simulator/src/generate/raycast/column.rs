@@ -4,7 +4,7 @@ use std::f32::consts::TAU;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::placement::{Placement, Sweep};
+use super::placement::Sweep;
 
 /// Rays of a sensor in one sweep: columns at even azimuths, each with the same even elevations.
 ///
@@ -107,12 +107,12 @@ impl ColumnPose {
         anchor: &Vector3<f64>,
     ) -> Self {
         let time = pattern.time(column);
-        let Placement { position_m, .. } = sensor.at(time);
-        let rotation = sensor.at(time).rotation();
+        let placement = sensor.at(time);
+        let rotation = placement.rotation();
         let (sin, cos) = f64::from(pattern.azimuth_rad(column)).sin_cos();
         Self {
             time: time as f32,
-            origin: (position_m - anchor).cast(),
+            origin: (placement.position_m - anchor).cast(),
             forward: (rotation * Vector3::new(cos, sin, 0.0)).cast(),
             up: (rotation * Vector3::z()).cast(),
         }

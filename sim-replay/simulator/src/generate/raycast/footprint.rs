@@ -32,10 +32,9 @@ pub(super) struct SensorFrames {
 
 impl SensorFrames {
     pub(super) fn new(sensor: &Sweep) -> Self {
-        let frame =
-            |placement: &Placement| (placement.rotation().transpose(), placement.position_m);
+        let frame = |end: &Placement| (end.rotation().transpose(), end.position_m);
         Self {
-            ends: [frame(&sensor.start), frame(&sensor.end)],
+            ends: [&sensor.start, &sensor.end].map(frame),
         }
     }
 
@@ -55,11 +54,10 @@ impl SensorFrames {
             return None;
         }
         if nearest_m < TOUCHING_M {
-            let channels = 0..pattern.channels;
             return Some(Footprint {
                 first_column: 0,
                 columns: pattern.columns,
-                channels,
+                channels: 0..pattern.channels,
                 nearest_m: 0.0,
             });
         }
@@ -75,11 +73,8 @@ impl SensorFrames {
 
     /// Cheap early test: most bodies of a scene are too far away.
     fn is_surely_out_of_range(&self, range_m: f32, body: &Body<'_>) -> bool {
-        let [near_x, near_y] = [0, 1].map(|axis: usize| {
-            body.shape.bounds.min_m[axis]
-                .abs()
-                .max(body.shape.bounds.max_m[axis].abs())
-        });
+        let Bounds { min_m, max_m } = &body.shape.bounds;
+        let [near_x, near_y] = [0, 1].map(|axis: usize| min_m[axis].abs().max(max_m[axis].abs()));
         // Both ends may be a sweep's motion apart; the margin is conservative.
         let reach_m = f64::from(range_m + near_x + near_y) + 10.0;
         let offset = body.motion.end.position_m - self.ends[1].1;
@@ -107,15 +102,14 @@ impl SensorFrames {
         let axes: Matrix3<f32> = (self.ends[1].0 * motion.end.rotation()).cast();
         let closest = flat
             .iter()
-            .min_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()))
-            .unwrap_or(center);
+            .min_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared()));
+        let closest = closest.unwrap_or(center);
         let (x, y) = (axes.column(0).xy(), axes.column(1).xy());
         let directions = [x, -x, y, -y, *center, *closest];
         let parting = |direction: &Vector2<f32>| {
             let direction = direction.try_normalize(1e-6)?;
-            flat.iter()
-                .map(|corner| corner.dot(&direction))
-                .min_by(f32::total_cmp)
+            let along = flat.iter().map(|corner| corner.dot(&direction));
+            along.min_by(f32::total_cmp)
         };
         directions
             .iter()
@@ -130,36 +124,20 @@ fn channels(
     corners: &[Vector3<f32>; 16],
     nearest_m: f32,
 ) -> Option<Range<usize>> {
-    let farthest_m = corners
-        .iter()
-        .map(|corner| corner.xy().norm())
-        .fold(0.0, f32::max)
-        + BEND_M;
-    let low = corners
-        .iter()
-        .map(|corner| corner.z)
-        .fold(f32::MAX, f32::min)
-        - BEND_M;
-    let high = corners
-        .iter()
-        .map(|corner| corner.z)
-        .fold(f32::MIN, f32::max)
-        + BEND_M;
+    let distances = corners.iter().map(|corner| corner.xy().norm());
+    let farthest_m = distances.fold(0.0, f32::max) + BEND_M;
+    let heights = || corners.iter().map(|corner| corner.z);
+    let low = heights().fold(f32::MAX, f32::min) - BEND_M;
+    let high = heights().fold(f32::MIN, f32::max) + BEND_M;
     let steepest = |height: f32, falling: bool| {
-        (height
-            / if (height < 0.0) == falling {
-                nearest_m
-            } else {
-                farthest_m
-            })
-        .atan()
+        let is_near = (height < 0.0) == falling;
+        (height / if is_near { nearest_m } else { farthest_m }).atan()
     };
     let channel =
         |elevation: f32| (elevation - pattern.first_elevation_rad) / pattern.elevation_step_rad;
     let first = channel(steepest(low, true)).floor().max(0.0);
-    let last = channel(steepest(high, false))
-        .ceil()
-        .min((pattern.channels - 1) as f32);
+    let last = channel(steepest(high, false)).ceil();
+    let last = last.min((pattern.channels - 1) as f32);
     (first <= last).then(|| first as usize..last as usize + 1)
 }
 
@@ -181,10 +159,8 @@ fn columns(
     let margin = BEND_M / nearest_m;
     let index = |azimuth: f32| (azimuth - pattern.first_azimuth_rad) / pattern.azimuth_step_rad;
     let interval = |turn: f32| {
-        let (a, b) = (
-            index(middle + low - margin + turn),
-            index(middle + high + margin + turn),
-        );
+        let a = index(middle + low - margin + turn);
+        let b = index(middle + high + margin + turn);
         (a.min(b).floor() as i64 - 1, a.max(b).ceil() as i64 + 1)
     };
     let count = pattern.columns as i64;
@@ -193,10 +169,8 @@ fn columns(
         return Some((first, (last - first + 1).min(count) as usize));
     }
     debug_assert!(middle.abs() <= PI + 1e-3);
-    let clipped = [-TAU, 0.0, TAU]
-        .map(interval)
-        .into_iter()
-        .filter(|(first, last)| *last >= 0 && *first < count);
+    let intervals = [-TAU, 0.0, TAU].map(interval).into_iter();
+    let clipped = intervals.filter(|(first, last)| *last >= 0 && *first < count);
     let (first, last) = clipped.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
     let (first, last) = (first.max(0), last.min(count - 1));
     Some((first, (last - first + 1) as usize))

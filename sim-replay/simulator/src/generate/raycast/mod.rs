@@ -44,11 +44,8 @@ impl BodyShape {
     /// # Panics
     /// If `parts` is empty: a body without extent is an error of the caller.
     pub fn new(parts: Vec<Part>, reflectivity: f32) -> Self {
-        let bounds = parts
-            .iter()
-            .map(Part::bounds)
-            .reduce(|a, b| a.union(&b))
-            .expect("a body has parts");
+        let bounds = parts.iter().map(Part::bounds).reduce(|a, b| a.union(&b));
+        let bounds = bounds.expect("a body has parts");
         Self {
             parts,
             bounds,
@@ -147,12 +144,10 @@ pub(crate) struct Caster {
 impl Caster {
     /// A caster for sweeps of `pattern`.
     pub(crate) fn new(pattern: RayPattern) -> Self {
-        let elevations: Vec<f32> = (0..pattern.channels)
-            .map(|channel| pattern.elevation_rad(channel))
-            .collect();
+        let elevations = (0..pattern.channels).map(|channel| pattern.elevation_rad(channel));
         Self {
-            cos: elevations.iter().map(|elevation| elevation.cos()).collect(),
-            sin: elevations.iter().map(|elevation| elevation.sin()).collect(),
+            cos: elevations.clone().map(f32::cos).collect(),
+            sin: elevations.map(f32::sin).collect(),
             columns: Vec::new(),
             order: Vec::new(),
             image: RangeImage::default(),
@@ -174,25 +169,19 @@ impl Caster {
         let anchor = sensor.end.position_m;
         let (pattern, channels) = (&self.pattern, self.pattern.channels);
         self.columns.clear();
-        self.columns.extend(
-            (0..pattern.columns).map(|column| ColumnPose::new(pattern, column, sensor, &anchor)),
-        );
-        self.image.depths_m.clear();
-        self.image
-            .depths_m
-            .resize(pattern.columns * channels, pattern.range_m);
-        self.image.hits.clear();
-        self.image.hits.resize(pattern.columns * channels, MISS);
-
-        let image = self
-            .image
-            .depths_m
-            .chunks_exact_mut(channels)
-            .zip(self.image.hits.chunks_exact_mut(channels));
+        let columns = 0..pattern.columns;
+        let poses = columns.map(|column| ColumnPose::new(pattern, column, sensor, &anchor));
+        self.columns.extend(poses);
+        let RangeImage { depths_m, hits } = &mut self.image;
+        depths_m.clear();
+        depths_m.resize(pattern.columns * channels, pattern.range_m);
+        hits.clear();
+        hits.resize(pattern.columns * channels, MISS);
+        let depths = depths_m.chunks_exact_mut(channels);
+        let image = depths.zip(hits.chunks_exact_mut(channels));
         for (pose, (depths, hits)) in self.columns.iter().zip(image) {
-            let origin = anchor + pose.origin.cast::<f64>();
             let rays = SurfaceRays {
-                origin,
+                origin: anchor + pose.origin.cast::<f64>(),
                 forward: pose.forward,
                 up: pose.up,
                 cos: &self.cos,
@@ -203,11 +192,11 @@ impl Caster {
 
         let frames = SensorFrames::new(sensor);
         self.order.clear();
-        let visible = bodies.iter().enumerate();
-        self.order.extend(
-            visible
-                .filter_map(|(index, body)| Some((frames.footprint(&self.pattern, body)?, index))),
-        );
+        let visible = bodies
+            .iter()
+            .zip(0..)
+            .filter_map(|(body, index)| Some((frames.footprint(&self.pattern, body)?, index)));
+        self.order.extend(visible);
         // Near bodies first: bodies behind them need not be intersected. The index makes the order of ties
         // deterministic.
         self.order
@@ -250,28 +239,21 @@ impl Caster {
         anchor: &Vector3<f64>,
     ) {
         let count = self.pattern.columns as i64;
-        let (cos, sin) = (
-            &self.cos[footprint.channels.clone()],
-            &self.sin[footprint.channels.clone()],
-        );
+        let channels = footprint.channels.clone();
+        let (cos, sin) = (&self.cos[channels.clone()], &self.sin[channels.clone()]);
         let frame = |time: f32| -> (Matrix3<f32>, Vector3<f32>) {
             let placement = body.motion.at(f64::from(time));
-            (
-                placement.rotation().transpose().cast(),
-                (placement.position_m - anchor).cast(),
-            )
+            let body_from_world = placement.rotation().transpose().cast();
+            (body_from_world, (placement.position_m - anchor).cast())
         };
         let still = body.motion.is_still().then(|| frame(1.0));
         for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
             let column = column.rem_euclid(count) as usize;
             let offset = column * self.pattern.channels;
-            let range = offset + footprint.channels.start..offset + footprint.channels.end;
+            let range = offset + channels.start..offset + channels.end;
             let depths = &mut self.image.depths_m[range.clone()];
-            if depths
-                .iter()
-                .fold(0.0f32, |far, &depth| if depth > far { depth } else { far })
-                < footprint.nearest_m
-            {
+            let farther = |far: f32, &depth: &f32| if depth > far { depth } else { far };
+            if depths.iter().fold(0.0, farther) < footprint.nearest_m {
                 continue;
             }
             let hits = &mut self.image.hits[range];

@@ -44,6 +44,9 @@ pub struct Bounds {
     pub max_m: [f32; 3],
 }
 
+/// Depths and hits along a column of rays, and the id of the body that is cast.
+type Pixels<'a> = (&'a mut [f32], &'a mut [u32], u32);
+
 impl Bounds {
     /// A box from its centre and half sizes.
     pub(crate) fn centered(center_m: [f32; 3], half_m: [f32; 3]) -> Self {
@@ -69,15 +72,11 @@ impl Bounds {
 
     /// The eight corners.
     pub fn corners(&self) -> [[f32; 3]; 8] {
-        std::array::from_fn(|corner| {
-            std::array::from_fn(|axis| {
-                if corner >> axis & 1 == 0 {
-                    self.min_m[axis]
-                } else {
-                    self.max_m[axis]
-                }
-            })
-        })
+        let edge = |corner: usize, axis: usize| match corner >> axis & 1 {
+            0 => self.min_m[axis],
+            _ => self.max_m[axis],
+        };
+        std::array::from_fn(|corner| std::array::from_fn(|axis| edge(corner, axis)))
     }
 
     /// True if the plane through `origin` with unit normal `normal` touches the box.
@@ -108,30 +107,20 @@ impl Part {
     /// Shortens the depths of a column to this part where it is hit from outside, and writes `id` there.
     pub(super) fn cast(&self, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
         let rays = &rays.cut(depth.len());
+        if !self.bounds().meets_plane(&rays.origin, &rays.normal()) {
+            return;
+        }
+        let pixels = (depth, hit, id);
         match self {
-            Self::Hull { planes, bounds } => {
-                if bounds.meets_plane(&rays.origin, &rays.normal()) {
-                    cast_hull(planes, rays, depth, hit, id);
-                }
-            }
-            Self::Box(bounds) => {
-                if bounds.meets_plane(&rays.origin, &rays.normal()) {
-                    cast_box(bounds, rays, depth, hit, id);
-                }
-            }
+            Self::Hull { planes, .. } => cast_hull(planes, rays, pixels),
+            Self::Box(bounds) => cast_box(bounds, rays, pixels),
             Self::Cylinder {
                 center_m,
                 radius_m,
                 half_height_m,
-            } => {
-                if self.bounds().meets_plane(&rays.origin, &rays.normal()) {
-                    cast_cylinder(*center_m, *radius_m, *half_height_m, rays, depth, hit, id);
-                }
-            }
+            } => cast_cylinder(*center_m, [*radius_m, *half_height_m], rays, pixels),
             Self::Ellipsoid { center_m, radii_m } => {
-                if self.bounds().meets_plane(&rays.origin, &rays.normal()) {
-                    cast_ellipsoid(*center_m, *radii_m, rays, depth, hit, id);
-                }
+                cast_ellipsoid(*center_m, *radii_m, rays, pixels);
             }
         }
     }
@@ -159,14 +148,11 @@ fn greater(a: f32, b: f32) -> f32 {
 
 #[inline(always)]
 fn off_zero(value: f32) -> f32 {
-    if value.abs() < PARALLEL {
-        -PARALLEL
-    } else {
-        value
-    }
+    let is_parallel = value.abs() < PARALLEL;
+    if is_parallel { -PARALLEL } else { value }
 }
 
-fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
+fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, (depth, hit, id): Pixels<'_>) {
     let low: [f32; 3] = std::array::from_fn(|axis| bounds.min_m[axis] - rays.origin[axis]);
     let high: [f32; 3] = std::array::from_fn(|axis| bounds.max_m[axis] - rays.origin[axis]);
     let (h, u) = (rays.forward, rays.up);
@@ -183,13 +169,7 @@ fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut
     }
 }
 
-fn cast_hull(
-    planes: &[[f32; 4]],
-    rays: &ColumnRays<'_>,
-    depth: &mut [f32],
-    hit: &mut [u32],
-    id: u32,
-) {
+fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, (depth, hit, id): Pixels<'_>) {
     const LANES: usize = 64;
     for start in (0..depth.len()).step_by(LANES) {
         let count = LANES.min(depth.len() - start);
@@ -198,27 +178,17 @@ fn cast_hull(
         for plane in planes {
             let dot = |v: &[f32; 3]| plane[0] * v[0] + plane[1] * v[1] + plane[2] * v[2];
             // Distance to the plane from inside, and its decrease along the two directions that span the column.
-            let (inside, along, rise) = (
-                plane[3] - dot(&rays.origin),
-                dot(&rays.forward),
-                dot(&rays.up),
-            );
+            let inside = plane[3] - dot(&rays.origin);
+            let (along, rise) = (dot(&rays.forward), dot(&rays.up));
             let lanes = enter[..count].iter_mut().zip(&mut exit[..count]);
             for ((enter, exit), (cos, sin)) in
                 lanes.zip(rays.cos[range.clone()].iter().zip(&rays.sin[range.clone()]))
             {
                 let slope = off_zero(along * cos + rise * sin);
                 let at = inside / slope;
-                *enter = if slope < 0.0 {
-                    greater(*enter, at)
-                } else {
-                    *enter
-                };
-                *exit = if slope < 0.0 {
-                    *exit
-                } else {
-                    lesser(*exit, at)
-                };
+                let (latest, earliest) = (greater(*enter, at), lesser(*exit, at));
+                *enter = if slope < 0.0 { latest } else { *enter };
+                *exit = if slope < 0.0 { *exit } else { earliest };
             }
         }
         let lanes = enter[..count].iter().zip(&exit[..count]);
@@ -232,21 +202,15 @@ fn cast_hull(
 
 fn cast_cylinder(
     center: [f32; 3],
-    radius: f32,
-    half_height: f32,
+    [radius, half_height]: [f32; 2],
     rays: &ColumnRays<'_>,
-    depth: &mut [f32],
-    hit: &mut [u32],
-    id: u32,
+    (depth, hit, id): Pixels<'_>,
 ) {
     let o: [f32; 3] = std::array::from_fn(|axis| rays.origin[axis] - center[axis]);
     let (h, u) = (rays.forward, rays.up);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
-        let (dx, dy, dz) = (
-            h[0] * cos + u[0] * sin,
-            h[1] * cos + u[1] * sin,
-            off_zero(h[2] * cos + u[2] * sin),
-        );
+        let [dx, dy, dz] = [0, 1, 2].map(|axis| h[axis] * cos + u[axis] * sin);
+        let dz = off_zero(dz);
         let flat = greater(dx * dx + dy * dy, PARALLEL);
         // From the ray's distance to the axis rather than from b^2 - ac, which cancels for a thin pole far away.
         let aside = o[0] * dy - o[1] * dx;
@@ -254,10 +218,8 @@ fn cast_cylinder(
         let half_chord = greater(room, 0.0).sqrt();
         let middle = -(o[0] * dx + o[1] * dy);
         let inverse = 1.0 / dz;
-        let (a, b) = (
-            (-half_height - o[2]) * inverse,
-            (half_height - o[2]) * inverse,
-        );
+        let a = (-half_height - o[2]) * inverse;
+        let b = (half_height - o[2]) * inverse;
         let enter = greater((middle - half_chord) / flat, lesser(a, b));
         let exit = lesser((middle + half_chord) / flat, greater(a, b));
         shorten(enter, (room >= 0.0) & (enter <= exit), depth, hit, id);
@@ -268,29 +230,18 @@ fn cast_ellipsoid(
     center: [f32; 3],
     radii: [f32; 3],
     rays: &ColumnRays<'_>,
-    depth: &mut [f32],
-    hit: &mut [u32],
-    id: u32,
+    (depth, hit, id): Pixels<'_>,
 ) {
     // In the space where the ellipsoid is the unit sphere.
     let o: [f32; 3] = std::array::from_fn(|axis| (rays.origin[axis] - center[axis]) / radii[axis]);
     let h: [f32; 3] = std::array::from_fn(|axis| rays.forward[axis] / radii[axis]);
     let u: [f32; 3] = std::array::from_fn(|axis| rays.up[axis] / radii[axis]);
     for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
-        let d = [
-            h[0] * cos + u[0] * sin,
-            h[1] * cos + u[1] * sin,
-            h[2] * cos + u[2] * sin,
-        ];
+        let d = [0, 1, 2].map(|axis| h[axis] * cos + u[axis] * sin);
         let square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
         let middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / square;
-        let closest = [
-            o[0] + middle * d[0],
-            o[1] + middle * d[1],
-            o[2] + middle * d[2],
-        ];
-        let room =
-            1.0 - (closest[0] * closest[0] + closest[1] * closest[1] + closest[2] * closest[2]);
+        let [x, y, z] = [0, 1, 2].map(|axis| o[axis] + middle * d[axis]);
+        let room = 1.0 - (x * x + y * y + z * z);
         let enter = middle - (greater(room, 0.0) / square).sqrt();
         shorten(enter, room >= 0.0, depth, hit, id);
     }

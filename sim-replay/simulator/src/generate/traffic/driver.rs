@@ -60,10 +60,10 @@ impl Driver {
             // The model's own term brakes far too hard before a mere bend.
             -self.comfort_mps2 * (1.0 - wanted / speed_mps).max(0.0).sqrt() * 1.5
         };
-        let most = obstacles
+        let interactions = obstacles
             .iter()
-            .map(|obstacle| self.interaction(speed_mps, obstacle))
-            .fold(0.0, f64::max);
+            .map(|obstacle| self.interaction(speed_mps, obstacle));
+        let most = interactions.fold(0.0, f64::max);
         (free - self.acceleration_mps2 * most).max(-EMERGENCY_MPS2)
     }
 
@@ -84,17 +84,15 @@ pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
     (0..points.len())
         .map(|index| {
             let at = |index: usize| [points[index][0], points[index][1]];
-            let (a, b, c) = (
-                at(index.saturating_sub(REACH)),
-                at(index),
-                at((index + REACH).min(points.len() - 1)),
-            );
+            let (before, after) = (index.saturating_sub(REACH), index + REACH);
+            let (a, b, c) = (at(before), at(index), at(after.min(points.len() - 1)));
             let side = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
             let doubled_area =
                 ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
             let product = side(a, b) * side(b, c) * side(a, c);
             // Curvature of the circle through the three points.
-            let curvature = if product > 1e-6 {
+            let is_triangle = product > 1e-6;
+            let curvature = if is_triangle {
                 2.0 * doubled_area / product
             } else {
                 0.0

@@ -36,7 +36,7 @@ impl Explorer {
                 onto[next.0 as usize].push((lane.id, length_m));
             }
             for beside in [Side::Left, Side::Right]
-                .into_iter()
+                .iter()
                 .filter_map(|side| side.of(lane))
             {
                 onto[beside.0 as usize].push((lane.id, CHANGE_M));
@@ -74,12 +74,10 @@ impl Explorer {
         let Some(least) = distances.iter().flatten().min() else {
             return;
         };
-        let mut distances = distances.iter();
-        lanes.retain(|_| {
-            distances
-                .next()
-                .is_some_and(|distance| distance.as_ref() == Some(least))
-        });
+        let mut are_best = distances
+            .iter()
+            .map(|distance| distance.as_ref() == Some(least));
+        lanes.retain(|_| are_best.next().unwrap_or(false));
     }
 
     /// True if the lane `beside` justifies the change from `own`.
@@ -111,11 +109,8 @@ impl Explorer {
                 continue;
             }
             unknown_m[lane] = Some(distance_m);
-            open.extend(
-                self.onto[lane]
-                    .iter()
-                    .map(|&(from, cost_m)| Reverse((distance_m + cost_m, from.0 as usize))),
-            );
+            let onto = self.onto[lane].iter();
+            open.extend(onto.map(|&(from, m)| Reverse((distance_m + m, from.0 as usize))));
         }
         unknown_m
     }

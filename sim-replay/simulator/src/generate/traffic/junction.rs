@@ -29,9 +29,8 @@ impl RightOfWay {
             return true;
         }
         let taken = |other: &LaneId| {
-            self.holders[other.0 as usize]
-                .iter()
-                .any(|&holder| holder != index)
+            let mut holders = self.holders[other.0 as usize].iter();
+            holders.any(|&holder| holder != index)
         };
         if roads.graph.lane(lane).conflicts.iter().any(taken) {
             return false;
@@ -46,14 +45,11 @@ impl RightOfWay {
         if car.held.is_empty() {
             return;
         }
-        let needed: Vec<LaneId> = if car.is_present {
-            let under = car.path.lanes_under(roads.graph, car.half_length_m() + 0.5);
-            under
-                .chain(car.path.ahead(roads.graph).map(|(lane, _)| lane))
-                .collect()
-        } else {
-            Vec::new()
-        };
+        let mut needed: Vec<LaneId> = Vec::new();
+        if car.is_present {
+            needed.extend(car.path.lanes_under(roads.graph, car.half_length_m() + 0.5));
+            needed.extend(car.path.ahead(roads.graph).map(|(lane, _)| lane));
+        }
         let holders = &mut self.holders;
         car.held.retain(|lane| {
             let is_needed = needed.contains(lane);

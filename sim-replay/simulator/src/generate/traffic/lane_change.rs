@@ -96,10 +96,7 @@ enum Reason {
 impl Traffic<'_> {
     /// Begins the changes that are wanted, possible and safe. Needs the list of occupants, and keeps it up to date.
     pub(super) fn change_lanes(&mut self, near: &mut Vec<u32>) {
-        for index in 0..self.cars.len() {
-            if !self.cars[index].is_present {
-                continue;
-            }
+        for index in self.present() {
             self.update_state(index);
             if let Some(path) = self.wanted_change(index, near) {
                 self.begin_change(index, path);
@@ -112,38 +109,32 @@ impl Traffic<'_> {
         let is_held_up = is_held_up(car, self.roads);
         let state = &mut car.lane_change;
         // The waiting time after a change elapses in any case.
-        let is_rising = is_held_up || state.held_up_s < 0.0;
-        state.held_up_s = if is_rising {
-            state.held_up_s + STEP_S
-        } else {
-            (state.held_up_s - STEP_S).max(0.0)
+        state.held_up_s = match is_held_up || state.held_up_s < 0.0 {
+            true => state.held_up_s + STEP_S,
+            false => (state.held_up_s - STEP_S).max(0.0),
         };
         state.random_change_timer_s -= STEP_S;
         if state.random_change_timer_s > 0.0 {
             return;
         }
         // A random change expires; after the pause there may be another one.
-        let random_change = if state.random_change.is_some() {
-            None
-        } else {
-            self.random_change(index)
+        let random_change = match state.random_change {
+            Some(_) => None,
+            None => self.random_change(index),
         };
-        let turns_in_s = if random_change.is_some() {
-            RANDOM_CHANGE_S
-        } else {
-            self.time_to_random_change_s(index)
+        let turns_in_s = match random_change {
+            Some(_) => RANDOM_CHANGE_S,
+            None => self.time_to_random_change_s(index),
         };
         let state = &mut self.cars[index].lane_change;
         (state.random_change, state.random_change_timer_s) = (random_change, turns_in_s);
     }
 
     fn time_to_random_change_s(&mut self, index: usize) -> f64 {
-        let [low, high] = if self.explores(index) {
-            [4.0, 16.0]
-        } else {
-            [20.0, 80.0]
-        };
-        self.random.between(low, high)
+        match self.explores(index) {
+            true => self.random.between(4.0, 16.0),
+            false => self.random.between(20.0, 80.0),
+        }
     }
 
     fn explores(&self, index: usize) -> bool {
@@ -153,11 +144,9 @@ impl Traffic<'_> {
     /// Side of a random change; for an exploring focus, one that leads to less visited roads.
     fn random_change(&mut self, index: usize) -> Option<Side> {
         let own = self.cars[index].path.lane();
-        let sides = [Side::Left, Side::Right];
         let lane = self.roads.graph.lane(own);
-        let sides = sides
-            .into_iter()
-            .filter_map(|side| Some((side, side.of(lane)?)));
+        let sides = [Side::Left, Side::Right].into_iter();
+        let sides = sides.filter_map(|side| Some((side, side.of(lane)?)));
         let mut sides: Vec<(Side, LaneId)> = sides.collect();
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             let wanted = |&(_, lane): &(Side, LaneId)| explorer.prefers(lane, own);
@@ -221,39 +210,28 @@ impl Traffic<'_> {
             return false;
         }
         let brakes_softly = |car: &Car, ahead: Obstacle| {
-            let braking = -car
-                .driver
-                .acceleration_mps2(car.speed_mps, car.speed_mps, &[ahead]);
+            let speed_mps = car.speed_mps;
+            let braking = -car.driver.acceleration_mps2(speed_mps, speed_mps, &[ahead]);
             ahead.gap_m > SAFE_GAP_M && braking < SAFE_MPS2
         };
-        if !self
-            .leader_on(index, path)
-            .is_none_or(|leader| brakes_softly(car, leader))
-        {
+        let leader = self.leader_on(index, path);
+        if !leader.is_none_or(|leader| brakes_softly(car, leader)) {
             return false;
         }
         let follower = self.follower_on(index, path.lane(), path.s_m());
         let is_let_in = |(follower, apart_m): (usize, f64)| {
             let follower = &self.cars[follower];
             let gap_m = apart_m - car.half_length_m() - follower.half_length_m();
-            brakes_softly(
-                follower,
-                Obstacle {
-                    gap_m,
-                    speed_mps: car.speed_mps,
-                },
-            )
+            let speed_mps = car.speed_mps;
+            brakes_softly(follower, Obstacle { gap_m, speed_mps })
         };
         if !follower.is_none_or(is_let_in) {
             return false;
         }
         // Vehicles that are not in the list of the lane: those that cross it, or have nearly left it.
-        let beside = Path::new(path.lane(), path.s_m()).placement(
-            self.roads.graph,
-            0.0,
-            car.wheelbase_m(),
-            car.aside_m,
-        );
+        let beside = Path::new(path.lane(), path.s_m());
+        let graph = self.roads.graph;
+        let beside = beside.placement(graph, 0.0, car.wheelbase_m(), car.aside_m);
         let mut room = Rectangle::new(&beside, &car.vehicle.size_m).grown(0.3);
         room.half_m[0] += SAFE_GAP_M;
         self.is_free(index, &room, near)
@@ -263,30 +241,24 @@ impl Traffic<'_> {
     fn follower_on(&self, index: usize, lane: LaneId, s_m: f64) -> Option<(usize, f64)> {
         let mut nearest: Option<(usize, f64)> = None;
         // Lanes still to be searched, and the distance of their ends behind the position.
-        let mut open = vec![(lane, s_m - self.roads.graph.lane(lane).length_m)];
+        let graph = self.roads.graph;
+        let mut open = vec![(lane, s_m - graph.lane(lane).length_m)];
         while let Some((lane, end_m)) = open.pop() {
-            let start_m = end_m + self.roads.graph.lane(lane).length_m;
+            let start_m = end_m + graph.lane(lane).length_m;
             let behind = self.occupants[lane.0 as usize]
                 .iter()
                 .map(|&(other_m, other)| (other as usize, start_m - other_m))
                 .filter(|&(other, apart_m)| other != index && apart_m >= 0.0)
                 .min_by(|a, b| a.1.total_cmp(&b.1));
             match behind {
-                Some(found) if nearest.is_none_or(|(_, least_m)| found.1 < least_m) => {
-                    nearest = Some(found)
+                Some(found) if nearest.is_none_or(|least| found.1 < least.1) => {
+                    nearest = Some(found);
                 }
-                Some(_) => {}
                 None if start_m < BEHIND_M => {
-                    open.extend(
-                        self.roads
-                            .graph
-                            .lane(lane)
-                            .predecessors
-                            .iter()
-                            .map(|&before| (before, start_m)),
-                    );
+                    let before = graph.lane(lane).predecessors.iter();
+                    open.extend(before.map(|&before| (before, start_m)));
                 }
-                None => {}
+                _ => {}
             }
         }
         nearest
@@ -302,11 +274,12 @@ impl Traffic<'_> {
         };
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             // Lanes that were decided but will not be driven do not count.
+            let graph = self.roads.graph;
             car.path
-                .ahead(self.roads.graph)
+                .ahead(graph)
                 .skip(1)
                 .for_each(|(lane, _)| explorer.give_up(lane));
-            path.ahead(self.roads.graph)
+            path.ahead(graph)
                 .for_each(|(lane, _)| explorer.choose(lane));
         }
         let entry = (path.s_m(), index as u32);
@@ -338,11 +311,8 @@ fn change_m(car: &Car) -> f64 {
 fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
     let graph = roads.graph;
     let is_in_junction = |lane: LaneId| graph.lane(lane).in_junction;
-    if car
-        .path
-        .lanes_under(graph, car.half_length_m())
-        .any(is_in_junction)
-    {
+    let mut under = car.path.lanes_under(graph, car.half_length_m());
+    if under.any(is_in_junction) {
         return None;
     }
     let mut left = car.path.lane();
@@ -363,11 +333,8 @@ fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
         }
         (lane, left) = roads.onward(lane).into_iter().find_map(|next| {
             let next_left = side.opposite().of(graph.lane(next))?;
-            graph
-                .lane(left)
-                .successors
-                .contains(&next_left)
-                .then_some((next, next_left))
+            let is_next = graph.lane(left).successors.contains(&next_left);
+            is_next.then_some((next, next_left))
         })?;
     }
 }

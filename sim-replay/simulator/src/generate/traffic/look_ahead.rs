@@ -71,10 +71,8 @@ impl Traffic<'_> {
             if let Some(&(s_m, other)) = self.occupants[lane.0 as usize].iter().find(is_ahead) {
                 let leader = &self.cars[other as usize];
                 let gap_m = start_m + s_m - car.half_length_m() - leader.half_length_m();
-                return Some(Obstacle {
-                    gap_m,
-                    speed_mps: leader.speed_mps,
-                });
+                let speed_mps = leader.speed_mps;
+                return Some(Obstacle { gap_m, speed_mps });
             }
         }
         None
@@ -97,11 +95,9 @@ impl Traffic<'_> {
             let is_inside = start_m < self.cars[index].half_length_m();
             let has_room = is_inside || self.has_exit_room(index, exit);
             let car = &mut self.cars[index];
-            if has_room && self.right_of_way.take(index as u32, car, lane, self.roads) {
-                continue;
-            }
-            if is_inside {
-                // Already across the line: wait in the lane for the others by the swept way alone.
+            // Already across the line: wait in the lane for the others by the swept way alone.
+            if has_room && self.right_of_way.take(index as u32, car, lane, self.roads) || is_inside
+            {
                 continue;
             }
             return Some(Obstacle {
@@ -117,10 +113,8 @@ impl Traffic<'_> {
         let Some(exit) = exit.filter(|exit| !self.roads.graph.lane(*exit).in_junction) else {
             return true;
         };
-        let Some(&(s_m, last)) = self.occupants[exit.0 as usize]
-            .iter()
-            .find(|(_, other)| *other as usize != index)
-        else {
+        let mut occupants = self.occupants[exit.0 as usize].iter();
+        let Some(&(s_m, last)) = occupants.find(|(_, other)| *other as usize != index) else {
             return true;
         };
         let last = &self.cars[last as usize];
@@ -139,8 +133,8 @@ impl Traffic<'_> {
         let reach_m = (6.0 + 2.5 * car.speed_mps).min(30.0);
         let here = car.motion.end;
         let (sin, cos) = here.yaw_rad.sin_cos();
-        self.index
-            .near(car.point_m(), reach_m + car.half_length_m() + 6.0, near);
+        let radius_m = reach_m + car.half_length_m() + 6.0;
+        self.index.near(car.point_m(), radius_m, near);
         near.retain(|&other| {
             let other_car = &self.cars[other as usize];
             let offset = other_car.motion.end.position_m - here.position_m;
@@ -159,16 +153,13 @@ impl Traffic<'_> {
         let mut ahead_m = car.half_length_m();
         while ahead_m < car.half_length_m() + reach_m {
             let [x, y, _] = car.path.point_m(self.roads.graph, ahead_m);
-            let hit = near.iter().find(|&&other| {
-                self.cars[other as usize].rectangle().distance_m([x, y]) < half_width_m
-            });
-            if let Some(&other) = hit {
-                let other = &self.cars[other as usize];
+            let mut others = near.iter().map(|&other| &self.cars[other as usize]);
+            let hit = others.find(|other| other.rectangle().distance_m([x, y]) < half_width_m);
+            if let Some(other) = hit {
                 let turned = wrapped(other.motion.end.yaw_rad - here.yaw_rad);
-                let speed_mps = (other.speed_mps * turned.cos()).max(0.0);
                 return Some(Obstacle {
                     gap_m: ahead_m - car.half_length_m(),
-                    speed_mps,
+                    speed_mps: (other.speed_mps * turned.cos()).max(0.0),
                 });
             }
             ahead_m += SWEEP_STEP_M;

@@ -73,10 +73,7 @@ impl<'t> Traffic<'t> {
         self.list_occupants();
         self.change_lanes(&mut near);
         self.decide_ways();
-        for index in 0..self.cars.len() {
-            if !self.cars[index].is_present {
-                continue;
-            }
+        for index in self.present() {
             let acceleration = self.acceleration_mps2(index, &mut near);
             let car = &self.cars[index];
             let speed = (car.speed_mps + acceleration * STEP_S).max(0.0);
@@ -87,6 +84,13 @@ impl<'t> Traffic<'t> {
                 .release_behind(index as u32, &mut self.cars[index], self.roads);
         }
         self.exchange_far_cars();
+    }
+
+    /// Indices of the cars that are on the road.
+    fn present(&self) -> Vec<usize> {
+        (0..self.cars.len())
+            .filter(|&index| self.cars[index].is_present)
+            .collect()
     }
 
     /// Moves one vehicle, unless another one blocks it.
@@ -123,30 +127,22 @@ impl<'t> Traffic<'t> {
     fn is_free(&self, index: usize, footprint: &Rectangle, near: &mut Vec<u32>) -> bool {
         let radius_m = footprint.radius_m() + 9.0;
         self.index.near(footprint.center_m, radius_m, near);
-        let cars = near
+        let mut others = near
             .iter()
             .map(|&other| other as usize)
             .filter(|&other| other != index);
-        if cars
-            .into_iter()
-            .any(|other| self.cars[other].rectangle().overlaps(footprint))
-        {
+        if others.any(|other| self.cars[other].rectangle().overlaps(footprint)) {
             return false;
         }
         self.parked_index.near(footprint.center_m, radius_m, near);
-        !near
-            .iter()
-            .any(|&spot| self.parked[spot as usize].overlaps(footprint))
+        let mut parked = near.iter().map(|&spot| &self.parked[spot as usize]);
+        !parked.any(|parked| parked.overlaps(footprint))
     }
 
     fn list_occupants(&mut self) {
         self.occupants.iter_mut().for_each(Vec::clear);
-        for (index, car) in self
-            .cars
-            .iter()
-            .enumerate()
-            .filter(|(_, car)| car.is_present)
-        {
+        let cars = self.cars.iter().enumerate();
+        for (index, car) in cars.filter(|(_, car)| car.is_present) {
             self.occupants[car.path.lane().0 as usize].push((car.path.s_m(), index as u32));
             // Vehicles behind it on the lane that it leaves must not hit it.
             if let Some((lane, s_m)) = car.path.leaving(self.roads.graph) {

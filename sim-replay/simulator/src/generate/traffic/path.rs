@@ -47,10 +47,8 @@ impl Change {
     }
 
     fn left_beside(&self, lane: LaneId) -> Option<LaneId> {
-        self.beside
-            .iter()
-            .find(|pair| pair.lane == lane)
-            .map(|pair| pair.left)
+        let pair = self.beside.iter().find(|pair| pair.lane == lane);
+        pair.map(|pair| pair.left)
     }
 }
 
@@ -115,23 +113,17 @@ impl Path {
 
     /// The lane that the vehicle is leaving and its position there, metres, while it occupies space there.
     pub(crate) fn leaving(&self, graph: &LaneGraph) -> Option<(LaneId, f64)> {
-        let change = self
-            .change
-            .as_ref()
-            .filter(|change| change.share(0.0) < LEFT_SHARE)?;
+        let change = self.change.as_ref();
+        let change = change.filter(|change| change.share(0.0) < LEFT_SHARE)?;
         let left = change.left_beside(self.lane())?;
-        Some((
-            left,
-            self.s_m / graph.lane(self.lane()).length_m * graph.lane(left).length_m,
-        ))
+        let [own, beside] = [self.lane(), left].map(|lane| graph.lane(lane).length_m);
+        Some((left, self.s_m / own * beside))
     }
 
     /// Length of the decided path ahead, metres.
     pub(crate) fn remaining_m(&self, graph: &LaneGraph) -> f64 {
-        self.ahead(graph)
-            .map(|(lane, start_m)| start_m + graph.lane(lane).length_m)
-            .last()
-            .unwrap_or(0.0)
+        let last = self.ahead(graph).last();
+        last.map_or(0.0, |(lane, start_m)| start_m + graph.lane(lane).length_m)
     }
 
     /// The lane under the vehicle and those ahead, each with the distance to its start (negative for the first),
@@ -161,13 +153,8 @@ impl Path {
             self.current += 1;
         }
         let behind = |path: &Self| -> f64 {
-            path.lanes
-                .iter()
-                .take(path.current)
-                .skip(1)
-                .map(|&lane| graph.lane(lane).length_m)
-                .sum::<f64>()
-                + path.s_m
+            let lanes = path.lanes.iter().take(path.current).skip(1);
+            lanes.map(|&lane| graph.lane(lane).length_m).sum::<f64>() + path.s_m
         };
         while self.current > 0 && behind(self) > keep_behind_m {
             self.lanes.pop_front();
@@ -275,11 +262,8 @@ fn point_on(lane: &Lane, s_m: f64) -> [f64; 3] {
     let (point, heading) = lane.at(s_m);
     let beyond_m = s_m - s_m.clamp(0.0, lane.length_m);
     let (sin, cos) = heading.sin_cos();
-    [
-        point[0] + beyond_m * cos,
-        point[1] + beyond_m * sin,
-        point[2],
-    ]
+    let [x, y, z] = point;
+    [x + beyond_m * cos, y + beyond_m * sin, z]
 }
 
 #[cfg(test)]

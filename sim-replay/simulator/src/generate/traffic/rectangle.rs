@@ -46,10 +46,7 @@ impl Rectangle {
 
     /// True if both lie on one level and share a point (separating axes).
     pub(crate) fn overlaps(&self, other: &Self) -> bool {
-        let offset = [
-            other.center_m[0] - self.center_m[0],
-            other.center_m[1] - self.center_m[1],
-        ];
+        let offset = [0, 1].map(|axis| other.center_m[axis] - self.center_m[axis]);
         if (self.z_m - other.z_m).abs() > LEVEL_M
             || offset[0].hypot(offset[1]) > self.radius_m() + other.radius_m()
         {
@@ -57,8 +54,9 @@ impl Rectangle {
         }
         let side = |axis: [f64; 2]| [-axis[1], axis[0]];
         let axes = [self.axis, side(self.axis), other.axis, side(other.axis)];
-        axes.iter()
-            .all(|axis| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis))
+        let meet =
+            |axis: &[f64; 2]| dot(*axis, offset).abs() <= self.reach(axis) + other.reach(axis);
+        axes.iter().all(meet)
     }
 
     /// Distance of a point from the rectangle, 0 inside, metres.
@@ -91,10 +89,7 @@ pub(crate) struct NeighbourIndex {
 
 impl NeighbourIndex {
     fn cell(point: [f64; 2]) -> (i32, i32) {
-        (
-            (point[0] / CELL_M).floor() as i32,
-            (point[1] / CELL_M).floor() as i32,
-        )
+        point.map(|metres| (metres / CELL_M).floor() as i32).into()
     }
 
     pub(crate) fn insert(&mut self, index: u32, point: [f64; 2]) {
@@ -106,9 +101,7 @@ impl NeighbourIndex {
         if Self::cell(from) == Self::cell(to) {
             return;
         }
-        if let Some(cell) = self.cells.get_mut(&Self::cell(from)) {
-            cell.retain(|&entry| entry != index);
-        }
+        self.remove(index, from);
         self.insert(index, to);
     }
 
@@ -122,10 +115,8 @@ impl NeighbourIndex {
     /// All entries in the cells within `radius_m` of `point`, in an order that depends on the contents alone.
     pub(crate) fn near(&self, point: [f64; 2], radius_m: f64, found: &mut Vec<u32>) {
         found.clear();
-        let (low, high) = (
-            Self::cell([point[0] - radius_m, point[1] - radius_m]),
-            Self::cell([point[0] + radius_m, point[1] + radius_m]),
-        );
+        let low = Self::cell(point.map(|metres| metres - radius_m));
+        let high = Self::cell(point.map(|metres| metres + radius_m));
         for x in low.0..=high.0 {
             for y in low.1..=high.1 {
                 found.extend(self.cells.get(&(x, y)).into_iter().flatten());

@@ -60,15 +60,12 @@ impl<'t> Roads<'t> {
     /// The successors of a lane: those that never end, if there are any.
     pub(crate) fn onward(&self, lane: LaneId) -> Vec<LaneId> {
         let successors = &self.graph.lane(lane).successors;
-        let endless: Vec<LaneId> = successors
-            .iter()
-            .copied()
-            .filter(|next| self.endless[next.0 as usize])
-            .collect();
-        if endless.is_empty() {
+        let mut onward = successors.clone();
+        onward.retain(|next| self.endless[next.0 as usize]);
+        if onward.is_empty() {
             successors.clone()
         } else {
-            endless
+            onward
         }
     }
 }
@@ -88,20 +85,16 @@ fn spawns_of(lane: &Lane) -> impl Iterator<Item = Spawn> + '_ {
 
 /// Removes lanes without successors until none is left.
 fn endless_lanes(graph: &LaneGraph) -> Vec<bool> {
-    let mut onward: Vec<usize> = graph
-        .lanes
-        .iter()
-        .map(|lane| lane.successors.len())
-        .collect();
+    let lanes = graph.lanes.iter();
+    let mut onward: Vec<usize> = lanes.map(|lane| lane.successors.len()).collect();
     let mut before: Vec<Vec<LaneId>> = vec![Vec::new(); graph.lanes.len()];
     for lane in &graph.lanes {
         for next in &lane.successors {
             before[next.0 as usize].push(lane.id);
         }
     }
-    let mut ends: Vec<usize> = (0..onward.len())
-        .filter(|&lane| onward[lane] == 0)
-        .collect();
+    let all = 0..onward.len();
+    let mut ends: Vec<usize> = all.filter(|&lane| onward[lane] == 0).collect();
     while let Some(end) = ends.pop() {
         for previous in &before[end] {
             let left = &mut onward[previous.0 as usize];

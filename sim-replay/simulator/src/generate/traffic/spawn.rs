@@ -87,21 +87,14 @@ impl<'t> Traffic<'t> {
             let distance = (spawn.point_m[0] - center_m[0]).hypot(spawn.point_m[1] - center_m[1]);
             (low_m..high_m).contains(&distance)
         };
-        self.roads
-            .spawns
-            .iter()
-            .filter(is_inside)
-            .copied()
-            .collect()
+        let spawns = self.roads.spawns.iter();
+        spawns.filter(is_inside).copied().collect()
     }
 
     fn has_room(&self, vehicle: &Vehicle, spawn: Spawn, index: usize, near: &mut Vec<u32>) -> bool {
-        let placement = Path::new(spawn.lane, spawn.s_m).placement(
-            self.roads.graph,
-            0.0,
-            0.6 * vehicle.size_m[0],
-            0.0,
-        );
+        let path = Path::new(spawn.lane, spawn.s_m);
+        let wheelbase_m = 0.6 * vehicle.size_m[0];
+        let placement = path.placement(self.roads.graph, 0.0, wheelbase_m, 0.0);
         let mut footprint = Rectangle::new(&placement, &vehicle.size_m).grown(0.4);
         footprint.half_m[0] += SPAWN_ROOM_M;
         self.is_free(index, &footprint, near)
@@ -114,8 +107,8 @@ impl<'t> Traffic<'t> {
         let lane_change = LaneChangeState::random(&mut self.random);
         let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
         let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
-        self.index
-            .insert(self.cars.len() as u32, placement.position_m.xy().into());
+        let index = self.cars.len() as u32;
+        self.index.insert(index, placement.position_m.xy().into());
         self.cars.push(Car {
             id: self.next_id,
             vehicle,
@@ -184,8 +177,8 @@ impl<'t> Traffic<'t> {
                 let car = &self.cars[index];
                 car.is_present && car.standing_s > NEXT_LEAVES_S
             });
-            return standing
-                .min_by(|&a, &b| distance_m(&self.cars[a]).total_cmp(&distance_m(&self.cars[b])));
+            let distance_m = |index: usize| distance_m(&self.cars[index]);
+            return standing.min_by(|&a, &b| distance_m(a).total_cmp(&distance_m(b)));
         }
         let is_first = |car: &Car| car.leader.is_none_or(|leader| leader.gap_m > QUEUE_GAP_M);
         let stuck = (1..self.cars.len()).filter(|&index| {

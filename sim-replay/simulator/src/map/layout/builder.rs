@@ -30,6 +30,31 @@ pub(super) struct LaneEnd {
 }
 
 /// A road network under construction.
+impl RoadEnd {
+    pub(super) fn start(road: usize) -> Self {
+        Self {
+            road,
+            contact: Contact::Start,
+        }
+    }
+
+    pub(super) fn end(road: usize) -> Self {
+        Self {
+            road,
+            contact: Contact::End,
+        }
+    }
+
+    pub(super) fn lane(self, lane: i32) -> LaneEnd {
+        LaneEnd { end: self, lane }
+    }
+
+    fn link(self) -> Option<RoadLink> {
+        let Self { road, contact } = self;
+        Some(RoadLink::Road { road, contact })
+    }
+}
+
 #[derive(Default)]
 pub(super) struct Builder {
     pub network: RoadNetwork,
@@ -63,10 +88,7 @@ impl CrossProfile {
 pub(super) fn path(poses: &[Pose2]) -> Vec<Curve> {
     let mut curves: Vec<Curve> = Vec::new();
     for pair in poses.windows(2) {
-        let s_m = curves
-            .last()
-            .map_or(0.0, |curve| curve.s_m + curve.length_m);
-        curves.push(clothoid::between(pair[0], pair[1], s_m));
+        curves.push(clothoid::between(pair[0], pair[1], path_length_m(&curves)));
     }
     curves
 }
@@ -113,18 +135,12 @@ impl Builder {
     /// Lets one road follow another, lane by lane on the right.
     pub(super) fn follow(&mut self, before: usize, after: usize) {
         let road = &mut self.network.roads[before];
-        road.successor = Some(RoadLink::Road {
-            road: after,
-            contact: Contact::Start,
-        });
+        road.successor = RoadEnd::start(after).link();
         for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
             lane.successor = Some(-(place as i32 + 1));
         }
         let road = &mut self.network.roads[after];
-        road.predecessor = Some(RoadLink::Road {
-            road: before,
-            contact: Contact::End,
-        });
+        road.predecessor = RoadEnd::end(before).link();
         for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
             lane.predecessor = Some(-(place as i32 + 1));
         }
@@ -143,28 +159,20 @@ impl Builder {
         let mut only = RoadLane::new(LaneKind::Driving, width);
         (only.predecessor, only.successor) = (Some(from.lane), Some(to.lane));
         let section = LaneSection {
-            s_m: 0.0,
-            left: Vec::new(),
             right: vec![only],
+            ..LaneSection::default()
         };
         let connecting = self.push(vec![curve], elevation, section, limit_mps);
-        let link = |end: RoadEnd| {
-            Some(RoadLink::Road {
-                road: end.road,
-                contact: end.contact,
-            })
-        };
         let road = &mut self.network.roads[connecting];
-        (road.junction, road.predecessor, road.successor) =
-            (Some(junction), link(from.end), link(to.end));
-        self.network.junctions[junction]
-            .connections
-            .push(Connection {
-                incoming: from.end.road,
-                connecting,
-                contact: Contact::Start,
-                lane_links: vec![(from.lane, -1)],
-            });
+        road.junction = Some(junction);
+        (road.predecessor, road.successor) = (from.end.link(), to.end.link());
+        let connections = &mut self.network.junctions[junction].connections;
+        connections.push(Connection {
+            incoming: from.end.road,
+            connecting,
+            contact: Contact::Start,
+            lane_links: vec![(from.lane, -1)],
+        });
         for end in [from.end, to.end] {
             let road = &mut self.network.roads[end.road];
             let link = match end.contact {
@@ -196,21 +204,10 @@ impl Builder {
 
     fn driving_lanes(&self, end: RoadEnd, along: bool) -> Vec<LaneEnd> {
         let section = &self.network.roads[end.road].sections[0];
-        let (side, sign) = if along {
-            (&section.right, -1)
-        } else {
-            (&section.left, 1)
-        };
-        let driving = side
-            .iter()
-            .enumerate()
-            .filter(|(_, lane)| lane.kind == LaneKind::Driving);
-        driving
-            .map(|(place, _)| LaneEnd {
-                end,
-                lane: sign * (place as i32 + 1),
-            })
-            .collect()
+        let sign = if along { -1 } else { 1 };
+        let lanes = (1..).zip(section.side(!along));
+        let driving = lanes.filter(|(_, lane)| lane.kind == LaneKind::Driving);
+        driving.map(|(place, _)| end.lane(sign * place)).collect()
     }
 
     /// The left edge of a lane where it leaves its road (`exit`) or enters it.
@@ -221,10 +218,9 @@ impl Builder {
             (end.contact == Contact::End) == exit,
             "lane {lane} does not lead this way"
         );
-        let s = if end.contact == Contact::End {
-            road.length_m
-        } else {
-            0.0
+        let s = match end.contact {
+            Contact::Start => 0.0,
+            Contact::End => road.length_m,
         };
         let [low, high] = road.lane_span_m(0, lane, s);
         let pose = road.pose_at(s);

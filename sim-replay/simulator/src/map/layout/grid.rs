@@ -29,7 +29,8 @@ pub(super) fn spread(
 ) -> Vec<f64> {
     let step = (high - low) / (count - 1) as f64;
     let value = |place: usize| {
-        let shift = if place == 0 || place + 1 == count {
+        let is_end = place == 0 || place + 1 == count;
+        let shift = if is_end {
             0.0
         } else {
             rng.random_range(-share..share)

@@ -4,8 +4,8 @@ use std::f64::consts::PI;
 
 use super::super::curve::Pose2;
 use super::super::profile::Profile;
-use super::super::road::{Contact, LaneKind, RoadStructure};
-use super::builder::{Builder, CrossProfile, LaneEnd, RoadEnd, path};
+use super::super::road::{LaneKind, RoadStructure};
+use super::builder::{Builder, CrossProfile, RoadEnd, path};
 use super::ring::Ring;
 
 /// Distance between the poses that a carriageway's clothoids connect, metres.
@@ -45,10 +45,8 @@ impl Motorway {
     ) -> usize {
         let steps = ((to_m - from_m).abs() / KNOT_M).ceil().max(1.0) as usize;
         let at = |step: usize| from_m + (to_m - from_m) * step as f64 / steps as f64;
-        let poses: Vec<Pose2> = (0..=steps)
-            .map(|step| self.left_edge(at(step), direction))
-            .collect();
-        let curves = path(&poses);
+        let poses = (0..=steps).map(|step| self.left_edge(at(step), direction));
+        let curves = path(&poses.collect::<Vec<_>>());
         let records = (0..steps).map(|step| {
             let (a, b) = (at(step), at(step + 1));
             let length = curves[step].length_m;
@@ -76,8 +74,8 @@ impl Motorway {
         stops_m: &[f64],
         direction: Direction,
     ) -> [usize; 2] {
-        let roads: Vec<usize> = stops_m
-            .windows(2)
+        let pairs = stops_m.windows(2);
+        let roads: Vec<usize> = pairs
             .map(|pair| self.carriageway(builder, pair[0], pair[1], direction))
             .collect();
         for pair in roads.windows(2) {
@@ -90,20 +88,8 @@ impl Motorway {
     pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
         self.go_on(builder, junction, before, after);
-        let outer = LaneEnd {
-            end: RoadEnd {
-                road: before,
-                contact: Contact::End,
-            },
-            lane: -(self.lanes as i32),
-        };
-        let ramp = LaneEnd {
-            end: RoadEnd {
-                road: ramp,
-                contact: Contact::Start,
-            },
-            lane: -1,
-        };
+        let outer = RoadEnd::end(before).lane(-(self.lanes as i32));
+        let ramp = RoadEnd::start(ramp).lane(-1);
         builder.connect(junction, outer, ramp, LIMIT_MPS);
     }
 
@@ -111,20 +97,8 @@ impl Motorway {
     pub(super) fn merge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
         let junction = builder.junction();
         self.go_on(builder, junction, before, after);
-        let ramp = LaneEnd {
-            end: RoadEnd {
-                road: ramp,
-                contact: Contact::End,
-            },
-            lane: -1,
-        };
-        let outer = LaneEnd {
-            end: RoadEnd {
-                road: after,
-                contact: Contact::Start,
-            },
-            lane: -(self.lanes as i32),
-        };
+        let ramp = RoadEnd::end(ramp).lane(-1);
+        let outer = RoadEnd::start(after).lane(-(self.lanes as i32));
         builder.connect(junction, ramp, outer, LIMIT_MPS);
     }
 
@@ -137,14 +111,8 @@ impl Motorway {
         port: Pose2,
     ) -> usize {
         let start = self.ramp_pose(s_m, direction, -RAMP_ANGLE_RAD);
-        self.ramp(
-            builder,
-            [start, port.reversed()],
-            [
-                [self.ring.height_m(s_m), direction * self.ring.slope(s_m)],
-                [0.0; 2],
-            ],
-        )
+        let height = [self.ring.height_m(s_m), direction * self.ring.slope(s_m)];
+        self.ramp(builder, [start, port.reversed()], [height, [0.0; 2]])
     }
 
     /// A ramp from `port` up to `s_m`, where it joins.
@@ -156,14 +124,8 @@ impl Motorway {
         port: Pose2,
     ) -> usize {
         let end = self.ramp_pose(s_m, direction, RAMP_ANGLE_RAD);
-        self.ramp(
-            builder,
-            [port, end],
-            [
-                [0.0; 2],
-                [self.ring.height_m(s_m), direction * self.ring.slope(s_m)],
-            ],
-        )
+        let height = [self.ring.height_m(s_m), direction * self.ring.slope(s_m)];
+        self.ramp(builder, [port, end], [[0.0; 2], height])
     }
 
     /// Puts a tunnel over a whole carriageway.
@@ -178,13 +140,9 @@ impl Motorway {
 
     fn ramp(&self, builder: &mut Builder, poses: [Pose2; 2], heights: [[f64; 2]; 2]) -> usize {
         let curves = path(&poses);
+        let [from, to] = heights;
         let elevation = Profile {
-            records: vec![Profile::hermite(
-                0.0,
-                curves[0].length_m,
-                heights[0],
-                heights[1],
-            )],
+            records: vec![Profile::hermite(0.0, curves[0].length_m, from, to)],
         };
         let profile = CrossProfile {
             left: vec![(LaneKind::Shoulder, 0.4)],
@@ -211,21 +169,8 @@ impl Motorway {
 
     fn go_on(&self, builder: &mut Builder, junction: usize, before: usize, after: usize) {
         for lane in 1..=self.lanes as i32 {
-            let from = LaneEnd {
-                end: RoadEnd {
-                    road: before,
-                    contact: Contact::End,
-                },
-                lane: -lane,
-            };
-            let to = LaneEnd {
-                end: RoadEnd {
-                    road: after,
-                    contact: Contact::Start,
-                },
-                lane: -lane,
-            };
-            builder.connect(junction, from, to, LIMIT_MPS);
+            let (from, to) = (RoadEnd::end(before), RoadEnd::start(after));
+            builder.connect(junction, from.lane(-lane), to.lane(-lane), LIMIT_MPS);
         }
     }
 }

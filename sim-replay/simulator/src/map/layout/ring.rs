@@ -35,10 +35,7 @@ struct Bump {
 impl Ring {
     /// A line of some 2.8 km: its right-hand lobe reaches to about x = 500 m.
     pub(super) fn random(rng: &mut ChaCha8Rng) -> Self {
-        let half_m = [
-            rng.random_range(480.0..540.0),
-            rng.random_range(235.0..270.0),
-        ];
+        let half_m = [480.0..540.0, 235.0..270.0].map(|range| rng.random_range(range));
         let lean = [rng.random_range(-0.07..0.07), rng.random_range(-0.09..0.09)];
         let waves = [(); 4].map(|()| [rng.random_range(0.0..9.0), rng.random_range(0.0..2.0 * PI)]);
         let mut ring = Self {
@@ -64,9 +61,8 @@ impl Ring {
             reach_m: rng.random_range(240.0..300.0),
         });
         let height_m = rng.random_range(RISE_M[0]..RISE_M[1]);
-        let middle_m = ring.apex_m();
         ring.bumps.push(Bump {
-            middle_m,
+            middle_m: ring.apex_m(),
             height_m,
             plateau_m: 25.0,
             reach_m: rng.random_range(290.0..340.0),
@@ -91,10 +87,8 @@ impl Ring {
     /// Place and heading at a length, which may lie beyond one round.
     pub(super) fn pose(&self, s_m: f64) -> Pose2 {
         let s = s_m.rem_euclid(self.length_m());
-        let after = self
-            .lengths_m
-            .partition_point(|&length| length <= s)
-            .clamp(1, SAMPLES);
+        let after = self.lengths_m.partition_point(|&length| length <= s);
+        let after = after.clamp(1, SAMPLES);
         let (low, high) = (self.lengths_m[after - 1], self.lengths_m[after]);
         let t = 2.0 * PI * ((after - 1) as f64 + (s - low) / (high - low)) / SAMPLES as f64;
         let [x, y] = self.point(t);
@@ -148,10 +142,7 @@ impl Ring {
 
     /// A leaning figure of eight with some waves. At a quarter of the parameter it heads down the right-hand end.
     fn point(&self, t: f64) -> [f64; 2] {
-        let (a, b) = (
-            self.half_m[0] * (1.0 + self.lean[0] * t.sin()),
-            self.half_m[1] * (1.0 + self.lean[1] * t.sin()),
-        );
+        let [a, b] = [0, 1].map(|axis| self.half_m[axis] * (1.0 + self.lean[axis] * t.sin()));
         let wave =
             |[height, phase]: [f64; 2], frequency: f64| height * (frequency * t + phase).sin();
         let [x2, y2, x3, y3] = self.waves;

@@ -4,8 +4,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use super::super::curve::Pose2;
 use super::super::profile::Profile;
-use super::super::road::{Contact, LaneKind};
-use super::builder::{Builder, CrossProfile, LaneEnd, RoadEnd, arc};
+use super::super::road::LaneKind;
+use super::builder::{Builder, CrossProfile, RoadEnd, arc};
 
 /// Width of the ring's lane, metres.
 const LANE_M: f64 = 5.0;
@@ -27,20 +27,14 @@ pub(super) struct Roundabout {
 impl Roundabout {
     /// End of the arm at an angle, facing away from the roundabout.
     pub(super) fn port(&self, angle_rad: f64) -> Pose2 {
-        Pose2::new(self.center_m[0], self.center_m[1], angle_rad).moved(
-            self.radius_m + PORT_M,
-            0.0,
-            0.0,
-        )
+        let [x, y] = self.center_m;
+        Pose2::new(x, y, angle_rad).moved(self.radius_m + PORT_M, 0.0, 0.0)
     }
 
     /// x, y and radius of the free middle, metres.
     pub(super) fn island(&self) -> [f64; 3] {
-        [
-            self.center_m[0],
-            self.center_m[1],
-            self.radius_m - LANE_M / 2.0 - 2.5,
-        ]
+        let [x, y] = self.center_m;
+        [x, y, self.radius_m - LANE_M / 2.0 - 2.5]
     }
 
     /// Builds the ring and joins the arms to it, by rising angle; the roads of the arms end at their ports.
@@ -51,20 +45,8 @@ impl Roundabout {
         for (place, &(_, arm)) in arms.iter().enumerate() {
             let junction = builder.junction();
             let before = ring[(place + ring.len() - 1) % ring.len()];
-            let end = LaneEnd {
-                end: RoadEnd {
-                    road: before,
-                    contact: Contact::End,
-                },
-                lane: -1,
-            };
-            let start = LaneEnd {
-                end: RoadEnd {
-                    road: ring[place],
-                    contact: Contact::Start,
-                },
-                lane: -1,
-            };
+            let end = RoadEnd::end(before).lane(-1);
+            let start = RoadEnd::start(ring[place]).lane(-1);
             builder.connect(junction, end, start, LIMIT_MPS);
             for incoming in builder.incoming(arm) {
                 builder.connect(junction, incoming, start, LIMIT_MPS);
@@ -89,11 +71,7 @@ impl Roundabout {
             left: vec![(LaneKind::Shoulder, 1.0)],
             right: vec![(LaneKind::Driving, LANE_M), (LaneKind::Shoulder, 0.6)],
         };
-        builder.road(
-            arc(start, 1.0 / inner, inner * turn),
-            Profile::default(),
-            &profile,
-            LIMIT_MPS,
-        )
+        let curve = arc(start, 1.0 / inner, inner * turn);
+        builder.road(curve, Profile::default(), &profile, LIMIT_MPS)
     }
 }

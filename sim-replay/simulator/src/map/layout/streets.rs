@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::super::lane::wrap_angle;
 use super::super::profile::Profile;
-use super::super::road::{Contact, LaneKind};
+use super::super::road::LaneKind;
 use super::builder::{Builder, CrossProfile, RoadEnd, path};
 
 /// Half of the largest angle by which a street leaves its edge's direction, radians.
@@ -49,11 +49,8 @@ struct Chain {
 
 impl StreetGraph {
     pub(super) fn degree(&self, node: usize) -> usize {
-        self.edges
-            .iter()
-            .flatten()
-            .filter(|&&end| end == node)
-            .count()
+        let ends = self.edges.iter().flatten();
+        ends.filter(|&&end| end == node).count()
     }
 
     fn angle(&self, from: usize, to: usize) -> f64 {
@@ -100,20 +97,10 @@ pub(super) fn lay_out(
     // Road ends by node, in the order of the chains.
     let mut ends: Vec<Vec<RoadEnd>> = vec![Vec::new(); graph.nodes.len()];
     for chain in &chains {
-        let road = builder.road(
-            path(&poses(graph, chain, &radii)),
-            Profile::default(),
-            &chain.profile,
-            limit_mps,
-        );
-        ends[chain.nodes[0]].push(RoadEnd {
-            road,
-            contact: Contact::Start,
-        });
-        ends[chain.nodes[chain.nodes.len() - 1]].push(RoadEnd {
-            road,
-            contact: Contact::End,
-        });
+        let curves = path(&poses(graph, chain, &radii));
+        let road = builder.road(curves, Profile::default(), &chain.profile, limit_mps);
+        ends[chain.nodes[0]].push(RoadEnd::start(road));
+        ends[chain.nodes[chain.nodes.len() - 1]].push(RoadEnd::end(road));
     }
     let mut ports = Vec::new();
     for (node, ends) in ends.iter().enumerate() {
@@ -134,12 +121,11 @@ fn join(builder: &mut Builder, junction: usize, ends: &[RoadEnd], limit_mps: f64
             if from == to {
                 continue;
             }
-            let turn = wrap_angle(
-                builder.outward_pose(to).heading_rad + std::f64::consts::PI
-                    - builder.outward_pose(from).heading_rad,
-            );
+            let [from_rad, to_rad] = [from, to].map(|end| builder.outward_pose(end).heading_rad);
+            let turn = wrap_angle(to_rad + std::f64::consts::PI - from_rad);
             // Turning traffic slows down.
-            let limit = if turn.abs() > 0.5 {
+            let is_turn = turn.abs() > 0.5;
+            let limit = if is_turn {
                 limit_mps.min(7.0)
             } else {
                 limit_mps
@@ -186,7 +172,8 @@ fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
 
 /// Lanes of one street: a lane each way, with or without parking, verge and broad pavements.
 fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
-    let verge_m = if rng.random_bool(0.3) {
+    let has_verge = rng.random_bool(0.3);
+    let verge_m = if has_verge {
         rng.random_range(1.2..2.4)
     } else {
         0.0
@@ -194,11 +181,10 @@ fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
     let sidewalk_m = rng.random_range(1.6..3.4);
     let mut side = || {
         let mut lanes = vec![(LaneKind::Driving, 3.5)];
-        if rng.random_bool(0.6) {
-            lanes.push((LaneKind::Parking, 2.3));
-        } else {
-            lanes.push((LaneKind::Shoulder, 0.5));
-        }
+        lanes.push(match rng.random_bool(0.6) {
+            true => (LaneKind::Parking, 2.3),
+            false => (LaneKind::Shoulder, 0.5),
+        });
         if verge_m > 0.0 {
             lanes.push((LaneKind::Other, verge_m));
         }
@@ -243,16 +229,11 @@ fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
     let last = chain.nodes.len() - 1;
     let mut poses = vec![end_pose(graph, chain, radii, 0)];
     for place in 1..last {
-        let [before, corner, after] = [
-            chain.nodes[place - 1],
-            chain.nodes[place],
-            chain.nodes[place + 1],
-        ];
-        let reach = 0.4
-            * graph
-                .distance_m(before, corner)
-                .min(graph.distance_m(corner, after));
-        let reach = reach.min(22.0);
+        let [before, corner, after] = [place - 1, place, place + 1].map(|place| chain.nodes[place]);
+        let shorter_m = graph
+            .distance_m(before, corner)
+            .min(graph.distance_m(corner, after));
+        let reach = (0.4 * shorter_m).min(22.0);
         let middle = |heading| Pose2::new(graph.nodes[corner].x, graph.nodes[corner].y, heading);
         poses.push(middle(graph.angle(before, corner)).moved(-reach, 0.0, 0.0));
         poses.push(middle(graph.angle(corner, after)).moved(reach, 0.0, 0.0));
@@ -272,15 +253,13 @@ fn end_pose(graph: &StreetGraph, chain: &Chain, radii: &[f64], which: usize) -> 
     if let Some(port) = graph.nodes[node].port {
         return port;
     }
-    let wiggle = if graph.distance_m(node, next) > WIGGLE_MIN_M {
+    let is_long = graph.distance_m(node, next) > WIGGLE_MIN_M;
+    let wiggle = if is_long {
         chain.wiggle_rad[which]
     } else {
         0.0
     };
-    let middle = Pose2::new(
-        graph.nodes[node].x,
-        graph.nodes[node].y,
-        graph.angle(node, next) + wiggle,
-    );
+    let heading_rad = graph.angle(node, next) + wiggle;
+    let middle = Pose2::new(graph.nodes[node].x, graph.nodes[node].y, heading_rad);
     middle.moved(radii[node], 0.0, 0.0)
 }

@@ -13,10 +13,8 @@ const LIMIT_MPS: f64 = 11.176;
 /// Lays out the map of a seed.
 pub(crate) fn lay_out(seed: u64) -> Layout {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let (width, height) = (
-        rng.random_range(385.0..415.0),
-        rng.random_range(325.0..355.0),
-    );
+    let width = rng.random_range(385.0..415.0);
+    let height = rng.random_range(325.0..355.0);
     let (columns, rows) = [(5, 4), (4, 5), (5, 5)][rng.random_range(0..3)];
     // Streets that are not at right angles: the rows' ends lie at different heights.
     let (shear, taper) = (rng.random_range(-0.1..0.1), rng.random_range(-0.08..0.08));

@@ -7,7 +7,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::super::profile::Profile;
-use super::super::road::{Contact, LaneKind};
+use super::super::road::LaneKind;
 use super::builder::{Builder, CrossProfile, RoadEnd, path};
 use super::grid::{GridPlan, grid, spread};
 use super::motorway::{Motorway, RAMP_ZONE_M};
@@ -42,26 +42,18 @@ pub(crate) fn lay_out(seed: u64) -> Layout {
     let map_model = map_model(&mut builder, &motorway, &inside, &mut rng);
     let works = works(&mut builder, &outside, &mut rng);
     let [off_inside, on_inside, off_outside, on_outside] = ramps;
-    let start = |road| RoadEnd {
-        road,
-        contact: Contact::Start,
-    };
-    let end = |road| RoadEnd {
-        road,
-        contact: Contact::End,
-    };
     let arms = [
-        (0.0, start(link)),
-        (FRAC_PI_2, end(off_inside)),
+        (0.0, RoadEnd::start(link)),
+        (FRAC_PI_2, RoadEnd::end(off_inside)),
         (PI, map_model),
-        (-FRAC_PI_2, start(on_inside)),
+        (-FRAC_PI_2, RoadEnd::start(on_inside)),
     ];
     inside.join(&mut builder, &arms);
     let arms = [
         (0.0, works),
-        (FRAC_PI_2, start(on_outside)),
-        (PI, end(link)),
-        (-FRAC_PI_2, end(off_outside)),
+        (FRAC_PI_2, RoadEnd::start(on_outside)),
+        (PI, RoadEnd::end(link)),
+        (-FRAC_PI_2, RoadEnd::end(off_outside)),
     ];
     outside.join(&mut builder, &arms);
     Layout {
@@ -90,13 +82,9 @@ fn link_road(builder: &mut Builder, inside: &Roundabout, outside: &Roundabout) -
         (LaneKind::Shoulder, 0.8),
         (LaneKind::Sidewalk, 2.2),
     ];
-    let poses = [inside.port(0.0), outside.port(PI).reversed()];
-    builder.road(
-        path(&poses),
-        Profile::default(),
-        &CrossProfile::both(lanes),
-        LINK_LIMIT_MPS,
-    )
+    let curves = path(&[inside.port(0.0), outside.port(PI).reversed()]);
+    let profile = CrossProfile::both(lanes);
+    builder.road(curves, Profile::default(), &profile, LINK_LIMIT_MPS)
 }
 
 /// Carriageways and ramps. Returns the ramps: off and on at the inner roundabout, off and on at the outer one.
@@ -131,10 +119,8 @@ fn interchange(
             motorway.carriageways(builder, &[second, (second + back) / 2.0, back], direction);
         builder.follow(covered, rest);
         // Inside, the ring leads down: traffic comes from above. Outside it comes from below.
-        let (from, to) = (
-            roundabout.port(direction * FRAC_PI_2),
-            roundabout.port(-direction * FRAC_PI_2),
-        );
+        let from = roundabout.port(direction * FRAC_PI_2);
+        let to = roundabout.port(-direction * FRAC_PI_2);
         let off = motorway.off_ramp(builder, before, direction, from);
         let on = motorway.on_ramp(builder, after, direction, to);
         motorway.diverge(builder, arriving, inner, off);
@@ -152,21 +138,14 @@ fn map_model(
     rng: &mut ChaCha8Rng,
 ) -> RoadEnd {
     let port = inside.port(PI);
-    let (east, west) = (
-        port.x - rng.random_range(30.0..45.0),
-        motorway.ring.pose(0.0).x + rng.random_range(150.0..175.0),
-    );
+    let east = port.x - rng.random_range(30.0..45.0);
+    let west = motorway.ring.pose(0.0).x + rng.random_range(150.0..175.0);
     let y_range = |x: f64| {
         let [low, high] = motorway.ring.lobe_m(x);
         [low + CLEARANCE_M, high - CLEARANCE_M]
     };
-    let columns_m = spread(
-        west,
-        east,
-        (((east - west) / STREETS_M) as usize + 1).clamp(2, 4),
-        0.12,
-        rng,
-    );
+    let columns = (((east - west) / STREETS_M) as usize + 1).clamp(2, 4);
+    let columns_m = spread(west, east, columns, 0.12, rng);
     // As many rows as the shortest column has room for.
     let heights = columns_m.iter().map(|&x| y_range(x)[1] - y_range(x)[0]);
     let rows = (heights.fold(f64::INFINITY, f64::min) / STREETS_M) as usize + 1;
@@ -184,10 +163,8 @@ fn map_model(
 fn works(builder: &mut Builder, outside: &Roundabout, rng: &mut ChaCha8Rng) -> RoadEnd {
     let port = outside.port(0.0);
     let west = port.x + rng.random_range(35.0..50.0);
-    let (width, height) = (
-        rng.random_range(120.0..180.0),
-        rng.random_range(150.0..210.0),
-    );
+    let width = rng.random_range(120.0..180.0);
+    let height = rng.random_range(150.0..210.0);
     let plan = GridPlan {
         columns_m: vec![west, west + width],
         rows: 3,
@@ -195,12 +172,7 @@ fn works(builder: &mut Builder, outside: &Roundabout, rng: &mut ChaCha8Rng) -> R
         jitter_m: 5.0,
     };
     let (y, shear) = (port.y, rng.random_range(-0.15..0.15));
-    let y_range = |x: f64| {
-        [
-            y - height / 2.0 + shear * (x - west),
-            y + height / 2.0 + shear * (x - west),
-        ]
-    };
+    let y_range = |x: f64| [y - height / 2.0, y + height / 2.0].map(|y| y + shear * (x - west));
     let graph = grid(&plan, y_range, Some(port), rng);
     streets::lay_out(builder, &graph, TOWN_LIMIT_MPS, rng)[0].1
 }

@@ -2,15 +2,14 @@
 
 use super::super::finding::FindingLog;
 use super::super::road::{RoadObject, RoadSignal, RoadStructure};
-use super::OpenDriveError;
-use super::element::{Element, MAX_LENGTH_M, children};
+use super::element::{Element, MAX_LENGTH_M, Result, children};
 
 /// Every element named `name` in the list `list` of a road; elements that cannot be read are left out.
 fn read_all<T>(
     road: Element,
     list: &'static str,
     name: &'static str,
-    read: impl Fn(Element) -> Result<T, OpenDriveError>,
+    read: impl Fn(Element) -> Result<T>,
     log: &mut FindingLog,
 ) -> Vec<T> {
     let Some(list) = road.child(list) else {
@@ -45,10 +44,9 @@ pub(super) fn read_objects(road: Element, log: &mut FindingLog) -> Vec<RoadObjec
 pub(super) fn read_signals(road: Element, log: &mut FindingLog) -> Vec<RoadSignal> {
     let read_signal = |element: Element| {
         // The signal faces against the direction it is for; `+` is for traffic along the road.
-        let flip = if element.optional_text("orientation") == Some("-") {
-            std::f64::consts::PI
-        } else {
-            0.0
+        let flip = match element.optional_text("orientation") {
+            Some("-") => std::f64::consts::PI,
+            _ => 0.0,
         };
         Ok(RoadSignal {
             name: element.optional_text("name").unwrap_or_default().to_owned(),

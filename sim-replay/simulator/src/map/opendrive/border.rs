@@ -8,8 +8,7 @@ use super::super::curve::{cubic, cubic_slope};
 use super::super::finding::FindingLog;
 use super::super::profile::Profile;
 use super::super::road::{MAX_OFFSET_M, RoadLane};
-use super::OpenDriveError;
-use super::element::Element;
+use super::element::{Element, Result};
 use super::lanes::Stretch;
 use super::profile::read_profile;
 
@@ -25,11 +24,9 @@ pub(super) fn widths_from_borders(
     sign: i32,
     stretch: &Stretch,
     log: &mut FindingLog,
-) -> Result<(), OpenDriveError> {
-    if elements
-        .iter()
-        .all(|element| element.child("border").is_none())
-    {
+) -> Result<()> {
+    let has_border = |element: &Element| element.child("border").is_some();
+    if !elements.iter().any(has_border) {
         return Ok(());
     }
     let side = f64::from(sign);
@@ -45,7 +42,7 @@ pub(super) fn widths_from_borders(
             }
             continue;
         }
-        if element.child("border").is_some() {
+        if has_border(element) {
             element.note(log, "has both <width> and <border>", "the width is used");
         }
         inner = sum(&inner, &lane.width);
@@ -60,7 +57,7 @@ fn read_border(
     side: f64,
     stretch: &Stretch,
     log: &mut FindingLog,
-) -> Result<Profile, OpenDriveError> {
+) -> Result<Profile> {
     let border = read_profile(element, "border", "sOffset", MAX_OFFSET_M)?;
     let looks =
         (0..=LOOKS).map(|look| border.at(stretch.length_m * f64::from(look) / f64::from(LOOKS)));
@@ -84,21 +81,13 @@ fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut Fin
 
 /// A profile over places counted from `start_m` on.
 fn shifted(profile: &Profile, start_m: f64) -> Profile {
-    let last_before = profile
+    let after = profile
         .records
-        .partition_point(|&(start, _)| start <= start_m)
-        .saturating_sub(1);
-    let records = profile
-        .records
-        .get(last_before..)
-        .unwrap_or_default()
-        .iter();
-    let records = records.map(|&(start, coefficients)| {
-        if start < start_m {
-            (0.0, moved(coefficients, start_m - start))
-        } else {
-            (start - start_m, coefficients)
-        }
+        .partition_point(|&(start, _)| start <= start_m);
+    let records = profile.records.iter().skip(after.saturating_sub(1));
+    let records = records.map(|&(start, coefficients)| match start < start_m {
+        true => (0.0, moved(coefficients, start_m - start)),
+        false => (start - start_m, coefficients),
     });
     Profile {
         records: records.collect(),
@@ -106,10 +95,8 @@ fn shifted(profile: &Profile, start_m: f64) -> Profile {
 }
 
 fn times(profile: &Profile, factor: f64) -> Profile {
-    let records = profile
-        .records
-        .iter()
-        .map(|&(start, coefficients)| (start, coefficients.map(|c| factor * c)));
+    let records = profile.records.iter();
+    let records = records.map(|&(start, cubic)| (start, cubic.map(|c| factor * c)));
     Profile {
         records: records.collect(),
     }
@@ -117,26 +104,18 @@ fn times(profile: &Profile, factor: f64) -> Profile {
 
 /// Sum of two profiles: a record wherever either has one.
 fn sum(a: &Profile, b: &Profile) -> Profile {
-    let mut starts: Vec<f64> = a
-        .records
-        .iter()
-        .chain(&b.records)
-        .map(|&(start, _)| start)
-        .collect();
+    let records = a.records.iter().chain(&b.records);
+    let mut starts: Vec<f64> = records.map(|&(start, _)| start).collect();
     starts.sort_unstable_by(f64::total_cmp);
     starts.dedup();
     let at = |profile: &Profile, place: f64| {
-        let after = profile
-            .records
-            .partition_point(|&(start, _)| start <= place);
-        let record = profile.records.get(after.saturating_sub(1));
-        record.map_or([0.0; 4], |&(start, coefficients)| {
+        let record = profile.record_at(place);
+        record.map_or([0.0; 4], |(start, coefficients)| {
             moved(coefficients, place - start)
         })
     };
     let records = starts.into_iter().map(|place| {
-        let (a, b) = (at(a, place), at(b, place));
-        let ([a0, a1, a2, a3], [b0, b1, b2, b3]) = (a, b);
+        let ([a0, a1, a2, a3], [b0, b1, b2, b3]) = (at(a, place), at(b, place));
         (place, [a0 + b0, a1 + b1, a2 + b2, a3 + b3])
     });
     Profile {
@@ -146,13 +125,9 @@ fn sum(a: &Profile, b: &Profile) -> Profile {
 
 /// The same cubic of a variable that begins `by` later.
 fn moved(coefficients: [f64; 4], by: f64) -> [f64; 4] {
+    let (value, slope) = (cubic(coefficients, by), cubic_slope(coefficients, by));
     let [_, _, c, d] = coefficients;
-    [
-        cubic(coefficients, by),
-        cubic_slope(coefficients, by),
-        c + 3.0 * d * by,
-        d,
-    ]
+    [value, slope, c + 3.0 * d * by, d]
 }
 
 #[cfg(test)]

@@ -1,5 +1,8 @@
 //! Typed access to XML elements, with errors that give the position, and findings where a value is treated as absent.
 
+use std::fmt::Display;
+use std::str::FromStr;
+
 use roxmltree::Node;
 
 use super::super::finding::FindingLog;
@@ -28,16 +31,6 @@ pub enum OpenDriveError {
         /// The fault.
         problem: String,
     },
-    /// An attribute is missing.
-    #[error("line {line}: <{element}> has no attribute {attribute}")]
-    Missing {
-        /// Line in the file.
-        line: u32,
-        /// Name of the element.
-        element: String,
-        /// Name of the attribute.
-        attribute: &'static str,
-    },
     /// An attribute has an invalid value.
     #[error("line {line}: <{element}> has {attribute}=\"{value}\"; expected {expected}")]
     Value {
@@ -54,6 +47,9 @@ pub enum OpenDriveError {
     },
 }
 
+/// Result of reading a part of a map.
+pub(super) type Result<T> = std::result::Result<T, OpenDriveError>;
+
 impl OpenDriveError {
     /// Records the error as a finding: the affected part was handled by `action`.
     pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
@@ -66,18 +62,6 @@ impl OpenDriveError {
                 element,
                 problem,
             } => log.add(*line, element, problem, action),
-            Self::Missing {
-                line,
-                element,
-                attribute,
-            } => {
-                log.add(
-                    *line,
-                    element,
-                    &format!("has no attribute {attribute}"),
-                    action,
-                );
-            }
             Self::Value {
                 line,
                 element,
@@ -85,12 +69,8 @@ impl OpenDriveError {
                 value,
                 expected,
             } => {
-                log.add(
-                    *line,
-                    element,
-                    &format!("{attribute}=\"{value}\", expected {expected}"),
-                    action,
-                );
+                let found = format!("{attribute}=\"{value}\", expected {expected}");
+                log.add(*line, element, &found, action);
             }
         }
     }
@@ -186,7 +166,7 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     /// The first child with a name, which must be there.
-    pub(super) fn required(&self, name: &'static str) -> Result<Self, OpenDriveError> {
+    pub(super) fn required(&self, name: &'static str) -> Result<Self> {
         self.child(name)
             .ok_or_else(|| self.error_element(&format!("has no <{name}>")))
     }
@@ -195,31 +175,28 @@ impl<'a, 'input> Element<'a, 'input> {
         self.node.attribute(attribute)
     }
 
-    pub(super) fn text(&self, attribute: &'static str) -> Result<&'a str, OpenDriveError> {
+    pub(super) fn text(&self, attribute: &'static str) -> Result<&'a str> {
         self.optional_text(attribute)
-            .ok_or_else(|| OpenDriveError::Missing {
-                line: self.line(),
-                element: self.name().to_owned(),
-                attribute,
-            })
+            .ok_or_else(|| self.error_element(&format!("has no attribute {attribute}")))
     }
 
     /// A finite number within bounds.
-    pub(super) fn number(
+    pub(super) fn number(&self, attribute: &'static str, low: f64, high: f64) -> Result<f64> {
+        self.parsed(attribute, "a number", low, high)
+    }
+
+    fn parsed<T: FromStr + PartialOrd + Display>(
         &self,
         attribute: &'static str,
-        low: f64,
-        high: f64,
-    ) -> Result<f64, OpenDriveError> {
+        what: &str,
+        low: T,
+        high: T,
+    ) -> Result<T> {
         let text = self.text(attribute)?;
-        let value: f64 = text
-            .trim()
-            .parse()
-            .map_err(|_| self.error_value(attribute, text, "a number"))?;
-        if (low..=high).contains(&value) {
-            Ok(value)
-        } else {
-            Err(self.error_range(attribute, text, low, high))
+        match text.trim().parse() {
+            Ok(value) if low <= value && value <= high => Ok(value),
+            Ok(_) => Err(self.error_range(attribute, text, low, high)),
+            Err(_) => Err(self.error_value(attribute, text, what)),
         }
     }
 
@@ -230,7 +207,7 @@ impl<'a, 'input> Element<'a, 'input> {
         default: f64,
         low: f64,
         high: f64,
-    ) -> Result<f64, OpenDriveError> {
+    ) -> Result<f64> {
         if self.node.has_attribute(attribute) {
             self.number(attribute, low, high)
         } else {
@@ -239,22 +216,12 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     /// A lane id.
-    pub(super) fn lane_id(&self, attribute: &'static str) -> Result<i32, OpenDriveError> {
-        let text = self.text(attribute)?;
-        let value: i32 = text
-            .trim()
-            .parse()
-            .map_err(|_| self.error_value(attribute, text, "a lane id"))?;
-        // The absolute value of the lowest `i32` does not fit into an `i32`.
-        if value.unsigned_abs() <= MAX_LANES.unsigned_abs() {
-            Ok(value)
-        } else {
-            Err(self.error_range(attribute, text, -MAX_LANES, MAX_LANES))
-        }
+    pub(super) fn lane_id(&self, attribute: &'static str) -> Result<i32> {
+        self.parsed(attribute, "a lane id", -MAX_LANES, MAX_LANES)
     }
 
     /// Coefficients a, b, c, d with a prefix or suffix, such as `aU`.
-    pub(super) fn cubic(&self, names: [&'static str; 4]) -> Result<[f64; 4], OpenDriveError> {
+    pub(super) fn cubic(&self, names: [&'static str; 4]) -> Result<[f64; 4]> {
         let mut coefficients = [0.0; 4];
         for (coefficient, name) in coefficients.iter_mut().zip(names) {
             *coefficient = self.number(name, -MAX_COORDINATE_M, MAX_COORDINATE_M)?;
@@ -288,30 +255,31 @@ impl<'a, 'input> Element<'a, 'input> {
     pub(super) fn error_value(
         &self,
         attribute: &'static str,
-        value: &str,
+        value: impl ToString,
         expected: &str,
     ) -> OpenDriveError {
         OpenDriveError::Value {
             line: self.line(),
             element: self.name().to_owned(),
             attribute,
-            value: value.chars().take(80).collect(),
+            value: value.to_string().chars().take(80).collect(),
             expected: expected.to_owned(),
         }
+    }
+
+    /// The error of an attribute that falls from one element to the next.
+    pub(super) fn error_order(&self, attribute: &'static str, value: f64) -> OpenDriveError {
+        self.error_value(attribute, value, "the elements in rising order")
     }
 
     pub(super) fn error_range(
         &self,
         attribute: &'static str,
         value: impl ToString,
-        low: impl std::fmt::Display,
-        high: impl std::fmt::Display,
+        low: impl Display,
+        high: impl Display,
     ) -> OpenDriveError {
-        self.error_value(
-            attribute,
-            &value.to_string(),
-            &format!("a value from {low} to {high}"),
-        )
+        self.error_value(attribute, value, &format!("a value from {low} to {high}"))
     }
 }
 

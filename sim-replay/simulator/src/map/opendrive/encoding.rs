@@ -44,12 +44,8 @@ fn unmarked(bytes: &[u8], log: &mut FindingLog) -> &'static Encoding {
         Some(encoding) if encoding == UTF_16LE || encoding == UTF_16BE => UTF_8,
         Some(encoding) => encoding,
         None => {
-            log.add(
-                1,
-                "OpenDRIVE",
-                &format!("encoding=\"{label}\""),
-                "unknown; read as UTF-8",
-            );
+            let found = format!("encoding=\"{label}\"");
+            log.add(1, "OpenDRIVE", &found, "unknown; read as UTF-8");
             UTF_8
         }
     }
@@ -63,19 +59,14 @@ fn declared(head: &[u8]) -> Option<String> {
         .strip_prefix("<?xml")?
         .split("?>")
         .next()?;
-    let value = declaration
-        .split_once("encoding")?
-        .1
-        .trim_start()
-        .strip_prefix('=')?
-        .trim_start();
+    let (_, value) = declaration.split_once("encoding")?;
+    let value = value.trim_start().strip_prefix('=')?.trim_start();
     let quote = value
         .chars()
         .next()
-        .filter(|&quote| quote == '"' || quote == '\'')?;
-    value[1..]
-        .split_once(quote)
-        .map(|(label, _)| label.trim().to_owned())
+        .filter(|quote| matches!(quote, '"' | '\''))?;
+    let (label, _) = value[1..].split_once(quote)?;
+    Some(label.trim().to_owned())
 }
 
 #[cfg(test)]

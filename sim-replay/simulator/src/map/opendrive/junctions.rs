@@ -2,9 +2,9 @@
 
 use super::super::finding::FindingLog;
 use super::super::road::{Connection, Junction};
-use super::element::{Element, children};
+use super::Ids;
+use super::element::{Element, Result, children};
 use super::links::read_contact;
-use super::{Ids, OpenDriveError};
 
 /// Reads a junction; connections that cannot be read are left out.
 pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junction {
@@ -12,16 +12,14 @@ pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junctio
     let direct = kind == "direct";
     match kind {
         "default" | "direct" | "" => {}
-        "virtual" => element.note_value(
-            log,
-            "type",
-            "built only where its roads begin or end at other roads' ends",
-        ),
-        "crossing" => element.note_value(
-            log,
-            "type",
-            "left out: pedestrian crossings are not simulated",
-        ),
+        "virtual" => {
+            let action = "built only where its roads begin or end at other roads' ends";
+            element.note_value(log, "type", action);
+        }
+        "crossing" => {
+            let action = "left out: pedestrian crossings are not simulated";
+            element.note_value(log, "type", action);
+        }
         _ => element.note_value(log, "type", "treated as a common junction"),
     }
     let mut connections = Vec::new();
@@ -46,16 +44,15 @@ fn read_connection(
     ids: &Ids,
     direct: bool,
     log: &mut FindingLog,
-) -> Result<Option<Connection>, OpenDriveError> {
+) -> Result<Option<Connection>> {
     let road = |attribute| {
         let id = element.text(attribute)?;
         let found = ids.roads.get(id).copied();
         found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
     };
-    let onto = if direct {
-        "linkedRoad"
-    } else {
-        "connectingRoad"
+    let onto = match direct {
+        true => "linkedRoad",
+        false => "connectingRoad",
     };
     if element.optional_text(onto).is_none() {
         return Ok(None);

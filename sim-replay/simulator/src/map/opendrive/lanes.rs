@@ -3,9 +3,9 @@
 use super::super::finding::FindingLog;
 use super::super::profile::Profile;
 use super::super::road::{LaneKind, LaneSection, MAX_WIDTH_M, RoadLane};
-use super::OpenDriveError;
+
 use super::border::widths_from_borders;
-use super::element::{Element, MAX_LANES, children};
+use super::element::{Element, MAX_LANES, Result, children};
 use super::profile::read_profile;
 use super::speed::read_speed;
 
@@ -14,16 +14,15 @@ pub(super) fn read_sections(
     lane_offset: &Profile,
     road_length_m: f64,
     log: &mut FindingLog,
-) -> Result<Vec<LaneSection>, OpenDriveError> {
+) -> Result<Vec<LaneSection>> {
     let mut starts: Vec<(f64, Element)> = Vec::new();
     for element in children(lanes, "laneSection") {
         // Writers round: a section may begin a little behind the road's end.
-        let s_m = element
-            .number("s", 0.0, road_length_m + 1.0)?
-            .min(road_length_m);
+        let s_m = element.number("s", 0.0, road_length_m + 1.0)?;
+        let s_m = s_m.min(road_length_m);
         if let Some((before, _)) = starts.last().filter(|(before, _)| s_m < *before) {
             let expected = format!("at least the section before, {before}");
-            return Err(element.error_value("s", &s_m.to_string(), &expected));
+            return Err(element.error_value("s", s_m, &expected));
         }
         starts.push((s_m, element));
     }
@@ -38,14 +37,12 @@ pub(super) fn read_sections(
         if matches!(element.optional_text("singleSide"), Some("true" | "1")) {
             element.note_value(log, "singleSide", "the other side has no lanes here");
         }
-        let mut side = |name, sign| {
-            let stretch = Stretch {
-                s_m,
-                length_m: end_m - s_m,
-                lane_offset,
-            };
-            read_side(element, name, sign, &stretch, log)
+        let stretch = Stretch {
+            s_m,
+            length_m: end_m - s_m,
+            lane_offset,
         };
+        let mut side = |name, sign| read_side(element, name, sign, &stretch, log);
         let section = LaneSection {
             s_m,
             left: side("left", 1)?,
@@ -66,30 +63,17 @@ pub(super) struct Stretch<'a> {
 }
 
 /// Refuses sections whose width polynomials exceed the limits of a road.
-fn check_widths(
-    element: Element,
-    section: &LaneSection,
-    length_m: f64,
-) -> Result<(), OpenDriveError> {
-    let widest = |width: &Profile| {
-        (0..=20)
-            .map(|i| width.at(length_m * f64::from(i) / 20.0))
-            .fold(0.0, f64::max)
-    };
-    match section
-        .left
-        .iter()
-        .chain(&section.right)
-        .map(|lane| widest(&lane.width))
-        .find(|&width| width > MAX_WIDTH_M)
-    {
-        Some(width) => {
-            let problem =
-                format!("holds a lane that is {width:.1} m wide; expected at most {MAX_WIDTH_M}");
-            Err(element.error_element(&problem))
+fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<()> {
+    for lane in section.left.iter().chain(&section.right) {
+        let widths = (0..=20).map(|i| lane.width.at(length_m * f64::from(i) / 20.0));
+        let widest = widths.fold(0.0, f64::max);
+        if widest > MAX_WIDTH_M {
+            return Err(element.error_element(&format!(
+                "holds a lane that is {widest:.1} m wide; expected at most {MAX_WIDTH_M}"
+            )));
         }
-        None => Ok(()),
     }
+    Ok(())
 }
 
 /// Lanes of one side, from the reference line outwards. A lane whose id cannot be read is left out with all lanes
@@ -100,7 +84,7 @@ fn read_side(
     sign: i32,
     stretch: &Stretch,
     log: &mut FindingLog,
-) -> Result<Vec<RoadLane>, OpenDriveError> {
+) -> Result<Vec<RoadLane>> {
     let Some(side) = section.child(name) else {
         return Ok(Vec::new());
     };
@@ -115,34 +99,24 @@ fn read_side(
         }
     }
     elements.sort_by_key(|&(id, _)| id);
-    let count = elements
-        .iter()
-        .zip(1..)
-        .take_while(|((id, _), place)| id == place)
-        .count();
-    let next = elements
-        .iter()
-        .zip(1..)
-        .find(|((id, _), place)| id != place)
-        .map_or(1, |(_, place)| place);
+    let numbered = elements.iter().zip(1..);
+    let count = numbered.take_while(|((id, _), place)| id == place).count();
+    let next: i32 = (1..).nth(count).unwrap_or(1);
     for &(_, element) in elements.iter().skip(count) {
         let expected = format!("{}, without gaps or doubles", sign * next);
         let id = element.optional_text("id").unwrap_or_default();
-        element
-            .error_value("id", id, &expected)
-            .note(log, "lane left out");
+        let error = element.error_value("id", id, &expected);
+        error.note(log, "lane left out");
     }
     elements.truncate(count);
-    let mut lanes = Vec::with_capacity(count);
-    for &(_, element) in &elements {
-        lanes.push(read_lane(element, log)?);
-    }
     let elements: Vec<Element> = elements.into_iter().map(|(_, element)| element).collect();
+    let lanes = elements.iter().map(|element| read_lane(*element, log));
+    let mut lanes = lanes.collect::<Result<Vec<_>>>()?;
     widths_from_borders(&elements, &mut lanes, sign, stretch, log)?;
     Ok(lanes)
 }
 
-fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane, OpenDriveError> {
+fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane> {
     let width = read_profile(element, "width", "sOffset", MAX_WIDTH_M)?;
     let link = element.child("link");
     let mut linked = |name| {
@@ -155,11 +129,8 @@ fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane, OpenDri
     let mut speeds = children(element, "speed");
     let speed_limit_mps = speeds.next().and_then(|speed| read_speed(speed, log));
     for further in speeds {
-        further.note_value(
-            log,
-            "sOffset",
-            "left out: the first limit holds for the whole lane",
-        );
+        let action = "left out: the first limit holds for the whole lane";
+        further.note_value(log, "sOffset", action);
     }
     let reversed = match element.optional_text("direction") {
         Some("reversed") => true,
@@ -204,15 +175,12 @@ fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
 fn note_heights(element: Element, log: &mut FindingLog) {
     let height =
         |element: &Element, name| element.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0).abs();
-    let heights = children(element, "height")
-        .map(|record| height(&record, "inner").max(height(&record, "outer")));
+    let heights = children(element, "height");
+    let heights = heights.map(|record| height(&record, "inner").max(height(&record, "outer")));
     let highest_m = heights.fold(0.0, f64::max);
     if highest_m > 0.0 {
         let kind = element.optional_text("type").unwrap_or_default();
-        element.note(
-            log,
-            &format!("type=\"{kind}\" has <height> up to {highest_m} m"),
-            "height over the road left out",
-        );
+        let found = format!("type=\"{kind}\" has <height> up to {highest_m} m");
+        element.note(log, &found, "height over the road left out");
     }
 }

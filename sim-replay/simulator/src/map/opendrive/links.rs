@@ -2,8 +2,8 @@
 
 use super::super::finding::FindingLog;
 use super::super::road::{Contact, Road, RoadLink};
-use super::element::Element;
-use super::{Ids, OpenDriveError};
+use super::Ids;
+use super::element::{Element, Result};
 
 /// Fills the links of a road; links to elements that are not in this map are treated as absent.
 pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut FindingLog) {
@@ -20,18 +20,15 @@ pub(super) fn read(element: Element, road: &mut Road, ids: &Ids, log: &mut Findi
         Some(id) => {
             let junction = ids.junctions.get(id).copied();
             if junction.is_none() {
-                element.note_value(
-                    log,
-                    "junction",
-                    "no such junction in this map; treated as none",
-                );
+                let action = "no such junction in this map; treated as none";
+                element.note_value(log, "junction", action);
             }
             junction
         }
     };
 }
 
-fn read_link(element: Element, ids: &Ids) -> Result<RoadLink, OpenDriveError> {
+fn read_link(element: Element, ids: &Ids) -> Result<RoadLink> {
     let id = element.text("elementId")?;
     match element.text("elementType")? {
         "junction" => match ids.junctions.get(id) {
@@ -56,7 +53,7 @@ fn read_link(element: Element, ids: &Ids) -> Result<RoadLink, OpenDriveError> {
     }
 }
 
-pub(super) fn read_contact(element: Element) -> Result<Contact, OpenDriveError> {
+pub(super) fn read_contact(element: Element) -> Result<Contact> {
     match element.text("contactPoint")? {
         "start" => Ok(Contact::Start),
         "end" => Ok(Contact::End),

@@ -33,7 +33,7 @@ use std::collections::BTreeMap;
 use roxmltree::{Document, ParsingOptions};
 
 pub use element::OpenDriveError;
-use element::{Element, LineIndex, children};
+use element::{Element, LineIndex, Result, children};
 
 use super::finding::FindingLog;
 use super::road::{Road, RoadNetwork};
@@ -60,7 +60,7 @@ struct Ids {
 /// # Errors
 /// [`OpenDriveError`] if the text is no OpenDRIVE map, exceeds a limit, or holds no road that can be read; the latter
 /// with line, element, attribute and value of the first road's fault.
-pub fn read(text: &str) -> Result<RoadNetwork, OpenDriveError> {
+pub fn read(text: &str) -> Result<RoadNetwork> {
     check_size(text.len())?;
     read_text(text, FindingLog::default())
 }
@@ -69,25 +69,22 @@ pub fn read(text: &str) -> Result<RoadNetwork, OpenDriveError> {
 ///
 /// # Errors
 /// As [`read`].
-pub fn read_bytes(bytes: &[u8]) -> Result<RoadNetwork, OpenDriveError> {
+pub fn read_bytes(bytes: &[u8]) -> Result<RoadNetwork> {
     check_size(bytes.len())?;
     let mut log = FindingLog::default();
     let text = encoding::decode(bytes, &mut log);
     read_text(&text, log)
 }
 
-fn check_size(bytes: usize) -> Result<(), OpenDriveError> {
-    if bytes > MAX_BYTES {
-        Err(OpenDriveError::TooLarge {
-            bytes,
-            limit: MAX_BYTES,
-        })
-    } else {
-        Ok(())
+fn check_size(bytes: usize) -> Result<()> {
+    let limit = MAX_BYTES;
+    match bytes > limit {
+        true => Err(OpenDriveError::TooLarge { bytes, limit }),
+        false => Ok(()),
     }
 }
 
-fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveError> {
+fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork> {
     let options = ParsingOptions {
         nodes_limit: MAX_NODES,
         ..ParsingOptions::default()
@@ -104,8 +101,8 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveEr
     let (junctions, junction_elements) = collect_ids(root, "junction", &mut log);
     let places = roads
         .iter()
-        .enumerate()
-        .map(|(place, road)| (road.id.clone(), place));
+        .zip(0..)
+        .map(|(road, place)| (road.id.clone(), place));
     let ids = Ids {
         roads: places.collect(),
         junctions,
@@ -114,17 +111,13 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveEr
     for (road, element) in roads.iter_mut().zip(elements) {
         log.enter("road", &road.id);
         links::read(element, road, &ids, &mut log);
-        if let Some(total_m) = road
+        let total_m = road
             .junction
-            .and_then(|junction| junctions_m.get_mut(junction))
-        {
+            .and_then(|junction| junctions_m.get_mut(junction));
+        if let Some(total_m) = total_m {
             *total_m += lanes_length_m(road);
-            check_total(
-                element,
-                "the lanes of its junction",
-                *total_m,
-                MAX_JUNCTION_M,
-            )?;
+            let what = "the lanes of its junction";
+            check_total(element, what, *total_m, MAX_JUNCTION_M)?;
         }
     }
     let mut junctions = Vec::new();
@@ -143,7 +136,7 @@ fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveEr
 fn read_roads<'a, 'input>(
     root: Element<'a, 'input>,
     log: &mut FindingLog,
-) -> Result<(Vec<Road>, Vec<Element<'a, 'input>>), OpenDriveError> {
+) -> Result<(Vec<Road>, Vec<Element<'a, 'input>>)> {
     let (_, elements) = collect_ids(root, "road", log);
     if elements.is_empty() {
         return Err(root.error_element("has no <road>"));
@@ -182,12 +175,7 @@ fn lanes_length_m(road: &Road) -> f64 {
     lengths.sum()
 }
 
-fn check_total(
-    element: Element,
-    what: &str,
-    total_m: f64,
-    limit_m: f64,
-) -> Result<(), OpenDriveError> {
+fn check_total(element: Element, what: &str, total_m: f64, limit_m: f64) -> Result<()> {
     if total_m <= limit_m {
         return Ok(());
     }
@@ -206,9 +194,8 @@ fn collect_ids<'a, 'input>(
     for element in children(root, name) {
         match element.text("id") {
             Ok(id) if ids.contains_key(id) => {
-                element
-                    .error_value("id", id, "used by one element only")
-                    .note(log, "left out");
+                let error = element.error_value("id", id, "used by one element only");
+                error.note(log, "left out");
             }
             Ok(id) => {
                 ids.insert(id.to_owned(), elements.len());

@@ -2,8 +2,7 @@
 
 use super::super::curve::{Curve, CurveShape, Pose2};
 use super::super::finding::FindingLog;
-use super::OpenDriveError;
-use super::element::{Element, MAX_COORDINATE_M, MAX_LENGTH_M, children};
+use super::element::{Element, MAX_COORDINATE_M, MAX_LENGTH_M, Result, children};
 
 /// Tightest bend: a radius of 0.1 m.
 const MAX_CURVATURE: f64 = 10.0;
@@ -20,30 +19,21 @@ const JOINT_TOLERANCE_M: f64 = 2.0;
 const SHORT_M: f64 = 1.0;
 
 /// Reads a reference line; also returns the length of its road: that of the elements where the road's own differs.
-pub(super) fn read(
-    road: Element,
-    log: &mut FindingLog,
-) -> Result<(Vec<Curve>, f64), OpenDriveError> {
+pub(super) fn read(road: Element, log: &mut FindingLog) -> Result<(Vec<Curve>, f64)> {
     let plan_view = road.required("planView")?;
     let mut curves: Vec<Curve> = Vec::new();
     for element in children(plan_view, "geometry") {
         let curve = read_curve(element, log)?;
-        if curves.last().is_some_and(|before| curve.s_m < before.s_m) {
-            return Err(element.error_value(
-                "s",
-                &curve.s_m.to_string(),
-                "the elements in rising order",
-            ));
-        }
-        if let Some(gap_m) = curves
-            .last()
-            .map(|before| before.end().distance_m(&curve.start))
-            .filter(too_far)
-        {
-            let problem = format!(
-                "starts {gap_m:.2} m from the end of the one before; expected at most {JOINT_TOLERANCE_M}"
-            );
-            return Err(element.error_element(&problem));
+        if let Some(before) = curves.last() {
+            if curve.s_m < before.s_m {
+                return Err(element.error_order("s", curve.s_m));
+            }
+            let gap_m = before.end().distance_m(&curve.start);
+            if gap_m > JOINT_TOLERANCE_M {
+                return Err(element.error_element(&format!(
+                    "starts {gap_m:.2} m from the end of the one before; expected at most {JOINT_TOLERANCE_M}"
+                )));
+            }
         }
         // An element of no length has no direction of its own and adds nothing.
         if curve.length_m > 0.0 || curves.is_empty() {
@@ -60,28 +50,20 @@ pub(super) fn read(
 fn road_length_m(road: Element, total_m: f64, log: &mut FindingLog) -> f64 {
     let error = match road.number("length", 0.0, MAX_LENGTH_M) {
         Ok(length_m) if (total_m - length_m).abs() <= LENGTH_TOLERANCE_M => return length_m,
-        Ok(length_m) => road.error_value(
-            "length",
-            &length_m.to_string(),
-            &format!("{total_m}, as its <planView>"),
-        ),
+        Ok(length_m) => {
+            let expected = format!("{total_m}, as its <planView>");
+            road.error_value("length", length_m, &expected)
+        }
         Err(error) => error,
     };
     error.note(log, "the length of its reference line is used");
     total_m
 }
 
-fn too_far(gap_m: &f64) -> bool {
-    *gap_m > JOINT_TOLERANCE_M
-}
-
-fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve, OpenDriveError> {
+fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve> {
     let coordinate = |name| element.number(name, -MAX_COORDINATE_M, MAX_COORDINATE_M);
-    let start = Pose2::new(
-        coordinate("x")?,
-        coordinate("y")?,
-        element.number("hdg", -1e4, 1e4)?,
-    );
+    let (x, y) = (coordinate("x")?, coordinate("y")?);
+    let start = Pose2::new(x, y, element.number("hdg", -1e4, 1e4)?);
     let length_m = element.number("length", 0.0, MAX_LENGTH_M)?;
     let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
     let Some(kind) = element.elements().find(|child| child.name() != "userData") else {
@@ -95,23 +77,15 @@ fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve, OpenDrive
     };
     let shape = match kind.name() {
         "line" => return Ok(curve(CurveShape::Line)),
-        "arc" => {
-            let [curvature] = curvatures(kind, ["curvature"], length_m, log)?;
-            if curvature.is_nan() {
-                CurveShape::Line
-            } else {
-                CurveShape::Arc { curvature }
-            }
-        }
+        "arc" => match curvatures(kind, ["curvature"], length_m, log)? {
+            Some([curvature]) => CurveShape::Arc { curvature },
+            None => CurveShape::Line,
+        },
         "spiral" if length_m == 0.0 => CurveShape::Line,
-        "spiral" => {
-            let [start, end] = curvatures(kind, ["curvStart", "curvEnd"], length_m, log)?;
-            if start.is_nan() {
-                CurveShape::Line
-            } else {
-                CurveShape::Spiral { start, end }
-            }
-        }
+        "spiral" => match curvatures(kind, ["curvStart", "curvEnd"], length_m, log)? {
+            Some([start, end]) => CurveShape::Spiral { start, end },
+            None => CurveShape::Line,
+        },
         "poly3" => CurveShape::Poly3(kind.cubic(["a", "b", "c", "d"])?),
         "paramPoly3" => return read_param_poly3(element, kind, &curve, log),
         other => {
@@ -130,7 +104,7 @@ fn curvatures<const N: usize>(
     names: [&'static str; N],
     length_m: f64,
     log: &mut FindingLog,
-) -> Result<[f64; N], OpenDriveError> {
+) -> Result<Option<[f64; N]>> {
     let bound = MAX_CURVATURE.min(MAX_TURN_RAD / length_m.max(1e-9));
     let mut values = [0.0; N];
     for (value, name) in values.iter_mut().zip(names) {
@@ -141,12 +115,11 @@ fn curvatures<const N: usize>(
         .zip(names)
         .find(|(value, _)| value.abs() > bound);
     let Some((value, name)) = odd else {
-        return Ok(values);
+        return Ok(Some(values));
     };
-    element
-        .error_range(name, value, -bound, bound)
-        .note(log, &format!("built as a straight line of {length_m} m"));
-    Ok([f64::NAN; N])
+    let error = element.error_range(name, value, -bound, bound);
+    error.note(log, &format!("built as a straight line of {length_m} m"));
+    Ok(None)
 }
 
 /// The parameter runs from 0 to 1 unless the element has it run over the length.
@@ -155,11 +128,9 @@ fn read_param_poly3(
     kind: Element,
     curve: &dyn Fn(CurveShape) -> Curve,
     log: &mut FindingLog,
-) -> Result<Curve, OpenDriveError> {
-    let (u, v) = (
-        kind.cubic(["aU", "bU", "cU", "dU"])?,
-        kind.cubic(["aV", "bV", "cV", "dV"])?,
-    );
+) -> Result<Curve> {
+    let u = kind.cubic(["aU", "bU", "cU", "dU"])?;
+    let v = kind.cubic(["aV", "bV", "cV", "dV"])?;
     let with = |normalized| curve(CurveShape::ParamPoly3 { u, v, normalized });
     let has_length = with(true).length_m > 0.0;
     match kind.optional_text("pRange").map(str::trim) {
@@ -169,26 +140,20 @@ fn read_param_poly3(
         None => {}
     }
     if has_length && !fits(&with(true)) && fits(&with(false)) {
-        kind.note(
-            log,
-            "has no pRange and fits its length only by arcLength",
-            "arcLength is used",
-        );
+        let found = "has no pRange and fits its length only by arcLength";
+        kind.note(log, found, "arcLength is used");
         return Ok(with(false));
     }
     checked(element, with(has_length), log)
 }
 
 /// The curve, if it is about as long as its element; a short one that is not becomes a straight line.
-fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve, OpenDriveError> {
+fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve> {
     if keeps_its_length(&curve) {
         return Ok(curve);
     }
-    let error = element.error_value(
-        "length",
-        &curve.length_m.to_string(),
-        "about the length of its curve",
-    );
+    let expected = "about the length of its curve";
+    let error = element.error_value("length", curve.length_m, expected);
     if curve.length_m > SHORT_M {
         return Err(error);
     }

@@ -4,8 +4,7 @@ use super::super::finding::FindingLog;
 use super::super::lateral::{CrossShape, LateralProfile, MAX_SHAPE_M, MAX_SLOPE_RAD};
 use super::super::profile::Profile;
 use super::super::road::MAX_OFFSET_M;
-use super::OpenDriveError;
-use super::element::{Element, MAX_LENGTH_M, children};
+use super::element::{Element, MAX_LENGTH_M, Result, children};
 
 /// Samples along a road at which slopes are checked.
 const LOOKS: u32 = 50;
@@ -16,13 +15,13 @@ pub(super) fn read_profile(
     name: &'static str,
     start: &'static str,
     bound: f64,
-) -> Result<Profile, OpenDriveError> {
+) -> Result<Profile> {
     let mut records: Vec<(f64, [f64; 4])> = Vec::new();
     for element in children(parent, name) {
         let s = element.number(start, 0.0, MAX_LENGTH_M)?;
         element.number("a", -bound, bound)?;
         if records.last().is_some_and(|&(before, _)| s < before) {
-            return Err(element.error_value(start, &s.to_string(), "the elements in rising order"));
+            return Err(element.error_order(start, s));
         }
         records.push((s, element.cubic(["a", "b", "c", "d"])?));
     }
@@ -51,11 +50,8 @@ pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -
         Err(error) => error.note(log, "shape of the road left out"),
     }
     for other in element.elements() {
-        if !matches!(
-            other.name(),
-            "superelevation" | "crossfall" | "shape" | "userData"
-        ) {
-            let found = format!("up to {:.2} m high", highest_constant_m(other));
+        if !["superelevation", "crossfall", "shape", "userData"].contains(&other.name()) {
+            let found = format!("up to {:.2} m high", other.largest("constant", "a"));
             other.note(log, &found, "left out: the road is built without it");
         }
     }
@@ -69,14 +65,18 @@ fn slope(
     length_m: f64,
     log: &mut FindingLog,
 ) -> Profile {
-    let profile = match read_wanted(parent, name, is_wanted) {
-        Ok(profile) if is_zero(&profile) => return Profile::default(),
+    let mut profile = match read_profile(parent, name, "s", MAX_OFFSET_M) {
         Ok(profile) => profile,
         Err(error) => {
             error.note(log, "left out: the road is built without it");
             return Profile::default();
         }
     };
+    let mut wanted = children(parent, name).map(|record| is_wanted(&record));
+    profile.records.retain(|_| wanted.next().unwrap_or(false));
+    if is_zero(&profile) {
+        return Profile::default();
+    }
     let steepest =
         (0..=LOOKS).map(|look| profile.at(length_m * f64::from(look) / f64::from(LOOKS)));
     let steepest = steepest.map(f64::abs).fold(0.0, f64::max);
@@ -89,19 +89,8 @@ fn slope(
     profile
 }
 
-fn read_wanted(
-    parent: Element,
-    name: &'static str,
-    is_wanted: impl Fn(&Element) -> bool,
-) -> Result<Profile, OpenDriveError> {
-    let mut profile = read_profile(parent, name, "s", MAX_OFFSET_M)?;
-    let mut wanted = children(parent, name).map(|record| is_wanted(&record));
-    profile.records.retain(|_| wanted.next().unwrap_or(false));
-    Ok(profile)
-}
-
 /// The records of one place along the road, by rising `t`, are one cross-section.
-fn read_shapes(parent: Element) -> Result<Vec<CrossShape>, OpenDriveError> {
+fn read_shapes(parent: Element) -> Result<Vec<CrossShape>> {
     let mut shapes: Vec<CrossShape> = Vec::new();
     for element in children(parent, "shape") {
         let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
@@ -110,26 +99,14 @@ fn read_shapes(parent: Element) -> Result<Vec<CrossShape>, OpenDriveError> {
         let record = (t_m, element.cubic(["a", "b", "c", "d"])?);
         match shapes.last_mut() {
             Some(last) if last.s_m == s_m => {
-                if last
-                    .height_m
-                    .records
-                    .last()
-                    .is_some_and(|&(before, _)| t_m < before)
-                {
-                    return Err(element.error_value(
-                        "t",
-                        &t_m.to_string(),
-                        "the elements in rising order",
-                    ));
+                let records = &mut last.height_m.records;
+                if records.last().is_some_and(|&(before, _)| t_m < before) {
+                    return Err(element.error_order("t", t_m));
                 }
-                last.height_m.records.push(record);
+                records.push(record);
             }
             Some(last) if last.s_m > s_m => {
-                return Err(element.error_value(
-                    "s",
-                    &s_m.to_string(),
-                    "the elements in rising order",
-                ));
+                return Err(element.error_order("s", s_m));
             }
             _ => shapes.push(CrossShape {
                 s_m,
@@ -143,13 +120,9 @@ fn read_shapes(parent: Element) -> Result<Vec<CrossShape>, OpenDriveError> {
 }
 
 fn is_zero(profile: &Profile) -> bool {
-    profile
+    let mut coefficients = profile
         .records
         .iter()
-        .all(|(_, coefficients)| coefficients.iter().all(|&coefficient| coefficient == 0.0))
-}
-
-/// The largest constant of an element's descendants, metres: the height of a surface that is not built.
-fn highest_constant_m(element: Element) -> f64 {
-    element.largest("constant", "a")
+        .flat_map(|(_, coefficients)| coefficients);
+    coefficients.all(|&coefficient| coefficient == 0.0)
 }

@@ -3,10 +3,10 @@
 use super::super::finding::FindingLog;
 use super::super::profile::Profile;
 use super::super::road::{MAX_OFFSET_M, Road};
-use super::element::{Element, MAX_LENGTH_M, children};
+use super::element::{Element, MAX_LENGTH_M, Result, children};
 use super::profile::{read_lateral, read_profile};
 use super::speed::read_speed;
-use super::{OpenDriveError, beside, lanes, plan_view};
+use super::{beside, lanes, plan_view};
 
 /// Highest road over the map's zero, metres.
 const MAX_HEIGHT_M: f64 = 10_000.0;
@@ -15,7 +15,7 @@ const MAX_HEIGHT_M: f64 = 10_000.0;
 ///
 /// # Errors
 /// If its reference line, heights or lanes cannot be read.
-pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road, OpenDriveError> {
+pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road> {
     let (plan_view, length_m) = plan_view::read(element, log)?;
     let lanes = element.required("lanes")?;
     let lane_offset = read_profile(lanes, "laneOffset", "s", MAX_OFFSET_M)?;
@@ -56,10 +56,8 @@ fn read_rule(element: Element, log: &mut FindingLog) -> bool {
 fn read_speed_limits(road: Element, log: &mut FindingLog) -> Vec<(f64, f64)> {
     let mut limits: Vec<(f64, f64)> = Vec::new();
     for element in children(road, "type") {
-        let Some(limit) = element
-            .child("speed")
-            .and_then(|speed| read_speed(speed, log))
-        else {
+        let speed = element.child("speed");
+        let Some(limit) = speed.and_then(|speed| read_speed(speed, log)) else {
             continue;
         };
         match element.number("s", 0.0, MAX_LENGTH_M) {
@@ -78,12 +76,12 @@ fn note_unread(road: Element, log: &mut FindingLog) {
             "link" | "type" | "planView" | "elevationProfile" | "lateralProfile" | "lanes"
             | "objects" | "signals" | "railroad" | "userData" | "dataQuality" => {}
             "surface" => {
-                for surface in element
+                let surfaces = element
                     .elements()
-                    .filter(|surface| surface.name() != "userData")
-                {
+                    .filter(|surface| surface.name() != "userData");
+                surfaces.for_each(|surface| {
                     surface.note_value(log, "file", "left out: the road is built without it");
-                }
+                });
             }
             _ => element.note(log, "is not supported", "left out"),
         }

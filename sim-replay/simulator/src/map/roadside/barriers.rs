@@ -3,12 +3,14 @@
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use super::super::curve::Pose2;
 use super::super::lane::wrap_angle;
+use super::super::road::{LaneKind, RoadLane};
 use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
 use super::frontage::{Side, Zone, sides};
 use super::parts::{PartFootprint, wall};
-use super::site::Site;
+use super::site::{Site, outline};
 
 /// Longest straight piece, metres.
 const PIECE_M: f64 = 12.0;
@@ -31,14 +33,8 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
         let (share, barrier) = match side.zone {
             Zone::Street => continue,
-            Zone::Motorway if side.median => (
-                1.0,
-                if rng.random_bool(0.5) {
-                    Barrier::Concrete
-                } else {
-                    Barrier::Steel
-                },
-            ),
+            Zone::Motorway if side.median && rng.random_bool(0.5) => (1.0, Barrier::Concrete),
+            Zone::Motorway if side.median => (1.0, Barrier::Steel),
             Zone::Motorway => (0.9, Barrier::Steel),
             Zone::Rural => (0.55, Barrier::Steel),
         };
@@ -55,19 +51,13 @@ fn along_side(site: &mut Site, side: &Side, share: f64, barrier: Barrier, rng: &
         let stretch = rng.random_range(40.0..160.0f64);
         let end = (s + stretch).min(side.length_m);
         if rng.random_bool(share) {
-            let line = |s: f64| {
-                let pose = side.beyond_kerb(site.surface, site.network, s, 0.45);
-                [pose.x, pose.y, side.road_m(site.surface, site.network, s)]
-            };
-            let pieces = pieces(s, end, |s| {
-                site.network.roads[side.road].pose_at(s).heading_rad
-            });
-            let parts: Vec<Vec<Solid>> = pieces
-                .iter()
-                .map(|&[from, to]| piece(line(from), line(to), barrier))
-                .collect();
-            for parts in parts {
-                site.try_place(&parts, 0.0, false);
+            let road = &site.network.roads[side.road];
+            for stop in pieces(s, end, |s| road.pose_at(s).heading_rad) {
+                let [from, to] = stop.map(|s| {
+                    let pose = side.beyond_kerb(site, s, 0.45);
+                    [pose.x, pose.y, side.road_m(site, s)]
+                });
+                site.try_place(&piece(from, to, barrier), 0.0, false);
             }
         }
         s = end;
@@ -79,21 +69,20 @@ fn between_directions(site: &mut Site, road: usize) {
     let network = site.network;
     let middle = |cut: &CrossSection| {
         let section = &network.roads[road].sections[cut.section];
-        let edge = |ids: Vec<i32>| {
-            ids.into_iter().find(|&id| {
-                section
-                    .lane(id)
-                    .is_some_and(|lane| lane.kind == super::super::road::LaneKind::Driving)
-            })
+        let innermost = |side: &[RoadLane]| {
+            let place = side
+                .iter()
+                .position(|lane| lane.kind == LaneKind::Driving)?;
+            Some(place as i32 + 1)
         };
-        let left = edge((1..=section.left.len() as i32).collect())?;
-        let right = edge((1..=section.right.len() as i32).map(|id| -id).collect())?;
+        let (left, right) = (innermost(&section.left)?, innermost(&section.right)?);
+        let road = &network.roads[road];
         let s = cut
             .s_m
-            .min(network.roads[road].section_end_m(cut.section) - 1e-6)
+            .min(road.section_end_m(cut.section) - 1e-6)
             .max(section.s_m);
-        let low = network.roads[road].lane_span_m(cut.section, right, s)[1];
-        let high = network.roads[road].lane_span_m(cut.section, left, s)[0];
+        let low = road.lane_span_m(cut.section, -right, s)[1];
+        let high = road.lane_span_m(cut.section, left, s)[0];
         (high - low > 1.0).then(|| {
             let middle_m = (low + high) / 2.0;
             let [x, y] = cut.at(middle_m);
@@ -115,7 +104,7 @@ fn between_directions(site: &mut Site, road: usize) {
     // Inside a junction only where no lane leads across.
     let clear = |part: &Solid| {
         let [a, b] = [part.bottom_m(), part.top_m()];
-        let outline = super::site::outline(part);
+        let outline = outline(part);
         network.roads[road].junction.is_none()
             && !site.surface.any(&outline, |patch| {
                 patch.road as usize != road
@@ -150,42 +139,20 @@ fn piece(from: [f64; 3], to: [f64; 3], barrier: Barrier) -> Vec<Solid> {
     let (a, b) = ([from[0], from[1]], [to[0], to[1]]);
     let z = from[2].min(to[2]);
     let rise = (to[2] - from[2]).abs();
-    match barrier {
-        Barrier::Concrete => vec![wall(
-            SolidKind::Barrier,
-            a,
-            b,
-            [z - 0.2, z + rise + 0.85],
-            0.4,
-            0.5,
-        )],
-        Barrier::Steel => {
-            let mut parts = vec![wall(
-                SolidKind::Barrier,
-                a,
-                b,
-                [z + 0.42, z + rise + 0.76],
-                0.1,
-                0.6,
-            )];
-            let length = (b[0] - a[0]).hypot(b[1] - a[1]);
-            let posts = (length / POST_M).floor() as u32;
-            for post in 0..=posts {
-                let share = f64::from(post) * POST_M / length.max(0.1);
-                let at = |i: usize| from[i] + share * (to[i] - from[i]);
-                let pose =
-                    super::super::curve::Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
-                let foot = PartFootprint::new(pose, at(2));
-                parts.push(foot.cuboid(
-                    SolidKind::Barrier,
-                    [0.0, 0.0, -0.3],
-                    [0.1, 0.14, 1.02],
-                    0.5,
-                ));
-            }
-            parts
-        }
+    let kind = SolidKind::Barrier;
+    if barrier == Barrier::Concrete {
+        return vec![wall(kind, a, b, [z - 0.2, z + rise + 0.85], 0.4, 0.5)];
     }
+    let mut parts = vec![wall(kind, a, b, [z + 0.42, z + rise + 0.76], 0.1, 0.6)];
+    let length = (b[0] - a[0]).hypot(b[1] - a[1]);
+    for post in 0..=(length / POST_M).floor() as u32 {
+        let share = f64::from(post) * POST_M / length.max(0.1);
+        let at = |i: usize| from[i] + share * (to[i] - from[i]);
+        let pose = Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
+        let foot = PartFootprint::new(pose, at(2));
+        parts.push(foot.standing(kind, -0.3, [0.1, 0.14, 1.02], 0.5));
+    }
+    parts
 }
 
 #[cfg(test)]

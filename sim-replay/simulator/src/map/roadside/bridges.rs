@@ -2,11 +2,13 @@
 
 use super::super::convex::Rectangle;
 use super::super::curve::Pose2;
+
+use super::super::road::RoadStructure;
 use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
-use super::frontage::cut_at;
-use super::parts::{PartFootprint, wall};
-use super::site::{HEADROOM_M, Site};
+
+use super::parts::wall;
+use super::site::{HEADROOM_M, Site, outline};
 
 /// A road this far above the terrain stands on a bridge, metres.
 const BRIDGE_M: f64 = 1.2;
@@ -26,17 +28,9 @@ const TUNNEL_M: f64 = 5.2;
 pub(super) fn place(site: &mut Site) {
     let flat = site.ground.plane_z_m().is_some();
     for road in 0..site.surface.roads.len() {
-        for structure in site.network.roads[road]
-            .structures
-            .iter()
-            .filter(|structure| structure.tunnel)
-        {
-            tunnel(
-                site,
-                road,
-                structure.s_m,
-                structure.s_m + structure.length_m,
-            );
+        let structures = site.network.roads[road].structures.iter();
+        for RoadStructure { s_m, length_m, .. } in structures.filter(|one| one.tunnel) {
+            tunnel(site, road, *s_m, s_m + length_m);
         }
         if !flat {
             bridge(site, road);
@@ -48,16 +42,10 @@ pub(super) fn place(site: &mut Site) {
 /// Height of the road over the lowest terrain under a cut, metres.
 fn drop_m(site: &Site, cut: &CrossSection) -> f64 {
     let [low, high] = cut.paved_m;
-    let probes = [
-        low,
-        low + 0.25 * (high - low),
-        (low + high) / 2.0,
-        high - 0.25 * (high - low),
-        high,
-    ];
-    probes
-        .iter()
-        .map(|&t| cut.height_m(t) - site.ground_m(cut.at(t)))
+    let quarter = 0.25 * (high - low);
+    [low, low + quarter, (low + high) / 2.0, high - quarter, high]
+        .map(|t| cut.height_m(t) - site.ground_m(cut.at(t)))
+        .into_iter()
         .fold(0.0, f64::max)
 }
 
@@ -73,11 +61,9 @@ fn bridge(site: &mut Site, road: usize) {
             continue;
         }
         let drop = drops[i - 1].min(drops[i]);
-        let thickness = (drop - HEADROOM_M - 0.05)
-            .clamp(SLAB_M[0], SLAB_M[1])
-            .min(drop * 0.4);
-        let slab = slab(from, to, thickness);
-        site.place(&[slab]);
+        let thickness = (drop - HEADROOM_M - 0.05).clamp(SLAB_M[0], SLAB_M[1]);
+        let thickness = thickness.min(drop * 0.4);
+        site.place(&[slab(from, to, thickness)]);
         parapet(site, road, from, to);
         since_pillars += length;
         if since_pillars >= PILLARS_M && drop > 3.0 {
@@ -92,14 +78,8 @@ fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
     let (a, b) = (middle(from), middle(to));
     let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
     let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;
-    wall(
-        SolidKind::BridgeDeck,
-        a,
-        b,
-        [top - thickness_m, top],
-        width + 0.3,
-        0.35,
-    )
+    let z = [top - thickness_m, top];
+    wall(SolidKind::BridgeDeck, a, b, z, width + 0.3, 0.35)
 }
 
 /// Low walls at both edges, where no other lane of the same height joins.
@@ -110,8 +90,7 @@ fn parapet(site: &mut Site, road: usize, from: &CrossSection, to: &CrossSection)
         let edges = [from, to].map(|cut| cut.height_m(cut.paved_m[side]));
         let z = [edges[0].min(edges[1]) - 0.3, edges[0].max(edges[1]) + 1.0];
         let part = wall(SolidKind::Barrier, a, b, z, 0.25, 0.45);
-        let outline = super::site::outline(&part);
-        let joined = site.surface.any(&outline, |patch| {
+        let joined = site.surface.any(&outline(&part), |patch| {
             let own = patch.road as usize == road && !patch.carriageway;
             !own && z[0] < patch.high_m() + HEADROOM_M && z[1] > patch.low_m() - 0.05
         });
@@ -126,27 +105,17 @@ fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
     let count = if high - low > 9.0 { 3 } else { 2 };
     for place in 0..count {
         let t = low + (high - low) * (f64::from(place) + 0.5) / f64::from(count);
-        let at = cut.at(t);
-        let ground = site.ground_m(at);
-        let height = cut.range_m()[0] - thickness_m - 0.1 - ground;
+        let [x, y] = cut.at(t);
+        let foot = site.foot(Pose2::new(x, y, cut.pose.heading_rad));
+        let height = cut.range_m()[0] - thickness_m - 0.1 - foot.z_m;
         if height < 2.0 {
             continue;
         }
-        let foot = PartFootprint::new(Pose2::new(at[0], at[1], cut.pose.heading_rad), ground);
-        let pillar = foot.cylinder(
-            SolidKind::Pillar,
-            [0.0, 0.0, -0.5],
-            [0.55, height + 0.5],
-            0.4,
-        );
-        let around = super::site::outline(&pillar).grown(0.5);
+        let pillar = foot.post(SolidKind::Pillar, -0.5, [0.55, height + 0.5], 0.4);
+        let around = outline(&pillar).grown(0.5);
         // Clear of the lanes below; its own slab above does not count.
-        if site.surface.is_clear(
-            &around,
-            [pillar.bottom_m(), pillar.top_m() - 0.2],
-            HEADROOM_M,
-            true,
-        ) {
+        let z = [pillar.bottom_m(), pillar.top_m() - 0.2];
+        if site.surface.is_clear(&around, z, HEADROOM_M, true) {
             site.place(&[pillar]);
         }
     }
@@ -172,12 +141,9 @@ fn retaining_walls(site: &mut Site, road: usize) {
                 continue;
             }
             let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + sign * 0.5));
-            let middle = [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
-            let around = Rectangle {
-                center_m: middle,
-                half_m: [1.0, 1.0],
-                yaw_rad: from.pose.heading_rad,
-            };
+            let [x, y] = [0, 1].map(|axis| (a[axis] + b[axis]) / 2.0);
+            let middle = Pose2::new(x, y, from.pose.heading_rad);
+            let around = Rectangle::around(middle, [1.0, 1.0]);
             let mut above = f64::INFINITY;
             site.surface.any(&around, |patch| {
                 let z = patch.low_m();
@@ -186,18 +152,12 @@ fn retaining_walls(site: &mut Site, road: usize) {
                 }
                 false
             });
-            let covered = above.is_finite();
-            let top = (high + 0.4).min(above - 0.9);
-            let kind = if covered {
-                SolidKind::TunnelWall
-            } else {
-                SolidKind::Wall
+            let kind = match above.is_finite() {
+                true => SolidKind::TunnelWall,
+                false => SolidKind::Wall,
             };
-            site.try_place(
-                &[wall(kind, a, b, [road_z - 0.4, top], 0.3, 0.4)],
-                0.0,
-                false,
-            );
+            let z = [road_z - 0.4, (high + 0.4).min(above - 0.9)];
+            site.try_place(&[wall(kind, a, b, z, 0.3, 0.4)], 0.0, false);
         }
     }
 }
@@ -209,50 +169,25 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
     let mut s = from_m;
     while s + 1.0 < end {
         let next = (s + PIECE_M).min(end);
-        let (a, b) = (
-            *cut_at(site.surface, road, s),
-            *cut_at(site.surface, road, next),
-        );
-        let z = [
-            a.range_m()[0].min(b.range_m()[0]),
-            a.range_m()[1].max(b.range_m()[1]),
-        ];
+        let [a, b] = [s, next].map(|s| site.cut_at(road, s));
+        let ([low_a, high_a], [low_b, high_b]) = (a.range_m(), b.range_m());
+        let z = [low_a.min(low_b), high_a.max(high_b)];
         for side in [0, 1] {
             let out = if side == 0 { -0.45 } else { 0.45 };
             let [p, q] = [a, b].map(|cut| cut.at(cut.paved_m[side] + out));
-            let part = wall(
-                SolidKind::TunnelWall,
-                p,
-                q,
-                [z[0] - 0.3, z[1] + TUNNEL_M],
-                0.4,
-                0.4,
-            );
-            if site.surface.is_clear(
-                &super::site::outline(&part),
-                [z[0], z[1] + 1.0],
-                HEADROOM_M,
-                true,
-            ) {
+            let height = [z[0] - 0.3, z[1] + TUNNEL_M];
+            let part = wall(SolidKind::TunnelWall, p, q, height, 0.4, 0.4);
+            let z = [z[0], z[1] + 1.0];
+            if site.surface.is_clear(&outline(&part), z, HEADROOM_M, true) {
                 site.place(&[part]);
             }
         }
         let [p, q] = [a, b].map(|cut| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0));
         let width = (a.paved_m[1] - a.paved_m[0]).max(b.paved_m[1] - b.paved_m[0]) + 1.3;
-        let roof = wall(
-            SolidKind::BridgeDeck,
-            p,
-            q,
-            [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8],
-            width,
-            0.35,
-        );
-        if site.surface.is_clear(
-            &super::site::outline(&roof),
-            [roof.bottom_m(), roof.top_m()],
-            HEADROOM_M,
-            true,
-        ) {
+        let height = [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8];
+        let roof = wall(SolidKind::BridgeDeck, p, q, height, width, 0.35);
+        let z = [roof.bottom_m(), roof.top_m()];
+        if site.surface.is_clear(&outline(&roof), z, HEADROOM_M, true) {
             site.place(&[roof]);
         }
         s = next;

@@ -61,18 +61,18 @@ pub(super) fn build(style: Style, lot: &Lot, rng: &mut ChaCha8Rng) -> Vec<Solid>
         reflectivity: rng.random_range(0.15..0.75),
         parts: Vec::new(),
     };
-    let size = [lot.width_m, lot.depth_m];
-    match style {
-        Style::House => house(&mut draft, size, rng),
-        Style::Row => row(&mut draft, size, rng),
-        Style::Block => block(&mut draft, size, rng),
-        Style::Tower => tower(&mut draft, size, rng),
-        Style::Shop => shop(&mut draft, size, rng),
-        Style::Hall => hall(&mut draft, size, rng),
-        Style::Church => church(&mut draft, size, rng),
-        Style::Tanks => tanks(&mut draft, size, rng),
-        Style::PetrolStation => petrol_station(&mut draft, size, rng),
-    }
+    let add_parts = match style {
+        Style::House => house,
+        Style::Row => row,
+        Style::Block => block,
+        Style::Tower => tower,
+        Style::Shop => shop,
+        Style::Hall => hall,
+        Style::Church => church,
+        Style::Tanks => tanks,
+        Style::PetrolStation => petrol_station,
+    };
+    add_parts(&mut draft, [lot.width_m, lot.depth_m], rng);
     draft.parts
 }
 
@@ -91,52 +91,36 @@ impl Draft {
 
     /// A box whose lower side is at `at[2]`.
     fn block_at(&mut self, at: [f64; 3], size: [f64; 3]) {
-        self.parts.push(
-            self.foot
-                .cuboid(SolidKind::Building, at, size, self.reflectivity),
-        );
+        let (foot, kind) = (self.foot, SolidKind::Building);
+        self.parts
+            .push(foot.cuboid(kind, at, size, self.reflectivity));
     }
 
     fn cylinder(&mut self, at: [f64; 3], size: [f64; 2]) {
-        self.parts.push(
-            self.foot
-                .cylinder(SolidKind::Building, at, size, self.reflectivity),
-        );
+        let (foot, kind) = (self.foot, SolidKind::Building);
+        self.parts
+            .push(foot.cylinder(kind, at, size, self.reflectivity));
     }
 
     /// A gabled roof as steps, its ridge along `u` or along `v`.
-    fn gable(
-        &mut self,
-        u: f64,
-        v: f64,
-        z: f64,
-        [width, depth]: [f64; 2],
-        rise: f64,
-        ridge_along_u: bool,
-    ) {
+    fn gable(&mut self, [u, v, z]: [f64; 3], size: [f64; 2], rise: f64, ridge_along_u: bool) {
         const STEPS: u32 = 4;
+        let ([width, depth], height) = (size, rise / f64::from(STEPS));
         for step in 0..STEPS {
             let share = 1.0 - f64::from(step) / f64::from(STEPS);
-            let size = if ridge_along_u {
-                [width, depth * share]
-            } else {
-                [width * share, depth]
+            let [width, depth] = match ridge_along_u {
+                true => [width, depth * share],
+                false => [width * share, depth],
             };
-            let height = rise / f64::from(STEPS);
-            self.block_at(
-                [u, v, z + f64::from(step) * height],
-                [size[0], size[1], height],
-            );
+            let z = z + f64::from(step) * height;
+            self.block_at([u, v, z], [width, depth, height]);
         }
     }
 }
 
 fn house(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
-    let height = if rng.random_bool(0.5) {
-        rng.random_range(2.8..3.6)
-    } else {
-        rng.random_range(5.2..6.6)
-    };
+    let has_one_floor = rng.random_bool(0.5);
+    let height = rng.random_range(if has_one_floor { 2.8..3.6 } else { 5.2..6.6 });
     // The porch takes the first metre and a half of the lot.
     let porch = 1.4;
     let (body_depth, v) = (depth - porch, porch / 2.0);
@@ -147,29 +131,14 @@ fn house(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     draft.body(u, v, [body_width, body_depth, height]);
     match rng.random_range(0..4) {
         0 => draft.block_at([u, v, height], [body_width, body_depth, 0.4]),
-        1 => draft.gable(
-            u,
-            v,
-            height,
-            [body_width, body_depth],
-            rng.random_range(2.0..4.0),
-            false,
-        ),
-        _ => draft.gable(
-            u,
-            v,
-            height,
-            [body_width, body_depth],
-            rng.random_range(2.0..4.0),
-            true,
-        ),
+        roof => {
+            let (size, rise) = ([body_width, body_depth], rng.random_range(2.0..4.0));
+            draft.gable([u, v, height], size, rise, roof != 1);
+        }
     }
-    let chimney = [
-        u + rng.random_range(-0.3..0.3) * body_width,
-        v + 0.2 * body_depth,
-        height + 1.0,
-    ];
-    draft.block_at(chimney, [0.6, 0.6, rng.random_range(2.2..3.6)]);
+    let chimney_u = u + rng.random_range(-0.3..0.3) * body_width;
+    let chimney = [0.6, 0.6, rng.random_range(2.2..3.6)];
+    draft.block_at([chimney_u, v + 0.2 * body_depth, height + 1.0], chimney);
     let door = u + rng.random_range(-0.3..0.3) * body_width;
     let front = -depth / 2.0 + porch / 2.0;
     match rng.random_range(0..3) {
@@ -185,11 +154,8 @@ fn house(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     }
     if with_garage {
         let deep = (body_depth * 0.7).max(5.0).min(body_depth);
-        draft.body(
-            side * (width - garage) / 2.0,
-            v + (body_depth - deep) / 2.0,
-            [garage - 0.1, deep, 2.6],
-        );
+        let (u, v) = (side * (width - garage) / 2.0, v + (body_depth - deep) / 2.0);
+        draft.body(u, v, [garage - 0.1, deep, 2.6]);
     }
 }
 
@@ -206,14 +172,8 @@ fn row(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         draft.reflectivity = rng.random_range(0.15..0.75);
         draft.body(u, back / 2.0, [size[0], size[1], own]);
         if gabled {
-            draft.gable(
-                u,
-                back / 2.0,
-                own,
-                size,
-                rng.random_range(1.8..3.0),
-                rng.random_bool(0.75),
-            );
+            let rise = rng.random_range(1.8..3.0);
+            draft.gable([u, back / 2.0, own], size, rise, rng.random_bool(0.75));
         } else {
             draft.block_at([u, back / 2.0, own], [1.2, 0.8, rng.random_range(0.8..1.8)]);
         }
@@ -230,9 +190,8 @@ fn row(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
 fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let floors = rng.random_range(3..=6);
     let height = f64::from(floors) * 3.0 + rng.random_range(0.5..1.5);
-    let bar = (depth * rng.random_range(0.45..0.6))
-        .max(8.0)
-        .min(depth - 1.2);
+    let bar = depth * rng.random_range(0.45..0.6);
+    let bar = bar.max(8.0).min(depth - 1.2);
     let front = -depth / 2.0 + 1.2;
     draft.body(0.0, front + bar / 2.0, [width, bar, height]);
     let wing = (width * 0.35).min(10.0);
@@ -246,26 +205,14 @@ fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     };
     for side in wings {
         let lower = height - 3.0 * f64::from(rng.random_range(0..=1));
-        draft.body(
-            side * (width - wing) / 2.0,
-            front + bar + rest / 2.0,
-            [wing, rest, lower],
-        );
+        let (u, v) = (side * (width - wing) / 2.0, front + bar + rest / 2.0);
+        draft.body(u, v, [wing, rest, lower]);
     }
     for _ in 0..rng.random_range(1..=3) {
-        let at = [
-            rng.random_range(-0.4..0.4) * width,
-            front + bar * rng.random_range(0.3..0.7),
-            height,
-        ];
-        draft.block_at(
-            at,
-            [
-                rng.random_range(1.5..4.0),
-                rng.random_range(1.5..3.0),
-                rng.random_range(1.0..2.8),
-            ],
-        );
+        let u = rng.random_range(-0.4..0.4) * width;
+        let v = front + bar * rng.random_range(0.3..0.7);
+        let size = [1.5..4.0, 1.5..3.0, 1.0..2.8].map(|range| rng.random_range(range));
+        draft.block_at([u, v, height], size);
     }
     let columns = rng.random_range(2..=4);
     let balconies = rng.random_bool(0.7);
@@ -273,11 +220,8 @@ fn block(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         let u = width * ((f64::from(column) + 0.5) / f64::from(columns) - 0.5);
         if !balconies {
             // Stair towers or pilasters instead.
-            draft.body(
-                u,
-                front - 0.3,
-                [rng.random_range(0.6..2.4), 0.6, height - 0.5],
-            );
+            let size = [rng.random_range(0.6..2.4), 0.6, height - 0.5];
+            draft.body(u, front - 0.3, size);
             continue;
         }
         for floor in 1..floors {
@@ -291,21 +235,14 @@ fn tower(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let (mut size, mut z) = ([width, depth], 0.0);
     let [mut u, mut v] = [0.0, 0.0];
     for stage in 0..stages {
-        let height = if stage == 0 {
-            rng.random_range(5.0..10.0)
-        } else {
-            rng.random_range(8.0..18.0)
-        };
+        let height = rng.random_range(if stage == 0 { 5.0..10.0 } else { 8.0..18.0 });
         if stage == 0 {
             draft.body(u, v, [size[0], size[1], height]);
         } else {
             draft.block_at([u, v, z], [size[0], size[1], height]);
         }
         z += height;
-        let next = [
-            size[0] * rng.random_range(0.6..0.9),
-            size[1] * rng.random_range(0.6..0.9),
-        ];
+        let next = size.map(|size| size * rng.random_range(0.6..0.9));
         u += rng.random_range(-0.5..0.5) * (size[0] - next[0]);
         v += rng.random_range(-0.5..0.5) * (size[1] - next[1]);
         size = next;
@@ -314,11 +251,8 @@ fn tower(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     draft.cylinder([u, v, z + 2.5], [0.15, rng.random_range(3.0..9.0)]);
     // An entrance hall at the foot would leave the lot; corner piers mark the front instead.
     for side in [-0.5, 0.5] {
-        draft.body(
-            side * (width - 1.0),
-            -depth / 2.0 + 0.5,
-            [1.0, 1.0, rng.random_range(10.0..16.0)],
-        );
+        let size = [1.0, 1.0, rng.random_range(10.0..16.0)];
+        draft.body(side * (width - 1.0), -depth / 2.0 + 0.5, size);
     }
 }
 
@@ -327,27 +261,20 @@ fn shop(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let height = rng.random_range(3.8..6.5);
     draft.body(0.0, awning / 2.0, [width, depth - awning, height]);
     let front = -depth / 2.0;
-    draft.block_at(
-        [0.0, front + awning / 2.0, 2.9],
-        [width * rng.random_range(0.6..1.0), awning, 0.2],
-    );
+    let size = [width * rng.random_range(0.6..1.0), awning, 0.2];
+    draft.block_at([0.0, front + awning / 2.0, 2.9], size);
     let posts = (width / 5.0).floor().max(1.0) as u32;
     for post in 0..=posts {
         let u = (f64::from(post) / f64::from(posts) - 0.5) * (width - 0.6);
         draft.cylinder([u, front + 0.3, 0.0], [0.1, 2.9]);
     }
-    let sign = [
-        rng.random_range(-0.3..0.3) * width,
-        front + awning + 0.3,
-        height,
-    ];
-    draft.block_at(
-        sign,
-        [rng.random_range(2.0..5.0), 0.4, rng.random_range(0.8..1.8)],
-    );
+    let u = rng.random_range(-0.3..0.3) * width;
+    let sign = [rng.random_range(2.0..5.0), 0.4, rng.random_range(0.8..1.8)];
+    draft.block_at([u, front + awning + 0.3, height], sign);
     if rng.random_bool(0.5) {
+        let upper_width = width * rng.random_range(0.35..0.7);
         let upper = [
-            width * rng.random_range(0.35..0.7),
+            upper_width,
             (depth - awning) * 0.8,
             rng.random_range(2.8..6.0),
         ];
@@ -355,19 +282,10 @@ fn shop(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         draft.block_at([u, awning / 2.0, height], upper);
     }
     for _ in 0..rng.random_range(1..=3) {
-        let at = [
-            rng.random_range(-0.4..0.4) * width,
-            rng.random_range(0.0..0.35) * depth,
-            height,
-        ];
-        draft.block_at(
-            at,
-            [
-                rng.random_range(1.0..2.5),
-                rng.random_range(1.0..2.0),
-                rng.random_range(0.8..1.6),
-            ],
-        );
+        let u = rng.random_range(-0.4..0.4) * width;
+        let v = rng.random_range(0.0..0.35) * depth;
+        let size = [1.0..2.5, 1.0..2.0, 0.8..1.6].map(|range| rng.random_range(range));
+        draft.block_at([u, v, height], size);
     }
 }
 
@@ -376,44 +294,33 @@ fn hall(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let height = rng.random_range(5.5..9.5);
     draft.body(0.0, ramp / 2.0, [width, depth - ramp, height]);
     match rng.random_range(0..3) {
-        0 => draft.gable(
-            0.0,
-            ramp / 2.0,
-            height,
-            [width, depth - ramp],
-            rng.random_range(1.2..2.5),
-            true,
-        ),
+        0 => {
+            let (at, rise) = ([0.0, ramp / 2.0, height], rng.random_range(1.2..2.5));
+            draft.gable(at, [width, depth - ramp], rise, true);
+        }
         1 => {
             // A saw-tooth roof.
             let teeth = (width / 6.0).floor().max(2.0) as u32;
             for tooth in 0..teeth {
                 let u = ((f64::from(tooth) + 0.25) / f64::from(teeth) - 0.5) * width;
-                draft.block_at(
-                    [u, ramp / 2.0, height],
-                    [width / f64::from(teeth) * 0.4, depth - ramp, 1.6],
-                );
+                let size = [width / f64::from(teeth) * 0.4, depth - ramp, 1.6];
+                draft.block_at([u, ramp / 2.0, height], size);
             }
         }
-        _ => draft.block_at(
-            [0.2 * width, 0.1 * depth, height],
-            [0.4 * width, 0.5 * depth, rng.random_range(1.5..4.0)],
-        ),
+        _ => {
+            let size = [0.4 * width, 0.5 * depth, rng.random_range(1.5..4.0)];
+            draft.block_at([0.2 * width, 0.1 * depth, height], size);
+        }
     }
     let docks = rng.random_range(1..=4);
     for dock in 0..docks {
         let u = ((f64::from(dock) + 0.5) / f64::from(docks) - 0.5) * width * 0.9;
-        draft.body(
-            u,
-            -depth / 2.0 + ramp / 2.0,
-            [rng.random_range(2.4..3.6), ramp, rng.random_range(0.8..3.4)],
-        );
+        let size = [rng.random_range(2.4..3.6), ramp, rng.random_range(0.8..3.4)];
+        draft.body(u, -depth / 2.0 + ramp / 2.0, size);
     }
     if rng.random_bool(0.35) {
-        draft.cylinder(
-            [0.4 * width, 0.3 * depth, 0.0],
-            [rng.random_range(0.5..0.9), rng.random_range(14.0..26.0)],
-        );
+        let chimney = [rng.random_range(0.5..0.9), rng.random_range(14.0..26.0)];
+        draft.cylinder([0.4 * width, 0.3 * depth, 0.0], chimney);
     }
 }
 
@@ -422,12 +329,11 @@ fn church(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let nave = depth - tower;
     let height = rng.random_range(6.0..9.0);
     draft.body(0.0, tower / 2.0, [width * 0.75, nave, height]);
+    let rise = rng.random_range(4.0..6.0);
     draft.gable(
-        0.0,
-        tower / 2.0,
-        height,
+        [0.0, tower / 2.0, height],
         [width * 0.75, nave],
-        rng.random_range(4.0..6.0),
+        rise,
         false,
     );
     draft.body(0.0, depth * 0.15, [width, tower, height * 0.9]);
@@ -449,10 +355,8 @@ fn tanks(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
         let height = rng.random_range(5.0..14.0);
         if rng.random_bool(0.25) {
             // A water tower: a tank on a stem.
-            draft.cylinder(
-                [u, 0.0, -FOOTING_M],
-                [radius * 0.35, height + FOOTING_M + 4.0],
-            );
+            let stem = [radius * 0.35, height + FOOTING_M + 4.0];
+            draft.cylinder([u, 0.0, -FOOTING_M], stem);
             draft.cylinder([u, 0.0, height + 4.0], [radius * 0.9, 5.0]);
         } else {
             draft.cylinder([u, 0.0, -FOOTING_M], [radius, height + FOOTING_M]);
@@ -463,11 +367,8 @@ fn tanks(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
 
 fn petrol_station(draft: &mut Draft, [width, depth]: [f64; 2], rng: &mut ChaCha8Rng) {
     let kiosk = depth * 0.35;
-    draft.body(
-        0.0,
-        (depth - kiosk) / 2.0,
-        [width * 0.6, kiosk, rng.random_range(3.2..4.4)],
-    );
+    let size = [width * 0.6, kiosk, rng.random_range(3.2..4.4)];
+    draft.body(0.0, (depth - kiosk) / 2.0, size);
     let (roof_width, roof_depth) = (width * 0.8, depth * 0.5);
     let v = -depth / 2.0 + roof_depth / 2.0 + 0.5;
     draft.block_at([0.0, v, 5.0], [roof_width, roof_depth, 0.9]);

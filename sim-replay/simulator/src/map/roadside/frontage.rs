@@ -1,8 +1,9 @@
 //! Frontage: the two sides of every road, along which objects are placed.
 
 use super::super::curve::Pose2;
-use super::super::road::{LaneKind, Road, RoadNetwork};
-use super::super::surface::Surface;
+use super::super::road::{LaneKind, Road, RoadLane, RoadNetwork};
+use super::super::surface::CrossSection;
+use super::site::Site;
 
 /// Roads with at least this speed limit have no houses along them, metres per second.
 const FAST_MPS: f64 = 17.0;
@@ -37,22 +38,14 @@ pub(super) struct Side {
 /// Both sides of every road outside junctions.
 pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
     let mut sides = Vec::new();
-    for (index, road) in network
-        .roads
-        .iter()
-        .enumerate()
-        .filter(|(_, road)| road.junction.is_none())
-    {
+    let roads = network.roads.iter().enumerate();
+    for (index, road) in roads.filter(|(_, road)| road.junction.is_none()) {
         let [left, right] = [drives(road, true), drives(road, false)];
         for sign in [-1.0, 1.0] {
             let zone = zone(road);
-            let along = if sign < 0.0 {
-                right != road.left_hand
-            } else {
-                left == road.left_hand
-            };
-            let one_way_left = (sign > 0.0 && !left) || (sign < 0.0 && !right);
-            let median = one_way_left && zone == Zone::Motorway;
+            let has_lanes = if sign < 0.0 { right } else { left };
+            let along = (sign < 0.0) == (has_lanes != road.left_hand);
+            let median = !has_lanes && zone == Zone::Motorway;
             sides.push(Side {
                 road: index,
                 sign,
@@ -69,35 +62,24 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
 impl Side {
     /// The pose `out_m` beyond the paved area, `s_m` along the road (also a little before its start or behind its end),
     /// looking along the road.
-    pub(super) fn beyond_paved(
-        &self,
-        surface: &Surface,
-        network: &RoadNetwork,
-        s_m: f64,
-        out_m: f64,
-    ) -> Pose2 {
-        self.beyond(surface, network, s_m, out_m, |cut| cut.paved_m)
+    pub(super) fn beyond_paved(&self, site: &Site, s_m: f64, out_m: f64) -> Pose2 {
+        self.beyond(site, s_m, out_m, |cut| cut.paved_m)
     }
 
     /// The same, from the edge of the carriageway.
-    pub(super) fn beyond_kerb(
-        &self,
-        surface: &Surface,
-        network: &RoadNetwork,
-        s_m: f64,
-        out_m: f64,
-    ) -> Pose2 {
-        self.beyond(surface, network, s_m, out_m, |cut| cut.carriageway_m)
+    pub(super) fn beyond_kerb(&self, site: &Site, s_m: f64, out_m: f64) -> Pose2 {
+        self.beyond(site, s_m, out_m, |cut| cut.carriageway_m)
     }
 
     /// Height of the road at the edge of its carriageway, metres.
-    pub(super) fn road_m(&self, surface: &Surface, network: &RoadNetwork, s_m: f64) -> f64 {
+    pub(super) fn road_m(&self, site: &Site, s_m: f64) -> f64 {
         let s_m = s_m.clamp(0.0, self.length_m);
-        let z_m = network.roads[self.road].elevation.at(s_m);
-        if network.roads[self.road].lateral.is_level() {
+        let road = &site.network.roads[self.road];
+        let z_m = road.elevation.at(s_m);
+        if road.lateral.is_level() {
             return z_m;
         }
-        let cut = cut_at(surface, self.road, s_m);
+        let cut = site.cut_at(self.road, s_m);
         z_m + cut.height_m(cut.carriageway_m[usize::from(self.sign > 0.0)]) - cut.z_m
     }
 
@@ -108,8 +90,8 @@ impl Side {
     }
 
     /// Width of pavement and verge on this side, metres.
-    pub(super) fn pavement_m(&self, surface: &Surface, s_m: f64) -> f64 {
-        let cut = cut_at(surface, self.road, s_m);
+    pub(super) fn pavement_m(&self, site: &Site, s_m: f64) -> f64 {
+        let cut = site.cut_at(self.road, s_m);
         if self.sign > 0.0 {
             cut.paved_m[1] - cut.carriageway_m[1]
         } else {
@@ -117,48 +99,44 @@ impl Side {
         }
     }
 
-    /// Angle by which something that faces the road from this side is turned against the road's direction, radians.
-    pub(super) fn facing_rad(&self) -> f64 {
-        -self.sign * std::f64::consts::FRAC_PI_2
+    /// A pose beside the road turned to face it.
+    pub(super) fn facing(&self, pose: Pose2) -> Pose2 {
+        pose.moved(0.0, 0.0, -self.sign * std::f64::consts::FRAC_PI_2)
+    }
+
+    /// The pose turned so that the road lies to its right.
+    pub(super) fn with_road_right(&self, pose: Pose2) -> Pose2 {
+        if self.sign > 0.0 {
+            pose
+        } else {
+            pose.reversed()
+        }
     }
 
     fn beyond(
         &self,
-        surface: &Surface,
-        network: &RoadNetwork,
+        site: &Site,
         s_m: f64,
         out_m: f64,
-        range: impl Fn(&super::super::surface::CrossSection) -> [f64; 2],
+        range: impl Fn(&CrossSection) -> [f64; 2],
     ) -> Pose2 {
         let inside = s_m.clamp(0.0, self.length_m);
-        let cut = cut_at(surface, self.road, inside);
+        let cut = site.cut_at(self.road, inside);
         let [low, high] = range(cut).map(|t_m| cut.aside_m(t_m));
         let t = if self.sign > 0.0 {
             high + out_m
         } else {
             low - out_m
         };
-        network.roads[self.road]
-            .pose_at(inside)
-            .moved(s_m - inside, t, 0.0)
+        let pose = site.network.roads[self.road].pose_at(inside);
+        pose.moved(s_m - inside, t, 0.0)
     }
-}
-
-/// The cross-section nearest to `s_m`, at or before it.
-pub(super) fn cut_at(
-    surface: &Surface,
-    road: usize,
-    s_m: f64,
-) -> &super::super::surface::CrossSection {
-    let cuts = &surface.roads[road];
-    let after = cuts.partition_point(|cut| cut.s_m <= s_m);
-    &cuts[after.saturating_sub(1)]
 }
 
 fn drives(road: &Road, left: bool) -> bool {
     road.sections.iter().any(|section| {
-        let side = if left { &section.left } else { &section.right };
-        side.iter().any(|lane| lane.kind == LaneKind::Driving)
+        let mut side = section.side(left).iter();
+        side.any(|lane| lane.kind == LaneKind::Driving)
     })
 }
 
@@ -166,7 +144,7 @@ fn zone(road: &Road) -> Zone {
     let middle = road.length_m / 2.0;
     let section = &road.sections[road.section_at(middle)];
     let lanes = || section.left.iter().chain(&section.right);
-    let driving = |side: &[super::super::road::RoadLane]| -> f64 {
+    let driving = |side: &[RoadLane]| -> f64 {
         side.iter()
             .filter(|lane| lane.kind == LaneKind::Driving)
             .map(|lane| lane.width.at(middle - section.s_m))

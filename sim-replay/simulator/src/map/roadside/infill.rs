@@ -5,9 +5,9 @@ use rand_chacha::ChaCha8Rng;
 
 use super::super::convex::Rectangle;
 use super::super::curve::Pose2;
-use super::buildings::{Lot, Style, build};
+use super::buildings::Style;
 use super::lots;
-use super::parts::PartFootprint;
+
 use super::plots::monument;
 use super::site::Site;
 use super::trees::{Species, plant};
@@ -23,14 +23,11 @@ const MAX_ATTEMPTS: u32 = 60_000;
 pub(super) fn place_islands(site: &mut Site, islands: &[[f64; 3]], rng: &mut ChaCha8Rng) {
     for &[x, y, radius] in islands {
         let middle = Pose2::new(x, y, rng.random_range(0.0..std::f64::consts::TAU));
-        let parts = monument(PartFootprint::new(middle, site.ground_m([x, y])), rng);
-        site.try_place(&parts, 0.0, true);
+        let foot = site.foot(middle);
+        site.try_place(&monument(foot, rng), 0.0, true);
         for _ in 0..rng.random_range(3..=9) {
-            let pose = middle.moved(0.0, 0.0, rng.random_range(-3.1..3.1)).moved(
-                rng.random_range(2.5..radius),
-                0.0,
-                0.0,
-            );
+            let turned = middle.moved(0.0, 0.0, rng.random_range(-3.1..3.1));
+            let pose = turned.moved(rng.random_range(2.5..radius), 0.0, 0.0);
             let species = if rng.random_bool(0.5) {
                 Species::Bush
             } else {
@@ -39,34 +36,27 @@ pub(super) fn place_islands(site: &mut Site, islands: &[[f64; 3]], rng: &mut Cha
             plant(site, pose, species, rng.random_range(0.5..0.8), rng);
         }
         // No houses here.
-        let island = Rectangle {
-            center_m: [x, y],
-            half_m: [radius * 0.7; 2],
-            yaw_rad: 0.0,
-        };
-        let z = site.ground_m([x, y]);
-        site.take(&island, [z - 1.0, z + 40.0]);
+        let island = Rectangle::square([x, y], radius * 0.7);
+        site.take(&island, [foot.z_m - 1.0, foot.z_m + 40.0]);
     }
 }
 
 /// Houses of the second row, sheds and trees wherever there is room near a road.
 pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     let [low, high] = site.surface.bounds_m;
-    let [low, high] = [
-        low.map(|low| low - REACH_M / 2.0),
-        high.map(|high| high + REACH_M / 2.0),
-    ];
+    let low = low.map(|low| low - REACH_M / 2.0);
+    let high = high.map(|high| high + REACH_M / 2.0);
     let area = (high[0] - low[0]) * (high[1] - low[1]);
     let attempts = ((area / AREA_M2) as u32).min(MAX_ATTEMPTS);
     for _ in 0..attempts {
         let [x, y] = [0, 1].map(|axis| rng.random_range(low[axis]..high[axis]));
         let pose = Pose2::new(x, y, rng.random_range(-3.1..3.1));
-        let (choice, species, size) = (
-            rng.random_range(0..10),
-            Species::random(rng),
-            rng.random_range(0.8..1.5),
-        );
-        if !near_road(site, x, y) {
+        let (choice, species) = (rng.random_range(0..10), Species::random(rng));
+        let size = rng.random_range(0.8..1.5);
+        if !site
+            .surface
+            .any(&Rectangle::square([x, y], REACH_M), |_| true)
+        {
             continue;
         }
         match choice {
@@ -79,40 +69,11 @@ pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
     }
 }
 
-fn near_road(site: &Site, x: f64, y: f64) -> bool {
-    let around = Rectangle {
-        center_m: [x, y],
-        half_m: [REACH_M; 2],
-        yaw_rad: 0.0,
-    };
-    site.surface.any(&around, |_| true)
-}
-
 fn second_row(site: &mut Site, pose: Pose2, rng: &mut ChaCha8Rng) {
-    let style = [
-        Style::House,
-        Style::House,
-        Style::Row,
-        Style::Block,
-        Style::Tower,
-    ][rng.random_range(0..5)];
-    let [width_m, depth_m] = style.lot_m(rng);
-    let half_m = [width_m / 2.0, depth_m / 2.0];
-    let rectangle = Rectangle {
-        center_m: [pose.x, pose.y],
-        half_m,
-        yaw_rad: pose.heading_rad,
-    };
-    let [low, high] = site.ground_range_m(&rectangle);
+    use Style::{Block, House, Row, Tower};
+    let style = [House, House, Row, Block, Tower][rng.random_range(0..5)];
     // Room for the street's own plots in front: six metres to everything.
-    if high - low < 2.5 && site.is_free(&rectangle.grown(6.0), [low - 1.5, low + 40.0], true) {
-        let lot = Lot {
-            foot: PartFootprint::new(pose, low),
-            width_m,
-            depth_m,
-        };
-        let parts = build(style, &lot, rng);
-        site.place(&parts);
-        site.take(&lots::outline(&lot), [low - 1.5, low + 40.0]);
+    if let Some(lot) = lots::free_lot(site, pose, style.lot_m(rng), 2.5, 6.0) {
+        lots::build_on(site, &lot, style, rng);
     }
 }

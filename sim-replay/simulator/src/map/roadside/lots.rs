@@ -4,8 +4,9 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::convex::Rectangle;
+use super::super::curve::Pose2;
 use super::super::{ParkingSpot, SolidKind};
-use super::buildings::Lot;
+use super::buildings::{Lot, Style, build};
 use super::parts::PartFootprint;
 use super::site::Site;
 use super::trees::{Species, tree};
@@ -15,6 +16,8 @@ const BAY_M: [f64; 2] = [5.2, 2.6];
 /// Width of the lane between two rows of bays, metres.
 const AISLE_M: f64 = 6.4;
 /// Depth of a lot with two rows, metres.
+/// Height up to which a lot is kept free, metres.
+pub(super) const LOT_HEIGHT_M: f64 = 40.0;
 pub(super) const DEPTH_M: f64 = 2.0 * BAY_M[0] + AISLE_M + 1.4;
 
 /// Fills `lot` (free ground of at least [`DEPTH_M`] depth) with two rows of bays, lamps or trees between them and a
@@ -33,51 +36,66 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
                 .pose
                 .moved(u, v, turn * std::f64::consts::FRAC_PI_2);
             if bay % island == island - 1 && rng.random_bool(0.6) {
-                let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
+                let foot = site.foot(pose);
                 let parts = if rng.random_bool(0.6) {
                     tree(foot, Species::Broadleaf, rng.random_range(0.5..0.65), rng)
                 } else {
-                    vec![foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.1, 6.2], 0.6)]
+                    vec![foot.post(SolidKind::Pole, -0.2, [0.1, 6.2], 0.6)]
                 };
                 site.place(&parts);
                 continue;
             }
-            let center_m = site.on_ground(pose);
             // Some drivers park backwards.
-            let yaw_rad = if rng.random_bool(0.3) {
-                pose.reversed().heading_rad
+            let parked = if rng.random_bool(0.3) {
+                pose.reversed()
             } else {
-                pose.heading_rad
+                pose
             };
             site.parking.push(ParkingSpot {
-                center_m,
-                yaw_rad,
+                center_m: [pose.x, pose.y, site.ground_m([pose.x, pose.y])],
+                yaw_rad: parked.heading_rad,
                 roll_rad: 0.0,
                 length_m: BAY_M[0],
                 width_m: BAY_M[1],
             });
         }
     }
-    let back = PartFootprint::new(
-        lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0),
-        lot.foot.z_m,
-    );
+    let pose = lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0);
+    let back = PartFootprint::new(pose, lot.foot.z_m);
     let height = rng.random_range(0.6..2.2);
-    let wall = back.cuboid(
-        SolidKind::Wall,
-        [0.0, 0.0, -0.5],
-        [lot.width_m - 0.2, 0.25, height + 0.5],
-        0.4,
-    );
-    site.place(&[wall]);
+    let size = [lot.width_m - 0.2, 0.25, height + 0.5];
+    site.place(&[back.standing(SolidKind::Wall, -0.5, size, 0.4)]);
 }
 
 /// Outline of a lot.
 pub(super) fn outline(lot: &Lot) -> Rectangle {
-    let pose = lot.foot.pose;
-    Rectangle {
-        center_m: [pose.x, pose.y],
-        half_m: [lot.width_m / 2.0, lot.depth_m / 2.0],
-        yaw_rad: pose.heading_rad,
-    }
+    Rectangle::around(lot.foot.pose, [lot.width_m / 2.0, lot.depth_m / 2.0])
+}
+
+/// A lot of this width and depth around a pose, if the terrain rises less than `slope_m` there and nothing stands
+/// within `room_m` of it.
+pub(super) fn free_lot(
+    site: &Site,
+    pose: Pose2,
+    [width_m, depth_m]: [f64; 2],
+    slope_m: f64,
+    room_m: f64,
+) -> Option<Lot> {
+    let rectangle = Rectangle::around(pose, [width_m / 2.0, depth_m / 2.0]);
+    let [low, high] = site.ground_range_m(&rectangle);
+    let z_m = [low - 1.5, low + LOT_HEIGHT_M];
+    let is_free = high - low < slope_m && site.is_free(&rectangle.grown(room_m), z_m, true);
+    let foot = PartFootprint::new(pose, low);
+    is_free.then_some(Lot {
+        foot,
+        width_m,
+        depth_m,
+    })
+}
+
+/// Places a building on a lot, which nothing else may enter.
+pub(super) fn build_on(site: &mut Site, lot: &Lot, style: Style, rng: &mut ChaCha8Rng) {
+    site.place(&build(style, lot, rng));
+    let low = lot.foot.z_m;
+    site.take(&outline(lot), [low - 1.5, low + LOT_HEIGHT_M]);
 }

@@ -3,10 +3,9 @@
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::super::convex::Rectangle;
 use super::super::{Solid, SolidKind};
-use super::buildings::{Lot, Style, build};
-use super::frontage::{Side, Zone, cut_at, sides};
+use super::buildings::Style;
+use super::frontage::{Side, Zone, sides};
 use super::lots;
 use super::parts::{PartFootprint, wall};
 use super::site::{HEADROOM_M, Site};
@@ -39,29 +38,18 @@ fn across(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
-    let cut = *cut_at(site.surface, side.road, s);
+    let cut = site.cut_at(side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 0.9, cut.carriageway_m[1] + 0.9];
     let clear = rng.random_range(5.4..6.4);
     let [_, z] = cut.range_m();
     let mut parts = Vec::new();
     for t in [low, high] {
-        let pose = cut.pose.moved(0.0, t, 0.0);
-        let ground = site.ground_m([pose.x, pose.y]);
-        parts.push(PartFootprint::new(pose, ground).cylinder(
-            SolidKind::Pole,
-            [0.0, 0.0, -0.3],
-            [0.2, z + clear + 0.9 - ground],
-            0.5,
-        ));
+        let foot = site.foot(cut.pose.moved(0.0, t, 0.0));
+        let size = [0.2, z + clear + 0.9 - foot.z_m];
+        parts.push(foot.post(SolidKind::Pole, -0.3, size, 0.5));
     }
-    parts.push(wall(
-        SolidKind::Pole,
-        cut.at(low),
-        cut.at(high),
-        [z + clear, z + clear + 0.6],
-        0.5,
-        0.5,
-    ));
+    let (a, b, beam) = (cut.at(low), cut.at(high), [z + clear, z + clear + 0.6]);
+    parts.push(wall(SolidKind::Pole, a, b, beam, 0.5, 0.5));
     let boards = rng.random_range(1..=3);
     for board in 0..boards {
         let t = low
@@ -76,12 +64,10 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 
 /// A bridge for walkers from this side to the other side of the carriageway: deck, rails, stairs towers.
 fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
-    let cut = *cut_at(site.surface, side.road, s);
+    let cut = site.cut_at(side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 1.6, cut.carriageway_m[1] + 1.6];
-    let (z, width) = (
-        cut.range_m()[1] + rng.random_range(5.3..6.2),
-        rng.random_range(2.4..4.5),
-    );
+    let z = cut.range_m()[1] + rng.random_range(5.3..6.2);
+    let width = rng.random_range(2.4..4.5);
     let (a, b) = (cut.at(low), cut.at(high));
     let mut parts = vec![wall(SolidKind::BridgeDeck, a, b, [z, z + 0.5], width, 0.4)];
     for edge in [-0.5, 0.5] {
@@ -92,18 +78,12 @@ fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
         parts.push(wall(SolidKind::Fence, p, q, [z + 0.5, z + 1.6], 0.08, 0.4));
     }
     for t in [low + 0.5, high - 0.5] {
-        let pose = cut.pose.moved(0.0, t, 0.0);
-        let ground = site.ground_m([pose.x, pose.y]);
-        if z - ground < 1.0 {
+        let foot = site.foot(cut.pose.moved(0.0, t, 0.0));
+        if z - foot.z_m < 1.0 {
             return;
         }
-        let foot = PartFootprint::new(pose, ground);
-        parts.push(foot.cuboid(
-            SolidKind::Pillar,
-            [0.0, 0.0, -0.5],
-            [width * 0.6, 0.7, z - ground + 0.5],
-            0.4,
-        ));
+        let size = [width * 0.6, 0.7, z - foot.z_m + 0.5];
+        parts.push(foot.standing(SolidKind::Pillar, -0.5, size, 0.4));
     }
     site.try_place(&parts, 0.0, true);
 }
@@ -115,33 +95,21 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
         let (height, step) = (rng.random_range(2.2..5.0), rng.random_range(3.5..6.0));
         let end = (s + length).min(side.length_m);
         while s + step < end {
-            let [a, b] =
-                [s, s + step].map(|s| side.beyond_paved(site.surface, site.network, s, out));
-            let ground = [a, b].map(|pose| site.ground_m([pose.x, pose.y]));
-            let (low, high) = (ground[0].min(ground[1]), ground[0].max(ground[1]));
+            let [a, b] = [s, s + step].map(|s| site.foot(side.beyond_paved(site, s, out)));
+            let (low, high) = (a.z_m.min(b.z_m), a.z_m.max(b.z_m));
             // Panels of slightly different height between posts; some are missing or glazed (lower).
+            let is_low = rng.random_bool(0.08);
             let own = height
-                * if rng.random_bool(0.08) {
+                * if is_low {
                     0.45
                 } else {
                     rng.random_range(0.94..1.06)
                 };
-            let near_road = (low - side.road_m(site.surface, site.network, s)).abs() < 3.0;
-            if near_road {
-                let panel = wall(
-                    SolidKind::NoiseWall,
-                    [a.x, a.y],
-                    [b.x, b.y],
-                    [low - 0.3, high + own],
-                    0.2,
-                    0.35,
-                );
-                let post = PartFootprint::new(a, ground[0]).cuboid(
-                    SolidKind::NoiseWall,
-                    [0.0, 0.0, -0.3],
-                    [0.3, 0.4, own + 0.6],
-                    0.4,
-                );
+            if (low - side.road_m(site, s)).abs() < 3.0 {
+                let (kind, z) = (SolidKind::NoiseWall, [low - 0.3, high + own]);
+                let [p, q] = [a, b].map(|foot| [foot.pose.x, foot.pose.y]);
+                let panel = wall(kind, p, q, z, 0.2, 0.35);
+                let post = a.standing(kind, -0.3, [0.3, 0.4, own + 0.6], 0.4);
                 site.try_place(&[panel, post], 0.0, true);
             }
             s += step;
@@ -154,34 +122,27 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..40.0);
     while s < side.length_m - 2.0 {
-        let pose = side.beyond_kerb(site.surface, site.network, s, rng.random_range(1.1..1.9));
-        let pose = if side.along { pose } else { pose.reversed() };
-        let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
+        let pose = side.beyond_kerb(site, s, rng.random_range(1.1..1.9));
+        let foot = site.foot(if side.along { pose } else { pose.reversed() });
         let parts: Vec<Solid> = match rng.random_range(0..6) {
             0 => {
                 let size = [0.1, rng.random_range(1.5..3.2), rng.random_range(1.0..2.4)];
-                let posts = [-0.4, 0.4].map(|v| {
-                    foot.cylinder(
-                        SolidKind::Pole,
-                        [0.1, v * size[1], -0.2],
-                        [0.07, 2.0 + size[2]],
-                        0.5,
-                    )
-                });
-                let board = foot.cuboid(SolidKind::Sign, [0.0, 0.0, 1.8], size, 0.95);
-                vec![posts[0], posts[1], board]
+                let post = |v: f64| {
+                    let (at, post) = ([0.1, v * size[1], -0.2], [0.07, 2.0 + size[2]]);
+                    foot.cylinder(SolidKind::Pole, at, post, 0.5)
+                };
+                let board = foot.standing(SolidKind::Sign, 1.8, size, 0.95);
+                vec![post(-0.4), post(0.4), board]
             }
-            1 => vec![foot.cuboid(
-                SolidKind::StreetFurniture,
-                [0.0, 0.0, -0.1],
-                [0.5, 1.2, rng.random_range(1.2..2.0)],
-                0.5,
-            )],
+            1 => {
+                let size = [0.5, 1.2, rng.random_range(1.2..2.0)];
+                vec![foot.standing(SolidKind::StreetFurniture, -0.1, size, 0.5)]
+            }
             2 => vec![
-                foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.05, 1.4], 0.5),
-                foot.cuboid(SolidKind::Sign, [0.0, 0.0, 1.2], [0.25, 0.35, 0.5], 0.9),
+                foot.post(SolidKind::Pole, -0.2, [0.05, 1.4], 0.5),
+                foot.standing(SolidKind::Sign, 1.2, [0.25, 0.35, 0.5], 0.9),
             ],
-            _ => vec![foot.cuboid(SolidKind::Pole, [0.0, 0.0, -0.1], [0.12, 0.12, 1.1], 0.8)],
+            _ => vec![foot.standing(SolidKind::Pole, -0.1, [0.12, 0.12, 1.1], 0.8)],
         };
         site.try_place(&parts, 0.05, false);
         s += rng.random_range(14.0..55.0);
@@ -197,25 +158,17 @@ fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             2 => mast(site, side, s, rng),
             3..=4 => {
                 // A row of one species.
-                let (species, out, step) = (
-                    Species::random(rng),
-                    rng.random_range(4.0..9.0),
-                    rng.random_range(4.0..8.0),
-                );
+                let species = Species::random(rng);
+                let (out, step) = (rng.random_range(4.0..9.0), rng.random_range(4.0..8.0));
                 for place in 0..rng.random_range(3..=8) {
-                    let pose = side.beyond_paved(
-                        site.surface,
-                        site.network,
-                        s + f64::from(place) * step,
-                        out,
-                    );
+                    let pose = side.beyond_paved(site, s + f64::from(place) * step, out);
                     plant(site, pose, species, rng.random_range(0.8..1.2), rng);
                 }
             }
             _ => {
                 for _ in 0..rng.random_range(1..=5) {
                     let (ds, out) = (rng.random_range(-8.0..8.0), rng.random_range(3.0..26.0));
-                    let pose = side.beyond_paved(site.surface, site.network, s + ds, out);
+                    let pose = side.beyond_paved(site, s + ds, out);
                     let species = Species::random(rng);
                     plant(site, pose, species, rng.random_range(0.7..1.5), rng);
                 }
@@ -226,66 +179,31 @@ fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
-    let style = [
-        Style::Hall,
-        Style::Hall,
-        Style::Block,
-        Style::Tanks,
-        Style::Tower,
-    ][rng.random_range(0..5)];
-    let [width_m, depth_m] = style.lot_m(rng);
-    let out = rng.random_range(6.0..30.0) + depth_m / 2.0;
-    let pose = side.beyond_paved(site.surface, site.network, s, out);
-    let pose = if side.sign > 0.0 {
-        pose
-    } else {
-        pose.reversed()
-    };
-    let half_m = [width_m / 2.0, depth_m / 2.0];
-    let rectangle = Rectangle {
-        center_m: [pose.x, pose.y],
-        half_m,
-        yaw_rad: pose.heading_rad,
-    };
-    let [low, high] = site.ground_range_m(&rectangle);
-    if high - low < 3.0 && site.is_free(&rectangle.grown(0.5), [low - 1.5, low + 40.0], true) {
-        let lot = Lot {
-            foot: PartFootprint::new(pose, low),
-            width_m,
-            depth_m,
-        };
-        let parts = build(style, &lot, rng);
-        site.place(&parts);
-        site.take(&lots::outline(&lot), [low - 1.5, low + 40.0]);
+    use Style::{Block, Hall, Tanks, Tower};
+    let style = [Hall, Hall, Block, Tanks, Tower][rng.random_range(0..5)];
+    let size = style.lot_m(rng);
+    let out = rng.random_range(6.0..30.0) + size[1] / 2.0;
+    let pose = side.with_road_right(side.beyond_paved(site, s, out));
+    if let Some(lot) = lots::free_lot(site, pose, size, 3.0, 0.5) {
+        lots::build_on(site, &lot, style, rng);
     }
 }
 
 /// A mast for power lines or radio: legs and arms.
 fn mast(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
-    let pose = side.beyond_paved(site.surface, site.network, s, rng.random_range(8.0..30.0));
-    let foot = PartFootprint::new(
-        pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)),
-        site.ground_m([pose.x, pose.y]),
-    );
+    let pose = side.beyond_paved(site, s, rng.random_range(8.0..30.0));
+    let foot = site.foot(pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)));
     let (height, spread) = (rng.random_range(14.0..28.0), rng.random_range(0.9..2.2));
+    let kind = SolidKind::Pole;
     let mut parts = Vec::new();
     for (u, v) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
         let at = [u * spread, v * spread, -0.5];
-        parts.push(foot.cuboid(SolidKind::Pole, at, [0.25, 0.25, height * 0.6], 0.5));
+        parts.push(foot.cuboid(kind, at, [0.25, 0.25, height * 0.6], 0.5));
     }
-    parts.push(foot.cuboid(
-        SolidKind::Pole,
-        [0.0, 0.0, height * 0.6 - 0.5],
-        [0.9, 0.9, height * 0.4],
-        0.5,
-    ));
+    parts.push(foot.standing(kind, height * 0.6 - 0.5, [0.9, 0.9, height * 0.4], 0.5));
     for arm in [0.62, 0.78, 0.94] {
-        parts.push(foot.cuboid(
-            SolidKind::Pole,
-            [0.0, 0.0, height * arm],
-            [0.3, 6.0 + 4.0 * (1.0 - arm), 0.3],
-            0.5,
-        ));
+        let size = [0.3, 6.0 + 4.0 * (1.0 - arm), 0.3];
+        parts.push(foot.standing(kind, height * arm, size, 0.5));
     }
     debug_assert!(height * 0.6 > HEADROOM_M);
     site.try_place(&parts, 0.3, true);

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::ParkingSpot;
 use super::super::convex::Rectangle;
 use super::super::road::LaneKind;
-use super::frontage::{Side, Zone, cut_at, sides};
+use super::frontage::{Side, Zone, sides};
 use super::site::Site;
 
 /// Length and width of a spot, metres.
@@ -32,11 +32,7 @@ pub(super) fn place_along_kerbs(site: &mut Site, rng: &mut ChaCha8Rng) {
 
 fn has_parking_lane(site: &Site, side: &Side) -> bool {
     let section = &site.network.roads[side.road].sections[0];
-    let lanes = if side.sign > 0.0 {
-        &section.left
-    } else {
-        &section.right
-    };
+    let lanes = section.side(side.sign > 0.0);
     lanes.iter().any(|lane| lane.kind == LaneKind::Parking)
 }
 
@@ -62,25 +58,16 @@ fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             if middle + SPOT_M[0] / 2.0 + CORNER_M > side.length_m {
                 break;
             }
-            let pavement = side.pavement_m(site.surface, middle);
-            let pose = side.beyond_kerb(
-                site.surface,
-                site.network,
-                middle,
-                pavement + SPOT_M[1] / 2.0 + 0.2,
-            );
+            let out_m = side.pavement_m(site, middle) + SPOT_M[1] / 2.0 + 0.2;
+            let pose = side.beyond_kerb(site, middle, out_m);
             let half_m = [SPOT_M[0] / 2.0, SPOT_M[1] / 2.0 + 0.1];
-            let rectangle = Rectangle {
-                center_m: [pose.x, pose.y],
-                half_m,
-                yaw_rad: pose.heading_rad,
-            };
-            let road = side.road_m(site.surface, site.network, middle);
+            let rectangle = Rectangle::around(pose, half_m);
+            let road = side.road_m(site, middle);
             let [low, high] = site.ground_range_m(&rectangle);
             let z_m = [road - 0.5, road + 3.5];
             if high - low < 0.5 && (low - road).abs() < 0.6 && site.is_free(&rectangle, z_m, true) {
                 site.take(&rectangle, z_m);
-                push_spot(site, side, middle, pavement + SPOT_M[1] / 2.0 + 0.2);
+                push_spot(site, side, middle, out_m);
             }
             s += SPOT_M[0];
         }
@@ -90,27 +77,21 @@ fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 
 /// A spot with its middle `out_m` beyond the kerb, in the direction of traffic on its side.
 fn push_spot(site: &mut Site, side: &Side, s_m: f64, out_m: f64) {
-    let pose = side.beyond_kerb(site.surface, site.network, s_m, out_m);
-    let ground = site.ground_m([pose.x, pose.y]);
+    let pose = side.beyond_kerb(site, s_m, out_m);
     // In a parking lane the spot lies on the road, which may be a deck.
-    let z = if out_m < 0.0 {
-        side.road_m(site.surface, site.network, s_m)
-    } else {
-        ground
+    let (z, bank_rad) = match out_m < 0.0 {
+        true => (
+            side.road_m(site, s_m),
+            site.cut_at(side.road, s_m).bank_rad(),
+        ),
+        false => (site.ground_m([pose.x, pose.y]), 0.0),
     };
-    let bank_rad = if out_m < 0.0 {
-        cut_at(site.surface, side.road, s_m).bank_rad()
-    } else {
-        0.0
+    let (yaw_rad, roll_rad) = match side.along {
+        true => (pose.heading_rad, bank_rad),
+        false => (pose.reversed().heading_rad, -bank_rad),
     };
-    let (pose, roll_rad) = if side.along {
-        (pose, bank_rad)
-    } else {
-        (pose.reversed(), -bank_rad)
-    };
-    let (center_m, yaw_rad) = ([pose.x, pose.y, z], pose.heading_rad);
     site.parking.push(ParkingSpot {
-        center_m,
+        center_m: [pose.x, pose.y, z],
         yaw_rad,
         roll_rad,
         length_m: SPOT_M[0],

@@ -16,6 +16,28 @@ impl PartFootprint {
         Self { pose, z_m }
     }
 
+    /// A box of full `size_m` over the middle of the foot, standing `lift_m` over it.
+    pub(super) fn standing(
+        &self,
+        kind: SolidKind,
+        lift_m: f64,
+        size_m: [f64; 3],
+        reflectivity: f32,
+    ) -> Solid {
+        self.cuboid(kind, [0.0, 0.0, lift_m], size_m, reflectivity)
+    }
+
+    /// A cylinder of this radius and height over the middle of the foot, standing `lift_m` over it.
+    pub(super) fn post(
+        &self,
+        kind: SolidKind,
+        lift_m: f64,
+        size_m: [f64; 2],
+        reflectivity: f32,
+    ) -> Solid {
+        self.cylinder(kind, [0.0, 0.0, lift_m], size_m, reflectivity)
+    }
+
     /// A box of full `size_m`, its middle `u` ahead and `v` to the left, standing `lift_m` over the foot.
     pub(super) fn cuboid(
         &self,
@@ -25,12 +47,8 @@ impl PartFootprint {
         reflectivity: f32,
     ) -> Solid {
         let half_m = size_m.map(|length| length / 2.0);
-        self.solid(
-            kind,
-            Shape::Box { half_m },
-            [u, v, lift_m + half_m[2]],
-            reflectivity,
-        )
+        let center_m = [u, v, lift_m + half_m[2]];
+        self.solid(kind, Shape::Box { half_m }, center_m, reflectivity)
     }
 
     /// An upright cylinder.
@@ -67,13 +85,13 @@ impl PartFootprint {
         reflectivity: f32,
     ) -> Solid {
         let at = self.pose.moved(u, v, 0.0);
-        Solid::new(
+        Solid {
             kind,
             shape,
-            [at.x, at.y, self.z_m + w],
-            self.pose.heading_rad,
+            center_m: [at.x, at.y, self.z_m + w],
+            yaw_rad: self.pose.heading_rad,
             reflectivity,
-        )
+        }
     }
 }
 
@@ -87,21 +105,13 @@ pub(super) fn wall(
     reflectivity: f32,
 ) -> Solid {
     let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
-    let half_m = [
-        dx.hypot(dy) / 2.0,
-        thickness_m / 2.0,
-        (top_m - bottom_m) / 2.0,
-    ];
-    let center_m = [
-        (from[0] + to[0]) / 2.0,
-        (from[1] + to[1]) / 2.0,
-        (bottom_m + top_m) / 2.0,
-    ];
-    Solid::new(
+    let half_m = [dx.hypot(dy), thickness_m, top_m - bottom_m].map(|size_m| size_m / 2.0);
+    let center_m = [from[0] + to[0], from[1] + to[1], bottom_m + top_m].map(|sum| sum / 2.0);
+    Solid {
         kind,
-        Shape::Box { half_m },
+        shape: Shape::Box { half_m },
         center_m,
-        dy.atan2(dx),
+        yaw_rad: dy.atan2(dx),
         reflectivity,
-    )
+    }
 }

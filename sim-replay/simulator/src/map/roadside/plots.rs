@@ -1,13 +1,14 @@
 //! Plots along streets and country roads: buildings, gardens, parking lots, greens.
 
+use std::f64::consts::TAU;
+
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
-use super::super::convex::Rectangle;
 use super::super::{Solid, SolidKind};
-use super::buildings::{Lot, Style, build};
+use super::buildings::{Lot, Style};
 use super::frontage::{Side, Zone, sides};
-use super::lots;
+use super::lots::{self, LOT_HEIGHT_M};
 use super::parts::{PartFootprint, wall};
 use super::site::Site;
 use super::trees::{Species, plant};
@@ -16,8 +17,6 @@ use super::trees::{Species, plant};
 const MAX_SLOPE_M: f64 = 2.5;
 /// Length by which plots reach beyond the ends of a road, around the corner, metres.
 const CORNER_M: f64 = 9.0;
-/// Height up to which a lot is kept free, metres.
-const LOT_HEIGHT_M: f64 = 40.0;
 
 /// Places plots along all streets and country roads.
 pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
@@ -40,35 +39,19 @@ struct Character {
 fn character(rng: &mut ChaCha8Rng) -> Character {
     use Style::*;
     let (styles, set_back_m, gap_m) = match rng.random_range(0..5) {
-        0 => (
-            vec![House, House, House, Row, Shop],
-            rng.random_range(2.5..6.0),
-            3.5,
-        ),
-        1 => (
-            vec![Row, Row, House, Block, Shop],
-            rng.random_range(0.6..3.5),
-            1.2,
-        ),
-        2 => (
-            vec![Block, Block, Tower, Shop, Row],
-            rng.random_range(0.6..4.0),
-            3.0,
-        ),
+        0 => (vec![House, House, House, Row, Shop], 2.5..6.0, 3.5),
+        1 => (vec![Row, Row, House, Block, Shop], 0.6..3.5, 1.2),
+        2 => (vec![Block, Block, Tower, Shop, Row], 0.6..4.0, 3.0),
         3 => (
             vec![Shop, Shop, Block, House, PetrolStation, Church],
-            rng.random_range(1.0..5.0),
+            1.0..5.0,
             4.0,
         ),
-        _ => (
-            vec![Hall, Hall, Tanks, Shop, Block],
-            rng.random_range(3.0..8.0),
-            5.0,
-        ),
+        _ => (vec![Hall, Hall, Tanks, Shop, Block], 3.0..8.0, 5.0),
     };
     Character {
         styles,
-        set_back_m,
+        set_back_m: rng.random_range(set_back_m),
         gap_m,
     }
 }
@@ -83,22 +66,15 @@ fn along_street(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             13..18 => green(site, side, s, rng),
             _ => {
                 let style = character.styles[rng.random_range(0..character.styles.len())];
-                let [width, depth] = style.lot_m(rng);
+                let size = style.lot_m(rng);
                 let set_back = character.set_back_m + rng.random_range(0.0..1.8);
-                building(site, side, s, [width, depth], set_back, style, rng)
+                let mut end = building(site, side, s, size, set_back, style, rng);
+                if end.is_none() {
                     // A small house where nothing else fits.
-                    .or_else(|| {
-                        building(
-                            site,
-                            side,
-                            s,
-                            [8.2, 8.0],
-                            0.8 + set_back * 0.5,
-                            Style::House,
-                            rng,
-                        )
-                    })
-                    .map(|end| end + character.gap_m * rng.random_range(0.4..2.2))
+                    let (style, set_back) = (Style::House, 0.8 + set_back * 0.5);
+                    end = building(site, side, s, [8.2, 8.0], set_back, style, rng);
+                }
+                end.map(|end| end + character.gap_m * rng.random_range(0.4..2.2))
             }
         };
         s = advanced.unwrap_or(s + 2.5);
@@ -111,26 +87,16 @@ fn along_country_road(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
         let set_back = rng.random_range(4.0..14.0);
         let advanced = match rng.random_range(0..10) {
             0 => building(site, side, s, [14.0, 12.0], set_back, Style::House, rng),
-            1 => building(
-                site,
-                side,
-                s,
-                [26.0, 18.0],
-                set_back + 4.0,
-                Style::Hall,
-                rng,
-            ),
+            1 => {
+                let set_back = set_back + 4.0;
+                building(site, side, s, [26.0, 18.0], set_back, Style::Hall, rng)
+            }
             2 => building(site, side, s, [16.0, 12.0], set_back, Style::Tanks, rng),
             3 => Some(fence(site, side, s, rng)),
             _ => {
                 for _ in 0..rng.random_range(1..=3) {
                     let out = rng.random_range(2.5..12.0);
-                    let pose = side.beyond_paved(
-                        site.surface,
-                        site.network,
-                        s + rng.random_range(-4.0..4.0),
-                        out,
-                    );
+                    let pose = side.beyond_paved(site, s + rng.random_range(-4.0..4.0), out);
                     let species = Species::random(rng);
                     plant(site, pose, species, rng.random_range(0.7..1.3), rng);
                 }
@@ -142,37 +108,13 @@ fn along_country_road(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 }
 
 /// The lot `width` x `depth` from `s` on, `set_back` behind the paved area, if it is free and level enough.
-fn free_lot(
-    site: &Site,
-    side: &Side,
-    s: f64,
-    [width, depth]: [f64; 2],
-    set_back: f64,
-) -> Option<Lot> {
-    let middle = s + width / 2.0;
+fn free_lot(site: &Site, side: &Side, s: f64, size: [f64; 2], set_back: f64) -> Option<Lot> {
+    let middle = s + size[0] / 2.0;
     // On a bend the front's middle and its ends lie at different distances; the free test settles it.
-    let pose = side.beyond_paved(site.surface, site.network, middle, set_back + depth / 2.0);
-    // The street to the right, seen along the lot.
-    let pose = if side.sign > 0.0 {
-        pose
-    } else {
-        pose.reversed()
-    };
-    let half_m = [width / 2.0, depth / 2.0];
-    let rectangle = Rectangle {
-        center_m: [pose.x, pose.y],
-        half_m,
-        yaw_rad: pose.heading_rad,
-    };
-    let [low, high] = site.ground_range_m(&rectangle);
-    let road = side.road_m(site.surface, site.network, middle);
-    let fits = high - low < MAX_SLOPE_M && (low - road).abs() < 4.0;
-    let free = fits && site.is_free(&rectangle.grown(0.4), [low - 1.5, low + LOT_HEIGHT_M], true);
-    free.then(|| Lot {
-        foot: PartFootprint::new(pose, low),
-        width_m: width,
-        depth_m: depth,
-    })
+    let pose = side.beyond_paved(site, middle, set_back + size[1] / 2.0);
+    let lot = lots::free_lot(site, side.with_road_right(pose), size, MAX_SLOPE_M, 0.4)?;
+    let road = side.road_m(site, middle);
+    ((lot.foot.z_m - road).abs() < 4.0).then_some(lot)
 }
 
 /// Places a building, with a garden in front and trees behind; returns the end of the lot along the street.
@@ -186,26 +128,13 @@ fn building(
     rng: &mut ChaCha8Rng,
 ) -> Option<f64> {
     let lot = free_lot(site, side, s, size, set_back)?;
-    let parts = build(style, &lot, rng);
-    site.place(&parts);
-    site.take(
-        &lots::outline(&lot),
-        [lot.foot.z_m - 1.5, lot.foot.z_m + LOT_HEIGHT_M],
-    );
+    lots::build_on(site, &lot, style, rng);
     front(site, &lot, set_back, rng);
     for _ in 0..rng.random_range(0..=2) {
-        let (u, v) = (
-            rng.random_range(-0.5..0.5) * lot.width_m,
-            lot.depth_m / 2.0 + rng.random_range(2.0..8.0),
-        );
-        let species = Species::random(rng);
-        plant(
-            site,
-            lot.foot.pose.moved(u, v, 0.0),
-            species,
-            rng.random_range(0.6..1.1),
-            rng,
-        );
+        let u = rng.random_range(-0.5..0.5) * lot.width_m;
+        let v = lot.depth_m / 2.0 + rng.random_range(2.0..8.0);
+        let (pose, species) = (lot.foot.pose.moved(u, v, 0.0), Species::random(rng));
+        plant(site, pose, species, rng.random_range(0.6..1.1), rng);
     }
     Some(s + size[0])
 }
@@ -217,22 +146,17 @@ fn front(site: &mut Site, lot: &Lot, set_back: f64, rng: &mut ChaCha8Rng) {
     }
     let v = -lot.depth_m / 2.0 - set_back + 0.4;
     let (kind, thickness, height, reflectivity) = match rng.random_range(0..5) {
-        0 => (
-            SolidKind::Wall,
-            0.25,
-            rng.random_range(0.5..2.0),
-            rng.random_range(0.3..0.6),
-        ),
+        0 => {
+            let height = rng.random_range(0.5..2.0);
+            (SolidKind::Wall, 0.25, height, rng.random_range(0.3..0.6))
+        }
         1 => (SolidKind::Fence, 0.06, rng.random_range(0.8..1.6), 0.3),
         2 => (SolidKind::Hedge, 0.7, rng.random_range(0.7..1.9), 0.3),
         _ => {
             let bushes = rng.random_range(0..=3);
             for _ in 0..bushes {
-                let pose = lot.foot.pose.moved(
-                    rng.random_range(-0.45..0.45) * lot.width_m,
-                    v * rng.random_range(0.85..1.0),
-                    0.0,
-                );
+                let u = rng.random_range(-0.45..0.45) * lot.width_m;
+                let pose = lot.foot.pose.moved(u, v * rng.random_range(0.85..1.0), 0.0);
                 plant(site, pose, Species::Bush, rng.random_range(0.7..1.2), rng);
             }
             return;
@@ -242,15 +166,9 @@ fn front(site: &mut Site, lot: &Lot, set_back: f64, rng: &mut ChaCha8Rng) {
     let gate = rng.random_range(0.15..0.75) * lot.width_m - lot.width_m / 2.0;
     for [from, to] in [[-lot.width_m / 2.0, gate], [gate + 2.6, lot.width_m / 2.0]] {
         if to - from > 0.8 {
-            let middle = lot.foot.pose.moved((from + to) / 2.0, v, 0.0);
-            let z = site.ground_m([middle.x, middle.y]);
-            let piece = PartFootprint::new(middle, z).cuboid(
-                kind,
-                [0.0, 0.0, -0.4],
-                [to - from, thickness, height + 0.4],
-                reflectivity,
-            );
-            site.try_place(&[piece], 0.05, true);
+            let foot = site.foot(lot.foot.pose.moved((from + to) / 2.0, v, 0.0));
+            let size = [to - from, thickness, height + 0.4];
+            site.try_place(&[foot.standing(kind, -0.4, size, reflectivity)], 0.05, true);
         }
     }
 }
@@ -273,76 +191,43 @@ fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f
     let (width, depth) = (rng.random_range(14.0..32.0), rng.random_range(12.0..22.0));
     let lot = free_lot(site, side, s, [width, depth], 1.0)?;
     let spot = |rng: &mut ChaCha8Rng| {
-        let (u, v) = (
-            rng.random_range(-0.45..0.45) * width,
-            rng.random_range(-0.42..0.42) * depth,
-        );
-        lot.foot
-            .pose
-            .moved(u, v, rng.random_range(0.0..std::f64::consts::TAU))
+        let u = rng.random_range(-0.45..0.45) * width;
+        let v = rng.random_range(-0.42..0.42) * depth;
+        lot.foot.pose.moved(u, v, rng.random_range(0.0..TAU))
     };
     for _ in 0..rng.random_range(3..=9) {
         let (pose, species) = (spot(rng), Species::random(rng));
         plant(site, pose, species, rng.random_range(0.7..1.4), rng);
     }
     for _ in 0..rng.random_range(1..=3) {
-        let pose = spot(rng);
-        let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
-        site.try_place(
-            &[foot.cuboid(
-                SolidKind::StreetFurniture,
-                [0.0, 0.0, -0.1],
-                [1.8, 0.6, 0.9],
-                0.4,
-            )],
-            0.1,
-            true,
-        );
+        let foot = site.foot(spot(rng));
+        let bench = foot.standing(SolidKind::StreetFurniture, -0.1, [1.8, 0.6, 0.9], 0.4);
+        site.try_place(&[bench], 0.1, true);
     }
     if rng.random_bool(0.4) {
-        let pose = lot.foot.pose;
-        let monument = monument(
-            PartFootprint::new(pose, site.ground_m([pose.x, pose.y])),
-            rng,
-        );
+        let monument = monument(site.foot(lot.foot.pose), rng);
         site.try_place(&monument, 0.2, true);
     }
-    site.take(
-        &lots::outline(&lot),
-        [lot.foot.z_m - 1.0, lot.foot.z_m + LOT_HEIGHT_M],
-    );
+    let low = lot.foot.z_m;
+    site.take(&lots::outline(&lot), [low - 1.0, low + LOT_HEIGHT_M]);
     Some(s + width)
 }
 
 /// A monument, as a landmark.
 pub(super) fn monument(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let base = rng.random_range(1.6..3.2);
-    let mut parts = vec![foot.cuboid(
-        SolidKind::StreetFurniture,
-        [0.0, 0.0, -0.3],
-        [base, base, 1.0],
-        0.5,
-    )];
+    let kind = SolidKind::StreetFurniture;
+    let mut parts = vec![foot.standing(kind, -0.3, [base, base, 1.0], 0.5)];
     match rng.random_range(0..3) {
-        0 => parts.push(foot.cylinder(
-            SolidKind::StreetFurniture,
-            [0.0, 0.0, 0.7],
-            [0.35, rng.random_range(3.0..7.0)],
-            0.5,
-        )),
+        0 => parts.push(foot.post(kind, 0.7, [0.35, rng.random_range(3.0..7.0)], 0.5)),
         1 => {
             for step in 0..3 {
                 let side = base * (0.7 - 0.2 * f64::from(step));
-                let at = [0.0, 0.0, 0.7 + 1.2 * f64::from(step)];
-                parts.push(foot.cuboid(SolidKind::StreetFurniture, at, [side, side, 1.2], 0.5));
+                let lift = 0.7 + 1.2 * f64::from(step);
+                parts.push(foot.standing(kind, lift, [side, side, 1.2], 0.5));
             }
         }
-        _ => parts.push(foot.ellipsoid(
-            SolidKind::StreetFurniture,
-            [0.0, 0.0, 2.0],
-            [0.8, 0.8, 1.4],
-            0.5,
-        )),
+        _ => parts.push(foot.ellipsoid(kind, [0.0, 0.0, 2.0], [0.8, 0.8, 1.4], 0.5)),
     }
     parts
 }
@@ -354,21 +239,14 @@ fn fence(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> f64 {
     let hedge = rng.random_bool(0.4);
     let mut at = s;
     while at < (s + length).min(side.length_m) {
-        let [a, b] = [at, at + 5.0].map(|s| side.beyond_paved(site.surface, site.network, s, out));
-        let ground = site.ground_m([a.x, a.y]).min(site.ground_m([b.x, b.y]));
-        let (kind, thickness) = if hedge {
-            (SolidKind::Hedge, 0.8)
-        } else {
-            (SolidKind::Fence, 0.08)
+        let [a, b] = [at, at + 5.0].map(|s| side.beyond_paved(site, s, out));
+        let [a, b] = [a, b].map(|pose| [pose.x, pose.y]);
+        let ground = site.ground_m(a).min(site.ground_m(b));
+        let z = [ground - 0.3, ground + height];
+        let piece = match hedge {
+            true => wall(SolidKind::Hedge, a, b, z, 0.8, 0.3),
+            false => wall(SolidKind::Fence, a, b, z, 0.08, 0.3),
         };
-        let piece = wall(
-            kind,
-            [a.x, a.y],
-            [b.x, b.y],
-            [ground - 0.3, ground + height],
-            thickness,
-            0.3,
-        );
         site.try_place(&[piece], 0.0, true);
         at += 5.0;
     }

@@ -1,12 +1,14 @@
 //! Lamp posts, traffic lights, signs and the small things on pavements.
 
+use std::ops::Range;
+
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
 use super::super::road::{Road, RoadLink};
 use super::super::{Solid, SolidKind};
-use super::frontage::{Side, Zone, cut_at, sides};
+use super::frontage::{Side, Zone, sides};
 use super::parts::PartFootprint;
 use super::site::Site;
 
@@ -43,8 +45,12 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
         let road = &site.network.roads[index];
         for signal in &road.signals {
             lights |= signal.dynamic;
-            let pose = beside_line(road, signal.s_m, signal.t_m, signal.heading_rad);
-            let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
+            let foot = site.foot(beside_line(
+                road,
+                signal.s_m,
+                signal.t_m,
+                signal.heading_rad,
+            ));
             let parts = if signal.dynamic {
                 light(foot)
             } else {
@@ -53,8 +59,12 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
             beside_carriageway(site, &parts, signal.t_m);
         }
         for object in road.objects.iter().filter(|object| is_sign(&object.label)) {
-            let pose = beside_line(road, object.s_m, object.t_m, object.heading_rad);
-            let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
+            let foot = site.foot(beside_line(
+                road,
+                object.s_m,
+                object.t_m,
+                object.heading_rad,
+            ));
             let parts = sign(foot, rng);
             beside_carriageway(site, &parts, object.t_m);
         }
@@ -71,18 +81,13 @@ fn beside_line(road: &Road, s_m: f64, t_m: f64, heading_rad: f64) -> Pose2 {
 /// Places parts, or the same a little farther out where the map has them on the carriageway.
 fn beside_carriageway(site: &mut Site, parts: &[Solid], t_m: f64) {
     for shift in [0.0, 0.4, 0.8, 1.4, 2.2, 3.0] {
-        let moved: Vec<Solid> = parts
-            .iter()
-            .map(|part| {
-                // Their own y axis points across the road.
-                let pose = Pose2::new(part.center_m[0], part.center_m[1], part.yaw_rad);
-                let pose = pose.moved(0.0, shift * t_m.signum(), 0.0);
-                Solid {
-                    center_m: [pose.x, pose.y, part.center_m[2]],
-                    ..*part
-                }
-            })
-            .collect();
+        let mut moved = parts.to_vec();
+        for part in &mut moved {
+            // Their own y axis points across the road.
+            let [x, y, z] = part.center_m;
+            let pose = Pose2::new(x, y, part.yaw_rad).moved(0.0, shift * t_m.signum(), 0.0);
+            part.center_m = [pose.x, pose.y, z];
+        }
         if site.try_place(&moved, 0.05, false) {
             return;
         }
@@ -99,7 +104,7 @@ fn is_sign(label: &str) -> bool {
 
 fn light(foot: PartFootprint) -> Vec<Solid> {
     vec![
-        foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.1, 4.2], 0.5),
+        foot.post(SolidKind::Pole, -0.2, [0.1, 4.2], 0.5),
         foot.cuboid(SolidKind::Sign, [-0.2, 0.0, 2.9], [0.25, 0.45, 1.2], 0.6),
     ]
 }
@@ -113,27 +118,18 @@ fn sign(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
         2 => [0.6, 1.3],
         _ => [rng.random_range(0.9..1.8), rng.random_range(0.4..0.9)],
     };
+    let post = [0.04, height + tall + 0.2];
     vec![
-        foot.cylinder(
-            SolidKind::Pole,
-            [0.06, 0.0, -0.2],
-            [0.04, height + tall + 0.2],
-            0.5,
-        ),
-        foot.cuboid(
-            SolidKind::Sign,
-            [0.0, 0.0, height],
-            [0.04, width, tall],
-            0.95,
-        ),
+        foot.cylinder(SolidKind::Pole, [0.06, 0.0, -0.2], post, 0.5),
+        foot.standing(SolidKind::Sign, height, [0.04, width, tall], 0.95),
     ]
 }
 
 fn lamps(
     site: &mut Site,
     side: &Side,
-    rhythm_m: std::ops::Range<f64>,
-    height_m: std::ops::Range<f64>,
+    rhythm_m: Range<f64>,
+    height_m: Range<f64>,
     rng: &mut ChaCha8Rng,
 ) {
     // Lamps stand on one side of a street or the other, or alternate.
@@ -144,30 +140,14 @@ fn lamps(
     let mut s = rng.random_range(2.0..rhythm);
     while s < side.length_m - 1.0 {
         let out = if side.zone == Zone::Street { 0.45 } else { 1.3 };
-        let pose = side.beyond_kerb(site.surface, site.network, s, out);
         // The arm points over the road.
-        let pose = pose.moved(0.0, 0.0, side.facing_rad());
-        let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
+        let foot = site.foot(side.facing(side.beyond_kerb(site, s, out)));
         let arm = height * 0.2;
+        let (kind, post) = (SolidKind::Pole, [POST_M + height * 0.006, height + 0.2]);
         let parts = [
-            foot.cylinder(
-                SolidKind::Pole,
-                [0.0, 0.0, -0.2],
-                [POST_M + height * 0.006, height + 0.2],
-                0.5,
-            ),
-            foot.cuboid(
-                SolidKind::Pole,
-                [arm / 2.0, 0.0, height - 0.1],
-                [arm, 0.1, 0.1],
-                0.5,
-            ),
-            foot.cuboid(
-                SolidKind::Pole,
-                [arm, 0.0, height - 0.15],
-                [0.7, 0.3, 0.15],
-                0.5,
-            ),
+            foot.post(kind, -0.2, post, 0.5),
+            foot.cuboid(kind, [arm / 2.0, 0.0, height - 0.1], [arm, 0.1, 0.1], 0.5),
+            foot.cuboid(kind, [arm, 0.0, height - 0.15], [0.7, 0.3, 0.15], 0.5),
         ];
         site.try_place(&parts, 0.05, false);
         s += rhythm * rng.random_range(0.9..1.1);
@@ -191,45 +171,31 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     if !lit || !side.is_near(site.network) {
         return;
     }
-    let pose = side.beyond_kerb(site.surface, site.network, s, 0.4);
-    let pose = if side.along { pose } else { pose.reversed() };
-    let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
+    let pose = side.beyond_kerb(site, s, 0.4);
+    let foot = site.foot(if side.along { pose } else { pose.reversed() });
     let mut parts = light(foot);
     // Some carry a second head over the lane.
     if rng.random_bool(0.3) {
-        parts[0] = foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.12, 6.6], 0.5);
+        parts[0] = foot.post(SolidKind::Pole, -0.2, [0.12, 6.6], 0.5);
         let over = if road.left_hand { -1.0 } else { 1.0 };
-        parts.push(foot.cuboid(
-            SolidKind::Pole,
-            [0.0, over * 1.7, 6.0],
-            [0.12, 3.2, 0.12],
-            0.5,
-        ));
-        parts.push(foot.cuboid(
-            SolidKind::Sign,
-            [-0.2, over * 3.0, 5.2],
-            [0.25, 0.45, 1.2],
-            0.6,
-        ));
+        let (arm, head) = ([0.0, over * 1.7, 6.0], [-0.2, over * 3.0, 5.2]);
+        parts.push(foot.cuboid(SolidKind::Pole, arm, [0.12, 3.2, 0.12], 0.5));
+        parts.push(foot.cuboid(SolidKind::Sign, head, [0.25, 0.45, 1.2], 0.6));
     }
     site.try_place(&parts, 0.02, false);
 }
 
-fn signs(site: &mut Site, side: &Side, distance_m: std::ops::Range<f64>, rng: &mut ChaCha8Rng) {
+fn signs(site: &mut Site, side: &Side, distance_m: Range<f64>, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..distance_m.end);
     while s < side.length_m - 2.0 {
         let out = if side.zone == Zone::Street {
-            rng.random_range(0.5..0.9)
+            0.5..0.9
         } else {
-            rng.random_range(0.8..1.6)
+            0.8..1.6
         };
-        let pose = side.beyond_kerb(site.surface, site.network, s, out);
-        let pose = if side.along { pose } else { pose.reversed() };
-        let parts = sign(
-            PartFootprint::new(pose, site.ground_m([pose.x, pose.y])),
-            rng,
-        );
-        site.try_place(&parts, 0.05, false);
+        let pose = side.beyond_kerb(site, s, rng.random_range(out));
+        let foot = site.foot(if side.along { pose } else { pose.reversed() });
+        site.try_place(&sign(foot, rng), 0.05, false);
         s += rng.random_range(distance_m.clone());
     }
 }
@@ -238,33 +204,23 @@ fn signs(site: &mut Site, side: &Side, distance_m: std::ops::Range<f64>, rng: &m
 fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let mut s = rng.random_range(3.0..20.0);
     while s < side.length_m - 3.0 {
-        let pavement = side.pavement_m(site.surface, s);
-        let out = if rng.random_bool(0.5) {
+        let pavement = side.pavement_m(site, s);
+        let is_at_kerb = rng.random_bool(0.5);
+        let out = if is_at_kerb {
             0.6
         } else {
             (pavement - 0.4).max(0.6)
         };
-        let pose = side.beyond_kerb(site.surface, site.network, s, out);
-        let foot = PartFootprint::new(
-            pose.moved(0.0, 0.0, side.facing_rad()),
-            site.ground_m([pose.x, pose.y]),
-        );
+        let foot = site.foot(side.facing(side.beyond_kerb(site, s, out)));
         let kind = SolidKind::StreetFurniture;
         let parts = match rng.random_range(0..12) {
-            0..=2 => vec![foot.cylinder(kind, [0.0, 0.0, -0.1], [0.25, 1.0], 0.4)],
-            3..=4 => vec![foot.cylinder(kind, [0.0, 0.0, -0.1], [0.12, 0.85], 0.7)],
-            5..=6 => vec![foot.cuboid(kind, [0.0, 0.0, -0.1], [0.45, 1.1, 1.4], 0.5)],
-            7..=8 => vec![foot.cuboid(kind, [0.0, 0.0, -0.1], [0.6, 1.8, 0.95], 0.4)],
-            9 => (0..4)
-                .map(|i| {
-                    foot.cylinder(
-                        SolidKind::Pole,
-                        [0.0, 1.4 * f64::from(i), -0.1],
-                        [0.07, 1.0],
-                        0.5,
-                    )
-                })
-                .collect(),
+            0..=2 => vec![foot.post(kind, -0.1, [0.25, 1.0], 0.4)],
+            3..=4 => vec![foot.post(kind, -0.1, [0.12, 0.85], 0.7)],
+            5..=6 => vec![foot.standing(kind, -0.1, [0.45, 1.1, 1.4], 0.5)],
+            7..=8 => vec![foot.standing(kind, -0.1, [0.6, 1.8, 0.95], 0.4)],
+            9 => [0.0, 1.0, 2.0, 3.0]
+                .map(|i| foot.cylinder(SolidKind::Pole, [0.0, 1.4 * i, -0.1], [0.07, 1.0], 0.5))
+                .to_vec(),
             10 => shelter(site, side, s, rng),
             _ => kiosk(site, side, s, pavement, rng),
         };
@@ -275,48 +231,28 @@ fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
 
 /// A bus shelter: back, one side and roof.
 fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
-    let pavement = cut_at(site.surface, side.road, s);
-    let depth = side.pavement_m(site.surface, pavement.s_m).clamp(1.2, 1.7);
-    let pose = side.beyond_kerb(site.surface, site.network, s, 0.5 + depth / 2.0);
-    let foot = PartFootprint::new(
-        pose.moved(0.0, 0.0, side.facing_rad()),
-        site.ground_m([pose.x, pose.y]),
-    );
+    let cut = site.cut_at(side.road, s);
+    let depth = side.pavement_m(site, cut.s_m).clamp(1.2, 1.7);
+    let foot = site.foot(side.facing(side.beyond_kerb(site, s, 0.5 + depth / 2.0)));
     let length = rng.random_range(3.0..4.6);
     let kind = SolidKind::StreetFurniture;
+    let back = [-depth / 2.0 + 0.05, 0.0, -0.1];
+    let end = [0.0, length / 2.0 - 0.05, -0.1];
+    let bench = [-depth / 2.0 + 0.35, 0.0, -0.1];
     vec![
-        foot.cuboid(
-            kind,
-            [-depth / 2.0 + 0.05, 0.0, -0.1],
-            [0.08, length, 2.5],
-            0.3,
-        ),
-        foot.cuboid(
-            kind,
-            [0.0, length / 2.0 - 0.05, -0.1],
-            [depth, 0.08, 2.5],
-            0.3,
-        ),
-        foot.cuboid(kind, [0.0, 0.0, 2.4], [depth, length, 0.15], 0.4),
-        foot.cuboid(
-            kind,
-            [-depth / 2.0 + 0.35, 0.0, -0.1],
-            [0.4, length * 0.7, 0.6],
-            0.4,
-        ),
+        foot.cuboid(kind, back, [0.08, length, 2.5], 0.3),
+        foot.cuboid(kind, end, [depth, 0.08, 2.5], 0.3),
+        foot.standing(kind, 2.4, [depth, length, 0.15], 0.4),
+        foot.cuboid(kind, bench, [0.4, length * 0.7, 0.6], 0.4),
     ]
 }
 
 fn kiosk(site: &Site, side: &Side, s: f64, pavement: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
-    let pose = side.beyond_kerb(site.surface, site.network, s, pavement + 1.3);
-    let foot = PartFootprint::new(
-        pose.moved(0.0, 0.0, side.facing_rad()),
-        site.ground_m([pose.x, pose.y]),
-    );
+    let foot = site.foot(side.facing(side.beyond_kerb(site, s, pavement + 1.3)));
     let kind = SolidKind::StreetFurniture;
     let width = rng.random_range(2.2..3.6);
     vec![
-        foot.cuboid(kind, [0.0, 0.0, -0.3], [2.0, width, 2.8], 0.5),
+        foot.standing(kind, -0.3, [2.0, width, 2.8], 0.5),
         foot.cuboid(kind, [0.2, 0.0, 2.5], [2.5, width + 0.4, 0.2], 0.5),
     ]
 }

@@ -1,12 +1,13 @@
 //! Ground plan of a scene: outlines that are occupied, and solids that have been placed.
 
 pub(super) use super::super::clearance::outline;
-use super::super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
+use super::super::convex::{CellIndex, Rectangle, bounds, overlap};
 use super::super::curve::Pose2;
 use super::super::ground::Ground;
 use super::super::road::RoadNetwork;
-use super::super::surface::Surface;
+use super::super::surface::{CrossSection, Surface};
 use super::super::{ParkingSpot, Solid};
+use super::parts::PartFootprint;
 
 /// Height over a road that stays free, metres.
 pub(super) const HEADROOM_M: f64 = 4.7;
@@ -29,7 +30,6 @@ pub(super) struct Site<'a> {
 
 impl<'a> Site<'a> {
     pub(super) fn new(network: &'a RoadNetwork, surface: &'a Surface, ground: &'a Ground) -> Self {
-        let index = CellIndex::new(surface.bounds_m, CELL_M);
         let mut site = Self {
             network,
             surface,
@@ -37,7 +37,7 @@ impl<'a> Site<'a> {
             solids: Vec::new(),
             parking: Vec::new(),
             taken: Vec::new(),
-            index,
+            index: CellIndex::new(surface.bounds_m, CELL_M),
         };
         for junction in 0..network.junctions.len() {
             site.keep_junction_free(junction);
@@ -83,19 +83,25 @@ impl<'a> Site<'a> {
 
     /// Lowest and highest terrain under the corners and the middle of a rectangle, metres.
     pub(super) fn ground_range_m(&self, rectangle: &Rectangle) -> [f64; 2] {
-        let corners: Quad = rectangle.corners();
+        let corners = rectangle.corners().into_iter();
         let heights = corners
-            .iter()
-            .chain(std::iter::once(&rectangle.center_m))
-            .map(|&corner| self.ground_m(corner));
+            .chain([rectangle.center_m])
+            .map(|place| self.ground_m(place));
         heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| {
             [low.min(z), high.max(z)]
         })
     }
 
-    /// A pose on the terrain as position.
-    pub(super) fn on_ground(&self, pose: Pose2) -> [f64; 3] {
-        [pose.x, pose.y, self.ground_m([pose.x, pose.y])]
+    /// The foot of parts that stand on the terrain.
+    pub(super) fn foot(&self, pose: Pose2) -> PartFootprint {
+        PartFootprint::new(pose, self.ground_m([pose.x, pose.y]))
+    }
+
+    /// The cross-section of a road nearest to `s_m`, at or before it.
+    pub(super) fn cut_at(&self, road: usize, s_m: f64) -> &'a CrossSection {
+        let cuts = &self.surface.roads[road];
+        let after = cuts.partition_point(|cut| cut.s_m <= s_m);
+        &cuts[after.saturating_sub(1)]
     }
 
     fn is_taken(&self, outline: &[[f64; 2]], [bottom_m, top_m]: [f64; 2]) -> bool {
@@ -113,13 +119,9 @@ impl<'a> Site<'a> {
     /// Reserves the hull of a junction's lanes, so that nothing is placed between them.
     fn keep_junction_free(&mut self, junction: usize) {
         let inside = |road: u32| self.network.roads[road as usize].junction == Some(junction);
-        let patches = self
-            .surface
-            .patches
-            .iter()
-            .filter(|patch| patch.carriageway && inside(patch.road));
         let (mut points, mut z_m) = (Vec::new(), [f64::INFINITY, f64::NEG_INFINITY]);
-        for patch in patches {
+        let patches = self.surface.patches.iter();
+        for patch in patches.filter(|patch| patch.carriageway && inside(patch.road)) {
             points.extend(patch.quad);
             z_m = [
                 z_m[0].min(patch.z_m[0]).min(patch.z_m[3]),

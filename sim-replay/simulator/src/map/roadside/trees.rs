@@ -38,12 +38,7 @@ pub(super) fn tree(
 ) -> Vec<Solid> {
     let leaves = rng.random_range(0.2..0.45);
     let trunk = |radius_m: f64, height_m: f64| {
-        foot.cylinder(
-            SolidKind::TreeTrunk,
-            [0.0, 0.0, -0.3],
-            [radius_m, height_m + 0.3],
-            0.25,
-        )
+        foot.post(SolidKind::TreeTrunk, -0.3, [radius_m, height_m + 0.3], 0.25)
     };
     let crown =
         |at: [f64; 3], radii: [f64; 3]| foot.ellipsoid(SolidKind::TreeCrown, at, radii, leaves);
@@ -73,10 +68,8 @@ pub(super) fn tree(
             let radius = height * rng.random_range(0.13..0.2);
             let mut parts = vec![trunk(0.16 * size, height * 0.5)];
             for (level, share) in [(0.28, 1.0), (0.52, 0.72), (0.76, 0.42)] {
-                parts.push(crown(
-                    [0.0, 0.0, level * height],
-                    [radius * share, radius * share, 0.22 * height],
-                ));
+                let radii = [radius * share, radius * share, 0.22 * height];
+                parts.push(crown([0.0, 0.0, level * height], radii));
             }
             parts
         }
@@ -91,12 +84,8 @@ pub(super) fn tree(
         Species::Bush => {
             let radius = rng.random_range(0.5..1.1) * size;
             let height = rng.random_range(0.5..1.0) * size;
-            vec![foot.ellipsoid(
-                SolidKind::Hedge,
-                [0.0, 0.0, height * 0.7],
-                [radius, radius * 0.9, height],
-                leaves,
-            )]
+            let (at, radii) = ([0.0, 0.0, height * 0.7], [radius, radius * 0.9, height]);
+            vec![foot.ellipsoid(SolidKind::Hedge, at, radii, leaves)]
         }
     }
 }
@@ -109,8 +98,7 @@ pub(super) fn plant(
     size: f64,
     rng: &mut ChaCha8Rng,
 ) -> bool {
-    let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
-    let parts = tree(foot, species, size, rng);
+    let parts = tree(site.foot(pose), species, size, rng);
     // Crowns may touch; the trunk keeps its distance from walls and poles by the crown around it.
     site.try_place(&parts, 0.0, false)
 }
@@ -119,7 +107,7 @@ pub(super) fn plant(
 pub(super) fn place_along_streets(site: &mut Site, rng: &mut ChaCha8Rng) {
     for side in sides(site.network) {
         if side.zone != Zone::Street
-            || side.pavement_m(site.surface, side.length_m / 2.0) < 2.2
+            || side.pavement_m(site, side.length_m / 2.0) < 2.2
             || rng.random_bool(0.35)
         {
             continue;
@@ -133,15 +121,9 @@ pub(super) fn place_along_streets(site: &mut Site, rng: &mut ChaCha8Rng) {
         let mut s = rng.random_range(4.0..14.0);
         while s < side.length_m - 4.0 {
             if rng.random_bool(0.85) {
-                let pose =
-                    side.beyond_kerb(site.surface, site.network, s, rng.random_range(0.7..1.0));
-                plant(
-                    site,
-                    pose,
-                    species,
-                    size * rng.random_range(0.85..1.15),
-                    rng,
-                );
+                let pose = side.beyond_kerb(site, s, rng.random_range(0.7..1.0));
+                let size = size * rng.random_range(0.85..1.15);
+                plant(site, pose, species, size, rng);
             }
             s += rhythm * rng.random_range(0.8..1.25);
         }
