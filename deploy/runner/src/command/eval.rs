@@ -22,6 +22,7 @@ use runner::experiment::evaluation::{OpenedData, Trial, evaluate};
 use runner::experiment::report;
 use runner::experiment::spec::Experiment;
 use runner::experiment::table::{self, TableObserver};
+use support::file_error::FileError;
 use support::{output, progress};
 use training::feature_store::KeptMaps;
 
@@ -326,8 +327,8 @@ fn bad(error: FieldError) -> BadInput {
 fn tables(file: &Path, out: &Path, slices: &SliceArgs) -> anyhow::Result<Outcome> {
     let experiment = Experiment::read(file).map_err(BadInput::of)?;
     let Some(last) = experiment.tables.last() else {
-        let reason = format!("{}: tables is left out", file.display());
-        return Err(BadInput::new(reason).into());
+        let problem = "this is an experiment: v2vloc sweep FILE";
+        return Err(BadInput::of(FileError::new(file, problem)).into());
     };
     let (name, folder) = (file.to_string_lossy(), out.to_string_lossy());
     let command = ["v2vloc", "eval", "--table", &*name, "--out", &*folder];

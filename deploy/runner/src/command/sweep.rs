@@ -4,8 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use figures::FigureError;
-use runner::experiment::spec::Experiment;
-use runner::experiment::sweep::{Sweep, SweepOptions, WorkerError};
+use runner::experiment::sweep::{self, Sweep, SweepOptions, WorkerError};
 use support::output;
 
 use super::left_out;
@@ -42,9 +41,7 @@ impl Arguments {
     /// Runs the experiment and prints its table.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         tch::set_num_threads(1);
-        let name = Experiment::read(&self.experiment)
-            .map_err(BadInput::of)?
-            .name;
+        let name = sweep::read(&self.experiment).map_err(BadInput::of)?.name;
         let out = self
             .out
             .unwrap_or_else(|| PathBuf::from("sweeps").join(&name));

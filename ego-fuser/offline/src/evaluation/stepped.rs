@@ -14,7 +14,7 @@ use std::time::Duration;
 use dataset::frame::Frame;
 use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
-use protocol::{CavId, Detections, PoseEstimate, RateChoice, StageTiming, Stream};
+use protocol::{CavId, Detections, PoseEstimate, StageTiming};
 
 pub use compute::ComputeTimes;
 pub use remote::{RemoteError, RemotePool};
@@ -23,7 +23,7 @@ use super::participant::Participant;
 use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator};
-use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
+use delayed_delivery::{DelayedDelivery, Envelope};
 use ego_fuser::capture_clock::SweepTime;
 use ego_fuser::ego_loop::{EgoLoop, Input, Message, Output, Reception};
 use fusion::method::Exchange;
@@ -80,7 +80,7 @@ struct Run<'a> {
     computed: VecDeque<Option<Computed>>,
     delivery: DelayedDelivery,
     /// Messages that arrive after the last decision, in order of time.
-    arriving: VecDeque<Arrived>,
+    arriving: VecDeque<Envelope>,
     /// The own agent's messages that arrive after the last decision.
     own: VecDeque<Message>,
     ego_loop: EgoLoop,
@@ -112,9 +112,9 @@ impl<'a> Run<'a> {
         let end = begin.saturating_add(setup.frames.unwrap_or(usize::MAX));
         let began_nanos = { scenario.ticks.get(begin) }.map_or(0, |tick| tick.capture_nanos);
         let ego = &scenario.agents[ego_place];
-        let delivery = DelayedDelivery::new(setup.emulator(scenario)?, ego, began_nanos);
-        let options = setup.loop_options(scenario);
-        let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, options);
+        let mut ego_loop = EgoLoop::new(ego, &evaluator.ego, setup.loop_options(scenario));
+        let (link, stream) = (setup.emulator(scenario)?, ego_loop.stream());
+        let delivery = DelayedDelivery::new(link, ego, stream, began_nanos);
         // An ego-only method needs no messages of others.
         if evaluator.ego.method().exchange() != Exchange::Nothing {
             for &place in &places[1..] {
@@ -183,7 +183,7 @@ impl<'a> Run<'a> {
                 failure = self.send_own(tick, sent, own_sweep)?;
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 let distance_m = distance_m(&frames[0], &frames[place]);
-                enqueue(&mut self.delivery, &self.compute, tick, sent, distance_m);
+                self.delivery.enqueue(tick, sent, &self.compute, distance_m);
             }
         }
         let blind = LoadOptions {
@@ -291,7 +291,7 @@ impl<'a> Run<'a> {
                 self.own
                     .front()
                     .map(|message| message.reception.arrived_nanos),
-                self.arriving.front().map(|arrived| arrived.nanos),
+                self.arriving.front().map(Envelope::arrived_nanos),
                 self.ego_loop.wakes_nanos(),
             ];
             let next = moments.into_iter().flatten().min().unwrap_or(u64::MAX);
@@ -319,7 +319,7 @@ impl<'a> Run<'a> {
                 .own
                 .front()
                 .map(|message| message.reception.arrived_nanos);
-            let other_nanos = self.arriving.front().map(|arrived| arrived.nanos);
+            let other_nanos = self.arriving.front().map(Envelope::arrived_nanos);
             let is_own_first = own_nanos.is_some_and(|own| other_nanos.is_none_or(|it| own <= it));
             let next_nanos = own_nanos.into_iter().chain(other_nanos).min();
             if next_nanos.is_none_or(|next| next > now_nanos) {
@@ -337,17 +337,10 @@ impl<'a> Run<'a> {
     }
 
     /// Hands a neighbour's message to the ego, and before it the arrival of its sweep.
-    fn take_in(&mut self, arrived: Arrived, now_nanos: u64) -> Result<(), EvaluateError> {
-        let Arrived { nanos, envelope } = arrived;
-        let cav = envelope.view.cav.clone();
-        self.handle(Input::Sweeps(cav, vec![envelope.sweep]), now_nanos)?;
-        let message = Message {
-            reception: exact_reception(&envelope.view.cav, nanos),
-            view: envelope.view,
-            sequence: 0,
-            payload_bytes: envelope.payload_bytes,
-            wire_bytes: envelope.wire_bytes,
-        };
+    fn take_in(&mut self, arrived: Envelope, now_nanos: u64) -> Result<(), EvaluateError> {
+        let Envelope { message, sweep } = arrived;
+        let cav = message.view.cav.clone();
+        self.handle(Input::Sweeps(cav, vec![sweep]), now_nanos)?;
         self.handle(Input::Message(Box::new(message)), now_nanos)
     }
 
@@ -445,7 +438,7 @@ impl<'a> Run<'a> {
             return Ok(());
         }
         while let Some(arrived) = self.arriving.pop_front() {
-            let nanos = arrived.nanos.max(self.ego_free_nanos);
+            let nanos = arrived.arrived_nanos().max(self.ego_free_nanos);
             self.take_in(arrived, nanos)?;
         }
         for &place in &self.places[1..] {
@@ -466,43 +459,6 @@ fn exact_reception(cav: &CavId, arrived_nanos: u64) -> Reception {
         arrived_nanos,
         transport: None,
         clock_offset_s: None,
-    }
-}
-
-/// Hands over a neighbour's messages for a tick: its pose as soon as it is known, the rest when it is computed.
-fn enqueue(
-    delivery: &mut DelayedDelivery,
-    compute: &ComputeTimes,
-    tick: usize,
-    sent: Sent,
-    distance_m: f64,
-) {
-    let sequence = tick as u64;
-    let pose_nanos = sent.capture_nanos.saturating_add(compute.pose_nanos());
-    let (cav, pose_bytes) = (sent.cav.clone(), sent.pose_bytes);
-    delivery.enqueue_pose(&cav, sequence, pose_bytes, pose_nanos, distance_m);
-    let (payload_bytes, wire_bytes) = (sent.payload_bytes, sent.wire_bytes);
-    let sent_nanos = sent.capture_nanos.saturating_add(compute.agent_nanos());
-    let stream = match sent.content.as_ref().map(ego_fuser::ego::Content::exchange) {
-        Some(Exchange::Boxes) => Stream::Boxes,
-        Some(Exchange::Points) => Stream::Points,
-        _ => Stream::Bev,
-    };
-    if let Some(RateChoice { reason, .. }) = sent.rate {
-        delivery.adapted(&cav, stream, reason);
-    }
-    if let Some(view) = sent.into_view() {
-        let envelope = Envelope {
-            sweep: SweepTime {
-                capture_nanos: view.capture_nanos,
-                arrived_nanos: view.capture_nanos,
-            },
-            view,
-            payload_bytes,
-            wire_bytes,
-        };
-        let bytes = wire_bytes - pose_bytes;
-        delivery.enqueue(stream, sequence, bytes, sent_nanos, distance_m, envelope);
     }
 }
 

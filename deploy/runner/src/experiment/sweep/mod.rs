@@ -403,13 +403,16 @@ impl Sweep {
     }
 }
 
-/// An experiment with a grid.
-fn read(file: &Path) -> Result<Experiment, FileError> {
+/// Reads an experiment with a grid.
+///
+/// # Errors
+/// As [`Experiment::read`]; also for a file of tables.
+pub fn read(file: &Path) -> Result<Experiment, FileError> {
     let experiment = Experiment::read(file)?;
     match experiment.tables[..] {
         [] => Ok(experiment),
         _ => {
-            let problem = "tables are filled by `v2vloc eval --table`: a sweep has a grid";
+            let problem = "this is a file of tables: v2vloc eval --table FILE --out DIR";
             Err(FileError::new(file, problem))
         }
     }

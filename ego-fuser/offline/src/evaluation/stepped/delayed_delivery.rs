@@ -5,27 +5,28 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use bus::process_id;
 use link::{Delivery, LinkEmulator, Outcome, Packet};
-use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateReason, Role, Stream, Topic};
+use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateChoice, Role, Stream, Topic};
 
 use ego_fuser::capture_clock::SweepTime;
-use ego_fuser::ego::View;
+use ego_fuser::ego_loop::Message;
+
+use super::super::sent::Sent;
+use super::{ComputeTimes, exact_reception};
 
 /// A neighbour's message for the ego.
 #[derive(Debug, Clone)]
 pub(super) struct Envelope {
-    pub(super) view: View,
+    /// The arrival is known once it has arrived.
+    pub(super) message: Message,
     /// Its sweep, which arrives at the agent at its capture.
     pub(super) sweep: SweepTime,
-    pub(super) payload_bytes: u64,
-    /// Headers and the pose message included.
-    pub(super) wire_bytes: u64,
 }
 
-/// A message that has arrived.
-pub(super) struct Arrived {
+impl Envelope {
     /// Arrival on the scene's clock, nanoseconds.
-    pub(super) nanos: u64,
-    pub(super) envelope: Envelope,
+    pub(super) fn arrived_nanos(&self) -> u64 {
+        self.message.reception.arrived_nanos
+    }
 }
 
 /// A message that was handed over; of a pose only the size is needed.
@@ -53,7 +54,8 @@ pub(super) struct DelayedDelivery {
 }
 
 impl DelayedDelivery {
-    pub(super) fn new(link: LinkEmulator, ego: &CavId, began_nanos: u64) -> Self {
+    /// Delivery of poses and the messages of a stream, from `began_nanos` on.
+    pub(super) fn new(link: LinkEmulator, ego: &CavId, stream: Stream, began_nanos: u64) -> Self {
         Self {
             link,
             receiver: process_id(Role::Ego, ego),
@@ -62,81 +64,74 @@ impl DelayedDelivery {
             pending: BTreeMap::new(),
             kept: BTreeMap::new(),
             next_id: 0,
-            stream: Stream::Bev,
+            stream,
             ledger: Ledger::default(),
             sent_bytes: 0,
         }
     }
 
-    /// Hands over a pose that will be sent at `nanos`.
-    pub(super) fn enqueue_pose(
-        &mut self,
-        from: &CavId,
-        sequence: u64,
-        bytes: u64,
-        nanos: u64,
-        distance_m: f64,
-    ) {
-        self.hand_over(from, Stream::Pose, sequence, bytes, nanos, distance_m, None);
-    }
-
-    /// Hands over a message that will be sent at `nanos`.
+    /// Hands over a neighbour's messages for a tick: its pose as soon as it is known, the rest when it is computed.
     pub(super) fn enqueue(
         &mut self,
-        stream: Stream,
-        sequence: u64,
-        bytes: u64,
-        nanos: u64,
+        tick: usize,
+        sent: Sent,
+        compute: &ComputeTimes,
         distance_m: f64,
-        mut envelope: Envelope,
     ) {
-        self.stream = stream;
-        let clock = self.link.clock();
-        envelope.view.capture_nanos =
-            clock.shown_since(self.began_nanos, envelope.view.capture_nanos);
-        envelope.sweep.capture_nanos = envelope.view.capture_nanos;
-        let from = envelope.view.cav.clone();
-        let envelope = Some(envelope);
-        self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, envelope);
-    }
-
-    /// Counts a map that the rate control has adapted.
-    pub(super) fn adapted(&mut self, from: &CavId, stream: Stream, reason: RateReason) {
-        self.ledger
-            .adapted(&Account::published(topic(from, stream)), reason);
-    }
-
-    #[expect(clippy::too_many_arguments, reason = "the fields of a packet")]
-    fn hand_over(
-        &mut self,
-        from: &CavId,
-        stream: Stream,
-        sequence: u64,
-        bytes: u64,
-        nanos: u64,
-        distance_m: f64,
-        envelope: Option<Envelope>,
-    ) {
-        let id = self.next_id;
-        self.next_id += 1;
-        let topic = topic(from, stream);
-        self.kept.insert(id, Kept { topic, envelope });
-        let submitted_nanos = nanos.saturating_sub(self.began_nanos);
-        let packet = Packet {
-            id,
-            from: from.clone(),
+        let pose = Packet {
+            id: 0,
+            from: sent.cav.clone(),
             to: self.ego.clone(),
-            stream,
-            sequence,
-            bytes,
-            submitted_nanos,
+            stream: Stream::Pose,
+            sequence: tick as u64,
+            bytes: sent.pose_bytes,
+            submitted_nanos: sent.capture_nanos.saturating_add(compute.pose_nanos()),
             distance_m,
         };
-        self.pending.insert((submitted_nanos, id), packet);
+        let content = Packet {
+            stream: self.stream,
+            bytes: sent.wire_bytes.saturating_sub(sent.pose_bytes),
+            submitted_nanos: sent.capture_nanos.saturating_add(compute.agent_nanos()),
+            ..pose.clone()
+        };
+        self.hand_over(pose, None);
+        if let Some(RateChoice { reason, .. }) = sent.rate {
+            let topic = topic(&sent.cav, self.stream);
+            self.ledger.adapted(&Account::published(topic), reason);
+        }
+        let (captured_nanos, payload_bytes) = (sent.capture_nanos, sent.payload_bytes);
+        let wire_bytes = sent.wire_bytes;
+        let Some(mut view) = sent.into_view() else {
+            return;
+        };
+        let clock = self.link.clock();
+        view.capture_nanos = clock.shown_since(self.began_nanos, captured_nanos);
+        let sweep = SweepTime {
+            capture_nanos: view.capture_nanos,
+            arrived_nanos: captured_nanos,
+        };
+        let message = Message {
+            reception: exact_reception(&view.cav, 0),
+            view,
+            sequence: 0,
+            payload_bytes,
+            wire_bytes,
+        };
+        self.hand_over(content, Some(Envelope { message, sweep }));
+    }
+
+    fn hand_over(&mut self, mut packet: Packet, envelope: Option<Envelope>) {
+        packet.id = self.next_id;
+        packet.submitted_nanos = packet.submitted_nanos.saturating_sub(self.began_nanos);
+        self.next_id += 1;
+        let topic = topic(&packet.from, packet.stream);
+        self.kept.insert(packet.id, Kept { topic, envelope });
+        self.pending
+            .insert((packet.submitted_nanos, packet.id), packet);
     }
 
     /// Arrivals by `nanos`, in order of time. All messages that are sent until then have been handed over.
-    pub(super) fn until(&mut self, nanos: u64) -> Vec<Arrived> {
+    pub(super) fn until(&mut self, nanos: u64) -> Vec<Envelope> {
         let nanos = nanos.saturating_sub(self.began_nanos);
         while let Some(entry) = self
             .pending
@@ -156,7 +151,7 @@ impl DelayedDelivery {
             .collect()
     }
 
-    fn settle(&mut self, outcome: Outcome) -> Option<Arrived> {
+    fn settle(&mut self, outcome: Outcome) -> Option<Envelope> {
         let packet = outcome.packet;
         let account = Account::towards(topic(&packet.from, packet.stream), &self.receiver);
         let envelope = match outcome.delivery {
@@ -180,7 +175,10 @@ impl DelayedDelivery {
             self.ledger.received(&account);
         }
         let nanos = outcome.nanos.saturating_add(self.began_nanos);
-        envelope.map(|envelope| Arrived { nanos, envelope })
+        envelope.map(|mut envelope| {
+            envelope.message.reception.arrived_nanos = nanos;
+            envelope
+        })
     }
 
     /// The ego has used a message. That of its own agent takes no link.
