@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::operate::status::RunStatus;
-use crate::report::{Comparison, RunReport};
+use crate::report::{Comparison, RunReport, TrackReport, TrackTable};
 use support::output;
 
 use support::cli::{BadInput, Outcome};
@@ -19,12 +19,17 @@ pub(crate) struct Arguments {
     /// Print report.json (a list of them for several runs) instead of tables: times in milliseconds, CPU in seconds, sizes in bytes.
     #[arg(long)]
     json: bool,
+    /// Track the objects, and print the quality of the tracks instead: AMOTA, AMOTP, MOTA, IDS, FRAG, HOTA, IDF1, a row
+    /// for each run. Takes folders of `v2vloc eval --out` too. Distances in metres.
+    #[arg(long)]
+    tracks: bool,
 }
 
 impl Arguments {
     /// Prints the report of the run, or a comparison of several.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         match self.named.as_slice() {
+            named if self.tracks => self.track(named),
             [] => self.print(None),
             [run] => self.print(Some(run.clone())),
             several => self.compare(several),
@@ -41,6 +46,22 @@ impl Arguments {
                 "run       {}, {} with {} poses, {} clock\n{report}",
                 report.run, report.method, report.pose_source, report.clock
             ))?;
+        }
+        Ok(Outcome::Done)
+    }
+
+    fn track(&self, named: &[PathBuf]) -> anyhow::Result<Outcome> {
+        let runs = match named {
+            [] => vec![None],
+            named => named.iter().cloned().map(Some).collect(),
+        };
+        let folder = |run| RunStatus::folder(run, &self.runs).map_err(BadInput::of);
+        let read = |run| TrackReport::read(&folder(run)?).map_err(BadInput::of);
+        let reports = runs.into_iter().map(read).collect::<Result<Vec<_>, _>>()?;
+        match reports.as_slice() {
+            [report] if self.json => output::line(serde_json::to_string_pretty(report)?)?,
+            reports if self.json => output::line(serde_json::to_string_pretty(reports)?)?,
+            reports => output::text(TrackTable(reports))?,
         }
         Ok(Outcome::Done)
     }

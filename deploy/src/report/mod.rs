@@ -6,6 +6,7 @@ mod comparison;
 mod pace;
 mod resources;
 mod text;
+mod tracks;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -21,6 +22,7 @@ pub use clocks::OtherClock;
 pub use comparison::Comparison;
 pub use pace::{AgentPace, Pace};
 pub use resources::{ProcessResources, StageTimes, StreamBytes};
+pub use tracks::{TrackReport, TrackTable};
 
 use crate::score::metrics::Metrics;
 use crate::score::{FrameRecord, ProcessStats};

@@ -2,10 +2,10 @@
 
 use dataset::ground_truth::GroundTruth;
 use protocol::{CavId, Pose};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// One line: the ground truth of a tick for one ego.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TruthLine {
     /// Tick of the scene, counted from 0.
     pub tick: u64,

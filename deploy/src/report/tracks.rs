@@ -1,0 +1,491 @@
+//! Quality of the tracks that the detections of a run give: `v2vloc report --tracks`.
+//!
+//! Needs `detections.jsonl` and `truth.jsonl` only: the folder of a run, or of a method of an evaluation. The tracker
+//! gets what a live one would have: detections and the ego's own pose, no truth.
+
+use std::collections::HashMap;
+use std::fmt;
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+
+use dataset::ground_truth::{GroundTruth, TrueBox};
+use protocol::{Box3d, DetectionsReport, PoseEstimate, corners_within};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use support::bounded_file;
+use support::text_table::{Side, TextTable, number};
+use tracking::metrics::{
+    MATCH_DISTANCE_M, Sequence, TrackPoint, TrackQuality, TrackedFrame, TruePoint,
+};
+use tracking::{Tracker, TrackerConfig};
+
+use super::ReportError;
+use crate::score::TruthLine;
+
+/// Longest line that is read, bytes: a result with the most boxes that a message may hold has less.
+const MAX_LINE_BYTES: u64 = 16 << 20;
+
+/// Quality of the tracks of a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct TrackReport {
+    /// Name of the folder.
+    pub run: String,
+    /// Fusion method; `None` without a result.
+    pub method: Option<String>,
+    /// Ticks of the ground truth.
+    pub ticks: usize,
+    /// Ticks with detections. In the others there are no tracks.
+    pub answered: usize,
+    /// Answered ticks without tracks, because the ego had no pose.
+    pub without_pose: usize,
+    /// Results without a line in `truth.jsonl`, which are left out.
+    pub without_truth: usize,
+    /// Detections that are left out, because a number is none.
+    pub rejected_detections: u64,
+    /// The metrics.
+    #[serde(flatten)]
+    pub quality: TrackQuality,
+}
+
+/// A line with the scenario that it is of, where there are several.
+#[derive(Deserialize)]
+struct OfScenario<T> {
+    scenario: Option<String>,
+    #[serde(flatten)]
+    line: T,
+}
+
+/// Scenario, ego and tick.
+type Key = (Option<String>, String, u64);
+
+/// Tracks of one ego in one scenario.
+struct Followed {
+    scenario: Option<String>,
+    ego: String,
+    last_nanos: u64,
+    tracker: Tracker,
+    sequence: Sequence,
+}
+
+impl TrackReport {
+    /// Tracks the detections in a folder.
+    ///
+    /// # Errors
+    /// [`ReportError`] names file and line.
+    pub fn read(folder: &Path) -> Result<Self, ReportError> {
+        let mut results: HashMap<Key, DetectionsReport> = HashMap::new();
+        let mut method = None;
+        let mut without_truth = 0;
+        for_each_line(
+            &folder.join("detections.jsonl"),
+            |line: OfScenario<DetectionsReport>| {
+                let OfScenario { scenario, line } = line;
+                let DetectionsReport {
+                    tick, ref result, ..
+                } = line;
+                method.get_or_insert_with(|| result.method.clone());
+                match tick {
+                    Some(tick) => {
+                        let key = (scenario, result.ego.to_string(), tick);
+                        results.entry(key).or_insert(line);
+                    }
+                    None => without_truth += 1,
+                }
+                Ok(())
+            },
+        )?;
+        let name = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+        let mut report = Self {
+            run: name
+                .file_name()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned(),
+            method,
+            ..Self::default()
+        };
+        let mut followed: Vec<Followed> = Vec::new();
+        for_each_line(
+            &folder.join("truth.jsonl"),
+            |OfScenario { scenario, line }| {
+                report.follow(&mut followed, scenario, &line, &mut results)
+            },
+        )?;
+        report.without_truth = without_truth + results.len();
+        report.rejected_detections = followed.iter().map(|one| one.tracker.rejected()).sum();
+        let sequences: Vec<Sequence> = followed.into_iter().map(|one| one.sequence).collect();
+        report.quality = TrackQuality::of(&sequences);
+        Ok(report)
+    }
+
+    /// Takes a tick of the ground truth, and its result.
+    fn follow(
+        &mut self,
+        followed: &mut Vec<Followed>,
+        scenario: Option<String>,
+        line: &TruthLine,
+        results: &mut HashMap<Key, DetectionsReport>,
+    ) -> Result<(), String> {
+        let ego = line.ego.to_string();
+        let key = (scenario, ego, line.tick);
+        let result = results.remove(&key);
+        let (scenario, ego, _) = key;
+        let last = followed
+            .iter()
+            .rposition(|one| (&one.scenario, &one.ego) == (&scenario, &ego));
+        // A scene that is played once more begins a new sequence.
+        let index = match last.filter(|&last| followed[last].last_nanos < line.capture_nanos) {
+            Some(last) => last,
+            None => {
+                followed.push(Followed::new(scenario, ego, &line.truth));
+                followed.len() - 1
+            }
+        };
+        let one = &mut followed[index];
+        one.last_nanos = line.capture_nanos;
+        self.ticks += 1;
+        self.answered += usize::from(result.is_some());
+        let boxes = result.map(|result| one.boxes(line.capture_nanos, &result));
+        self.without_pose += usize::from(matches!(boxes, Some(None)));
+        let tracks = boxes.flatten().unwrap_or_default();
+        let frame = frame(&line.truth, tracks);
+        one.sequence.add(frame).map_err(|error| error.to_string())
+    }
+}
+
+impl Followed {
+    fn new(scenario: Option<String>, ego: String, truth: &GroundTruth) -> Self {
+        let config = TrackerConfig {
+            area_m: truth.area_m,
+            ..TrackerConfig::default()
+        };
+        Self {
+            scenario,
+            ego,
+            last_nanos: 0,
+            tracker: Tracker::new(config),
+            sequence: Sequence::default(),
+        }
+    }
+
+    /// Tracks after a result: id, box in the ego's LiDAR frame, score; `None` if the ego had no usable pose.
+    fn boxes(
+        &mut self,
+        capture_nanos: u64,
+        report: &DetectionsReport,
+    ) -> Option<Vec<(u64, Box3d, f64)>> {
+        let PoseEstimate::Pose {
+            world_from_cav,
+            covariance,
+            ..
+        } = &report.result.pose
+        else {
+            return None;
+        };
+        let detections = &report.result.detections;
+        let tracked = { &mut self.tracker }.update(
+            capture_nanos,
+            world_from_cav,
+            covariance.as_ref(),
+            detections,
+        );
+        let tracks = tracked.ok()?;
+        let ego_from_world = world_from_cav.isometry().inverse();
+        let in_ego = tracks.iter().map(|track| {
+            let box3d = track.box3d.transformed(&ego_from_world);
+            (track.id, box3d, track.score)
+        });
+        Some(in_ego.collect())
+    }
+}
+
+/// A tick with the tracks that count, as for detections: all corners in range, and not on an object that does not count.
+fn frame(truth: &GroundTruth, tracks: Vec<(u64, Box3d, f64)>) -> TrackedFrame {
+    let objects = truth.objects.iter().map(|object| TruePoint {
+        id: object.id,
+        center_m: center_m(&object.box3d),
+    });
+    let counting = tracks.into_iter().filter(|(_, box3d, _)| {
+        let distance = |others: &[TrueBox]| {
+            let distances = others.iter().map(|other| distance_m(&other.box3d, box3d));
+            distances.fold(f64::INFINITY, f64::min)
+        };
+        let to_ignored = distance(&truth.ignored);
+        let is_on_ignored = to_ignored < MATCH_DISTANCE_M && to_ignored < distance(&truth.objects);
+        corners_within(&box3d.corners(), truth.area_m) && !is_on_ignored
+    });
+    let tracks = counting.map(|(id, box3d, score)| TrackPoint {
+        id,
+        center_m: center_m(&box3d),
+        score,
+    });
+    TrackedFrame {
+        objects: objects.collect(),
+        tracks: tracks.collect(),
+    }
+}
+
+fn center_m(box3d: &Box3d) -> [f64; 2] {
+    let [x, y, _] = box3d.center_m;
+    [x, y]
+}
+
+fn distance_m(a: &Box3d, b: &Box3d) -> f64 {
+    let ([x, y], [other_x, other_y]) = (center_m(a), center_m(b));
+    (x - other_x).hypot(y - other_y)
+}
+
+/// Reads a file of JSON lines, one at a time.
+fn for_each_line<T: DeserializeOwned>(
+    path: &Path,
+    mut take: impl FnMut(T) -> Result<(), String>,
+) -> Result<(), ReportError> {
+    let cannot_read = |source| ReportError::Read {
+        path: path.to_owned(),
+        source,
+    };
+    let mut reader = BufReader::new(bounded_file::open(path).map_err(cannot_read)?);
+    let mut line = Vec::new();
+    for index in 1.. {
+        line.clear();
+        let mut bounded = reader.by_ref().take(MAX_LINE_BYTES);
+        if bounded.read_until(b'\n', &mut line).map_err(cannot_read)? == 0 {
+            break;
+        }
+        let parsed = serde_json::from_slice(&line).map_err(|error| error.to_string());
+        parsed
+            .and_then(&mut take)
+            .map_err(|problem| ReportError::Syntax {
+                path: path.to_owned(),
+                problem: format!("line {index}: {problem}"),
+            })?;
+    }
+    Ok(())
+}
+
+/// A table with a row for each run.
+#[derive(Debug)]
+pub struct TrackTable<'a>(pub &'a [TrackReport]);
+
+impl fmt::Display for TrackTable<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let names = ["run", "method"].map(|name| (name, Side::Left));
+        let numbers = [
+            "answered", "AMOTA", "AMOTP, m", "MOTA", "MOTP, m", "recall", "IDS", "FRAG", "MT",
+            "ML", "HOTA", "DetA", "AssA", "IDF1",
+        ];
+        let numbers = numbers.map(|name| (name, Side::Right));
+        let mut table = TextTable::new(names.into_iter().chain(numbers));
+        for report in self.0 {
+            let quality = &report.quality;
+            let count = |count: Option<usize>| count.map_or("-".into(), |count| count.to_string());
+            let of_true = |count: Option<usize>| match (count, quality.true_tracks) {
+                (Some(count), Some(all)) => format!("{count}/{all}"),
+                _ => "-".into(),
+            };
+            table.row([
+                report.run.clone(),
+                report.method.clone().unwrap_or_else(|| "-".into()),
+                format!("{}/{}", report.answered, report.ticks),
+                number(quality.amota, 3),
+                number(quality.amotp_m, 2),
+                number(quality.mota, 3),
+                number(quality.motp_m, 2),
+                number(quality.recall, 3),
+                count(quality.ids),
+                count(quality.frag),
+                of_true(quality.mt),
+                of_true(quality.ml),
+                number(quality.hota, 3),
+                number(quality.det_a, 3),
+                number(quality.ass_a, 3),
+                number(quality.idf1, 3),
+            ]);
+        }
+        write!(f, "{table}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{CavId, Detection, Detections, Pose, Stamp};
+
+    use super::*;
+
+    const EGO: &str = "12";
+
+    fn car(x: f64, y: f64) -> Box3d {
+        Box3d {
+            center_m: [x, y, 0.0],
+            size_m: [4.0, 2.0, 1.5],
+            heading_rad: 0.0,
+        }
+    }
+
+    fn truth(tick: u64, objects: &[(i64, Box3d)], ignored: &[(i64, Box3d)]) -> String {
+        let boxes = |boxes: &[(i64, Box3d)]| {
+            let of_box = |(id, box3d): &(i64, Box3d)| TrueBox {
+                id: *id,
+                class: dataset::frame::ObjectClass::Car,
+                box3d: *box3d,
+            };
+            boxes.iter().map(of_box).collect()
+        };
+        let line = TruthLine {
+            tick,
+            capture_nanos: (tick + 1) * 100_000_000,
+            publish_nanos: 0,
+            ego: CavId::new(EGO).unwrap(),
+            world_from_ego: Some(Pose::IDENTITY),
+            truth: GroundTruth {
+                objects: boxes(objects),
+                ignored: boxes(ignored),
+                area_m: [-50.0, -50.0, 50.0, 50.0],
+            },
+        };
+        line.to_json()
+    }
+
+    fn result(tick: u64, pose: PoseEstimate, boxes: &[Box3d]) -> String {
+        let cav = CavId::new(EGO).unwrap();
+        let stamp = Stamp {
+            cav: cav.clone(),
+            epoch: u64::MAX,
+            sequence: tick,
+            capture_nanos: (tick + 1) * 100_000_000,
+            publish_nanos: 0,
+        };
+        let detection = |box3d: &Box3d| Detection {
+            box3d: *box3d,
+            score: 0.9,
+            source: None,
+        };
+        let result = Detections {
+            ego: cav,
+            agent_frame: tick,
+            method: "pastat".into(),
+            pose,
+            detections: boxes.iter().map(detection).collect(),
+            fused: vec![],
+            skipped: vec![],
+            neighbours: vec![],
+            stages: vec![],
+        };
+        DetectionsReport::new(&stamp, Some(tick), result).to_json()
+    }
+
+    fn posed(x: f64) -> PoseEstimate {
+        PoseEstimate::new(Pose::from_xyz_yaw([x, 0.0, 0.0], 0.0), 1.0)
+    }
+
+    fn read(truth: &[String], detections: &[String]) -> Result<TrackReport, ReportError> {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, lines) in [("truth.jsonl", truth), ("detections.jsonl", detections)] {
+            let text: String = lines.iter().map(|line| format!("{line}\n")).collect();
+            std::fs::write(folder.path().join(name), text).unwrap();
+        }
+        TrackReport::read(folder.path())
+    }
+
+    #[test]
+    fn right_detections_of_a_driving_ego_give_right_tracks() {
+        // The ego drives 1 m a tick beside a vehicle, and passes a standing one.
+        let boxes = |tick: u64| [car(5.0, 3.5), car(30.0 - tick as f64, -4.0)];
+        let truths: Vec<String> = (0..20)
+            .map(|tick| truth(tick, &[(7, boxes(tick)[0]), (9, boxes(tick)[1])], &[]))
+            .collect();
+        let results: Vec<String> = (0..20)
+            .map(|tick| result(tick, posed(tick as f64), &boxes(tick)))
+            .collect();
+        let report = read(&truths, &results).unwrap();
+        assert_eq!((report.ticks, report.answered), (20, 20));
+        assert_eq!(report.method.as_deref(), Some("pastat"));
+        let quality = &report.quality;
+        assert_eq!((quality.amota, quality.idf1), (Some(1.0), Some(1.0)));
+        assert_eq!((quality.ids, quality.mt), (Some(0), Some(2)));
+        assert!(quality.hota > Some(0.99), "{quality:?}");
+        let text = TrackTable(&[report]).to_string();
+        assert!(text.contains("pastat") && text.contains("20/20"), "{text}");
+    }
+
+    #[test]
+    fn unanswered_ticks_and_ticks_without_pose_have_no_tracks() {
+        let no_pose = PoseEstimate::NoPose {
+            reason: protocol::NoPoseReason::TooFewInliers,
+            inlier_count: 0,
+        };
+        let car = car(10.0, 0.0);
+        let truths: Vec<String> = (0..10).map(|tick| truth(tick, &[(7, car)], &[])).collect();
+        let results: Vec<String> = (0..9)
+            .map(|tick| result(tick, if tick == 4 { no_pose } else { posed(0.0) }, &[car]))
+            .chain([result(99, posed(0.0), &[car])])
+            .collect();
+        let report = read(&truths, &results).unwrap();
+        let TrackReport {
+            ticks,
+            answered,
+            without_pose,
+            without_truth,
+            quality,
+            ..
+        } = report;
+        assert_eq!(
+            (ticks, answered, without_pose, without_truth),
+            (10, 9, 1, 1)
+        );
+        assert_eq!(
+            (quality.recall, quality.frag, quality.ids),
+            (Some(0.8), Some(1), Some(0))
+        );
+    }
+
+    #[test]
+    fn tracks_beyond_the_range_or_on_ignored_objects_do_not_count() {
+        let (counted, ignored) = (car(10.0, 0.0), car(20.0, 0.0));
+        let seen = [counted, ignored, car(48.5, 0.0), car(-20.0, 0.0)];
+        let truths: Vec<String> = (0..10)
+            .map(|tick| truth(tick, &[(7, counted)], &[(8, ignored)]))
+            .collect();
+        let results: Vec<String> = (0..10)
+            .map(|tick| result(tick, posed(0.0), &seen))
+            .collect();
+        let report = read(&truths, &results).unwrap();
+        assert_eq!(
+            report.quality.fp,
+            Some(10),
+            "only the box without an object"
+        );
+    }
+
+    #[test]
+    fn a_scene_that_is_played_again_begins_a_new_sequence() {
+        let car = car(10.0, 0.0);
+        let again = |tick: u64| {
+            let mut line: serde_json::Value =
+                serde_json::from_str(&truth(tick, &[(7, car)], &[])).unwrap();
+            line["capture_nanos"] = ((tick % 5 + 1) * 100_000_000).into();
+            line.to_string()
+        };
+        let truths: Vec<String> = (0..10).map(again).collect();
+        let results: Vec<String> = (0..10)
+            .map(|tick| result(tick, posed(0.0), &[car]))
+            .collect();
+        let quality = read(&truths, &results).unwrap().quality;
+        assert_eq!((quality.true_tracks, quality.ids), (Some(2), Some(0)));
+    }
+
+    #[test]
+    fn a_broken_line_is_named() {
+        let line = truth(0, &[], &[]);
+        let error = read(&[line.clone(), "{".into()], &[])
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("truth.jsonl: line 2: "), "{error}");
+        let twice = truth(1, &[(7, car(0.0, 0.0)), (7, car(5.0, 0.0))], &[]);
+        let error = read(&[line, twice], &[]).unwrap_err().to_string();
+        assert!(
+            error.contains("line 2: two points of a frame have the id 7"),
+            "{error}"
+        );
+    }
+}

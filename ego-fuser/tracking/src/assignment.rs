@@ -1,0 +1,182 @@
+//! Optimal assignment: pairs rows and columns of a cost matrix with the lowest total cost.
+//!
+//! Successive shortest augmenting paths with dual prices (Jonker and Volgenant 1987): each row in turn is connected to a
+//! free column along the cheapest path of reduced costs, which stay non-negative. Cubic time in the smaller side.
+
+use nalgebra::DMatrix;
+
+/// Pairs `(row, column)` of the lowest total cost, ordered by row: as many as the shorter side has.
+///
+/// Costs that are not finite give pairs of an unspecified total, never a panic; see [`of_allowed`] for pairs that must
+/// not be made.
+#[must_use]
+pub fn of_lowest_cost(costs: &DMatrix<f64>) -> Vec<(usize, usize)> {
+    if costs.nrows() <= costs.ncols() {
+        return Solver::new(costs).solve();
+    }
+    let mut pairs: Vec<(usize, usize)> = Solver::new(&costs.transpose())
+        .solve()
+        .into_iter()
+        .map(|(column, row)| (row, column))
+        .collect();
+    pairs.sort_unstable();
+    pairs
+}
+
+/// As many allowed pairs as possible, and among these sets the one of the lowest total cost. `None` and costs that are
+/// not finite are pairs that must not be made.
+#[must_use]
+pub fn of_allowed(
+    rows: usize,
+    columns: usize,
+    cost: impl Fn(usize, usize) -> Option<f64>,
+) -> Vec<(usize, usize)> {
+    let cost = |row, column| cost(row, column).filter(|cost| cost.is_finite());
+    let largest = (0..rows)
+        .flat_map(|row| (0..columns).map(move |column| (row, column)))
+        .filter_map(|(row, column)| cost(row, column))
+        .fold(0.0_f64, |largest, cost| largest.max(cost.abs()));
+    // No saving among the other pairs makes up for one pair that is forbidden.
+    let forbidden = (largest + 1.0) * (2 * rows.min(columns) + 1) as f64;
+    let costs = DMatrix::from_fn(rows, columns, |row, column| {
+        cost(row, column).unwrap_or(forbidden)
+    });
+    let mut pairs = of_lowest_cost(&costs);
+    pairs.retain(|&(row, column)| cost(row, column).is_some());
+    pairs
+}
+
+/// State of the search over a matrix with at most as many rows as columns.
+struct Solver<'a> {
+    costs: &'a DMatrix<f64>,
+    row_price: Vec<f64>,
+    column_price: Vec<f64>,
+    row_of: Vec<Option<usize>>,
+    column_of: Vec<Option<usize>>,
+}
+
+/// Cheapest paths from a free row to the columns.
+struct Paths {
+    cost: Vec<f64>,
+    from_row: Vec<usize>,
+    is_final: Vec<bool>,
+}
+
+impl<'a> Solver<'a> {
+    fn new(costs: &'a DMatrix<f64>) -> Self {
+        let (rows, columns) = costs.shape();
+        Self {
+            costs,
+            row_price: vec![0.0; rows],
+            column_price: vec![0.0; columns],
+            row_of: vec![None; columns],
+            column_of: vec![None; rows],
+        }
+    }
+
+    fn solve(mut self) -> Vec<(usize, usize)> {
+        for row in 0..self.costs.nrows() {
+            self.connect(row);
+        }
+        let columns = self.column_of.into_iter().enumerate();
+        columns
+            .filter_map(|(row, column)| Some((row, column?)))
+            .collect()
+    }
+
+    /// Connects a free row, with other columns for other rows where that is cheaper.
+    fn connect(&mut self, free_row: usize) {
+        let columns = self.costs.ncols();
+        let mut paths = Paths {
+            cost: vec![f64::INFINITY; columns],
+            from_row: vec![free_row; columns],
+            is_final: vec![false; columns],
+        };
+        let (mut row, mut reached) = (free_row, 0.0);
+        let end = loop {
+            let Some(nearest) = self.extend(&mut paths, row, reached) else {
+                return;
+            };
+            reached = paths.cost[nearest];
+            paths.is_final[nearest] = true;
+            match self.row_of[nearest] {
+                Some(owner) => row = owner,
+                None => break nearest,
+            }
+        };
+        self.row_price[free_row] += reached;
+        for column in (0..columns).filter(|&column| paths.is_final[column]) {
+            if let Some(owner) = self.row_of[column] {
+                self.row_price[owner] += reached - paths.cost[column];
+                self.column_price[column] -= reached - paths.cost[column];
+            }
+        }
+        let mut next = Some(end);
+        while let Some(column) = next {
+            let row = paths.from_row[column];
+            self.row_of[column] = Some(row);
+            next = self.column_of[row].replace(column);
+        }
+    }
+
+    /// Extends the paths by the edges of a row that is reached at a cost; returns the cheapest column that is not final.
+    fn extend(&self, paths: &mut Paths, row: usize, reached: f64) -> Option<usize> {
+        let mut nearest = None;
+        let mut lowest = f64::INFINITY;
+        for column in 0..self.costs.ncols() {
+            if paths.is_final[column] {
+                continue;
+            }
+            let reduced =
+                self.costs[(row, column)] - self.row_price[row] - self.column_price[column];
+            if reached + reduced < paths.cost[column] {
+                paths.cost[column] = reached + reduced;
+                paths.from_row[column] = row;
+            }
+            if paths.cost[column] < lowest {
+                (nearest, lowest) = (Some(column), paths.cost[column]);
+            }
+        }
+        nearest
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_row_gives_its_column_up_where_the_total_gets_lower() {
+        let costs = DMatrix::from_row_slice(2, 2, &[1.0, 2.0, 1.0, 9.0]);
+        assert_eq!(of_lowest_cost(&costs), [(0, 1), (1, 0)]);
+        let tall = DMatrix::from_row_slice(3, 1, &[5.0, -4.0, 3.0]);
+        assert_eq!(of_lowest_cost(&tall), [(1, 0)]);
+        assert_eq!(of_lowest_cost(&DMatrix::zeros(0, 3)), []);
+        assert_eq!(of_lowest_cost(&DMatrix::zeros(2, 0)), []);
+    }
+
+    #[test]
+    fn more_pairs_come_before_lower_costs_and_forbidden_pairs_are_never_made() {
+        // Row 1 may have column 0 only.
+        let cost =
+            |row: usize, column: usize| [[Some(0.1), Some(1.9)], [Some(1.8), None]][row][column];
+        assert_eq!(of_allowed(2, 2, cost), [(0, 1), (1, 0)]);
+        assert_eq!(of_allowed(2, 2, |_, _| None), []);
+        assert_eq!(
+            of_allowed(1, 2, |_, column| [Some(f64::NAN), Some(3.0)][column]),
+            [(0, 1)]
+        );
+    }
+
+    #[test]
+    fn costs_that_are_not_finite_do_not_panic() {
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, f64::MAX] {
+            let costs = DMatrix::from_fn(
+                4,
+                5,
+                |row, column| if (row + column) % 2 == 0 { bad } else { 1.0 },
+            );
+            let _ = of_lowest_cost(&costs);
+        }
+    }
+}

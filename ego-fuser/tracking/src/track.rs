@@ -1,0 +1,153 @@
+//! Track: an object with identity, motion and a probability of existence.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use nalgebra::Vector2;
+use protocol::Box3d;
+use serde::{Deserialize, Serialize};
+
+use crate::TrackerConfig;
+use crate::kalman::{ConstantVelocity, Innovation};
+use crate::measurement::Measurement;
+
+/// Share of a new measurement in size, height and heading.
+const SMOOTHING: f64 = 0.3;
+/// Largest probability of existence: any object may vanish between two frames.
+const MAX_EXISTENCE: f64 = 0.99;
+/// Speed from which the direction of motion tells front from rear, metres per second.
+const CLEAR_MOTION_MPS: f64 = 3.0;
+
+/// A tracked object at a capture time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Track {
+    /// Identity, from 1 on; never used again by the same tracker.
+    pub id: u64,
+    /// The object in the world frame.
+    #[serde(rename = "box")]
+    pub box3d: Box3d,
+    /// Velocity x, y in the world frame, metres per second.
+    pub velocity_mps: [f64; 2],
+    /// Covariance of x, y, velocity x, velocity y, by rows: metres and metres per second.
+    pub covariance: [[f64; 4]; 4],
+    /// Mean score of its detections times the probability that the object exists, 0..=1.
+    pub score: f64,
+    /// Number of its detections.
+    pub hits: u32,
+    /// Time since its last detection, seconds; 0 if it is in this frame.
+    pub unseen_s: f64,
+}
+
+/// State of a track between frames.
+#[derive(Debug, Clone)]
+pub(crate) struct TrackState {
+    id: u64,
+    filter: ConstantVelocity,
+    z_m: f64,
+    size_m: [f64; 3],
+    heading_rad: f64,
+    existence: f64,
+    score_sum: f64,
+    hits: u32,
+    unseen_s: f64,
+}
+
+impl TrackState {
+    /// The track of a first detection.
+    pub(crate) fn new(id: u64, measured: &Measurement, config: &TrackerConfig) -> Self {
+        let position = measured.position_m();
+        Self {
+            id,
+            filter: ConstantVelocity::at(position, &measured.noise_m2, config.initial_sigma_mps),
+            z_m: measured.box3d.center_m[2],
+            size_m: measured.box3d.size_m,
+            heading_rad: measured.box3d.heading_rad,
+            existence: measured.score.min(MAX_EXISTENCE),
+            score_sum: measured.score,
+            hits: 1,
+            unseen_s: 0.0,
+        }
+    }
+
+    pub(crate) fn predict(&mut self, elapsed_s: f64, config: &TrackerConfig) {
+        self.filter.predict(elapsed_s, config.acceleration_mps2);
+        self.unseen_s += elapsed_s;
+    }
+
+    pub(crate) fn innovation(&self, measured: &Measurement) -> Option<Innovation> {
+        self.filter
+            .innovation(measured.position_m(), &measured.noise_m2)
+    }
+
+    /// Takes a detection in.
+    pub(crate) fn hit(&mut self, innovation: &Innovation, measured: &Measurement) {
+        self.filter.correct(innovation, &measured.noise_m2);
+        let smooth = |old: &mut f64, new: f64| *old += SMOOTHING * (new - *old);
+        smooth(&mut self.z_m, measured.box3d.center_m[2]);
+        for (old, new) in self.size_m.iter_mut().zip(measured.box3d.size_m) {
+            smooth(old, new);
+        }
+        self.turn(measured.box3d.heading_rad);
+        // Independent evidence: it does not exist only if both are wrong.
+        let both_wrong = (1.0 - self.existence) * (1.0 - measured.score);
+        self.existence = (1.0 - both_wrong).min(MAX_EXISTENCE);
+        self.score_sum += measured.score;
+        self.hits = self.hits.saturating_add(1);
+        self.unseen_s = 0.0;
+    }
+
+    /// Moves the heading towards a measured one. Detectors confuse front and rear: the nearer of the two counts, and the
+    /// direction of a clear motion.
+    fn turn(&mut self, measured_rad: f64) {
+        let mut difference = wrapped(measured_rad - self.heading_rad);
+        if difference.abs() > FRAC_PI_2 {
+            difference = wrapped(difference + PI);
+        }
+        self.heading_rad = wrapped(self.heading_rad + SMOOTHING * difference);
+        let (velocity, (sin, cos)) = (self.filter.velocity_mps(), self.heading_rad.sin_cos());
+        if velocity.norm() > CLEAR_MOTION_MPS && velocity.dot(&Vector2::new(cos, sin)) < 0.0 {
+            self.heading_rad = wrapped(self.heading_rad + PI);
+        }
+    }
+
+    /// No detection in a frame whose area of view holds the object.
+    pub(crate) fn miss(&mut self, config: &TrackerConfig) {
+        let missed = 1.0 - config.detection_probability;
+        self.existence *= missed / (1.0 - self.existence * config.detection_probability);
+    }
+
+    pub(crate) fn is_alive(&self, config: &TrackerConfig) -> bool {
+        self.existence >= config.death_existence && self.unseen_s <= config.max_unseen_s
+    }
+
+    pub(crate) fn is_reported(&self, config: &TrackerConfig) -> bool {
+        self.existence >= config.report_existence
+    }
+
+    pub(crate) fn box3d(&self) -> Box3d {
+        let position = self.filter.position_m();
+        Box3d {
+            center_m: [position.x, position.y, self.z_m],
+            size_m: self.size_m,
+            heading_rad: self.heading_rad,
+        }
+    }
+
+    pub(crate) fn report(&self) -> Track {
+        let covariance = self.filter.covariance;
+        Track {
+            id: self.id,
+            box3d: self.box3d(),
+            velocity_mps: self.filter.velocity_mps().into(),
+            covariance: covariance.transpose().into(),
+            score: self.existence * self.score_sum / f64::from(self.hits),
+            hits: self.hits,
+            unseen_s: self.unseen_s,
+        }
+    }
+}
+
+/// The angle within half a turn of 0, radians.
+fn wrapped(angle_rad: f64) -> f64 {
+    let turned = angle_rad.rem_euclid(TAU);
+    if turned > PI { turned - TAU } else { turned }
+}

@@ -1,0 +1,225 @@
+//! Tracker: the tracks of an ego from frame to frame.
+
+use nalgebra::{Isometry3, Point3};
+use protocol::{Detection, InvalidPose, PlanarCovariance, Pose};
+
+use crate::assignment;
+use crate::kalman::Innovation;
+use crate::measurement::Measurement;
+use crate::track::{Track, TrackState};
+
+/// Settings of a tracker.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackerConfig {
+    /// Area of view: x, y of the lower, then of the upper corner in the ego's LiDAR frame, metres. Outside it a missing
+    /// detection is no evidence against an object.
+    pub area_m: [f64; 4],
+    /// Standard deviation of a detected centre of score 1 in each direction, metres.
+    pub sigma_certain_m: f64,
+    /// The same for score 0; scores between are interpolated.
+    pub sigma_uncertain_m: f64,
+    /// Standard deviation of the acceleration of objects in each direction, metres per square second.
+    pub acceleration_mps2: f64,
+    /// Standard deviation of the velocity of a new object in each direction, metres per second.
+    pub initial_sigma_mps: f64,
+    /// Largest squared Mahalanobis distance of a detection from its track.
+    pub gate: f64,
+    /// Probability that an object in the area of view is detected in a frame.
+    pub detection_probability: f64,
+    /// New objects and false alarms per frame, per square metre.
+    pub density_per_m2: f64,
+    /// Lowest score of a detection that begins a track.
+    pub birth_score: f64,
+    /// Lowest probability of existence of a track that is reported.
+    pub report_existence: f64,
+    /// Probability of existence below which a track ends.
+    pub death_existence: f64,
+    /// Longest time without a detection, seconds.
+    pub max_unseen_s: f64,
+}
+
+impl Default for TrackerConfig {
+    fn default() -> Self {
+        Self {
+            area_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX],
+            sigma_certain_m: 0.2,
+            sigma_uncertain_m: 0.8,
+            acceleration_mps2: 4.0,
+            initial_sigma_mps: 10.0,
+            // 99.9 % of the chi-square distribution with two degrees of freedom.
+            gate: 13.816,
+            detection_probability: 0.7,
+            density_per_m2: 1e-3,
+            birth_score: 0.1,
+            report_existence: 0.3,
+            death_existence: 0.05,
+            max_unseen_s: 1.0,
+        }
+    }
+}
+
+/// Reason why a frame was not taken; the tracks are as before.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum TrackingError {
+    /// Time does not advance.
+    #[error("capture time {given_nanos} ns is not after the frame before, {previous_nanos} ns")]
+    Time {
+        /// Capture time of the last frame.
+        previous_nanos: u64,
+        /// Capture time of this frame.
+        given_nanos: u64,
+    },
+    /// The pose of the ego is none.
+    #[error("world_from_ego: {0}")]
+    Pose(#[from] InvalidPose),
+}
+
+/// Tracks of one ego.
+#[derive(Debug, Clone)]
+pub struct Tracker {
+    config: TrackerConfig,
+    tracks: Vec<TrackState>,
+    begun: u64,
+    last_nanos: Option<u64>,
+    rejected: u64,
+}
+
+impl Tracker {
+    /// A tracker without tracks.
+    #[must_use]
+    pub fn new(config: TrackerConfig) -> Self {
+        Self {
+            config,
+            tracks: Vec::new(),
+            begun: 0,
+            last_nanos: None,
+            rejected: 0,
+        }
+    }
+
+    /// Number of detections so far that were left out: a number is not finite, a size negative, or the score not within
+    /// 0..=1.
+    #[must_use]
+    pub fn rejected(&self) -> u64 {
+        self.rejected
+    }
+
+    /// Takes a frame and returns the tracks at its capture time, ordered by id.
+    ///
+    /// `world_from_ego` is the pose of the ego's LiDAR, `covariance` that of this pose in the plane of the world (`None`:
+    /// taken as 0), and `detections` are in the ego's LiDAR frame.
+    ///
+    /// # Errors
+    /// [`TrackingError`] when time does not advance, or the pose is none; nothing has changed then.
+    pub fn update(
+        &mut self,
+        capture_nanos: u64,
+        world_from_ego: &Pose,
+        covariance: Option<&PlanarCovariance>,
+        detections: &[Detection],
+    ) -> Result<Vec<Track>, TrackingError> {
+        world_from_ego.validate()?;
+        let elapsed_s = self.advance(capture_nanos)?;
+        let world_from_ego = world_from_ego.isometry();
+        let measure =
+            |detection| Measurement::new(detection, &world_from_ego, covariance, &self.config);
+        let measurements: Vec<_> = detections.iter().filter_map(measure).collect();
+        self.rejected += (detections.len() - measurements.len()) as u64;
+        for track in &mut self.tracks {
+            track.predict(elapsed_s, &self.config);
+        }
+        let owners = self.assign(&measurements);
+        self.count_misses(&owners, &world_from_ego.inverse());
+        self.tracks.retain(|track| track.is_alive(&self.config));
+        self.begin(&measurements, &owners);
+        let reported = self.tracks.iter();
+        Ok(reported
+            .filter(|track| track.is_reported(&self.config))
+            .map(TrackState::report)
+            .collect())
+    }
+
+    /// Time since the frame before, seconds; 0 for the first.
+    fn advance(&mut self, given_nanos: u64) -> Result<f64, TrackingError> {
+        let elapsed_nanos = match self.last_nanos {
+            Some(previous_nanos) if given_nanos <= previous_nanos => {
+                return Err(TrackingError::Time {
+                    previous_nanos,
+                    given_nanos,
+                });
+            }
+            Some(previous_nanos) => given_nanos - previous_nanos,
+            None => 0,
+        };
+        self.last_nanos = Some(given_nanos);
+        Ok(elapsed_nanos as f64 / 1e9)
+    }
+
+    /// Gives detections to tracks; returns the index of the track of each detection.
+    ///
+    /// The set of pairs has the highest likelihood (Blackman and Popoli 1999, Section 6.4): a pair costs its squared
+    /// distance and the logarithm of its covariance, a track without detection and a detection without track what these
+    /// are worth together.
+    fn assign(&mut self, measurements: &[Measurement]) -> Vec<Option<usize>> {
+        let innovations: Vec<Vec<Option<Innovation>>> = self
+            .tracks
+            .iter()
+            .map(|track| {
+                let innovations = measurements
+                    .iter()
+                    .map(|measured| track.innovation(measured));
+                innovations.collect()
+            })
+            .collect();
+        let found = self.config.detection_probability;
+        let unpaired = 2.0
+            * (found / (1.0 - found) / (std::f64::consts::TAU * self.config.density_per_m2)).ln();
+        let cost = |track: usize, column: usize| {
+            if column >= measurements.len() {
+                return Some(unpaired);
+            }
+            let innovation = innovations[track][column].as_ref()?;
+            let distance = innovation.mahalanobis_squared();
+            (distance <= self.config.gate).then_some(distance + innovation.log_determinant)
+        };
+        // A column for each track that stays without a detection.
+        let columns = measurements.len() + self.tracks.len();
+        let pairs = assignment::of_allowed(self.tracks.len(), columns, cost);
+        let mut owners = vec![None; measurements.len()];
+        for (track, column) in pairs {
+            let Some(measured) = measurements.get(column) else {
+                continue;
+            };
+            if let Some(innovation) = &innovations[track][column] {
+                self.tracks[track].hit(innovation, measured);
+                owners[column] = Some(track);
+            }
+        }
+        owners
+    }
+
+    fn count_misses(&mut self, owners: &[Option<usize>], ego_from_world: &Isometry3<f64>) {
+        let [x_low, y_low, x_high, y_high] = self.config.area_m;
+        for (index, track) in self.tracks.iter_mut().enumerate() {
+            let center = ego_from_world * Point3::from(track.box3d().center_m);
+            let is_in_view =
+                (x_low..=x_high).contains(&center.x) && (y_low..=y_high).contains(&center.y);
+            if is_in_view && !owners.contains(&Some(index)) {
+                track.miss(&self.config);
+            }
+        }
+    }
+
+    fn begin(&mut self, measurements: &[Measurement], owners: &[Option<usize>]) {
+        for (measured, owner) in measurements.iter().zip(owners) {
+            if owner.is_none() && measured.score >= self.config.birth_score {
+                self.begun += 1;
+                let track = TrackState::new(self.begun, measured, &self.config);
+                self.tracks.push(track);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,242 @@
+use std::f64::consts::PI;
+
+use protocol::Box3d;
+
+use super::*;
+
+const TICK_NANOS: u64 = 100_000_000;
+
+fn detection(x: f64, y: f64, score: f32) -> Detection {
+    let box3d = Box3d {
+        center_m: [x, y, 0.5],
+        size_m: [4.5, 1.9, 1.6],
+        heading_rad: 0.0,
+    };
+    Detection {
+        box3d,
+        score,
+        source: None,
+    }
+}
+
+/// Tracks after each of some frames at 10 Hz, given by pose and detections.
+fn run(
+    config: TrackerConfig,
+    frames: impl IntoIterator<Item = (Pose, Vec<Detection>)>,
+) -> Vec<Vec<Track>> {
+    let mut tracker = Tracker::new(config);
+    let frames = frames.into_iter().zip(1..);
+    frames
+        .map(|((pose, detections), tick)| {
+            tracker
+                .update(tick * TICK_NANOS, &pose, None, &detections)
+                .unwrap()
+        })
+        .collect()
+}
+
+fn ids(tracks: &[Track]) -> Vec<u64> {
+    tracks.iter().map(|track| track.id).collect()
+}
+
+#[test]
+fn objects_that_meet_keep_their_identities() {
+    // Two vehicles at 15 m/s in opposite lanes, detections in a changing order.
+    let frames = (0..60).map(|tick| {
+        let along = f64::from(tick) * 1.5 - 45.0;
+        let mut detections = vec![detection(along, 0.0, 0.9), detection(-along, 3.5, 0.8)];
+        if tick % 2 == 0 {
+            detections.reverse();
+        }
+        (Pose::IDENTITY, detections)
+    });
+    let tracks = run(TrackerConfig::default(), frames);
+    let last = tracks.last().unwrap();
+    assert_eq!(ids(last), [1, 2]);
+    let [first, second] = [&last[0], &last[1]].map(|track| track.velocity_mps[0]);
+    assert!(
+        (first.abs() - 15.0).abs() < 0.2 && (first + second).abs() < 0.2,
+        "{last:?}"
+    );
+}
+
+#[test]
+fn standing_objects_stand_while_the_ego_drives_and_turns() {
+    let objects = [[30.0, 5.0], [60.0, -8.0]];
+    let frames = (0..40).map(|tick| {
+        let time = f64::from(tick) / 10.0;
+        let pose = Pose::from_xyz_yaw([12.0 * time, time * time, 0.0], 0.3 * time);
+        let ego_from_world = pose.isometry().inverse();
+        let in_ego = objects.map(|[x, y]| {
+            let seen = detection(x, y, 0.9);
+            let box3d = seen.box3d.transformed(&ego_from_world);
+            Detection { box3d, ..seen }
+        });
+        (pose, in_ego.to_vec())
+    });
+    let tracks = run(TrackerConfig::default(), frames);
+    for (track, [x, y]) in tracks.last().unwrap().iter().zip(objects) {
+        assert!((track.box3d.center_m[0] - x).hypot(track.box3d.center_m[1] - y) < 1e-6);
+        assert!(track.velocity_mps[0].hypot(track.velocity_mps[1]) < 1e-6);
+        assert!(track.box3d.heading_rad.abs() < 1e-6);
+    }
+    assert_eq!(ids(&tracks[39]), [1, 2]);
+}
+
+#[test]
+fn a_missing_detection_counts_against_an_object_in_view_only() {
+    let config = TrackerConfig {
+        area_m: [-50.0, -20.0, 50.0, 20.0],
+        ..TrackerConfig::default()
+    };
+    let frames = (0..20).map(|tick| {
+        let seen = vec![detection(10.0, 0.0, 0.9), detection(60.0, 0.0, 0.9)];
+        (Pose::IDENTITY, if tick < 5 { seen } else { vec![] })
+    });
+    let tracks = run(config, frames);
+    assert_eq!(ids(&tracks[4]), [1, 2]);
+    assert_eq!(
+        ids(&tracks[6]),
+        [1, 2],
+        "two misses do not end a sure track"
+    );
+    assert_eq!(ids(&tracks[12]), [2]);
+    assert_eq!(tracks[12][0].unseen_s, 0.8);
+    assert!(tracks[16].is_empty(), "followed for longer than a second");
+}
+
+#[test]
+fn an_identity_is_not_used_again_and_a_weak_detection_begins_no_track() {
+    let frames = (0..40).map(|tick| {
+        let seen = match tick {
+            0..5 | 30.. => vec![detection(10.0, 0.0, 0.9)],
+            _ => vec![detection(10.0, 0.0, 0.05)],
+        };
+        (
+            Pose::IDENTITY,
+            if (10..30).contains(&tick) {
+                vec![]
+            } else {
+                seen
+            },
+        )
+    });
+    let tracks = run(TrackerConfig::default(), frames);
+    assert_eq!((ids(&tracks[4]), ids(&tracks[39])), (vec![1], vec![2]));
+    let weak = (0..5).map(|_| (Pose::IDENTITY, vec![detection(0.0, 0.0, 0.09)]));
+    assert!(
+        run(TrackerConfig::default(), weak)
+            .iter()
+            .all(Vec::is_empty)
+    );
+}
+
+#[test]
+fn front_and_rear_are_told_apart_by_a_clear_motion() {
+    let frames = (0..30).map(|tick| {
+        let mut seen = detection(f64::from(tick), 0.0, 0.9);
+        // Every detection but each fourth has the front at the rear.
+        seen.box3d.heading_rad = if tick % 4 == 0 { 0.05 } else { PI - 0.05 };
+        (Pose::IDENTITY, vec![seen])
+    });
+    let tracks = run(TrackerConfig::default(), frames);
+    assert!(tracks[29][0].box3d.heading_rad.abs() < 0.06, "{tracks:?}");
+}
+
+#[test]
+fn an_uncertain_pose_widens_the_gate() {
+    let covariance = PlanarCovariance {
+        xx_m2: 4.0,
+        xy_m2: 0.0,
+        yy_m2: 4.0,
+        yaw_rad2: 0.0,
+    };
+    let identities = |covariance: Option<&PlanarCovariance>| {
+        let mut tracker = Tracker::new(TrackerConfig::default());
+        let mut tracks = Vec::new();
+        for tick in 1..=20 {
+            // The pose jumps by 4 m to the side.
+            let pose = Pose::from_xyz_yaw([0.0, if tick < 20 { 0.0 } else { 4.0 }, 0.0], 0.0);
+            let detections = [detection(20.0, 0.0, 0.9)];
+            tracks = tracker
+                .update(tick * TICK_NANOS, &pose, covariance, &detections)
+                .unwrap();
+        }
+        ids(&tracks)
+    };
+    assert_eq!(identities(Some(&covariance)), [1]);
+    assert_eq!(identities(None), [1, 2]);
+}
+
+#[test]
+fn time_that_does_not_advance_and_a_broken_pose_change_nothing() {
+    let mut tracker = Tracker::new(TrackerConfig::default());
+    let seen = [detection(5.0, 0.0, 0.9)];
+    let at = |tracker: &mut Tracker, nanos, pose: &Pose| tracker.update(nanos, pose, None, &seen);
+    let nan = Pose {
+        translation_m: [f64::NAN, 0.0, 0.0],
+        ..Pose::IDENTITY
+    };
+    at(&mut tracker, TICK_NANOS, &Pose::IDENTITY).unwrap();
+    for given_nanos in [0, TICK_NANOS] {
+        let error = at(&mut tracker, given_nanos, &Pose::IDENTITY).unwrap_err();
+        let previous_nanos = TICK_NANOS;
+        assert_eq!(
+            error,
+            TrackingError::Time {
+                previous_nanos,
+                given_nanos
+            }
+        );
+    }
+    let error = at(&mut tracker, 2 * TICK_NANOS, &nan).unwrap_err();
+    assert!(matches!(error, TrackingError::Pose(_)));
+    let tracks = at(&mut tracker, 2 * TICK_NANOS, &Pose::IDENTITY).unwrap();
+    assert_eq!((ids(&tracks), tracks[0].hits), (vec![1], 2));
+    // A pause of a century ends tracks, and numbers stay finite.
+    let tracks = at(&mut tracker, u64::MAX, &Pose::IDENTITY).unwrap();
+    assert_eq!(ids(&tracks), [2]);
+}
+
+#[test]
+fn detections_that_are_none_are_counted_and_the_others_are_taken() {
+    let mut tracker = Tracker::new(TrackerConfig::default());
+    let detections = [
+        detection(f64::NAN, 0.0, 0.9),
+        detection(5.0, 0.0, 0.9),
+        detection(9.0, 0.0, f32::INFINITY),
+    ];
+    let tracks = tracker
+        .update(1, &Pose::IDENTITY, None, &detections)
+        .unwrap();
+    assert_eq!((tracks.len(), tracker.rejected()), (1, 2));
+}
+
+#[test]
+fn equal_inputs_give_equal_tracks() {
+    let frames = || {
+        (0..50).map(|tick| {
+            let time = f64::from(tick);
+            let seen = (0..20).map(|k| {
+                let k = f64::from(k);
+                detection(
+                    (k * 37.0 + time * k / 9.0) % 80.0 - 40.0,
+                    (k * 3.3) % 40.0 - 20.0,
+                    0.6,
+                )
+            });
+            (
+                Pose::from_xyz_yaw([time, 0.0, 0.0], 0.01 * time),
+                seen.collect(),
+            )
+        })
+    };
+    let tracks = run(TrackerConfig::default(), frames());
+    assert_eq!(tracks, run(TrackerConfig::default(), frames()));
+    assert!(
+        tracks
+            .iter()
+            .flatten()
+            .all(|track| (0.0..=1.0).contains(&track.score))
+    );
+}
