@@ -33,6 +33,7 @@
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod baselines;
+pub mod map_registration;
 pub mod pgc;
 pub mod pose_covariance;
 pub mod pose_source;

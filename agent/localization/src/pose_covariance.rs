@@ -11,8 +11,11 @@ const MAX_VARIANCE: f64 = 1e6;
 /// Covariance of x, y, z (metres) and of rotations about the world's x, y, z (radians), row by row, in ROS's order.
 ///
 /// Residuals determine the ratios between axes; errors of neighbouring cells are correlated, so that their size is that
-/// of a [`PoseMeasurement`]: the error which the fitted confidence stands for.
+/// of a [`PoseMeasurement`]: the error which the fitted confidence stands for. That of a registered pose is its own.
 pub fn pose_covariance(found: &FoundPose) -> [[f64; 6]; 6] {
+    if found.is_registered {
+        return found.cell_covariance;
+    }
     let PoseMeasurement {
         position_std_m,
         yaw_std_rad,

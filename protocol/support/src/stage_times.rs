@@ -31,12 +31,17 @@ impl StageTimes {
         let now = Instant::now();
         let took = now - self.last;
         self.last = now;
+        self.add(stage, took);
+        took
+    }
+
+    /// Adds a time that was measured elsewhere to a stage.
+    pub fn add(&mut self, stage: &str, took: Duration) {
         let timing = StageTiming::new(stage, took);
         match self.timings.iter_mut().find(|known| known.stage == stage) {
             Some(known) => known.nanos = known.nanos.saturating_add(timing.nanos),
             None => self.timings.push(timing),
         }
-        took
     }
 
     /// All stages so far.

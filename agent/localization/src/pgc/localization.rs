@@ -52,6 +52,11 @@ impl Localization {
         }
     }
 
+    /// A pose, rejected or not.
+    pub(crate) fn of_found(found: FoundPose, times: StageTimes) -> Self {
+        Self::new(&Ok(found), times)
+    }
+
     /// Result of a method without cells: its estimate is the only evidence.
     pub fn from_estimate(estimate: PoseEstimate, times: StageTimes) -> Self {
         let (found, inlier_count) = match estimate {
@@ -64,6 +69,7 @@ impl Localization {
                     world_from_sensor: world_from_cav.isometry(),
                     evidence: PoseEvidence::none(),
                     cell_covariance: PoseStd::UNBOUNDED.covariance,
+                    is_registered: false,
                     sigma: f64::from(confidence),
                     is_rejected: false,
                 };

@@ -20,7 +20,7 @@ mod int8_levels;
 pub(crate) mod localization;
 mod localize;
 mod localizer;
-mod pose_evidence;
+pub(crate) mod pose_evidence;
 pub mod pose_refinement;
 pub mod pose_search;
 pub mod pose_solver;

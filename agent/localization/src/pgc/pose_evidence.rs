@@ -102,7 +102,7 @@ impl PoseEvidence {
     }
 
     /// Evidence of a pose that was not estimated from cells.
-    pub(super) fn none() -> Self {
+    pub(crate) fn none() -> Self {
         Self {
             cells: 0,
             inliers: 0,

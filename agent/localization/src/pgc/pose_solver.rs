@@ -49,6 +49,8 @@ pub struct FoundPose {
     /// cells alone: its shape is right, but errors of neighbouring cells are correlated, so it is too small
     /// ([`crate::pose_covariance`]).
     pub cell_covariance: [[f64; 6]; 6],
+    /// True if the pose was registered to a map: then `cell_covariance` is that of the registration, in full.
+    pub is_registered: bool,
     /// Confidence, 0..=1.
     pub sigma: f64,
     /// True if the confidence is below the threshold: the pose is not published.
@@ -140,6 +142,7 @@ impl PoseSolver {
             world_from_sensor,
             evidence,
             cell_covariance,
+            is_registered: false,
             sigma,
             is_rejected,
         }
@@ -169,6 +172,7 @@ pub(super) fn confirm(
             world_from_sensor,
             evidence: PoseEvidence::of_refinement(refined, start),
             cell_covariance: refined.std.covariance,
+            is_registered: false,
             sigma: 1.0 / (1.0 + error_m * error_m),
             is_rejected: false,
         }

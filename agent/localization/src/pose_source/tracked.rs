@@ -168,9 +168,23 @@ impl TrackedPose {
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
     pub fn load(config: &TrackedPoseConfig, inference: Inference) -> Result<Self, LocalizerError> {
+        Ok(Self::new(
+            Self::localizer(config, inference)?,
+            config.clone(),
+        ))
+    }
+
+    /// The localizer of a tracked vehicle.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn localizer(
+        config: &TrackedPoseConfig,
+        inference: Inference,
+    ) -> Result<Box<dyn Localize>, LocalizerError> {
         let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         localizer.set_most_parts(MOST_PARTS);
-        Ok(Self::new(Box::new(localizer), config.clone()))
+        Ok(Box::new(localizer))
     }
 
     /// Follows a vehicle with another localizer.

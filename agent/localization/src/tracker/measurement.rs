@@ -31,6 +31,9 @@ impl PoseMeasurement {
     /// Measurement from an estimated pose. The variance is the squared error that its sigma stands for (Eq. 6), spread
     /// over two axes.
     pub fn new(capture_nanos: u64, found: &FoundPose) -> Self {
+        if found.is_registered {
+            return Self::registered(capture_nanos, found);
+        }
         let error_m: f64 = (1.0 / found.sigma.clamp(1e-6, 1.0) - 1.0).sqrt();
         let [least, most] = YAW_STD_RAD;
         Self {
@@ -39,6 +42,17 @@ impl PoseMeasurement {
             position_std_m: (POSITION_FACTOR * error_m / std::f64::consts::SQRT_2)
                 .max(LEAST_POSITION_STD_M),
             yaw_std_rad: (ROTATION_FACTOR * found.evidence.rotation_std_rad).clamp(least, most),
+        }
+    }
+
+    /// Measurement from a pose that was registered to a map: its covariance holds.
+    fn registered(capture_nanos: u64, found: &FoundPose) -> Self {
+        let variance = |axis: usize| found.cell_covariance[axis][axis];
+        Self {
+            capture_nanos,
+            world_from_lidar: found.world_from_sensor,
+            position_std_m: f64::midpoint(variance(0), variance(1)).sqrt(),
+            yaw_std_rad: variance(5).sqrt().min(YAW_STD_RAD[1]),
         }
     }
 }

@@ -14,6 +14,7 @@ use anyhow::Context;
 use clap::{ArgGroup, ValueEnum};
 use dataset::{self, LeftOut};
 use localization::baselines::{LightLoc, Retrieval, load_baseline};
+use localization::map_registration::MapRegistration;
 use localization::pgc::confidence::{
     CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss,
 };
@@ -89,6 +90,9 @@ pub(crate) struct Args {
         conflicts_with_all = ["encoder", "head", "baseline", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
+    /// Register the poses of PGC to a surfel map of the place (`agent map`): poses to the millimetre.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["baseline", "lightloc", "retrieval", "icp_map", "fit_confidence"])]
+    surfel_map: Option<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
     #[arg(long, value_name = "M", default_value_t = 5.0, requires = "icp_map")]
     map_spacing_m: f64,
@@ -260,7 +264,9 @@ impl Args {
         {
             scenarios.extend(dataset::open(folder)?.scenarios);
         }
-        let mut files: Vec<PathBuf> = self.baseline.iter().cloned().collect();
+        let mut files: Vec<PathBuf> = { self.baseline.iter().chain(&self.surfel_map) }
+            .cloned()
+            .collect();
         for head in heads.filter(|_| self.uses_head()) {
             files.extend([self.encoder(head)?, head.to_owned()]);
         }
@@ -290,7 +296,8 @@ impl Args {
             ..self.tracker.0.clone()
         };
         config.validate().map_err(BadInput::of)?;
-        let source = TrackedPose::load(&config, self.inference()?).map_err(BadInput::of)?;
+        let localizer = TrackedPose::localizer(&config, self.inference()?).map_err(BadInput::of)?;
+        let source = TrackedPose::new(self.registered(localizer)?, config);
         Ok(Subject::Source(Box::new(source)))
     }
 
@@ -328,7 +335,12 @@ impl Args {
         }
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
-        Ok(Box::new(localizer))
+        self.registered(Box::new(localizer))
+    }
+
+    /// The localizer behind the surfel map, if there is one.
+    fn registered(&self, localizer: Box<dyn Localize>) -> Result<Box<dyn Localize>, BadInput> {
+        MapRegistration::of(localizer, self.surfel_map.as_deref()).map_err(BadInput::of)
     }
 
     fn retrieval(

@@ -3,19 +3,24 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use agent_offline::icp_map::read_map;
 use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
 use localization::pgc::head_files::{ENCODER_FILE, released_encoder};
+use localization::registration::icp::surfel_map::SurfelMap;
 use perception::compute_device::ComputeDevice;
 use perception::train::{
     ComputePrecision, Interruption, Length, ModelCard, RunConfig, TrainingBar, check_out,
 };
 use support::cli::{BadInput, Outcome};
+use support::file_error::AtFile;
 use support::output;
 
 use super::train::options::check_folders;
 
+/// Name of the surfel map beside the weights.
+const SURFELS_FILE: &str = "surfels.safetensors";
 /// Name of the report beside the weights.
 const REPORT_FILE: &str = "map.json";
 
@@ -40,6 +45,12 @@ pub(crate) struct Args {
     /// Time of everything, reading and encoding included, minutes.
     #[arg(long, default_value_t = 10.0)]
     minutes: f64,
+    /// Make the surfel map alone, in seconds: no head.
+    #[arg(long, conflicts_with_all = ["minutes", "sweeps", "encoder", "seed", "device", "threads", "resume", "json"])]
+    surfels_only: bool,
+    /// Distance between two sweeps of a drive in the surfel map, metres.
+    #[arg(long, value_name = "M", default_value_t = 5.0)]
+    surfel_spacing_m: f64,
     /// Largest number of training sweeps, evenly spread [default: as many as there is time for].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     sweeps: Option<u32>,
@@ -67,6 +78,12 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    if args.surfels_only {
+        check_folders(&args.drives)?;
+        check_out(&args.out, false, args.force).map_err(BadInput::of)?;
+        std::fs::create_dir_all(&args.out).at(&args.out)?;
+        return args.write_surfels();
+    }
     malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS)
         .context("cannot execute this program again")?;
     let config = args.config()?;
@@ -83,6 +100,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         false => anyhow::Error::from(error),
     })?;
     write(&config, &report)?;
+    args.write_surfels()?;
     let head = report.trained.weights.display();
     if args.json {
         output::line(serde_json::to_string_pretty(&report)?)?;
@@ -97,6 +115,19 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 impl Args {
+    /// Writes the planes of the place beside the head.
+    fn write_surfels(&self) -> anyhow::Result<Outcome> {
+        let target = read_map(&self.drives, self.surfel_spacing_m, &SurfelMap::building());
+        let target = target.map_err(BadInput::of)?;
+        let path = self.out.join(SURFELS_FILE);
+        let sha256 = SurfelMap::write(&path, &target)?;
+        let (planes, path) = (target.planes(), path.display());
+        output::line(format_args!(
+            "surfels    {planes} planes, {path}, SHA-256 {sha256}"
+        ))?;
+        Ok(Outcome::Done)
+    }
+
     fn config(&self) -> anyhow::Result<MapConfig> {
         check_folders(&self.drives)?;
         let minutes = self.minutes;

@@ -6,6 +6,7 @@
 //!
 //! Two uses: a neighbour's sweep against the ego's, and a sweep against a map of many sweeps ([`IcpTarget::add`]).
 
+pub mod surfel_map;
 mod surfels;
 
 use nalgebra::{
@@ -17,6 +18,8 @@ use surfels::{Surfels, decimate};
 
 /// Distance that a rotation of one radian moves a typical point, metres: makes rotations and translations comparable.
 const LEVER_M: f64 = 10.0;
+/// Smallest vertical part of the normal of a level plane.
+const LEVEL_NORMAL_Z: f64 = 0.9;
 /// A step smaller than this ends a level: metres and, times [`LEVER_M`], radians.
 const CONVERGED_M: f64 = 1e-3;
 
@@ -77,7 +80,7 @@ impl Default for IcpConfig {
 /// Target of a registration: one sweep, or a map of many.
 #[derive(Debug, Clone)]
 pub struct IcpTarget {
-    /// Relative to `origin_m`.
+    /// Relative to `origin_m`; later levels of a configuration use the last one.
     levels: Vec<Surfels>,
     /// Position of the first sweep: keeps numbers small far out in the world.
     origin_m: Option<Vector3<f64>>,
@@ -167,8 +170,13 @@ pub struct IcpFit {
     pub target_from_source: Isometry3<f64>,
     /// Share of the source's points with a partner near its plane.
     pub overlap: f64,
+    /// The same share of those points that do not lie on the ground: the ground fits everywhere.
+    pub overlap_above_ground: f64,
     /// Root mean square of their distances to the planes, metres.
     pub rms_m: f64,
+    /// Inverse of the normal equations times the mean squared distance: covariance of the position (metres) and of the
+    /// rotation about the target's axes (radians), if distances were independent.
+    pub covariance: Matrix6<f64>,
     /// Steps taken.
     pub steps: u32,
 }
@@ -237,7 +245,10 @@ pub fn register(
     let origin = Translation3::from(target.origin_m.unwrap_or_default());
     let (mut motion, mut steps) = (origin.inverse() * start, 0);
     let mut last = NormalEquations::default();
-    for (planes, level) in target.levels.iter().zip(&config.levels) {
+    for (index, level) in config.levels.iter().enumerate() {
+        let Some(planes) = target.levels.get(index).or(target.levels.last()) else {
+            break;
+        };
         for _ in 0..level.max_steps {
             last = NormalEquations::gather(&points, planes, &motion, level);
             let Some(step) = last.step() else { break };
@@ -249,11 +260,15 @@ pub fn register(
         }
     }
     last.judge(points.len(), config)?;
-    let overlap = last.pairs / points.len() as f64;
+    let points = points.len() as f64;
+    let mean_square_m2 = last.squares / last.pairs;
     Ok(IcpFit {
         target_from_source: origin * motion,
-        overlap,
-        rms_m: (last.squares / last.pairs).sqrt(),
+        overlap: last.pairs / points,
+        overlap_above_ground: (last.pairs - last.ground_pairs)
+            / (points - last.ground_pairs).max(1.0),
+        rms_m: mean_square_m2.sqrt(),
+        covariance: last.covariance(mean_square_m2),
         steps,
     })
 }
@@ -275,8 +290,9 @@ struct NormalEquations {
     gradient: Vector6<f64>,
     /// Sum of the weights.
     weight: f64,
-    /// Pairs within three scales of their planes.
+    /// Pairs within three scales of their planes, and those of them on level planes.
     pairs: f64,
+    ground_pairs: f64,
     /// Sum of their squared distances.
     squares: f64,
 }
@@ -301,6 +317,9 @@ impl NormalEquations {
             let scaled = (distance / level.scale_m).powi(2);
             if scaled < 9.0 {
                 sums.pairs += 1.0;
+                if plane.normal.z.abs() > LEVEL_NORMAL_Z {
+                    sums.ground_pairs += 1.0;
+                }
                 sums.squares += distance * distance;
             }
             let weight = 1.0 / ((1.0 + scaled) * (1.0 + scaled));
@@ -325,6 +344,20 @@ impl NormalEquations {
         let damped = self.hessian + Matrix6::identity() * (1e-6 * self.weight);
         let step = damped.cholesky()?.solve(&-self.gradient);
         step.iter().all(|value| value.is_finite()).then_some(step)
+    }
+
+    /// Covariance of position and rotation, in this order, of pairs with this mean squared distance.
+    fn covariance(&self, mean_square_m2: f64) -> Matrix6<f64> {
+        let damped = self.hessian + Matrix6::identity() * (1e-9 * self.weight);
+        let inverse = damped.try_inverse().unwrap_or_else(Matrix6::identity) * mean_square_m2;
+        // Rotation is first there, in units of 1 / LEVER_M radians.
+        let (axis, unit) = (
+            [3, 4, 5, 0, 1, 2],
+            [1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M],
+        );
+        Matrix6::from_fn(|row, column| {
+            inverse[(axis[row], axis[column])] / (unit[row] * unit[column])
+        })
     }
 
     fn judge(&self, points: usize, config: &IcpConfig) -> Result<(), NoIcpFit> {

@@ -128,6 +128,34 @@ impl Surfels {
             .collect();
     }
 
+    /// A grid of planes that were fitted before: no point can be added to it.
+    pub(super) fn of_planes(
+        voxel_m: f64,
+        planes: impl IntoIterator<Item = ([i32; 3], Surfel)>,
+    ) -> Self {
+        let mut surfels = Self::new(voxel_m);
+        for (voxel, plane) in planes {
+            // A voxel has one plane: the first.
+            if surfels.sites.add(voxel) as usize == surfels.planes.len() {
+                surfels.planes.push(Some(plane));
+            }
+        }
+        surfels
+    }
+
+    /// Voxels with their planes, in order of first appearance.
+    pub(super) fn planes(&self) -> impl Iterator<Item = ([i32; 3], Surfel)> {
+        let voxels = self.sites.coords().iter().copied();
+        voxels
+            .zip(&self.planes)
+            .filter_map(|(voxel, plane)| Some((voxel, (*plane)?)))
+    }
+
+    /// Side of a voxel, metres.
+    pub(super) fn voxel_m(&self) -> f64 {
+        self.voxel_m
+    }
+
     /// Number of voxels with a plane.
     pub(super) fn len(&self) -> usize {
         self.planes.iter().flatten().count()
@@ -183,7 +211,7 @@ pub(super) fn decimate(
 }
 
 /// Voxel of a point; `None` if no voxel can hold it.
-fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
+pub(super) fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
     let voxel = (point_m / voxel_m).map(f64::floor);
     // One voxel of margin for the neighbours that are looked up. Also rejects values that are not finite.
     let held = voxel

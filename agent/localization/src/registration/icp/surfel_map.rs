@@ -1,0 +1,320 @@
+//! Surfel map: a place as small planes on one voxel grid, in a file, to which sweeps are registered.
+//!
+//! The file is a safetensors file of kind `surfel_map`: voxel indices `voxels` `[N, 3]` i16 relative to the origin,
+//! centres `centres` `[N, 3]` u8 in 256ths of a voxel, unit normals `normals` `[N, 3]` i8 times 127. A centre is rounded
+//! by 1 mm at most in voxels of half a metre.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use nalgebra::Vector3;
+use perception::weights::{CONFIG_KEY, FileError, KIND_KEY};
+use protocol::text::hex;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use support::file_error::AtFile;
+use support::{atomic_file, bounded_file};
+
+use super::surfels::{Surfel, Surfels};
+use super::{IcpConfig, IcpLevel, IcpTarget};
+
+/// Kind of the file.
+const KIND: &str = "surfel_map";
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 30;
+/// Side of the voxels, metres.
+const VOXEL_M: f64 = 0.5;
+
+/// Settings of the file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Config {
+    /// Side of the voxels, metres.
+    voxel_m: f64,
+    /// Position of voxel (0, 0, 0) in the world, metres.
+    origin_m: [f64; 3],
+    /// Nearest and farthest points of a sweep that were used, metres.
+    range_m: [f64; 2],
+}
+
+/// A place to register sweeps to.
+#[derive(Debug, Clone)]
+pub struct SurfelMap {
+    target: IcpTarget,
+    sha256: String,
+}
+
+impl SurfelMap {
+    /// Settings of registrations to a map: one grid, first with a wide kernel, then with a narrow one.
+    #[must_use]
+    pub fn registration() -> IcpConfig {
+        let level = |scale_m, max_steps| IcpLevel {
+            voxel_m: VOXEL_M,
+            scale_m,
+            max_steps,
+        };
+        IcpConfig {
+            levels: vec![level(0.4, 8), level(0.1, 12)],
+            max_points: 2000,
+            ..IcpConfig::default()
+        }
+    }
+
+    /// Settings of a target that [`Self::write`] takes.
+    #[must_use]
+    pub fn building() -> IcpConfig {
+        let mut config = Self::registration();
+        config.levels.truncate(1);
+        config
+    }
+
+    /// Planes of the place.
+    #[must_use]
+    pub fn target(&self) -> &IcpTarget {
+        &self.target
+    }
+
+    /// SHA-256 of the file.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// Writes the finest planes of a fitted target; returns the file's SHA-256.
+    ///
+    /// # Errors
+    /// [`FileError`] when the place is wider than 32,767 voxels, or the file cannot be written.
+    pub fn write(path: &Path, target: &IcpTarget) -> Result<String, FileError> {
+        let (Some(surfels), Some(origin_m)) = (target.levels.last(), target.origin_m) else {
+            return Err(FileError::new(path, "the map has no sweep"));
+        };
+        let mut planes: Vec<([i32; 3], Surfel)> = surfels.planes().collect();
+        // In order of the grid, so that the same drives in another order give nearly the same file.
+        planes.sort_unstable_by_key(|(voxel, _)| *voxel);
+        let (mut voxels, mut centres, mut normals) = (Vec::new(), Vec::new(), Vec::new());
+        for (voxel, plane) in &planes {
+            for ((index, centre_m), normal) in voxel.iter().zip(&plane.centre_m).zip(&plane.normal)
+            {
+                let held = i16::try_from(*index).map_err(|_| {
+                    FileError::new(path, "the place is wider than 32,767 voxels of the map")
+                })?;
+                voxels.extend(held.to_le_bytes());
+                let inside = centre_m / surfels.voxel_m() - f64::from(*index);
+                centres.push((inside * 256.0) as u8);
+                normals.push((normal * 127.0).round() as i8 as u8);
+            }
+        }
+        let config = Config {
+            voxel_m: surfels.voxel_m(),
+            origin_m: origin_m.into(),
+            range_m: target.range_m,
+        };
+        let bytes = encode(&config, planes.len(), [&voxels, &centres, &normals])
+            .map_err(|error| FileError::new(path, error))?;
+        atomic_file::write(path, &bytes).at(path)?;
+        Ok(hex(&Sha256::digest(&bytes)))
+    }
+
+    /// Reads a map.
+    ///
+    /// # Errors
+    /// [`FileError`] when the file is missing, truncated, of another kind, or holds values that are no planes.
+    pub fn load(path: &Path) -> Result<Self, FileError> {
+        let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
+        let target = decode(&bytes).map_err(|problem| FileError::new(path, problem))?;
+        Ok(Self {
+            target,
+            sha256: hex(&Sha256::digest(&bytes)),
+        })
+    }
+}
+
+fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>, String> {
+    let kinds = [
+        ("voxels", Dtype::I16),
+        ("centres", Dtype::U8),
+        ("normals", Dtype::I8),
+    ];
+    let mut tensors = Vec::new();
+    for ((name, dtype), data) in kinds.into_iter().zip(columns) {
+        let view = TensorView::new(dtype, vec![count, 3], data);
+        tensors.push((name, view.map_err(|error| error.to_string())?));
+    }
+    let config = serde_json::to_string(config).map_err(|error| error.to_string())?;
+    let metadata = HashMap::from([
+        (KIND_KEY.to_owned(), KIND.to_owned()),
+        (CONFIG_KEY.to_owned(), config),
+    ]);
+    serialize(tensors, Some(metadata)).map_err(|error| error.to_string())
+}
+
+fn decode(bytes: &[u8]) -> Result<IcpTarget, String> {
+    let incomplete = |error| {
+        format!(
+            "not a complete safetensors file ({} bytes): {error}",
+            bytes.len()
+        )
+    };
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(incomplete)?;
+    let file = SafeTensors::deserialize(bytes).map_err(incomplete)?;
+    let metadata = header.metadata().clone().unwrap_or_default();
+    let kind = metadata.get(KIND_KEY).map(String::as_str);
+    if kind != Some(KIND) {
+        return Err(format!(
+            "a file of kind {kind:?}, needed is one of kind {KIND:?}"
+        ));
+    }
+    let config = metadata
+        .get(CONFIG_KEY)
+        .map(String::as_str)
+        .unwrap_or_default();
+    let config: Config = serde_json::from_str(config)
+        .map_err(|error| format!("metadata {CONFIG_KEY:?}: {error}"))?;
+    config.check()?;
+    let voxels = column(&file, "voxels", Dtype::I16)?;
+    let centres = column(&file, "centres", Dtype::U8)?;
+    let normals = column(&file, "normals", Dtype::I8)?;
+    let counts = [voxels.len() / 2, centres.len(), normals.len()].map(|values| values / 3);
+    if counts.iter().any(|count| *count != counts[0]) {
+        return Err(format!(
+            "{counts:?} voxels, centres and normals, must be as many of each"
+        ));
+    }
+    let planes = (0..counts[0]).map(|row| {
+        let of = |axis: usize| 3 * row + axis;
+        let voxel: [i32; 3] = std::array::from_fn(|axis| {
+            let at = 2 * of(axis);
+            i32::from(i16::from_le_bytes([voxels[at], voxels[at + 1]]))
+        });
+        let inside = Vector3::from_fn(|axis, _| (f64::from(centres[of(axis)]) + 0.5) / 256.0);
+        let centre_m = (Vector3::from(voxel.map(f64::from)) + inside) * config.voxel_m;
+        let normal = Vector3::from_fn(|axis, _| f64::from(normals[of(axis)] as i8));
+        let normal = normal.try_normalize(0.5).unwrap_or_else(Vector3::z);
+        (voxel, Surfel { centre_m, normal })
+    });
+    Ok(IcpTarget {
+        levels: vec![Surfels::of_planes(config.voxel_m, planes)],
+        origin_m: Some(config.origin_m.into()),
+        range_m: config.range_m,
+    })
+}
+
+impl Config {
+    fn check(&self) -> Result<(), String> {
+        let Self {
+            voxel_m,
+            origin_m,
+            range_m,
+        } = self;
+        if !(0.05..=10.0).contains(voxel_m) {
+            return Err(format!("voxel_m is {voxel_m}, must be 0.05 to 10"));
+        }
+        let is_finite = origin_m
+            .iter()
+            .chain(range_m)
+            .all(|value| value.is_finite());
+        is_finite
+            .then_some(())
+            .ok_or_else(|| format!("origin_m {origin_m:?} and range_m {range_m:?} must be finite"))
+    }
+}
+
+/// Bytes of a tensor `[N, 3]`.
+fn column<'a>(file: &SafeTensors<'a>, name: &str, dtype: Dtype) -> Result<&'a [u8], String> {
+    let view = file
+        .tensor(name)
+        .map_err(|error| format!("tensor {name:?}: {error}"))?;
+    match view.dtype() == dtype && matches!(view.shape(), [_, 3]) {
+        true => Ok(view.data()),
+        false => Err(format!(
+            "tensor {name:?} is {:?} of shape {:?}, must be {dtype:?} of shape [N, 3]",
+            view.dtype(),
+            view.shape()
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Isometry3;
+
+    use super::super::{IcpSource, register};
+    use super::*;
+
+    /// Ground and two walls around the origin, 2 m below and around the sensor.
+    fn yard() -> Vec<[f32; 4]> {
+        let ground = (0..6400).map(|k| {
+            [
+                (k % 80) as f32 * 0.5 - 20.0,
+                (k / 80) as f32 * 0.5 - 20.0,
+                -2.0,
+                0.1,
+            ]
+        });
+        let walls = (0..8000).map(|k| {
+            let (along, up) = (
+                (k % 100) as f32 * 0.35 - 17.5,
+                (k / 100 % 40) as f32 * 0.15 - 2.0,
+            );
+            match k / 4000 {
+                0 => [along, 12.0, up, 0.1],
+                _ => [-15.0, along, up, 0.1],
+            }
+        });
+        ground.chain(walls).collect()
+    }
+
+    fn stored() -> (tempfile::TempDir, std::path::PathBuf, Isometry3<f64>) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("yard.safetensors");
+        let pose = Isometry3::new(Vector3::new(1200.0, -340.0, 20.0), Vector3::z() * 0.8);
+        let mut target = IcpTarget::new(&SurfelMap::building());
+        target.add(&yard(), &pose);
+        target.fit();
+        SurfelMap::write(&path, &target).unwrap();
+        (folder, path, pose)
+    }
+
+    #[test]
+    fn a_sweep_is_registered_to_a_map_from_a_file() {
+        let (_folder, path, truth) = stored();
+        let map = SurfelMap::load(&path).unwrap();
+        let config = SurfelMap::registration();
+        let source = IcpSource::of_sweep(&yard(), &config);
+        let start = truth * Isometry3::new(Vector3::new(0.3, -0.2, 0.1), Vector3::z() * 0.02);
+        let fit = register(&source, map.target(), &start, &config).unwrap();
+        let off = truth.inv_mul(&fit.target_from_source);
+        assert!(
+            off.translation.vector.norm() < 5e-3 && off.rotation.angle() < 1e-3,
+            "{off}"
+        );
+        assert!(
+            fit.overlap > 0.9 && fit.overlap_above_ground > 0.9,
+            "{fit:?}"
+        );
+        // Two hundred metres beside it nothing above the ground has a partner.
+        let elsewhere = Isometry3::translation(200.0, 0.0, 0.0) * truth;
+        assert!(register(&source, map.target(), &elsewhere, &config).is_err());
+        assert_eq!(map.sha256().len(), 64);
+    }
+
+    #[test]
+    fn a_file_that_is_no_map_is_named_with_its_fault() {
+        let (folder, path, _) = stored();
+        let whole = std::fs::read(&path).unwrap();
+        let other = folder.path().join("other.safetensors");
+        let message = |bytes: &[u8]| {
+            std::fs::write(&other, bytes).unwrap();
+            SurfelMap::load(&other).unwrap_err().to_string()
+        };
+        assert!(message(&whole[..whole.len() - 9]).contains("not a complete safetensors file"));
+        let config = Config {
+            voxel_m: 0.0,
+            origin_m: [0.0; 3],
+            range_m: [1.0, 80.0],
+        };
+        let one = encode(&config, 1, [&[0; 6], &[0; 3], &[0; 3]]).unwrap();
+        assert!(message(&one).contains("voxel_m is 0, must be 0.05 to 10"));
+    }
+}
