@@ -35,7 +35,7 @@ pub struct RecorderOptions {
 }
 
 /// Report of a recording.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct RecordReport {
     /// The file.
     pub file: PathBuf,
@@ -145,13 +145,8 @@ pub fn record(
         on_failure,
         report: RecordReport {
             file: options.out.clone(),
-            messages: 0,
-            bytes: 0,
-            seconds: 0.0,
-            overwritten: 0,
-            undelivered: 0,
-            not_written: 0,
             failure,
+            ..RecordReport::default()
         },
     };
     if recorder.report.failure.is_some() {

@@ -10,7 +10,7 @@ use super::files::Listing;
 use super::frame_files::{AgentFolder, BIN, PCD, RADAR, holds_pairs};
 use super::points::{SweepStorage, Sweeps};
 use super::yaml::{self, Field};
-use super::{MissingFrame, OpenOptions, ReadError, Tick, files};
+use super::{MissingFrame, OpenOptions, ReadError, Result, Tick, files};
 use support::rounding;
 
 /// Depth below the opened folder to which scenarios are searched.
@@ -38,7 +38,7 @@ pub(super) struct ScenarioFolder {
 }
 
 /// Folders of scenarios at or below `dir`. Folders below that cannot be listed are left out.
-pub(super) fn find(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<PathBuf>, ReadError> {
+pub(super) fn find(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<PathBuf>> {
     let mut found = Vec::new();
     // A bag may be a single file.
     if dir.is_file() {
@@ -103,10 +103,7 @@ fn is_number(name: &str) -> bool {
 
 /// The agents of a scenario with the contents of their folders. Copies of folders such as `650 (1)` or `650_old` are
 /// not agents.
-fn agents_in(
-    dir: &Path,
-    problems: &mut Vec<ReadError>,
-) -> Result<Vec<(CavId, Listing)>, ReadError> {
+fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Listing)>> {
     let mut below = files::list_below(dir, &files::list(dir)?, problems);
     let name = |folder: &Path| {
         folder
@@ -142,7 +139,7 @@ fn agents_in(
 
 impl ScenarioFolder {
     /// Lists the folders of all agents. Parts that have to be left out are added to `problems`.
-    pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+    pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self> {
         let listed = agents_in(dir, problems)?;
         let has = |suffix: &str| {
             listed
@@ -302,7 +299,7 @@ impl ScenarioFolder {
     }
 
     /// `world.fixed_delta_seconds` of `data_protocol.yaml` in nanoseconds, if there is such a file and key.
-    fn tick_nanos(&self) -> Result<Option<u64>, ReadError> {
+    fn tick_nanos(&self) -> Result<Option<u64>> {
         let path = self.tick_length();
         if !path.is_file() {
             return Ok(None);

@@ -7,7 +7,7 @@ use std::path::Path;
 use protocol::{EgoMotion, Handedness, InvalidPose, Pose};
 
 use super::yaml::{Field, Value};
-use super::{Problem, ReadError, classes};
+use super::{Problem, ReadError, Result, classes};
 use crate::carla_pose::CarlaPose;
 use crate::frame::{Object, ObjectClass};
 
@@ -46,7 +46,7 @@ impl<'a> Annotations<'a> {
     pub(super) fn optional<T>(
         &mut self,
         keys: &[&str],
-        read: impl Fn(&Field<'a>) -> Result<T, ReadError>,
+        read: impl Fn(&Field<'a>) -> Result<T>,
     ) -> Option<T> {
         let root = self.root.clone();
         self.optional_of(&root, keys, read)
@@ -56,7 +56,7 @@ impl<'a> Annotations<'a> {
         &mut self,
         parent: &Field<'a>,
         keys: &[&str],
-        read: impl Fn(&Field<'a>) -> Result<T, ReadError>,
+        read: impl Fn(&Field<'a>) -> Result<T>,
     ) -> Option<T> {
         let field = keys
             .iter()
@@ -69,7 +69,7 @@ impl<'a> Annotations<'a> {
     /// yaw rate of left-handed files is clockwise.
     pub(super) fn motion(&mut self, handedness: Handedness) -> EgoMotion {
         let imu = self.root.optional("imu").ok().flatten();
-        let mut measured = |key, read: &dyn Fn(&Field<'a>) -> Result<f64, ReadError>| {
+        let mut measured = |key, read: &dyn Fn(&Field<'a>) -> Result<f64>| {
             imu.as_ref()
                 .and_then(|imu| self.optional_of(imu, &[key], read))
         };
@@ -95,7 +95,7 @@ impl<'a> Annotations<'a> {
     /// to the world.
     pub(super) fn objects(
         &mut self,
-        id: impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
+        id: impl Fn(i64, &Field<'a>) -> Result<i64>,
         pose: impl Fn(&CarlaPose) -> Result<Pose, InvalidPose>,
     ) -> Vec<Object> {
         let entries = self.object_entries().unwrap_or_else(|error| {
@@ -126,9 +126,9 @@ impl<'a> Annotations<'a> {
         &mut self,
         key: &str,
         field: &Field<'a>,
-        id: &impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
+        id: &impl Fn(i64, &Field<'a>) -> Result<i64>,
         pose: &impl Fn(&CarlaPose) -> Result<Pose, InvalidPose>,
-    ) -> Result<Object, ReadError> {
+    ) -> Result<Object> {
         let listed_id = listed_id(key, field)?;
         Ok(Object {
             id: id(listed_id, field)?,
@@ -141,7 +141,7 @@ impl<'a> Annotations<'a> {
     }
 
     /// The map of annotated objects: `vehicles`, or `objects` in relatives of the format.
-    fn object_entries(&self) -> Result<Vec<(&'a str, Field<'a>)>, ReadError> {
+    fn object_entries(&self) -> Result<Vec<(&'a str, Field<'a>)>> {
         let root = &self.root;
         let key = if !root.has("vehicles") && root.has("objects") {
             "objects"
@@ -200,7 +200,7 @@ impl<'a> Annotations<'a> {
 
 /// Ids are integers; those that went through an array of floats have a point.
 #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
-fn listed_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
+fn listed_id(key: &str, field: &Field<'_>) -> Result<i64> {
     let whole = || {
         key.parse()
             .ok()
@@ -214,7 +214,7 @@ fn listed_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
 }
 
 /// Centre and rotation of the box, in the numbers of the file.
-fn place(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
+fn place(field: &Field<'_>) -> Result<CarlaPose> {
     let center = field
         .optional("center")?
         .map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
@@ -230,7 +230,7 @@ fn place(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
 }
 
 /// `extent` holds half sizes.
-fn size_m(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
+fn size_m(field: &Field<'_>) -> Result<[f64; 3]> {
     let extent = field.required("extent")?;
     let half = extent.numbers::<3>()?;
     if half
@@ -245,17 +245,17 @@ fn size_m(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
 }
 
 /// Speed of an object, metres per second.
-fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
+fn speed_mps(field: &Field<'_>) -> Result<f64> {
     within(field, speed_mps_of_kmh(field)?, MAX_SPEED_MPS, "m/s")
 }
 
 /// Speed of the vehicle itself, metres per second.
-fn own_speed_mps(field: &Field<'_>, speed_mps: f64) -> Result<f64, ReadError> {
+fn own_speed_mps(field: &Field<'_>, speed_mps: f64) -> Result<f64> {
     within(field, speed_mps, EgoMotion::MAX_SPEED_MPS, "m/s")
 }
 
 /// km/h to m/s. Related formats write a vector; its length is the speed.
-fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64, ReadError> {
+fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64> {
     let kmh = field.number().or_else(|error| {
         let vector = field.array().map_err(|_| error)?.values;
         Ok(vector
@@ -268,7 +268,7 @@ fn speed_mps_of_kmh(field: &Field<'_>) -> Result<f64, ReadError> {
 }
 
 /// The value, if its size is at most `most`.
-fn within(field: &Field<'_>, value: f64, most: f64, unit: &str) -> Result<f64, ReadError> {
+fn within(field: &Field<'_>, value: f64, most: f64, unit: &str) -> Result<f64> {
     // NaN does not satisfy this comparison.
     let is_within = value.abs() <= most;
     if is_within {

@@ -7,9 +7,9 @@ use imagesize::ImageSize;
 use nalgebra::{Isometry3, Matrix3, Rotation3, UnitQuaternion};
 use protocol::{Camera, CameraMetadata, ImageFormat, Limits, Payload, Pinhole, Pose};
 
-use super::ReadError;
 use super::files;
 use super::yaml::Field;
+use super::{ReadError, Result};
 
 /// Prefixes of the number of a camera in file names and in the YAML: OPV2V's and V2X-Real's.
 const PREFIXES: [&str; 2] = ["camera", "cam"];
@@ -39,7 +39,7 @@ fn number(name: &str) -> Option<u8> {
 }
 
 /// The image of a camera beside `dir/stem.yaml`.
-pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf, ReadError> {
+pub(super) fn find(dir: &Path, stem: &str, number: u8) -> Result<PathBuf> {
     let names = PREFIXES.iter().flat_map(|prefix| {
         ENDINGS
             .iter()
@@ -65,8 +65,8 @@ pub(super) fn read(
     path: &Path,
     number: u8,
     root: &Field<'_>,
-    pose: &dyn Fn(&Field<'_>) -> Result<Pose, ReadError>,
-) -> Result<Camera, ReadError> {
+    pose: &dyn Fn(&Field<'_>) -> Result<Pose>,
+) -> Result<Camera> {
     let image = files::read_limited(path, MAX_BYTES)?;
     let format = ImageFormat::of_bytes(&image)
         .ok_or_else(|| ReadError::malformed(path, "neither a PNG nor a JPEG by its first bytes"))?;
@@ -98,7 +98,7 @@ pub(super) fn read(
     Ok(Camera { metadata, image })
 }
 
-fn pinhole(field: &Field<'_>) -> Result<Pinhole, ReadError> {
+fn pinhole(field: &Field<'_>) -> Result<Pinhole> {
     let rows = field.items()?;
     let rows = rows
         .iter()

@@ -8,7 +8,8 @@ use protocol::PointCloud;
 
 use super::points::{FileKind, SweepStorage, Sweeps};
 use super::{
-    Layout, OpenOptions, Plausibility, ReadError, Scenario, files, rosbag, single_vehicle_id,
+    Layout, OpenOptions, Plausibility, ReadError, Result, Scenario, files, rosbag,
+    single_vehicle_id,
 };
 use crate::findings::SweepFindings;
 use crate::pcd::PcdCloud;
@@ -51,7 +52,7 @@ pub struct Cloud {
 /// Files at paths, each a file or a folder: of a folder its files of points in natural order, or all sweeps of the data
 /// set in it.
 #[must_use]
-pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile, ReadError>> {
+pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile>> {
     let mut found = Vec::new();
     for path in paths {
         match listed(path) {
@@ -67,7 +68,7 @@ pub fn clouds_at(paths: &[PathBuf]) -> Vec<Result<CloudFile, ReadError>> {
 }
 
 /// Files of points directly in a folder, in natural order.
-pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
+pub(super) fn clouds_in(dir: &Path) -> Result<Vec<PathBuf>> {
     let mut names = files::list(dir)?.files;
     names.sort_by(|first, second| files::natural_order(first, second));
     let paths = names.into_iter().map(|name| dir.join(name));
@@ -80,7 +81,7 @@ enum Listed {
     Known(CloudFile),
 }
 
-fn listed(path: &Path) -> Result<Vec<Listed>, ReadError> {
+fn listed(path: &Path) -> Result<Vec<Listed>> {
     let about = std::fs::metadata(path).map_err(|error| ReadError::io(path, error))?;
     let clouds = match about.is_dir() {
         true => clouds_in(path)?,
@@ -224,7 +225,7 @@ impl CloudFile {
     /// # Errors
     /// [`ReadError`] when the file cannot be read, is malformed or holds no points that a LiDAR measures: in this case
     /// with the exceeded limit.
-    pub fn read(&self) -> Result<Cloud, ReadError> {
+    pub fn read(&self) -> Result<Cloud> {
         let cloud = match &self.source {
             Source::Frame {
                 scenario,

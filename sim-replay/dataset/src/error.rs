@@ -3,6 +3,9 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+/// The result of reading: a [`ReadError`] if nothing else is named.
+pub(crate) type Result<T, E = ReadError> = std::result::Result<T, E>;
+
 /// Reasons why a dataset, or a frame of it, cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {

@@ -1,6 +1,6 @@
 //! Faults of one file's rows: counted, and reported in one line that names the first.
 
-use super::ReadError;
+use super::{ReadError, Result};
 
 /// Rows that were left out of one file.
 #[derive(Debug, Default)]
@@ -16,7 +16,7 @@ impl Faults {
     }
 
     /// The value, or `None` and a fault.
-    pub(super) fn take<T>(&mut self, result: Result<T, ReadError>) -> Option<T> {
+    pub(super) fn take<T>(&mut self, result: Result<T>) -> Option<T> {
         result.map_err(|fault| self.push(fault)).ok()
     }
 

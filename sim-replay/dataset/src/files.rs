@@ -4,7 +4,7 @@ use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
-use super::ReadError;
+use super::{ReadError, Result};
 use support::bounded_file;
 
 /// A folder's entries that are not hidden, in text order.
@@ -17,7 +17,7 @@ pub(super) struct Listing {
 }
 
 /// Lists a folder. Names that are not UTF-8 are left out; so are dangling links, which count as missing files.
-pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
+pub(super) fn list(dir: &Path) -> Result<Listing> {
     let mut listing = Listing::default();
     for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
         let entry = entry.map_err(|error| ReadError::io(dir, error))?;
@@ -85,7 +85,7 @@ pub(super) fn list_below(
 }
 
 /// Reads a file of at most `max_bytes`.
-pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadError> {
+pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>> {
     bounded_file::read(path, max_bytes).map_err(|error| match error.kind() {
         io::ErrorKind::FileTooLarge => ReadError::malformed(path, error.to_string()),
         _ => ReadError::io(path, error),
@@ -94,7 +94,7 @@ pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadE
 
 /// Reads a text file of at most `max_bytes`. Bytes that are no UTF-8 become replacement characters, which no number
 /// contains.
-pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String, ReadError> {
+pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String> {
     let bytes = read_limited(path, max_bytes)?;
     Ok(String::from_utf8(bytes)
         .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))

@@ -111,27 +111,15 @@ impl AgentFolder {
                 Sweep::WithoutYaml(stem) => drop(without_yaml.insert(stem)),
             }
         }
-        if let Some(first) = strays.iter().min() {
-            let reason = format!(
-                "{} files whose names are no frame numbers are left out, first: {first}",
-                strays.len()
-            );
-            problems.push(ReadError::malformed(dir, reason));
-        }
-        let without_sweep = yamls
-            .into_iter()
-            .filter(|stem| !agent.stems.contains(*stem));
-        for (stem, missing, there) in without_yaml
-            .into_iter()
-            .map(|stem| (stem, ".yaml", suffix))
-            .chain(without_sweep.map(|stem| (stem, suffix, ".yaml")))
-        {
+        problems.extend(named_once(dir, &strays));
+        let without_yaml = without_yaml.into_iter();
+        let alone = without_yaml.map(|stem| (stem, ".yaml", suffix));
+        let without_sweep = yamls.iter().filter(|stem| !agent.stems.contains(**stem));
+        let alone = alone.chain(without_sweep.map(|&stem| (stem, suffix, ".yaml")));
+        problems.extend(alone.map(|(stem, missing, there)| {
             let reason = format!("does not exist beside {stem}{there}: the frame is left out");
-            problems.push(ReadError::malformed(
-                &dir.join(format!("{stem}{missing}")),
-                reason,
-            ));
-        }
+            ReadError::malformed(&dir.join(format!("{stem}{missing}")), reason)
+        }));
         agent
     }
 }

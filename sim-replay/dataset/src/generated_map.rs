@@ -4,7 +4,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 use super::yaml::{self, Field};
-use super::{ReadError, Scenario};
+use super::{Result, Scenario};
 
 /// A generated map: the name of its roads and the seed of its objects.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -25,8 +25,8 @@ impl Scenario {
     /// The map that a scenario was generated on.
     ///
     /// # Errors
-    /// [`ReadError`] when there is no protocol of a generation in the scenario's folder, or it names no map.
-    pub fn generated_map(&self) -> Result<GeneratedMap, ReadError> {
+    /// [`crate::ReadError`] when there is no protocol of a generation in the scenario's folder, or it names no map.
+    pub fn generated_map(&self) -> Result<GeneratedMap> {
         let points = self.points_path(0, 0, None)?;
         let folder = points
             .ancestors()

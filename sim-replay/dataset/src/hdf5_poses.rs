@@ -11,7 +11,7 @@ use nalgebra::Matrix4;
 use protocol::Pose;
 
 use super::faults::Faults;
-use super::{ReadError, files};
+use super::{ReadError, Result, files};
 use support::rounding;
 
 /// Largest HDF5 file, and largest dataset in it, that is read, bytes: a million poses.
@@ -33,7 +33,7 @@ pub(super) fn read(
     path: &Path,
     order: RowOrder,
     problems: &mut Vec<ReadError>,
-) -> Result<BTreeMap<u64, Pose>, ReadError> {
+) -> Result<BTreeMap<u64, Pose>> {
     let bytes = files::read_limited(path, MAX_BYTES as u64)?;
     parse(path, bytes, order, problems)
 }
@@ -43,7 +43,7 @@ fn parse(
     bytes: Vec<u8>,
     order: RowOrder,
     problems: &mut Vec<ReadError>,
-) -> Result<BTreeMap<u64, Pose>, ReadError> {
+) -> Result<BTreeMap<u64, Pose>> {
     let options = OpenOptions::default()
         .with_max_read_bytes(MAX_BYTES)
         .with_max_chunk_bytes(MAX_BYTES);
@@ -103,7 +103,7 @@ fn wrong(path: &Path, field: &str, reason: String) -> ReadError {
 }
 
 /// Shape and values of a dataset of numbers. Microseconds since 1970 fit a double exactly.
-fn numbers(path: &Path, file: &Hdf5File, name: &str) -> Result<(Vec<u64>, Vec<f64>), ReadError> {
+fn numbers(path: &Path, file: &Hdf5File, name: &str) -> Result<(Vec<u64>, Vec<f64>)> {
     let unsound = |error: hdf5_reader::error::Error| wrong(path, name, error.to_string());
     let dataset = file.dataset(name).map_err(unsound)?;
     let values = match dataset.dtype() {
@@ -131,7 +131,7 @@ pub(crate) mod tests {
     use super::*;
     pub(crate) use crate::hdf5_file::poses_file as file;
 
-    fn parse(bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+    fn parse(bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>> {
         let mut problems = Vec::new();
         let poses = super::parse(Path::new("a.h5"), bytes, order, &mut problems);
         assert!(problems.is_empty(), "{problems:?}");

@@ -5,13 +5,13 @@ use std::str::FromStr;
 
 use serde_json::Value;
 
-use super::{ReadError, files};
+use super::{ReadError, Result, files};
 
 /// Largest file of one frame, bytes: calibrations have some 500, labels of a hundred objects 100 kB.
 const MAX_FRAME_BYTES: u64 = 16 << 20;
 
 /// Reads and parses the file of one frame.
-pub(super) fn read(path: &Path) -> Result<Value, ReadError> {
+pub(super) fn read(path: &Path) -> Result<Value> {
     parse(&files::read_limited(path, MAX_FRAME_BYTES)?).map_err(|error| {
         let line = Some(error.line() as u64).filter(|&line| line > 0);
         ReadError::malformed_at(path, line, None, format!("no sound JSON: {error}"))
@@ -99,7 +99,7 @@ impl<'a> Field<'a> {
     }
 
     /// The items of a list.
-    pub(super) fn items(&self) -> Result<impl ExactSizeIterator<Item = Self>, ReadError> {
+    pub(super) fn items(&self) -> Result<impl ExactSizeIterator<Item = Self>> {
         let items = self
             .value
             .as_array()
@@ -109,7 +109,7 @@ impl<'a> Field<'a> {
     }
 
     /// An entry that may be missing, null or an empty text.
-    pub(super) fn optional(&self, key: &str) -> Result<Option<Self>, ReadError> {
+    pub(super) fn optional(&self, key: &str) -> Result<Option<Self>> {
         let map = self
             .value
             .as_object()
@@ -120,13 +120,13 @@ impl<'a> Field<'a> {
     }
 
     /// A required entry.
-    pub(super) fn required(&self, key: &str) -> Result<Self, ReadError> {
+    pub(super) fn required(&self, key: &str) -> Result<Self> {
         self.optional(key)?
             .ok_or_else(|| self.child(key, self.value).error("missing"))
     }
 
     /// A finite number, as such or as text.
-    pub(super) fn number(&self) -> Result<f64, ReadError> {
+    pub(super) fn number(&self) -> Result<f64> {
         let number = self.stated(serde_json::Number::as_f64);
         number
             .filter(|number| number.is_finite())
@@ -143,7 +143,7 @@ impl<'a> Field<'a> {
     }
 
     /// A time from 0, as a number or as text, in whatever unit: [`super::time_stamps`] tells it.
-    pub(super) fn time(&self) -> Result<f64, ReadError> {
+    pub(super) fn time(&self) -> Result<f64> {
         let time = self.number()?;
         if time < 0.0 {
             return Err(self.expected("a time from 0"));
@@ -152,17 +152,17 @@ impl<'a> Field<'a> {
     }
 
     /// A whole number from 0, as such or as text.
-    pub(super) fn count(&self) -> Result<u64, ReadError> {
+    pub(super) fn count(&self) -> Result<u64> {
         let count = self.stated(serde_json::Number::as_u64);
         count.ok_or_else(|| self.expected("a whole number from 0"))
     }
 
-    pub(super) fn text(&self) -> Result<&'a str, ReadError> {
+    pub(super) fn text(&self) -> Result<&'a str> {
         self.value.as_str().ok_or_else(|| self.expected("a text"))
     }
 
     /// A text, or a whole number as text: ids are written either way.
-    pub(super) fn id(&self) -> Result<String, ReadError> {
+    pub(super) fn id(&self) -> Result<String> {
         match self.value {
             Value::String(text) => Ok(text.clone()),
             Value::Number(number) if number.is_u64() => Ok(number.to_string()),
@@ -171,7 +171,7 @@ impl<'a> Field<'a> {
     }
 
     /// Exactly `N` finite numbers, regardless of nesting: `[x, y, z]` and `[[x], [y], [z]]` are the same.
-    pub(super) fn numbers<const N: usize>(&self) -> Result<[f64; N], ReadError> {
+    pub(super) fn numbers<const N: usize>(&self) -> Result<[f64; N]> {
         let mut numbers = Vec::with_capacity(N);
         self.flatten(N, &mut numbers)?;
         numbers
@@ -179,7 +179,7 @@ impl<'a> Field<'a> {
             .map_err(|found: Vec<f64>| self.error(format!("{} numbers, expected {N}", found.len())))
     }
 
-    fn flatten(&self, most: usize, numbers: &mut Vec<f64>) -> Result<(), ReadError> {
+    fn flatten(&self, most: usize, numbers: &mut Vec<f64>) -> Result<()> {
         if self.value.is_array() {
             let mut items = self.items()?;
             return items.try_for_each(|item| item.flatten(most, numbers));

@@ -7,8 +7,8 @@ use std::path::Path;
 use serde::Deserialize;
 use serde_json::Value;
 
-use super::ReadError;
 use super::json::{self, Field};
+use super::{ReadError, Result};
 use support::bounded_file;
 
 /// Bytes read at once.
@@ -34,8 +34,8 @@ pub(super) fn read_all(
     path: &Path,
     max_bytes: u64,
     problems: &mut Vec<ReadError>,
-    row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
-) -> Result<usize, ReadError> {
+    row: impl FnMut(&Field<'_>) -> Result<()>,
+) -> Result<usize> {
     read(path, max_bytes, problems, |_| true, row)
 }
 
@@ -51,8 +51,8 @@ pub(super) fn read(
     max_bytes: u64,
     problems: &mut Vec<ReadError>,
     is_needed: impl Fn(&Keys<'_>) -> bool,
-    mut row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
-) -> Result<usize, ReadError> {
+    mut row: impl FnMut(&Field<'_>) -> Result<()>,
+) -> Result<usize> {
     let (mut used, mut unusable, mut first_problems) = (0, 0, Vec::new());
     let whole = for_each_row(path, max_bytes, |index, raw| {
         let is_needed = |raw: &[u8]| serde_json::from_slice(raw).map(|keys| is_needed(&keys));
@@ -87,7 +87,7 @@ pub(super) fn read(
     Ok(used)
 }
 
-fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value, ReadError> {
+fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value> {
     json::parse(raw).map_err(|error| {
         let reason = format!("no sound JSON: {error}");
         ReadError::malformed_at(path, None, Some(&index.to_string()), reason)
@@ -96,11 +96,7 @@ fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value, ReadError> 
 
 /// Passes on the entries of the list in the order of the file. An entry need not be valid: it ends when its brackets
 /// are closed.
-fn for_each_row(
-    path: &Path,
-    max_bytes: u64,
-    mut entry: impl FnMut(usize, &[u8]),
-) -> Result<(), ReadError> {
+fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])) -> Result<()> {
     let io = |error| ReadError::io(path, error);
     let file = bounded_file::open(path).map_err(io)?;
     let size = file.metadata().map_err(io)?.len();

@@ -13,7 +13,7 @@ use super::kitti_text::{self, Calibration};
 use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
 use super::{
-    FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files,
+    FrameSource, Layout, OpenOptions, Problem, ReadError, Result, Scenario, Tick, classes, files,
     single_vehicle,
 };
 use crate::frame::{Frame, Object, ObjectClass};
@@ -56,7 +56,7 @@ pub(super) fn open(
     dir: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Scenario, ReadError> {
+) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
     let listing = files::list(&velodyne)?;
     let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").into_iter().collect());
@@ -82,7 +82,7 @@ pub(super) fn open(
 }
 
 impl FrameSource for Split {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = Some(Pose::IDENTITY);
         if self.has_labels {
@@ -95,12 +95,7 @@ impl FrameSource for Split {
         Ok(frame)
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
     }
@@ -133,10 +128,7 @@ impl Split {
 
 /// The labelled objects in the LiDAR frame, and the faults of those left out. `DontCare` regions have no box and are
 /// not counted.
-fn objects(
-    path: &Path,
-    lidar_from_camera: &Isometry3<f64>,
-) -> Result<(Vec<Object>, Vec<Problem>), ReadError> {
+fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Object>, Vec<Problem>)> {
     let (mut objects, mut problems) = (Vec::new(), Vec::new());
     for (line, text) in kitti_text::lines(path)? {
         let (kind, numbers) = text.trim().split_once(' ').unwrap_or((text.trim(), ""));
@@ -172,7 +164,7 @@ fn object(
     numbers: &str,
     id: i64,
     lidar_from_camera: &Isometry3<f64>,
-) -> Result<Object, ReadError> {
+) -> Result<Object> {
     // The first word of an arbitrary file may be long.
     let field: String = kind.chars().take(40).collect();
     let malformed = |reason: String| kitti_text::malformed(path, line, Some(&field), reason);

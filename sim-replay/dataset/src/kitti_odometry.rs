@@ -13,7 +13,9 @@ use super::faults::Faults;
 use super::kitti_text::{self, Calibration};
 use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
+use super::{
+    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
+};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 use support::rounding;
@@ -51,7 +53,7 @@ pub(super) fn open(
     dir: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Scenario, ReadError> {
+) -> Result<Scenario> {
     let velodyne = dir.join("velodyne");
     let mut scans = scans(&velodyne, problems)?;
     let times = or_without("times", times(dir, &scans, problems), problems);
@@ -100,10 +102,7 @@ pub(super) fn open(
 }
 
 /// Number and stem of the scans. Files of other names are left out.
-fn scans(
-    velodyne: &Path,
-    problems: &mut Vec<ReadError>,
-) -> Result<Vec<(usize, String)>, ReadError> {
+fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, String)>> {
     let mut strays = Faults::default();
     let listing = files::list(velodyne)?;
     let stems = files::stems(&listing.files, ".bin").into_iter();
@@ -115,11 +114,7 @@ fn scans(
 }
 
 /// Values that a file gives for all scans; if it cannot be read, a problem and nothing.
-fn or_without<T>(
-    what: &str,
-    read: Result<Option<T>, ReadError>,
-    problems: &mut Vec<ReadError>,
-) -> Option<T> {
+fn or_without<T>(what: &str, read: Result<Option<T>>, problems: &mut Vec<ReadError>) -> Option<T> {
     read.unwrap_or_else(|error| {
         problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
         None
@@ -134,8 +129,8 @@ fn of_lines<T>(
     path: &Path,
     scans: &[(usize, String)],
     problems: &mut Vec<ReadError>,
-    read: impl Fn(u64, &str) -> Result<T, ReadError>,
-) -> Result<Vec<Option<T>>, ReadError> {
+    read: impl Fn(u64, &str) -> Result<T>,
+) -> Result<Vec<Option<T>>> {
     let mut faults = Faults::default();
     let rows = kitti_text::rows(path, &mut faults, read)?;
     let numbers = scans.iter().map(|(scan, _)| *scan);
@@ -179,7 +174,7 @@ fn keep_those_with<T>(
 }
 
 impl FrameSource for Sequence {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         if let Some(poses) = &self.world_from_lidar {
             let scan = scan_number(&self.dir.join("velodyne"), &tick.stem)?;
@@ -188,12 +183,7 @@ impl FrameSource for Sequence {
         Ok(frame)
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
     }
@@ -210,7 +200,7 @@ impl FrameSource for Sequence {
     }
 }
 
-fn scan_number(velodyne: &Path, stem: &str) -> Result<usize, ReadError> {
+fn scan_number(velodyne: &Path, stem: &str) -> Result<usize> {
     let path = velodyne.join(format!("{stem}.bin"));
     stem.parse()
         .map_err(|_| ReadError::malformed(&path, format!("{stem:?} is no scan number")))
@@ -239,7 +229,7 @@ fn poses(
     dir: &Path,
     scans: &[(usize, String)],
     problems: &mut Vec<ReadError>,
-) -> Result<Option<Vec<Option<Pose>>>, ReadError> {
+) -> Result<Option<Vec<Option<Pose>>>> {
     let Some(path) = poses_path(dir) else {
         return Ok(None);
     };
@@ -260,7 +250,7 @@ fn times(
     dir: &Path,
     scans: &[(usize, String)],
     problems: &mut Vec<ReadError>,
-) -> Result<Option<Vec<Option<u64>>>, ReadError> {
+) -> Result<Option<Vec<Option<u64>>>> {
     let path = dir.join("times.txt");
     if !path.is_file() {
         return Ok(None);

@@ -7,7 +7,7 @@ use protocol::Pose;
 use protocol::text::excerpt;
 
 use super::faults::Faults;
-use super::{ReadError, files};
+use super::{ReadError, Result, files};
 
 /// Largest text file that is read, bytes: poses of a hundred thousand scans.
 const MAX_BYTES: u64 = 32 << 20;
@@ -21,14 +21,14 @@ pub(super) struct Calibration {
 }
 
 /// The lines of a text file, with their numbers from 1, blank ones left out.
-pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
+pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>> {
     let mut lines = counted_lines(path)?;
     lines.retain(|(_, line)| !line.trim().is_empty());
     Ok(lines)
 }
 
 /// The lines of a text file whose values belong to lines, with their numbers from 1; blank ones at the end left out.
-pub(super) fn counted_lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
+pub(super) fn counted_lines(path: &Path) -> Result<Vec<(u64, String)>> {
     let text = files::read_text(path, MAX_BYTES)?;
     let lines = text.trim_end().lines().map(str::to_owned);
     Ok((1..).zip(lines).collect())
@@ -41,8 +41,8 @@ pub(super) fn counted_lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError
 pub(super) fn rows<T>(
     path: &Path,
     faults: &mut Faults,
-    read: impl Fn(u64, &str) -> Result<T, ReadError>,
-) -> Result<Vec<Option<T>>, ReadError> {
+    read: impl Fn(u64, &str) -> Result<T>,
+) -> Result<Vec<Option<T>>> {
     let lines = counted_lines(path)?;
     let is_comment = |(_, text): &&(u64, String)| text.trim_start().starts_with('#');
     if let Some((line, _)) = lines.iter().find(is_comment) {
@@ -66,7 +66,7 @@ pub(super) fn numbers<const N: usize>(
     line: u64,
     field: Option<&str>,
     text: &str,
-) -> Result<[f64; N], ReadError> {
+) -> Result<[f64; N]> {
     let mut numbers = [0.0; N];
     let mut found = 0;
     for word in text.split_ascii_whitespace() {
@@ -88,12 +88,7 @@ pub(super) fn numbers<const N: usize>(
 }
 
 /// A rigid transform from a row-major 3x4 matrix.
-pub(super) fn rigid(
-    path: &Path,
-    line: u64,
-    field: Option<&str>,
-    rows: &[f64; 12],
-) -> Result<Pose, ReadError> {
+pub(super) fn rigid(path: &Path, line: u64, field: Option<&str>, rows: &[f64; 12]) -> Result<Pose> {
     Pose::from_matrix(&matrix(rows))
         .map_err(|error| malformed(path, line, field, error.to_string()))
 }
@@ -111,7 +106,7 @@ fn matrix(rows: &[f64; 12]) -> Matrix4<f64> {
 }
 
 impl Calibration {
-    pub(super) fn read(path: &Path) -> Result<Self, ReadError> {
+    pub(super) fn read(path: &Path) -> Result<Self> {
         let entries = lines(path)?.into_iter().filter_map(|(number, line)| {
             let (name, values) = line.split_once(':')?;
             Some((name.trim().to_owned(), number, values.to_owned()))
@@ -122,7 +117,7 @@ impl Calibration {
         })
     }
 
-    fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N]), ReadError> {
+    fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N])> {
         let Some((_, line, values)) = self.entries.iter().find(|(found, ..)| found == name) else {
             return Err(ReadError::malformed_at(
                 &self.path,
@@ -135,13 +130,13 @@ impl Calibration {
     }
 
     /// A 3x4 transform.
-    pub(super) fn transform(&self, name: &str) -> Result<Pose, ReadError> {
+    pub(super) fn transform(&self, name: &str) -> Result<Pose> {
         let (line, rows) = self.numbers::<12>(name)?;
         rigid(&self.path, line, Some(name), &rows)
     }
 
     /// A 3x3 rotation.
-    pub(super) fn rotation(&self, name: &str) -> Result<Pose, ReadError> {
+    pub(super) fn rotation(&self, name: &str) -> Result<Pose> {
         let (line, [a, b, c, d, e, f, g, h, i]) = self.numbers::<9>(name)?;
         let rows = [a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0];
         rigid(&self.path, line, Some(name), &rows)

@@ -8,8 +8,8 @@ use std::path::Path;
 use serde::{Serialize, Serializer};
 
 use crate::{
-    Dataset, OpenOptions, ReadError, Scenario, cloud_sequence, dair, kitti_object, kitti_odometry,
-    localization, nuscenes, opv2v_family, recorded, rosbag,
+    Dataset, OpenOptions, ReadError, Result, Scenario, cloud_sequence, dair, kitti_object,
+    kitti_odometry, localization, nuscenes, opv2v_family, recorded, rosbag,
 };
 
 /// A layout of files on disk: its row of the table.
@@ -37,13 +37,13 @@ pub struct LayoutRow {
 #[derive(Debug)]
 pub(crate) enum Reader {
     /// Opens the data sets at or below a folder; `Ok(None)` where there are none.
-    DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>, ReadError>),
+    DataSet(fn(&Path, &OpenOptions) -> Result<Option<Dataset>>),
     /// Opens sequences of a single vehicle, one at a time.
     Sequence {
         /// True for the folder of a sequence.
         is_one: fn(&Path) -> bool,
         /// Opens it; its name is relative to the first path.
-        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario, ReadError>,
+        open: fn(&Path, &Path, &OpenOptions, &mut Vec<ReadError>) -> Result<Scenario>,
     },
 }
 

@@ -100,6 +100,7 @@ pub use problem::{Problem, reasons};
 pub use recorded::recording_of;
 pub use unfinished::UNFINISHED;
 
+use crate::error::Result;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 use presence::Absences;
@@ -227,7 +228,7 @@ struct CameraImages {
 
 impl CameraImages {
     /// Adds the image of a camera, or the reason why there is none.
-    fn add(&mut self, number: u8, image: Result<Camera, ReadError>) {
+    fn add(&mut self, number: u8, image: Result<Camera>) {
         match image {
             Ok(image) => self.images.push((number, image)),
             Err(error) => self.problems.push(Problem::from(&error)),
@@ -238,18 +239,13 @@ impl CameraImages {
 /// Reader of a layout's frames, in the conventions of [`protocol`].
 trait FrameSource: std::fmt::Debug + Send + Sync {
     /// Reads a frame without its points.
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError>;
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame>;
 
     /// Reads the LiDAR's points, the plain sweep or a variant.
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError>;
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud>;
 
     /// Reads the radar's points. Called only for scenarios that have them.
-    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud> {
         let path = self.points_path(agent, tick, None);
         Err(ReadError::malformed(
             &path,
@@ -313,7 +309,7 @@ impl Scenario {
         agent_index: usize,
         tick_index: usize,
         options: &LoadOptions,
-    ) -> Result<Frame, ReadError> {
+    ) -> Result<Frame> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         let mut frame = self.source.frame(agent, tick)?;
         if self.contradicted.contains(agent) {
@@ -343,7 +339,7 @@ impl Scenario {
     ///
     /// # Errors
     /// As [`Self::load`].
-    pub fn load_radar(&self, agent_index: usize, tick_index: usize) -> Result<PcdCloud, ReadError> {
+    pub fn load_radar(&self, agent_index: usize, tick_index: usize) -> Result<PcdCloud> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         self.source.radar(agent, tick)
     }
@@ -357,7 +353,7 @@ impl Scenario {
         agent_index: usize,
         tick_index: usize,
         variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    ) -> Result<PcdCloud> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         let is_unknown = |asked: &&str| !self.lidar_variants.iter().any(|known| known == asked);
         if let Some(asked) = variant.filter(is_unknown) {
@@ -380,16 +376,12 @@ impl Scenario {
         agent_index: usize,
         tick_index: usize,
         variant: Option<&str>,
-    ) -> Result<PathBuf, ReadError> {
+    ) -> Result<PathBuf> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
         Ok(self.source.points_path(agent, tick, variant))
     }
 
-    fn frame_of(
-        &self,
-        agent_index: usize,
-        tick_index: usize,
-    ) -> Result<(&CavId, &Tick), ReadError> {
+    fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick)> {
         let agent = self.agents.get(agent_index);
         let agent = agent.ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
         let tick = self.ticks.get(tick_index);

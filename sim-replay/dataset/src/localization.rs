@@ -27,7 +27,9 @@ use super::kitti_text::{lines, numbers};
 use super::layouts::{LayoutRow, Reader};
 use super::nclt_ground_truth::{self, GroundTruth};
 use super::points::{SweepStorage, Sweeps};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
+use super::{
+    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
+};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -107,7 +109,7 @@ pub(super) fn open(
     dir: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Scenario, ReadError> {
+) -> Result<Scenario> {
     let storage = storage(dir);
     let points_dir = dir.join(if storage == Storage::NcltRaw {
         RAW
@@ -192,7 +194,7 @@ fn poses(
     storage: Storage,
     stamps: &BTreeMap<u64, String>,
     problems: &mut Vec<ReadError>,
-) -> Result<Option<BTreeMap<u64, Pose>>, ReadError> {
+) -> Result<Option<BTreeMap<u64, Pose>>> {
     let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps, problems)? else {
         return Ok(None);
     };
@@ -213,7 +215,7 @@ fn poses_as_stored(
     storage: Storage,
     stamps: &BTreeMap<u64, String>,
     problems: &mut Vec<ReadError>,
-) -> Result<Option<StoredPoses>, ReadError> {
+) -> Result<Option<StoredPoses>> {
     let is_nclt = storage != Storage::Oxford;
     let aligned = dir.join(ALIGNED_POSES);
     if aligned.is_file() {
@@ -259,7 +261,7 @@ fn pose_files(dir: &Path) -> Vec<PathBuf> {
 
 /// Mean that LightLoc subtracts from all positions of a scene, metres in the axes of the poses' file; zero without its
 /// file.
-fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
+fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>> {
     let Some(path) = middle_file(dir, scene) else {
         return Ok(Translation3::identity());
     };
@@ -269,7 +271,7 @@ fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
 
 /// The mean of positions: LightLoc writes three numbers, one a line; SGLoc, LiSA, DiffLoc and others a row of three,
 /// and their standard deviation as a second row.
-fn first_row(path: &Path) -> Result<[f64; 3], ReadError> {
+fn first_row(path: &Path) -> Result<[f64; 3]> {
     let mut lines = lines(path)?;
     lines.retain(|(_, text)| !text.trim_start().starts_with('#'));
     let first = lines.first().map(|(line, text)| (*line, text.clone()));
@@ -307,7 +309,7 @@ fn half_turn() -> Isometry3<f64> {
 }
 
 impl FrameSource for Sequence {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = self
             .world_from_lidar
@@ -316,12 +318,7 @@ impl FrameSource for Sequence {
         Ok(frame)
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         let mut cloud = self
             .sweeps
             .read(agent, &self.points_path(agent, tick, variant))?;

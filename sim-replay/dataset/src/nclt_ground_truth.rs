@@ -11,7 +11,7 @@ use protocol::text::excerpt;
 
 use super::faults::Faults;
 use super::trajectory::Trajectory;
-use super::{ReadError, files};
+use super::{ReadError, Result, files};
 use support::csv_file;
 use support::rounding;
 
@@ -42,7 +42,7 @@ pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
 impl GroundTruth {
     /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and
     /// reported.
-    pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+    pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self> {
         let text = files::read_text(path, MAX_BYTES)?;
         Ok(Self::parse(path, &text, problems))
     }
@@ -73,11 +73,7 @@ impl GroundTruth {
 }
 
 /// Time and pose of a row; `None` if it holds no pose.
-fn row(
-    path: &Path,
-    line: u64,
-    record: &StringRecord,
-) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
+fn row(path: &Path, line: u64, record: &StringRecord) -> Result<Option<(u64, Isometry3<f64>)>> {
     if record.len() != COLUMNS.len() {
         let reason = format!("{} columns, expected {}", record.len(), COLUMNS.len());
         return Err(ReadError::malformed_at(path, Some(line), None, reason));

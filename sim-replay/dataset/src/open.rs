@@ -6,8 +6,8 @@ use super::layouts::{LAYOUTS, LayoutRow, Reader};
 use super::points::IntensityScale;
 use super::problem::listed;
 use super::{
-    Dataset, ReadError, Scenario, agent_folders, files, layouts_text, recorded_motion, roots,
-    unfinished,
+    Dataset, ReadError, Result, Scenario, agent_folders, files, layouts_text, recorded_motion,
+    roots, unfinished,
 };
 
 /// Depth below the opened folder to which sequences of a single vehicle are searched.
@@ -39,7 +39,7 @@ impl Default for OpenOptions {
 /// # Errors
 /// [`ReadError`] if `dir` cannot be read or has no supported layout. Faults of single frames are found when they are
 /// loaded; parts that had to be left out are listed in [`Dataset::problems`].
-pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
+pub fn open(dir: &Path) -> Result<Dataset> {
     open_with(dir, &OpenOptions::default())
 }
 
@@ -47,7 +47,7 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 ///
 /// # Errors
 /// As [`open`].
-pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset> {
     check_file_system(dir)?;
     let mut dataset = open_among(&LAYOUTS, dir, options)?;
     unfinished::report(dir, &mut dataset);
@@ -56,7 +56,7 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError
 }
 
 /// Refuses the file systems of the kernel, whose folders and files have no end.
-fn check_file_system(dir: &Path) -> Result<(), ReadError> {
+fn check_file_system(dir: &Path) -> Result<()> {
     let is_kernels = |dir: PathBuf| KERNEL_FOLDERS.iter().any(|kernel| dir.starts_with(kernel));
     match dir.canonicalize().is_ok_and(is_kernels) {
         true => Err(ReadError::Layout {
@@ -68,11 +68,7 @@ fn check_file_system(dir: &Path) -> Result<(), ReadError> {
 }
 
 /// Tries `layouts` in their order.
-fn open_among(
-    layouts: &[&LayoutRow],
-    dir: &Path,
-    options: &OpenOptions,
-) -> Result<Dataset, ReadError> {
+fn open_among(layouts: &[&LayoutRow], dir: &Path, options: &OpenOptions) -> Result<Dataset> {
     for layout in layouts {
         if let Some(Reader::DataSet(open)) = layout.reader
             && let Some(dataset) = open(dir, options)?
@@ -100,7 +96,7 @@ fn open_sequences(
     options: &OpenOptions,
     scenarios: &mut Vec<Scenario>,
     problems: &mut Vec<ReadError>,
-) -> Result<(), ReadError> {
+) -> Result<()> {
     let reader = layouts.iter().find_map(|layout| match layout.reader {
         Some(Reader::Sequence { is_one, open }) if is_one(dir) => Some(open),
         _ => None,
@@ -134,7 +130,7 @@ pub(super) fn opened(
     dir: &Path,
     scenarios: Vec<Scenario>,
     problems: Vec<ReadError>,
-) -> Result<Option<Dataset>, ReadError> {
+) -> Result<Option<Dataset>> {
     match scenarios.first().map(|scenario| scenario.layout) {
         Some(layout) => Ok(Some(Dataset {
             layout,

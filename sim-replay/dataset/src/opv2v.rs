@@ -12,7 +12,7 @@ use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
-use super::{CameraImages, FrameSource, Problem, ReadError, Tick, camera_files, points};
+use super::{CameraImages, FrameSource, Problem, Result, Tick, camera_files, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
@@ -26,7 +26,7 @@ pub(super) struct Opv2v {
 }
 
 impl FrameSource for Opv2v {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         if self.folder.without_yaml.contains(agent) {
             return Ok(Frame::empty(
                 agent.clone(),
@@ -39,18 +39,13 @@ impl FrameSource for Opv2v {
         self.frame_without_points(agent, tick, Field::root(&path, &node))
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
             .map(|cloud| self.right_handed(cloud))
     }
 
-    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud> {
         points::read_pcd(&self.folder.radar(agent, &tick.stem))
             .map(|cloud| self.right_handed(cloud))
     }
@@ -105,12 +100,7 @@ impl FrameSource for Opv2v {
 }
 
 impl Opv2v {
-    fn frame_without_points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        root: Field<'_>,
-    ) -> Result<Frame, ReadError> {
+    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame> {
         let pose = |field: &Field<'_>| self.six_numbers(field);
         let world_from_lidar = root
             .optional("lidar_pose")?
@@ -135,7 +125,7 @@ impl Opv2v {
     }
 
     /// x, y, z, roll, yaw, pitch in metres and degrees.
-    fn six_numbers(&self, field: &Field<'_>) -> Result<Pose, ReadError> {
+    fn six_numbers(&self, field: &Field<'_>) -> Result<Pose> {
         match WrittenPose::read(field)? {
             WrittenPose::SixNumbers(place) => self.world_from(&place).map_err(|error| field.error(error.to_string())),
             WrittenPose::Matrix(_) => Err(field.error(

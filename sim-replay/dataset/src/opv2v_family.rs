@@ -14,7 +14,7 @@ use super::presence::Absences;
 use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
-use super::{Dataset, FrameSource, Layout, ReadError, Scenario, Tick, files};
+use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Result, Scenario, Tick, files};
 
 /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
 pub(crate) static OPV2V: LayoutRow = LayoutRow {
@@ -50,7 +50,7 @@ pub(crate) static V2XREAL: LayoutRow = LayoutRow {
 const FRAMES_TO_TRY: usize = 5;
 
 /// Opens the scenarios at or below `root`; `None` where there are none.
-fn open(root: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
+fn open(root: &Path, options: &OpenOptions) -> Result<Option<Dataset>> {
     let mut problems = Vec::new();
     let folders = agent_folders::find(root, &mut problems)?;
     if folders.is_empty() {
@@ -91,10 +91,10 @@ fn agent_folder_scenario(
     let moments = folder.ticks(options.period_nanos, problems);
     let (agents, missing) = (folder.agents.clone(), folder.missing.clone());
     let ego_lacks = |tick: &Tick| {
-        let of_ego = missing
+        let is_of_ego = |frame: &MissingFrame| Some(&frame.agent) == agents.first();
+        missing
             .iter()
-            .filter(|frame| Some(&frame.agent) == agents.first());
-        of_ego.into_iter().any(|frame| frame.stem == tick.stem)
+            .any(|frame| is_of_ego(frame) && frame.stem == tick.stem)
     };
     let ticks = moments.iter().filter(|tick| !ego_lacks(tick));
     let ticks: Vec<Tick> = ticks.cloned().collect();
@@ -139,7 +139,7 @@ fn family_layout(folder: &ScenarioFolder) -> Layout {
     }
 }
 
-fn lidar_pose(path: &Path) -> Result<WrittenPose, ReadError> {
+fn lidar_pose(path: &Path) -> Result<WrittenPose> {
     let node = yaml::read(path)?;
     WrittenPose::read(&Field::root(path, &node).required("lidar_pose")?)
 }

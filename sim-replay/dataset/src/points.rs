@@ -20,7 +20,7 @@ pub use plausibility::Plausibility;
 use floats::FloatForm;
 use intensity::SAMPLES;
 
-use super::{OpenOptions, ReadError, files, npy, ply};
+use super::{OpenOptions, ReadError, Result, files, npy, ply};
 use crate::pcd::{self, IntensityKind, IntensityOrigin, MAX_BYTES, PcdCloud};
 
 /// Storage of the points of a file.
@@ -103,7 +103,7 @@ impl Sweeps {
     /// # Errors
     /// [`ReadError`] for a file that cannot be read or is malformed, and for every file of an agent whose numbers are
     /// neither four nor five to a point.
-    pub(super) fn read(&self, agent: &CavId, path: &Path) -> Result<PcdCloud, ReadError> {
+    pub(super) fn read(&self, agent: &CavId, path: &Path) -> Result<PcdCloud> {
         let unknown = AgentSweeps::default();
         let agent = self.agents.get(agent).unwrap_or(&unknown);
         let mut cloud = agent.read_stored(self.storage, path)?;
@@ -129,7 +129,7 @@ impl AgentSweeps {
     }
 
     /// Number of floats per point.
-    fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
+    fn form(&self, path: &Path) -> Result<FloatForm> {
         let form = self.form.get_or_init(|| {
             let is_floats = |path: &&PathBuf| matches!(FileKind::of(path), Ok(FileKind::Floats));
             let files = self.files.iter().filter(is_floats);
@@ -142,7 +142,7 @@ impl AgentSweeps {
     }
 
     /// Reads a sweep with the intensities as stored.
-    fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
+    fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud> {
         match storage {
             SweepStorage::ByName => match FileKind::of(path)? {
                 FileKind::Pcd => read_with(path, pcd::decode_stored),
@@ -187,7 +187,7 @@ impl FileKind {
     ///
     /// # Errors
     /// The ending, if files with it are not read.
-    pub(super) fn of(path: &Path) -> Result<Self, ReadError> {
+    pub(super) fn of(path: &Path) -> Result<Self> {
         let ending = (path.extension())
             .map(|ending| ending.to_string_lossy().to_ascii_lowercase())
             .unwrap_or_default();
@@ -209,20 +209,20 @@ impl FileKind {
 fn read_described(
     path: &Path,
     decode: impl FnOnce(&[u8]) -> Result<PcdCloud, String>,
-) -> Result<PcdCloud, ReadError> {
+) -> Result<PcdCloud> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     decode(&bytes).map_err(|reason| ReadError::malformed(path, reason))
 }
 
 /// Reads a PCD file that is no LiDAR sweep: the fourth value is as stored, or the red byte of a colour from 0 to 1.
-pub(super) fn read_pcd(path: &Path) -> Result<PcdCloud, ReadError> {
+pub(super) fn read_pcd(path: &Path) -> Result<PcdCloud> {
     read_with(path, pcd::decode)
 }
 
 fn read_with(
     path: &Path,
     decode: fn(&[u8]) -> Result<PcdCloud, pcd::PcdError>,
-) -> Result<PcdCloud, ReadError> {
+) -> Result<PcdCloud> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     decode(&bytes).map_err(|error| {
         ReadError::malformed_at(path, error.line, error.field.as_deref(), error.reason)

@@ -12,8 +12,8 @@ use protocol::{
 use super::layouts::{LayoutRow, Reader};
 use super::presence::Absences;
 use super::{
-    CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario,
-    Tick,
+    CameraImages, Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result,
+    Scenario, Tick,
 };
 use crate::frame::{Frame, Object};
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
@@ -43,7 +43,7 @@ pub fn recording_of(path: &Path) -> Option<PathBuf> {
 }
 
 /// Opens the recording that a path names.
-fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
+fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>> {
     let Some(file) = recording_of(path) else {
         return Ok(None);
     };
@@ -56,7 +56,7 @@ fn open_given(path: &Path, _: &OpenOptions) -> Result<Option<Dataset>, ReadError
 }
 
 /// Opens a recording as a data set of one scenario. A truncated end is reported in [`Dataset::problems`].
-fn open(file: &Path, recording: Recording) -> Result<Dataset, ReadError> {
+fn open(file: &Path, recording: Recording) -> Result<Dataset> {
     let mut problems = Vec::new();
     for damage in recording.damage() {
         problems.push(ReadError::malformed(file, damage.to_string()));
@@ -94,7 +94,7 @@ struct Recorded {
 impl Recorded {
     /// An unreadable ground truth is a problem of its tick, and not of the scene. Of two replays of one tick the first
     /// is used, sweeps and ground truth alike.
-    fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+    fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self> {
         let mut sensors = BTreeMap::new();
         let (mut truth, mut first_epochs, mut duplicates) = (BTreeMap::new(), BTreeMap::new(), 0);
         for entry in recording.entries() {
@@ -207,12 +207,7 @@ impl Recorded {
         self.sensors.contains_key(&key)
     }
 
-    fn sensor<M: Payload>(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        stream: Stream,
-    ) -> Result<M, ReadError> {
+    fn sensor<M: Payload>(&self, agent: &CavId, tick: &Tick, stream: Stream) -> Result<M> {
         let key = (tick.capture_nanos, agent.clone(), stream);
         let lacks = || {
             let reason = format!("no {agent}/{stream} at {}", tick.stem);
@@ -223,7 +218,7 @@ impl Recorded {
 }
 
 impl FrameSource for Recorded {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         let truth = self.truth.get(&tick.capture_nanos);
         let mut truths = truth.into_iter().flat_map(|truth| &truth.agents);
@@ -242,7 +237,7 @@ impl FrameSource for Recorded {
         Ok(frame)
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud> {
         let Lidar { points } = self.sensor(agent, tick, Stream::Lidar)?;
         let intensity = Some(IntensityOrigin::stored("intensity", IntensityKind::Number));
         Ok(PcdCloud {
@@ -253,7 +248,7 @@ impl FrameSource for Recorded {
         })
     }
 
-    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud> {
         let Radar { points } = self.sensor(agent, tick, Stream::Radar)?;
         Ok(PcdCloud {
             points,
@@ -282,7 +277,7 @@ impl FrameSource for Recorded {
     }
 }
 
-fn message<M: Payload>(recording: &Recording, entry: &Entry) -> Result<M, ReadError> {
+fn message<M: Payload>(recording: &Recording, entry: &Entry) -> Result<M> {
     let bytes = recording.read(entry).map_err(as_read_error)?;
     let decoded = wire::decode([bytes.as_slice()], &Limits::DEFAULT);
     decoded

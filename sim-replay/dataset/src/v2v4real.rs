@@ -12,7 +12,7 @@ use super::annotations::Annotations;
 use super::points::Sweeps;
 use super::written_pose::{WrittenPose, rigid};
 use super::yaml::{self, Field};
-use super::{FrameSource, ReadError, Tick};
+use super::{FrameSource, Result, Tick};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -27,18 +27,13 @@ pub(super) struct V2v4Real {
 }
 
 impl FrameSource for V2v4Real {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
         self.frame_without_points(agent, tick, Field::root(&path, &node))
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
     }
@@ -59,12 +54,7 @@ impl FrameSource for V2v4Real {
 }
 
 impl V2v4Real {
-    fn frame_without_points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        root: Field<'_>,
-    ) -> Result<Frame, ReadError> {
+    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame> {
         let world_from_lidar = lidar_pose(&root.required("lidar_pose")?)?;
         let mut annotations = Annotations::new(root);
         let objects = annotations.objects(
@@ -94,12 +84,7 @@ impl V2v4Real {
     }
 
     /// `ass_id` is the id that both agents share; -1 means that only this agent has the object.
-    fn associated_id(
-        &self,
-        agent: &CavId,
-        listed_id: i64,
-        field: &Field<'_>,
-    ) -> Result<i64, ReadError> {
+    fn associated_id(&self, agent: &CavId, listed_id: i64, field: &Field<'_>) -> Result<i64> {
         match field
             .optional("ass_id")?
             .map(|id| id.integer())
@@ -123,7 +108,7 @@ impl V2v4Real {
     }
 }
 
-fn lidar_pose(field: &Field<'_>) -> Result<Pose, ReadError> {
+fn lidar_pose(field: &Field<'_>) -> Result<Pose> {
     match WrittenPose::read(field)? {
         WrittenPose::Matrix(matrix) => rigid(&matrix, field),
         WrittenPose::SixNumbers(_) => Err(field.error(
@@ -133,7 +118,7 @@ fn lidar_pose(field: &Field<'_>) -> Result<Pose, ReadError> {
 }
 
 /// A matrix, or six numbers by the reference's formula in the right-handed axes of this data set: nothing is mirrored.
-fn pose(field: &Field<'_>) -> Result<Pose, ReadError> {
+fn pose(field: &Field<'_>) -> Result<Pose> {
     match WrittenPose::read(field)? {
         WrittenPose::Matrix(matrix) => rigid(&matrix, field),
         WrittenPose::SixNumbers(place) => rigid(&place.left_handed_matrix(), field),

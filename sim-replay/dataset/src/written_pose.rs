@@ -4,7 +4,7 @@
 use nalgebra::{Matrix4, RowVector4};
 use protocol::Pose;
 
-use super::ReadError;
+use super::Result;
 use super::numpy_tags::{self, NumpyArray};
 use super::yaml::Field;
 use crate::carla_pose::CarlaPose;
@@ -20,7 +20,7 @@ pub(super) enum WrittenPose {
 
 impl WrittenPose {
     /// Reads six numbers, sixteen, or four rows of four: lists, arrays, or lists of arrays.
-    pub(super) fn read(field: &Field<'_>) -> Result<Self, ReadError> {
+    pub(super) fn read(field: &Field<'_>) -> Result<Self> {
         let NumpyArray { shape, values } = field.array()?;
         if let Some(number) = values.iter().find(|number| !number.is_finite()) {
             return Err(field.error(format!("{number}, expected finite numbers")));
@@ -38,7 +38,7 @@ impl WrittenPose {
 }
 
 /// A rigid transform from a matrix of a file.
-pub(super) fn rigid(matrix: &Matrix4<f64>, field: &Field<'_>) -> Result<Pose, ReadError> {
+pub(super) fn rigid(matrix: &Matrix4<f64>, field: &Field<'_>) -> Result<Pose> {
     let mut matrix = *matrix;
     let last = RowVector4::new(0.0, 0.0, 0.0, 1.0);
     // Inverting and multiplying matrices leaves rounding errors in the last row.
@@ -56,7 +56,7 @@ mod tests {
     use super::super::yaml;
     use super::*;
 
-    fn read(text: &str) -> Result<WrittenPose, ReadError> {
+    fn read(text: &str) -> Result<WrittenPose> {
         let path = Path::new("0.yaml");
         let node = yaml::parse(path, text.as_bytes())?;
         WrittenPose::read(&Field::root(path, &node).required("pose")?)

@@ -68,11 +68,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     match result {
         Ok(converted) => {
             print(&converted, args)?;
-            Ok(if converted.left_out.is_nothing() {
-                Outcome::Done
-            } else {
-                Outcome::DataLost
-            })
+            Ok(Outcome::of(!converted.left_out.is_nothing()))
         }
         Err(error @ SynthError::Write(_)) => Err(error.into()),
         Err(error) => {

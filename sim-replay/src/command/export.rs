@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::print_json;
 use bus::log_to_stderr;
 use recording::{ExportReport, ExportTimes, export_ros2};
 use ros2::Mount;
@@ -61,15 +62,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
     if args.json {
-        output::line(serde_json::to_string(&report)?)?;
+        print_json(&report)?;
     } else {
         print(&report, args)?;
     }
-    Ok(if report.damage.is_empty() {
-        Outcome::Done
-    } else {
-        Outcome::DataLost
-    })
+    Ok(Outcome::of(!report.damage.is_empty()))
 }
 
 fn print(report: &ExportReport, args: &Args) -> anyhow::Result<()> {

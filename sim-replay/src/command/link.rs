@@ -1,7 +1,7 @@
 //! `sim-replay link`: link emulation between the agents of a run and an ego.
 
 use anyhow::Context;
-use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use bus::{Configured, log_to_stderr};
 use clap::{Arg, ArgMatches, Command, FromArgMatches};
 use link::{LinkConfig, LinkEmulator};
 use protocol::Role;
@@ -9,6 +9,7 @@ use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
+use super::{leave, print_json};
 use support::cli::Outcome;
 
 /// Forward the agents' messages to an ego as a wireless link would: delayed, queued or lost.
@@ -92,20 +93,13 @@ fn forward(args: ForwardArgs) -> anyhow::Result<Outcome> {
     };
     let report = link_node::run(&bus, emulator, &options, &stop)?;
     print(&report, args.json)?;
-    if let Err(overdue) = bus.leave(STOP_LIMIT) {
-        tracing::warn!("{overdue}");
-    }
-    Ok(if report.is_complete() {
-        Outcome::Done
-    } else {
-        Outcome::DataLost
-    })
+    leave(bus);
+    Ok(Outcome::of(!report.is_complete()))
 }
 
 fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        output::line(serde_json::to_string(report)?)?;
-        return Ok(());
+        return print_json(report);
     }
     let LinkReport {
         submitted,

@@ -8,3 +8,19 @@ pub(crate) mod record;
 pub(crate) mod recover;
 pub(crate) mod stream;
 pub(crate) mod synth;
+
+use bus::{Bus, STOP_LIMIT};
+use serde::Serialize;
+use support::output;
+
+/// Prints a report as one line of JSON.
+fn print_json(report: &impl Serialize) -> anyhow::Result<()> {
+    Ok(output::line(serde_json::to_string(report)?)?)
+}
+
+/// Leaves the bus; a process ends even if the router does not answer.
+fn leave(bus: Bus) {
+    if let Err(overdue) = bus.leave(STOP_LIMIT) {
+        tracing::warn!("{overdue}");
+    }
+}

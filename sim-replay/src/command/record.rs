@@ -1,12 +1,13 @@
 //! `sim-replay record`: records a live run into a file.
 
 use anyhow::Context;
-use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use bus::{Configured, log_to_stderr};
 use protocol::{CavId, Role};
 use sim_replay::config::RecorderConfig;
 use sim_replay::recorder::{self, RecordReport, RecorderError};
 use support::output;
 
+use super::{leave, print_json};
 use support::cli::Outcome;
 
 /// Write all messages of a run into an MCAP file, which `sim-replay stream` replays and Foxglove opens.
@@ -32,12 +33,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let options = config.options();
     // A failure is reported at once to a process that waits for the report; the last line is the final report.
     let mut on_failure = |report: &RecordReport| {
-        if args.json
-            && serde_json::to_string(report)
-                .map_err(Into::into)
-                .and_then(output::line)
-                .is_err()
-        {
+        if args.json && print_json(report).is_err() {
             tracing::error!("the failure cannot be printed");
         }
     };
@@ -47,20 +43,13 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Err(error) => return Err(error.into()),
     };
     print(&report, args.json)?;
-    if let Err(overdue) = bus.leave(STOP_LIMIT) {
-        tracing::warn!("{overdue}");
-    }
-    Ok(if report.is_complete() {
-        Outcome::Done
-    } else {
-        Outcome::DataLost
-    })
+    leave(bus);
+    Ok(Outcome::of(!report.is_complete()))
 }
 
 fn print(report: &RecordReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        output::line(serde_json::to_string(report)?)?;
-        return Ok(());
+        return print_json(report);
     }
     output::line(format_args!(
         "{} messages, {:.1} MB in {}",

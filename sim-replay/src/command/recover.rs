@@ -6,6 +6,7 @@ use bus::log_to_stderr;
 use recording::{Contents, RecordingOptions, recover};
 use support::output;
 
+use super::print_json;
 use support::cli::Outcome;
 
 /// Copy the readable part of a truncated (power, disk, kill) or damaged recording into a new, indexed file.
@@ -46,7 +47,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     };
     if args.json {
-        output::line(serde_json::to_string(&report)?)?;
+        print_json(&report)?;
     } else {
         output::line(format_args!(
             "{} messages in {}",
@@ -57,9 +58,5 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             output::line(damage)?;
         }
     }
-    Ok(if report.damage.is_empty() {
-        Outcome::Done
-    } else {
-        Outcome::DataLost
-    })
+    Ok(Outcome::of(!report.damage.is_empty()))
 }

@@ -3,13 +3,14 @@
 use std::collections::BTreeMap;
 
 use anyhow::Context;
-use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use bus::{Configured, log_to_stderr};
 use dataset::{self, OpenOptions, Scenario};
 use protocol::{CavId, DropReason, Role};
 use sim_replay::config::{ReplayConfig, SceneConfig};
 use sim_replay::stream::{Replay, SensorLinkReport, StreamError, StreamReport};
 use support::output;
 
+use super::{leave, print_json};
 use support::cli::Outcome;
 
 /// Publish a scene as if its vehicles were driving now.
@@ -67,14 +68,8 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     );
     let report = replay.play();
     print(&report, args.json)?;
-    if let Err(overdue) = bus.leave(STOP_LIMIT) {
-        tracing::warn!("{overdue}");
-    }
-    Ok(if report.is_complete() {
-        Outcome::Done
-    } else {
-        Outcome::DataLost
-    })
+    leave(bus);
+    Ok(Outcome::of(!report.is_complete()))
 }
 
 fn open(scene: &SceneConfig) -> anyhow::Result<Scenario> {
@@ -86,36 +81,20 @@ fn open(scene: &SceneConfig) -> anyhow::Result<Scenario> {
     for problem in &dataset.problems {
         tracing::warn!("{problem}");
     }
-    let names = || {
-        dataset
-            .scenarios
-            .iter()
-            .map(|scenario| scenario.name.as_str())
-            .collect::<Vec<_>>()
-            .join(", ")
-    };
-    let found = match &scene.scenario {
-        None => dataset.scenarios.first().cloned(),
-        Some(name) => dataset
-            .scenarios
-            .iter()
-            .find(|scenario| scenario.name == *name)
-            .cloned(),
-    };
+    let asked = scene.scenario.as_deref();
+    let is_asked = |scenario: &&Scenario| asked.is_none_or(|name| scenario.name == name);
+    let found = dataset.scenarios.iter().find(is_asked).cloned();
     found.with_context(|| {
-        let asked = scene.scenario.as_deref().unwrap_or("any");
-        format!(
-            "{}: no scenario {asked}; there are: {}",
-            scene.dir.display(),
-            names()
-        )
+        let names = dataset.scenarios.iter().map(|scenario| &*scenario.name);
+        let (dir, asked) = (scene.dir.display(), asked.unwrap_or("any"));
+        let names = names.collect::<Vec<_>>().join(", ");
+        format!("{dir}: no scenario {asked}; there are: {names}")
     })
 }
 
 fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        output::line(serde_json::to_string(report)?)?;
-        return Ok(());
+        return print_json(report);
     }
     let messages: u64 = report.sent.iter().map(|count| count.messages).sum();
     output::line(format_args!(

@@ -173,27 +173,19 @@ impl<'a> Replay<'a> {
     ) -> Result<Self, StreamError> {
         let agents = agent_indices(scenario, &options.agents)?;
         check(scenario, &options)?;
-        let cavs: Vec<CavId> = agents
-            .iter()
-            .map(|&index| scenario.agents[index].clone())
-            .collect();
+        let cavs = agents.iter().map(|&index| scenario.agents[index].clone());
         let options = StreamOptions {
-            agents: cavs,
+            agents: cavs.collect(),
             ..options
         };
         let read = |path: &PathBuf| Place::read(path, &scenario.name, scenario.ticks.len());
         let place = options.checkpoint.as_ref().map(read).transpose()?.flatten();
-        let schedule = Schedule::new(
-            &scenario.ticks,
-            options.seek,
-            options.frames,
-            options.repeats,
-        );
+        let (seek, frames) = (options.seek, options.frames);
+        let mut schedule = Schedule::new(&scenario.ticks, seek, frames, options.repeats);
+        if let Some(place) = &place {
+            schedule = schedule.resumed(place.position);
+        }
         let mut clock = ReplayClock::new(options.rate);
-        let schedule = match &place {
-            Some(place) => schedule.resumed(place.position),
-            None => schedule,
-        };
         if place.as_ref().is_some_and(|place| place.is_halted) {
             clock.pause();
         }
@@ -477,16 +469,12 @@ impl<'a> Replay<'a> {
                     match &mut self.sensor_link {
                         None => self.outlet.submit(agent, capture_nanos, frame),
                         Some(link) => {
-                            let cav = frame.cav.clone();
-                            link.submit(
-                                &cav,
-                                DelayedSweep {
-                                    agent,
-                                    capture_nanos,
-                                    frame,
-                                },
-                                Instant::now(),
-                            );
+                            let sweep = DelayedSweep {
+                                agent,
+                                capture_nanos,
+                                frame,
+                            };
+                            link.submit(sweep, Instant::now());
                         }
                     }
                 }
@@ -494,13 +482,9 @@ impl<'a> Replay<'a> {
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
-        self.outlet.submit_truth(
-            capture_nanos,
-            Truth {
-                tick: tick_index as u64,
-                agents,
-            },
-        );
+        let tick = tick_index as u64;
+        let truth = Truth { tick, agents };
+        self.outlet.submit_truth(capture_nanos, truth);
         self.deliver();
         self.report.ticks += 1;
         self.clock.published(capture_nanos, due);
@@ -513,13 +497,8 @@ impl<'a> Replay<'a> {
         }
         let capture_nanos = planned.capture_nanos;
         let is_asked = |ego: &&CavId| self.present.contains(ego);
-        let mut missing: BTreeSet<CavId> = self
-            .options
-            .lockstep
-            .iter()
-            .filter(is_asked)
-            .cloned()
-            .collect();
+        let egos = self.options.lockstep.iter().filter(is_asked);
+        let mut missing: BTreeSet<CavId> = egos.cloned().collect();
         let deadline = end_of(self.options.answer_timeout);
         while !missing.is_empty() {
             match self.inbox.take(deadline) {
@@ -566,11 +545,10 @@ fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError
         return Err(StreamError::LinkInLockstep);
     }
     if options.seek >= scenario.ticks.len() {
-        let (scenario, ticks) = (scenario.name.clone(), scenario.ticks.len());
         return Err(StreamError::NoTick {
-            scenario,
+            scenario: scenario.name.clone(),
             asked: options.seek,
-            ticks,
+            ticks: scenario.ticks.len(),
         });
     }
     Ok(())
@@ -580,21 +558,17 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
     if asked.is_empty() {
         return Ok((0..scenario.agents.len()).collect());
     }
+    let agents = &scenario.agents;
     let find = |cav: &CavId| {
-        scenario
-            .agents
-            .iter()
-            .position(|agent| agent == cav)
-            .ok_or_else(|| StreamError::NoAgent {
+        let found = agents.iter().position(|agent| agent == cav);
+        found.ok_or_else(|| {
+            let available: Vec<&str> = agents.iter().map(CavId::as_str).collect();
+            StreamError::NoAgent {
                 scenario: scenario.name.clone(),
                 asked: cav.clone(),
-                available: scenario
-                    .agents
-                    .iter()
-                    .map(CavId::as_str)
-                    .collect::<Vec<_>>()
-                    .join(", "),
-            })
+                available: available.join(", "),
+            }
+        })
     };
     asked.iter().map(find).collect()
 }

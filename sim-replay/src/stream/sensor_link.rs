@@ -59,9 +59,10 @@ impl SensorLink {
         })
     }
 
-    /// Submits the current frame of vehicle `cav`. Data of all its sensors at a tick are transmitted together.
-    pub(super) fn submit(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
+    /// Submits the current frame of a vehicle. Data of all its sensors at a tick are transmitted together.
+    pub(super) fn submit(&mut self, held: DelayedSweep, now: Instant) {
         let Frame {
+            cav,
             points,
             radar,
             cameras,
@@ -70,24 +71,23 @@ impl SensorLink {
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
         let images: usize = cameras.iter().map(|(_, camera)| camera.image.len()).sum();
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64 + images as u64;
-        let (id, submitted_nanos) = (self.next_id, nanos::between(self.began, now));
+        let id = self.next_id;
         self.next_id += 1;
         let next_sequence = self.next_sequences.entry(cav.clone()).or_default();
         let sequence = *next_sequence;
         *next_sequence += 1;
         self.report.submitted += 1;
-        self.held.insert(id, held);
-        let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
         self.emulator.submit(Packet {
             id,
-            from,
-            to,
-            stream,
+            from: cav.clone(),
+            to: cav.clone(),
+            stream: Stream::Lidar,
             sequence,
             bytes,
-            submitted_nanos,
+            submitted_nanos: nanos::between(self.began, now),
             distance_m: 0.0,
         });
+        self.held.insert(id, held);
     }
 
     /// Time at which the next frame can arrive; `None` while none is in flight.
@@ -158,7 +158,7 @@ mod tests {
             let began = link_under_test.began;
             for tick in 0..100 {
                 cavs.iter()
-                    .for_each(|cav| link_under_test.submit(cav, held(cav, tick), began));
+                    .for_each(|cav| link_under_test.submit(held(cav, tick), began));
             }
             let arrived = link_under_test
                 .arrived(began)
@@ -184,8 +184,8 @@ mod tests {
         let mut link_under_test = SensorLink::new(&link, 1).unwrap();
         let at = Duration::from_millis;
         let began = link_under_test.began;
-        link_under_test.submit(&cav, held(&cav, 0), began);
-        link_under_test.submit(&cav, held(&cav, 1), began);
+        link_under_test.submit(held(&cav, 0), began);
+        link_under_test.submit(held(&cav, 1), began);
         assert!(link_under_test.arrived(began + at(107)).is_empty());
         let first = link_under_test.arrived(began + at(110));
         assert_eq!(
@@ -212,7 +212,7 @@ mod tests {
         )
         .unwrap();
         let began = lossy.began;
-        (0..200).for_each(|tick| lossy.submit(&cav, held(&cav, tick), began));
+        (0..200).for_each(|tick| lossy.submit(held(&cav, tick), began));
         let arrived = lossy.arrived(began).len() as u64;
         let report = lossy.report();
         assert!((70..130).contains(&arrived), "{arrived}");

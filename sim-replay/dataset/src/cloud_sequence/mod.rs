@@ -23,7 +23,9 @@ use super::cloud_files::clouds_in;
 use super::faults::Faults;
 use super::layouts::{LayoutRow, Reader};
 use super::points::{SweepStorage, Sweeps};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
+use super::{
+    FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, files, single_vehicle,
+};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -95,7 +97,7 @@ fn open(
     dir: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Scenario, ReadError> {
+) -> Result<Scenario> {
     let (path, mut files) =
         place_of(dir).ok_or_else(|| ReadError::malformed(dir, "no clouds with poses"))?;
     let mut faults = Faults::default();
@@ -172,7 +174,7 @@ fn stems_of(files: &[PathBuf]) -> Vec<&str> {
 }
 
 /// Refuses two clouds of one number, time or stem: one pose cannot be that of both.
-fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<(), ReadError> {
+fn no_two_alike(files: &[PathBuf], keys: &Keys) -> Result<()> {
     for (pair, index) in files.windows(2).zip(0..) {
         if keys.are_equal(index, index + 1)
             && let [first, second] = pair
@@ -200,18 +202,13 @@ fn capture_nanos(
 }
 
 impl FrameSource for Sequence {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = self.clouds.get(&tick.stem).map(|(_, pose)| *pose);
         Ok(frame)
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
     }

@@ -8,9 +8,9 @@ use protocol::Pose;
 
 use super::columns::{Columns, PoseColumns, TimeColumns, quaternion_order};
 use super::keys::{Keys, stamp_nanos, whole_numbers};
-use crate::ReadError;
 use crate::faults::Faults;
 use crate::kitti_text::{counted_lines, malformed};
+use crate::{ReadError, Result};
 
 /// Signs that begin a comment.
 const COMMENT: [char; 2] = ['#', '%'];
@@ -38,7 +38,7 @@ impl PoseFile {
     ///
     /// # Errors
     /// [`ReadError`] if the file cannot be read, or its header is not understood.
-    pub(super) fn read(path: &Path, faults: &mut Faults) -> Result<Self, ReadError> {
+    pub(super) fn read(path: &Path, faults: &mut Faults) -> Result<Self> {
         let lines = counted_lines(path)?;
         let (comments, mut rows): (Vec<Row<'_>>, Vec<Row<'_>>) = lines
             .iter()
@@ -68,7 +68,7 @@ fn columns(
     header: Option<Row<'_>>,
     comments: &[Row<'_>],
     width: usize,
-) -> Result<Columns, ReadError> {
+) -> Result<Columns> {
     if let Some(header) = &header {
         return header.columns(path, width);
     }
@@ -185,7 +185,7 @@ impl<'a> Row<'a> {
     }
 
     /// The columns that a header names.
-    fn columns(&self, path: &Path, width: usize) -> Result<Columns, ReadError> {
+    fn columns(&self, path: &Path, width: usize) -> Result<Columns> {
         let names = self.names();
         let columns = match names.len() == width {
             true => Columns::of_names(&names),
@@ -205,7 +205,7 @@ impl<'a> Row<'a> {
             .ok_or_else(|| "not all values are finite numbers".to_owned())
     }
 
-    fn pose(&self, path: &Path, columns: &Columns) -> Result<Pose, ReadError> {
+    fn pose(&self, path: &Path, columns: &Columns) -> Result<Pose> {
         let pose = match self.words.len() == columns.width {
             true => self.pose_at(columns),
             false => Err(format!(

@@ -6,7 +6,7 @@ use std::path::Path;
 use super::calibration::offset_m;
 use crate::faults::Faults;
 use crate::json::Field;
-use crate::{Layout, ReadError, Tick, json_table, time_stamps};
+use crate::{Layout, ReadError, Result, Tick, json_table, time_stamps};
 
 /// The pairs, below the root.
 pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
@@ -77,7 +77,7 @@ impl Index {
         root: &Path,
         period_nanos: u64,
         problems: &mut Vec<ReadError>,
-    ) -> Result<Self, ReadError> {
+    ) -> Result<Self> {
         let path = root.join(COOPERATIVE);
         let (kind, pairs) = read_pairs(&path, problems)?;
         if pairs.is_empty() {
@@ -133,7 +133,7 @@ fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
     pairs.into_iter().map(tick).collect()
 }
 
-fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<Pair>), ReadError> {
+fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<Pair>)> {
     let mut kind = None;
     let mut pairs: Vec<Pair> = Vec::new();
     let mut seen = HashSet::new();
@@ -150,7 +150,7 @@ fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<P
 }
 
 /// The first entry decides which of the two data sets it is.
-fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair, ReadError> {
+fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair> {
     let is_sequence = entry.optional("vehicle_frame")?.is_some();
     let kind = *kind.get_or_insert(match is_sequence {
         true => Kind::V2xSeq,
@@ -182,18 +182,18 @@ fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair, ReadError> {
 }
 
 /// The id of a frame: the name of its files without suffix.
-fn stem(path: &Field<'_>) -> Result<String, ReadError> {
+fn stem(path: &Field<'_>) -> Result<String> {
     let text = path.text()?;
     let name = text.rsplit(['/', '\\']).next().unwrap_or(text);
     checked_id(path, name.rsplit_once('.').map_or(name, |(stem, _)| stem))
 }
 
-fn frame_id(field: &Field<'_>) -> Result<String, ReadError> {
+fn frame_id(field: &Field<'_>) -> Result<String> {
     checked_id(field, &field.id()?)
 }
 
 /// Ids become names of files.
-fn checked_id(field: &Field<'_>, id: &str) -> Result<String, ReadError> {
+fn checked_id(field: &Field<'_>, id: &str) -> Result<String> {
     let is_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_' || letter == '-';
     if id.is_empty() || id.len() > 64 || !id.chars().all(is_name) {
         let shown: String = id.chars().take(40).collect();
@@ -238,7 +238,7 @@ fn read_captures(
 }
 
 /// Id of a frame, and its batch or sequence where the entry states one.
-fn frame_and_group(entry: &Field<'_>, kind: Kind) -> Result<(String, Option<String>), ReadError> {
+fn frame_and_group(entry: &Field<'_>, kind: Kind) -> Result<(String, Option<String>)> {
     let id = match entry.optional("frame_id")? {
         Some(id) => frame_id(&id)?,
         None => stem(&entry.required("pointcloud_path")?)?,

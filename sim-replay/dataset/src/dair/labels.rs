@@ -9,7 +9,7 @@ use protocol::text::excerpt;
 use crate::frame::{Object, ObjectClass};
 use crate::ground_truth::upright_box;
 use crate::json::{self, Field};
-use crate::{Problem, ReadError, classes};
+use crate::{Problem, ReadError, Result, classes};
 use protocol::rotated_iou::Polygon;
 
 /// Most boxes of a file.
@@ -43,7 +43,7 @@ impl Block {
 
 /// Cooperative labels of DAIR-V2X: eight corners in the world. They have no ids: the number in the list serves as one,
 /// and does not identify the object at another tick.
-pub(super) fn in_world(path: &Path) -> Result<Objects, ReadError> {
+pub(super) fn in_world(path: &Path) -> Result<Objects> {
     read(path, |number, label| {
         let Some((world_from_object, size_m)) = from_corners(&label.required("world_8_points")?)?
         else {
@@ -65,7 +65,7 @@ pub(super) fn in_frame(
     path: &Path,
     world_from_lidar: &Isometry3<f64>,
     block: Block,
-) -> Result<Objects, ReadError> {
+) -> Result<Objects> {
     read(path, |number, label| {
         let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else {
             return Ok(None);
@@ -94,8 +94,8 @@ pub(super) fn in_frame(
 
 fn read(
     path: &Path,
-    object: impl Fn(i64, &Field<'_>) -> Result<Option<Object>, ReadError>,
-) -> Result<Objects, ReadError> {
+    object: impl Fn(i64, &Field<'_>) -> Result<Option<Object>>,
+) -> Result<Objects> {
     let value = json::read(path)?;
     let labels = Field::root(path, &value);
     let labels = labels.items()?;
@@ -120,7 +120,7 @@ fn read(
 }
 
 /// An object of unknown type is not a vehicle.
-fn class(label: &Field<'_>) -> Result<ObjectClass, ReadError> {
+fn class(label: &Field<'_>) -> Result<ObjectClass> {
     Ok(classes::of_name(label.required("type")?.text()?).unwrap_or(ObjectClass::Other))
 }
 
@@ -134,7 +134,7 @@ fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
 }
 
 /// Length, width, height; nothing if one is 0: such labels have a box in the image alone.
-fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>, ReadError> {
+fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>> {
     let edge = |key| dimensions.required(key)?.number();
     let size_m = [edge("l")?, edge("w")?, edge("h")?];
     if size_m.contains(&0.0) {
@@ -143,7 +143,7 @@ fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>, ReadError> {
     check_size(dimensions, size_m).map(Some)
 }
 
-fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3], ReadError> {
+fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3]> {
     if size_m.iter().all(|size| *size > 0.0 && *size <= MAX_SIZE_M) {
         return Ok(size_m);
     }
@@ -156,7 +156,7 @@ fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3], ReadError
 /// them. The edge from the third and fourth corner to the second and first points ahead; the first may be on either
 /// side.
 #[expect(clippy::indexing_slicing, reason = "24 numbers are 8 corners")]
-fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError> {
+fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>> {
     let numbers = field.numbers::<24>()?;
     let (corners, _) = numbers.as_chunks::<3>();
     let corner = |index: usize| Vector3::from(corners[index]);

@@ -28,8 +28,8 @@ use super::open::opened;
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
 use super::{
-    Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Scenario, Tick, files,
-    roots,
+    Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Result, Scenario, Tick,
+    files, roots,
 };
 use crate::frame::{Frame, Object};
 use crate::pcd::PcdCloud;
@@ -61,7 +61,7 @@ const VEHICLE: &str = "vehicle";
 const INFRASTRUCTURE: &str = "infrastructure";
 
 /// Opens the data sets at or below `dir`; `None` where there are none.
-pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
+pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>> {
     let root = files::above(dir).find(|above| is_root(above));
     if let Some(root) = root.filter(|_| is_side(dir)) {
         let root = root.display();
@@ -94,7 +94,7 @@ fn open_root(
     root: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Vec<Scenario>, ReadError> {
+) -> Result<Vec<Scenario>> {
     let Index { kind, groups } = Index::read(root, options.period_nanos, problems)?;
     let scenarios = groups.into_iter().map(|(group, pairs)| {
         let name = match root == opened {
@@ -247,7 +247,7 @@ struct Source {
 }
 
 impl Source {
-    fn pair(&self, tick: &Tick) -> Result<&Pair, ReadError> {
+    fn pair(&self, tick: &Tick) -> Result<&Pair> {
         let unknown = || {
             let reason = format!("no pair of vehicle frame {}", tick.stem);
             ReadError::malformed(&self.sides.root, reason)
@@ -255,7 +255,7 @@ impl Source {
         self.pairs.get(&tick.stem).ok_or_else(unknown)
     }
 
-    fn vehicle_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn vehicle_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let pair = self.pair(tick)?;
         let poses = calibration::vehicle(&self.sides, pair)?;
         let world_from_lidar = poses.world_from_lidar();
@@ -274,7 +274,7 @@ impl Source {
         Ok(frame)
     }
 
-    fn infrastructure_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn infrastructure_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let pair = self.pair(tick)?;
         let world_from_lidar = calibration::infrastructure(&self.sides, pair)?;
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
@@ -295,7 +295,7 @@ impl Source {
 }
 
 /// The objects of a list; its faults are added to the frame's problems.
-fn usable(labels: Result<Objects, ReadError>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
+fn usable(labels: Result<Objects>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
     match labels {
         Ok((objects, wrong)) => {
             problems.extend(wrong);
@@ -309,19 +309,14 @@ fn usable(labels: Result<Objects, ReadError>, problems: &mut Vec<Problem>) -> Op
 }
 
 impl FrameSource for Source {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         match Side::of(agent) {
             Side::Vehicle => self.vehicle_frame(agent, tick),
             Side::Infrastructure => self.infrastructure_frame(agent, tick),
         }
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud> {
         self.sweeps
             .read(agent, &self.points_path(agent, tick, variant))
     }

@@ -1,5 +1,8 @@
 //! Options of an evaluation protocol: a preset, and single changes over it.
 
+use std::fmt;
+use std::ops::RangeInclusive;
+
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -64,14 +67,14 @@ impl ProtocolConfig {
         rule.comm_range_m =
             checked("comm_range_m", self.comm_range_m, 0.0..=1e5)?.unwrap_or(rule.comm_range_m);
         rule.min_corners =
-            counted("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
+            checked("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
         rule.classes = self.classes.unwrap_or(rule.classes);
         if let Some(range) = &self.ground_truth_range_m {
             [rule.x_m, rule.y_m, rule.z_m] = intervals(range)?;
             protocol.exact_range = true;
         }
         protocol.max_agents =
-            counted("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
+            checked("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
         protocol.agents = self.agent_kinds.unwrap_or(protocol.agents);
         protocol.ego = self.ego_kind.unwrap_or(protocol.ego);
         protocol.ap_order = self.ap_order.unwrap_or(protocol.ap_order);
@@ -79,50 +82,33 @@ impl ProtocolConfig {
     }
 }
 
-fn checked(
+/// An error if the value is outside `range`.
+fn checked<T: PartialOrd + fmt::Display>(
     name: &str,
-    value: Option<f64>,
-    range: std::ops::RangeInclusive<f64>,
-) -> Result<Option<f64>, String> {
-    match value.filter(|value| !range.contains(value)) {
-        Some(value) => Err(format!(
-            "{name}: {value}, expected {} to {}",
-            range.start(),
-            range.end()
-        )),
-        None => Ok(value),
-    }
-}
-
-fn counted(
-    name: &str,
-    value: Option<usize>,
-    range: std::ops::RangeInclusive<usize>,
-) -> Result<Option<usize>, String> {
-    match value.filter(|value| !range.contains(value)) {
-        Some(value) => Err(format!(
-            "{name}: {value}, expected {} to {}",
-            range.start(),
-            range.end()
-        )),
-        None => Ok(value),
+    value: Option<T>,
+    range: RangeInclusive<T>,
+) -> Result<Option<T>, String> {
+    match value {
+        Some(value) if !range.contains(&value) => {
+            let (low, high) = (range.start(), range.end());
+            Err(format!("{name}: {value}, expected {low} to {high}"))
+        }
+        value => Ok(value),
     }
 }
 
 /// Low and high of x, y and z.
 fn intervals(range: &[f64]) -> Result<[[f64; 2]; 3], String> {
     let &[x_low, y_low, z_low, x_high, y_high, z_high] = range else {
-        return Err(format!(
-            "ground_truth_range_m: {} numbers, expected 6",
-            range.len()
-        ));
+        let count = range.len();
+        return Err(format!("ground_truth_range_m: {count} numbers, expected 6"));
     };
     let intervals = [[x_low, x_high], [y_low, y_high], [z_low, z_high]];
     let is_wrong = |[low, high]: &[f64; 2]| !(low.is_finite() && high.is_finite() && low < high);
-    match intervals.iter().find(|interval| is_wrong(interval)) {
-        Some([low, high]) => Err(format!(
-            "ground_truth_range_m: from {low} to {high} is no range"
-        )),
-        None => Ok(intervals),
-    }
+    let Some([low, high]) = intervals.iter().find(|interval| is_wrong(interval)) else {
+        return Ok(intervals);
+    };
+    Err(format!(
+        "ground_truth_range_m: from {low} to {high} is no range"
+    ))
 }

@@ -3,13 +3,13 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 
-use super::super::ReadError;
+use super::super::Result;
 use super::super::yaml::{Field, Value};
 use super::{APPLY, args, expect_tag, items};
 use crate::scalar::{Scalar, ScalarKind};
 
 /// `dtype('f8', False, True)` with a state whose second item is the byte order.
-pub(super) fn read_dtype(field: &Field<'_>) -> Result<Scalar, ReadError> {
+pub(super) fn read_dtype(field: &Field<'_>) -> Result<Scalar> {
     expect_tag(field, "python/object/apply:numpy.dtype")?;
     let [name, ..] = items::<3>(&field.required("args")?)?;
     let (kind, size) = match name.text()? {
@@ -51,7 +51,7 @@ pub(super) fn read_dtype(field: &Field<'_>) -> Result<Scalar, ReadError> {
 }
 
 /// Bytes in base64, on their own or as the one argument of `bytearray`.
-pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
+pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>> {
     let tag = field.node().tag.as_deref();
     let function = tag.and_then(|tag| tag.strip_prefix(APPLY));
     if function == Some("builtins.bytearray") && !matches!(field.node().value, Value::Text(_)) {
@@ -61,7 +61,7 @@ pub(super) fn binary(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
     base64(field)
 }
 
-fn base64(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
+fn base64(field: &Field<'_>) -> Result<Vec<u8>> {
     expect_tag(field, "binary")?;
     // The lines of a block are part of the text.
     let text: String = field.text()?.split_ascii_whitespace().collect();
@@ -71,11 +71,7 @@ fn base64(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
 }
 
 /// Exactly `count` numbers.
-pub(super) fn numbers(
-    field: &Field<'_>,
-    dtype: Scalar,
-    count: usize,
-) -> Result<Vec<f64>, ReadError> {
+pub(super) fn numbers(field: &Field<'_>, dtype: Scalar, count: usize) -> Result<Vec<f64>> {
     let bytes = binary(field)?;
     let (found, size) = (bytes.len(), dtype.size);
     if count.checked_mul(size) != Some(found) {

@@ -9,7 +9,7 @@ mod data;
 
 use std::path::Path;
 
-use super::ReadError;
+use super::Result;
 use super::yaml::{Field, Node, Value};
 use data::{binary, numbers, read_dtype};
 
@@ -49,7 +49,7 @@ pub(super) fn key_text(node: &Node) -> Option<String> {
 }
 
 /// Reads `_reconstruct` and `_frombuffer`; a scalar is an array without dimensions.
-pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray> {
     match function(field)? {
         Function::Reconstruct => reconstruct(field),
         Function::FromBuffer => from_buffer(field),
@@ -61,7 +61,7 @@ pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
 }
 
 /// Reads `scalar(dtype, data)` or an array with one number; it must be finite.
-pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
+pub(super) fn scalar(field: &Field<'_>) -> Result<f64> {
     let NumpyArray { shape, values } = array(field)?;
     match values[..] {
         [value] if value.is_finite() => Ok(value),
@@ -78,7 +78,7 @@ enum Function {
     Scalar,
 }
 
-fn function(field: &Field<'_>) -> Result<Function, ReadError> {
+fn function(field: &Field<'_>) -> Result<Function> {
     const KNOWN: [(&str, Function); 3] = [
         ("multiarray._reconstruct", Function::Reconstruct),
         ("numeric._frombuffer", Function::FromBuffer),
@@ -107,7 +107,7 @@ fn function(field: &Field<'_>) -> Result<Function, ReadError> {
 }
 
 /// `_reconstruct(ndarray, (0,), b'b')` with its state `(1, shape, dtype, is_fortran, data)`.
-fn reconstruct(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+fn reconstruct(field: &Field<'_>) -> Result<NumpyArray> {
     let parts = field.entries()?;
     if parts.len() != 2 {
         return Err(field.error(format!("{} parts, expected args and state", parts.len())));
@@ -130,7 +130,7 @@ fn reconstruct(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
 }
 
 /// `_frombuffer(data, dtype, shape, order)`.
-fn from_buffer(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+fn from_buffer(field: &Field<'_>) -> Result<NumpyArray> {
     let [data, dtype, shape, order] = items::<4>(&args(field)?)?;
     let shape = read_shape(&shape)?;
     let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
@@ -142,7 +142,7 @@ fn from_buffer(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
 }
 
 /// `scalar(dtype, data)`.
-fn scalar_value(field: &Field<'_>) -> Result<f64, ReadError> {
+fn scalar_value(field: &Field<'_>) -> Result<f64> {
     let [dtype, data] = items::<2>(&args(field)?)?;
     let values = numbers(&data, read_dtype(&dtype)?, 1)?;
     values
@@ -152,7 +152,7 @@ fn scalar_value(field: &Field<'_>) -> Result<f64, ReadError> {
 }
 
 /// Arguments of a call without state are its items, or the entry `args`.
-fn args<'a>(field: &Field<'a>) -> Result<Field<'a>, ReadError> {
+fn args<'a>(field: &Field<'a>) -> Result<Field<'a>> {
     if matches!(field.node().value, Value::Map(_)) {
         field.required("args")
     } else {
@@ -160,7 +160,7 @@ fn args<'a>(field: &Field<'a>) -> Result<Field<'a>, ReadError> {
     }
 }
 
-fn expect_tag(field: &Field<'_>, expected: &str) -> Result<(), ReadError> {
+fn expect_tag(field: &Field<'_>, expected: &str) -> Result<()> {
     match field.node().tag.as_deref() {
         Some(tag) if tag == expected => Ok(()),
         tag => Err(field.error(format!("tag {}, expected !!{expected}", shown(tag)))),
@@ -173,7 +173,7 @@ fn shown(tag: Option<&str>) -> String {
     })
 }
 
-fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadError> {
+fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N]> {
     let items = field.items()?;
     let found = items.len();
     items
@@ -181,13 +181,13 @@ fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadEr
         .map_err(|_| field.error(format!("{found} items, expected {N}")))
 }
 
-fn tuple<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadError> {
+fn tuple<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N]> {
     expect_tag(field, "python/tuple")?;
     items(field)
 }
 
 /// `args` of `_reconstruct` are always the same: an empty array to be filled by the state.
-fn check_args(args: &Field<'_>) -> Result<(), ReadError> {
+fn check_args(args: &Field<'_>) -> Result<()> {
     let [class, shape, code] = items::<3>(args)?;
     expect_tag(&class, "python/name:numpy.ndarray")?;
     let [zero] = tuple::<1>(&shape)?;
@@ -200,7 +200,7 @@ fn check_args(args: &Field<'_>) -> Result<(), ReadError> {
     }
 }
 
-fn read_shape(field: &Field<'_>) -> Result<Vec<usize>, ReadError> {
+fn read_shape(field: &Field<'_>) -> Result<Vec<usize>> {
     expect_tag(field, "python/tuple")?;
     let shape: Vec<usize> = field
         .items()?

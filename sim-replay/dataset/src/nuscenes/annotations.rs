@@ -9,7 +9,7 @@ use protocol::{PointCloud, Pose};
 use super::tables::{read_all, referred, transform};
 use crate::frame::{Object, ObjectClass};
 use crate::json::Field;
-use crate::{ReadError, classes};
+use crate::{ReadError, Result, classes};
 
 /// Largest edge of a box, metres.
 const MAX_SIZE_M: f64 = 200.0;
@@ -55,7 +55,7 @@ struct Instance {
 fn read_instances(
     version: &Path,
     problems: &mut Vec<ReadError>,
-) -> Result<HashMap<String, Instance>, ReadError> {
+) -> Result<HashMap<String, Instance>> {
     let (mut names, mut unknown) = (HashMap::new(), Vec::new());
     read_all(version, "category.json", problems, |row| {
         let name = row.required("name")?;
@@ -86,7 +86,7 @@ fn unknown_type(name: &Field<'_>) -> ReadError {
     ))
 }
 
-fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object, ReadError> {
+fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object> {
     let token = row.required("instance_token")?;
     let no_instance = || token.error("no row of instance.json has this token");
     let Instance { id, class } = instances.get(&token.id()?).ok_or_else(no_instance)?;

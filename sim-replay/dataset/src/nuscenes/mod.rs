@@ -25,8 +25,8 @@ use super::open::opened;
 use super::points::{SweepStorage, Sweeps};
 use super::presence::Absences;
 use super::{
-    Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Scenario, Tick, files,
-    roots,
+    Dataset, FrameSource, Layout, MissingFrame, OpenOptions, ReadError, Result, Scenario, Tick,
+    files, roots,
 };
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
@@ -67,7 +67,7 @@ const TABLES: [&str; 2] = ["sample.json", "sample_data.json"];
 const TWO_WHEELER_WIDTH_M: f64 = 1.5;
 
 /// Opens the data sets at or below `dir`; `None` if there are none.
-pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
+pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>> {
     let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
     for version in &roots::find(dir, is_version) {
         match open_version(dir, version, options, &mut problems) {
@@ -87,7 +87,7 @@ fn open_version(
     version: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Vec<Scenario>, ReadError> {
+) -> Result<Vec<Scenario>> {
     let root = files::above(version)
         .find(|root| root.is_dir())
         .unwrap_or_else(|| version.to_owned());
@@ -125,7 +125,7 @@ fn open_version(
 }
 
 /// The layout of the first supported channel.
-fn layout(version: &Path, samples: &[Sample]) -> Result<Layout, ReadError> {
+fn layout(version: &Path, samples: &[Sample]) -> Result<Layout> {
     let channels = samples.iter().flat_map(|sample| sample.sweeps.keys());
     let channels: BTreeSet<&str> = channels.map(String::as_str).collect();
     channels.iter().find_map(|channel| Some(rig::agent_of(channel)?.0)).ok_or_else(|| {
@@ -165,7 +165,7 @@ impl Builder<'_> {
         mut samples: Vec<(Sample, Vec<Object>)>,
         options: &OpenOptions,
         problems: &mut Vec<ReadError>,
-    ) -> Result<Option<Scenario>, ReadError> {
+    ) -> Result<Option<Scenario>> {
         samples.sort_by_key(|(sample, _)| sample.micros);
         let agents = self.agents(&samples)?;
         let Some((ego, _)) = agents.first() else {
@@ -243,7 +243,7 @@ impl Builder<'_> {
 
     /// Agents with the channels of their LiDARs, ego first: vehicles in the order of the data set or of their names, a
     /// roadside unit last.
-    fn agents(&self, moments: &[(Sample, Vec<Object>)]) -> Result<Vec<(CavId, String)>, ReadError> {
+    fn agents(&self, moments: &[(Sample, Vec<Object>)]) -> Result<Vec<(CavId, String)>> {
         let channels = moments.iter().flat_map(|(sample, _)| sample.sweeps.keys());
         let mut agents = Vec::new();
         for channel in channels.collect::<BTreeSet<&String>>() {
@@ -335,7 +335,7 @@ struct Source {
 }
 
 impl Source {
-    fn sweep(&self, agent: &CavId, tick: &Tick) -> Result<(&Moment, &Sweep), ReadError> {
+    fn sweep(&self, agent: &CavId, tick: &Tick) -> Result<(&Moment, &Sweep)> {
         let moment = self.moments.get(&tick.stem);
         let found = moment.and_then(|moment| Some((moment, moment.sweeps.get(agent)?)));
         found.ok_or_else(|| {
@@ -357,7 +357,7 @@ impl Source {
 
 impl FrameSource for Source {
     /// Reads the sweep as well: an agent lists the objects hit by it.
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let (moment, sweep) = self.sweep(agent, tick)?;
         let world_from_lidar = sweep.world_from_lidar();
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
@@ -371,12 +371,7 @@ impl FrameSource for Source {
         Ok(frame)
     }
 
-    fn points(
-        &self,
-        agent: &CavId,
-        tick: &Tick,
-        _variant: Option<&str>,
-    ) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> Result<PcdCloud> {
         let (_, sweep) = self.sweep(agent, tick)?;
         let mut cloud = self.sweeps.read(agent, &self.root.join(&sweep.file))?;
         sweep.turns().apply(&mut cloud.points);

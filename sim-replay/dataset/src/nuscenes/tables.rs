@@ -9,11 +9,11 @@ use protocol::Pose;
 use protocol::text::excerpt;
 
 use super::annotations;
-use crate::ReadError;
 use crate::frame::Object;
 use crate::json::Field;
 use crate::json_table::{self, Keys};
 use crate::time_stamps;
+use crate::{ReadError, Result};
 
 /// The tables that are read.
 pub(super) const NAMES: [&str; 9] = [
@@ -86,7 +86,7 @@ struct SweepRow {
 ///
 /// # Errors
 /// If a table is missing or broken before its first row. Annotations may be missing.
-pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tables, ReadError> {
+pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tables> {
     let mounts = read_mounts(version, problems)?;
     let (scenes, scene_indices) = read_scenes(version, problems)?;
     let (mut samples, sample_indices) = read_samples(version, &scene_indices, problems)?;
@@ -106,8 +106,8 @@ fn read_rows(
     name: &str,
     problems: &mut Vec<ReadError>,
     is_needed: impl Fn(&Keys<'_>) -> bool,
-    row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
-) -> Result<usize, ReadError> {
+    row: impl FnMut(&Field<'_>) -> Result<()>,
+) -> Result<usize> {
     json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
 }
 
@@ -116,16 +116,13 @@ pub(super) fn read_all(
     version: &Path,
     name: &str,
     problems: &mut Vec<ReadError>,
-    row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
-) -> Result<usize, ReadError> {
+    row: impl FnMut(&Field<'_>) -> Result<()>,
+) -> Result<usize> {
     read_rows(version, name, problems, |_| true, row)
 }
 
 /// LiDARs by the token of their calibration.
-fn read_mounts(
-    version: &Path,
-    problems: &mut Vec<ReadError>,
-) -> Result<HashMap<String, Mount>, ReadError> {
+fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Mount>> {
     let mut channels = HashMap::new();
     read_all(version, "sensor.json", problems, |row| {
         let channel = row.required("channel")?.text()?;
@@ -154,10 +151,7 @@ fn read_mounts(
 
 type Indices = HashMap<String, usize>;
 
-fn read_scenes(
-    version: &Path,
-    problems: &mut Vec<ReadError>,
-) -> Result<(Vec<Scene>, Indices), ReadError> {
+fn read_scenes(version: &Path, problems: &mut Vec<ReadError>) -> Result<(Vec<Scene>, Indices)> {
     let (mut scenes, mut indices) = (Vec::new(), Indices::new());
     read_all(version, "scene.json", problems, |row| {
         let mut vehicles = Vec::new();
@@ -178,7 +172,7 @@ fn read_samples(
     version: &Path,
     scenes: &Indices,
     problems: &mut Vec<ReadError>,
-) -> Result<(Vec<Sample>, Indices), ReadError> {
+) -> Result<(Vec<Sample>, Indices)> {
     let (mut samples, mut stamps, mut indices) = (Vec::new(), Vec::new(), Indices::new());
     read_all(version, "sample.json", problems, |row| {
         let scene = referred(row, "scene_token", scenes)?;
@@ -205,7 +199,7 @@ fn read_sweeps(
     mounts: &HashMap<String, Mount>,
     samples: &Indices,
     problems: &mut Vec<ReadError>,
-) -> Result<HashMap<String, Vec<SweepRow>>, ReadError> {
+) -> Result<HashMap<String, Vec<SweepRow>>> {
     let mut sweeps: HashMap<String, Vec<SweepRow>> = HashMap::new();
     let is_needed = |keys: &Keys<'_>| {
         keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token)
@@ -238,7 +232,7 @@ fn place(
     mut rows: HashMap<String, Vec<SweepRow>>,
     samples: &mut [Sample],
     problems: &mut Vec<ReadError>,
-) -> Result<(), ReadError> {
+) -> Result<()> {
     let tokens: std::collections::HashSet<String> = rows.keys().cloned().collect();
     let is_needed = |keys: &Keys<'_>| tokens.contains(&*keys.token);
     read_rows(version, "ego_pose.json", problems, is_needed, |row| {
@@ -266,7 +260,7 @@ fn place(
 }
 
 /// The index of the row that a token refers to.
-pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize, ReadError> {
+pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize> {
     let token = row.required(key)?;
     let text = token.id()?;
     let unknown = || token.error(format!("no row has the token {:?}", excerpt(&text, 40)));
@@ -274,7 +268,7 @@ pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<
 }
 
 /// `translation` in metres and `rotation` as quaternion w, x, y, z.
-pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>, ReadError> {
+pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>> {
     let translation_m = row.required("translation")?.numbers::<3>()?;
     let rotation = row.required("rotation")?;
     let rotation_wxyz = rotation.numbers::<4>()?;

@@ -122,11 +122,8 @@ impl Header {
         while !entries.has("DATA") {
             line += 1;
             let Some(end) = rest.iter().take(MAX_LINE).position(|&byte| byte == b'\n') else {
-                return Err(PcdError::at(
-                    line,
-                    "DATA",
-                    "the header ends before a DATA line",
-                ));
+                let reason = "the header ends before a DATA line";
+                return Err(PcdError::at(line, "DATA", reason));
             };
             let (text, after) = rest.split_at(end);
             entries.add(line, without_comment(text))?;
@@ -292,11 +289,10 @@ impl<'a> Entries<'a> {
         let entry = self.get(key)?;
         match entry.values[..] {
             [value] => Ok((entry.line, value)),
-            _ => Err(PcdError::at(
-                entry.line,
-                key,
-                format!("{} values, expected 1", entry.values.len()),
-            )),
+            _ => {
+                let reason = format!("{} values, expected 1", entry.values.len());
+                Err(PcdError::at(entry.line, key, reason))
+            }
         }
     }
 
@@ -308,11 +304,8 @@ impl<'a> Entries<'a> {
         if VERSIONS.contains(&version) {
             return Ok(());
         }
-        Err(PcdError::at(
-            line,
-            "VERSION",
-            format!("{version:?}, expected 0.7, 0.6 or 0.5"),
-        ))
+        let reason = format!("{version:?}, expected 0.7, 0.6 or 0.5");
+        Err(PcdError::at(line, "VERSION", reason))
     }
 
     /// One value for each field, or an error with both counts.
@@ -321,11 +314,8 @@ impl<'a> Entries<'a> {
         if entry.values.len() == fields {
             return Ok(entry);
         }
-        Err(PcdError::at(
-            entry.line,
-            key,
-            format!("{} values for {fields} FIELDS", entry.values.len()),
-        ))
+        let reason = format!("{} values for {fields} FIELDS", entry.values.len());
+        Err(PcdError::at(entry.line, key, reason))
     }
 
     #[expect(
@@ -369,24 +359,15 @@ impl<'a> Entries<'a> {
             return Ok(());
         };
         if entry.values.len() != 7 {
-            return Err(PcdError::at(
-                entry.line,
-                "VIEWPOINT",
-                format!("{} values, expected 7", entry.values.len()),
-            ));
+            let reason = format!("{} values, expected 7", entry.values.len());
+            return Err(PcdError::at(entry.line, "VIEWPOINT", reason));
         }
-        match entry
-            .values
-            .iter()
-            .find(|value| !value.parse::<f64>().is_ok_and(f64::is_finite))
-        {
-            Some(value) => Err(PcdError::at(
-                entry.line,
-                "VIEWPOINT",
-                format!("{value:?} is no finite number"),
-            )),
-            None => Ok(()),
-        }
+        let is_number = |value: &&str| value.parse::<f64>().is_ok_and(f64::is_finite);
+        let Some(value) = entry.values.iter().find(|value| !is_number(value)) else {
+            return Ok(());
+        };
+        let reason = format!("{value:?} is no finite number");
+        Err(PcdError::at(entry.line, "VIEWPOINT", reason))
     }
 
     fn data(&self) -> Result<Data, PcdError> {
@@ -429,25 +410,18 @@ fn number_size(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
         .ok()
         .filter(|size| (1..=MAX_SIZE).contains(size));
     size.ok_or_else(|| {
-        PcdError::at(
-            line,
-            "SIZE",
-            format!("{value:?} of field {name}, expected 1 to {MAX_SIZE}"),
-        )
+        let reason = format!("{value:?} of field {name}, expected 1 to {MAX_SIZE}");
+        PcdError::at(line, "SIZE", reason)
     })
 }
 
 fn field_count(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
     let count = value.parse().ok().filter(|&count: &u64| count <= MAX_COUNT);
-    count
-        .and_then(|count| usize::try_from(count).ok())
-        .ok_or_else(|| {
-            PcdError::at(
-                line,
-                "COUNT",
-                format!("{value:?} of field {name}, expected 0 to {MAX_COUNT}"),
-            )
-        })
+    let count = count.and_then(|count| usize::try_from(count).ok());
+    count.ok_or_else(|| {
+        let reason = format!("{value:?} of field {name}, expected 0 to {MAX_COUNT}");
+        PcdError::at(line, "COUNT", reason)
+    })
 }
 
 /// The only coordinate of that name, which must hold one number.
@@ -460,18 +434,12 @@ fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, Pcd
         .next()
         .ok_or_else(|| PcdError::at(line, "FIELDS", format!("no field {name}")))?;
     if found.next().is_some() {
-        return Err(PcdError::at(
-            line,
-            "FIELDS",
-            format!("{name} is given twice"),
-        ));
+        let reason = format!("{name} is given twice");
+        return Err(PcdError::at(line, "FIELDS", reason));
     }
     if field.count != 1 {
-        return Err(PcdError::at(
-            line,
-            "COUNT",
-            format!("{} of field {name}, expected 1", field.count),
-        ));
+        let reason = format!("{} of field {name}, expected 1", field.count);
+        return Err(PcdError::at(line, "COUNT", reason));
     }
     Ok(index)
 }

@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use support::bounded_file;
 use tempfile::TempPath;
 
-use crate::ReadError;
 use crate::files::list;
 use crate::yaml::{self, Field};
+use crate::{ReadError, Result};
 
 /// Name of the file that describes a bag in its folder.
 const METADATA: &str = "metadata.yaml";
@@ -83,10 +83,7 @@ fn in_folder(dir: &Path) -> Vec<PathBuf> {
 
 /// The files of the bag at a path, in order. Those that its description lists and that do not exist, and the reverse, are
 /// problems.
-pub(super) fn files_of(
-    path: &Path,
-    problems: &mut Vec<ReadError>,
-) -> Result<Vec<PathBuf>, ReadError> {
+pub(super) fn files_of(path: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<PathBuf>> {
     if path.is_file() {
         return Ok(vec![path.to_owned()]);
     }
@@ -129,7 +126,7 @@ pub(super) fn files_of(
 }
 
 /// The files that the description lists.
-fn listed(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
+fn listed(dir: &Path) -> Result<Vec<PathBuf>> {
     let path = dir.join(METADATA);
     let node = yaml::read(&path)?;
     let root = Field::root(&path, &node);
@@ -154,7 +151,7 @@ pub(super) enum Unpacked {
 }
 
 impl Unpacked {
-    pub(super) fn of(path: &Path) -> Result<Self, ReadError> {
+    pub(super) fn of(path: &Path) -> Result<Self> {
         let is_compressed = path.to_str().is_some_and(|name| name.ends_with(COMPRESSED));
         if !is_compressed {
             return Ok(Self::AsIs(path.to_owned()));

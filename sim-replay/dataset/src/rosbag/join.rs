@@ -10,8 +10,8 @@ use super::contents::Contents;
 use super::pose_source::{MAX_GAP_NANOS, PoseSource, PoseSources};
 use super::scan::Place;
 use super::sweeps::SweepTopic;
-use crate::ReadError;
 use crate::trajectory::NoPose;
+use crate::{ReadError, Result};
 
 /// Numbers of messages of two topics of clouds count as equal up to this share: a recorder begins between them.
 const SAME_COUNT: f64 = 0.95;
@@ -55,7 +55,7 @@ pub(super) fn join(
     path: &Path,
     contents: &Contents,
     problems: &mut Vec<ReadError>,
-) -> Result<Joined, ReadError> {
+) -> Result<Joined> {
     let topics = topics(path, contents)?;
     let mut attempts: Vec<Attempt> = Vec::new();
     for sweeps in topics {
@@ -75,7 +75,7 @@ pub(super) fn join(
 
 /// Topics of sweeps, those with most messages first, of equally many those with most bytes. Clouds in the world's frame
 /// are no sweeps.
-fn topics(path: &Path, contents: &Contents) -> Result<Vec<SweepTopic>, ReadError> {
+fn topics(path: &Path, contents: &Contents) -> Result<Vec<SweepTopic>> {
     let all = contents.clouds.iter();
     let mut topics: Vec<SweepTopic> = all
         .map(|(topic, clouds)| SweepTopic::new(path, topic, clouds))

@@ -31,7 +31,7 @@ use self::storage::Storage;
 use super::files::name_below;
 use super::layouts::{LayoutRow, Reader};
 use super::points::{IntensityScale, Sweeps, divisor_of_first};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, single_vehicle};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Result, Scenario, Tick, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::{IntensityOrigin, PcdCloud};
 
@@ -77,7 +77,7 @@ fn open(
     path: &Path,
     options: &OpenOptions,
     problems: &mut Vec<ReadError>,
-) -> Result<Scenario, ReadError> {
+) -> Result<Scenario> {
     let files = files::files_of(path, problems)?;
     let mut contents = Contents::of(path);
     let storage = Storage::open(&files, &mut contents, problems)?;
@@ -107,13 +107,13 @@ fn open(
 }
 
 impl Bag {
-    fn sweep(&self, tick: &Tick) -> Result<&JoinedSweep, ReadError> {
+    fn sweep(&self, tick: &Tick) -> Result<&JoinedSweep> {
         let lacks = || ReadError::malformed(Path::new(""), format!("no sweep at {}", tick.stem));
         self.sweeps.get(&tick.capture_nanos).ok_or_else(lacks)
     }
 
     /// A sweep with the intensities as stored.
-    fn read_stored(&self, sweep: &JoinedSweep) -> Result<PcdCloud, ReadError> {
+    fn read_stored(&self, sweep: &JoinedSweep) -> Result<PcdCloud> {
         let bytes = self.storage.read(sweep.place)?;
         let read = read_point_cloud(&bytes, LIMITS).map_err(|error| {
             let reason = format!("sweep {}: {error}", sweep.nanos);
@@ -130,13 +130,13 @@ impl Bag {
 }
 
 impl FrameSource for Bag {
-    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame> {
         let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
         frame.world_from_lidar = self.sweep(tick)?.world_from_lidar;
         Ok(frame)
     }
 
-    fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
+    fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud> {
         let mut cloud = self.read_stored(self.sweep(tick)?)?;
         self.scale.apply(&mut cloud, || {
             *self.divisor.get_or_init(|| {

@@ -8,8 +8,8 @@ use recording::McapFile;
 use super::files::{Kind, Unpacked, unpacked_message};
 use super::scan::{At, Message, Place, Scan, Topic};
 use super::sqlite::SqliteFile;
-use crate::ReadError;
 use crate::recorded::as_read_error;
+use crate::{ReadError, Result};
 
 /// The files of a bag.
 pub(super) struct Storage(Vec<BagFile>);
@@ -35,7 +35,7 @@ impl Storage {
         paths: &[PathBuf],
         scan: &mut dyn Scan,
         problems: &mut Vec<ReadError>,
-    ) -> Result<Self, ReadError> {
+    ) -> Result<Self> {
         let (mut files, mut faults) = (Vec::new(), Vec::new());
         for path in paths {
             match BagFile::open(path, files.len(), scan, problems) {
@@ -64,7 +64,7 @@ impl Storage {
     }
 
     /// The bytes of a message in CDR.
-    pub(super) fn read(&self, place: Place) -> Result<Vec<u8>, ReadError> {
+    pub(super) fn read(&self, place: Place) -> Result<Vec<u8>> {
         let fault = |reason: String| ReadError::malformed(self.path(place), reason);
         let data = match (self.0.get(place.file).map(|file| &file.form), place.at) {
             (Some(Form::Mcap(file)), At::Mcap(at)) => file.read(at).map_err(as_read_error)?,
@@ -84,7 +84,7 @@ impl BagFile {
         index: usize,
         scan: &mut dyn Scan,
         problems: &mut Vec<ReadError>,
-    ) -> Result<Self, ReadError> {
+    ) -> Result<Self> {
         let kind = Kind::of(path);
         if kind == Some(Kind::Ros1) {
             let reason = "a bag of ROS 1: `rosbags-convert --src FILE.bag --dst FOLDER` makes one of ROS 2 of it";
@@ -109,7 +109,7 @@ fn scan_mcap(
     file: usize,
     scan: &mut dyn Scan,
     problems: &mut Vec<ReadError>,
-) -> Result<McapFile, ReadError> {
+) -> Result<McapFile> {
     let mcap = McapFile::open(path, &mut |message, at| {
         let channel = &message.channel;
         let schema = channel.schema.as_ref();

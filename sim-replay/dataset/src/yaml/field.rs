@@ -3,9 +3,9 @@
 use std::path::Path;
 
 use super::{Node, Value};
-use crate::ReadError;
 use crate::json::child_name;
 use crate::numpy_tags::{self, NumpyArray};
+use crate::{ReadError, Result};
 
 /// A node with its position in the document; readers take values from it.
 ///
@@ -62,7 +62,7 @@ impl<'a> Field<'a> {
     }
 
     /// The entries of a map.
-    pub(crate) fn entries(&self) -> Result<Vec<(&'a str, Self)>, ReadError> {
+    pub(crate) fn entries(&self) -> Result<Vec<(&'a str, Self)>> {
         match &self.node.value {
             Value::Map(entries) => Ok(entries
                 .iter()
@@ -73,7 +73,7 @@ impl<'a> Field<'a> {
     }
 
     /// The items of a list.
-    pub(crate) fn items(&self) -> Result<Vec<Self>, ReadError> {
+    pub(crate) fn items(&self) -> Result<Vec<Self>> {
         match &self.node.value {
             Value::List(items) => Ok(items
                 .iter()
@@ -90,7 +90,7 @@ impl<'a> Field<'a> {
     }
 
     /// An entry that may be missing or null. Of equal keys the last is used, as in Python.
-    pub(crate) fn optional(&self, key: &str) -> Result<Option<Self>, ReadError> {
+    pub(crate) fn optional(&self, key: &str) -> Result<Option<Self>> {
         let Value::Map(entries) = &self.node.value else {
             return Err(self.expected("a map"));
         };
@@ -101,13 +101,13 @@ impl<'a> Field<'a> {
     }
 
     /// A required entry.
-    pub(crate) fn required(&self, key: &str) -> Result<Self, ReadError> {
+    pub(crate) fn required(&self, key: &str) -> Result<Self> {
         self.optional(key)?
             .ok_or_else(|| self.child(key, self.node).error("missing"))
     }
 
     /// A finite number, in any notation.
-    pub(crate) fn number(&self) -> Result<f64, ReadError> {
+    pub(crate) fn number(&self) -> Result<f64> {
         if numpy_tags::is_python(self.node) && !matches!(self.node.value, Value::Text(_)) {
             return numpy_tags::scalar(self);
         }
@@ -118,7 +118,7 @@ impl<'a> Field<'a> {
 
     /// An integer, or a float without fraction: ids are written as `-1.0` where they went through an array of floats.
     #[expect(clippy::cast_possible_truncation, reason = "an integer below 1e15")]
-    pub(crate) fn integer(&self) -> Result<i64, ReadError> {
+    pub(crate) fn integer(&self) -> Result<i64> {
         if let Value::Integer(value) = self.node.value {
             return Ok(value);
         }
@@ -128,7 +128,7 @@ impl<'a> Field<'a> {
         }
     }
 
-    pub(crate) fn text(&self) -> Result<&'a str, ReadError> {
+    pub(crate) fn text(&self) -> Result<&'a str> {
         match &self.node.value {
             Value::Text(text) => Ok(text),
             _ => Err(self.expected("a text")),
@@ -136,7 +136,7 @@ impl<'a> Field<'a> {
     }
 
     /// Exactly `N` finite numbers, as a list or an array with one row or column.
-    pub(crate) fn numbers<const N: usize>(&self) -> Result<[f64; N], ReadError> {
+    pub(crate) fn numbers<const N: usize>(&self) -> Result<[f64; N]> {
         let mut numbers = [0.0; N];
         match &self.node.value {
             Value::List(items) if !numpy_tags::is_call(self.node) => {
@@ -167,7 +167,7 @@ impl<'a> Field<'a> {
     }
 
     /// Numbers in any form: a list, a list of equally long rows, or an array.
-    pub(crate) fn array(&self) -> Result<NumpyArray, ReadError> {
+    pub(crate) fn array(&self) -> Result<NumpyArray> {
         let items = match &self.node.value {
             Value::List(items) if !numpy_tags::is_call(self.node) => items,
             _ if numpy_tags::is_python(self.node) => return numpy_tags::array(self),
@@ -193,7 +193,7 @@ impl<'a> Field<'a> {
     }
 
     /// An item of a list: a number, or a row of numbers.
-    fn row(&self) -> Result<NumpyArray, ReadError> {
+    fn row(&self) -> Result<NumpyArray> {
         match &self.node.value {
             Value::List(items) if !numpy_tags::is_call(self.node) => {
                 let values = self

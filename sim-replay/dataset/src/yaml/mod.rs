@@ -13,8 +13,8 @@ pub(super) use field::Field;
 
 use tree::Unsound;
 
-use super::ReadError;
 use super::files;
+use super::{ReadError, Result};
 
 /// Largest YAML file that is read, bytes. Frames with four cameras and fifty objects have about 20 kB.
 const MAX_BYTES: u64 = 16 << 20;
@@ -43,12 +43,12 @@ pub(super) enum Value {
 }
 
 /// Reads and parses a file.
-pub(super) fn read(path: &Path) -> Result<Node, ReadError> {
+pub(super) fn read(path: &Path) -> Result<Node> {
     parse(path, &files::read_limited(path, MAX_BYTES)?)
 }
 
 /// Parses a document; `path` is for messages.
-pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node, ReadError> {
+pub(super) fn parse(path: &Path, bytes: &[u8]) -> Result<Node> {
     let malformed =
         |line: u64, reason: String| ReadError::malformed_at(path, Some(line), None, reason);
     let text = std::str::from_utf8(bytes).map_err(|error| {

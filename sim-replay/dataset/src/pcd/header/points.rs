@@ -34,11 +34,8 @@ impl Entries<'_> {
             }
         };
         if count > MAX_POINTS {
-            return Err(PcdError::at(
-                line,
-                key,
-                format!("{count} points, at most {MAX_POINTS} are read"),
-            ));
+            let reason = format!("{count} points, at most {MAX_POINTS} are read");
+            return Err(PcdError::at(line, key, reason));
         }
         usize::try_from(count)
             .map_err(|_| PcdError::at(line, key, format!("{count} do not fit this machine")))
@@ -69,9 +66,6 @@ fn check_product(width: u64, height: Option<u64>, line: u64, points: u64) -> Res
         || "of no HEIGHT".into(),
         |height| format!("x HEIGHT {height}"),
     );
-    Err(PcdError::at(
-        line,
-        "POINTS",
-        format!("{points}, which does not match WIDTH {width} {height}"),
-    ))
+    let reason = format!("{points}, which does not match WIDTH {width} {height}");
+    Err(PcdError::at(line, "POINTS", reason))
 }

@@ -67,7 +67,7 @@ impl FromStr for ImageSize {
     }
 }
 
-/// The mounts of OPV2V and V2VLoc, by number.
+/// The mounts of OPV2V and V2VLoc, by number: position on the vehicle, metres, and yaw, degrees.
 const MOUNTS: [([f64; 3], f64); 4] = [
     ([2.5, 0.0, 1.0], 0.0),
     ([0.0, -0.3, 1.8], -100.0),
