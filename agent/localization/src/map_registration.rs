@@ -41,17 +41,14 @@ pub struct MapRegistration {
 }
 
 impl MapRegistration {
-    /// Poses of a localizer, registered to the map in a file where there is one.
+    /// Poses of a localizer, registered to the map in a file; without a file the localizer itself.
     ///
     /// # Errors
     /// [`FileError`] as [`SurfelMap::load`].
-    pub fn of(
-        localizer: Box<dyn Localize>,
-        map: Option<&Path>,
-    ) -> Result<Box<dyn Localize>, FileError> {
-        let Some(map) = map else {
+    pub fn of(localizer: Box<dyn Localize>, map: &Path) -> Result<Box<dyn Localize>, FileError> {
+        if map.as_os_str().is_empty() {
             return Ok(localizer);
-        };
+        }
         let map = Arc::new(SurfelMap::load(map)?);
         Ok(Box::new(Self::new(localizer, map)))
     }

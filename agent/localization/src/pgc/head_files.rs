@@ -14,6 +14,11 @@ const ENDING: &str = "safetensors";
 pub const ENCODER_FILE: &str = "pgc-encoder.safetensors";
 /// Name of the weights in the folder of a training.
 const TRAINED_FILE: &str = "weights.safetensors";
+/// Name of the surfel map in the folder of a place.
+pub const SURFELS_FILE: &str = "surfels.safetensors";
+/// Beginnings of the names of released heads and surfel maps.
+const HEAD_PREFIX: &str = "pgc-";
+const SURFELS_PREFIX: &str = "surfels-";
 /// Folders of released weights from the working directory.
 const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 
@@ -22,22 +27,38 @@ const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 /// # Errors
 /// [`FileError`] with the names of the released heads.
 pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
+    released_file(head, HEAD_PREFIX, TRAINED_FILE)
+}
+
+/// The file of a surfel map: a path, the folder that `agent map` wrote, or the name of a released one (`town1`).
+///
+/// # Errors
+/// [`FileError`] with the names of the released maps.
+pub fn surfel_map_file(map: &Path) -> Result<PathBuf, FileError> {
+    released_file(map, SURFELS_PREFIX, SURFELS_FILE)
+}
+
+/// The file at a path, `trained` in a folder, or the released file of a name with this prefix.
+fn released_file(head: &Path, prefix: &str, trained: &str) -> Result<PathBuf, FileError> {
     if head.is_file() {
         return Ok(head.to_owned());
     }
     if head.is_dir() {
-        return Ok(head.join(TRAINED_FILE));
+        return Ok(head.join(trained));
     }
     let folders = weights_folders();
     let name = head.display();
-    let names = [format!("pgc-{name}.{ENDING}"), format!("{name}.{ENDING}")];
+    let names = [
+        format!("{prefix}{name}.{ENDING}"),
+        format!("{name}.{ENDING}"),
+    ];
     let mut files = folders
         .iter()
         .flat_map(|folder| names.iter().map(move |name| folder.join(name)));
     let released = || {
         let files = folders.iter().flat_map(|folder| files_in(folder));
         let stems = files
-            .filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix("pgc-")?.to_owned()));
+            .filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix(prefix)?.to_owned()));
         // A folder may be reached by two paths.
         let names: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
         names.into_iter().collect()
@@ -45,7 +66,7 @@ pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
     files.find(|file| file.is_file()).ok_or_else(|| {
         let released: Vec<String> = released();
         let released = released.join(", ");
-        let problem = format_args!("no such file or released head; released are {released}");
+        let problem = format_args!("no such file or released one; released are {released}");
         FileError::new(head, problem)
     })
 }
@@ -161,7 +182,7 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(
-            message.contains("town-that-nobody-drove: no such file or released head"),
+            message.contains("town-that-nobody-drove: no such file or released one"),
             "{message}"
         );
     }

@@ -12,6 +12,7 @@ use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::settings::{PoseBasis, PoseSettings, require_file};
 use super::{PoseInput, PoseSource, PoseSourceError};
 use crate::baselines::{LightLoc, load_baseline};
+use crate::map_registration::MapRegistration;
 use crate::pgc::pose_solver::PoseSolver;
 use crate::pgc::{Localize, Localizer, LocalizerError};
 
@@ -28,6 +29,11 @@ pub struct PgcConfig {
     /// (pose sources pgc and tracked).
     #[arg(long, value_name = "FILE|NAME")]
     pub head: PathBuf,
+    /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
+    /// wrote, or a released one, town1 or town4. Absent: poses are not registered (pose sources pgc and tracked).
+    #[arg(id = "surfel_map", long = "surfel-map", value_name = "FILE|NAME")]
+    #[serde(default)]
+    pub surfel_map: PathBuf,
     /// Leave out what PGC adds to LightLoc: predicted error, refinement and confidence (pose source pgc).
     #[arg(long)]
     #[serde(default)]
@@ -70,6 +76,7 @@ impl LocalizedPose {
             true => Box::new(LightLoc::new(localizer, PoseSolver::default())),
             false => Box::new(localizer),
         };
+        let localizer = MapRegistration::of(localizer, &config.surfel_map)?;
         Ok(Self::new(localizer, config.motion_gate.clone()))
     }
 
@@ -108,8 +115,8 @@ impl PoseSettings for PgcConfig {
         require_file("pgc.head", "--head", &self.head)
     }
 
-    fn networks(&mut self) -> Option<[&mut PathBuf; 2]> {
-        Some([&mut self.encoder, &mut self.head])
+    fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
+        Some([&mut self.encoder, &mut self.head, &mut self.surfel_map])
     }
 }
 

@@ -33,7 +33,7 @@ pub use recorded::RecordedPose;
 pub use table::PoseSourceConfig;
 pub use tracked::{TrackedPose, TrackedPoseConfig};
 
-use crate::pgc::head_files::{encoder_or_named, head_file, is_name};
+use crate::pgc::head_files::{encoder_or_named, head_file, is_name, surfel_map_file};
 use crate::pgc::{LocalizerError, LocalizerInput};
 use crate::tracker::PoseMeasurement;
 use settings::{PoseBasis, PoseSettings};
@@ -181,8 +181,13 @@ impl PoseSourceConfig {
     pub fn with_networks(mut self) -> Result<Self, FileError> {
         let networks = self.settings_mut().and_then(|settings| settings.networks());
         // A head that is not given is refused by the check of the values.
-        if let Some([encoder, head]) = networks.filter(|[_, head]| !head.as_os_str().is_empty()) {
+        if let Some([encoder, head, map]) =
+            networks.filter(|[_, head, _]| !head.as_os_str().is_empty())
+        {
             *head = head_file(head)?;
+            if !map.as_os_str().is_empty() {
+                *map = surfel_map_file(map)?;
+            }
             let given = Some(encoder.as_path()).filter(|file| !file.as_os_str().is_empty());
             *encoder = encoder_or_named(given, head)?;
         }
@@ -192,7 +197,7 @@ impl PoseSourceConfig {
     /// The scene-specific head of PGC, if the source has one.
     pub fn head(&self) -> Option<PathBuf> {
         let mut source = self.clone();
-        let [_, head] = source.settings_mut()?.networks()?;
+        let [_, head, _] = source.settings_mut()?.networks()?;
         Some(std::mem::take(head))
     }
 

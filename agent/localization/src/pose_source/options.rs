@@ -14,7 +14,7 @@ use super::settings::PoseSettings;
 /// Identifier of the option that chooses the source.
 pub(super) const CHOICE: &str = "pose_source";
 /// Options of the networks of PGC, for every source that has them.
-const NETWORKS: [&str; 2] = ["encoder", "head"];
+const NETWORKS: [&str; 3] = ["encoder", "head", "surfel_map"];
 
 /// The option that chooses the source.
 pub(super) fn choice<K: ValueEnum + Clone + Send + Sync + 'static>() -> Arg {

@@ -32,14 +32,19 @@ pub(crate) trait PoseSettings {
         Ok(())
     }
 
-    /// Encoder and scene-specific head of PGC: they may be given by name, and by the options `--encoder` and `--head`.
-    fn networks(&mut self) -> Option<[&mut PathBuf; 2]> {
+    /// Encoder, scene-specific head and surfel map of PGC: they may be given by name, and by the options `--encoder`,
+    /// `--head` and `--surfel-map`.
+    fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
         None
     }
 
     /// Files that the source reads.
     fn files(&mut self) -> Vec<&mut PathBuf> {
-        self.networks().into_iter().flatten().collect()
+        let networks = self.networks().into_iter().flatten();
+        // A surfel map is optional.
+        networks
+            .filter(|file| !file.as_os_str().is_empty())
+            .collect()
     }
 
     /// What the identifiers of its options have before the name of the field.

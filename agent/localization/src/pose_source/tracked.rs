@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::settings::{PoseBasis, PoseSettings, require_file};
 use super::{PoseInput, PoseSource, PoseSourceError};
+use crate::map_registration::MapRegistration;
 use crate::pgc::{Localization, Localize, Localizer, LocalizerError, LocalizerInput};
 use crate::tracker::{Correction, PoseMeasurement, PoseTracker, TrackedState, TrackerLimits};
 
@@ -29,6 +30,10 @@ pub struct TrackedPoseConfig {
     #[arg(skip)]
     #[serde(default)]
     pub head: PathBuf,
+    /// Surfel map of the place, or the name of a released one. Absent: poses are not registered to a map.
+    #[arg(skip)]
+    #[serde(default)]
+    pub surfel_map: PathBuf,
     /// Sweeps from one measurement to the next, 1 to 100, of a vehicle that measures its yaw rate; of one without, half
     /// as many (pose source tracked).
     #[arg(
@@ -63,6 +68,7 @@ impl Default for TrackedPoseConfig {
         Self {
             encoder: PathBuf::new(),
             head: PathBuf::new(),
+            surfel_map: PathBuf::new(),
             measure_every: Self::measure_every(),
             phase: 0,
             global_period_s: Self::global_period_s(),
@@ -119,8 +125,8 @@ impl PoseSettings for TrackedPoseConfig {
         Self::validate(self)
     }
 
-    fn networks(&mut self) -> Option<[&mut PathBuf; 2]> {
-        Some([&mut self.encoder, &mut self.head])
+    fn networks(&mut self) -> Option<[&mut PathBuf; 3]> {
+        Some([&mut self.encoder, &mut self.head, &mut self.surfel_map])
     }
 
     fn option_prefix() -> &'static str {
@@ -184,7 +190,10 @@ impl TrackedPose {
     ) -> Result<Box<dyn Localize>, LocalizerError> {
         let mut localizer = Localizer::load(&config.encoder, &config.head, inference)?;
         localizer.set_most_parts(MOST_PARTS);
-        Ok(Box::new(localizer))
+        Ok(MapRegistration::of(
+            Box::new(localizer),
+            &config.surfel_map,
+        )?)
     }
 
     /// Follows a vehicle with another localizer.

@@ -18,7 +18,7 @@ use localization::map_registration::MapRegistration;
 use localization::pgc::confidence::{
     CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss,
 };
-use localization::pgc::head_files::encoder_or_named;
+use localization::pgc::head_files::{encoder_or_named, surfel_map_file};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pgc::{Localize, Localizer};
@@ -90,8 +90,8 @@ pub(crate) struct Args {
         conflicts_with_all = ["encoder", "head", "baseline", "lightloc", "retrieval", "fit_confidence", "solver"]
     )]
     icp_map: Vec<PathBuf>,
-    /// Register the poses of PGC to a surfel map of the place (`agent map`): poses to the millimetre.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["baseline", "lightloc", "retrieval", "icp_map", "fit_confidence"])]
+    /// Register the poses of PGC to a surfel map of the place (`agent map`) or of a released one (town1, town4): poses to the millimetre.
+    #[arg(long, value_name = "FILE|NAME", conflicts_with_all = ["baseline", "lightloc", "retrieval", "icp_map", "fit_confidence"])]
     surfel_map: Option<PathBuf>,
     /// Distance between two sweeps on that point-cloud map, metres.
     #[arg(long, value_name = "M", default_value_t = 5.0, requires = "icp_map")]
@@ -264,9 +264,10 @@ impl Args {
         {
             scenarios.extend(dataset::open(folder)?.scenarios);
         }
-        let mut files: Vec<PathBuf> = { self.baseline.iter().chain(&self.surfel_map) }
-            .cloned()
-            .collect();
+        let mut files: Vec<PathBuf> = self.baseline.iter().cloned().collect();
+        if self.surfel_map.is_some() {
+            files.push(self.surfel_map_file()?);
+        }
         for head in heads.filter(|_| self.uses_head()) {
             files.extend([self.encoder(head)?, head.to_owned()]);
         }
@@ -338,9 +339,15 @@ impl Args {
         self.registered(Box::new(localizer))
     }
 
+    /// File of the surfel map; empty without one.
+    fn surfel_map_file(&self) -> Result<PathBuf, BadInput> {
+        let file = self.surfel_map.as_deref().map(surfel_map_file).transpose();
+        Ok(file.map_err(BadInput::of)?.unwrap_or_default())
+    }
+
     /// The localizer behind the surfel map, if there is one.
     fn registered(&self, localizer: Box<dyn Localize>) -> Result<Box<dyn Localize>, BadInput> {
-        MapRegistration::of(localizer, self.surfel_map.as_deref()).map_err(BadInput::of)
+        MapRegistration::of(localizer, &self.surfel_map_file()?).map_err(BadInput::of)
     }
 
     fn retrieval(

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, Scenario, findings};
 use indicatif::ProgressBar;
-use localization::pgc::head_files::encoder_or_named;
+use localization::pgc::head_files::{encoder_or_named, surfel_map_file};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::{
     LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable,
@@ -35,6 +35,10 @@ pub(crate) struct Args {
     /// The table.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
+    /// wrote, or a released one (town1, town4) [default: none].
+    #[arg(long, value_name = "FILE|NAME")]
+    surfel_map: Option<PathBuf>,
     /// Number format in which networks are computed.
     #[arg(long, value_enum, default_value_t)]
     precision: InferencePrecision,
@@ -98,6 +102,9 @@ impl Args {
         let config = PgcConfig {
             encoder: encoder_or_named(self.encoder.as_deref(), head).map_err(bad)?,
             head: head.to_owned(),
+            surfel_map: { self.surfel_map.as_deref().map(surfel_map_file).transpose() }
+                .map_err(bad)?
+                .unwrap_or_default(),
             ..PgcConfig::default()
         };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use dataset::IntensityScale;
 use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
 use dataset::findings::{self, SweepFindings};
-use localization::pgc::head_files::{encoder_or_named, head_file};
+use localization::map_registration::MapRegistration;
+use localization::pgc::head_files::{encoder_or_named, head_file, surfel_map_file};
 use localization::pgc::pose_solver::FoundPose;
 use localization::pgc::wrong_place::other_lidar_hint;
 use localization::pgc::{Localization, Localize, Localizer, LocalizerInput};
@@ -43,6 +44,10 @@ pub(crate) struct Args {
     /// Weights of the encoder, or of a detector that has it [default: those that the head names, beside it or released].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
+    /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
+    /// wrote, or a released one (town1, town4) [default: none].
+    #[arg(long, value_name = "FILE|NAME")]
+    surfel_map: Option<PathBuf>,
     /// Direction of the y axis in files that belong to no data set: left, right (CARLA, OPV2V), or whichever gives a pose,
     /// left first.
     #[arg(long, value_enum, default_value_t = YAxis::Auto)]
@@ -111,11 +116,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let head = head_file(&args.head).map_err(BadInput::of)?;
     let encoder = encoder_or_named(args.encoder.as_deref(), &head).map_err(BadInput::of)?;
     let inference = Inference::new(Device::Cpu, args.precision);
-    let mut localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
+    let localizer = Localizer::load(&encoder, &head, inference).map_err(BadInput::of)?;
+    let head_config = localizer.head_config().clone();
+    let map = args.surfel_map.as_deref().map(surfel_map_file).transpose();
+    let map = map.map_err(BadInput::of)?.unwrap_or_default();
+    let localizer = MapRegistration::of(Box::new(localizer), &map);
+    let mut localizer = localizer.map_err(BadInput::of)?;
     let (mut found, mut lost, mut bad) = (0, 0, 0);
     let (mut points, mut sweeps) = (Vec::new(), Vec::new());
     for file in clouds_at(&args.clouds) {
-        let located = args.locate(&mut localizer, file, &mut sweeps)?;
+        let located = args.locate(&mut *localizer, &head_config.scene_name, file, &mut sweeps)?;
         match (&located.error, &located.pose) {
             (Some(_), _) => bad += 1,
             (None, Some(_)) => found += 1,
@@ -136,7 +146,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     if found == 0 && lost > 0 {
-        let (head, map) = (head.display(), &localizer.head_config().scene_name);
+        let (head, map) = (head.display(), &head_config.scene_name);
         output::note(format_args!(
             "no cloud found itself: is {head} the head of this place and this LiDAR, and were these roads driven for \
              it? Its map is {map}"
@@ -145,7 +155,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let folder = args.clouds.first().map_or(Path::new(""), PathBuf::as_path);
     let sweeps: Vec<&SweepFindings> = sweeps.iter().collect();
     findings::note(&findings::of_clouds(folder, &sweeps, IntensityScale::AUTO));
-    if let Some(hint) = other_lidar_hint(localizer.head_config().sweep_points, &points) {
+    if let Some(hint) = other_lidar_hint(head_config.sweep_points, &points) {
         output::note(hint);
     }
     Ok(if bad > 0 {
@@ -158,11 +168,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 impl Args {
     fn locate(
         &self,
-        localizer: &mut Localizer,
+        localizer: &mut dyn Localize,
+        map: &str,
         file: Result<CloudFile, dataset::ReadError>,
         sweeps: &mut Vec<SweepFindings>,
     ) -> anyhow::Result<Located> {
-        let map = localizer.head_config().scene_name.clone();
+        let map = map.to_owned();
         let name = |file: &CloudFile| file.path().display().to_string();
         let (cloud, read) = match file {
             Ok(file) => (name(&file), file.read()),

@@ -7,7 +7,7 @@ use agent_offline::icp_map::read_map;
 use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
-use localization::pgc::head_files::{ENCODER_FILE, released_encoder};
+use localization::pgc::head_files::{ENCODER_FILE, SURFELS_FILE, released_encoder};
 use localization::registration::icp::surfel_map::SurfelMap;
 use perception::compute_device::ComputeDevice;
 use perception::train::{
@@ -19,8 +19,6 @@ use support::output;
 
 use super::train::options::check_folders;
 
-/// Name of the surfel map beside the weights.
-const SURFELS_FILE: &str = "surfels.safetensors";
 /// Name of the report beside the weights.
 const REPORT_FILE: &str = "map.json";
 
