@@ -74,11 +74,14 @@ impl RecordedFrame {
     }
 }
 
+/// Quality, vehicles, frames and agents of one attempt.
+type Attempt = (f64, Vec<Vehicle>, Vec<RecordedFrame>, Vec<usize>);
+
 /// Simulates a scene; tries others of the same seed if too few vehicles stay near the ego.
 pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
     let seed = derive_seed(spec.seed, &[1]);
     let parked = park(world.map_model, &world.lane_index, seed);
-    let mut best: Option<(f64, Vec<Vehicle>, Vec<RecordedFrame>, Vec<usize>)> = None;
+    let mut best: Option<Attempt> = None;
     for attempt in 0..ATTEMPTS {
         let seed = derive_seed(spec.seed, &[2, attempt]);
         let (vehicles, frames) = simulate(world, spec, &parked, seed)?;
