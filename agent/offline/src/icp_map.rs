@@ -4,6 +4,7 @@
 //! the vehicle and a receiver has to give the start.
 
 use crate::Error;
+use crate::sweep_database::present_sweeps;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -37,10 +38,10 @@ impl PoseSource for IcpMapPose {
         };
         let source = IcpSource::of_sweep(&input.cloud.xyzi, &self.config);
         match icp::register(&source, &self.map, &start.isometry(), &self.config) {
-            Ok(fit) => PoseEstimate::new(
-                fit.target_from_source.into(),
-                fit.overlap.clamp(0.0, 1.0) as f32,
-            ),
+            Ok(fit) => {
+                let confidence = fit.overlap.clamp(0.0, 1.0) as f32;
+                PoseEstimate::new(fit.target_from_source.into(), confidence)
+            }
             Err(NoIcpFit::TooFew { .. }) => no_pose(NoPoseReason::TooFewPoints),
             Err(NoIcpFit::TooLittleOverlap { .. } | NoIcpFit::Unconstrained { .. }) => {
                 no_pose(NoPoseReason::TooFewInliers)
@@ -69,36 +70,25 @@ pub fn read_map(
     for folder in folders {
         let mut sweeps = 0;
         for scenario in dataset::open(folder.as_ref())?.scenarios {
-            for agent in 0..scenario.agents.len() {
-                let mut last: Option<Isometry3<f64>> = None;
-                for tick in
-                    (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick))
-                {
-                    let without_points = LoadOptions {
-                        points: false,
-                        ..LoadOptions::default()
-                    };
-                    let Some(pose) = scenario
-                        .load(agent, tick, &without_points)?
-                        .world_from_lidar
-                    else {
-                        continue;
-                    };
-                    let pose = pose.isometry();
-                    let way_m = last.map_or(f64::INFINITY, |last| {
-                        (last.translation.vector - pose.translation.vector).norm()
-                    });
-                    if way_m >= spacing_m {
-                        map.add(
-                            &scenario
-                                .load(agent, tick, &LoadOptions::default())?
-                                .points
-                                .xyzi,
-                            &pose,
-                        );
-                        last = Some(pose);
-                        sweeps += 1;
-                    }
+            let mut last: Option<(usize, Isometry3<f64>)> = None;
+            for (agent, tick) in present_sweeps(&scenario) {
+                let without_points = LoadOptions {
+                    points: false,
+                    ..LoadOptions::default()
+                };
+                let frame = scenario.load(agent, tick, &without_points)?;
+                let Some(pose) = frame.world_from_lidar else {
+                    continue;
+                };
+                let pose = pose.isometry();
+                let way_m = last
+                    .filter(|(of, _)| *of == agent)
+                    .map(|(_, last)| (last.translation.vector - pose.translation.vector).norm());
+                if way_m.is_none_or(|way_m| way_m >= spacing_m) {
+                    let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+                    map.add(&frame.points.xyzi, &pose);
+                    last = Some((agent, pose));
+                    sweeps += 1;
                 }
             }
         }

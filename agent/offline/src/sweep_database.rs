@@ -18,47 +18,34 @@ pub fn read_database(
     left_out: &mut LeftOut,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<SweepDatabase, Error> {
-    let datasets = folders
-        .iter()
-        .map(|folder| dataset::open(folder.as_ref()))
-        .collect::<Result<Vec<_>, _>>()?;
-    let scenarios: Vec<_> = datasets
-        .iter()
-        .flat_map(|dataset| &dataset.scenarios)
-        .collect();
-    let total = scenarios
-        .iter()
-        .map(|scenario| scenario.ticks.len() * scenario.agents.len())
-        .sum();
-    datasets
-        .iter()
-        .for_each(|dataset| left_out.add_files(&dataset.problems));
-    let (mut sweeps, mut done) = (Vec::new(), 0);
-    for scenario in scenarios {
-        for agent in 0..scenario.agents.len() {
-            for tick in 0..scenario.ticks.len() {
-                done += 1;
-                progress(done, total);
-                if !scenario.is_present(agent, tick) {
-                    continue;
-                }
-                match described(scenario, agent, tick, localizer) {
-                    Ok(sweep) => sweeps.extend(sweep),
-                    Err(Error::Read(error)) => {
-                        left_out.add_unreadable(agent, Problem::from(&error))
-                    }
-                    Err(error) => return Err(error),
-                }
-            }
+    let datasets = folders.iter().map(|folder| dataset::open(folder.as_ref()));
+    let datasets: Vec<_> = datasets.collect::<Result<_, _>>()?;
+    for dataset in &datasets {
+        left_out.add_files(&dataset.problems);
+    }
+    let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
+    let of_scenario = |scenario| present_sweeps(scenario).map(move |sweep| (scenario, sweep));
+    let all: Vec<_> = scenarios.flat_map(of_scenario).collect();
+    let mut sweeps = Vec::new();
+    for (place, &(scenario, (agent, tick))) in all.iter().enumerate() {
+        progress(place + 1, all.len());
+        match described(scenario, agent, tick, localizer) {
+            Ok(sweep) => sweeps.extend(sweep),
+            Err(Error::Read(error)) => left_out.add_unreadable(agent, Problem::from(&error)),
+            Err(error) => return Err(error),
         }
     }
-    let folders = || {
-        folders
-            .iter()
-            .map(|folder| folder.as_ref().to_owned())
-            .collect()
-    };
-    SweepDatabase::new(&sweeps).ok_or_else(|| Error::NoSweeps(folders(), left_out.reasons()))
+    SweepDatabase::new(&sweeps).ok_or_else(|| {
+        let folders = folders.iter().map(|folder| folder.as_ref().to_owned());
+        Error::NoSweeps(folders.collect(), left_out.reasons())
+    })
+}
+
+/// Agent and tick of all sweeps of a scenario, vehicle by vehicle, in the order of time.
+pub(crate) fn present_sweeps(scenario: &Scenario) -> impl Iterator<Item = (usize, usize)> {
+    let of_agent = move |agent| (0..scenario.ticks.len()).map(move |tick| (agent, tick));
+    let all = (0..scenario.agents.len()).flat_map(of_agent);
+    all.filter(move |&(agent, tick)| scenario.is_present(agent, tick))
 }
 
 /// Features and pose of a sweep; `None` for a sweep without cells.

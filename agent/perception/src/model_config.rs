@@ -227,17 +227,15 @@ impl DetectorConfig {
 
     /// Channels of the transmitted feature map: of the code, if there is a compressor.
     pub fn sent_channels(&self) -> i64 {
-        self.compress_ratio
-            .map_or(self.feature_channels(), |ratio| {
-                (self.feature_channels() / ratio).max(1)
-            })
+        let channels = self.feature_channels();
+        let code = |ratio: i64| (channels / ratio).max(1);
+        self.compress_ratio.map_or(channels, code)
     }
 
     /// BEV grid of the transmitted feature map.
     pub fn feature_grid(&self) -> BevGrid {
-        let [width, height, _] = self
-            .pillar_grid()
-            .map(|count| u32::try_from(count).unwrap_or(u32::MAX));
+        let pillars = self.pillar_grid();
+        let [width, height, _] = pillars.map(|count| u32::try_from(count).unwrap_or(u32::MAX));
         let pillars = BevGrid {
             x_min_m: self.lidar_range_m[0],
             y_min_m: self.lidar_range_m[1],
@@ -255,11 +253,9 @@ impl DetectorConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         self.check_area()?;
         self.check_levels()?;
+        let points = i64::try_from(self.max_points_per_pillar).unwrap_or(0);
         for (field, value) in [
-            (
-                "max_points_per_pillar",
-                i64::try_from(self.max_points_per_pillar).unwrap_or(0),
-            ),
+            ("max_points_per_pillar", points),
             ("pillar_channels", self.pillar_channels),
             ("shrink channels", self.feature_channels()),
             ("number of anchor yaws", self.anchors.yaws_deg.len() as i64),
@@ -281,11 +277,8 @@ impl DetectorConfig {
         let canvas = x * y * self.pillar_channels;
         within("pillar grid times pillar_channels", canvas, 0, MAX_VALUES)?;
         let step = self.layer_strides[0] / self.upsample_strides[0];
-        let layers = [
-            self.backbone_channels(),
-            self.feature_channels(),
-            self.head_channels(),
-        ];
+        let (features, head) = (self.feature_channels(), self.head_channels());
+        let layers = [self.backbone_channels(), features, head];
         let widest = self.num_filters.iter().chain(&layers).max();
         let map = (x / step) * (y / step) * widest.copied().unwrap_or(0);
         let field = "cells of a feature map times the largest of num_filters, num_upsample_filters, shrink and anchors";
@@ -305,14 +298,13 @@ impl DetectorConfig {
         let mut count = 0;
         for (level, &filters) in self.num_filters.iter().enumerate() {
             let layers = self.layer_nums[level] as i64;
-            let more = if self.blocks == BlockKind::Residual {
-                2 * layers - 1
-            } else {
-                layers
+            let more = match self.blocks {
+                BlockKind::Residual => 2 * layers - 1,
+                BlockKind::Plain => layers,
             };
             count += 9 * filters * (input + more * filters);
-            count +=
-                self.upsample_strides[level].pow(2) * filters * self.num_upsample_filters[level];
+            let edge = self.upsample_strides[level];
+            count += edge.pow(2) * filters * self.num_upsample_filters[level];
             input = filters;
         }
         let channels = self.feature_channels();
@@ -345,12 +337,8 @@ impl DetectorConfig {
         require(is_even, "lidar_range_m", range, rule)?;
         let [x, y, z] = self.pillar_grid();
         within("pillar layers along z", z, 1, 1)?;
-        within(
-            "cells of the pillar grid",
-            x.saturating_mul(y),
-            1,
-            MAX_CELLS,
-        )
+        let cells = x.saturating_mul(y);
+        within("cells of the pillar grid", cells, 1, MAX_CELLS)
     }
 
     fn check_levels(&self) -> Result<(), FieldError> {

@@ -15,7 +15,6 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use dataset::{self, IntensityScale, LoadOptions, Scenario};
-use perception::detector::Detector;
 use perception::train::Prefetch;
 use perception::weights::Weights;
 use protocol::message::Bev;
@@ -24,9 +23,9 @@ use protocol::{Dtype, Header, Limits, WIRE_VERSION, WireError, wire};
 use sha2::{Digest, Sha256};
 use support::file_digests::FileDigests;
 use support::file_error::AtFile;
-use tch::{Device, Tensor};
+use tch::Tensor;
 
-use sweep_encoder::SweepEncoder;
+use sweep_encoder::{SweepEncoder, ThreadEncoder};
 
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;
@@ -106,9 +105,8 @@ impl FeatureStore {
         scenarios: &[Scenario],
         digests: &FileDigests,
     ) -> Result<PathBuf, Error> {
-        Ok(kept
-            .folder
-            .join(file_name(kept, weights, scenarios, digests)?))
+        let name = file_name(kept, weights, scenarios, digests)?;
+        Ok(kept.folder.join(name))
     }
 
     /// Opens the file of these scenarios and encodes the missing sweeps on `threads` CPU threads, up to its size;
@@ -143,28 +141,19 @@ impl FeatureStore {
         for scenario in scenarios {
             first.push(first[first.len() - 1] + scenario.agents.len() * scenario.ticks.len());
         }
-        let names = scenarios
-            .iter()
-            .map(|scenario| scenario.name.clone())
-            .collect();
-        let ticks = scenarios
-            .iter()
-            .map(|scenario| scenario.ticks.len())
-            .collect();
         let encoder = SweepEncoder {
-            weights: Arc::clone(weights),
+            encoder: ThreadEncoder::new(Arc::clone(weights)),
             scenarios: scenarios.into(),
             first: first.as_slice().into(),
             dtype: kept.dtype,
             path: path.clone(),
-            detector: None,
         };
         let mut store = Self {
-            path: path.clone(),
+            path,
             file,
-            names,
+            names: scenarios.iter().map(|of| of.name.clone()).collect(),
             first,
-            ticks,
+            ticks: scenarios.iter().map(|of| of.ticks.len()).collect(),
             starts,
         };
         store.fill(encoder, kept.limit_bytes, threads, on_sweep)?;
@@ -222,12 +211,8 @@ impl FeatureStore {
             message.features.decode(&Limits::default())
         };
         let features = decode().at(&self.path)?.features;
-        let size = [
-            1,
-            i64::from(features.channels),
-            i64::from(features.grid.height),
-            i64::from(features.grid.width),
-        ];
+        let (channels, grid) = (features.channels, features.grid);
+        let size = [1, channels, grid.height, grid.width].map(i64::from);
         Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
     }
 
@@ -269,32 +254,17 @@ fn starts(file: &File) -> io::Result<Vec<u64>> {
 }
 
 /// Maps from a store, and from the encoder for sweeps that it does not hold.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct MapSource {
     store: Arc<FeatureStore>,
-    weights: Arc<Weights>,
-    encoder: Option<Detector>,
-}
-
-impl Clone for MapSource {
-    /// The encoder is built anew where it is needed: every thread has its own.
-    fn clone(&self) -> Self {
-        Self {
-            store: Arc::clone(&self.store),
-            weights: Arc::clone(&self.weights),
-            encoder: None,
-        }
-    }
+    encoder: ThreadEncoder,
 }
 
 impl MapSource {
     /// Reads from `store`, which was made with `weights`.
     pub fn new(store: Arc<FeatureStore>, weights: Arc<Weights>) -> Self {
-        Self {
-            store,
-            weights,
-            encoder: None,
-        }
+        let encoder = ThreadEncoder::new(weights);
+        Self { store, encoder }
     }
 
     /// The index of a scenario.
@@ -317,14 +287,7 @@ impl MapSource {
             return Ok(map);
         }
         let frame = scenario.load(agent, tick, &LoadOptions::default())?;
-        let encoder = match &mut self.encoder {
-            Some(encoder) => encoder,
-            None => {
-                let config = self.weights.detector_config()?;
-                self.encoder
-                    .insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
-            }
-        };
-        Ok(encoder.encode_sweep(&frame.points)?.features)
+        let encoded = self.encoder.detector()?.encode_sweep(&frame.points)?;
+        Ok(encoded.features)
     }
 }

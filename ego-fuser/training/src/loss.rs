@@ -3,6 +3,7 @@
 //! As PointPillars and OpenCOOD define it: per sample divided by its number of positives (at least one), summed,
 //! divided by the batch size.
 
+use perception::tensor_values::tensor;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::samples::Offset;
@@ -100,10 +101,9 @@ impl LabelTensors {
             let weight = 1.0 / labels.positives.len().max(1) as f32;
             score_weight[first..first + anchors].fill(weight);
             if unassigned == Unassigned::Ignored {
-                labels
-                    .unassigned
-                    .iter()
-                    .for_each(|&anchor| score_weight[first + anchor] = 0.0);
+                for &anchor in &labels.unassigned {
+                    score_weight[first + anchor] = 0.0;
+                }
             }
             for entry in &labels.positives {
                 positive[first + entry.anchor] = 1.0;
@@ -113,14 +113,13 @@ impl LabelTensors {
             }
         }
         let shape = [samples.len() as i64, anchors as i64];
+        let positives = index.len() as i64;
+        let numbers = |values: &[f32], shape| Tensor::from_slice(values).view(shape);
+        let code = Tensor::from_slice(&code).view([positives, BOX_CODE as i64]);
         Self {
-            positive: Tensor::from_slice(&positive).view(shape).to_device(device),
-            score_weight: Tensor::from_slice(&score_weight)
-                .view(shape)
-                .to_device(device),
-            code: Tensor::from_slice(&code)
-                .view([index.len() as i64, BOX_CODE as i64])
-                .to_device(device),
+            positive: numbers(&positive, shape).to_device(device),
+            score_weight: numbers(&score_weight, shape).to_device(device),
+            code: code.to_device(device),
             index: Tensor::from_slice(&index).to_device(device),
             box_weight: Tensor::from_slice(&box_weight).to_device(device),
         }
@@ -142,10 +141,12 @@ pub fn detection_loss(
     config: &LossConfig,
 ) -> Result<Loss, TchError> {
     let batch = scores.size()[0].max(1) as f64;
-    let score =
-        focal_loss(scores, labels, config)?.f_sum(Kind::Float)? * (config.score_weight / batch);
-    let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)? * (config.box_weight / batch);
-    Ok(Loss { score, boxes })
+    let score = focal_loss(scores, labels, config)?.f_sum(Kind::Float)?;
+    let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)?;
+    Ok(Loss {
+        score: score * (config.score_weight / batch),
+        boxes: boxes * (config.box_weight / batch),
+    })
 }
 
 /// Difference of corrections from those that undo the added pose errors: smooth L1 per view, mean over views and
@@ -164,16 +165,11 @@ pub(crate) fn alignment_loss(
     let mut losses = Vec::new();
     for (moved_by, offsets) in corrections.iter().zip(offsets) {
         let Some(moved_by) = moved_by else { continue };
-        let wanted: Vec<f32> = offsets
-            .iter()
-            .skip(1)
-            .flat_map(|Offset(offset)| offset.map(|value| value as f32))
-            .collect();
-        let wanted = Tensor::f_from_slice(&wanted)?
-            .f_view([-1, 3])?
-            .f_to_device(moved_by.device())?;
-        let off =
-            (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
+        let device = moved_by.device();
+        let of_others = offsets.iter().skip(1);
+        let wanted = of_others.flat_map(|Offset(offset)| offset.map(|value| value as f32));
+        let wanted = tensor(&wanted.collect::<Vec<f32>>(), &[-1, 3], device)?;
+        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(device)?;
         let left_m = off.f_abs()?.f_amax([1_i64].as_slice(), true)?;
         let off = off * left_m.f_le(RECOVERABLE_M)?;
         losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
@@ -191,21 +187,15 @@ fn focal_loss(
     config: &LossConfig,
 ) -> Result<Tensor, TchError> {
     let target = &labels.positive;
-    let logits = scores
-        .f_to_kind(Kind::Float)?
-        .f_permute([0, 2, 3, 1])?
-        .f_reshape(target.size())?;
+    let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?;
+    let logits = logits.f_reshape(target.size())?;
     let probability = logits.f_sigmoid()?;
     let background: Tensor = 1.0 - target;
     // 1 - p_t of the paper: error of the prediction.
     let wrong: Tensor = target * (1.0 - &probability) + &background * &probability;
     let balance = target * config.alpha + &background * (1.0 - config.alpha);
-    let entropy = logits.f_binary_cross_entropy_with_logits(
-        target,
-        None::<&Tensor>,
-        None::<&Tensor>,
-        tch::Reduction::None,
-    )?;
+    let (none, each) = (None::<&Tensor>, tch::Reduction::None);
+    let entropy = logits.f_binary_cross_entropy_with_logits(target, none, none, each)?;
     Ok(balance * wrong.f_pow_tensor_scalar(config.gamma)? * entropy * &labels.score_weight)
 }
 
@@ -216,19 +206,15 @@ fn box_loss(
     config: &LossConfig,
 ) -> Result<Tensor, TchError> {
     let code = BOX_CODE as i64;
-    let predicted = boxes
-        .f_permute([0, 2, 3, 1])?
-        .f_reshape([-1, code])?
-        .f_index_select(0, &labels.index)?;
+    let predicted = boxes.f_permute([0, 2, 3, 1])?.f_reshape([-1, code])?;
+    let predicted = predicted.f_index_select(0, &labels.index)?;
     let difference = predicted.f_to_kind(Kind::Float)? - &labels.code;
     let linear = difference.f_narrow(1, 0, code - 1)?;
     let turn = difference.f_narrow(1, code - 1, 1)?.f_sin()?;
     let distance = Tensor::f_cat(&[linear, turn], 1)?.f_abs()?;
     let squared = distance.f_square()? * (0.5 / config.beta);
-    let loss = squared.f_where_self(
-        &distance.f_lt(config.beta)?,
-        &(&distance - 0.5 * config.beta),
-    )?;
+    let above = &distance - 0.5 * config.beta;
+    let loss = squared.f_where_self(&distance.f_lt(config.beta)?, &above)?;
     Ok(loss * labels.box_weight.f_unsqueeze(1)?)
 }
 

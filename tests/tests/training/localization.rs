@@ -5,9 +5,8 @@ use std::time::Duration;
 
 use agent_offline::Error;
 use agent_offline::training::{
-    DiffLocReport, DiffLocTrainConfig, EncoderReport, EncoderTrainConfig, RedundancyConfig,
-    SceneReport, SceneTrainConfig, SgLocReport, SgLocTrainConfig, SweepAugmentation, train_diffloc,
-    train_encoder, train_scene, train_sgloc,
+    DiffLocTrainConfig, EncoderTrainConfig, RedundancyConfig, SceneTrainConfig, SgLocTrainConfig,
+    SweepAugmentation, train_diffloc, train_encoder, train_scene, train_sgloc,
 };
 use dataset::{self, LoadOptions};
 use localization::baselines::diffloc::{DiffLocConfig, RangeImageConfig};
@@ -16,7 +15,7 @@ use localization::baselines::sgloc::SgLocConfig;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{Localize, Localizer, LocalizerError, LocalizerInput, SceneEncoder};
 use perception::inference::Inference;
-use perception::train::{Length, RunConfig, TrainingError};
+use perception::train::{Length, Progress, RunConfig, TrainingError};
 use perception::weights::Weights;
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 use simulator::generate::{Subset, SynthOptions, generate};
@@ -92,10 +91,11 @@ fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
     let mut losses = Vec::new();
     let mut validations = 0;
     let config = encoder_config(scenes, out, 40);
-    let mut observe = |report: &EncoderReport| match report {
-        EncoderReport::Read(data) => assert_eq!(data.left_out(), None),
-        EncoderReport::Stepped { loss, .. } => losses.push(*loss),
-        EncoderReport::Validated(..) => validations += 1,
+    let mut observe = |progress: &Progress| match progress {
+        Progress::Read(data) => assert_eq!(data.left_out(), None),
+        Progress::Stepped(report) => losses.push(report.means[0]),
+        Progress::Validated(_) => validations += 1,
+        other => panic!("{other:?}"),
     };
     let summary = train_encoder(&config, &mut observe).unwrap();
     assert_eq!((summary.trained.steps, validations), (40, 4));
@@ -117,9 +117,9 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
 
     let mut errors = Vec::new();
     let config = scene_config(&scenes, &encoder, &dir.path().join("head"), 400);
-    let summary = train_scene(&config, &mut |report| {
-        if let SceneReport::Stepped { error_m, .. } = report {
-            errors.push(*error_m);
+    let summary = train_scene(&config, &mut |progress| {
+        if let Progress::Stepped(report) = progress {
+            errors.push(report.means[0]);
         }
     })
     .unwrap();
@@ -232,9 +232,10 @@ fn sgloc_learns_on_the_features_of_an_encoder_that_stays_as_it_is() {
         },
     };
     let (mut errors, mut encoded) = (Vec::new(), 0);
-    let trained = train_sgloc(&config(150), &mut |report| match report {
-        SgLocReport::Encoding(done, _) => encoded = *done,
-        SgLocReport::Stepped { error_m, .. } => errors.push(*error_m),
+    let trained = train_sgloc(&config(150), &mut |progress| match progress {
+        Progress::Encoding(done, _) => encoded = *done,
+        Progress::Stepped(report) => errors.push(report.means[0]),
+        _ => {}
     })
     .unwrap();
     assert!(
@@ -295,15 +296,11 @@ fn diffloc_learns_to_denoise_poses_and_answers_alike_for_the_same_sweep() {
         },
     };
     let (mut poses_l1, mut found_m) = (Vec::new(), Vec::new());
-    let summary = train_diffloc(&config(200), &mut |report| match report {
-        DiffLocReport::Imaging(..) => {}
-        DiffLocReport::Stepped {
-            pose_l1, accuracy, ..
-        } => {
-            poses_l1.push(*pose_l1);
-            found_m.push(accuracy.p50_m);
+    let summary = train_diffloc(&config(200), &mut |progress| {
+        if let Progress::Stepped(report) = progress {
+            poses_l1.push(report.means[0]);
+            found_m.push(report.means[2]);
         }
-        DiffLocReport::Validated(..) => {}
     })
     .unwrap();
     assert_eq!(summary.sweeps, 48);
@@ -370,8 +367,8 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     // Stopped at the second validation, whose checkpoint is then not yet written.
     let mut validations = 0;
     let stopped = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-        let mut stop = |report: &EncoderReport| {
-            validations += u32::from(matches!(report, EncoderReport::Validated(..)));
+        let mut stop = |progress: &Progress| {
+            validations += u32::from(matches!(progress, Progress::Validated(_)));
             assert!(validations < 2, "stopped by the test");
         };
         train_encoder(&encoder_config(&scenes, &b, 20), &mut stop)

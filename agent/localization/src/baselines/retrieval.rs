@@ -34,21 +34,14 @@ pub struct SweepDatabase {
 impl SweepDatabase {
     /// A database of descriptors of equal length; `None` if there is none or they are empty.
     pub fn new(sweeps: &[DescribedSweep]) -> Option<Self> {
-        let channels = sweeps
-            .first()
-            .map(|sweep| sweep.descriptor.len())
-            .filter(|&channels| channels > 0)?;
-        let count = sweeps.len() as f32;
+        let first = &sweeps.first()?.descriptor;
+        let channels = Some(first.len()).filter(|&channels| channels > 0)?;
         let mean_of = |value: &dyn Fn(&[f32]) -> f32| {
-            sweeps
-                .iter()
-                .map(|sweep| value(&sweep.descriptor))
-                .sum::<f32>()
-                / count
+            let values = sweeps.iter().map(|sweep| value(&sweep.descriptor));
+            values.sum::<f32>() / sweeps.len() as f32
         };
-        let mean: Vec<f32> = (0..channels)
-            .map(|channel| mean_of(&|of| of[channel]))
-            .collect();
+        let mean = (0..channels).map(|channel| mean_of(&|of| of[channel]));
+        let mean: Vec<f32> = mean.collect();
         let variance = |channel: usize| mean_of(&|of| (of[channel] - mean[channel]).powi(2));
         let scale = (0..channels)
             .map(|channel| 1.0 / variance(channel).sqrt().max(LEAST_DEVIATION))
@@ -59,14 +52,10 @@ impl SweepDatabase {
             descriptors: Vec::new(),
             world_from_sensor: Vec::new(),
         };
-        for DescribedSweep {
-            descriptor,
-            world_from_sensor,
-        } in sweeps
-        {
-            let normalised = database.normalise(descriptor);
+        for sweep in sweeps {
+            let normalised = database.normalise(&sweep.descriptor);
             database.descriptors.extend(normalised);
-            database.world_from_sensor.push(*world_from_sensor);
+            database.world_from_sensor.push(sweep.world_from_sensor);
         }
         Some(database)
     }
@@ -75,16 +64,12 @@ impl SweepDatabase {
     pub fn nearest(&self, descriptor: &[f32]) -> Isometry3<f64> {
         let wanted = self.normalise(descriptor);
         let distance = |stored: &[f32]| {
-            stored
-                .iter()
-                .zip(&wanted)
-                .map(|(a, b)| (a - b).powi(2))
-                .sum::<f32>()
+            let squares = stored.iter().zip(&wanted).map(|(a, b)| (a - b).powi(2));
+            squares.sum::<f32>()
         };
-        let distances = self.descriptors.chunks_exact(self.mean.len()).map(distance);
-        let nearest = distances
-            .enumerate()
-            .min_by(|(_, a), (_, b)| a.total_cmp(b));
+        let stored = self.descriptors.chunks_exact(self.mean.len());
+        let distances = stored.map(distance).enumerate();
+        let nearest = distances.min_by(|(_, a), (_, b)| a.total_cmp(b));
         nearest.map_or_else(Isometry3::identity, |(row, _)| self.world_from_sensor[row])
     }
 

@@ -25,19 +25,20 @@ impl Dense {
         }
     }
 
-    /// `[N, inputs]` to `[N, outputs]`.
+    /// `[.., inputs]` to `[.., outputs]`.
     pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        self.bias
-            .to_kind(x.kind())
-            .f_addmm(x, &self.weight.to_kind(x.kind()))
+        let (inputs, outputs) = self.weight.size2()?;
+        let mut shape = x.size();
+        shape.pop();
+        shape.push(outputs);
+        let (weight, bias) = (self.weight.to_kind(x.kind()), self.bias.to_kind(x.kind()));
+        bias.f_addmm(&x.f_reshape([-1, inputs])?, &weight)?
+            .f_view(shape.as_slice())
     }
 
     /// The same in integers.
     pub(crate) fn int8(&self, format: LayerFormat) -> Result<Int8Linear, TchError> {
-        Int8Linear::new(
-            &self.weight.f_tr()?.f_contiguous()?,
-            Some(&self.bias),
-            format,
-        )
+        let weight = self.weight.f_tr()?.f_contiguous()?;
+        Int8Linear::new(&weight, Some(&self.bias), format)
     }
 }

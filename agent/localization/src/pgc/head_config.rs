@@ -1,7 +1,11 @@
 //! Configuration of a scene head.
 
+use std::path::Path;
+
 use protocol::config::{FieldError, require, within};
 use serde::{Deserialize, Serialize};
+
+use super::error::LocalizerError;
 
 /// Largest number of values of a key grid.
 const MAX_KEY_GRID: i64 = 64_000_000;
@@ -126,6 +130,27 @@ impl RefinerConfig {
 }
 
 impl SceneHeadConfig {
+    /// Rejects the head of a file for an encoder that it was not trained with.
+    ///
+    /// # Errors
+    /// [`LocalizerError::OtherEncoder`] with both digests.
+    pub fn check_encoder(
+        &self,
+        head: &Path,
+        encoder: &Path,
+        sha256: &str,
+    ) -> Result<(), LocalizerError> {
+        if self.encoder_sha256 == sha256 {
+            return Ok(());
+        }
+        Err(LocalizerError::OtherEncoder {
+            head: head.display().to_string(),
+            expected: self.encoder_sha256.clone(),
+            encoder: encoder.display().to_string(),
+            found: sha256.to_owned(),
+        })
+    }
+
     /// Checks that a network can be built.
     ///
     /// # Errors

@@ -55,17 +55,13 @@ fn released_file(head: &Path, prefix: &str, trained: &str) -> Result<PathBuf, Fi
     let mut files = folders
         .iter()
         .flat_map(|folder| names.iter().map(move |name| folder.join(name)));
-    let released = || {
+    files.find(|file| file.is_file()).ok_or_else(|| {
         let files = folders.iter().flat_map(|folder| files_in(folder));
         let stems = files
             .filter_map(|file| Some(file.file_stem()?.to_str()?.strip_prefix(prefix)?.to_owned()));
         // A folder may be reached by two paths.
-        let names: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
-        names.into_iter().collect()
-    };
-    files.find(|file| file.is_file()).ok_or_else(|| {
-        let released: Vec<String> = released();
-        let released = released.join(", ");
+        let released: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
+        let released = Vec::from_iter(released).join(", ");
         let problem = format_args!("no such file or released one; released are {released}");
         FileError::new(head, problem)
     })
@@ -111,57 +107,41 @@ fn named_encoder(head: &Path) -> Result<Result<PathBuf, String>, FileError> {
     let weights = Weights::load(head)?;
     weights.check_kind(SceneHead::KIND)?;
     let sha256 = weights.config::<SceneHeadConfig>()?.encoder_sha256;
-    let folders = head
-        .parent()
-        .map(Path::to_owned)
-        .into_iter()
-        .chain(weights_folders());
-    let files = folders
-        .flat_map(|folder| files_in(&folder))
-        .filter(|file| file != head);
-    let (encoders, others): (Vec<PathBuf>, Vec<PathBuf>) = files.partition(|file| {
-        file.file_stem()
-            .and_then(|stem| stem.to_str())
-            .is_some_and(|stem| stem.contains("encoder"))
-    });
+    let beside = head.parent().map(Path::to_owned).into_iter();
+    let folders = beside.chain(weights_folders());
+    let mut files: Vec<_> = folders.flat_map(|folder| files_in(&folder)).collect();
+    files.retain(|file| file != head);
+    let is_other = |file: &PathBuf| {
+        let stem = file.file_stem().and_then(|stem| stem.to_str());
+        !stem.is_some_and(|stem| stem.contains("encoder"))
+    };
+    files.sort_by_key(is_other);
     let is_named = |file: &PathBuf| {
         Weights::load(file).is_ok_and(|weights| CellEncoder::sha256_of(&weights) == sha256)
     };
-    Ok(encoders
-        .into_iter()
-        .chain(others)
-        .find(is_named)
-        .ok_or(sha256))
+    Ok(files.into_iter().find(is_named).ok_or(sha256))
 }
 
 /// The released encoder, for a new head.
 #[must_use]
 pub fn released_encoder() -> Option<PathBuf> {
-    weights_folders()
-        .into_iter()
-        .map(|folder| folder.join(ENCODER_FILE))
-        .find(|file| file.is_file())
+    let folders = weights_folders().into_iter();
+    let mut files = folders.map(|folder| folder.join(ENCODER_FILE));
+    files.find(|file| file.is_file())
 }
 
 /// Folders of released weights that exist.
 fn weights_folders() -> Vec<PathBuf> {
-    let here = FROM_HERE
-        .into_iter()
-        .map(PathBuf::from)
-        .filter(|folder| folder.is_dir());
+    let here = FROM_HERE.into_iter().map(PathBuf::from);
+    let here = here.filter(|folder| folder.is_dir());
     here.chain(shared_files::shared("weights")).collect()
 }
 
 /// Weights in a folder, in text order.
 fn files_in(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder)
-        .into_iter()
-        .flatten()
-        .flatten()
-        .map(|entry| entry.path());
-    let mut files: Vec<PathBuf> = entries
-        .filter(|path| path.extension().is_some_and(|ending| ending == ENDING))
-        .collect();
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut files: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
+    files.retain(|path| path.extension().is_some_and(|ending| ending == ENDING));
     files.sort_unstable();
     files
 }

@@ -4,12 +4,11 @@ use std::path::Path;
 
 use perception::inference::Inference;
 use perception::int8::ScaleSearch;
-use perception::tensor_values::values;
+use perception::tensor_values::{tensor, values};
 use perception::weights::Weights;
 use protocol::PointCloud;
 use support::stage_times::StageTimes;
-use tch::nn::VarStore;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Device, Kind, TchError, Tensor, nn, no_grad};
 
 use super::cell_choice::choose_evenly;
 use super::cell_encoder::{CellEncoder, PreparedSweep};
@@ -83,39 +82,26 @@ impl Localizer {
         let Inference { device, precision } = inference;
         let (mut network, encoder_sha256) = CellEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?.with_precision(precision);
-        weights.check_kind(SceneHead::KIND)?;
-        let config: SceneHeadConfig = weights.config()?;
-        if config.encoder_sha256 != encoder_sha256 {
-            return Err(LocalizerError::OtherEncoder {
-                head: head.display().to_string(),
-                expected: config.encoder_sha256,
-                encoder: encoder.display().to_string(),
-                found: encoder_sha256,
-            });
-        }
-        let mut variables = VarStore::new(device);
-        let mut scene_head = SceneHead::new(&variables.root(), &config)?;
-        weights.copy_into(&variables)?;
-        variables.freeze();
+        let build = |path: &nn::Path<'_>, config: SceneHeadConfig| {
+            config.check_encoder(head, encoder, &encoder_sha256)?;
+            SceneHead::new(path, &config)
+        };
+        let mut scene_head = weights.network(SceneHead::KIND, device, build)?;
         if let Some(scales) = weights.activation_scales()? {
             let quantised = network
                 .quantise(&scales)
                 .and_then(|()| scene_head.quantise(&scales));
             quantised.map_err(|error| weights.quantise_error(error))?;
         }
-        let sha256 = [encoder_sha256, weights.sha256().to_owned()];
-        let solver = PoseSolver::default();
-        Ok((
-            Self {
-                encoder: network,
-                head: scene_head,
-                solver,
-                most_parts: MOST_PARTS,
-                device,
-                sha256,
-            },
-            weights,
-        ))
+        let localizer = Self {
+            encoder: network,
+            head: scene_head,
+            solver: PoseSolver::default(),
+            most_parts: MOST_PARTS,
+            device,
+            sha256: [encoder_sha256, weights.sha256().to_owned()],
+        };
+        Ok((localizer, weights))
     }
 
     /// Adds the activations of a sweep to a search for their scales; a sweep without cells has none.
@@ -127,22 +113,20 @@ impl Localizer {
         cloud: &PointCloud,
         search: &mut ScaleSearch,
     ) -> Result<(), LocalizerError> {
-        let Some(EncodedSweep {
-            sweep, features, ..
-        }) = self.encode(LocalizerInput::of(cloud), &mut stopwatch())?
-        else {
+        let Some(encoded) = self.encode(LocalizerInput::of(cloud), &mut stopwatch())? else {
             return Ok(());
         };
-        self.encoder.observe(&sweep, search)?;
+        let EncodedSweep {
+            sweep, features, ..
+        } = &encoded;
+        self.encoder.observe(sweep, search)?;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
-        let cells = self.pick(&sweep, &features, &chosen)?.features;
+        let cells = self.pick(sweep, features, &chosen)?.features;
         no_grad(|| {
-            let logits = self
-                .head
-                .classify(&features.sweeps, false)?
-                .f_expand([chosen.len() as i64, -1], false)?;
-            self.head
-                .observe(&self.head.normalise(&cells)?, &logits, search)
+            let logits = self.head.classify(&features.sweeps, false)?;
+            let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
+            let cells = self.head.normalise(&cells)?;
+            self.head.observe(&cells, &logits, search)
         })?;
         Ok(())
     }
@@ -166,12 +150,11 @@ impl Localizer {
         sweep: LocalizerInput<'_>,
     ) -> Result<(SceneCoordinates, StageTimes), LocalizerError> {
         let mut times = stopwatch();
-        let coordinates = match self.encode(sweep, &mut times)? {
-            Some(encoded) => {
-                self.regress(&encoded, CELLS, &self.classify(&encoded)?, &mut times)?
-            }
-            None => SceneCoordinates::default(),
+        let Some(encoded) = self.encode(sweep, &mut times)? else {
+            return Ok((SceneCoordinates::default(), times));
         };
+        let logits = self.classify(&encoded)?;
+        let coordinates = self.regress(&encoded, CELLS, &logits, &mut times)?;
         Ok((coordinates, times))
     }
 
@@ -226,30 +209,22 @@ impl Localizer {
         logits: &Tensor,
         times: &mut StageTimes,
     ) -> Result<SceneCoordinates, LocalizerError> {
-        let EncodedSweep {
-            sweep, features, ..
-        } = encoded;
+        let sweep = &encoded.sweep;
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(count));
-        let SweepCells {
-            features: cells,
-            sensor_m,
-        } = self.pick(sweep, features, &chosen)?;
+        let cells = self.pick(sweep, &encoded.features, &chosen)?;
         let regression = no_grad(|| {
             let logits = logits.f_expand([chosen.len() as i64, -1], false)?;
-            let cells = self.head.normalise(&cells)?;
-            self.head.regress(&cells, &logits, Kind::Float)
+            let features = self.head.normalise(&cells.features)?;
+            self.head.regress(&features, &logits, Kind::Float)
         })?;
-        let (world, epsilon_m) = (
-            values(&regression.coordinates_m)?,
-            values(&regression.epsilon_m)?,
-        );
+        let world = values(&regression.coordinates_m)?;
+        let epsilon_m = values(&regression.epsilon_m)?;
         times.lap(REGRESS);
-        let origin_m = self.head.config().origin_m;
         Ok(SceneCoordinates {
-            sensor_m,
+            sensor_m: cells.sensor_m,
             world_m: world.as_chunks().0.to_vec(),
             epsilon_m,
-            origin_m,
+            origin_m: self.head.config().origin_m,
         })
     }
 
@@ -260,14 +235,11 @@ impl Localizer {
         chosen: &[usize],
     ) -> Result<SweepCells, TchError> {
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
-        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
-        let features = no_grad(|| features.cells.f_index_select(0, &rows))?;
+        let rows = tensor(&rows, &[-1], self.device)?;
+        let centroids = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m);
         Ok(SweepCells {
-            features,
-            sensor_m: chosen
-                .iter()
-                .map(|&cell| sweep.cells()[cell].centroid_m)
-                .collect(),
+            features: no_grad(|| features.cells.f_index_select(0, &rows))?,
+            sensor_m: centroids.collect(),
         })
     }
 
@@ -305,6 +277,7 @@ mod tests {
     use std::collections::BTreeMap;
 
     use perception::weights::{self, Precision};
+    use tch::nn::VarStore;
 
     use super::*;
 

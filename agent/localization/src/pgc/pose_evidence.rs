@@ -63,36 +63,31 @@ impl PoseEvidence {
         second: Option<&RefinedPose>,
     ) -> Self {
         let std = std_of(coordinates, registration, second);
+        let (inliers, start) = (&registration.inliers, &registration.target_from_source);
         Self {
             cells: coordinates.sensor_m.len(),
-            inliers: registration.inliers.len(),
+            inliers: inliers.len(),
             inlier_ratio: registration.inlier_ratio,
             rms_m: registration.rms_m,
-            inlier_epsilon_m: mean_over(&registration.inliers, &coordinates.epsilon_m, f64::from),
+            inlier_epsilon_m: mean_over(inliers, &coordinates.epsilon_m, f64::from),
             median_epsilon_m: median(&coordinates.epsilon_m),
-            inlier_sigma: mean_over(&registration.inliers, &coordinates.epsilon_m, |epsilon| {
-                f64::from(sigma(epsilon))
-            }),
+            inlier_sigma: mean_sigma(inliers, &coordinates.epsilon_m),
             position_std_m: std.position_m,
             rotation_std_rad: std.rotation_rad,
-            second: second
-                .map(|second| RefinementEvidence::gather(&registration.target_from_source, second)),
+            second: second.map(|second| RefinementEvidence::gather(start, second)),
         }
     }
 
     /// Evidence of a pose that was refined from a predicted one, relative to the head's origin.
     pub(super) fn of_refinement(refined: &RefinedPose, start: &Isometry3<f64>) -> Self {
         let second = RefinementEvidence::gather(start, refined);
+        let inliers = &refined.registration.inliers;
         Self {
             cells: refined.epsilon_m.len(),
-            inliers: refined.registration.inliers.len(),
+            inliers: inliers.len(),
             inlier_ratio: second.inlier_ratio,
             rms_m: second.rms_m,
-            inlier_epsilon_m: mean_over(
-                &refined.registration.inliers,
-                &refined.epsilon_m,
-                f64::from,
-            ),
+            inlier_epsilon_m: mean_over(inliers, &refined.epsilon_m, f64::from),
             median_epsilon_m: second.median_epsilon_m,
             inlier_sigma: second.inlier_sigma,
             position_std_m: refined.std.position_m,
@@ -120,44 +115,38 @@ impl PoseEvidence {
     /// Confidence without calibration: mean confidence of the inliers, from the last stage, times the inlier ratio of
     /// the first one.
     pub(crate) fn plain_sigma(&self) -> f64 {
-        let inlier_sigma = self
-            .second
-            .map_or(self.inlier_sigma, |second| second.inlier_sigma);
+        let first = self.inlier_sigma;
+        let inlier_sigma = self.second.map_or(first, |second| second.inlier_sigma);
         (inlier_sigma * self.inlier_ratio).clamp(0.0, 1.0)
     }
 }
 
 impl RefinementEvidence {
     fn gather(start: &Isometry3<f64>, second: &RefinedPose) -> Self {
-        let RefinedPose {
-            registration,
-            epsilon_m,
-            residual_quartile_m,
-            std,
-            information_per_m2,
-        } = second;
+        let registration = &second.registration;
         let moved = registration.target_from_source.translation.vector - start.translation.vector;
         Self {
             inlier_ratio: registration.inlier_ratio,
             rms_m: registration.rms_m,
-            median_epsilon_m: median(epsilon_m),
-            inlier_sigma: mean_over(&registration.inliers, epsilon_m, |epsilon| {
-                f64::from(sigma(epsilon))
-            }),
+            median_epsilon_m: median(&second.epsilon_m),
+            inlier_sigma: mean_sigma(&registration.inliers, &second.epsilon_m),
             moved_m: moved.norm(),
-            residual_quartile_m: *residual_quartile_m,
-            information_per_m2: *information_per_m2,
-            worst_axis_std_m: std.worst_axis_m,
+            residual_quartile_m: second.residual_quartile_m,
+            information_per_m2: second.information_per_m2,
+            worst_axis_std_m: second.std.worst_axis_m,
         }
     }
 }
 
+/// Mean confidence (Eq. 6) of some cells; 0 for none.
+fn mean_sigma(cells: &[u32], epsilon_m: &[f32]) -> f64 {
+    mean_over(cells, epsilon_m, |epsilon| f64::from(sigma(epsilon)))
+}
+
 /// Mean over some cells; 0 for none.
 fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f64 {
-    let values = cells
-        .iter()
-        .filter_map(|&cell| epsilon_m.get(cell as usize))
-        .map(|&epsilon| value(epsilon));
+    let known = (cells.iter()).filter_map(|&cell| epsilon_m.get(cell as usize));
+    let values = known.map(|&epsilon| value(epsilon));
     values.sum::<f64>() / cells.len().max(1) as f64
 }
 
@@ -165,10 +154,9 @@ fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f6
 fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
     let middle = sorted.len() / 2;
-    if sorted.is_empty() {
-        0.0
-    } else {
-        f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1)
+    match sorted.is_empty() {
+        true => 0.0,
+        false => f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1),
     }
 }
 
@@ -184,14 +172,10 @@ pub(super) fn std_of(
 /// Standard deviation of a coarse pose: its inliers are weighted by their confidences.
 fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> PoseStd {
     let pairs = coordinates.correspondences();
-    let inliers = registration
-        .inliers
-        .iter()
-        .filter_map(|&cell| pairs.get(cell as usize));
-    PoseStd::of(
-        &registration.target_from_source,
-        inliers.map(|pair| (pair, f64::from(pair.weight))),
-    )
+    let inliers = registration.inliers.iter();
+    let inliers = inliers.filter_map(|&cell| pairs.get(cell as usize));
+    let weighted = inliers.map(|pair| (pair, f64::from(pair.weight)));
+    PoseStd::of(&registration.target_from_source, weighted)
 }
 
 #[cfg(test)]

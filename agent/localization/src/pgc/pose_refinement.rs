@@ -1,7 +1,7 @@
 //! Pose refinement: from a coarse pose to an accurate one, by two rounds of the refiner's predictions and a new fit.
 
 use nalgebra::{Isometry3, Point3, Vector3};
-use perception::tensor_values::values;
+use perception::tensor_values::{tensor, values};
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::pose_std::PoseStd;
@@ -65,26 +65,17 @@ pub(super) fn refine(
     let mut answer = None;
     let wide_rounds = if is_wide { 2 } else { 0 };
     for scales_m in std::iter::repeat_n(WIDE_ROUND_M, wide_rounds).chain(ROUNDS_M) {
-        let assumed: Vec<f32> = sensor_m
-            .iter()
-            .flat_map(|point| {
-                (pose * Point3::from(point.map(f64::from)))
-                    .coords
-                    .map(|axis| axis as f32)
-                    .data
-                    .0[0]
-            })
-            .collect();
+        let mut assumed = Vec::with_capacity(3 * sensor_m.len());
+        for point in sensor_m {
+            let point = pose * Point3::from(point.map(f64::from));
+            assumed.extend([point.x, point.y, point.z].map(|axis| axis as f32));
+        }
         let ahead = pose.rotation * Vector3::x();
         let norm = ahead.xy().norm().max(1e-6);
-        let heading = Tensor::f_from_slice(&[(ahead.x / norm) as f32, (ahead.y / norm) as f32])?;
-        let heading = heading
-            .f_to_device(device)?
-            .f_view([1, 2])?
-            .f_expand([sensor_m.len() as i64, -1], false)?;
-        let assumed = Tensor::f_from_slice(&assumed)?
-            .f_view([-1, 3])?
-            .f_to_device(device)?;
+        let heading = [(ahead.x / norm) as f32, (ahead.y / norm) as f32];
+        let heading = tensor(&heading, &[1, 2], device)?;
+        let heading = heading.f_expand([sensor_m.len() as i64, -1], false)?;
+        let assumed = tensor(&assumed, &[-1, 3], device)?;
         let seen = no_grad(|| refiner.look(&cells, &assumed, &heading, kind))?;
         let world = values(&seen.coordinates_m)?;
         let epsilon_m = values(&seen.epsilon_m)?;
@@ -97,12 +88,9 @@ pub(super) fn refine(
             .collect();
         let usable = pairs.iter().filter(|pair| pair.usable());
         let fits = usable.map(|pair| {
-            let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
-            (
-                point(pair.source_m),
-                point(pair.target_m),
-                f64::from(pair.weight),
-            )
+            let [source, target] =
+                [pair.source_m, pair.target_m].map(|point| Vector3::from(point.map(f64::from)));
+            (source, target, f64::from(pair.weight))
         });
         match reweighted(&fits.collect::<Vec<_>>(), &pose, scales_m.iter().copied()) {
             Ok(fitted) => pose = fitted,
@@ -112,11 +100,8 @@ pub(super) fn refine(
         let weigh = |pair: &Correspondence| {
             f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m)
         };
-        let weighted: Vec<_> = pairs
-            .iter()
-            .filter(|pair| pair.usable())
-            .map(|pair| (pair, weigh(pair)))
-            .collect();
+        let usable = pairs.iter().filter(|pair| pair.usable());
+        let weighted: Vec<_> = usable.map(|pair| (pair, weigh(pair))).collect();
         let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
         let std = PoseStd::of(&pose, weighted.into_iter());
         let registration = Registration::judge(&pairs, pose, INLIER_M);
@@ -135,20 +120,18 @@ pub(super) fn refine(
 
 /// Distance between a predicted position and the one of its cell under a pose, metres; infinite if it is not finite.
 fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
-    if pair.usable() {
-        pair.residual_m(pose)
-    } else {
-        f64::INFINITY
+    match pair.usable() {
+        true => pair.residual_m(pose),
+        false => f64::INFINITY,
     }
 }
 
 /// Lower quartile of the values; infinite if there are none. The fitted confidence model depends on this rule.
 fn lower_quartile(mut values: Vec<f64>) -> f64 {
     let quarter = values.len() / 4;
-    if values.is_empty() {
-        f64::INFINITY
-    } else {
-        *values.select_nth_unstable_by(quarter, f64::total_cmp).1
+    match values.is_empty() {
+        true => f64::INFINITY,
+        false => *values.select_nth_unstable_by(quarter, f64::total_cmp).1,
     }
 }
 

@@ -98,7 +98,7 @@ const fn diagonal(value: f64) -> [[f64; 6]; 6] {
 mod tests {
     use super::*;
     use crate::registration::kabsch::PairMoments;
-    use crate::registration::synthetic::Problem;
+    use crate::registration::test_problem::Problem;
 
     #[test]
     fn it_matches_the_spread_of_fits() {

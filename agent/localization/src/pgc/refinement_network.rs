@@ -5,6 +5,7 @@
 //! gives the cell are the candidates, and the prediction is their mean by attention. Neither the paper nor LightLoc has
 //! this stage; the solver's 'final refinement' is run on its predictions.
 
+use perception::tensor_values::tensor;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
@@ -40,25 +41,17 @@ impl Refiner {
         config.validate()?;
         let [columns, rows] = config.corners();
         let corners = columns * rows;
-        let RefinerConfig {
-            local_channels,
-            keys,
-            width,
-            ..
-        } = *config;
+        let (keys, width) = (config.keys, config.width);
+        let key = Init::Randn {
+            mean: 0.0,
+            stdev: 0.2,
+        };
         Ok(Self {
             config: config.clone(),
-            keys: path.var(
-                "keys",
-                &[corners, keys],
-                Init::Randn {
-                    mean: 0.0,
-                    stdev: 0.2,
-                },
-            ),
+            keys: path.var("keys", &[corners, keys], key),
             heights: path.var("heights", &[corners, 1], Init::Const(0.0)),
             sharpness: path.var("sharpness", &[1], Init::Const(FIRST_SHARPNESS)),
-            inward: Dense::new(&(path / "inward"), local_channels + 3, width, 1.0),
+            inward: Dense::new(&(path / "inward"), config.local_channels + 3, width, 1.0),
             query: Dense::new(&(path / "query"), width, keys, 0.5),
             height: Dense::new(&(path / "height"), width, 1, 0.1),
             epsilon: [
@@ -93,31 +86,20 @@ impl Refiner {
         let height = assumed_m.f_narrow(1, 2, 1)? / 10.0;
         let input = Tensor::f_cat(&[&local, heading, &height], 1)?.f_to_kind(kind)?;
         let hidden = self.inward.forward(&input)?.f_relu()?;
-        let query = self
-            .query
-            .forward(&hidden)?
-            .f_to_kind(Kind::Float)?
-            .f_unsqueeze(2)?;
+        let query = self.query.forward(&hidden)?.f_to_kind(Kind::Float)?;
 
         let window = self.window(assumed_m)?;
-        let similarity = gather(&self.keys, &window.corners)?
-            .f_bmm(&query)?
-            .f_squeeze_dim(2)?
-            * &self.sharpness;
+        let keys = gather(&self.keys, &window.corners)?;
+        let similarity = keys.f_bmm(&query.f_unsqueeze(2)?)?.f_squeeze_dim(2)? * &self.sharpness;
         let shares = similarity.f_softmax(1, Kind::Float)?.f_unsqueeze(1)?;
-        let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
-        let floor_m = shares
-            .f_bmm(&gather(&self.heights, &window.corners)?)?
-            .f_squeeze_dim(1)?;
+        let mean = |values: &Tensor| shares.f_bmm(values)?.f_squeeze_dim(1);
+        let plane_m = mean(&window.places_m)?;
+        let floor_m = mean(&gather(&self.heights, &window.corners)?)?;
         let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
         // The spread of the attention weights and the largest of them indicate the error of the prediction.
-        let square = shares
-            .f_bmm(&window.places_m.f_square()?)?
-            .f_squeeze_dim(1)?;
-        let spread = (square - plane_m.f_square()?)
-            .f_sum_dim_intlist(1_i64, true, Kind::Float)?
-            .f_clamp_min(1e-6)?
-            .f_sqrt()?;
+        let variance = mean(&window.places_m.f_square()?)? - plane_m.f_square()?;
+        let variance = variance.f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+        let spread = variance.f_clamp_min(1e-6)?.f_sqrt()?;
         let largest = shares.f_amax([2_i64], false)?;
         let evidence = Tensor::f_cat(&[hidden.f_to_kind(Kind::Float)?, spread, largest], 1)?;
         let epsilon = self.epsilon[1].forward(&self.epsilon[0].forward(&evidence)?.f_relu()?)?;
@@ -129,38 +111,30 @@ impl Refiner {
 
     /// The corners around each position.
     fn window(&self, assumed_m: &Tensor) -> Result<Window, TchError> {
-        let RefinerConfig {
-            spacing_m,
-            reach,
-            low_m,
-            ..
-        } = &self.config;
-        let [columns, rows] = self.config.corners();
+        let config = &self.config;
+        let (spacing_m, reach, low_m) = (config.spacing_m, config.reach, config.low_m);
+        let [columns, rows] = config.corners();
         let device = assumed_m.device();
         let axis = |axis: usize, size: i64| {
-            let steps =
-                ((assumed_m.f_select(1, axis as i64)? - low_m[axis]) / *spacing_m).f_round()?;
-            steps.f_clamp(*reach as f64, (size - 1 - reach) as f64)
+            let steps = (assumed_m.f_select(1, axis as i64)? - low_m[axis]) / spacing_m;
+            steps
+                .f_round()?
+                .f_clamp(reach as f64, (size - 1 - reach) as f64)
         };
         let (column, row) = (axis(0, columns)?, axis(1, rows)?);
-        let middle = [
-            &column * *spacing_m + low_m[0],
-            &row * *spacing_m + low_m[1],
-        ];
-        let first = (row * columns as f64 + column)
-            .f_to_kind(Kind::Int64)?
-            .f_unsqueeze(1)?;
-        let around = || (-reach..=*reach).flat_map(move |y| (-reach..=*reach).map(move |x| (x, y)));
-        let shifts: Vec<i64> = around().map(|(x, y)| y * columns + x).collect();
-        let places: Vec<f32> = around()
-            .flat_map(|(x, y)| [(x as f64 * spacing_m) as f32, (y as f64 * spacing_m) as f32])
-            .collect();
+        let middle = [&column * spacing_m + low_m[0], &row * spacing_m + low_m[1]];
+        let first = (row * columns as f64 + column).f_to_kind(Kind::Int64)?;
+        let (mut shifts, mut places) = (Vec::new(), Vec::new());
+        for y in -reach..=reach {
+            for x in -reach..=reach {
+                shifts.push(y * columns + x);
+                places.extend([x, y].map(|steps| (steps as f64 * spacing_m) as f32));
+            }
+        }
         let count = assumed_m.size()[0];
-        let places_m = Tensor::f_from_slice(&places)?
-            .f_view([1, -1, 2])?
-            .f_to_device(device)?;
+        let places_m = tensor(&places, &[1, -1, 2], device)?;
         Ok(Window {
-            corners: first + Tensor::f_from_slice(&shifts)?.f_to_device(device)?,
+            corners: first.f_unsqueeze(1)? + tensor(&shifts, &[-1], device)?,
             places_m: places_m.f_expand([count, -1, -1], false)?,
             middle_m: Tensor::f_stack(&middle, 1)?,
         })
@@ -181,8 +155,8 @@ struct Window {
 fn gather(rows: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
     let channels = rows.size()[1];
     let flat = index.f_reshape([-1, 1])?.f_expand([-1, channels], false)?;
-    rows.f_gather(0, &flat, false)?
-        .f_view([index.size()[0], index.size()[1], channels])
+    let gathered = rows.f_gather(0, &flat, false)?;
+    gathered.f_view([index.size()[0], index.size()[1], channels])
 }
 
 #[cfg(test)]

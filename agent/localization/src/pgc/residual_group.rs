@@ -57,11 +57,8 @@ impl ResidualGroup {
         let kind = x.kind();
         let inner = self.inward.forward(x, index)?.f_relu()?;
         on_activation(&inward_activation(name), &inner)?;
-        let inner = self
-            .middle_bias
-            .to_kind(kind)
-            .f_addmm(&inner, &self.middle.to_kind(kind))?
-            .f_relu()?;
+        let bias = self.middle_bias.to_kind(kind);
+        let inner = bias.f_addmm(&inner, &self.middle.to_kind(kind))?.f_relu()?;
         on_activation(&middle_activation(name), &inner)?;
         let inner = self.outward.forward(&inner, index)?;
         match &self.skip {
@@ -77,27 +74,20 @@ impl ResidualGroup {
         name: &str,
         scales: &ActivationScales,
     ) -> Result<Int8ResidualGroup, QuantiseError> {
-        let (inward, middle) = (
-            scales.get(&inward_activation(name))?,
-            scales.get(&middle_activation(name))?,
-        );
+        let inward = scales.get(&inward_activation(name))?;
+        let middle = scales.get(&middle_activation(name))?;
         let linear = |weight: &Tensor, bias: Option<&Tensor>, format| {
             Int8Linear::new(&weight.f_tr()?.f_contiguous()?, bias, format)
         };
+        let (bias, hidden) = (&self.middle_bias, LayerFormat::hidden(inward, middle));
+        let skip = self.skip.as_ref();
+        let skip = skip.map(|skip| linear(skip, None, LayerFormat::last(input)));
         Ok(Int8ResidualGroup {
             input,
             inward: self.inward.int8(LayerFormat::hidden(input, inward))?,
-            middle: linear(
-                &self.middle,
-                Some(&self.middle_bias),
-                LayerFormat::hidden(inward, middle),
-            )?,
+            middle: linear(&self.middle, Some(bias), hidden)?,
             outward: self.outward.int8(LayerFormat::last(middle))?,
-            skip: self
-                .skip
-                .as_ref()
-                .map(|skip| linear(skip, None, LayerFormat::last(input)))
-                .transpose()?,
+            skip: skip.transpose()?,
         })
     }
 }
@@ -110,10 +100,8 @@ impl Int8ResidualGroup {
             Some(skip) => skip.forward(x)?,
             None => self.input.dequantise(x)?,
         };
-        self.outward
-            .forward(&inner, index)?
-            .f_add_(&skipped)?
-            .f_relu_()
+        let mut outer = self.outward.forward(&inner, index)?;
+        outer.f_add_(&skipped)?.f_relu_()
     }
 }
 

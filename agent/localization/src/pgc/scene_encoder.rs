@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use tch::nn::{self, VarStore};
+use tch::nn;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::encoder_config::SceneEncoderConfig;
@@ -59,18 +59,13 @@ impl SceneEncoder {
         let down = (1..widths.len())
             .map(|to| SparseConv::new(&level(to), widths[to - 1], widths[to]))
             .collect();
-        let before_last = widths[widths.len() - 2];
-        let fine = config
-            .fine_cells
-            .then(|| ResidualGroup::new(&(path / "fine"), before_last, before_last));
+        let (before_last, fine) = (widths[widths.len() - 2], path / "fine");
+        let fine = (config.fine_cells).then(|| ResidualGroup::new(&fine, before_last, before_last));
         let mut coarse = Vec::new();
         let mut channels = widths[widths.len() - 1];
         for (group, &width) in config.residual_widths.iter().enumerate() {
-            coarse.push(ResidualGroup::new(
-                &(path / "residual" / group),
-                channels,
-                width,
-            ));
+            let path = path / "residual" / group;
+            coarse.push(ResidualGroup::new(&path, channels, width));
             channels = width;
         }
         Ok(Self {
@@ -90,21 +85,13 @@ impl SceneEncoder {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind.
     pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
         let weights = Weights::load(path)?;
-        Ok((
-            Self::from_weights(&weights, device)?,
-            weights.sha256().to_owned(),
-        ))
+        let encoder = Self::from_weights(&weights, device)?;
+        Ok((encoder, weights.sha256().to_owned()))
     }
 
     /// The encoder of a file already read, frozen.
     pub(super) fn from_weights(weights: &Weights, device: Device) -> Result<Self, LocalizerError> {
-        weights.check_kind(Self::KIND)?;
-        let config: SceneEncoderConfig = weights.config()?;
-        let mut network = VarStore::new(device);
-        let encoder = Self::new(&network.root(), &config)?;
-        weights.copy_into(&network)?;
-        network.freeze();
-        Ok(encoder)
+        weights.network(Self::KIND, device, |path, config| Self::new(path, &config))
     }
 
     /// Configuration that it was built from.
@@ -139,10 +126,8 @@ impl SceneEncoder {
         kind: Kind,
         on_activation: &mut OnActivation<'_>,
     ) -> Result<LocalFeatures, TchError> {
-        let mut x = self
-            .first
-            .forward(&batch.input.to_kind(kind), &batch.first)?
-            .f_relu()?;
+        let input = batch.input.to_kind(kind);
+        let mut x = self.first.forward(&input, &batch.first)?.f_relu()?;
         on_activation(&level_activation(0), &x)?;
         let mut fine = None;
         for (level, conv) in self.down.iter().enumerate() {
@@ -174,19 +159,15 @@ impl SceneEncoder {
             down.push(conv.int8(LayerFormat::hidden(input, output))?);
             (before, input) = (input, output);
         }
-        let fine = self
-            .fine
-            .as_ref()
-            .map(|group| group.int8(before, FINE, scales))
-            .transpose()?;
+        let fine = self.fine.as_ref();
+        let fine = fine.map(|group| group.int8(before, FINE, scales));
+        let fine = fine.transpose()?;
         let last = input;
         let mut coarse = Vec::with_capacity(self.coarse.len());
         for (number, group) in self.coarse.iter().enumerate() {
-            coarse.push((
-                group.int8(input, &coarse_activation(number), scales)?,
-                input,
-            ));
-            input = scales.get(&coarse_activation(number))?;
+            let name = coarse_activation(number);
+            coarse.push((group.int8(input, &name, scales)?, input));
+            input = scales.get(&name)?;
         }
         self.int8 = Some(Int8Levels {
             first,
@@ -214,33 +195,21 @@ impl SceneEncoder {
                 // Odd, so that the cell is in the centre.
                 let window = 2 * (edge_m / self.config.coarse_cell_m() / 2.0).round() as i64 + 1;
                 let context = rows(&plane.mean_over(window)?, &batch.columns)?;
-                parts.push(rows(
-                    &context.to_kind(local.cells.kind()),
-                    &batch.coarse_of_cell,
-                )?);
+                let context = context.to_kind(local.cells.kind());
+                parts.push(rows(&context, &batch.coarse_of_cell)?);
             }
         }
         let sweep = |rows: &std::ops::Range<i64>| {
-            let own = local
-                .coarse
-                .f_narrow(0, rows.start, rows.end - rows.start)?
-                .f_to_kind(Kind::Float)?;
+            let own = (local.coarse).f_narrow(0, rows.start, rows.end - rows.start)?;
+            let own = own.f_to_kind(Kind::Float)?;
             if own.size()[0] == 0 {
                 return own.f_new_zeros([2 * own.size()[1]], (Kind::Float, own.device()));
             }
-            Tensor::f_cat(
-                &[
-                    own.f_mean_dim(0_i64, false, Kind::Float)?,
-                    own.f_amax([0_i64], false)?,
-                ],
-                0,
-            )
+            let mean = own.f_mean_dim(0_i64, false, Kind::Float)?;
+            Tensor::f_cat(&[mean, own.f_amax([0_i64], false)?], 0)
         };
-        let sweeps: Vec<Tensor> = batch
-            .coarse_rows
-            .iter()
-            .map(sweep)
-            .collect::<Result<_, _>>()?;
+        let sweeps = batch.coarse_rows.iter().map(sweep);
+        let sweeps: Vec<Tensor> = sweeps.collect::<Result<_, _>>()?;
         Ok(SceneFeatures {
             cells: Tensor::f_cat(&parts, 1)?,
             sweeps: Tensor::f_stack(&sweeps, 0)?,
@@ -346,6 +315,8 @@ impl Plane {
 
 #[cfg(test)]
 mod tests {
+    use tch::nn::VarStore;
+
     use super::*;
     use crate::pgc::voxelise::SweepVoxels;
 

@@ -63,34 +63,23 @@ impl SceneHead {
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &SceneHeadConfig) -> Result<Self, LocalizerError> {
         config.validate()?;
-        let SceneHeadConfig {
-            cell_channels,
-            sweep_channels,
-            classes,
-            centres,
-            width,
-            blocks,
-            ..
-        } = *config;
+        let (cells, sweeps, width) = (config.cell_channels, config.sweep_channels, config.width);
+        let (classes, centres) = (config.classes, config.centres);
         let block = |number: usize| {
-            let layer =
-                |layer: usize| Dense::new(&(path / "blocks" / number / layer), width, width, 1.0);
-            [layer(0), layer(1), layer(2)]
+            let path = path / "blocks" / number;
+            [0, 1, 2].map(|layer: usize| Dense::new(&(&path / layer), width, width, 1.0))
         };
+        let refiner = |config| Refiner::new(&(path / "refiner"), config);
         Ok(Self {
             config: config.clone(),
-            cell_norm: FeatureNorm::new(&(path / "cell_norm"), cell_channels),
-            sweep_norm: FeatureNorm::new(&(path / "sweep_norm"), sweep_channels),
-            classifier: Classifier::new(&(path / "classifier"), sweep_channels, classes),
+            cell_norm: FeatureNorm::new(&(path / "cell_norm"), cells),
+            sweep_norm: FeatureNorm::new(&(path / "sweep_norm"), sweeps),
+            classifier: Classifier::new(&(path / "classifier"), sweeps, classes),
             centres: (path / "centres").zeros_no_train("position", &[centres, 3]),
-            inward: Dense::new(&(path / "inward"), cell_channels + classes, width, 1.0),
-            blocks: (0..blocks).map(block).collect(),
+            inward: Dense::new(&(path / "inward"), cells + classes, width, 1.0),
+            blocks: (0..config.blocks).map(block).collect(),
             outward: Dense::new(&(path / "outward"), width, centres + 4, 0.1),
-            refiner: config
-                .refiner
-                .as_ref()
-                .map(|config| Refiner::new(&(path / "refiner"), config))
-                .transpose()?,
+            refiner: config.refiner.as_ref().map(refiner).transpose()?,
             int8: None,
         })
     }
@@ -149,29 +138,20 @@ impl SceneHead {
         let input = self.input(cells, logits)?;
         let inward = self.inward.forward(&input.f_to_kind(kind)?)?.f_relu()?;
         let hidden = match &self.int8 {
-            Some(blocks) => blocks
-                .iter()
-                .try_fold(inward, |x, block| block.forward(&x))?,
+            Some(blocks) => (blocks.iter()).try_fold(inward, |x, block| block.forward(&x))?,
             None => self.hidden(inward, &mut |_, _| Ok(()))?,
         };
         let output = self.outward.forward(&hidden)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
-        let log_shares = output
-            .f_narrow(1, 0, centres)?
-            .f_log_softmax(1, Kind::Float)?;
+        let log_shares = output.f_narrow(1, 0, centres)?;
+        let log_shares = log_shares.f_log_softmax(1, Kind::Float)?;
         let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
-        let coordinates_m = log_shares.f_exp()?.f_matmul(&self.centres)? + offset;
-        let epsilon_m = output
-            .f_narrow(1, centres + 3, 1)?
-            .f_squeeze_dim(1)?
-            .f_softplus()?;
-        Ok((
-            Regression {
-                coordinates_m,
-                epsilon_m,
-            },
-            log_shares,
-        ))
+        let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?;
+        let regression = Regression {
+            coordinates_m: log_shares.f_exp()?.f_matmul(&self.centres)? + offset,
+            epsilon_m: epsilon_m.f_softplus()?,
+        };
+        Ok((regression, log_shares))
     }
 
     /// Residual blocks in floating point, from the output of the first layer on.
@@ -222,10 +202,8 @@ impl SceneHead {
                 second.int8(LayerFormat::hidden(inner, innermost))?,
                 third.int8(LayerFormat::last(innermost))?,
             ];
-            blocks.push(Int8Block {
-                input: before,
-                layers,
-            });
+            let input = before;
+            blocks.push(Int8Block { input, layers });
             before = output;
         }
         self.int8 = Some(blocks);
@@ -234,11 +212,8 @@ impl SceneHead {
 
     /// `[N, cell_channels + classes]`: features of cells beside the normalised logits of their sweeps.
     fn input(&self, cells: &Tensor, logits: &Tensor) -> Result<Tensor, TchError> {
-        let norm = logits
-            .f_square()?
-            .f_sum_dim_intlist(1_i64, true, Kind::Float)?
-            .f_add_scalar(1e-12)?
-            .f_sqrt()?;
+        let squares = (logits.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?;
+        let norm = squares.f_add_scalar(1e-12)?.f_sqrt()?;
         Tensor::f_cat(&[cells, &(logits / norm)], 1)
     }
 
@@ -288,10 +263,8 @@ impl Classifier {
     fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let mut x = x.shallow_clone();
         for (layer, norm) in self.layers.iter().zip(&self.norms) {
-            x = norm
-                .forward(&layer.forward(&x), train)
-                .f_relu()?
-                .f_dropout(DROPOUT, train)?;
+            let activation = norm.forward(&layer.forward(&x), train).f_relu()?;
+            x = activation.f_dropout(DROPOUT, train)?;
         }
         Ok(self.last.forward(&x))
     }

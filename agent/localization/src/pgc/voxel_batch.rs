@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use perception::tensor_values::tensor;
 use tch::{Device, TchError, Tensor};
 
 use super::encoder_config::SceneEncoderConfig;
@@ -38,51 +39,35 @@ impl VoxelBatch {
         config: &SceneEncoderConfig,
         device: Device,
     ) -> Result<Self, TchError> {
-        let input: Vec<f32> = sweeps
-            .iter()
-            .flat_map(|sweep| &sweep.input)
-            .copied()
-            .collect();
-        let input = Tensor::f_from_slice(&input)?
-            .f_view([-1, config.input.channels()])?
-            .f_to_device(device)?;
+        let input: Vec<f32> = (sweeps.iter().flat_map(|sweep| &sweep.input).copied()).collect();
+        let input = tensor(&input, &[-1, config.input.channels()], device)?;
         let stacked = |book: fn(&SweepVoxels) -> &Rulebook| {
             Rulebook::stacked(sweeps.iter().map(|s| book(s)), device)
         };
         let down = (0..config.levels() - 1)
             .map(|level| Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.down[level]), device))
             .collect::<Result<_, _>>()?;
-        let fine = match config.fine_cells {
-            true => Some(Rulebook::stacked(
-                sweeps.iter().filter_map(|sweep| sweep.fine.as_ref()),
-                device,
-            )?),
-            false => None,
-        };
+        let fine = sweeps.iter().filter_map(|sweep| sweep.fine.as_ref());
+        let fine = (config.fine_cells).then(|| Rulebook::stacked(fine, device));
         let edge = i64::from(plane_edge(config));
         let coarse_rows = ranges(sweeps, |sweep| sweep.columns.len());
         let shifted = |values: fn(&SweepVoxels) -> &[u32], shifts: Vec<i64>| {
-            let rows = sweeps.iter().zip(shifts);
-            let rows: Vec<i64> = rows
-                .flat_map(|(sweep, shift)| {
-                    values(sweep).iter().map(move |&row| shift + i64::from(row))
-                })
-                .collect();
-            Tensor::f_from_slice(&rows)?.f_to_device(device)
+            let mut rows = Vec::new();
+            for (sweep, shift) in sweeps.iter().zip(shifts) {
+                rows.extend(values(sweep).iter().map(|&row| shift + i64::from(row)));
+            }
+            tensor(&rows, &[-1], device)
         };
-        let planes = (0..sweeps.len() as i64)
-            .map(|sweep| sweep * edge * edge)
-            .collect();
+        let planes = (0..sweeps.len() as i64).map(|sweep| sweep * edge * edge);
+        let planes = planes.collect();
+        let starts = coarse_rows.iter().map(|rows| rows.start).collect();
         Ok(Self {
             input,
             first: stacked(|sweep| &sweep.first)?,
             down,
-            fine,
+            fine: fine.transpose()?,
             coarse: stacked(|sweep| &sweep.coarse)?,
-            coarse_of_cell: shifted(
-                |sweep| &sweep.coarse_of_cell,
-                coarse_rows.iter().map(|rows| rows.start).collect(),
-            )?,
+            coarse_of_cell: shifted(|sweep| &sweep.coarse_of_cell, starts)?,
             columns: shifted(|sweep| &sweep.columns, planes)?,
             plane_edge: edge,
             coarse_rows,

@@ -26,7 +26,7 @@ mod compatibility;
 mod pairs;
 mod sampling;
 #[cfg(test)]
-pub(crate) mod synthetic;
+pub(crate) mod test_problem;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 

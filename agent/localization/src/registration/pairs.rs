@@ -49,11 +49,8 @@ impl Pairs {
         usable.shuffle(random);
         usable.sort_by(|a, b| b.weight.total_cmp(&a.weight));
         let mean = |axis: usize| {
-            usable
-                .iter()
-                .map(|pair| f64::from(pair.target_m[axis]))
-                .sum::<f64>()
-                / usable.len().max(1) as f64
+            let values = usable.iter().map(|pair| f64::from(pair.target_m[axis]));
+            values.sum::<f64>() / usable.len().max(1) as f64
         };
         let origin = Vector3::new(mean(0), mean(1), mean(2));
         let column = |value: &dyn Fn(&Correspondence) -> f32| -> Column {
@@ -85,17 +82,11 @@ impl Pairs {
     }
 
     pub(super) fn source(&self, index: usize) -> Vector3<f64> {
-        let (block, lane) = (index / LANES, index % LANES);
-        Vector3::from(std::array::from_fn::<_, 3, _>(|axis| {
-            f64::from(self.source[axis][block][lane])
-        }))
+        at(&self.source, index)
     }
 
     pub(super) fn target(&self, index: usize) -> Vector3<f64> {
-        let (block, lane) = (index / LANES, index % LANES);
-        Vector3::from(std::array::from_fn::<_, 3, _>(|axis| {
-            f64::from(self.target[axis][block][lane])
-        }))
+        at(&self.target, index)
     }
 
     /// Source, target and weight of the pairs within `radius_m` of their positions under `motion`.
@@ -112,11 +103,8 @@ impl Pairs {
             for (lane, squared) in squared.into_iter().enumerate() {
                 let index = block * LANES + lane;
                 if squared < limit && index < self.count {
-                    near.push((
-                        self.source(index),
-                        self.target(index),
-                        f64::from(self.weight[block][lane]),
-                    ));
+                    let weight = f64::from(self.weight[block][lane]);
+                    near.push((self.source(index), self.target(index), weight));
                 }
             }
         }
@@ -161,18 +149,10 @@ impl Pairs {
 
     #[inline]
     fn squared_residuals(&self, model: &Model, block: usize) -> [f32; LANES] {
-        let [x, y, z] = [
-            &self.source[0][block],
-            &self.source[1][block],
-            &self.source[2][block],
-        ];
+        let [x, y, z] = self.source.each_ref().map(|column| &column[block]);
         let mut squared = [0.0; LANES];
-        for ((row, shift), target) in model
-            .rotation
-            .iter()
-            .zip(model.translation)
-            .zip(&self.target)
-        {
+        let rows = model.rotation.iter().zip(model.translation);
+        for ((row, shift), target) in rows.zip(&self.target) {
             let target = &target[block];
             for lane in 0..LANES {
                 let difference =
@@ -182,6 +162,11 @@ impl Pairs {
         }
         squared
     }
+}
+
+fn at(columns: &[Column; 3], index: usize) -> Vector3<f64> {
+    let (block, lane) = (index / LANES, index % LANES);
+    Vector3::from_fn(|axis, _| f64::from(columns[axis][block][lane]))
 }
 
 /// A motion in single precision.
@@ -207,7 +192,7 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
-    use crate::registration::synthetic::Problem;
+    use crate::registration::test_problem::Problem;
 
     #[test]
     fn the_gain_is_that_of_the_definition() {

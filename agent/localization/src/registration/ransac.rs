@@ -143,47 +143,35 @@ pub fn solve(
     check_enough(correspondences, required)?;
     let mut random = ChaCha8Rng::seed_from_u64(config.seed);
     let pairs = Pairs::new(correspondences, &mut random);
-    let Some(best) = Search {
+    let too_few = |found| NoRegistration::TooFewInliers {
+        found,
+        required,
+        given: correspondences.len(),
+    };
+    let search = Search {
         pairs: &pairs,
         config,
         best: None,
-    }
-    .run(&mut random) else {
-        return Err(NoRegistration::TooFewInliers {
-            found: 0,
-            required,
-            given: correspondences.len(),
-        });
     };
-    let near = pairs.near(&best, refine::CUTOFF_SCALES * config.refine_scale_m);
+    let best = search.run(&mut random).ok_or_else(|| too_few(0))?;
+    let scale_m = config.refine_scale_m;
+    let near = pairs.near(&best, refine::CUTOFF_SCALES * scale_m);
     if near.len() < required {
-        return Err(NoRegistration::TooFewInliers {
-            found: near.len(),
-            required,
-            given: correspondences.len(),
-        });
+        return Err(too_few(near.len()));
     }
-    let refined = refine::converge(
-        &near.iter().copied(),
-        &best,
-        config.refine_scale_m,
-        FINAL_STEPS,
-    )
-    .map_err(|reason| NoRegistration::Degenerate {
+    let degenerate = |reason| NoRegistration::Degenerate {
         inliers: near.len(),
         reason,
-    })?;
-    let motion = if config.allows_tilt_of(&refined) {
-        refined
-    } else {
-        best
     };
-    Registration::judge(
-        correspondences,
-        pairs.to_target_frame(&motion),
-        config.inlier_threshold_m,
-    )
-    .with_at_least(required, correspondences.len())
+    let refined = refine::converge(&near.iter().copied(), &best, scale_m, FINAL_STEPS);
+    let refined = refined.map_err(degenerate)?;
+    let motion = match config.allows_tilt_of(&refined) {
+        true => refined,
+        false => best,
+    };
+    let motion = pairs.to_target_frame(&motion);
+    Registration::judge(correspondences, motion, config.inlier_threshold_m)
+        .with_at_least(required, correspondences.len())
 }
 
 /// The draws and the best motion so far.
@@ -201,13 +189,10 @@ impl Search<'_> {
         let mut enough = self.config.max_draws;
         let mut draw = 0;
         while draw < enough {
+            let pairs = self.pairs;
             let drawn = match self.config.minimal {
-                MinimalSolver::UprightTwoPoint => {
-                    sampling::two_points(self.pairs, draw, &test, random)
-                }
-                MinimalSolver::ThreePoint => {
-                    sampling::three_points(self.pairs, draw, &test, random)
-                }
+                MinimalSolver::UprightTwoPoint => sampling::two_points(pairs, draw, &test, random),
+                MinimalSolver::ThreePoint => sampling::three_points(pairs, draw, &test, random),
             };
             draw += 1;
             let Some(motion) = drawn else { continue };
@@ -225,8 +210,8 @@ impl Search<'_> {
     }
 
     fn gain(&self, motion: &Isometry3<f64>, best: &Gain) -> Option<Gain> {
-        self.pairs
-            .gain(motion, self.config.inlier_threshold_m, best)
+        let threshold_m = self.config.inlier_threshold_m;
+        self.pairs.gain(motion, threshold_m, best)
     }
 
     /// Optimises a motion on the pairs near it; true if it became the new best.
@@ -238,9 +223,8 @@ impl Search<'_> {
             .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
             .filter(|(optimised, _)| optimised.total > gain.total);
         let candidate = optimised.unwrap_or((gain, *motion));
-        let better = self
-            .best
-            .is_none_or(|(best, _)| candidate.0.total > best.total);
+        let before = self.best.as_ref();
+        let better = before.is_none_or(|(best, _)| candidate.0.total > best.total);
         if better {
             self.best = Some(candidate);
         }
@@ -248,11 +232,9 @@ impl Search<'_> {
     }
 
     fn inliers(&self) -> usize {
-        self.best.map_or(0, |(_, motion)| {
-            self.pairs
-                .near(&motion, self.config.inlier_threshold_m)
-                .len()
-        })
+        let threshold_m = self.config.inlier_threshold_m;
+        let near = |(_, motion)| self.pairs.near(&motion, threshold_m).len();
+        self.best.map_or(0, near)
     }
 }
 
@@ -262,7 +244,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::registration::synthetic::Problem;
+    use crate::registration::test_problem::Problem;
 
     proptest! {
         #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]

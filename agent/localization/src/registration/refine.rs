@@ -90,7 +90,7 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
-    use crate::registration::synthetic::Problem;
+    use crate::registration::test_problem::Problem;
 
     fn pairs(problem: &Problem) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
         let vector = |point: [f32; 3]| Vector3::from(point.map(f64::from));

@@ -124,7 +124,7 @@ mod tests {
     use rand::SeedableRng;
 
     use super::*;
-    use crate::registration::synthetic::Problem;
+    use crate::registration::test_problem::Problem;
 
     #[test]
     fn clean_samples_fix_the_motion() {

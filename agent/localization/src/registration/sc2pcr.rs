@@ -114,11 +114,8 @@ pub fn solve(
 ) -> Result<Registration, NoRegistration> {
     let required = config.min_inliers.max(SMALL_SET);
     check_enough(correspondences, required)?;
-    let mut trusted: Vec<Correspondence> = correspondences
-        .iter()
-        .copied()
-        .filter(Correspondence::usable)
-        .collect();
+    let usable = correspondences.iter().copied();
+    let mut trusted: Vec<_> = usable.filter(Correspondence::usable).collect();
     trusted.sort_by(|a, b| b.weight.total_cmp(&a.weight));
     trusted.truncate(config.max_correspondences.max(required));
     let found = consensus(&trusted, config)?;
@@ -140,24 +137,19 @@ pub fn consensus(
     config: &Sc2PcrConfig,
 ) -> Result<Consensus, NoRegistration> {
     check_enough(correspondences, SMALL_SET)?;
-    let usable: Vec<_> = correspondences
-        .iter()
-        .take(config.max_correspondences)
-        .filter(|p| p.usable())
-        .collect();
-    let points = Points {
-        source: usable.iter().map(|pair| pair.source_m).collect(),
-        target: usable.iter().map(|pair| pair.target_m).collect(),
-    };
+    let first = correspondences.iter().take(config.max_correspondences);
+    let (source, target) = first
+        .filter(|pair| pair.usable())
+        .map(|pair| (pair.source_m, pair.target_m))
+        .unzip();
+    let points = Points { source, target };
     let count = points.source.len();
     let threshold = config.distance_threshold_m as f32;
     let source_distances = distances(&points.source);
     let changes = changes(&source_distances, &distances(&points.target));
 
-    let first_order: Vec<f32> = changes
-        .iter()
-        .map(|&change| soft(change, threshold))
-        .collect();
+    let first_order = changes.iter().map(|&change| soft(change, threshold));
+    let first_order: Vec<f32> = first_order.collect();
     let confidence = leading_eigenvectors(&first_order, count, config.power_iterations);
     let seeds = pick_seeds(&source_distances, &confidence, config);
 
@@ -165,12 +157,9 @@ pub fn consensus(
     let sets: Vec<Vec<usize>> = (seeds.iter())
         .map(|&seed| {
             let row = &changes[seed * count..(seed + 1) * count];
-            let score = |other: usize| {
-                if row[other] < threshold {
-                    tight.common(seed, other)
-                } else {
-                    0
-                }
+            let score = |other: usize| match row[other] < threshold {
+                true => tight.common(seed, other),
+                false => 0,
             };
             points.consensus_set(&(0..count).map(score).collect::<Vec<u32>>(), config)
         })
@@ -197,13 +186,9 @@ pub fn refine(
     start: &Isometry3<f64>,
     refinement: &Refinement,
 ) -> Isometry3<f64> {
-    let Refinement {
-        threshold_m,
-        rounds,
-    } = *refinement;
-    let mut motion = *start;
-    let mut previous = 0;
-    for _ in 0..rounds {
+    let threshold_m = refinement.threshold_m;
+    let (mut motion, mut previous) = (*start, 0);
+    for _ in 0..refinement.rounds {
         let mut moments = PairMoments::default();
         let mut inliers = 0;
         for pair in pairs.iter().filter(|pair| pair.usable()) {
@@ -228,11 +213,8 @@ pub fn refine(
 
 /// Absolute differences of two sets of distances.
 fn changes(source: &[f32], target: &[f32]) -> Vec<f32> {
-    source
-        .iter()
-        .zip(target)
-        .map(|(a, b)| (a - b).abs())
-        .collect()
+    let pairs = source.iter().zip(target);
+    pairs.map(|(a, b)| (a - b).abs()).collect()
 }
 
 /// Compatibility between 0 and 1 of two correspondences whose distance changes by this much.
@@ -260,9 +242,8 @@ fn pick_seeds(source_distances: &[f32], confidence: &[f32], config: &Sc2PcrConfi
 fn descending<T: PartialOrd>(values: &[T]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..values.len()).collect();
     order.sort_by(|&a, &b| {
-        values[b]
-            .partial_cmp(&values[a])
-            .unwrap_or(std::cmp::Ordering::Equal)
+        let order = values[b].partial_cmp(&values[a]);
+        order.unwrap_or(std::cmp::Ordering::Equal)
     });
     order
 }
@@ -281,10 +262,9 @@ impl Points {
     /// The correspondences that support a seed, the seed's strongest first: the best of the second-order compatibility
     /// `scores`, and of these the most compatible with the first.
     fn consensus_set(&self, scores: &[u32], config: &Sc2PcrConfig) -> Vec<usize> {
-        let (first, second) = if config.first_set > scores.len() {
-            (SMALL_SET, SMALL_SET)
-        } else {
-            (config.first_set, config.second_set.min(config.first_set))
+        let (first, second) = match config.first_set > scores.len() {
+            true => (SMALL_SET, SMALL_SET),
+            false => (config.first_set, config.second_set.min(config.first_set)),
         };
         let mut set = descending(scores);
         set.truncate(first);
@@ -293,11 +273,8 @@ impl Points {
         let size = set.len();
         let compatible = Bits::where_true(&changes, size, |change| change < threshold);
         let local: Vec<u32> = (0..size).map(|other| compatible.common(0, other)).collect();
-        descending(&local)
-            .into_iter()
-            .take(second)
-            .map(|place| set[place])
-            .collect()
+        let strongest = descending(&local).into_iter().take(second);
+        strongest.map(|place| set[place]).collect()
     }
 
     /// The fit with most inliers, and their number; the first of equal ones.
@@ -307,21 +284,16 @@ impl Points {
         config: &Sc2PcrConfig,
     ) -> Option<(Isometry3<f64>, usize)> {
         let size = sets.first()?.len();
-        let matrices: Vec<f32> = sets
-            .iter()
-            .flat_map(|set| self.soft_compatibility(set, config))
-            .collect();
+        let matrices = (sets.iter()).flat_map(|set| self.soft_compatibility(set, config));
+        let matrices: Vec<f32> = matrices.collect();
         let weights = leading_eigenvectors(&matrices, size, config.power_iterations);
         let mut best: Option<(Isometry3<f64>, usize)> = None;
         for (set, weights) in sets.iter().zip(weights.chunks(size)) {
             let total = weights.iter().sum::<f32>() + WEIGHT_EPSILON as f32;
             let mut moments = PairMoments::default();
             for (&index, weight) in set.iter().zip(weights) {
-                moments.add(
-                    &vector(&self.source[index]),
-                    &vector(&self.target[index]),
-                    f64::from(weight / total),
-                );
+                let (source, target) = (vector(&self.source[index]), vector(&self.target[index]));
+                moments.add(&source, &target, f64::from(weight / total));
             }
             let Ok(fit) = moments.fit_biased(WEIGHT_EPSILON) else {
                 continue;
@@ -339,15 +311,13 @@ impl Points {
     /// The paper weights by the second order here; the published implementation computes that and then leaves it out.
     fn soft_compatibility(&self, set: &[usize], config: &Sc2PcrConfig) -> Vec<f32> {
         let threshold = config.distance_threshold_m as f32;
-        let mut compatibility: Vec<f32> = self
-            .changes_within(set)
-            .into_iter()
-            .map(|change| soft(change, threshold))
-            .collect();
-        compatibility
-            .iter_mut()
-            .step_by(set.len() + 1)
-            .for_each(|own| *own = 0.0);
+        let mut compatibility = self.changes_within(set);
+        for change in &mut compatibility {
+            *change = soft(*change, threshold);
+        }
+        for own in compatibility.iter_mut().step_by(set.len() + 1) {
+            *own = 0.0;
+        }
         compatibility
     }
 
@@ -363,9 +333,8 @@ impl Points {
         let residual = |source: &[f32; 3], target: &[f32; 3]| {
             (rotation * vector(source) + motion.translation.vector - vector(target)).norm()
         };
-        self.source
-            .iter()
-            .zip(&self.target)
+        let pairs = self.source.iter().zip(&self.target);
+        pairs
             .filter(|(source, target)| residual(source, target) < threshold_m)
             .count()
     }
@@ -374,7 +343,7 @@ impl Points {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::registration::synthetic::Problem;
+    use crate::registration::test_problem::Problem;
 
     #[test]
     fn motions_are_found_among_outliers() {

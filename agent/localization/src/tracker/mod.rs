@@ -102,10 +102,8 @@ impl PoseTracker {
         let is_recent = |accepted: &PoseMeasurement| {
             seconds(accepted.capture_nanos, capture_nanos) <= self.limits.max_coast_s
         };
-        let is_ahead = self
-            .track
-            .as_ref()
-            .is_some_and(|track| track.filter.capture_nanos <= capture_nanos);
+        let track = self.track.as_ref();
+        let is_ahead = track.is_some_and(|track| track.filter.capture_nanos <= capture_nanos);
         is_ahead && self.accepted.as_ref().is_some_and(is_recent)
     }
 
@@ -155,11 +153,8 @@ impl PoseTracker {
     }
 
     fn reject(&mut self, measurement: &PoseMeasurement) -> Correction {
-        if self
-            .rejected
-            .last()
-            .is_some_and(|before| !can_follow(before, measurement))
-        {
+        let before = self.rejected.last();
+        if before.is_some_and(|before| !can_follow(before, measurement)) {
             self.rejected.clear();
         }
         self.rejected.push(*measurement);
@@ -174,20 +169,16 @@ impl PoseTracker {
     /// Starts at a measurement; with the speed from the one before it, if that is recent.
     fn start(&mut self, measurement: &PoseMeasurement) {
         let before = self.accepted.replace(*measurement);
-        let speed = before
-            .filter(|before| can_follow(before, measurement))
-            .map(|before| [speed_mps(&before, measurement), SPEED_STD_MPS]);
+        let before = before.filter(|before| can_follow(before, measurement));
+        let speed = before.map(|before| [speed_mps(&before, measurement), SPEED_STD_MPS]);
         self.track = Some(Track::at(measurement, speed));
         self.rejected.clear();
     }
 
     /// True if a measurement is needed now: the last one was rejected, or the speed is not known well.
     pub fn needs_measurement(&self) -> bool {
-        self.is_contradicted()
-            || self
-                .track
-                .as_ref()
-                .is_none_or(|track| track.speed_std_mps() > SPEED_STD_MPS)
+        let track = self.track.as_ref();
+        self.is_contradicted() || track.is_none_or(|track| track.speed_std_mps() > SPEED_STD_MPS)
     }
 
     /// The speed that is not used any more, since measured poses contradict it.
@@ -210,12 +201,8 @@ fn can_follow(from: &PoseMeasurement, to: &PoseMeasurement) -> bool {
 
 /// Speed along the heading from one pose to the next, metres per second.
 fn speed_mps(from: &PoseMeasurement, to: &PoseMeasurement) -> f64 {
-    let moved = from
-        .world_from_lidar
-        .inv_mul(&to.world_from_lidar)
-        .translation
-        .x;
-    moved / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
+    let moved = from.world_from_lidar.inv_mul(&to.world_from_lidar);
+    moved.translation.x / seconds(from.capture_nanos, to.capture_nanos).max(1e-3)
 }
 
 #[cfg(test)]

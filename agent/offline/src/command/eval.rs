@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use agent_offline::Error;
 use agent_offline::evaluation::{
-    Evaluated, EvaluatedSweep, IntegritySummary, LocalizationSummary, SweepSelection, evaluate,
-    evaluate_source, reliability_charts, write_csv, write_error_table,
+    Evaluated, EvaluatedSweep, LocalizationSummary, SweepSelection, evaluate, evaluate_source,
+    reliability_charts, write_csv, write_error_table,
 };
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use agent_offline::sweep_database::read_database;
@@ -184,9 +184,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let groups = by_head(&heads, &args.dataset)?;
     if args.fit_confidence && groups.len() > 1 {
         let count = groups.len();
-        return Err(
-            BadInput::new(format!("--fit-confidence fits one head, {count} are given")).into(),
-        );
+        let reason = format!("--fit-confidence fits one head, {count} are given");
+        return Err(BadInput::new(reason).into());
     }
     let (mut sweeps, mut tracked, mut left_out) = (Vec::new(), Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
@@ -203,15 +202,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     args.write(if args.tracked { &tracked } else { &sweeps })?;
     let summary = LocalizationSummary::of(&sweeps);
-    if let ([(head, scenes)], true) = (
-        &groups[..],
-        summary.no_pose == summary.sweeps && args.uses_head(),
-    ) {
-        output::note(wrong_place_hint(
-            summary.sweeps as u64,
-            head,
-            map_text(scenes).as_deref(),
-        ));
+    let is_lost = summary.no_pose == summary.sweeps && args.uses_head();
+    if let ([(head, scenes)], true) = (&groups[..], is_lost) {
+        let (sweeps, map) = (summary.sweeps as u64, map_text(scenes));
+        output::note(wrong_place_hint(sweeps, head, map.as_deref()));
     }
     let tracked = args.tracked.then(|| LocalizationSummary::of(&tracked));
     match &tracked {
@@ -225,10 +219,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             output::line(serde_json::to_string_pretty(&document)?)?;
         }
         Some(tracked) => {
+            let (single, tracked) = (table(&summary), table(tracked));
             output::text(format!(
-                "every sweep by itself\n{}\ntracked\n{}",
-                table(&summary),
-                table(tracked)
+                "every sweep by itself\n{single}\ntracked\n{tracked}"
             ))?;
         }
         None => output::text(table(&summary))?,
@@ -256,12 +249,8 @@ impl Args {
     /// Command, and digests of the program, the networks and all data that are read.
     fn provenance<'a>(&self, heads: impl Iterator<Item = &'a Path>) -> anyhow::Result<Provenance> {
         let mut scenarios = Vec::new();
-        for folder in self
-            .dataset
-            .iter()
-            .chain(&self.retrieval)
-            .chain(&self.icp_map)
-        {
+        let others = self.retrieval.iter().chain(&self.icp_map);
+        for folder in self.dataset.iter().chain(others) {
             scenarios.extend(dataset::open(folder)?.scenarios);
         }
         let mut files: Vec<PathBuf> = self.baseline.iter().cloned().collect();
@@ -271,11 +260,8 @@ impl Args {
         for head in heads.filter(|_| self.uses_head()) {
             files.extend([self.encoder(head)?, head.to_owned()]);
         }
-        Ok(dataset::provenance(
-            &scenarios,
-            files,
-            env!("V2VLOC_COMMIT"),
-        )?)
+        let commit = env!("V2VLOC_COMMIT");
+        Ok(dataset::provenance(&scenarios, files, commit)?)
     }
 
     /// True unless another method takes the place of the head.
@@ -284,9 +270,8 @@ impl Args {
     }
 
     fn inference(&self) -> Result<Inference, BadInput> {
-        let device = self.device.open();
-        let device =
-            device.map_err(|missing| BadInput::new(format!("--device cuda: {missing}")))?;
+        let no_cuda = |missing| BadInput::new(format!("--device cuda: {missing}"));
+        let device = self.device.open().map_err(no_cuda)?;
         Ok(Inference::new(device, self.precision))
     }
 
@@ -322,10 +307,9 @@ impl Args {
         if let Some(weights) = &self.baseline {
             return load_baseline(weights, inference.device, plain).map_err(BadInput::of);
         }
-        let load = if self.fit_confidence {
-            Localizer::load_without_confidence
-        } else {
-            Localizer::load
+        let load = match self.fit_confidence {
+            true => Localizer::load_without_confidence,
+            false => Localizer::load,
         };
         let mut localizer = load(&self.encoder(head)?, head, inference).map_err(BadInput::of)?;
         if self.lightloc {
@@ -448,23 +432,16 @@ fn table(summary: &LocalizationSummary) -> String {
     };
     let percent = |share: f64| format!("{:.1} %", 100.0 * share);
     let share = |value: Option<f64>| value.map_or("-".into(), percent);
-    let LocalizationSummary {
-        sweeps,
-        no_pose,
-        rejected,
-        ms,
-        ..
-    } = summary;
+    let (rejected, ms) = (&summary.rejected, &summary.ms);
     let total = ms.get("total").copied();
-    let stages: Vec<String> = ms
-        .iter()
-        .filter(|(stage, _)| *stage != "total")
-        .map(|(s, ms)| format!("{s} {ms:.1}"))
+    let stages = ms.iter().filter(|(stage, _)| *stage != "total");
+    let stages: Vec<String> = stages
+        .map(|(stage, ms)| format!("{stage} {ms:.1}"))
         .collect();
     let lines = [
         format!(
-            "sweeps     {sweeps}, {no_pose} without a pose {:?}",
-            summary.outcomes
+            "sweeps     {}, {} without a pose {:?}",
+            summary.sweeps, summary.no_pose, summary.outcomes
         ),
         format!(
             "success    {} under 3 m, {} under 1 m",
@@ -506,10 +483,11 @@ fn table(summary: &LocalizationSummary) -> String {
             stages.join(", ")
         ),
     ];
-    let integrity = summary.integrity.map(|IntegritySummary { exceeded_share, p50_bound_m, .. }| {
+    let integrity = summary.integrity.map(|integrity| {
         format!(
-            "integrity  {} of the errors exceed their bound of 95 % (median {p50_bound_m:.2} m)",
-            percent(exceeded_share)
+            "integrity  {} of the errors exceed their bound of 95 % (median {:.2} m)",
+            percent(integrity.exceeded_share),
+            integrity.p50_bound_m
         )
     });
     let lines = lines.into_iter().chain(integrity);

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use dataset::IntensityScale;
-use dataset::cloud_files::{Cloud, CloudFile, clouds_at};
+use dataset::cloud_files::{CloudFile, clouds_at};
 use dataset::findings::{self, SweepFindings};
 use localization::map_registration::MapRegistration;
 use localization::pgc::head_files::{encoder_or_named, head_file, surfel_map_file};
@@ -158,10 +158,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(hint) = other_lidar_hint(head_config.sweep_points, &points) {
         output::note(hint);
     }
-    Ok(if bad > 0 {
-        Outcome::BadInput
-    } else {
-        Outcome::of(lost > 0)
+    Ok(match bad > 0 {
+        true => Outcome::BadInput,
+        false => Outcome::of(lost > 0),
     })
 }
 
@@ -182,19 +181,16 @@ impl Args {
                 (path.unwrap_or_default(), Err(error))
             }
         };
-        let Cloud {
-            mut points,
-            left_out,
-            findings,
-            is_of_data_set,
-        } = match read {
+        let read = match read {
             Ok(read) => read,
             Err(error) => return Ok(Located::unreadable(cloud, map, &error)),
         };
-        sweeps.push(findings);
-        let (count, y_axis) = match is_of_data_set {
-            true => (points.len(), YAxis::Left),
-            false => (points.len(), self.y_axis),
+        let mut points = read.points;
+        let count = points.len();
+        sweeps.push(read.findings);
+        let y_axis = match read.is_of_data_set {
+            true => YAxis::Left,
+            false => self.y_axis,
         };
         if y_axis == YAxis::Right {
             mirror(&mut points);
@@ -217,7 +213,7 @@ impl Args {
             inliers: localization.inlier_count,
             inlier_ratio: localization.inlier_ratio,
             points: count,
-            points_left_out: left_out,
+            points_left_out: read.left_out,
             is_mirrored,
         })
     }
@@ -242,10 +238,9 @@ fn reason(estimate: &PoseEstimate) -> Option<&'static str> {
 
 /// Negates y, in place.
 fn mirror(points: &mut protocol::PointCloud) {
-    points
-        .xyzi
-        .iter_mut()
-        .for_each(|point| point[1] = -point[1]);
+    for point in &mut points.xyzi {
+        point[1] = -point[1];
+    }
 }
 
 impl LocatedPose {

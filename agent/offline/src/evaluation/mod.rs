@@ -4,10 +4,11 @@ mod summary;
 mod table;
 
 use crate::Error;
+use crate::sweep_database::present_sweeps;
 use std::path::PathBuf;
 
 use dataset::frame::Frame;
-use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, Scenario, findings};
+use dataset::{self, IntensityScale, LeftOut, LoadOptions, Problem, ReadError, findings};
 use protocol::{CavId, Pose, PoseError, PoseEstimate};
 
 pub use summary::{
@@ -52,17 +53,17 @@ impl EvaluatedSweep {
     /// Error of the estimated pose, rejected or not.
     #[must_use]
     pub fn error(&self) -> Option<PoseError> {
-        self.localization
-            .found
-            .map(|found| PoseError::between(&found.world_from_sensor.into(), &self.truth))
+        let found = self.localization.found?;
+        Some(PoseError::between(
+            &found.world_from_sensor.into(),
+            &self.truth,
+        ))
     }
 
     /// Error of the pose that is published, if there is one.
     pub(crate) fn told_error(&self) -> Option<PoseError> {
-        self.localization
-            .estimate
-            .world_from_cav()
-            .map(|pose| PoseError::between(pose, &self.truth))
+        let pose = self.localization.estimate.world_from_cav()?;
+        Some(PoseError::between(pose, &self.truth))
     }
 
     /// Sample for the fit of a confidence model.
@@ -95,14 +96,6 @@ pub struct Evaluated {
     pub left_out: LeftOut,
 }
 
-/// A sweep of a scenario.
-#[derive(Clone, Copy)]
-struct Sweep<'a> {
-    scenario: &'a Scenario,
-    agent: usize,
-    tick: usize,
-}
-
 /// Localizes every sweep of the scenes in turn; `on_sweep` gets the number done and the number of all.
 ///
 /// # Errors
@@ -113,11 +106,8 @@ pub fn evaluate(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    evaluate_with(
-        &mut |frame| localizer.localize(LocalizerInput::of(&frame.points)),
-        options,
-        on_sweep,
-    )
+    let mut localize = |frame: &Frame| localizer.localize(LocalizerInput::of(&frame.points));
+    evaluate_with(&mut localize, options, on_sweep)
 }
 
 /// The same for a pose source, which gets the pose of the GNSS receiver.
@@ -153,15 +143,14 @@ fn evaluate_with(
     options: &SweepSelection,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Evaluated, Error> {
-    let datasets = options
-        .scenes
-        .iter()
-        .map(|dir| dataset::open(dir))
-        .collect::<Result<Vec<_>, _>>()?;
-    let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
-    let all: Vec<Sweep<'_>> = scenarios
-        .flat_map(|scenario| sweeps_of(scenario, options.every))
-        .collect();
+    let datasets = options.scenes.iter().map(|dir| dataset::open(dir));
+    let datasets = datasets.collect::<Result<Vec<_>, _>>()?;
+    let is_used = |(_, tick): &(usize, usize)| tick.is_multiple_of(options.every.max(1));
+    let mut all = Vec::new();
+    for scenario in datasets.iter().flat_map(|dataset| &dataset.scenarios) {
+        let used = present_sweeps(scenario).filter(is_used);
+        all.extend(used.map(|sweep| (scenario, sweep)));
+    }
     let chosen = evenly_spread(&all, options.sweeps.unwrap_or(usize::MAX));
     if chosen.is_empty() {
         return Err(Error::Input(format!("no sweep in {:?}", options.scenes)));
@@ -179,8 +168,7 @@ fn evaluate_with(
         let findings = findings::sampled(&dataset.scenarios, IntensityScale::AUTO);
         evaluated.left_out.add_findings(findings);
     }
-    for (place, sweep) in chosen.iter().enumerate() {
-        let (scenario, agent, tick) = (sweep.scenario, sweep.agent, sweep.tick);
+    for (place, &(scenario, (agent, tick))) in chosen.iter().enumerate() {
         on_sweep(place + 1, chosen.len());
         let frame = match scenario.load(agent, tick, &load) {
             Ok(frame) => frame,
@@ -198,14 +186,12 @@ fn evaluate_with(
                 scenario.name, frame.cav
             )));
         };
-        let localization = localize(&frame)?;
-        let scenario = scenario.name.clone();
         evaluated.sweeps.push(EvaluatedSweep {
-            scenario,
+            scenario: scenario.name.clone(),
+            localization: localize(&frame)?,
             cav: frame.cav,
             stem,
             truth,
-            localization,
         });
     }
     if evaluated.sweeps.is_empty() {
@@ -217,34 +203,18 @@ fn evaluate_with(
     Ok(evaluated)
 }
 
-/// Sweeps vehicle by vehicle, in the order of time.
-fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_>> {
-    let ticks = move |agent| {
-        (0..scenario.ticks.len())
-            .step_by(every.max(1))
-            .filter(move |&tick| scenario.is_present(agent, tick))
-    };
-    (0..scenario.agents.len()).flat_map(move |agent| {
-        ticks(agent).map(move |tick| Sweep {
-            scenario,
-            agent,
-            tick,
-        })
-    })
-}
-
 /// Name of a sweep's outcome.
 fn outcome(estimate: &PoseEstimate) -> &'static str {
     use protocol::NoPoseReason::{Failed, LowConfidence, NoSource, TooFewInliers, TooFewPoints};
-    match estimate {
-        PoseEstimate::Pose { .. } => "pose",
-        PoseEstimate::NoPose { reason, .. } => match reason {
-            TooFewPoints => "too_few_points",
-            TooFewInliers => "too_few_inliers",
-            NoSource => "no_source",
-            LowConfidence => "low_confidence",
-            Failed => "failed",
-        },
+    let PoseEstimate::NoPose { reason, .. } = estimate else {
+        return "pose";
+    };
+    match reason {
+        TooFewPoints => "too_few_points",
+        TooFewInliers => "too_few_inliers",
+        NoSource => "no_source",
+        LowConfidence => "low_confidence",
+        Failed => "failed",
     }
 }
 

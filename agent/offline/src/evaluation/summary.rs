@@ -115,20 +115,18 @@ impl LocalizationSummary {
     /// Summary of sweeps.
     #[must_use]
     pub fn of(sweeps: &[EvaluatedSweep]) -> Self {
-        let published: Vec<_> = sweeps
-            .iter()
-            .filter_map(EvaluatedSweep::told_error)
-            .collect();
-        let metres: Vec<f64> = published.iter().map(|error| error.distance_m).collect();
-        let degrees: Vec<f64> = published.iter().map(|error| error.angle_deg).collect();
+        let published = sweeps.iter().filter_map(EvaluatedSweep::told_error);
+        let (metres, degrees): (Vec<f64>, Vec<f64>) = published
+            .map(|error| (error.distance_m, error.angle_deg))
+            .unzip();
         let (metres, degrees) = (sorted(&metres), sorted(&degrees));
         let success = |limit_m: f64| {
-            metres.iter().filter(|&&error_m| error_m < limit_m).count() as f64
-                / sweeps.len().max(1) as f64
+            let good = metres.iter().filter(|&&error_m| error_m < limit_m);
+            good.count() as f64 / sweeps.len().max(1) as f64
         };
         let judged = judged(sweeps);
-        let sigmas: Vec<f64> = judged.iter().map(|pose| pose.sigma).collect();
-        let errors: Vec<f64> = judged.iter().map(|pose| pose.error_m).collect();
+        let (sigmas, errors): (Vec<f64>, Vec<f64>) =
+            (judged.iter().map(|pose| (pose.sigma, pose.error_m))).unzip();
         let ratios: Vec<f64> = (sweeps.iter().filter_map(|sweep| sweep.localization.found))
             .map(|found| found.evidence.inlier_ratio)
             .collect();
@@ -138,14 +136,12 @@ impl LocalizationSummary {
             let outcome = outcome(&sweep.localization.estimate);
             *outcomes.entry(outcome).or_default() += 1;
         }
-        let total_ms: Vec<f64> = sweeps
+        let totals = sweeps.iter().map(|sweep| sweep.localization.times.total());
+        let total_ms: Vec<f64> = totals.map(|total| total.as_secs_f64() * 1e3).collect();
+        let gaps = calibration
             .iter()
-            .map(|sweep| sweep.localization.times.total().as_secs_f64() * 1e3)
-            .collect();
-        let gaps: Vec<f64> = calibration
-            .iter()
-            .map(|bin| (bin.sigma - bin.observed).abs())
-            .collect();
+            .map(|bin| (bin.sigma - bin.observed).abs());
+        let gaps: Vec<f64> = gaps.collect();
         Self {
             sweeps: sweeps.len(),
             success_3m: success(3.0),
@@ -159,7 +155,7 @@ impl LocalizationSummary {
             p50_deg: quantile(&degrees, 0.5),
             p95_deg: quantile(&degrees, 0.95),
             max_deg: degrees.last().copied(),
-            no_pose: sweeps.len() - published.len(),
+            no_pose: sweeps.len() - metres.len(),
             outcomes,
             sigma_spearman: spearman(&sigmas, &errors),
             inlier_ratio_spearman: spearman(&ratios, &errors),
@@ -230,15 +226,13 @@ fn integrity(sweeps: &[EvaluatedSweep]) -> Option<IntegritySummary> {
         else {
             return None;
         };
-        let off =
-            |axis: usize| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis];
-        Some((off(0).hypot(off(1)), covariance.bound_95_m()))
+        let [x, y] =
+            [0, 1].map(|axis| world_from_cav.translation_m[axis] - sweep.truth.translation_m[axis]);
+        Some((x.hypot(y), covariance.bound_95_m()))
     };
     let judged: Vec<(f64, f64)> = sweeps.iter().filter_map(judged).collect();
-    let exceeded = judged
-        .iter()
-        .filter(|(error_m, bound_m)| error_m > bound_m)
-        .count();
+    let exceeded = judged.iter().filter(|(error_m, bound_m)| error_m > bound_m);
+    let exceeded = exceeded.count();
     let bounds: Vec<f64> = judged.iter().map(|(_, bound_m)| *bound_m).collect();
     Some(IntegritySummary {
         poses: judged.len(),
@@ -253,17 +247,14 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
         let stages = &sweep.localization.times;
         let mut add = |stage: &str, ms: f64| times.entry(stage.to_owned()).or_default().push(ms);
         for timing in stages.timings() {
-            add(
-                timing.stage.trim_start_matches("pose "),
-                timing.nanos as f64 * 1e-6,
-            );
+            let stage = timing.stage.trim_start_matches("pose ");
+            add(stage, timing.nanos as f64 * 1e-6);
         }
         add("total", stages.total().as_secs_f64() * 1e3);
     }
-    times
-        .into_iter()
-        .map(|(stage, ms)| (stage, median(&ms).unwrap_or(0.0)))
-        .collect()
+    let medians = times.into_iter();
+    let medians = medians.map(|(stage, ms)| (stage, median(&ms).unwrap_or(0.0)));
+    medians.collect()
 }
 
 /// The reliability curve, and every pose by sigma and error.
@@ -271,17 +262,20 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
 pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
     let judged = judged(sweeps);
     let bins = calibration(&judged);
-    let published = sweeps
-        .iter()
-        .filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. }))
-        .count();
-    let cloud = |name: &str, is_rejected: bool| Series {
+    let is_published = |sweep: &&EvaluatedSweep| sweep.told_error().is_some();
+    let published = sweeps.iter().filter(is_published).count();
+    let series = |name: &str, points, mark| Series {
         name: name.into(),
-        points: (judged.iter().filter(|pose| pose.is_rejected == is_rejected))
-            .map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)))
-            .collect(),
-        mark: Mark::Dots,
+        points,
+        mark,
     };
+    let cloud = |name: &str, is_rejected: bool| {
+        let poses = judged.iter().filter(|pose| pose.is_rejected == is_rejected);
+        let points = poses.map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)));
+        series(name, points.collect(), Mark::Dots)
+    };
+    let groups = bins.iter().map(|bin| (bin.sigma, bin.observed)).collect();
+    let diagonal = vec![(0.0, 0.0), (1.0, 1.0)];
     let reliability = Chart {
         title: format!(
             "Reliability, {} sweeps, {published} poses published",
@@ -290,16 +284,8 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         x: Axis::linear("sigma", [0.0, 1.0]),
         y: Axis::linear("mean of 1 / (1 + e^2), e in m", [0.0, 1.0]),
         series: vec![
-            Series {
-                name: "poses in groups of equal size".into(),
-                points: bins.iter().map(|bin| (bin.sigma, bin.observed)).collect(),
-                mark: Mark::LineAndDots,
-            },
-            Series {
-                name: "perfectly calibrated".into(),
-                points: vec![(0.0, 0.0), (1.0, 1.0)],
-                mark: Mark::Line,
-            },
+            series("poses in groups of equal size", groups, Mark::LineAndDots),
+            series("perfectly calibrated", diagonal, Mark::Line),
         ],
     };
     let errors = Chart {
@@ -308,11 +294,7 @@ pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
         y: Axis::logarithmic("distance to the true position, m", [0.01, 1000.0]),
         series: vec![
             cloud("published", false),
-            Series {
-                name: "3 m".into(),
-                points: vec![(0.0, BAD_M), (1.0, BAD_M)],
-                mark: Mark::Line,
-            },
+            series("3 m", vec![(0.0, BAD_M), (1.0, BAD_M)], Mark::Line),
             cloud("rejected", true),
         ],
     };

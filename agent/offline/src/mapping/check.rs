@@ -61,13 +61,12 @@ pub(super) fn check(
             0 => (frame.points, truth),
             _ => turned(&frame.points, &truth, &mut rng),
         };
-        let localization = localizer.localize(LocalizerInput::of(&cloud))?;
         let sweep = EvaluatedSweep {
             scenario,
             cav: frame.cav,
             stem,
             truth,
-            localization,
+            localization: localizer.localize(LocalizerInput::of(&cloud))?,
         };
         check.labelled.extend(sweep.labelled());
         let mirrored = EvaluatedSweep {
@@ -75,11 +74,9 @@ pub(super) fn check(
             ..sweep.clone()
         };
         // A straight street is its own mirror image: a pose near the true one is no example of a wrong pose.
-        check.labelled.extend(
-            mirrored
-                .labelled()
-                .filter(|labelled| labelled.error_m > BAD_M),
-        );
+        let wrong = mirrored.labelled();
+        let wrong = wrong.filter(|labelled| labelled.error_m > BAD_M);
+        check.labelled.extend(wrong);
         if copy == 0 {
             check.sweeps.push(sweep);
         }
@@ -92,30 +89,23 @@ fn turned(cloud: &PointCloud, world_from_sensor: &Pose, rng: &mut impl Rng) -> (
     let turned_from_sensor = yaw(rng.random_range(-TURN_RAD..TURN_RAD));
     let keep = rng.random_range(KEEP..1.0);
     let turn: Isometry3<f32> = turned_from_sensor.cast();
-    let kept = cloud
-        .xyzi
-        .iter()
-        .filter(|_| rng.random_bool(keep))
-        .map(|&[x, y, z, intensity]| {
-            let point = turn * nalgebra::Point3::new(x, y, z);
-            [point.x, point.y, point.z, intensity]
-        });
-    (
-        PointCloud {
-            xyzi: kept.collect(),
-        },
-        (world_from_sensor.isometry() * turned_from_sensor.inverse()).into(),
-    )
+    let mut xyzi = cloud.xyzi.clone();
+    xyzi.retain(|_| rng.random_bool(keep));
+    for point in &mut xyzi {
+        let [x, y, z, intensity] = *point;
+        let turned = turn * nalgebra::Point3::new(x, y, z);
+        *point = [turned.x, turned.y, turned.z, intensity];
+    }
+    let world_from_turned = world_from_sensor.isometry() * turned_from_sensor.inverse();
+    (PointCloud { xyzi }, world_from_turned.into())
 }
 
 fn mirrored(cloud: &PointCloud) -> PointCloud {
-    PointCloud {
-        xyzi: cloud
-            .xyzi
-            .iter()
-            .map(|&[x, y, z, intensity]| [x, -y, z, intensity])
-            .collect(),
+    let mut mirrored = cloud.clone();
+    for point in &mut mirrored.xyzi {
+        point[1] = -point[1];
     }
+    mirrored
 }
 
 #[cfg(test)]

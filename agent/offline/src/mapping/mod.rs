@@ -20,15 +20,15 @@ use self::plan::{Plan, StoredPlan, feature_bytes, too_little_memory};
 use crate::Error;
 use crate::evaluation::LocalizationSummary;
 use crate::training::{
-    CELLS, FeatureCache, SceneReport, SceneSummary, SceneSweeps, SceneTrainConfig,
-    SweepAugmentation, SweepList, train_scene_on,
+    CELLS, FeatureCache, SceneSummary, SceneSweeps, SceneTrainConfig, SweepAugmentation, SweepList,
+    train_scene_on,
 };
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
 use localization::pgc::head_files::ENCODER_FILE;
 use localization::pgc::{CellEncoder, Localizer};
 use perception::inference::Inference;
 use perception::int8::{SCALES_KEY, ScaleSearch};
-use perception::train::{Length, RunConfig};
+use perception::train::{Length, Progress, RunConfig};
 use perception::weights::annotate;
 use support::file_error::AtFile;
 use support::sampling::evenly_spread;
@@ -182,9 +182,8 @@ impl Map<'_> {
     fn survey(&mut self) -> Result<Sweeps, Error> {
         let list = SweepList::open(&self.config.drives)?;
         self.at(format!("reading the poses of {} sweeps", list.len()));
-        let positions: Vec<(usize, Option<Vector3<f64>>)> = list
-            .poses()
-            .into_iter()
+        let poses = list.poses().into_iter();
+        let positions: Vec<(usize, Option<Vector3<f64>>)> = poses
             .map(|(drive, pose)| (drive, pose.map(|pose| pose.translation.vector)))
             .collect();
         let (mut training, mut held) = (Vec::new(), Vec::new());
@@ -196,10 +195,9 @@ impl Map<'_> {
                 .collect();
             let path: Vec<Vector3<f64>> = known.iter().map(|(_, position)| *position).collect();
             for ((index, _), is_held_out) in known.into_iter().zip(held_out::held_out(&path)) {
-                if is_held_out {
-                    held.push(index)
-                } else {
-                    training.push(index)
+                match is_held_out {
+                    true => held.push(index),
+                    false => training.push(index),
                 }
             }
         }
@@ -242,12 +240,11 @@ impl Map<'_> {
                 first_s = began.elapsed().as_secs_f64();
             }
         };
-        FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress).map_err(|error| {
-            match error {
-                Error::NoSweeps(..) => self.no_poses(&probes),
-                error => error,
-            }
-        })?;
+        let built = FeatureCache::build(&probes, &encoder, unchanged, run, &mut progress);
+        match built.map(drop) {
+            Err(Error::NoSweeps(..)) => return Err(self.no_poses(&probes)),
+            built => built?,
+        }
         let all_s = began.elapsed().as_secs_f64();
         let sweep_s = match probes.len() - first {
             0 => all_s / probes.len().max(1) as f64,
@@ -265,24 +262,13 @@ impl Map<'_> {
             )));
         }
         self.announce(sweeps, &plan, wanted);
-        StoredPlan {
-            sweeps: with_pose,
-            plan,
-        }
-        .write(&run.out)?;
+        let sweeps = with_pose;
+        StoredPlan { sweeps, plan }.write(&run.out)?;
         Ok(plan)
     }
 
     fn announce(&mut self, sweeps: &Sweeps, plan: &Plan, wanted: usize) {
-        let Plan {
-            training,
-            copies,
-            checked,
-            encoding_s,
-            scales_s,
-            check_s,
-            ..
-        } = *plan;
+        let (training, checked, copies) = (plan.training, plan.checked, plan.copies);
         let total_s = self.config.time.as_secs_f64();
         if training < wanted {
             let minutes = (total_s * wanted as f64 / training as f64 / 60.0).ceil();
@@ -291,11 +277,12 @@ impl Map<'_> {
                  {minutes:.0} would use all"
             ));
         }
-        let training_s = (total_s - self.seconds() - encoding_s - plan.after_training_s()).max(0.0);
-        let copies = if copies > 1 {
-            format!(" in {copies} copies, rotated and thinned")
-        } else {
-            String::new()
+        let left_s = total_s - self.seconds() - plan.encoding_s - plan.after_training_s();
+        let (training_s, encoding_s) = (left_s.max(0.0), plan.encoding_s);
+        let (scales_s, check_s) = (plan.scales_s, plan.check_s);
+        let copies = match copies > 1 {
+            true => format!(" in {copies} copies, rotated and thinned"),
+            false => String::new(),
         };
         self.note(format!(
             "{training} training sweeps{copies}, {checked} of {} held-out sweeps; encoding {encoding_s:.0} s, training \
@@ -347,47 +334,31 @@ impl Map<'_> {
         let observe = &mut *self.observe;
         let training_end_s = self.config.time.as_secs_f64() - plan.after_training_s();
         let mut steps_began_s = None;
-        let mut tell = |report: &SceneReport| {
+        let mut on_progress = |progress: &Progress| {
             let mut seconds = started.elapsed().as_secs_f64();
-            let text = match report {
-                SceneReport::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
-                SceneReport::Classified(share) => {
-                    format!(
-                        "{:.0} % of the sweeps are assigned to their part of the place",
-                        100.0 * share
-                    )
-                }
-                SceneReport::Stepped {
-                    step,
-                    share_done,
-                    error_m,
-                    refined_m,
-                    ..
-                } => {
+            let text = match progress {
+                Progress::Encoding(done, total) => format!("encoding, {done} of {total} sweeps"),
+                Progress::Note(text) => text.clone(),
+                Progress::Stepped(report) => {
                     // A resumed training has a part behind it.
                     let began_s: f64 = *steps_began_s.get_or_insert(seconds);
-                    seconds = began_s + share_done * (training_end_s - began_s).max(0.0);
-                    format!(
-                        "training, step {step}, error of cells {error_m:.2} m, refined {refined_m:.2} m"
-                    )
+                    seconds = began_s + report.share_done * (training_end_s - began_s).max(0.0);
+                    format!("training, {}", report.text)
                 }
-                SceneReport::Encoded(_) | SceneReport::Validated(..) => return,
+                Progress::Read(_) | Progress::Validated(_) => return,
             };
             observe(MapProgress::At(seconds, text));
         };
-        Ok((train_scene_on(&config, &sweeps, &mut tell)?, run))
+        Ok((train_scene_on(&config, &sweeps, &mut on_progress)?, run))
     }
 
     /// Copies the encoder beside the head, so that the folder is all that is needed.
     fn copy_encoder(&self) -> Result<(), Error> {
         let path = self.config.run.out.join(ENCODER_FILE);
         let is_there = path.canonicalize().ok() == self.config.encoder.canonicalize().ok();
-        let copied = if is_there {
-            Ok(0)
-        } else {
-            std::fs::copy(&self.config.encoder, &path)
-        };
-        copied.at(&path)?;
+        if !is_there {
+            std::fs::copy(&self.config.encoder, &path).at(&path)?;
+        }
         Ok(())
     }
 
@@ -417,11 +388,8 @@ impl Map<'_> {
     }
 
     fn check(&mut self, weights: &Path, held_out: &SweepList) -> Result<Check, Error> {
-        let mut localizer = Localizer::load_without_confidence(
-            &self.config.encoder,
-            weights,
-            Inference::default(),
-        )?;
+        let (encoder, inference) = (&self.config.encoder, Inference::default());
+        let mut localizer = Localizer::load_without_confidence(encoder, weights, inference)?;
         let started = self.started;
         let observe = &mut *self.observe;
         let mut progress = |done, all| {
@@ -430,13 +398,8 @@ impl Map<'_> {
         };
         let deadline = started + self.config.time;
         let seed = self.config.run.seed;
-        Ok(check::check(
-            &mut localizer,
-            held_out,
-            seed,
-            deadline,
-            &mut progress,
-        )?)
+        let checked = check::check(&mut localizer, held_out, seed, deadline, &mut progress);
+        Ok(checked?)
     }
 
     /// Fits the confidence, writes it into the head and applies it; the report and the new digest.

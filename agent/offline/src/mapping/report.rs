@@ -97,22 +97,12 @@ impl MapReport {
     /// The driven area, in one line.
     #[must_use]
     pub fn coverage_text(&self) -> String {
-        let Coverage {
-            sweeps,
-            length_m,
-            low_m,
-            high_m,
-            cells,
-            cell_m,
-            ..
-        } = &self.coverage;
+        let coverage = &self.coverage;
+        let ([x_low, y_low], [x_high, y_high]) = (coverage.low_m, coverage.high_m);
+        let (sweeps, length_m, cell_m) = (coverage.sweeps, coverage.length_m, coverage.cell_m);
         format!(
-            "{sweeps} sweeps along {length_m:.0} m, x {:.0} to {:.0} m, y {:.0} to {:.0} m, {} cells of {cell_m:.0} m (#; x to the right, y up)",
-            low_m[0],
-            high_m[0],
-            low_m[1],
-            high_m[1],
-            cells.len()
+            "{sweeps} sweeps along {length_m:.0} m, x {x_low:.0} to {x_high:.0} m, y {y_low:.0} to {y_high:.0} m, {} cells of {cell_m:.0} m (#; x to the right, y up)",
+            coverage.cells.len()
         )
     }
 
@@ -123,14 +113,11 @@ impl MapReport {
             0 | 1 => String::new(),
             copies => format!(" in {copies} copies"),
         };
-        let error = self
-            .cell_error_m
-            .map(|error_m| format!(", error of cells {error_m:.1} m"));
+        let error = self.cell_error_m;
+        let error = error.map(|error_m| format!(", error of cells {error_m:.1} m"));
         let (sweeps, steps) = (self.training_sweeps, self.trained.steps);
-        format!(
-            "{sweeps} sweeps{copies}, {steps} steps{}",
-            error.unwrap_or_default()
-        )
+        let error = error.unwrap_or_default();
+        format!("{sweeps} sweeps{copies}, {steps} steps{error}")
     }
 
     /// The limits of the head, in sentences.
@@ -138,16 +125,13 @@ impl MapReport {
     pub fn limits_text(&self) -> String {
         let roads = "Roads that were not driven give no pose: drive every road, and both directions of wide ones.";
         let limits = [self.training_limit(), self.confidence_limit()];
-        limits
-            .into_iter()
-            .flatten()
-            .fold(roads.to_owned(), |text, limit| text + " " + &limit)
+        let limits = limits.into_iter().flatten();
+        limits.fold(roads.to_owned(), |text, limit| text + " " + &limit)
     }
 
     fn training_limit(&self) -> Option<String> {
-        let error_m = self
-            .cell_error_m
-            .filter(|error_m| *error_m > SHORT_TRAINING_M)?;
+        let is_short = |error_m: &f64| *error_m > SHORT_TRAINING_M;
+        let error_m = self.cell_error_m.filter(is_short)?;
         Some(format!(
             "The training was too short, the cells of its own sweeps are {error_m:.0} m off: more --minutes."
         ))

@@ -7,19 +7,19 @@ use std::time::Instant;
 
 use serde::Serialize;
 use tch::nn::VarStore;
-use tch::{Device, no_grad};
+use tch::{Device, Tensor, no_grad};
 
-use super::contrast::{Contrast, ContrastLoss};
+use super::contrast::Contrast;
 use super::pairs::{Pair, PairMaker};
 use super::sweep_store::SweepStore;
 use crate::Error;
 use localization::pgc::{SceneEncoder, SceneEncoderConfig};
-use perception::train::{Curve, DataListing, Prefetch, RunConfig, Trained, Trainer};
+use perception::train::{
+    Curve, Means, Observe, Prefetch, Progress, RunConfig, SaveEvery, Task, Trained, Trainer,
+};
 
 /// Number of pairs of a validation.
 const VALIDATION_PAIRS: u64 = 24;
-/// Steps between two reports.
-const REPORT_EVERY: u64 = 10;
 
 /// Configuration of a training of an encoder.
 #[derive(Debug, Clone)]
@@ -45,28 +45,6 @@ pub struct EncoderAccuracy {
     pub offset_m: f64,
 }
 
-/// Progress of a training of an encoder.
-#[derive(Debug, Clone, PartialEq)]
-pub enum EncoderReport {
-    /// Sweeps to learn from or to validate on have been read.
-    Read(DataListing),
-    /// Some steps are done.
-    Stepped {
-        /// Steps done.
-        step: u64,
-        /// Share of the training that is done, 0..1.
-        share_done: f64,
-        /// Seconds spent so far.
-        seconds: f64,
-        /// Mean loss since the last report.
-        loss: f64,
-        /// Mean accuracy on the training pairs since the last report.
-        accuracy: EncoderAccuracy,
-    },
-    /// A validation is done, after so many steps.
-    Validated(u64, EncoderAccuracy),
-}
-
 /// Result of a training of an encoder.
 #[derive(Debug, Clone)]
 pub struct EncoderSummary {
@@ -78,198 +56,147 @@ pub struct EncoderSummary {
     pub accuracy: Option<EncoderAccuracy>,
 }
 
-/// Trains an encoder; writes checkpoint, curve and weights into `config.run.out`.
+/// Trains an encoder; writes checkpoint, curve and weights into `config.run.out`. Reported are loss, share of cells that
+/// find their match, and offset error in metres.
 ///
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
 pub fn train_encoder(
     config: &EncoderTrainConfig,
-    observe: &mut dyn FnMut(&EncoderReport),
+    observe: &mut Observe<'_>,
 ) -> Result<EncoderSummary, Error> {
-    let mut training = Training::prepare(config, observe)?;
-    let maker = training.maker.clone();
-    let batch = config.run.batch as u64;
-    let mut loader = Prefetch::start(
-        config.run.loader_threads,
-        training.trainer.steps(),
-        move |number| {
-            (number * batch..(number + 1) * batch)
-                .map(|pair| maker.pair(pair))
-                .collect::<Result<Vec<_>, _>>()
-        },
-    );
-    let mut window = Window::default();
-    while training.share_done() < 1.0 {
-        training.step(&loader.next_batch()??, &mut window)?;
-        training.trainer.check_interruption(&training.variables)?;
-        let step = training.trainer.steps();
-        if training.trainer.is_report_due(REPORT_EVERY) {
-            observe(&training.report(std::mem::take(&mut window))?);
-        }
-        if step.is_multiple_of(config.validate_every) || training.share_done() >= 1.0 {
-            if let Some(accuracy) = training.validate()? {
-                observe(&EncoderReport::Validated(step, accuracy));
-            }
-            training.trainer.checkpoint(&training.variables)?;
-        }
+    let run = &config.run;
+    run.start()?;
+    let variables = VarStore::new(run.device);
+    let encoder = SceneEncoder::new(&(variables.root() / "encoder"), &config.encoder)?;
+    let local_channels = config.encoder.local_channels();
+    let contrast = Contrast::new(&(variables.root() / "contrast"), local_channels);
+    let mut read = |folders: &[PathBuf], seed| {
+        let store = Arc::new(SweepStore::read(folders, config.encoder.range_m)?);
+        observe(&Progress::Read(store.data.clone()));
+        let maker = PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?;
+        Ok::<_, Error>((maker, store))
+    };
+    let (maker, store) = read(&config.scenes, run.seed)?;
+    let validation = match config.validation.as_slice() {
+        [] => None,
+        folders => Some(read(folders, u64::MAX - run.seed)?.0),
+    };
+    let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
+    let (batch, anchors) = (run.batch as u64, maker.anchors());
+    let prepare = move |number| {
+        let pairs = number * batch..(number + 1) * batch;
+        pairs.map(|pair| maker.pair(pair)).collect()
+    };
+    let mut training = Training {
+        config,
+        observe,
+        loader: Prefetch::start(run.loader_threads, trainer.steps(), prepare),
+        anchors,
+        validation,
+        variables,
+        encoder,
+        contrast,
+        curve: trainer.curve("step,seconds,loss,top1,offset_m")?,
+        latest: [0.0; 3],
+        means: Means::default(),
+        accuracy: None,
+    };
+    trainer.run(&mut training, SaveEvery::Steps(config.validate_every))?;
+    // Only the encoder is saved, under the names it is loaded by.
+    let encoder = VarStore::new(Device::Cpu);
+    SceneEncoder::new(&encoder.root(), &config.encoder)?;
+    let trained = training.variables.variables();
+    for (name, mut variable) in encoder.variables() {
+        no_grad(|| variable.f_copy_(&trained[&format!("encoder.{name}")]))?;
     }
-    training.finish()
+    let (kind, data) = (SceneEncoder::KIND, store.data.clone());
+    Ok(EncoderSummary {
+        trained: trainer.save_network(&encoder, kind, &config.encoder, data)?,
+        sweeps: store.sweeps.len(),
+        accuracy: training.accuracy,
+    })
 }
 
 struct Training<'a> {
     config: &'a EncoderTrainConfig,
-    store: Arc<SweepStore>,
-    maker: PairMaker,
+    observe: &'a mut Observe<'a>,
+    loader: Prefetch<Result<Vec<Pair>, Error>>,
+    /// Number of sweeps that have a partner.
+    anchors: usize,
     validation: Option<PairMaker>,
     variables: VarStore,
     encoder: SceneEncoder,
     contrast: Contrast,
-    trainer: Trainer,
-    accuracy: Option<EncoderAccuracy>,
     curve: Curve,
+    /// Of the last step, as reported.
+    latest: [f64; 3],
+    means: Means<3>,
+    accuracy: Option<EncoderAccuracy>,
 }
 
-impl<'a> Training<'a> {
-    fn prepare(
-        config: &'a EncoderTrainConfig,
-        observe: &mut dyn FnMut(&EncoderReport),
-    ) -> Result<Self, Error> {
-        let run = &config.run;
-        run.start()?;
-        let variables = VarStore::new(run.device);
-        let encoder = SceneEncoder::new(&(variables.root() / "encoder"), &config.encoder)?;
-        let contrast = Contrast::new(
-            &(variables.root() / "contrast"),
-            config.encoder.local_channels(),
-        );
-        let mut maker = |folders: &[PathBuf], seed| {
-            let store = Arc::new(SweepStore::read(folders, config.encoder.range_m)?);
-            observe(&EncoderReport::Read(store.data.clone()));
-            Ok::<_, Error>((
-                PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?,
-                store,
-            ))
-        };
-        let (training, store) = maker(&config.scenes, run.seed)?;
-        let validation = match config.validation.as_slice() {
-            [] => None,
-            folders => Some(maker(folders, u64::MAX - run.seed)?.0),
-        };
-        let trainer = Trainer::begin(run, &variables, None, Instant::now())?;
-        Ok(Self {
-            config,
-            store,
-            maker: training,
-            validation,
-            variables,
-            encoder,
-            contrast,
-            curve: trainer.curve("step,seconds,loss,top1,offset_m")?,
-            trainer,
-            accuracy: None,
-        })
+impl Training<'_> {
+    /// Loss, and its value with those of the accuracy.
+    fn loss_of(&self, pairs: &[Pair]) -> Result<(Tensor, [f64; 3]), Error> {
+        let (kind, device) = (self.config.run.precision.kind(), self.config.run.device);
+        let loss = self.contrast.loss(&self.encoder, pairs, kind, device)?;
+        let value = loss.total.f_double_value(&[])?;
+        Ok((loss.total, [value, loss.top1, loss.offset_m]))
+    }
+}
+
+impl Task for Training<'_> {
+    type Error = Error;
+    const REPORT_EVERY: u64 = 10;
+
+    fn variables(&self) -> &VarStore {
+        &self.variables
     }
 
-    fn share_done(&self) -> f64 {
-        let pairs = self.trainer.steps() * self.config.run.batch as u64;
-        self.trainer
-            .share_done(pairs as f64 / self.maker.anchors() as f64)
+    fn epoch(&self, steps: u64) -> f64 {
+        (steps * self.config.run.batch as u64) as f64 / self.anchors as f64
     }
 
-    fn loss(&self, pairs: &[Pair]) -> Result<ContrastLoss, tch::TchError> {
-        let RunConfig {
-            precision, device, ..
-        } = self.config.run;
-        self.contrast
-            .loss(&self.encoder, pairs, precision.kind(), device)
+    fn loss(&mut self, _: &Trainer) -> Result<Tensor, Error> {
+        let pairs = self.loader.next_batch()??;
+        let (loss, latest) = self.loss_of(&pairs)?;
+        self.latest = latest;
+        Ok(loss)
     }
 
-    fn step(&mut self, pairs: &[Pair], window: &mut Window) -> Result<(), Error> {
-        let loss = self.loss(pairs)?;
-        if self.trainer.step(&loss.total, self.share_done())? {
-            window.add(&loss)?;
+    fn stepped(&mut self, _: &Trainer, is_taken: bool) -> Result<(), Error> {
+        if is_taken {
+            self.means.add(self.latest);
         }
         Ok(())
     }
 
-    /// Report of the steps of `window`, also appended to the curve.
-    fn report(&mut self, window: Window) -> Result<EncoderReport, Error> {
-        let (loss, accuracy) = window.means();
-        let (step, seconds) = (self.trainer.steps(), self.trainer.seconds());
-        self.curve
-            .numbers(&[step as f64, seconds, loss, accuracy.top1, accuracy.offset_m])?;
-        let share_done = self.share_done().min(1.0);
-        Ok(EncoderReport::Stepped {
-            step,
-            share_done,
-            seconds,
-            loss,
-            accuracy,
-        })
+    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+        let means @ [loss, top1, offset_m] = self.means.take();
+        let (step, seconds) = (trainer.steps() as f64, trainer.seconds());
+        self.curve.numbers(&[step, seconds, loss, top1, offset_m])?;
+        let top1 = 100.0 * top1;
+        let text = format!("loss {loss:.3} top-1 {top1:.1} % offset {offset_m:.2} m");
+        let report = trainer.step_report(self.share_done(trainer), means.into(), &text);
+        (self.observe)(&report);
+        Ok(())
     }
 
-    fn validate(&mut self) -> Result<Option<EncoderAccuracy>, Error> {
+    fn validate(&mut self, trainer: &Trainer) -> Result<(), Error> {
         let Some(maker) = &self.validation else {
-            return Ok(None);
+            return Ok(());
         };
-        let mut window = Window::default();
+        let mut means = Means::default();
         for number in 0..VALIDATION_PAIRS {
             let pairs = [maker.pair(2 * number)?, maker.pair(2 * number + 1)?];
-            let loss = no_grad(|| self.loss(&pairs))?;
-            window.add(&loss)?;
+            means.add(no_grad(|| self.loss_of(&pairs))?.1);
         }
-        self.accuracy = Some(window.means().1);
-        Ok(self.accuracy)
-    }
-
-    fn finish(self) -> Result<EncoderSummary, Error> {
-        // Only the encoder is saved, under the names it is loaded by.
-        let encoder = VarStore::new(Device::Cpu);
-        SceneEncoder::new(&encoder.root(), &self.config.encoder)?;
-        let trained = self.variables.variables();
-        for (name, mut variable) in encoder.variables() {
-            no_grad(|| variable.f_copy_(&trained[&format!("encoder.{name}")]))?;
-        }
-        Ok(EncoderSummary {
-            trained: self.trainer.save_network(
-                &encoder,
-                SceneEncoder::KIND,
-                &self.config.encoder,
-                self.store.data.clone(),
-            )?,
-            sweeps: self.store.sweeps.len(),
-            accuracy: self.accuracy,
-        })
-    }
-}
-
-/// Sums since the last report.
-#[derive(Default)]
-struct Window {
-    steps: usize,
-    loss: f64,
-    top1: f64,
-    offset_m: f64,
-}
-
-impl Window {
-    fn add(&mut self, loss: &ContrastLoss) -> Result<(), tch::TchError> {
-        self.steps += 1;
-        self.loss += loss.total.f_double_value(&[])?;
-        self.top1 += loss.top1;
-        self.offset_m += loss.offset_m;
+        let [_, top1, offset_m] = means.get();
+        self.accuracy = Some(EncoderAccuracy { top1, offset_m });
+        let (step, top1) = (trainer.steps(), 100.0 * top1);
+        (self.observe)(&Progress::Validated(format!(
+            "step {step}: validation top-1 {top1:.1} % offset {offset_m:.2} m"
+        )));
         Ok(())
-    }
-
-    /// Mean loss and accuracy.
-    fn means(&self) -> (f64, EncoderAccuracy) {
-        let mean = |sum: f64| sum / self.steps.max(1) as f64;
-        (
-            mean(self.loss),
-            EncoderAccuracy {
-                top1: mean(self.top1),
-                offset_m: mean(self.offset_m),
-            },
-        )
     }
 }

@@ -6,12 +6,13 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Point3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::sweep_store::{SweepList, yaw};
 use super::turned_sweep::{CELLS, TurnedSweep};
 use crate::Error;
 use localization::pgc::{Cell, CellEncoder, PreparedSweep};
+use perception::tensor_values::tensor;
 use perception::train::{Prefetch, RunConfig};
 
 /// Number of sweeps of one forward pass.
@@ -71,52 +72,46 @@ impl FeatureCache {
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, Error> {
-        let RunConfig {
-            seed,
-            loader_threads,
-            precision,
-            device,
-            ..
-        } = *run;
+        let (seed, device) = (run.seed, run.device);
         let total = list.len() * augmentation.copies.max(1);
         let format = encoder.format().clone();
         let source = Arc::clone(list);
-        let prepare = move |batch: u64| -> Vec<TurnedSweep> {
-            let numbers =
-                (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
-            let prepared = numbers.map(|number| {
-                let (index, copy) = (
-                    number as usize % source.len(),
-                    number as usize / source.len(),
-                );
-                let sweep = source.posed_sweep(index, format.range_m())?;
-                let mut rng = ChaCha8Rng::seed_from_u64(seed);
-                rng.set_stream(number);
-                let (turn, keep) = match copy {
-                    0 => (Isometry3::identity(), 1.0),
-                    _ => {
-                        let angle = augmentation.turn_rad.clamp(1e-6, PI);
-                        let turn = yaw(rng.random_range(-angle..angle));
-                        (turn, rng.random_range(augmentation.keep..=1.0))
-                    }
-                };
-                Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
-            });
-            prepared.flatten().collect()
+        let prepare_one = move |number: u64| {
+            let (copy, index) = (
+                number as usize / source.len(),
+                number as usize % source.len(),
+            );
+            let sweep = source.posed_sweep(index, format.range_m())?;
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            rng.set_stream(number);
+            let (turn, keep) = match copy {
+                0 => (Isometry3::identity(), 1.0),
+                _ => {
+                    let angle = augmentation.turn_rad.clamp(1e-6, PI);
+                    let turn = yaw(rng.random_range(-angle..angle));
+                    (turn, rng.random_range(augmentation.keep..=1.0))
+                }
+            };
+            Some(TurnedSweep::new(sweep, &turn, keep, &mut rng, &format))
         };
-        let mut loader = Prefetch::start(loader_threads, 0, prepare);
-        let rows = (total * CELLS) as i64;
-        let mut builder = Builder::new(rows, encoder.format().cell_channels(), device)?;
+        let prepare = move |batch: u64| -> Vec<TurnedSweep> {
+            let numbers = batch * BATCH..((batch + 1) * BATCH).min(total as u64);
+            numbers.filter_map(&prepare_one).collect()
+        };
+        let mut loader = Prefetch::start(run.loader_threads, 0, prepare);
+        let size = [(total * CELLS) as i64, encoder.format().cell_channels()];
+        let cells = Tensor::f_empty(size, (Kind::Half, device))?;
+        let mut builder = Builder::default();
         let mut done = 0;
         while done < total {
             let batch = loader.next_batch()?;
             if !batch.is_empty() {
-                builder.add(&batch, encoder, precision.kind(), device)?;
+                builder.add(&cells, &batch, encoder, run.precision.kind())?;
             }
             done = (done + BATCH as usize).min(total);
             progress(done, total);
         }
-        builder.finish(device)
+        builder.finish(cells)
     }
 
     /// Number of sweeps.
@@ -124,11 +119,17 @@ impl FeatureCache {
         self.world_from_sensor.len()
     }
 
+    /// `[S]`: true positions of the sensor, metres.
+    pub(crate) fn positions_m(&self) -> Vec<[f64; 3]> {
+        let poses = self.world_from_sensor.iter();
+        poses.map(|pose| pose.translation.vector.into()).collect()
+    }
+
     /// Lets the regression targets be relative to another origin, metres in the world.
     pub(crate) fn move_origin(&mut self, origin_m: [f64; 3]) -> Result<(), TchError> {
         let moved: [f32; 3] =
             std::array::from_fn(|axis| (self.origin_m[axis] - origin_m[axis]) as f32);
-        let moved = Tensor::f_from_slice(&moved)?.f_to_device(self.targets_m.device())?;
+        let moved = tensor(&moved, &[3], self.targets_m.device())?;
         self.targets_m = self.targets_m.f_add(&moved)?;
         self.origin_m = origin_m;
         Ok(())
@@ -140,9 +141,8 @@ impl FeatureCache {
     }
 }
 
+#[derive(Default)]
 struct Builder {
-    /// One block from the start: thousands of pieces would stay in the allocator's lists for the whole training.
-    cells: Tensor,
     sweeps: Vec<Tensor>,
     sweep_of_cell: Vec<i64>,
     places: Vec<Cell>,
@@ -151,59 +151,46 @@ struct Builder {
 }
 
 impl Builder {
-    fn new(rows: i64, channels: i64, device: Device) -> Result<Self, TchError> {
-        let cells = Tensor::f_empty([rows, channels], (Kind::Half, device))?;
-        Ok(Self {
-            cells,
-            sweeps: Vec::new(),
-            sweep_of_cell: Vec::new(),
-            places: Vec::new(),
-            points: Vec::new(),
-            poses: Vec::new(),
-        })
-    }
-
+    /// Adds sweeps; the features of their cells are written to the next rows of `cells`, one block from the start:
+    /// thousands of pieces would stay in the allocator's lists for the whole training.
     fn add(
         &mut self,
+        cells: &Tensor,
         batch: &[TurnedSweep],
         encoder: &CellEncoder,
         kind: Kind,
-        device: Device,
     ) -> Result<(), Error> {
         let sweeps: Vec<&PreparedSweep> = batch.iter().map(|turned| &turned.sweep).collect();
         let encoded = encoder.encode(&sweeps, kind)?;
         let mut rows = Vec::new();
         let filled = self.places.len() as i64;
         for (turned, of_sweep) in batch.iter().zip(&encoded.rows) {
-            rows.extend(turned.rows.iter().map(|&row| of_sweep.start + row as i64));
-            self.sweep_of_cell
-                .extend(turned.rows.iter().map(|_| (self.poses.len()) as i64));
-            self.places
-                .extend(turned.rows.iter().map(|&row| turned.sweep.cells()[row]));
+            for &row in &turned.rows {
+                rows.push(of_sweep.start + row as i64);
+                self.sweep_of_cell.push(self.poses.len() as i64);
+                self.places.push(turned.sweep.cells()[row]);
+            }
             self.points.push(turned.points);
             self.poses.push(turned.world_from_sensor);
         }
-        let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
+        let rows = tensor(&rows, &[-1], cells.device())?;
         no_grad(|| {
-            let mut place = self.cells.f_narrow(0, filled, rows.size()[0])?;
-            place.f_copy_(&encoded.features.cells.f_index_select(0, &rows)?)?;
-            self.sweeps.push(encoded.features.sweeps);
-            Ok::<_, TchError>(())
+            let features = encoded.features.cells.f_index_select(0, &rows)?;
+            let mut place = cells.f_narrow(0, filled, rows.size()[0])?;
+            place.f_copy_(&features)
         })?;
+        self.sweeps.push(encoded.features.sweeps);
         Ok(())
     }
 
-    fn finish(self, device: Device) -> Result<FeatureCache, Error> {
+    fn finish(self, cells: Tensor) -> Result<FeatureCache, Error> {
         if self.poses.is_empty() || self.places.is_empty() {
             return Err(Error::NoSweeps(Vec::new(), String::new()));
         }
         let count = self.poses.len() as f64;
         let origin_m: [f64; 3] = std::array::from_fn(|axis| {
-            self.poses
-                .iter()
-                .map(|pose| pose.translation.vector[axis])
-                .sum::<f64>()
-                / count
+            let positions = self.poses.iter().map(|pose| pose.translation.vector[axis]);
+            positions.sum::<f64>() / count
         });
         let mut targets = Vec::with_capacity(3 * self.places.len());
         for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
@@ -211,21 +198,13 @@ impl Builder {
             let place = self.poses[sweep as usize] * Point3::new(x, y, z);
             targets.extend((0..3).map(|axis| (place[axis] - origin_m[axis]) as f32));
         }
-        let sensor: Vec<f32> = self
-            .places
-            .iter()
-            .flat_map(|cell| cell.centroid_m)
-            .collect();
-        let columns = |values: &[f32]| {
-            Tensor::f_from_slice(values)?
-                .f_view([-1, 3])?
-                .f_to_device(device)
-        };
+        let sensor: Vec<[f32; 3]> = self.places.iter().map(|cell| cell.centroid_m).collect();
+        let device = cells.device();
         Ok(FeatureCache {
-            cells: self.cells.f_narrow(0, 0, self.places.len() as i64)?,
-            sweep_of_cell: Tensor::f_from_slice(&self.sweep_of_cell)?.f_to_device(device)?,
-            targets_m: columns(&targets)?,
-            sensor_m: columns(&sensor)?,
+            cells: cells.f_narrow(0, 0, self.places.len() as i64)?,
+            sweep_of_cell: tensor(&self.sweep_of_cell, &[-1], device)?,
+            targets_m: tensor(&targets, &[-1, 3], device)?,
+            sensor_m: tensor(sensor.as_flattened(), &[-1, 3], device)?,
             sweeps: Tensor::f_cat(&self.sweeps, 0)?,
             points: self.points,
             world_from_sensor: self.poses,

@@ -18,24 +18,21 @@ pub(crate) fn kmeans<const N: usize>(
     let mut centres = spread(points, count.min(points.len()), seed);
     let mut labels = vec![0; points.len()];
     for _ in 0..ROUNDS {
-        labels
-            .iter_mut()
-            .zip(points)
-            .for_each(|(label, point)| *label = nearest(&centres, point).0);
+        for (label, point) in labels.iter_mut().zip(points) {
+            *label = nearest(&centres, point);
+        }
         let mut sums = vec![([0.0; N], 0.0); centres.len()];
         for (&label, point) in labels.iter().zip(points) {
             let (sum, count) = &mut sums[label];
-            sum.iter_mut()
-                .zip(point)
-                .for_each(|(sum, value)| *sum += value);
+            for (sum, value) in sum.iter_mut().zip(point) {
+                *sum += value;
+            }
             *count += 1.0;
         }
-        for (centre, (sum, count)) in centres
-            .iter_mut()
-            .zip(&sums)
-            .filter(|(_, (_, count))| *count > 0.0)
-        {
-            *centre = sum.map(|sum| sum / count);
+        for (centre, (sum, count)) in centres.iter_mut().zip(&sums) {
+            if *count > 0.0 {
+                *centre = sum.map(|sum| sum / count);
+            }
         }
     }
     (centres, labels)
@@ -47,36 +44,25 @@ fn spread<const N: usize>(points: &[[f64; N]], count: usize, seed: u64) -> Vec<[
     let mut centres: Vec<[f64; N]> = Vec::with_capacity(count);
     while centres.len() < count {
         let indices: Vec<usize> = (0..points.len()).collect();
-        let weight = |&index: &usize| {
-            if centres.is_empty() {
-                1.0
-            } else {
-                squares[index]
-            }
+        let weight = |&index: &usize| match centres.is_empty() {
+            true => 1.0,
+            false => squares[index],
         };
         // All weights are zero when points repeat: any point is a valid choice then.
-        let chosen = indices
-            .choose_weighted(&mut rng, weight)
-            .copied()
-            .unwrap_or(0);
-        let centre = points[chosen];
-        squares
-            .iter_mut()
-            .zip(points)
-            .for_each(|(least, point)| *least = least.min(square(&centre, point)));
+        let chosen = indices.choose_weighted(&mut rng, weight);
+        let centre = points[chosen.copied().unwrap_or(0)];
+        for (least, point) in squares.iter_mut().zip(points) {
+            *least = least.min(square(&centre, point));
+        }
         centres.push(centre);
     }
     centres
 }
 
-fn nearest<const N: usize>(centres: &[[f64; N]], point: &[f64; N]) -> (usize, f64) {
-    let distances = centres
-        .iter()
-        .map(|centre| square(centre, point))
-        .enumerate();
-    distances
-        .min_by(|a, b| a.1.total_cmp(&b.1))
-        .unwrap_or((0, f64::MAX))
+fn nearest<const N: usize>(centres: &[[f64; N]], point: &[f64; N]) -> usize {
+    let distances = centres.iter().map(|centre| square(centre, point));
+    let least = (distances.enumerate()).min_by(|a, b| a.1.total_cmp(&b.1));
+    least.map_or(0, |(index, _)| index)
 }
 
 fn square<const N: usize>(a: &[f64; N], b: &[f64; N]) -> f64 {

@@ -9,6 +9,7 @@ mod hypliloc_training;
 mod kmeans;
 mod pairs;
 mod place_classes;
+mod pose_scale;
 mod redundancy;
 mod scene_training;
 mod scene_validation;
@@ -16,22 +17,18 @@ mod sgloc_training;
 mod sweep_store;
 mod turned_sweep;
 
-pub use diffloc_training::{
-    DiffLocAccuracy, DiffLocReport, DiffLocSummary, DiffLocTrainConfig, train_diffloc,
-};
-pub use encoder_training::{
-    EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder,
-};
+pub use diffloc_training::{DiffLocAccuracy, DiffLocSummary, DiffLocTrainConfig, train_diffloc};
+pub use encoder_training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, train_encoder};
 pub(crate) use feature_cache::FeatureCache;
 pub use feature_cache::SweepAugmentation;
-pub use hypliloc_training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
+pub use hypliloc_training::{HypLiLocTrainConfig, train_hypliloc};
 pub(crate) use kmeans::kmeans;
 pub use pairs::Pair;
 pub(crate) use redundancy::Redundancy;
 pub use redundancy::{LeaveOut, RedundancyConfig};
-pub use scene_training::{SceneReport, SceneSummary, SceneTrainConfig, train_scene};
+pub use scene_training::{SceneSummary, SceneTrainConfig, train_scene};
 pub(crate) use scene_training::{SceneSweeps, train_scene_on};
 pub use scene_validation::SceneAccuracy;
-pub use sgloc_training::{SgLocReport, SgLocTrainConfig, train_sgloc};
+pub use sgloc_training::{SgLocTrainConfig, train_sgloc};
 pub(crate) use sweep_store::{SweepList, yaw};
 pub(crate) use turned_sweep::CELLS;

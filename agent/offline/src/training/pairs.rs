@@ -28,6 +28,9 @@ const TRIES: usize = 200;
 /// Largest share of those cells that may be flat ground.
 const FLAT_SHARE: f64 = 0.25;
 
+/// Largest roll and pitch, radians.
+const MAX_LEAN_RAD: f64 = 0.03;
+
 /// Cells of one sweep of a pair that enter the loss.
 #[derive(Debug)]
 pub struct ChosenCells {
@@ -76,11 +79,8 @@ impl PairMaker {
         seed: u64,
     ) -> Result<Self, Error> {
         let partners = partners(&store);
-        let anchors: Vec<u32> = (0..)
-            .zip(&partners)
-            .filter(|(_, [own, other])| own.len() + other.len() > 0)
-            .map(|(index, _)| index)
-            .collect();
+        let has_partner = |&index: &u32| !partners[index as usize].iter().all(Vec::is_empty);
+        let anchors: Vec<u32> = (0..partners.len() as u32).filter(has_partner).collect();
         if anchors.is_empty() {
             return Err(Error::Input(format!(
                 "no two sweeps of one world within {PAIR_RANGE_M} m of each other"
@@ -131,19 +131,16 @@ impl PairMaker {
         let mut turned = |index: usize| {
             let stored = &self.store.sweeps[index];
             // A car rolls and pitches a little, whatever its recorded pose.
-            let lean = UnitLean::random(rng);
-            let turned_from_sensor = lean.isometry() * yaw(rng.random_range(-PI..PI));
+            let turned_from_sensor = lean(rng) * yaw(rng.random_range(-PI..PI));
             let keep = rng.random_range(MIN_KEPT..1.0);
             let sweep = stored.turned_voxels(&turned_from_sensor, keep, rng, &self.config);
-            (
-                sweep,
-                origin.inverse() * stored.world_from_sensor * turned_from_sensor.inverse(),
-            )
+            let world_from_sensor = origin.inverse() * stored.world_from_sensor;
+            (sweep, world_from_sensor * turned_from_sensor.inverse())
         };
         let (anchor_sweep, world_from_anchor) = turned(anchor);
-        let (partner_sweep, world_from_partner) = turned(partner);
+        let (sweep, world_from_partner) = turned(partner);
         let anchor_places = places(anchor_sweep.cells(), &world_from_anchor);
-        let partner_places = places(partner_sweep.cells(), &world_from_partner);
+        let partner_places = places(sweep.cells(), &world_from_partner);
         let grid = Grid::new(&partner_places);
         let candidates = choose(anchor_sweep.cells(), CELLS, rng);
         let matched: Vec<(usize, usize)> = candidates
@@ -152,7 +149,7 @@ impl PairMaker {
             .collect();
         // The partners of the anchor's cells, and others as negatives.
         let mut rows: Vec<usize> = matched.iter().map(|&(_, partner)| partner).collect();
-        rows.extend(choose(partner_sweep.cells(), CELLS, rng));
+        rows.extend(choose(sweep.cells(), CELLS, rng));
         let mut seen = HashMap::new();
         let mut distinct = Vec::new();
         for row in rows {
@@ -162,21 +159,11 @@ impl PairMaker {
             });
         }
         let matches = matched.iter().map(|(_, partner)| seen[partner]).collect();
-        let anchor_rows: Vec<usize> = matched.iter().map(|&(cell, _)| cell).collect();
+        let rows: Vec<usize> = matched.iter().map(|&(cell, _)| cell).collect();
         let relative_yaw_rad = heading_rad(&world_from_partner) - heading_rad(&world_from_anchor);
         Pair {
-            anchor: chosen(
-                anchor_sweep,
-                anchor_rows,
-                &anchor_places,
-                &world_from_anchor,
-            ),
-            partner: chosen(
-                partner_sweep,
-                distinct,
-                &partner_places,
-                &world_from_partner,
-            ),
+            anchor: chosen(anchor_sweep, rows, &anchor_places, &world_from_anchor),
+            partner: chosen(sweep, distinct, &partner_places, &world_from_partner),
             matches,
             relative_yaw_rad,
         }
@@ -190,12 +177,8 @@ fn chosen(
     world_from_sensor: &Isometry3<f64>,
 ) -> ChosenCells {
     let places_m = rows.iter().map(|&row| places_m[row]).collect();
-    let rotation = world_from_sensor
-        .rotation
-        .inverse()
-        .to_rotation_matrix()
-        .into_inner()
-        .transpose();
+    let rotation = world_from_sensor.rotation.inverse().to_rotation_matrix();
+    let rotation = rotation.into_inner().transpose();
     // Column-major storage of the transpose is row-major storage of the matrix.
     let sensor_from_world = std::array::from_fn(|place| rotation.as_slice()[place] as f32);
     ChosenCells {
@@ -206,22 +189,10 @@ fn chosen(
     }
 }
 
-/// A small roll and pitch.
-struct UnitLean([f64; 2]);
-
-impl UnitLean {
-    /// Largest angle, radians.
-    const MAX_RAD: f64 = 0.03;
-
-    fn random(rng: &mut impl Rng) -> Self {
-        Self(std::array::from_fn(|_| {
-            rng.random_range(-Self::MAX_RAD..Self::MAX_RAD)
-        }))
-    }
-
-    fn isometry(&self) -> Isometry3<f64> {
-        Isometry3::rotation(nalgebra::Vector3::new(self.0[0], self.0[1], 0.0))
-    }
+/// A small roll and pitch at random.
+fn lean(rng: &mut impl Rng) -> Isometry3<f64> {
+    let [roll, pitch] = std::array::from_fn(|_| rng.random_range(-MAX_LEAN_RAD..MAX_LEAN_RAD));
+    Isometry3::rotation(nalgebra::Vector3::new(roll, pitch, 0.0))
 }
 
 /// Up to `count` cells at random, flat ground no more than its share.
@@ -264,23 +235,13 @@ impl<'a> Grid<'a> {
     fn nearest(&self, point: [f32; 3]) -> Option<usize> {
         let [x, y, z] = cube(point);
         let mut best = (MATCH_M * MATCH_M, None);
-        for dx in -1..=1 {
-            for dy in -1..=1 {
-                for dz in -1..=1 {
-                    for &index in self
-                        .cubes
-                        .get(&[x + dx, y + dy, z + dz])
-                        .into_iter()
-                        .flatten()
-                    {
-                        let place = self.places_m[index as usize];
-                        let square: f32 =
-                            (0..3).map(|axis| (place[axis] - point[axis]).powi(2)).sum();
-                        if square < best.0 {
-                            best = (square, Some(index as usize));
-                        }
-                    }
-                }
+        let cubes = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| [dx, dy]));
+        let cubes = cubes.flat_map(|[dx, dy]| (-1..=1).map(move |dz| [x + dx, y + dy, z + dz]));
+        for &index in cubes.filter_map(|cube| self.cubes.get(&cube)).flatten() {
+            let place = self.places_m[index as usize];
+            let square: f32 = (0..3).map(|axis| (place[axis] - point[axis]).powi(2)).sum();
+            if square < best.0 {
+                best = (square, Some(index as usize));
             }
         }
         best.1
@@ -296,19 +257,14 @@ fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
     let bucket = |index: usize, dx: i32, dy: i32| {
         let sweep = &store.sweeps[index];
         let place = sweep.world_from_sensor.translation.vector / PAIR_RANGE_M;
-        (
-            sweep.world,
-            place.x.floor() as i32 + dx,
-            place.y.floor() as i32 + dy,
-        )
+        let [x, y] = [place.x, place.y].map(|axis| axis.floor() as i32);
+        (sweep.world, x + dx, y + dy)
     };
     let mut buckets: HashMap<(usize, i32, i32), Vec<u32>> = HashMap::new();
-    (0..store.sweeps.len()).for_each(|index| {
-        buckets
-            .entry(bucket(index, 0, 0))
-            .or_default()
-            .push(index as u32)
-    });
+    for index in 0..store.sweeps.len() {
+        let bucket = buckets.entry(bucket(index, 0, 0)).or_default();
+        bucket.push(index as u32);
+    }
     let near = |index: usize| {
         let own = &store.sweeps[index];
         let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy)));
@@ -317,11 +273,8 @@ fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
             .flatten()
             .copied();
         let in_range = candidates.filter(|&other| {
-            let offset = store.sweeps[other as usize]
-                .world_from_sensor
-                .translation
-                .vector
-                - own.world_from_sensor.translation.vector;
+            let other_m = store.sweeps[other as usize].world_from_sensor.translation;
+            let offset = other_m.vector - own.world_from_sensor.translation.vector;
             other as usize != index && offset.xy().norm() <= PAIR_RANGE_M && offset.z.abs() <= 2.0
         });
         let (same, other) =

@@ -3,8 +3,9 @@
 //! The published networks are pretrained on large image collections. Not in their papers; the classifier is not used
 //! for localization.
 
+use perception::tensor_values::tensor;
 use tch::nn::{self, LinearConfig, Module};
-use tch::{Kind, Reduction, TchError, Tensor};
+use tch::{Device, Kind, Reduction, TchError, Tensor};
 
 use super::kmeans::kmeans;
 
@@ -34,29 +35,22 @@ impl<const BRANCHES: usize> PlaceClasses<BRANCHES> {
         scale_m: [f64; 3],
         seed: u64,
     ) -> Result<Self, TchError> {
-        let units_m = scale_m
-            .into_iter()
-            .chain([HEADING_M; 2])
-            .map(|unit| unit as f32)
-            .collect::<Vec<f32>>();
-        let units_m = Tensor::f_from_slice(&units_m)?.f_to_device(poses.device())?;
-        let rows: Vec<f64> = Vec::try_from(
-            &poses
-                .f_mul(&units_m)?
-                .f_to_kind(Kind::Double)?
-                .f_reshape([-1])?,
-        )?;
+        let [x, y, z] = scale_m.map(|unit| unit as f32);
+        let heading_m = HEADING_M as f32;
+        let device = poses.device();
+        let units_m = tensor(&[x, y, z, heading_m, heading_m], &[5], device)?;
+        let metres = poses.f_mul(&units_m)?.f_to_kind(Kind::Double)?;
+        let rows: Vec<f64> = Vec::try_from(&metres.f_reshape([-1])?)?;
         let (rows, _) = rows.as_chunks::<5>();
         let (centres, _) = kmeans(rows, CLASSES, seed);
-        let centres_m = Tensor::f_from_slice(centres.as_flattened())?
-            .f_to_kind(Kind::Float)?
-            .f_view([-1, 5])?;
+        let centres_m = tensor(centres.as_flattened(), &[-1, 5], Device::Cpu)?;
+        let centres_m = centres_m.f_to_kind(Kind::Float)?.f_to_device(device)?;
         let layers = paths
             .map(|path| nn::linear(path, width, centres.len() as i64, LinearConfig::default()));
         Ok(Self {
             layers,
             units_m,
-            centres_m: centres_m.f_to_device(poses.device())?,
+            centres_m,
         })
     }
 
@@ -68,14 +62,8 @@ impl<const BRANCHES: usize> PlaceClasses<BRANCHES> {
     ) -> Result<Tensor, TchError> {
         let classes = self.classes(poses)?;
         let losses = self.layers.iter().zip(features).map(|(layer, features)| {
-            let logits = layer.forward(features);
-            logits.f_cross_entropy_loss(
-                &classes,
-                None::<Tensor>,
-                Reduction::Mean,
-                -100,
-                LABEL_SMOOTHING,
-            )
+            let (logits, mean) = (layer.forward(features), Reduction::Mean);
+            logits.f_cross_entropy_loss(&classes, None::<Tensor>, mean, -100, LABEL_SMOOTHING)
         });
         Tensor::f_stack(&losses.collect::<Result<Vec<_>, _>>()?, 0)
     }

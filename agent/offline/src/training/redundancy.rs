@@ -80,26 +80,21 @@ impl Redundancy {
 
     /// True if losses are recorded when this share of the training is done.
     pub(crate) fn watches(&self, share_done: f64) -> bool {
-        self.config
-            .windows
-            .get(self.windows_done)
-            .is_some_and(|[from, to]| (*from..*to).contains(&share_done))
+        let window = self.config.windows.get(self.windows_done);
+        window.is_some_and(|[from, to]| (*from..*to).contains(&share_done))
     }
 
     /// Records the losses of the cells of one pass: pairs of sweep and loss.
     pub(crate) fn record(&mut self, losses: &[(usize, f32)]) {
         let mut by_sweep = vec![Vec::new(); self.weights.len()];
-        losses
-            .iter()
-            .for_each(|&(sweep, loss)| by_sweep[sweep].push(loss));
-        for (recorded, mut losses) in self
-            .recorded
-            .iter_mut()
-            .zip(by_sweep)
-            .filter(|(_, losses)| !losses.is_empty())
-        {
-            let middle = losses.len() / 2;
-            recorded.push(*losses.select_nth_unstable_by(middle, f32::total_cmp).1);
+        for &(sweep, loss) in losses {
+            by_sweep[sweep].push(loss);
+        }
+        for (recorded, mut losses) in self.recorded.iter_mut().zip(by_sweep) {
+            if !losses.is_empty() {
+                let middle = losses.len() / 2;
+                recorded.push(*losses.select_nth_unstable_by(middle, f32::total_cmp).1);
+            }
         }
     }
 
@@ -110,25 +105,17 @@ impl Redundancy {
 
     /// Updates the selection at the end of a pass. True if it has changed.
     pub(crate) fn advance(&mut self, share_done: f64) -> bool {
-        let is_over = |redundancy: &Self| {
-            redundancy
-                .config
-                .windows
-                .get(redundancy.windows_done)
-                .is_some_and(|[_, to]| share_done >= *to)
-        };
         if share_done >= self.config.all_from {
             let changes = self.is_time_for_all(share_done);
             self.weights.fill(1.0);
             self.windows_done = self.config.windows.len();
             return changes;
         }
-        if is_over(self) {
-            if self
-                .recorded
-                .iter()
-                .all(|losses| losses.len() < ENOUGH_PASSES)
-            {
+        let window = self.config.windows.get(self.windows_done);
+        let is_over = window.is_some_and(|[_, to]| share_done >= *to);
+        if is_over {
+            let is_short = |losses: &Vec<f32>| losses.len() < ENOUGH_PASSES;
+            if self.recorded.iter().all(is_short) {
                 tracing::warn!(
                     "a window of RSD held fewer than {ENOUGH_PASSES} passes over the data: no sweep is left out after it"
                 );
@@ -136,60 +123,34 @@ impl Redundancy {
             self.drop_redundant();
             self.windows_done += 1;
             self.recorded.iter_mut().for_each(Vec::clear);
-            return true;
         }
-        false
+        is_over
     }
 
     /// Leaves out the sweeps with the lowest variance of their losses in each cluster, or random ones; the weights of the
     /// others grow. A sweep of unknown variance stays, however many that leaves.
     fn drop_redundant(&mut self) {
-        let variances: Vec<f32> = self
-            .recorded
-            .iter()
-            .map(|losses| variance(losses))
-            .collect();
-        let order: Vec<f32> = match self.config.leave_out {
-            LeaveOut::EvenLoss => variances,
-            LeaveOut::Random => {
-                let rng = &mut self.rng;
-                // A random choice has the same chances: among sweeps of known variance.
-                variances
-                    .iter()
-                    .map(|&known| {
-                        if known < f32::MAX {
-                            rng.random()
-                        } else {
-                            f32::MAX
-                        }
-                    })
-                    .collect()
-            }
-        };
-        let classes = self
-            .class_of_sweep
-            .iter()
-            .max()
-            .map_or(0, |class| class + 1);
+        let mut order: Vec<f32> = self.recorded.iter().map(|of| variance(of)).collect();
+        if self.config.leave_out == LeaveOut::Random {
+            // A random choice has the same chances: among sweeps of known variance.
+            let known = order.iter_mut().filter(|variance| **variance < f32::MAX);
+            known.for_each(|place| *place = self.rng.random());
+        }
+        let last = self.class_of_sweep.iter().max();
+        let classes = last.map_or(0, |class| class + 1);
         for class in 0..classes {
-            let used =
-                |&sweep: &usize| self.class_of_sweep[sweep] == class && self.weights[sweep] > 0.0;
-            let mut members: Vec<(f32, usize)> = (0..self.weights.len())
-                .filter(used)
-                .map(|sweep| (order[sweep], sweep))
+            let mut members: Vec<usize> = (0..self.weights.len())
+                .filter(|&sweep| self.class_of_sweep[sweep] == class && self.weights[sweep] > 0.0)
                 .collect();
-            members.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            let known = members
-                .iter()
-                .take_while(|(variance, _)| *variance < f32::MAX)
-                .count();
+            // Sweeps of equal variance stay in their order.
+            members.sort_by(|&a, &b| order[a].total_cmp(&order[b]));
+            let known = members.partition_point(|&sweep| order[sweep] < f32::MAX);
             let dropped = ((members.len() as f64 * self.config.drop) as usize).min(known);
             let kept = (members.len() - dropped) as f32 / members.len().max(1) as f32;
-            for (place, &(_, sweep)) in members.iter().enumerate() {
-                self.weights[sweep] = if place < dropped {
-                    0.0
-                } else {
-                    self.weights[sweep] / kept
+            for (place, &sweep) in members.iter().enumerate() {
+                self.weights[sweep] = match place < dropped {
+                    true => 0.0,
+                    false => self.weights[sweep] / kept,
                 };
             }
         }
@@ -202,11 +163,8 @@ fn variance(values: &[f32]) -> f32 {
         return f32::MAX;
     }
     let mean = values.iter().sum::<f32>() / values.len() as f32;
-    values
-        .iter()
-        .map(|value| (value - mean).powi(2))
-        .sum::<f32>()
-        / values.len() as f32
+    let squares = values.iter().map(|value| (value - mean).powi(2));
+    squares.sum::<f32>() / values.len() as f32
 }
 
 #[cfg(test)]

@@ -1,8 +1,10 @@
 //! Validation of a head on cached features of sweeps that it was not trained on.
 
+use std::fmt;
+
 use serde::Serialize;
 use support::statistics;
-use tch::{Kind, Tensor, no_grad};
+use tch::{Kind, no_grad};
 
 use super::feature_cache::FeatureCache;
 use crate::Error;
@@ -11,7 +13,7 @@ use localization::pgc::pose_refinement::SweepCells;
 use localization::pgc::pose_search::PoseSearch;
 use localization::pgc::pose_solver::PoseSolver;
 use localization::pgc::{SceneCoordinates, SceneHead, stopwatch};
-use perception::tensor_values::values;
+use perception::tensor_values::{tensor, values};
 use protocol::PoseError;
 
 /// Errors on sweeps that were not trained on.
@@ -29,6 +31,17 @@ pub struct SceneAccuracy {
     pub success_1m: f64,
 }
 
+impl fmt::Display for SceneAccuracy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (cell_m, pose_m, pose_deg) = (self.cell_p50_m, self.pose_p50_m, self.pose_p50_deg);
+        let [under_3m, under_1m] = [self.success_3m, self.success_1m].map(|share| 100.0 * share);
+        write!(
+            f,
+            "cells {cell_m:.2} m, poses {pose_m:.3} m {pose_deg:.3} degrees, under 3 m {under_3m:.1} %, under 1 m {under_1m:.1} %"
+        )
+    }
+}
+
 /// Regresses and solves every sweep of `cache`.
 pub(super) fn validate(
     head: &SceneHead,
@@ -36,41 +49,33 @@ pub(super) fn validate(
     kind: Kind,
 ) -> Result<SceneAccuracy, Error> {
     let regression = no_grad(|| {
-        let logits = head
-            .classify(&cache.sweeps, false)?
-            .f_index_select(0, &cache.sweep_of_cell)?;
-        head.regress(&head.normalise(&cache.cells)?, &logits, kind)
+        let logits = head.classify(&cache.sweeps, false)?;
+        let of_cells = logits.f_index_select(0, &cache.sweep_of_cell)?;
+        head.regress(&head.normalise(&cache.cells)?, &of_cells, kind)
     })?;
     // Coordinates are relative to the origin of the head's scene.
-    let origin = head.config().origin_m;
-    let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
-    let targets =
-        &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
-    let error = (&regression.coordinates_m - targets)
-        .f_abs()?
-        .f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let origin_m = head.config().origin_m;
+    let moved = [0, 1, 2].map(|axis| (cache.origin_m[axis] - origin_m[axis]) as f32);
+    let targets = &cache.targets_m + tensor(&moved, &[3], cache.targets_m.device())?;
+    let error = (&regression.coordinates_m - targets).f_abs()?;
+    let error = error.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     let cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
     let world = values(&regression.coordinates_m)?;
     let sensor = values(&cache.sensor_m)?;
     let epsilon = values(&regression.epsilon_m)?;
     let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
     let solver = PoseSolver::default();
-    let mut translations = Vec::new();
-    let mut rotations = Vec::new();
-    let mut first = 0;
+    let (mut translations, mut rotations, mut first) = (Vec::new(), Vec::new(), 0);
     for (sweep, truth) in cache.world_from_sensor.iter().enumerate() {
-        let count = sweeps[first..]
-            .iter()
-            .take_while(|&&of| of == sweep as i64)
-            .count();
-        let rows = first..first + count;
-        let features = cache.cells.f_narrow(0, first as i64, count as i64)?;
-        first += count;
+        let own = sweeps[first..].iter().take_while(|&&of| of == sweep as i64);
+        let rows = first..first + own.count();
+        let features = cache.cells.f_narrow(0, first as i64, rows.len() as i64)?;
+        first = rows.end;
         let coordinates = SceneCoordinates {
             sensor_m: sensor.as_chunks().0[rows.clone()].to_vec(),
             world_m: world.as_chunks().0[rows.clone()].to_vec(),
             epsilon_m: epsilon[rows].to_vec(),
-            origin_m: head.config().origin_m,
+            origin_m,
         };
         let refinement_cells = SweepCells {
             features,
@@ -91,16 +96,15 @@ pub(super) fn validate(
         rotations.push(degrees);
     }
     let share = |limit: f64| {
-        translations.iter().filter(|&&error| error < limit).count() as f64
-            / translations.len() as f64
+        let successes = translations.iter().filter(|&&error| error < limit);
+        successes.count() as f64 / translations.len() as f64
     };
-    let (success_3m, success_1m) = (share(3.0), share(1.0));
     Ok(SceneAccuracy {
         cell_p50_m: median(&cell_errors),
         pose_p50_m: median(&translations),
         pose_p50_deg: median(&rotations),
-        success_3m,
-        success_1m,
+        success_3m: share(3.0),
+        success_1m: share(1.0),
     })
 }
 

@@ -7,17 +7,16 @@ use std::time::Instant;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::nn::VarStore;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::{CELLS, FeatureCache, SweepAugmentation, SweepList};
 use crate::Error;
 use localization::baselines::sgloc::{SgLoc, SgLocConfig, SgLocLocalizer};
 use localization::pgc::{CellEncoder, LocalizerError, SceneEncoder, SceneEncoderConfig};
-use perception::train::{RunConfig, Trained, Trainer};
+use perception::tensor_values::tensor;
+use perception::train::{Means, Observe, Progress, RunConfig, SaveEvery, Task, Trained, Trainer};
 use perception::weights::Weights;
 
-/// Steps between two reports.
-const REPORT_EVERY: u64 = 10;
 /// Steps between two checkpoints.
 const CHECKPOINT_EVERY: u64 = 500;
 /// Number of cells that statistics are computed from.
@@ -36,32 +35,11 @@ pub struct SgLocTrainConfig {
     pub run: RunConfig,
 }
 
-/// Progress of a training of SGLoc's head.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum SgLocReport {
-    /// Sweeps are being encoded: number done and number of all.
-    Encoding(usize, usize),
-    /// Some steps are done.
-    Stepped {
-        /// Number of steps done.
-        step: u64,
-        /// Share of the training that is done, 0..1.
-        share_done: f64,
-        /// Seconds spent.
-        seconds: f64,
-        /// Mean L1 error of a cell since the last report, metres.
-        error_m: f64,
-    },
-}
-
-/// Trains a head; writes checkpoint and weights into `config.run.out`.
+/// Trains a head; writes checkpoint and weights into `config.run.out`. Reported is the L1 error of a cell, metres.
 ///
 /// # Errors
 /// [`Error`].
-pub fn train_sgloc(
-    config: &SgLocTrainConfig,
-    observe: &mut dyn FnMut(&SgLocReport),
-) -> Result<Trained, Error> {
+pub fn train_sgloc(config: &SgLocTrainConfig, observe: &mut Observe<'_>) -> Result<Trained, Error> {
     let started = Instant::now();
     let run = &config.run;
     run.start()?;
@@ -69,8 +47,9 @@ pub fn train_sgloc(
     let (encoder, _) = SceneEncoder::load(&config.encoder, run.device)?;
     let encoder_config = encoder.config().clone();
     let encoder = CellEncoder::sparse(encoder, run.device);
-    let mut encoded = |done, total| observe(&SgLocReport::Encoding(done, total));
+    let mut encoded = |done, total| observe(&Progress::Encoding(done, total));
     let cache = FeatureCache::build(&list, &encoder, SweepAugmentation::NONE, run, &mut encoded)?;
+    observe(&Progress::Read(list.data()));
     let network_config = SgLocConfig {
         scene_name: config.scene_name.clone(),
         origin_m: cache.origin_m,
@@ -78,83 +57,81 @@ pub fn train_sgloc(
     };
     let variables = VarStore::new(run.device);
     let mut network = SgLoc::new(&variables.root(), &network_config)?;
-    let draw = Draw {
-        seed: run.seed,
-        cells: cache.cell_count(),
-        device: run.device,
-    };
-    let sample = draw.rows(0, STATISTICS_CELLS)?;
+    let sample = drawn_rows(&cache, run.seed, 0, STATISTICS_CELLS)?;
     network.set_statistics(&cache.cells.f_index_select(0, &sample)?)?;
     adopt_encoder(&variables, &config.encoder, &network_config.encoder)?;
     let mut trainer = Trainer::begin(run, &variables, None, started)?;
-    let mut window = Vec::new();
-    let share_done = |trainer: &Trainer| {
-        trainer.share_done((trainer.steps() * run.batch as u64) as f64 / list.len() as f64)
+    let mut training = Training {
+        run,
+        observe,
+        sweeps: list.len(),
+        cache,
+        variables,
+        network,
+        means: Means::default(),
     };
-    while share_done(&trainer) < 1.0 {
-        let rows = draw.rows(trainer.steps(), run.batch * CELLS)?;
-        let loss = coordinate_loss(&network, &cache, &rows, run.precision.kind())?;
-        window.push(loss.f_double_value(&[])?);
-        trainer.step(&loss, share_done(&trainer))?;
-        trainer.check_interruption(&variables)?;
-        let step = trainer.steps();
-        if trainer.is_report_due(REPORT_EVERY) {
-            let error_m = window.iter().sum::<f64>() / window.len() as f64;
-            window.clear();
-            let share_done = share_done(&trainer).min(1.0);
-            observe(&SgLocReport::Stepped {
-                step,
-                share_done,
-                seconds: trainer.seconds(),
-                error_m,
-            });
-        }
-        if step.is_multiple_of(CHECKPOINT_EVERY) {
-            trainer.checkpoint(&variables)?;
-        }
+    trainer.run(&mut training, SaveEvery::Steps(CHECKPOINT_EVERY))?;
+    let (variables, kind) = (&training.variables, SgLocLocalizer::KIND);
+    Ok(trainer.save_network(variables, kind, &network_config, list.data())?)
+}
+
+struct Training<'a> {
+    run: &'a RunConfig,
+    observe: &'a mut Observe<'a>,
+    sweeps: usize,
+    cache: FeatureCache,
+    variables: VarStore,
+    network: SgLoc,
+    means: Means<1>,
+}
+
+impl Task for Training<'_> {
+    type Error = Error;
+    const REPORT_EVERY: u64 = 10;
+
+    fn variables(&self) -> &VarStore {
+        &self.variables
     }
-    trainer.checkpoint(&variables)?;
-    Ok(trainer.save_network(
-        &variables,
-        SgLocLocalizer::KIND,
-        &network_config,
-        list.data(),
-    )?)
-}
 
-/// Random rows of a cache.
-struct Draw {
-    seed: u64,
-    cells: i64,
-    device: Device,
-}
+    fn epoch(&self, steps: u64) -> f64 {
+        (steps * self.run.batch as u64) as f64 / self.sweeps as f64
+    }
 
-impl Draw {
-    /// `[wanted]` rows, the same for the same step.
-    fn rows(&self, step: u64, wanted: usize) -> Result<Tensor, TchError> {
-        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
-        rng.set_stream(step);
-        let rows: Vec<i64> = (0..wanted)
-            .map(|_| rng.random_range(0..self.cells))
-            .collect();
-        Tensor::f_from_slice(&rows)?.f_to_device(self.device)
+    /// Mean L1 error of the scene coordinates of some cells, metres, the sum of its axes as in SGLoc.
+    fn loss(&mut self, trainer: &Trainer) -> Result<Tensor, Error> {
+        let wanted = self.run.batch * CELLS;
+        let rows = drawn_rows(&self.cache, self.run.seed, trainer.steps(), wanted)?;
+        let cells = self.cache.cells.f_index_select(0, &rows)?;
+        let sensor_m = self.cache.sensor_m.f_index_select(0, &rows)?;
+        let kind = self.run.precision.kind();
+        let found_m = self.network.coordinates(&cells, &sensor_m, kind, true)?;
+        let error_m = (found_m - self.cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
+        let error_m = error_m.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+        let loss = error_m.f_mean(Kind::Float)?;
+        self.means.add([loss.f_double_value(&[])?]);
+        Ok(loss)
+    }
+
+    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+        let [error_m] = self.means.take();
+        let (share_done, text) = (self.share_done(trainer), format!("error {error_m:.2} m"));
+        (self.observe)(&trainer.step_report(share_done, vec![error_m], &text));
+        Ok(())
     }
 }
 
-/// Mean L1 error of the scene coordinates of some cells, metres, the sum of its axes as in SGLoc.
-fn coordinate_loss(
-    network: &SgLoc,
+/// `[wanted]` random rows of a cache, the same for the same step.
+fn drawn_rows(
     cache: &FeatureCache,
-    rows: &Tensor,
-    kind: Kind,
+    seed: u64,
+    step: u64,
+    wanted: usize,
 ) -> Result<Tensor, TchError> {
-    let cells = cache.cells.f_index_select(0, rows)?;
-    let sensor_m = cache.sensor_m.f_index_select(0, rows)?;
-    let found_m = network.coordinates(&cells, &sensor_m, kind, true)?;
-    let error_m = (found_m - cache.targets_m.f_index_select(0, rows)?).f_abs()?;
-    error_m
-        .f_sum_dim_intlist(1_i64, false, Kind::Float)?
-        .f_mean(Kind::Float)
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(step);
+    let draw = |_| rng.random_range(0..cache.cell_count());
+    let rows: Vec<i64> = (0..wanted).map(draw).collect();
+    tensor(&rows, &[-1], cache.cells.device())
 }
 
 /// Gives the encoder below `variables` the weights of a file and freezes it.

@@ -10,6 +10,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
 
 use crate::Error;
+use crate::sweep_database::present_sweeps;
 use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 use perception::train::{DataListing, Prefetch};
 use support::file_digests::FileDigests;
@@ -50,9 +51,8 @@ impl StoredSweep {
 
     /// x, y, z of every point, metres in the sensor frame.
     pub(crate) fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        self.points
-            .iter()
-            .map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
+        let metres = |point: &[i16; 3]| point.map(|axis| f32::from(axis) * UNIT_M);
+        self.points.iter().map(metres)
     }
 
     /// The voxels of the same sweep for a sensor in another orientation, `turned_from_sensor`; each point is kept with
@@ -66,13 +66,9 @@ impl StoredSweep {
     ) -> SweepVoxels {
         let turn: Isometry3<f32> = turned_from_sensor.cast();
         // 32 decisions from one draw of the generator would be faster still; this does not dominate the time.
-        let kept = self
-            .points()
-            .filter(|_| keep >= 1.0 || rng.random_bool(keep));
-        SweepVoxels::new(
-            kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into()),
-            config,
-        )
+        let kept = (self.points()).filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        let turned = kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into());
+        SweepVoxels::new(turned, config)
     }
 }
 
@@ -85,10 +81,8 @@ pub(super) struct PosedSweep {
 
 /// A rotation about the vertical.
 pub(crate) fn yaw(angle_rad: f64) -> Isometry3<f64> {
-    Isometry3::from_parts(
-        Translation3::identity(),
-        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad),
-    )
+    let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad);
+    Isometry3::from_parts(Translation3::identity(), rotation)
 }
 
 /// Heading of a pose, radians.
@@ -131,19 +125,14 @@ impl SweepList {
             findings::note(&findings::sampled(&dataset.scenarios, IntensityScale::AUTO));
             problems.extend(dataset.problems.iter().map(ToString::to_string));
             for scenario in dataset.scenarios.into_iter().map(Arc::new) {
-                for agent in 0..scenario.agents.len() {
-                    let place = |tick| Place {
-                        scenario: Arc::clone(&scenario),
-                        agent,
-                        tick,
-                        world,
-                        drive,
-                    };
-                    let ticks =
-                        (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick));
-                    places.extend(ticks.map(place));
-                    drive += 1;
-                }
+                places.extend(present_sweeps(&scenario).map(|(agent, tick)| Place {
+                    scenario: Arc::clone(&scenario),
+                    agent,
+                    tick,
+                    world,
+                    drive: drive + agent,
+                }));
+                drive += scenario.agents.len();
                 scenarios.push(scenario);
             }
         }
@@ -151,11 +140,8 @@ impl SweepList {
             let reasons = reasons(&problems);
             return Err(Error::NoSweeps(folders.to_vec(), reasons));
         }
-        let sha256 = dataset::content_sha256(
-            scenarios.iter().map(AsRef::as_ref),
-            None,
-            &FileDigests::default(),
-        );
+        let scenarios = scenarios.iter().map(AsRef::as_ref);
+        let sha256 = dataset::content_sha256(scenarios, None, &FileDigests::default());
         Ok(Self {
             places,
             sha256,
@@ -208,9 +194,8 @@ impl SweepList {
     pub(crate) fn frame(&self, index: usize) -> Option<(Frame, String, String)> {
         let place = self.places.get(index)?;
         let stem = place.scenario.ticks.get(place.tick)?.stem.clone();
-        let loaded = place
-            .scenario
-            .load(place.agent, place.tick, &LoadOptions::default());
+        let options = LoadOptions::default();
+        let loaded = place.scenario.load(place.agent, place.tick, &options);
         let loaded = loaded.inspect_err(|error| self.leave_out(index, error));
         Some((loaded.ok()?, place.scenario.name.clone(), stem))
     }
@@ -240,14 +225,10 @@ impl SweepList {
     /// Reads one sweep, points within `range_m` of the sensor; `None` if its pose is unknown or it cannot be read, which
     /// is counted.
     pub(crate) fn read(&self, index: usize, range_m: f64) -> Option<StoredSweep> {
-        let Place { world, drive, .. } = self.places[index];
+        let (world, drive) = (self.places[index].world, self.places[index].drive);
         let sweep = self.posed_sweep(index, range_m)?;
-        Some(StoredSweep::new(
-            world,
-            drive,
-            sweep.world_from_sensor,
-            &sweep.points,
-        ))
+        let pose = sweep.world_from_sensor;
+        Some(StoredSweep::new(world, drive, pose, &sweep.points))
     }
 
     /// The same with the values of the file.
@@ -301,24 +282,19 @@ impl SweepStore {
         let count = list.len();
         let source = Arc::clone(&list);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let mut reader =
-            Prefetch::start(threads, 0, move |number| match (number as usize) < count {
-                true => source.read(number as usize, range_m),
-                false => None,
-            });
+        let read = move |number: u64| {
+            let is_known = (number as usize) < count;
+            is_known.then(|| source.read(number as usize, range_m))?
+        };
+        let mut reader = Prefetch::start(threads, 0, read);
         let mut sweeps = Vec::with_capacity(count);
         for _ in 0..count {
             sweeps.extend(reader.next_batch()?);
         }
+        let data = list.data();
         match sweeps.is_empty() {
-            true => {
-                let reasons = reasons(&list.data().problems);
-                Err(Error::NoSweeps(folders.to_vec(), reasons))
-            }
-            false => Ok(Self {
-                sweeps,
-                data: list.data(),
-            }),
+            true => Err(Error::NoSweeps(folders.to_vec(), reasons(&data.problems))),
+            false => Ok(Self { sweeps, data }),
         }
     }
 }

@@ -89,11 +89,9 @@ pub struct AgentBoxes<'a> {
 ///
 /// Returns the detections by descending score.
 pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec<Candidate> {
-    let mut candidates: Vec<Candidate> = agents
-        .iter()
-        .enumerate()
-        .flat_map(|(agent, boxes)| project(agent, boxes))
-        .collect();
+    let candidates = agents.iter().enumerate();
+    let candidates = candidates.flat_map(|(agent, boxes)| project(agent, boxes));
+    let mut candidates: Vec<Candidate> = candidates.collect();
     candidates.retain(|candidate| is_vehicle_sized(&candidate.corners, config));
     let mut kept = suppress(&candidates, config);
     kept.retain(|candidate| corners_within(&candidate.corners, config.keep_range_m));
@@ -125,20 +123,12 @@ pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> 
 
 /// Rotated non-maximum suppression on the footprints, by descending score.
 pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Candidate> {
-    let polygons: Vec<Polygon> = candidates
-        .iter()
-        .map(|candidate| Polygon::footprint(&candidate.corners))
-        .collect();
-    let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
-    let kept = rotated_nms(
-        &polygons,
-        &scores,
-        config.nms_iou,
-        config.nms_max_candidates,
-    );
-    kept.into_iter()
-        .map(|index| candidates[index].clone())
-        .collect()
+    let (polygons, scores): (Vec<Polygon>, Vec<f32>) = (candidates.iter())
+        .map(|candidate| (Polygon::footprint(&candidate.corners), candidate.score))
+        .unzip();
+    let (iou, most) = (config.nms_iou, config.nms_max_candidates);
+    let kept = rotated_nms(&polygons, &scores, iou, most).into_iter();
+    kept.map(|index| candidates[index].clone()).collect()
 }
 
 /// The upright box of eight corners.
@@ -148,20 +138,14 @@ pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Can
 pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
     let center_m =
         std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
-    let edge = |from: usize, to: usize| {
-        [
-            corners[to][0] - corners[from][0],
-            corners[to][1] - corners[from][1],
-        ]
-    };
+    let edge =
+        |from: usize, to: usize| [0, 1].map(|axis: usize| corners[to][axis] - corners[from][axis]);
     let mean_length =
         |edges: [[f64; 2]; 4]| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0;
     let along = [edge(3, 0), edge(2, 1), edge(7, 4), edge(6, 5)];
     let across = [edge(0, 1), edge(3, 2), edge(4, 5), edge(7, 6)];
-    let height = (0..4)
-        .map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs())
-        .sum::<f64>()
-        / 4.0;
+    let heights = (0..4).map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs());
+    let height = heights.sum::<f64>() / 4.0;
     let sum = |axis: usize| along.iter().map(|edge| edge[axis]).sum::<f64>();
     Box3d {
         center_m,

@@ -88,13 +88,8 @@ impl BevEncoder {
 
     /// Writes pillars to the canvas.
     pub(super) fn scatter(&mut self, pillars: &Pillars) -> Result<Canvas, TchError> {
-        let Self {
-            pillar_grid,
-            projection,
-            device,
-            layers,
-        } = self;
-        let flat = match layers {
+        let (pillar_grid, projection) = (&self.pillar_grid, &self.projection);
+        let flat = match &mut self.layers {
             Layers::Float { canvas, .. } => {
                 canvas.fill(0.0);
                 projection.scatter(pillars, pillar_grid, canvas);
@@ -111,26 +106,26 @@ impl BevEncoder {
             }
         };
         let [height, width] = [pillar_grid.height, pillar_grid.width].map(|size| size as i64);
-        let canvas = flat?.f_view([1, height, width, -1])?.f_to_device(*device)?;
+        let canvas = flat?.f_view([1, height, width, -1])?;
+        let canvas = canvas.f_to_device(self.device)?;
         Ok(Canvas(canvas.f_permute([0, 3, 1, 2])?))
     }
 
     /// Levels of the backbone for a canvas.
     pub(super) fn levels(&self, canvas: &Canvas) -> Result<Vec<BackboneLevel>, TchError> {
         match &self.layers {
-            Layers::Float { backbone, .. } => Ok(BackboneLevel::in_float(
-                backbone.levels_of(&canvas.0, false),
-            )),
+            Layers::Float { backbone, .. } => {
+                let levels = backbone.levels_of(&canvas.0, false);
+                Ok(BackboneLevel::in_float(levels))
+            }
             Layers::Int8 { backbone, .. } => backbone.levels(&canvas.0),
         }
     }
 
     /// Feature map `[1, C, H', W']` of the levels of a canvas, contiguous.
     pub(super) fn features(&self, levels: &[BackboneLevel]) -> Result<Tensor, TchError> {
-        let maps: Vec<Tensor> = levels
-            .iter()
-            .map(|level| level.values().shallow_clone())
-            .collect();
+        let maps = levels.iter().map(|level| level.values().shallow_clone());
+        let maps: Vec<Tensor> = maps.collect();
         match &self.layers {
             Layers::Float {
                 backbone, shrink, ..

@@ -31,6 +31,7 @@ use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillars::point_pillars::PointPillars;
 use crate::pillars::projection::PillarProjection;
 use crate::pillars::voxels::{Pillars, Voxeliser};
+use crate::tensor_values::tensor;
 use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
@@ -86,9 +87,10 @@ impl Detector {
             ..Self::from_network(pillars)
         };
         match weights.activation_scales()? {
-            Some(scales) if device == Device::Cpu => Ok(detector
-                .quantised(&scales)
-                .map_err(|error| weights.quantise_error(error))?),
+            Some(scales) if device == Device::Cpu => {
+                let quantised = detector.quantised(&scales);
+                Ok(quantised.map_err(|error| weights.quantise_error(error))?)
+            }
             _ => Ok(detector),
         }
     }
@@ -166,11 +168,8 @@ impl Detector {
     /// Channels, height and width of its feature maps, as they are fused.
     pub fn map_shape(&self) -> [i64; 3] {
         let grid = self.grid();
-        [
-            self.config.feature_channels(),
-            i64::from(grid.height),
-            i64::from(grid.width),
-        ]
+        let [height, width] = [grid.height, grid.width].map(i64::from);
+        [self.config.feature_channels(), height, width]
     }
 
     /// Channels, height and width as transmitted: with a compressor, of the code.
@@ -182,9 +181,8 @@ impl Detector {
     /// Channels of the feature map that the code represents, if there is a compressor: [`BevFeatures::code_of`] of its
     /// messages.
     pub fn code_of(&self) -> Option<u32> {
-        self.compressor
-            .as_ref()
-            .and_then(|_| u32::try_from(self.config.feature_channels()).ok())
+        self.compressor.as_ref()?;
+        u32::try_from(self.config.feature_channels()).ok()
     }
 
     /// Encodes one sweep.
@@ -266,9 +264,9 @@ impl Detector {
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
         if self.config.y_axis == YAxis::Right {
-            self.cropped
-                .iter_mut()
-                .for_each(|point| point[1] = -point[1]);
+            for point in &mut self.cropped {
+                point[1] = -point[1];
+            }
         }
         self.voxeliser.voxelise(&self.cropped)
     }
@@ -303,9 +301,8 @@ impl Detector {
             return Ok(features.shallow_clone());
         };
         let map = one_map(features, self.map_shape())?;
-        Ok(tch::no_grad(|| {
-            compressor.encode(&map, false).f_contiguous()
-        })?)
+        let code = tch::no_grad(|| compressor.encode(&map, false).f_contiguous());
+        Ok(code?)
     }
 
     /// Input of head and fusion, `[1, C, H, W]`, from a transmitted tensor.
@@ -317,9 +314,8 @@ impl Detector {
             return Ok(sent.shallow_clone());
         };
         let code = one_map(sent, self.sent_shape())?;
-        Ok(tch::no_grad(|| {
-            compressor.decode(&code, false).f_contiguous()
-        })?)
+        let map = tch::no_grad(|| compressor.decode(&code, false).f_contiguous());
+        Ok(map?)
     }
 
     /// An encoded feature map `[1, C, H, W]` after the compressor: compressed and expanded again.
@@ -338,18 +334,10 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] if it is not of this detector; the caller checks its BEV grid.
     pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor, DetectorError> {
-        let DecodedFeatures {
-            features:
-                BevFeatures {
-                    grid,
-                    channels,
-                    values,
-                    ..
-                },
-            sent,
-        } = message;
+        let (sent, values) = (&message.sent, &message.features.values);
+        let (channels, grid) = (message.features.channels, message.features.grid);
         let [expected, height, width] = self.sent_shape();
-        let found = [*channels, grid.height, grid.width].map(i64::from);
+        let found = [channels, grid.height, grid.width].map(i64::from);
         if found != self.sent_shape() || values.len() as i64 != expected * height * width {
             return Err(DetectorError::Shape {
                 what: "feature map of a message",
@@ -357,15 +345,13 @@ impl Detector {
                 expected: self.sent_shape(),
             });
         }
-        let values = Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?;
-        let decompressed = self.decompressed(&values.f_to_device(self.device)?)?;
+        let code = tensor(values, &[1, expected, height, width], self.device)?;
+        let decompressed = self.decompressed(&code)?;
         match (sent, &self.compressor) {
             // The expansion spreads the sent cells to their neighbours, and the bias everywhere.
             (Some(sent), Some(_)) => {
-                let sent = Tensor::f_from_slice(sent)?
-                    .f_to_kind(Kind::Float)?
-                    .f_view([1, 1, height, width])?;
-                Ok(decompressed.f_mul(&sent.f_to_device(self.device)?)?)
+                let sent = tensor(sent, &[1, 1, height, width], self.device)?;
+                Ok(decompressed.f_mul(&sent.f_to_kind(Kind::Float)?)?)
             }
             _ => Ok(decompressed),
         }
@@ -391,12 +377,8 @@ impl Detector {
         heads: &Heads,
         score_threshold: f32,
     ) -> Result<Vec<Decoded>, DetectorError> {
-        let mut boxes = decode(
-            &heads.scores,
-            &heads.offsets,
-            &self.anchors,
-            score_threshold,
-        )?;
+        let (scores, offsets) = (&heads.scores, &heads.offsets);
+        let mut boxes = decode(scores, offsets, &self.anchors, score_threshold)?;
         check_boxes(&boxes)?;
         if self.config.y_axis == YAxis::Right {
             for found in &mut boxes {

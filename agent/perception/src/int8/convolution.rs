@@ -73,18 +73,12 @@ impl Int8Convolution {
     /// # Errors
     /// Those of the tensor library, when `x` has other channels or is not `u8`.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let ConvGeometry {
-            stride,
-            padding,
-            upsampling,
-        } = self.geometry;
-        let y = self
-            .layer
-            .call("convolve", x, vec![both(stride), both(padding)])?;
-        if upsampling == 1 {
-            Ok(y)
-        } else {
-            cells_to_squares(&y, upsampling)
+        let (stride, padding) = (self.geometry.stride, self.geometry.padding);
+        let steps = vec![both(stride), both(padding)];
+        let y = self.layer.call("convolve", x, steps)?;
+        match self.geometry.upsampling {
+            1 => Ok(y),
+            edge => cells_to_squares(&y, edge),
         }
     }
 }
@@ -97,12 +91,11 @@ fn both(size: i64) -> IValue {
 /// `[1, C, edge * H, edge * W]`.
 fn cells_to_squares(y: &Tensor, edge: i64) -> Result<Tensor, TchError> {
     let (_, _, height, width) = y.size4()?;
-    let cells = y
-        .f_permute([0, 2, 3, 1])?
-        .f_reshape([height, width, edge, edge, -1])?;
+    let cells = y.f_permute([0, 2, 3, 1])?;
+    let cells = cells.f_reshape([height, width, edge, edge, -1])?;
     let rows = cells.f_permute([0, 2, 1, 3, 4])?.f_contiguous()?;
-    rows.f_view([1, height * edge, width * edge, -1])?
-        .f_permute([0, 3, 1, 2])
+    let map = rows.f_view([1, height * edge, width * edge, -1])?;
+    map.f_permute([0, 3, 1, 2])
 }
 
 #[cfg(test)]

@@ -78,11 +78,7 @@ impl Layer {
         x: &Tensor,
         others: Vec<IValue>,
     ) -> Result<Tensor, TchError> {
-        let LayerFormat {
-            input,
-            output,
-            relu,
-        } = self.format;
+        let (input, output, relu) = (self.format.input, self.format.output, self.format.relu);
         let tensor = |tensor: &Tensor| IValue::Tensor(tensor.shallow_clone());
         let mut arguments = vec![
             tensor(x),

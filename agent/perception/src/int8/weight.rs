@@ -24,30 +24,27 @@ impl QuantisedWeight {
     pub(super) fn new(weight: &Tensor) -> Result<Self, TchError> {
         let outputs = weight.size().first().copied().unwrap_or(0);
         let rows = weight.f_to_kind(Kind::Float)?.f_reshape([outputs, -1])?;
-        let largest = Vec::<f64>::try_from(
-            rows.f_abs()?
-                .f_amax([1_i64], false)?
-                .f_to_kind(Kind::Double)?,
-        )?;
+        let largest = rows.f_abs()?.f_amax([1_i64], false)?;
+        let largest = Vec::<f64>::try_from(largest.f_to_kind(Kind::Double)?)?;
         let (mut steps, mut scales) = (Vec::new(), Vec::new());
         for (row, largest) in (0..outputs).zip(largest) {
             let row = rows.f_get(row)?;
-            let wide = if largest > 0.0 {
-                Scale::reaching(largest, MAX_WEIGHT as f64)
-            } else {
-                Scale::of_exponent(0)
+            let wide = match largest > 0.0 {
+                true => Scale::reaching(largest, MAX_WEIGHT as f64),
+                false => Scale::of_exponent(0),
             };
             let (of_wide, wide_error) = quantised(&row, wide)?;
             let (of_finer, finer_error) = quantised(&row, wide.finer())?;
-            let is_finer_better = finer_error < wide_error;
-            steps.push(if is_finer_better { of_finer } else { of_wide });
-            scales.push(if is_finer_better { wide.finer() } else { wide }.step() as f32);
+            let (of_row, scale) = match finer_error < wide_error {
+                true => (of_finer, wide.finer()),
+                false => (of_wide, wide),
+            };
+            steps.push(of_row);
+            scales.push(scale.step() as f32);
         }
-        let shape = weight.size();
+        let steps = Tensor::f_stack(&steps, 0)?.f_to_kind(Kind::Int8)?;
         Ok(Self {
-            steps: Tensor::f_stack(&steps, 0)?
-                .f_to_kind(Kind::Int8)?
-                .f_reshape(shape.as_slice())?,
+            steps: steps.f_reshape(weight.size())?,
             zero_points: Tensor::f_zeros([outputs], (Kind::Int, weight.device()))?,
             scales: Tensor::f_from_slice(&scales)?,
         })
@@ -60,11 +57,8 @@ fn quantised(row: &Tensor, scale: Scale) -> Result<(Tensor, f64), TchError> {
         .f_mul_scalar(scale.step().recip())?
         .f_round()?
         .f_clamp(-MAX_WEIGHT, MAX_WEIGHT)?;
-    let error = steps
-        .f_mul_scalar(scale.step())?
-        .f_sub(row)?
-        .f_square()?
-        .f_sum(Kind::Double)?;
+    let error = steps.f_mul_scalar(scale.step())?.f_sub(row)?;
+    let error = error.f_square()?.f_sum(Kind::Double)?;
     Ok((steps, error.f_double_value(&[])?))
 }
 

@@ -109,12 +109,8 @@ impl BevBackbone {
     /// When there is no such level.
     pub fn level(&self, level: usize, x: &Tensor, train: bool) -> Tensor {
         match &self.blocks[level] {
-            Block::Plain(layers) => layers
-                .iter()
-                .fold(x.shallow_clone(), |x, layer| layer.forward(&x, train)),
-            Block::Residual(blocks) => blocks
-                .iter()
-                .fold(x.shallow_clone(), |x, block| block.forward(&x, train)),
+            Block::Plain(layers) => ConvLayer::through(layers, x, train),
+            Block::Residual(blocks) => ResidualBlock::through(blocks, x.shallow_clone(), train),
         }
     }
 

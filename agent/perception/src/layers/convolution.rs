@@ -60,16 +60,8 @@ impl Norm {
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let (weight, bias) = (Some(&self.weight), Some(&self.bias));
         let (mean, var) = (Some(&self.running_mean), Some(&self.running_var));
-        x.batch_norm(
-            weight,
-            bias,
-            mean,
-            var,
-            train,
-            self.momentum,
-            self.eps,
-            true,
-        )
+        let (momentum, eps) = (self.momentum, self.eps);
+        x.batch_norm(weight, bias, mean, var, train, momentum, eps, true)
     }
 
     /// Learnt shift `[C]`.
@@ -115,68 +107,33 @@ impl ConvLayer {
         kernel: i64,
         stride: i64,
     ) -> Self {
-        let config = nn::ConvConfig {
-            stride,
-            padding: kernel / 2,
-            bias: false,
-            ..Default::default()
-        };
-        Self::down(conv, io, kernel, config)
+        Self::unbiased(conv, io, kernel, stride)
             .with_norm(norm, io[1])
             .with_relu()
     }
 
     /// `kernel x kernel` convolution with bias and nothing after it.
     pub fn biased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        Self::down(
-            conv,
-            io,
-            kernel,
-            nn::ConvConfig {
-                stride,
-                padding: kernel / 2,
-                ..Default::default()
-            },
-        )
+        Self::down(conv, io, kernel, stride, kernel / 2, true)
     }
 
     /// `kernel x kernel` convolution without bias and with nothing after it.
     pub(crate) fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
-        Self::down(
-            conv,
-            io,
-            kernel,
-            nn::ConvConfig {
-                stride,
-                padding: kernel / 2,
-                bias: false,
-                ..Default::default()
-            },
-        )
+        Self::down(conv, io, kernel, stride, kernel / 2, false)
     }
 
     /// Convolution whose kernel is its stride, so that every input counts once; batch norm, ReLU.
     pub fn patches(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], patch: i64) -> Self {
-        let config = nn::ConvConfig {
-            stride: patch,
-            padding: 0,
-            bias: false,
-            ..Default::default()
-        };
-        Self::down(conv, io, patch, config)
+        Self::down(conv, io, patch, patch, 0, false)
             .with_norm(norm, io[1])
             .with_relu()
     }
 
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
     pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {
-        let weight = conv.var(
-            "weight",
-            &[io[0], io[1], stride, stride],
-            nn::init::DEFAULT_KAIMING_UNIFORM,
-        );
+        let shape = [io[0], io[1], stride, stride];
         let layer = Self {
-            weight,
+            weight: conv.var("weight", &shape, nn::init::DEFAULT_KAIMING_UNIFORM),
             bias: None,
             stride,
             padding: 0,
@@ -191,9 +148,16 @@ impl ConvLayer {
         path: &nn::Path<'_>,
         [input, output]: [i64; 2],
         kernel: i64,
-        config: nn::ConvConfig,
+        stride: i64,
+        padding: i64,
+        bias: bool,
     ) -> Self {
-        let (stride, padding) = (config.stride, config.padding);
+        let config = nn::ConvConfig {
+            stride,
+            padding,
+            bias,
+            ..Default::default()
+        };
         let conv = nn::conv2d(path, input, output, kernel, config);
         Self {
             weight: conv.ws,
@@ -255,6 +219,12 @@ impl ConvLayer {
         if self.relu { x.relu_() } else { x }
     }
 
+    /// Output of a chain of layers.
+    pub(crate) fn through(chain: &[Self], x: &Tensor, train: bool) -> Tensor {
+        let x = x.shallow_clone();
+        chain.iter().fold(x, |x, layer| layer.forward(&x, train))
+    }
+
     /// [`Self::forward`] of one map in inference, the result contiguous as `[1, C_out, H', W']`.
     ///
     /// A 1x1 layer is one matrix product, whose result can be written in either order at no cost, while transposing a
@@ -269,9 +239,8 @@ impl ConvLayer {
         let (true, Some(bias), None) = (pointwise, &self.bias, &self.norm) else {
             return self.forward(x, false).f_contiguous();
         };
-        let cells = x
-            .f_permute([0, 2, 3, 1])?
-            .f_reshape([height * width, input])?;
+        let cells = x.f_permute([0, 2, 3, 1])?;
+        let cells = cells.f_reshape([height * width, input])?;
         let weight = self.weight.f_reshape([kernel[0], input])?;
         let mut rows = bias.f_unsqueeze(1)?.f_addmm(&weight, &cells.f_tr()?)?;
         let rows = if self.relu { rows.f_relu_()? } else { rows };
@@ -284,53 +253,25 @@ impl ConvLayer {
         input: Quantisation,
         output: Option<Scale>,
     ) -> Result<Int8Convolution, TchError> {
-        let Self {
-            weight,
-            bias,
-            stride,
-            padding,
-            relu,
-            ..
-        } = self;
         let format = LayerFormat {
             input,
             output,
-            relu: *relu,
+            relu: self.relu,
         };
-        let (weight, bias, geometry) = match self.direction {
-            Direction::Down => {
-                let geometry = ConvGeometry {
-                    stride: *stride,
-                    padding: *padding,
-                    upsampling: 1,
-                };
-                (
-                    weight.f_contiguous()?,
-                    bias.as_ref().map(Tensor::shallow_clone),
-                    geometry,
-                )
-            }
+        let mut geometry = ConvGeometry {
+            stride: self.stride,
+            padding: self.padding,
+            upsampling: 1,
+        };
+        let mut bias = self.bias.as_ref().map(Tensor::shallow_clone);
+        let weight = match self.direction {
+            Direction::Down => self.weight.f_contiguous()?,
             Direction::Up => {
-                let (input, output, edge, _) = weight.size4()?;
-                let rows = weight.f_permute([2, 3, 1, 0])?.f_reshape([
-                    edge * edge * output,
-                    input,
-                    1,
-                    1,
-                ])?;
-                let bias = bias
-                    .as_ref()
-                    .map(|bias| bias.f_repeat([edge * edge]))
-                    .transpose()?;
-                (
-                    rows,
-                    bias,
-                    ConvGeometry {
-                        stride: 1,
-                        padding: 0,
-                        upsampling: edge,
-                    },
-                )
+                let (input, output, edge, _) = self.weight.size4()?;
+                (geometry.stride, geometry.upsampling) = (1, edge);
+                bias = bias.map(|bias| bias.f_repeat([edge * edge])).transpose()?;
+                let rows = self.weight.f_permute([2, 3, 1, 0])?;
+                rows.f_reshape([edge * edge * output, input, 1, 1])?
             }
         };
         Int8Convolution::new(&weight, bias.as_ref(), geometry, format)
@@ -339,10 +280,9 @@ impl ConvLayer {
     /// The same layer for inference: the norm's running statistics are folded into weight and bias, which saves one
     /// pass over the map; weights are channels-last, as the maps are.
     pub fn folded(&self) -> Self {
-        let output_dim = if self.direction == Direction::Down {
-            0
-        } else {
-            1
+        let output_dim = match self.direction {
+            Direction::Down => 0,
+            Direction::Up => 1,
         };
         let bias = self.bias.as_ref().map(Tensor::detach);
         let (weight, bias) = match &self.norm {
@@ -351,8 +291,10 @@ impl ConvLayer {
                 let (scale, shift) = norm.scale_shift();
                 let mut shape = [1_i64; 4];
                 shape[output_dim] = -1;
-                let shift =
-                    bias.map_or_else(|| shift.shallow_clone(), |bias| bias * &scale + &shift);
+                let shift = match bias {
+                    Some(bias) => bias * &scale + &shift,
+                    None => shift,
+                };
                 (&self.weight * scale.view(shape), Some(shift))
             }
         };
@@ -372,13 +314,10 @@ pub(crate) fn contiguous_map(map: &Tensor) -> Result<Tensor, TchError> {
     if batch != 1 {
         return map.f_contiguous();
     }
-    let cells = map
-        .f_permute([0, 2, 3, 1])?
-        .f_reshape([height * width, channels])?;
-    cells
-        .f_tr()?
-        .f_contiguous()?
-        .f_view([1, channels, height, width])
+    let cells = map.f_permute([0, 2, 3, 1])?;
+    let cells = cells.f_reshape([height * width, channels])?;
+    let rows = cells.f_tr()?.f_contiguous()?;
+    rows.f_view([1, channels, height, width])
 }
 
 /// The same values with the channels innermost in memory.

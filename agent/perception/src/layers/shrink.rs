@@ -45,13 +45,13 @@ impl Shrink {
 
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
-        chain(&self.layers, x, train)
+        ConvLayer::through(&self.layers, x, train)
     }
 
     /// [`Self::forward`] of one map in inference, contiguous.
     pub(crate) fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self.layers.split_last() {
-            Some((last, rest)) => last.forward_contiguous(&chain(rest, x, false)),
+            Some((last, rest)) => last.forward_contiguous(&ConvLayer::through(rest, x, false)),
             None => x.f_contiguous(),
         }
     }
@@ -97,7 +97,7 @@ impl Compressor {
 
     /// The code back to `[N, C, H, W]`.
     pub fn decode(&self, code: &Tensor, train: bool) -> Tensor {
-        chain(&self.decoder, code, train)
+        ConvLayer::through(&self.decoder, code, train)
     }
 
     /// The same for inference, norms folded in.
@@ -107,10 +107,4 @@ impl Compressor {
             decoder: self.decoder.iter().map(ConvLayer::folded).collect(),
         }
     }
-}
-
-fn chain(layers: &[ConvLayer], x: &Tensor, train: bool) -> Tensor {
-    layers
-        .iter()
-        .fold(x.shallow_clone(), |x, layer| layer.forward(&x, train))
 }

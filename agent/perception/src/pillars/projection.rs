@@ -36,11 +36,8 @@ impl PillarProjection {
         let (weight, bias) = encoder.folded();
         let channels = weight.size()[0] as usize;
         let flat = |tensor: Tensor| {
-            let tensor = tensor
-                .to_device(tch::Device::Cpu)
-                .to_kind(Kind::Float)
-                .contiguous()
-                .view([-1]);
+            let tensor = tensor.to_device(tch::Device::Cpu).to_kind(Kind::Float);
+            let tensor = tensor.contiguous().view([-1]);
             Vec::<f32>::try_from(&tensor).expect("contiguous f32 values on the CPU")
         };
         let (weight, bias) = (flat(weight), flat(bias));
@@ -57,6 +54,7 @@ impl PillarProjection {
                 .map(|block| std::array::from_fn(|axis| lanes(block, &|row| value(row, axis))))
                 .collect()
         };
+        let bias_of = |channel: usize| bias.get(channel).copied().unwrap_or(0.0);
         let position = axes(|row, axis| row[axis] + row[4 + axis] + row[7 + axis]);
         Self {
             channels,
@@ -66,11 +64,7 @@ impl PillarProjection {
             mean: axes(|row, axis| -row[4 + axis]),
             center: axes(|row, axis| row[axis]),
             bias: (0..blocks)
-                .map(|block| {
-                    std::array::from_fn(|lane| {
-                        bias.get(block * LANES + lane).copied().unwrap_or(0.0)
-                    })
-                })
+                .map(|block| std::array::from_fn(|lane| bias_of(block * LANES + lane)))
                 .collect(),
         }
     }
@@ -87,14 +81,9 @@ impl PillarProjection {
     pub fn scatter(&self, pillars: &Pillars, pillar_grid: &PillarGrid, canvas: &mut [f32]) {
         for (points, coord) in pillars.iter() {
             let cell = pillar_grid.cell(coord) * self.channels;
-            let center = pillar_grid.center_m(coord);
+            let (center, features) = (pillar_grid.center_m(coord), cell..cell + self.channels);
             let has_free_slot = points.len() < pillar_grid.max_points;
-            self.pillar(
-                points,
-                center,
-                has_free_slot,
-                &mut canvas[cell..cell + self.channels],
-            );
+            self.pillar(points, center, has_free_slot, &mut canvas[features]);
         }
     }
 
@@ -112,13 +101,9 @@ impl PillarProjection {
         let mut features = vec![0.0; self.channels];
         for (points, coord) in pillars.iter() {
             let cell = pillar_grid.cell(coord) * self.channels;
+            let center = pillar_grid.center_m(coord);
             let has_free_slot = points.len() < pillar_grid.max_points;
-            self.pillar(
-                points,
-                pillar_grid.center_m(coord),
-                has_free_slot,
-                &mut features,
-            );
+            self.pillar(points, center, has_free_slot, &mut features);
             quantisation.quantise_values(&features, &mut canvas[cell..cell + self.channels]);
         }
     }

@@ -64,10 +64,8 @@ impl AdamW {
     /// Optimizer before its first step.
     pub fn new(variables: &VarStore, config: AdamWConfig) -> Self {
         let named: BTreeMap<String, Tensor> = variables.variables().into_iter().collect();
-        let entries = named
-            .into_iter()
-            .filter(|(_, variable)| variable.requires_grad());
-        let entries = entries.map(|(name, variable)| Entry {
+        let trained = (named.into_iter()).filter(|(_, variable)| variable.requires_grad());
+        let entries = trained.map(|(name, variable)| Entry {
             name,
             mean: no_grad(|| variable.zeros_like()),
             square: no_grad(|| variable.zeros_like()),
@@ -83,9 +81,9 @@ impl AdamW {
 
     /// Clears the gradients of the last step.
     pub fn zero_grad(&mut self) {
-        self.entries
-            .iter_mut()
-            .for_each(|entry| entry.variable.zero_grad());
+        for entry in &mut self.entries {
+            entry.variable.zero_grad();
+        }
     }
 
     /// Updates every variable by its gradient.
@@ -94,49 +92,34 @@ impl AdamW {
     /// [`TchError`] from the tensor library.
     pub fn step(&mut self, learning_rate: f64) -> Result<Step, TchError> {
         no_grad(|| {
-            let gradients: Vec<Tensor> = self
-                .entries
-                .iter()
-                .map(|entry| entry.variable.grad())
-                .collect();
+            let gradients = self.entries.iter().map(|entry| entry.variable.grad());
+            let gradients: Vec<Tensor> = gradients.collect();
             let norm = global_norm(&gradients)?;
             if !norm.is_finite() {
                 return Ok(Step::Skipped);
             }
             let scale = (self.config.max_gradient_norm / (norm + 1e-6)).min(1.0);
             self.steps += 1;
-            let AdamWConfig {
-                beta1,
-                beta2,
-                eps,
-                weight_decay,
-                ..
-            } = self.config;
-            let mean_correction = 1.0 - beta1.powf(self.steps as f64);
-            let square_correction = 1.0 - beta2.powf(self.steps as f64);
+            let (config, steps) = (self.config, self.steps as f64);
+            let mean_correction = 1.0 - config.beta1.powf(steps);
+            let square_correction = 1.0 - config.beta2.powf(steps);
             for (entry, gradient) in self.entries.iter_mut().zip(&gradients) {
                 if !gradient.defined() {
                     continue;
                 }
+                let (mean, square) = (&mut entry.mean, &mut entry.square);
                 let gradient = gradient * scale;
-                let _ = entry
-                    .square
-                    .f_mul_scalar_(beta2)?
-                    .f_add_(&(gradient.f_square()?.f_mul_scalar_(1.0 - beta2)?))?;
-                let _ = entry
-                    .mean
-                    .f_mul_scalar_(beta1)?
-                    .f_add_(&(gradient * (1.0 - beta1)))?;
-                let deviation = (&entry.square / square_correction)
-                    .f_sqrt_()?
-                    .f_add_scalar_(eps)?;
+                let squared = gradient.f_square()?.f_mul_scalar_(1.0 - config.beta2)?;
+                let _ = square.f_mul_scalar_(config.beta2)?.f_add_(&squared)?;
+                let change = gradient * (1.0 - config.beta1);
+                let _ = mean.f_mul_scalar_(config.beta1)?.f_add_(&change)?;
+                let mut root = (&*square / square_correction).f_sqrt_()?;
+                let deviation = root.f_add_scalar_(config.eps)?;
                 if entry.decays {
-                    let _ = entry
-                        .variable
-                        .f_mul_scalar_(1.0 - learning_rate * weight_decay)?;
+                    let kept = 1.0 - learning_rate * config.weight_decay;
+                    let _ = entry.variable.f_mul_scalar_(kept)?;
                 }
-                let change =
-                    (&entry.mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
+                let change = (&*mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
             Ok(Step::Taken(norm))
@@ -189,10 +172,8 @@ fn global_norm(gradients: &[Tensor]) -> Result<f64, TchError> {
     if squares.is_empty() {
         return Ok(0.0);
     }
-    Ok(Tensor::f_stack(&squares, 0)?
-        .f_sum(Kind::Double)?
-        .f_double_value(&[])?
-        .sqrt())
+    let sum = Tensor::f_stack(&squares, 0)?.f_sum(Kind::Double)?;
+    Ok(sum.f_double_value(&[])?.sqrt())
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use support::output;
 use support::progress;
 
 use super::run_config::Length;
+use super::task::Progress;
 
 /// Shortest time between two plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -71,6 +72,22 @@ impl TrainingBar {
         }
     }
 
+    /// Shows the progress of a training.
+    pub fn show_progress(&self, progress: &Progress) {
+        match progress {
+            Progress::Encoding(done, all) => self.encoded(*done, *all),
+            Progress::Read(data) => {
+                if let Some(text) = data.left_out() {
+                    self.print_line(&text);
+                }
+            }
+            Progress::Note(text) | Progress::Validated(text) => self.print_line(text),
+            Progress::Stepped(report) => {
+                self.report(report.share_done, report.seconds, &report.text);
+            }
+        }
+    }
+
     /// Shows the progress: `share_done` 0..1 after `seconds`, and a text.
     pub fn report(&self, share_done: f64, seconds: f64, text: &str) {
         let remaining_s = match self.length {
@@ -90,47 +107,35 @@ impl TrainingBar {
             latest: done,
             is_estimated: false,
         };
-        let mut encoding = self
-            .encoding
-            .get()
-            .filter(|known| known.latest <= done)
-            .unwrap_or(fresh);
+        let known = self.encoding.get().filter(|known| known.latest <= done);
+        let mut encoding = known.unwrap_or(fresh);
         encoding.latest = done;
         let left = all.saturating_sub(done) as f64;
         let passed = encoding.began.elapsed();
         let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
-        if let Some(remaining_s) =
-            remaining_s.filter(|_| !encoding.is_estimated && passed >= ESTIMATE_AFTER)
-        {
+        let is_due = !encoding.is_estimated && passed >= ESTIMATE_AFTER;
+        if let Some(remaining_s) = remaining_s.filter(|_| is_due) {
             let seconds = passed.as_secs_f64() + remaining_s;
             self.print_line(&estimate(all, seconds, self.length, self.includes_encoding));
             encoding.is_estimated = true;
         }
         self.encoding.set(Some(encoding));
-        self.show(
-            done as f64 / all.max(1) as f64,
-            remaining_s,
-            &format!("{done} of {all} sweeps encoded"),
-        );
+        let text = format!("{done} of {all} sweeps encoded");
+        self.show(done as f64 / all.max(1) as f64, remaining_s, &text);
     }
 
     fn show(&self, share_done: f64, remaining_s: Option<f64>, text: &str) {
         if self.is_watched {
-            self.bar
-                .set_position((share_done * 1000.0 * PARTS as f64) as u64);
+            let position = share_done * 1000.0 * PARTS as f64;
+            self.bar.set_position(position as u64);
             self.bar.set_message(text.to_owned());
-        } else if self
-            .last_line
-            .get()
-            .is_none_or(|last| last.elapsed() >= LINE_EVERY)
-        {
-            let to_go = remaining_s
-                .map(|seconds| format!(", {seconds:.0} s remaining"))
-                .unwrap_or_default();
-            output::note(format_args!(
-                "{text}, {:.1} % done{to_go}",
-                100.0 * share_done
-            ));
+            return;
+        }
+        let last = self.last_line.get();
+        if last.is_none_or(|last| last.elapsed() >= LINE_EVERY) {
+            let to_go = remaining_s.map(|seconds| format!(", {seconds:.0} s remaining"));
+            let (share, to_go) = (100.0 * share_done, to_go.unwrap_or_default());
+            output::note(format_args!("{text}, {share:.1} % done{to_go}"));
             self.last_line.set(Some(Instant::now()));
         }
     }
@@ -158,21 +163,17 @@ fn estimate(
     includes_encoding: bool,
 ) -> String {
     let then = match length {
-        Some(Length::Time(time)) if includes_encoding && time.as_secs_f64() <= seconds => {
-            format!(
-                ", all of the {} in all: the training needs more time",
-                minutes(time.as_secs_f64())
-            )
+        Some(Length::Time(time)) => {
+            let (time_s, all) = (time.as_secs_f64(), minutes(time.as_secs_f64()));
+            if !includes_encoding {
+                format!(", then {all} of training")
+            } else if time_s <= seconds {
+                format!(", all of the {all} in all: the training needs more time")
+            } else {
+                let left = minutes(time_s - seconds);
+                format!(" of the {all} in all, which leaves {left} for the training")
+            }
         }
-        Some(Length::Time(time)) if includes_encoding => {
-            let left_s = time.as_secs_f64() - seconds;
-            format!(
-                " of the {} in all, which leaves {} for the training",
-                minutes(time.as_secs_f64()),
-                minutes(left_s)
-            )
-        }
-        Some(Length::Time(time)) => format!(", then {} of training", minutes(time.as_secs_f64())),
         Some(Length::Steps(steps)) => format!(", then {steps} steps of training"),
         Some(Length::Epochs(epochs)) => format!(", then {epochs} passes of training"),
         None => String::new(),

@@ -4,7 +4,7 @@
 //! stored. The one exception are scene-specific heads: one that is resumed begins a new pass over its cells, with all
 //! of its sweeps.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
@@ -17,7 +17,7 @@ use tch::{Tensor, no_grad};
 
 use super::adamw::AdamW;
 use crate::tensor_values::values;
-use crate::weights::MAX_BYTES;
+use crate::weights::{MAX_BYTES, Stored, file_bytes, numbers};
 
 /// Name of the checkpoint in the folder of the results.
 pub(super) const CHECKPOINT_FILE: &str = "checkpoint.safetensors";
@@ -37,31 +37,20 @@ pub fn save<P: Serialize>(
     progress: &P,
 ) -> Result<(), FileError> {
     let (moments, optimizer_steps) = optimizer.state();
-    let parameters = variables
-        .variables()
-        .into_iter()
+    let parameters = (variables.variables().into_iter())
         .map(|(name, tensor)| (format!("parameter.{name}"), tensor));
     let mut stored = Vec::new();
     for (name, tensor) in parameters.chain(moments) {
         let values = values(&tensor).at(path)?;
-        let shape: Vec<usize> = tensor.size().iter().map(|&size| size as usize).collect();
-        let bytes: Vec<u8> = values
-            .iter()
-            .flat_map(|value| value.to_le_bytes())
-            .collect();
-        stored.push((name, shape, bytes));
+        stored.push(Stored::new(name, &tensor, &values, Dtype::F32));
     }
-    let views: Result<Vec<_>, SafeTensorError> = (stored.iter())
-        .map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
-        .collect();
-    let header = HashMap::from([
-        (
-            PROGRESS_KEY.to_owned(),
-            serde_json::to_string(progress).unwrap_or_default(),
-        ),
-        (STEPS_KEY.to_owned(), optimizer_steps.to_string()),
-    ]);
-    let bytes = safetensors::serialize(views.at(path)?, Some(header)).at(path)?;
+    let progress = serde_json::to_string(progress).unwrap_or_default();
+    let texts = [
+        (PROGRESS_KEY, progress),
+        (STEPS_KEY, optimizer_steps.to_string()),
+    ];
+    let header = texts.map(|(key, text)| (key.to_owned(), text)).into();
+    let bytes = file_bytes(&stored, header).at(path)?;
     atomic_file::write(path, bytes).at(path)
 }
 
@@ -90,10 +79,9 @@ pub(crate) fn restore<P: DeserializeOwned>(
     let tensors = read_tensors(&bytes).map_err(incomplete).at(path)?;
     let mut targets = Vec::new();
     for (name, variable) in variables.variables() {
-        let stored = tensors
-            .get(&format!("parameter.{name}"))
-            .filter(|stored| stored.size() == variable.size());
+        let stored = tensors.get(&format!("parameter.{name}"));
         let stored = stored
+            .filter(|stored| stored.size() == variable.size())
             .ok_or_else(|| format!("no {name:?} of shape {:?}", variable.size()))
             .at(path)?;
         targets.push((variable, stored));
@@ -111,13 +99,7 @@ pub(crate) fn restore<P: DeserializeOwned>(
 fn read_tensors(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, SafeTensorError> {
     let file = SafeTensors::deserialize(bytes)?;
     let read = |(name, view): (&str, TensorView<'_>)| {
-        let values: Vec<f32> = view
-            .data()
-            .as_chunks()
-            .0
-            .iter()
-            .map(|&bytes| f32::from_le_bytes(bytes))
-            .collect();
+        let values = numbers(view.data(), f32::from_le_bytes);
         let shape: Vec<i64> = view.shape().iter().map(|&size| size as i64).collect();
         (name.to_owned(), Tensor::from_slice(&values).reshape(shape))
     };

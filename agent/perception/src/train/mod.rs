@@ -13,6 +13,7 @@ mod options;
 mod prefetch;
 mod run_config;
 mod schedule;
+mod task;
 mod trainer;
 
 pub use adamw::{AdamW, AdamWConfig, Step};
@@ -26,4 +27,5 @@ pub use options::{OptionsError, TrainingOptions, check_out};
 pub use prefetch::Prefetch;
 pub use run_config::{ComputePrecision, Length, RunConfig};
 pub use schedule::OneCycle;
+pub use task::{Means, Observe, Progress, SaveEvery, StepReport, Task};
 pub use trainer::{Trained, Trainer};

@@ -110,25 +110,16 @@ impl TrainingOptions {
     /// # Errors
     /// As [`output::line`].
     pub fn print(&self, trained: &Trained, more: &serde_json::Value) -> io::Result<()> {
-        let Trained {
-            steps,
-            seconds,
-            weights,
-            sha256,
-            ..
-        } = trained;
+        let (steps, seconds, weights) = (trained.steps, trained.seconds, &trained.weights);
         if self.json {
-            let mut report = serde_json::json!({"steps": steps, "seconds": seconds, "weights": weights, "sha256": sha256});
+            let mut report = serde_json::json!({"steps": steps, "seconds": seconds, "weights": weights, "sha256": trained.sha256});
             if let (Some(report), Some(more)) = (report.as_object_mut(), more.as_object()) {
                 report.extend(more.clone());
             }
-            output::line(report)
-        } else {
-            output::line(format_args!(
-                "{steps} steps in {seconds:.0} s: {}",
-                weights.display()
-            ))
+            return output::line(report);
         }
+        let weights = weights.display();
+        output::line(format_args!("{steps} steps in {seconds:.0} s: {weights}"))
     }
 
     /// The number format of a device: bfloat16 without support in the CPU would take many times longer.
@@ -162,10 +153,9 @@ impl TrainingOptions {
 pub fn check_out(out: &Path, resume: bool, force: bool) -> Result<(), OptionsError> {
     let [weights, checkpoint] = ["weights.safetensors", CHECKPOINT_FILE].map(|name| out.join(name));
     if resume {
-        return if checkpoint.exists() {
-            Ok(())
-        } else {
-            Err(OptionsError::NoCheckpoint(checkpoint))
+        return match checkpoint.exists() {
+            true => Ok(()),
+            false => Err(OptionsError::NoCheckpoint(checkpoint)),
         };
     }
     match [weights, checkpoint].into_iter().find(|file| file.exists()) {
@@ -177,10 +167,9 @@ pub fn check_out(out: &Path, resume: bool, force: bool) -> Result<(), OptionsErr
 impl ComputePrecision {
     /// The fastest number format of a device.
     pub fn fastest_on(device: Device) -> Self {
-        if device != Device::Cpu || has_bfloat16() {
-            Self::Bf16
-        } else {
-            Self::F32
+        match device != Device::Cpu || has_bfloat16() {
+            true => Self::Bf16,
+            false => Self::F32,
         }
     }
 }

@@ -1,15 +1,15 @@
 //! Annotation of an existing weights file with a text.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use protocol::text::hex;
 use safetensors::tensor::SafeTensors;
-use serde_json::Value;
+use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 use support::file_error::{AtFile, FileError};
 use support::{atomic_file, bounded_file};
 
+use super::save::with_header;
 use super::{MAX_BYTES, incomplete};
 
 /// Key of the header that contains the metadata.
@@ -23,38 +23,21 @@ const METADATA: &str = "__metadata__";
 pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, FileError> {
     let old = bounded_file::read(path, MAX_BYTES).at(path)?;
     SafeTensors::deserialize(&old).map_err(|error| incomplete(path, old.len(), error))?;
-    let new = annotated(&old, key, text)
-        .map_err(|error| FileError::new(path, format_args!("metadata {key:?}: {error}")))?;
+    let new = with_header(&old, |entries| {
+        let metadata = entries.entry(METADATA.to_owned());
+        if let Value::Object(texts) = metadata.or_insert_with(|| Value::Object(Map::new())) {
+            texts.insert(key.to_owned(), Value::String(text.to_owned()));
+        }
+    });
+    let new =
+        new.map_err(|error| FileError::new(path, format_args!("metadata {key:?}: {error}")))?;
     atomic_file::write(path, &new).at(path)?;
     Ok(hex(&Sha256::digest(&new)))
 }
 
-/// `file` has been read by the library: its length, its header and its data are valid.
-fn annotated(file: &[u8], key: &str, text: &str) -> Result<Vec<u8>, serde_json::Error> {
-    let length: [u8; 8] = std::array::from_fn(|byte| file.get(byte).copied().unwrap_or(0));
-    let length = u64::from_le_bytes(length) as usize;
-    let (header, data) = file[8..].split_at(length);
-    let mut entries: BTreeMap<String, Value> = serde_json::from_slice(header)?;
-    let metadata = entries
-        .entry(METADATA.to_owned())
-        .or_insert_with(|| Value::Object(serde_json::Map::new()));
-    if let Value::Object(texts) = metadata {
-        texts.insert(key.to_owned(), Value::String(text.to_owned()));
-    }
-    entries.values_mut().for_each(Value::sort_all_objects);
-    let mut header = serde_json::to_vec(&entries)?;
-    // Tensor data begin at a multiple of eight.
-    header.resize(header.len().next_multiple_of(8), b' ');
-    Ok([
-        &(header.len() as u64).to_le_bytes(),
-        header.as_slice(),
-        data,
-    ]
-    .concat())
-}
-
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
     use std::fs;
 
     use tch::nn::VarStore;

@@ -17,15 +17,17 @@ use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use support::bounded_file;
 use support::file_error::AtFile;
-use tch::Tensor;
-use tch::nn::VarStore;
+use tch::Device;
+use tch::nn::{self, VarStore};
 
 use crate::int8::{ActivationScales, InferencePrecision, QuantiseError, SCALES_KEY};
 use crate::model_config::DetectorConfig;
+use crate::tensor_values::tensor;
 use crate::torch_error::first_line;
 
 pub use annotate::annotate;
 pub use save::{Precision, save};
+pub(crate) use save::{Stored, file_bytes};
 pub use support::file_error::FileError;
 
 /// Metadata key of the configuration.
@@ -70,10 +72,9 @@ impl Weights {
             return Err(FileError::new(path, "a folder, must be one weights file"));
         }
         let bytes = bounded_file::read(path, MAX_BYTES).at(path)?;
-        let (_, header) = SafeTensors::read_metadata(&bytes)
-            .map_err(|error| incomplete(path, bytes.len(), error))?;
-        let file = SafeTensors::deserialize(&bytes)
-            .map_err(|error| incomplete(path, bytes.len(), error))?;
+        let incomplete = |error| incomplete(path, bytes.len(), error);
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(incomplete)?;
+        let file = SafeTensors::deserialize(&bytes).map_err(incomplete)?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.iter() {
             if let Some(values) = read_values(path, name, &view)? {
@@ -81,15 +82,10 @@ impl Weights {
                 tensors.insert(name.to_owned(), Values { shape, values });
             }
         }
-        let metadata = header
-            .metadata()
-            .clone()
-            .unwrap_or_default()
-            .into_iter()
-            .collect();
+        let metadata = header.metadata().clone().unwrap_or_default();
         Ok(Self {
             path: path.to_owned(),
-            metadata,
+            metadata: metadata.into_iter().collect(),
             tensors,
             sha256: hex(&Sha256::digest(&bytes)),
         })
@@ -103,12 +99,11 @@ impl Weights {
     /// SHA-256 over the tensors whose name is `wanted`: the same for files that share these and differ in others.
     pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
         let mut hash = Sha256::new();
-        for (name, Values { shape, values }) in self.tensors.iter().filter(|(name, _)| wanted(name))
-        {
-            hash.update(format!("{name} {shape:?}\n"));
-            values
-                .iter()
-                .for_each(|value| hash.update(value.to_le_bytes()));
+        for (name, tensor) in self.tensors.iter().filter(|(name, _)| wanted(name)) {
+            hash.update(format!("{name} {:?}\n", tensor.shape));
+            for value in &tensor.values {
+                hash.update(value.to_le_bytes());
+            }
         }
         hex(&hash.finalize())
     }
@@ -130,10 +125,8 @@ impl Weights {
 
     /// Number of parameters.
     pub fn parameters(&self) -> usize {
-        self.tensors
-            .values()
-            .map(|tensor| tensor.values.len())
-            .sum()
+        let sizes = self.tensors.values().map(|tensor| tensor.values.len());
+        sizes.sum()
     }
 
     /// The text under a metadata key.
@@ -163,6 +156,24 @@ impl Weights {
         self.metadata_json(CONFIG_KEY)
     }
 
+    /// Network of the file's configuration with its parameters, frozen; `build` gets the path of its variables.
+    ///
+    /// # Errors
+    /// [`FileError`] when the file is of another kind or its tensors are not those of the network, and those of `build`.
+    pub fn network<C: DeserializeOwned, N, E: From<FileError>>(
+        &self,
+        kind: &'static str,
+        device: Device,
+        build: impl FnOnce(&nn::Path<'_>, C) -> Result<N, E>,
+    ) -> Result<N, E> {
+        self.check_kind(kind)?;
+        let mut variables = VarStore::new(device);
+        let network = build(&variables.root(), self.config()?)?;
+        self.copy_into(&variables)?;
+        variables.freeze();
+        Ok(network)
+    }
+
     /// Configuration of a detector.
     ///
     /// # Errors
@@ -179,9 +190,8 @@ impl Weights {
     pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, FileError> {
         let Some(text) = self.metadata.get(key) else {
             let found: Vec<&String> = self.metadata.keys().collect();
-            return Err(self.error(format_args!(
-                "metadata has no key {key:?}; it has {found:?}"
-            )));
+            let problem = format_args!("metadata has no key {key:?}; it has {found:?}");
+            return Err(self.error(problem));
         };
         serde_json::from_str(text)
             .map_err(|error| self.error(format_args!("metadata {key:?}: {error}")))
@@ -192,10 +202,8 @@ impl Weights {
     /// # Errors
     /// [`FileError`] when the JSON has another form.
     pub fn activation_scales(&self) -> Result<Option<ActivationScales>, FileError> {
-        self.metadata
-            .contains_key(SCALES_KEY)
-            .then(|| self.metadata_json(SCALES_KEY))
-            .transpose()
+        let is_there = self.metadata.contains_key(SCALES_KEY);
+        is_there.then(|| self.metadata_json(SCALES_KEY)).transpose()
     }
 
     /// The same weights for a number format: in [`InferencePrecision::Float`] the scales of activations are ignored.
@@ -234,19 +242,15 @@ impl Weights {
         network: &VarStore,
         wanted: impl Fn(&str) -> bool,
     ) -> Result<(), FileError> {
-        let variables: BTreeMap<String, Tensor> = network
-            .variables()
-            .into_iter()
-            .filter(|(name, _)| wanted(name))
-            .collect();
+        let mut variables: BTreeMap<_, _> = network.variables().into_iter().collect();
+        variables.retain(|name, _| wanted(name));
         for (name, variable) in &variables {
             self.checked(name, variable.size())?;
         }
         for (name, mut variable) in variables {
             let source = self.checked(&name, variable.size())?;
             let copied = tch::no_grad(|| {
-                let values =
-                    Tensor::f_from_slice(&source.values)?.f_view(source.shape.as_slice())?;
+                let values = tensor(&source.values, &source.shape, Device::Cpu)?;
                 variable.f_copy_(&values)
             });
             copied.map_err(|error| {
@@ -283,30 +287,10 @@ fn read_values(
 ) -> Result<Option<Vec<f32>>, FileError> {
     let data = view.data();
     let values: Vec<f32> = match view.dtype() {
-        Dtype::F16 => data
-            .as_chunks()
-            .0
-            .iter()
-            .map(|&bytes| f16::from_le_bytes(bytes).to_f32())
-            .collect(),
-        Dtype::BF16 => data
-            .as_chunks()
-            .0
-            .iter()
-            .map(|&bytes| bf16::from_le_bytes(bytes).to_f32())
-            .collect(),
-        Dtype::F32 => data
-            .as_chunks()
-            .0
-            .iter()
-            .map(|&bytes| f32::from_le_bytes(bytes))
-            .collect(),
-        Dtype::F64 => data
-            .as_chunks()
-            .0
-            .iter()
-            .map(|&bytes| f64::from_le_bytes(bytes) as f32)
-            .collect(),
+        Dtype::F16 => numbers(data, |bytes| f16::from_le_bytes(bytes).to_f32()),
+        Dtype::BF16 => numbers(data, |bytes| bf16::from_le_bytes(bytes).to_f32()),
+        Dtype::F32 => numbers(data, f32::from_le_bytes),
+        Dtype::F64 => numbers(data, |bytes| f64::from_le_bytes(bytes) as f32),
         Dtype::I64 | Dtype::I32 => return Ok(None),
         dtype => {
             let problem = format_args!(
@@ -316,32 +300,34 @@ fn read_values(
         }
     };
     check_finite(path, name, &values)?;
-    if name.ends_with(VARIANCE_NAME) {
-        check_variance(path, name, &values)?;
+    let is_negative = |value: &f32| *value < 0.0;
+    match values.iter().position(is_negative) {
+        // The square root of a negative variance is NaN.
+        Some(index) if name.ends_with(VARIANCE_NAME) => {
+            let holds = holds(name, &values, index);
+            let problem = format_args!("{holds}; a variance is at least 0");
+            Err(FileError::new(path, problem))
+        }
+        _ => Ok(Some(values)),
     }
-    Ok(Some(values))
 }
 
-/// Refuses negative variances of a normalisation layer: their square root is NaN.
-fn check_variance(path: &Path, name: &str, values: &[f32]) -> Result<(), FileError> {
-    let Some(index) = values.iter().position(|value| *value < 0.0) else {
-        return Ok(());
-    };
-    let value = values[index];
-    let problem =
-        format_args!("tensor {name:?} holds {value} at index {index}; a variance is at least 0");
-    Err(FileError::new(path, problem))
+/// Numbers of `N` bytes each.
+pub(crate) fn numbers<const N: usize>(data: &[u8], number: impl Fn([u8; N]) -> f32) -> Vec<f32> {
+    let chunks = data.as_chunks().0.iter();
+    chunks.map(|&bytes| number(bytes)).collect()
 }
 
 fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), FileError> {
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(()),
-        Some(index) => {
-            let value = values[index];
-            let problem = format_args!("tensor {name:?} holds {value} at index {index}");
-            Err(FileError::new(path, problem))
-        }
+        Some(index) => Err(FileError::new(path, holds(name, values, index))),
     }
+}
+
+fn holds(name: &str, values: &[f32], index: usize) -> String {
+    let value = values[index];
+    format!("tensor {name:?} holds {value} at index {index}")
 }
 
 #[cfg(test)]

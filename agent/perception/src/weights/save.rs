@@ -6,6 +6,7 @@ use std::path::Path;
 use half::f16;
 use protocol::text::hex;
 use safetensors::tensor::{Dtype, SafeTensorError, TensorView};
+use serde_json::Value;
 use sha2::{Digest, Sha256};
 use support::atomic_file;
 use support::file_error::{AtFile, FileError};
@@ -42,95 +43,76 @@ pub fn save(
 ) -> Result<String, FileError> {
     let mut stored = Vec::new();
     for (name, variable) in network.variables() {
-        stored.push(store(path, name, &variable, precision)?);
+        let values = values(&variable).map_err(|error| {
+            let problem = format_args!("tensor {name:?}: {}", first_line(&error));
+            FileError::new(path, problem)
+        })?;
+        check_finite(path, &name, &values)?;
+        let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
+        let dtype = match precision {
+            Precision::Half if variable.dim() > 1 && fits => Dtype::F16,
+            _ => Dtype::F32,
+        };
+        stored.push(Stored::new(name, &variable, &values, dtype));
     }
-    let views: Result<Vec<_>, SafeTensorError> = (stored.iter())
-        .map(|tensor| {
-            Ok((
-                &tensor.name,
-                TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?,
-            ))
-        })
-        .collect();
-    let header: HashMap<_, _> = metadata.clone().into_iter().collect();
-    let bytes = safetensors::serialize(views.at(path)?, Some(header)).at(path)?;
-    let bytes = with_sorted_header(bytes);
+    let bytes = file_bytes(&stored, metadata.clone().into_iter().collect()).at(path)?;
+    let bytes = with_header(&bytes, |_| ()).at(path)?;
     atomic_file::write(path, &bytes).at(path)?;
     Ok(hex(&Sha256::digest(&bytes)))
 }
 
-/// The same file with its header in the order of names: the library writes metadata in the order of a hash map, and
-/// equal weights should give equal files.
-fn with_sorted_header(bytes: Vec<u8>) -> Vec<u8> {
-    let Some((length, rest)) = bytes.split_first_chunk::<8>() else {
-        return bytes;
-    };
-    let Some((header, data)) = rest.split_at_checked(u64::from_le_bytes(*length) as usize) else {
-        return bytes;
-    };
-    let Ok(mut entries) = serde_json::from_slice::<BTreeMap<String, serde_json::Value>>(header)
-    else {
-        return bytes;
-    };
-    entries
-        .values_mut()
-        .for_each(serde_json::Value::sort_all_objects);
-    let Ok(mut header) = serde_json::to_vec(&entries) else {
-        return bytes;
-    };
+/// The same file with a changed header, in the order of names: the library writes metadata in the order of a hash map,
+/// and equal weights should give equal files. `file` was read or written by the library: its length and header are valid.
+pub(super) fn with_header(
+    file: &[u8],
+    change: impl FnOnce(&mut BTreeMap<String, Value>),
+) -> Result<Vec<u8>, serde_json::Error> {
+    let length: [u8; 8] = std::array::from_fn(|byte| file.get(byte).copied().unwrap_or(0));
+    let (header, data) = file[8..].split_at(u64::from_le_bytes(length) as usize);
+    let mut entries = serde_json::from_slice(header)?;
+    change(&mut entries);
+    entries.values_mut().for_each(Value::sort_all_objects);
+    let mut header = serde_json::to_vec(&entries)?;
     // Tensor data begin at a multiple of eight.
     header.resize(header.len().next_multiple_of(8), b' ');
-    [
-        &(header.len() as u64).to_le_bytes(),
-        header.as_slice(),
-        data,
-    ]
-    .concat()
+    let length = (header.len() as u64).to_le_bytes();
+    Ok([&length, header.as_slice(), data].concat())
 }
 
-struct Stored {
+/// A tensor as it is in a file.
+pub(crate) struct Stored {
     name: String,
     dtype: Dtype,
     shape: Vec<usize>,
     bytes: Vec<u8>,
 }
 
-fn store(
-    path: &Path,
-    name: String,
-    variable: &Tensor,
-    precision: Precision,
-) -> Result<Stored, FileError> {
-    let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
-    let values = values(variable).map_err(|error| {
-        FileError::new(
-            path,
-            format_args!("tensor {name:?}: {}", first_line(&error)),
-        )
-    })?;
-    check_finite(path, &name, &values)?;
-    let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
-    let (dtype, bytes) = if precision == Precision::Half && shape.len() > 1 && fits {
-        (
-            Dtype::F16,
-            values
-                .iter()
-                .flat_map(|&value| f16::from_f32(value).to_le_bytes())
-                .collect(),
-        )
-    } else {
-        (
-            Dtype::F32,
-            values
-                .iter()
-                .flat_map(|value| value.to_le_bytes())
-                .collect(),
-        )
-    };
-    Ok(Stored {
-        name,
-        dtype,
-        shape,
-        bytes,
-    })
+impl Stored {
+    /// The `values` of a tensor as `dtype`: `f16` or `f32`.
+    pub(crate) fn new(name: String, tensor: &Tensor, values: &[f32], dtype: Dtype) -> Self {
+        let half = |&value: &f32| f16::from_f32(value).to_le_bytes();
+        let single = |value: &f32| value.to_le_bytes();
+        Self {
+            name,
+            dtype,
+            shape: tensor.size().iter().map(|&size| size as usize).collect(),
+            bytes: match dtype {
+                Dtype::F16 => values.iter().flat_map(half).collect(),
+                _ => values.iter().flat_map(single).collect(),
+            },
+        }
+    }
+}
+
+/// The file of some tensors with texts in its header.
+pub(crate) fn file_bytes(
+    tensors: &[Stored],
+    header: HashMap<String, String>,
+) -> Result<Vec<u8>, SafeTensorError> {
+    let mut views = Vec::new();
+    for stored in tensors {
+        let view = TensorView::new(stored.dtype, stored.shape.clone(), &stored.bytes)?;
+        views.push((&stored.name, view));
+    }
+    safetensors::serialize(views, Some(header))
 }

@@ -19,9 +19,40 @@ use support::file_error::AtFile;
 /// zstd level of a message: more costs time and saves nothing.
 const ZSTD_LEVEL: i32 = 1;
 
+/// Frozen encoder of one thread, built on first use; a clone builds its own.
+#[derive(Debug)]
+pub(super) struct ThreadEncoder {
+    weights: Arc<Weights>,
+    detector: Option<Detector>,
+}
+
+impl Clone for ThreadEncoder {
+    fn clone(&self) -> Self {
+        Self::new(Arc::clone(&self.weights))
+    }
+}
+
+impl ThreadEncoder {
+    pub(super) fn new(weights: Arc<Weights>) -> Self {
+        let detector = None;
+        Self { weights, detector }
+    }
+
+    /// The network of this thread.
+    pub(super) fn detector(&mut self) -> Result<&mut Detector, Error> {
+        if let Some(ref mut detector) = self.detector {
+            return Ok(detector);
+        }
+        let config = self.weights.detector_config()?;
+        let detector = Detector::from_weights(&self.weights, &config, Device::Cpu)?;
+        Ok(self.detector.insert(detector))
+    }
+}
+
 /// Encoder of the sweeps of some scenarios.
+#[derive(Clone)]
 pub(super) struct SweepEncoder {
-    pub(super) weights: Arc<Weights>,
+    pub(super) encoder: ThreadEncoder,
     pub(super) scenarios: Arc<[Scenario]>,
     /// Index of each scenario's first sweep, and of the end.
     pub(super) first: Arc<[usize]>,
@@ -29,22 +60,6 @@ pub(super) struct SweepEncoder {
     pub(super) dtype: Dtype,
     /// The store, for messages of errors.
     pub(super) path: PathBuf,
-    /// Network of this thread, once there is one.
-    pub(super) detector: Option<Detector>,
-}
-
-impl Clone for SweepEncoder {
-    /// The network is built anew where it is needed: every thread has its own.
-    fn clone(&self) -> Self {
-        Self {
-            weights: Arc::clone(&self.weights),
-            scenarios: Arc::clone(&self.scenarios),
-            first: Arc::clone(&self.first),
-            dtype: self.dtype,
-            path: self.path.clone(),
-            detector: None,
-        }
-    }
 }
 
 impl SweepEncoder {
@@ -60,14 +75,7 @@ impl SweepEncoder {
         let Ok(frame) = of.load(agent, tick, &LoadOptions::default()) else {
             return Ok(Vec::new());
         };
-        let detector = match &mut self.detector {
-            Some(detector) => detector,
-            None => {
-                let config = self.weights.detector_config()?;
-                self.detector
-                    .insert(Detector::from_weights(&self.weights, &config, Device::Cpu)?)
-            }
-        };
+        let detector = self.encoder.detector()?;
         let map = match detector.encode_sweep(&frame.points) {
             Ok(encoded) => encoded.features,
             // The error comes again where the map is needed.
@@ -77,9 +85,7 @@ impl SweepEncoder {
         let kept = detector.to_kept(&map)?;
         self.packed(kept)
     }
-}
 
-impl SweepEncoder {
     fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, Error> {
         let codec = CodecConfig {
             dtype: self.dtype,

@@ -169,25 +169,22 @@ impl SampleBuilder {
     /// [`Error`] when a file is missing or malformed, or a vehicle has no pose.
     pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, Error> {
         let frames = self.scenes.annotations(tick);
-        let present: Vec<usize> = (0..frames.len())
-            .filter(|&agent| frames[agent].is_some())
-            .collect();
+        let present = (0..frames.len()).filter(|&agent| frames[agent].is_some());
+        let present: Vec<usize> = present.collect();
         if present.is_empty() {
-            return Err(Error::Data(format!(
-                "no readable frame at tick {} of scenario {}",
-                tick.tick,
-                self.scenes.scenario(tick).name
-            )));
+            let (tick, scenario) = (tick.tick, &self.scenes.scenario(tick).name);
+            let problem = format!("no readable frame at tick {tick} of scenario {scenario}");
+            return Err(Error::Data(problem));
         }
         let ego = present[rng.random_range(0..present.len())];
         let agents = self.choose_agents(tick, &frames, ego, rng)?;
         let single = self.config.kind == SampleKind::Single;
-        let annotators = if single && !self.config.merged_truth {
-            &agents[..1]
-        } else {
-            &agents[..]
+        let viewers = if single { &agents[..1] } else { &agents[..] };
+        let annotators = match self.config.merged_truth {
+            true => &agents[..],
+            false => viewers,
         };
-        let entries = self.entries(tick, if single { &agents[..1] } else { &agents[..] }, rng)?;
+        let entries = self.entries(tick, viewers, rng)?;
         let scene = self.config.augmentation.scene(rng);
         let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
         let truth = self.truth(&frames, annotators, &changes[0]);
@@ -204,7 +201,8 @@ impl SampleBuilder {
                 SampleViews::Maps(Tensor::f_cat(&maps, 0)?)
             }
             None => {
-                SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?)
+                let pillars = self.pillars(tick.scenario, &entries, &changes, &mut facts)?;
+                SampleViews::Pillars(pillars)
             }
         };
         Ok(Sample {
@@ -230,25 +228,15 @@ impl SampleBuilder {
         let (mut newest, mut older) = (Vec::new(), Vec::new());
         for (index, &agent) in agents.iter().enumerate() {
             let is_ego = index == 0;
-            let last = if is_ego {
-                now.tick
-            } else {
-                self.config.moments.draw_newest(ticks, now.tick, rng)
+            let last = match is_ego {
+                true => now.tick,
+                false => self.config.moments.draw_newest(ticks, now.tick, rng),
             };
             let place = newest.len();
-            for (step, tick) in self
-                .config
-                .moments
-                .steps(ticks, now.tick, last, gap)
-                .into_iter()
-                .enumerate()
-            {
-                let [found, pose] = self.pose_at(
-                    TickRef { tick, ..now },
-                    agent,
-                    [index, agents.len()],
-                    &error,
-                )?;
+            let steps = self.config.moments.steps(ticks, now.tick, last, gap);
+            for (step, tick) in steps.into_iter().enumerate() {
+                let at = TickRef { tick, ..now };
+                let [found, pose] = self.pose_at(at, agent, [index, agents.len()], &error)?;
                 let PoseEstimate::Pose {
                     world_from_cav,
                     confidence,
@@ -260,23 +248,19 @@ impl SampleBuilder {
                         _ => continue,
                     }
                 };
-                let age_secs =
-                    (ticks[now.tick].capture_nanos - ticks[tick].capture_nanos) as f64 * 1e-9;
-                let found = found.world_from_cav().copied().unwrap_or(world_from_cav);
-                let confidence = f64::from(confidence);
+                let age_nanos = ticks[now.tick].capture_nanos - ticks[tick].capture_nanos;
                 let entry = Entry {
                     agent,
                     place,
                     tick,
                     world_from_cav,
-                    found,
-                    confidence,
-                    age_secs,
+                    found: found.world_from_cav().copied().unwrap_or(world_from_cav),
+                    confidence: f64::from(confidence),
+                    age_secs: age_nanos as f64 * 1e-9,
                 };
-                if step == 0 {
-                    newest.push(entry)
-                } else {
-                    older.push(entry)
+                match step {
+                    0 => newest.push(entry),
+                    _ => older.push(entry),
                 }
             }
             if is_ego && newest.is_empty() {
@@ -312,14 +296,10 @@ impl SampleBuilder {
             };
             return Ok([absent; 2]);
         };
-        let found = self
-            .config
-            .poses
-            .found(&self.scenes.scenario(tick).name, frame)?;
-        Ok([
-            found,
-            error.added(found, &frame.cav, frame.capture_nanos, place),
-        ])
+        let scenario = &self.scenes.scenario(tick).name;
+        let found = self.config.poses.found(scenario, frame)?;
+        let moved = error.added(found, &frame.cav, frame.capture_nanos, place);
+        Ok([found, moved])
     }
 
     /// The pillars of all views; of one view where all points are merged.
@@ -332,13 +312,8 @@ impl SampleBuilder {
     ) -> Result<Vec<Pillars>, Error> {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
-            let points = self.scenes.points(
-                TickRef {
-                    scenario,
-                    tick: entry.tick,
-                },
-                entry.agent,
-            )?;
+            let tick = entry.tick;
+            let points = (self.scenes).points(TickRef { scenario, tick }, entry.agent)?;
             // Hits on the vehicle that carries the LiDAR are removed before any rotation.
             let mut points = self.crop.without_own_body(&points);
             change.points(&mut points.xyzi);
@@ -349,10 +324,9 @@ impl SampleBuilder {
             clouds = vec![merge_points(&clouds, &poses)];
             facts.truncate(1);
         }
-        Ok(clouds
-            .iter()
-            .map(|cloud| self.voxeliser.voxelise(&cloud.xyzi))
-            .collect())
+        let pillars = clouds.iter();
+        let pillars = pillars.map(|cloud| self.voxeliser.voxelise(&cloud.xyzi));
+        Ok(pillars.collect())
     }
 
     /// The ego, then the neighbours in range that are not dropped.
@@ -368,11 +342,8 @@ impl SampleBuilder {
             return Ok(agents);
         };
         let [ego_x, ego_y, _] = self.world_from_lidar(tick, ego_frame)?.translation_m;
-        for (agent, frame) in frames
-            .iter()
-            .enumerate()
-            .filter_map(|(agent, frame)| Some((agent, frame.as_ref()?)))
-        {
+        for (agent, frame) in frames.iter().enumerate() {
+            let Some(frame) = frame else { continue };
             let [x, y, _] = self.world_from_lidar(tick, frame)?.translation_m;
             let in_reach = (x - ego_x).hypot(y - ego_y) <= self.config.comm_range_m;
             let dropped = rng.random_bool(self.config.drop_neighbour);
@@ -384,10 +355,8 @@ impl SampleBuilder {
     }
 
     fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose, Error> {
-        let scenario = &self.scenes.scenario(tick).name;
-        frame
-            .world_from_lidar
-            .ok_or_else(|| without_pose(scenario, frame))
+        let missing = || without_pose(&self.scenes.scenario(tick).name, frame);
+        frame.world_from_lidar.ok_or_else(missing)
     }
 
     /// Objects annotated by `annotators`, the ego first, in the changed ego frame; those that count are on the BEV grid.
@@ -406,10 +375,8 @@ impl SampleBuilder {
             min_corners: 8,
             classes: self.config.classes,
         };
-        let views: Vec<&Frame> = annotators
-            .iter()
-            .filter_map(|&agent| frames[agent].as_ref())
-            .collect();
+        let views = annotators.iter();
+        let views: Vec<&Frame> = views.filter_map(|&agent| frames[agent].as_ref()).collect();
         let mut truth = GroundTruth::of_tick(&views, 0, &rule);
         for object in truth.objects.iter_mut().chain(&mut truth.ignored) {
             object.box3d = ego_view.box3d(&object.box3d);
@@ -429,23 +396,15 @@ fn metadata(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Ve
         changes[0].pose(&ego.from_world(cav), change)
     };
     let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
-        let Entry {
-            place: agent,
-            confidence,
-            age_secs,
-            ..
-        } = *entry;
         let ego_from_cav = relative(&entries[0].world_from_cav, &entry.world_from_cav, change);
         let real = relative(&entries[0].found, &entry.found, change);
-        (
-            MapMetadata {
-                agent,
-                ego_from_cav,
-                confidence,
-                age_secs,
-            },
-            Offset::between(&ego_from_cav, &real),
-        )
+        let facts = MapMetadata {
+            agent: entry.place,
+            ego_from_cav,
+            confidence: entry.confidence,
+            age_secs: entry.age_secs,
+        };
+        (facts, Offset::between(&ego_from_cav, &real))
     };
     entries.iter().zip(changes).map(of_entry).unzip()
 }

@@ -33,15 +33,10 @@ impl SamplePoses {
     /// # Errors
     /// [`PoseSourceError`] names the field.
     pub fn validate(&self) -> Result<(), PoseSourceError> {
-        for (field, value) in [
-            ("noise_share", self.noise_share),
-            ("lost_share", self.lost_share),
-        ] {
-            within(field, value, 0.0, 1.0)?;
-        }
-        self.noise
-            .as_ref()
-            .map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
+        within("noise_share", self.noise_share, 0.0, 1.0)?;
+        within("lost_share", self.lost_share, 0.0, 1.0)?;
+        self.noise.as_ref().map(NoisyPose::new).transpose()?;
+        Ok(())
     }
 
     /// The same without an added error.
@@ -56,41 +51,30 @@ impl SamplePoses {
     /// Draws the error of one sample.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, Error> {
         // One draw fewer where the share is all or nothing: earlier samples stay the same.
-        let lost =
-            (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
+        let is_lost = self.lost_share > 0.0 && rng.random_bool(self.lost_share);
+        let lost = is_lost.then(|| Lost::draw(rng));
         let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
         let seed = rng.random();
-        let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else {
-            return Ok(DrawnError {
-                lost,
-                ..DrawnError::default()
-            });
-        };
-        let spares_ego = noise.mode.spares_ego();
-        let noise = NoisyPose::new(&NoisyPoseConfig {
-            seed,
-            ..noise.clone()
-        })?;
-        Ok(DrawnError {
-            noise: Some(noise),
-            spares_ego,
+        let mut drawn = DrawnError {
             lost,
-        })
+            ..DrawnError::default()
+        };
+        if let (Some(noise), true) = (self.noise.clone(), is_noisy) {
+            drawn.spares_ego = noise.mode.spares_ego();
+            drawn.noise = Some(NoisyPose::new(&NoisyPoseConfig { seed, ..noise })?);
+        }
+        Ok(drawn)
     }
 
     /// Pose of a vehicle without the added error.
     pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, Error> {
         let missing = || without_pose(scenario, frame);
         if self.tables.is_empty() {
-            return Ok(PoseEstimate::new(
-                frame.world_from_lidar.ok_or_else(missing)?,
-                1.0,
-            ));
+            let pose = frame.world_from_lidar.ok_or_else(missing)?;
+            return Ok(PoseEstimate::new(pose, 1.0));
         }
-        let found = self
-            .tables
-            .iter()
-            .find_map(|table| table.get(scenario, &frame.cav, frame.capture_nanos));
+        let (cav, nanos) = (&frame.cav, frame.capture_nanos);
+        let found = (self.tables.iter()).find_map(|table| table.get(scenario, cav, nanos));
         found.copied().ok_or_else(missing)
     }
 }
@@ -129,15 +113,12 @@ struct Lost {
 
 impl Lost {
     fn draw(rng: &mut impl Rng) -> Self {
-        let (distance_m, (sin, cos)) = (
-            rng.random_range(LOST_M),
-            rng.random_range(0.0..TAU).sin_cos(),
-        );
+        let distance_m = rng.random_range(LOST_M);
+        let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         // Half of them have the right heading.
-        let turn_rad = if rng.random_bool(0.5) {
-            rng.random_range(-PI..PI)
-        } else {
-            0.0
+        let turn_rad = match rng.random_bool(0.5) {
+            true => rng.random_range(-PI..PI),
+            false => 0.0,
         };
         Self {
             draw: rng.random_range(0..usize::MAX),
@@ -160,24 +141,15 @@ impl DrawnError {
     ) -> PoseEstimate {
         let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
         let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
-        match (self.lost.as_ref().filter(is_lost), noisy) {
-            (
-                Some(lost),
-                PoseEstimate::Pose {
-                    world_from_cav,
-                    confidence,
-                    ..
-                },
-            ) => {
-                let [x, y, z] = world_from_cav.translation_m;
-                let shifted = [x + lost.shift_m[0], y + lost.shift_m[1], z];
-                PoseEstimate::new(
-                    Pose::from_xyz_yaw(shifted, world_from_cav.yaw_rad() + lost.turn_rad),
-                    confidence,
-                )
-            }
-            _ => noisy,
-        }
+        let (Some(lost), Some((pose, confidence))) =
+            (self.lost.as_ref().filter(is_lost), known(&noisy))
+        else {
+            return noisy;
+        };
+        let ([x, y, z], [shift_x, shift_y]) = (pose.translation_m, lost.shift_m);
+        let heading_rad = pose.yaw_rad() + lost.turn_rad;
+        let pose = Pose::from_xyz_yaw([x + shift_x, y + shift_y, z], heading_rad);
+        PoseEstimate::new(pose, confidence)
     }
 
     fn noisy(
@@ -187,36 +159,35 @@ impl DrawnError {
         capture_nanos: u64,
         is_ego: bool,
     ) -> PoseEstimate {
-        let (
-            Some(noise),
-            PoseEstimate::Pose {
-                world_from_cav,
-                confidence,
-                ..
-            },
-        ) = (&self.noise, found)
-        else {
+        let (Some(noise), Some((pose, confidence))) = (&self.noise, known(&found)) else {
             return found;
         };
         if is_ego && self.spares_ego {
             return found;
         }
-        match noise.disturbed(cav, capture_nanos, &world_from_cav) {
-            PoseEstimate::Pose {
-                world_from_cav,
-                confidence: of_error,
-                ..
-            } => PoseEstimate::new(world_from_cav, confidence * of_error),
-            none @ PoseEstimate::NoPose { .. } => none,
+        let noisy = noise.disturbed(cav, capture_nanos, &pose);
+        match known(&noisy) {
+            Some((pose, of_error)) => PoseEstimate::new(pose, confidence * of_error),
+            None => noisy,
         }
+    }
+}
+
+/// Pose and confidence of an estimate.
+fn known(estimate: &PoseEstimate) -> Option<(Pose, f32)> {
+    match *estimate {
+        PoseEstimate::Pose {
+            world_from_cav,
+            confidence,
+            ..
+        } => Some((world_from_cav, confidence)),
+        PoseEstimate::NoPose { .. } => None,
     }
 }
 
 /// The error of a frame without a pose, whose view cannot be aligned.
 pub(super) fn without_pose(scenario: &str, frame: &Frame) -> Error {
-    let Frame {
-        cav, capture_nanos, ..
-    } = frame;
+    let (cav, capture_nanos) = (&frame.cav, frame.capture_nanos);
     Error::Data(format!(
         "scenario {scenario}, {capture_nanos} ns: agent {cav} has no pose"
     ))

@@ -53,23 +53,15 @@ impl SceneSet {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
             let dataset = dataset::open_with(folder, options)?;
-            findings::note(&findings::sampled(
-                &dataset.scenarios,
-                options.intensity_scale,
-            ));
-            let protocol = protocol
-                .resolve(dataset.layout)
-                .map_err(|error| Error::Data(format!("evaluation protocol: {error}")))?;
+            let sampled = findings::sampled(&dataset.scenarios, options.intensity_scale);
+            findings::note(&sampled);
+            let protocol = protocol.resolve(dataset.layout);
             let protocol = EvaluationProtocol {
                 max_agents: usize::MAX,
-                ..protocol
+                ..protocol.map_err(|error| Error::Data(format!("evaluation protocol: {error}")))?
             };
-            scenarios.extend(
-                dataset
-                    .scenarios
-                    .iter()
-                    .filter_map(|scenario| protocol.arrange(scenario)),
-            );
+            let found = dataset.scenarios.iter();
+            scenarios.extend(found.filter_map(|scenario| protocol.arrange(scenario)));
             problems.extend(dataset.problems.iter().map(ToString::to_string));
         }
         let set = Self {
@@ -77,21 +69,18 @@ impl SceneSet {
             ..Self::new(scenarios)
         };
         if set.ticks.is_empty() {
-            return Err(Error::Data(format!(
-                "no tick of any scenario in {folders:?}"
-            )));
+            let problem = format!("no tick of any scenario in {folders:?}");
+            return Err(Error::Data(problem));
         }
         Ok(set)
     }
 
     /// A set of scenarios that are open already.
     pub fn new(scenarios: Vec<Scenario>) -> Self {
-        let of_scenario = |(scenario, found): (usize, &Scenario)| {
-            (0..found.ticks.len())
-                .map(move |tick| TickRef { scenario, tick })
-                .collect::<Vec<_>>()
-        };
-        let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
+        let mut ticks = Vec::new();
+        for (scenario, found) in scenarios.iter().enumerate() {
+            ticks.extend((0..found.ticks.len()).map(|tick| TickRef { scenario, tick }));
+        }
         Self {
             scenarios,
             ticks,
@@ -120,8 +109,8 @@ impl SceneSet {
     /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; `None` for
     /// those that are absent or whose file cannot be read.
     pub fn annotations(&self, tick: TickRef) -> Arc<Vec<Option<Frame>>> {
-        let known = |set: &Self| lock(&set.known).get(&tick).cloned();
-        if let Some(frames) = known(self) {
+        let known = lock(&self.known).get(&tick).cloned();
+        if let Some(frames) = known {
             return frames;
         }
         let options = LoadOptions {
@@ -132,16 +121,12 @@ impl SceneSet {
         let loaded = scenario.load_tick(tick.tick, 0..scenario.agents.len(), &options);
         let mut frames: Vec<Option<Frame>> = scenario.agents.iter().map(|_| None).collect();
         for (agent, frame) in loaded.frames {
-            lock(&self.unreadable)
-                .extend(frame.problems.iter().map(|problem| problem.message.clone()));
+            let problems = frame.problems.iter().map(|problem| problem.message.clone());
+            lock(&self.unreadable).extend(problems);
             frames[agent] = Some(frame);
         }
-        lock(&self.unreadable).extend(
-            loaded
-                .unreadable
-                .into_iter()
-                .map(|(_, problem)| problem.message),
-        );
+        let problems = loaded.unreadable.into_iter();
+        lock(&self.unreadable).extend(problems.map(|(_, problem)| problem.message));
         let frames = Arc::new(frames);
         lock(&self.known).insert(tick, Arc::clone(&frames));
         frames
@@ -152,26 +137,17 @@ impl SceneSet {
     /// # Errors
     /// [`Error::Read`] when a file is missing or malformed.
     pub fn points(&self, tick: TickRef, agent: usize) -> Result<PointCloud, Error> {
-        Ok(self
-            .scenario(tick)
-            .load(agent, tick.tick, &LoadOptions::default())?
-            .points)
+        let options = LoadOptions::default();
+        Ok(self.scenario(tick).load(agent, tick.tick, &options)?.points)
     }
 
     /// Identification of the data, and their problems.
     pub fn data(&self) -> DataListing {
-        let sha256 = self
-            .sha256
-            .get_or_init(|| dataset::content_sha256(&self.scenarios, None, &FileDigests::default()))
-            .clone();
-        let problems = self
-            .problems
-            .iter()
-            .chain(lock(&self.unreadable).iter())
-            .cloned()
-            .collect();
+        let sha256 = || dataset::content_sha256(&self.scenarios, None, &FileDigests::default());
+        let mut problems = self.problems.clone();
+        problems.extend(lock(&self.unreadable).iter().cloned());
         DataListing {
-            sha256,
+            sha256: self.sha256.get_or_init(sha256).clone(),
             problems,
             without_pose: 0,
         }

@@ -5,7 +5,7 @@ use perception::train::ModelCard;
 use super::config::TrainConfig;
 use super::frozen::sample_config;
 use super::observer::Summary;
-use crate::samples::{SampleConfig, SceneSet};
+use crate::samples::SceneSet;
 use fusion::model::CooperativeModel;
 
 /// The card of a detector.
@@ -15,7 +15,7 @@ pub(super) fn card(
     scenes: &SceneSet,
     summary: &Summary,
 ) -> ModelCard {
-    let (detector, method) = (model.config(), model.method);
+    let (detector, method, run) = (model.config(), model.method, &config.run);
     let mut card = ModelCard::new(
         &format!("{} detector, method `{method}`", detector.name),
         &format!(
@@ -24,73 +24,46 @@ pub(super) fn card(
             method.summary()
         ),
     );
-    let data = format!(
-        "{} ticks of {} scenarios",
-        scenes.ticks().len(),
-        scenes.scenarios().len()
-    );
-    let run = &config.run;
+    let (ticks, scenarios) = (scenes.ticks().len(), scenes.scenarios().len());
+    let data = format!("{ticks} ticks of {scenarios} scenarios");
     card.trained(run, &summary.trained, &data, "samples");
-    card.row(
-        "peak learning rate",
-        format_args!(
-            "{:e}, weight decay {:e}",
-            run.learning_rate, run.optimizer.weight_decay
-        ),
-    );
-    card.row(
-        "anchors between the thresholds",
-        format_args!("{:?}", config.loss.unassigned),
-    );
+    let (rate, decay) = (run.learning_rate, run.optimizer.weight_decay);
+    let rate = format!("{rate:e}, weight decay {decay:e}");
+    card.row("peak learning rate", rate);
+    let unassigned = format!("{:?}", config.loss.unassigned);
+    card.row("anchors between the thresholds", unassigned);
     let samples = sample_config(config, model);
-    let SampleConfig {
-        augmentation,
-        drop_neighbour,
-        poses,
-        moments,
-        max_agents,
-        comm_range_m,
-        merged_truth,
-        ..
-    } = &samples;
+    let (poses, comm_range_m) = (&samples.poses, samples.comm_range_m);
     card.row(
         "augmentation",
         format_args!(
             "mirrored {:.0} %, turned up to {:.0} degrees, scaled up to {:.0} %",
-            100.0 * augmentation.mirror,
-            augmentation.turn_rad.to_degrees(),
-            100.0 * augmentation.scale
+            100.0 * samples.augmentation.mirror,
+            samples.augmentation.turn_rad.to_degrees(),
+            100.0 * samples.augmentation.scale
         ),
     );
     card.row(
         "vehicles",
         format_args!(
-            "up to {max_agents} within {comm_range_m} m, each neighbour missing in {:.0} % and up to {:.1} s late",
-            100.0 * drop_neighbour,
-            moments.max_delay_nanos as f64 * 1e-9
+            "up to {} within {comm_range_m} m, each neighbour missing in {:.0} % and up to {:.1} s late",
+            samples.max_agents,
+            100.0 * samples.drop_neighbour,
+            samples.moments.max_delay_nanos as f64 * 1e-9
         ),
     );
-    if *merged_truth {
-        card.row(
-            "ego-only",
-            "samples of one vehicle, its neighbours' annotations are targets too",
-        );
+    if samples.merged_truth {
+        let text = "samples of one vehicle, its neighbours' annotations are targets too";
+        card.row("ego-only", text);
     }
-    card.row(
-        "moments",
-        format_args!(
-            "{} frames of each vehicle, up to {} ticks from one to the next",
-            moments.frames, moments.gap
-        ),
-    );
-    card.row(
-        "poses",
-        if poses.tables.is_empty() {
-            "true"
-        } else {
-            "found by a pose generator"
-        },
-    );
+    let (frames, gap) = (samples.moments.frames, samples.moments.gap);
+    let text = format!("{frames} frames of each vehicle, up to {gap} ticks from one to the next");
+    card.row("moments", text);
+    let source = match poses.tables.is_empty() {
+        true => "true",
+        false => "found by a pose generator",
+    };
+    card.row("poses", source);
     if let Some(noise) = &poses.noise {
         card.row(
             "error on top of poses",
@@ -105,19 +78,14 @@ pub(super) fn card(
     }
     if poses.lost_share > 0.0 {
         let share = 100.0 * poses.lost_share;
-        card.row(
-            "lost vehicles",
-            format_args!(
-                "one neighbour in {share:.0} % of the samples, overconfident in a wrong pose"
-            ),
-        );
+        let text =
+            format!("one neighbour in {share:.0} % of the samples, overconfident in a wrong pose");
+        card.row("lost vehicles", text);
     }
     if config.loss.alignment_weight > 0.0 {
         let weight = config.loss.alignment_weight;
-        card.row(
-            "alignment",
-            format_args!("learns to undo that error, loss with weight {weight}"),
-        );
+        let text = format!("learns to undo that error, loss with weight {weight}");
+        card.row("alignment", text);
     }
     if config.frozen_encoder.is_some() {
         card.row("encoder", "frozen, its maps kept");

@@ -26,20 +26,16 @@ impl DetectorCurve {
     }
 
     pub(super) fn step(&mut self, report: &StepReport) -> Result<(), FileError> {
-        let StepReport {
-            step,
-            epoch,
-            seconds,
-            learning_rate,
-            score_loss,
-            box_loss,
-            samples_per_second,
-            waiting,
-            ..
-        } = *report;
-        let loss = score_loss + box_loss;
+        let (score_loss, box_loss) = (report.score_loss, report.box_loss);
         self.0.row(&format!(
-            "{step},{epoch:.3},{seconds:.1},{learning_rate:.3e},{loss:.5},{score_loss:.5},{box_loss:.5},{samples_per_second:.2},{waiting:.3},,,"
+            "{},{:.3},{:.1},{:.3e},{:.5},{score_loss:.5},{box_loss:.5},{:.2},{:.3},,,",
+            report.step,
+            report.epoch,
+            report.seconds,
+            report.learning_rate,
+            score_loss + box_loss,
+            report.samples_per_second,
+            report.waiting
         ))
     }
 
@@ -67,16 +63,16 @@ impl DetectorCurve {
 }
 
 fn charts(title: &str, csv: &str) -> Vec<Chart> {
-    let series = |name: &str, points, mark| Series {
+    let loss = |name: &str, column: &str| Series {
         name: name.into(),
-        points,
-        mark,
+        points: smooth(&column_over_steps(csv, column)),
+        mark: Mark::Line,
     };
-    let loss = |name: &str, column: &str| {
-        series(name, smooth(&column_over_steps(csv, column)), Mark::Line)
+    let accuracy = |name: &str, column: &str| Series {
+        name: name.into(),
+        points: column_over_steps(csv, column),
+        mark: Mark::LineAndDots,
     };
-    let accuracy =
-        |name: &str, column: &str| series(name, column_over_steps(csv, column), Mark::LineAndDots);
     let losses = vec![
         loss("sum", "loss"),
         loss("classes", "score_loss"),
@@ -87,27 +83,21 @@ fn charts(title: &str, csv: &str) -> Vec<Chart> {
         accuracy("0.5", "ap_50"),
         accuracy("0.7", "ap_70"),
     ];
-    let steps = column_over_steps(csv, "step")
-        .iter()
-        .map(|point| point.1)
-        .fold(1.0, f64::max);
-    let highest = losses
-        .iter()
-        .flat_map(|series| &series.points)
-        .map(|point| point.1)
-        .fold(0.1, f64::max);
+    let highest = |least, points: &mut dyn Iterator<Item = &(f64, f64)>| {
+        points.map(|point| point.1).fold(least, f64::max)
+    };
+    let steps = highest(1.0, &mut column_over_steps(csv, "step").iter());
+    let most = highest(0.1, &mut losses.iter().flat_map(|series| &series.points));
     let over_steps = |y: Axis, series| Chart {
         title: title.into(),
         x: Axis::linear("step", [0.0, steps]),
         y,
         series,
     };
-    let mut charts = vec![over_steps(Axis::linear("loss", [0.0, highest]), losses)];
+    let mut charts = vec![over_steps(Axis::linear("loss", [0.0, most]), losses)];
     if accuracies.iter().any(|series| !series.points.is_empty()) {
-        charts.push(over_steps(
-            Axis::linear("validation AP at IoU", [0.0, 1.0]),
-            accuracies,
-        ));
+        let axis = Axis::linear("validation AP at IoU", [0.0, 1.0]);
+        charts.push(over_steps(axis, accuracies));
     }
     charts
 }
@@ -126,21 +116,16 @@ fn column_over_steps(csv: &str, column: &str) -> Vec<(f64, f64)> {
 
 /// Means over so many neighbours that about [`SMOOTH_POINTS`] points are left.
 fn smooth(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
-    let finite: Vec<(f64, f64)> = points
-        .iter()
-        .copied()
+    let finite: Vec<_> = (points.iter().copied())
         .filter(|point| point.1.is_finite())
         .collect();
     let mean = |few: &[(f64, f64)]| {
-        let [x, y] = few
-            .iter()
-            .fold([0.0; 2], |sum, point| [sum[0] + point.0, sum[1] + point.1]);
+        let sum = |[x, y]: [f64; 2], point: &(f64, f64)| [x + point.0, y + point.1];
+        let [x, y] = few.iter().fold([0.0; 2], sum);
         (x / few.len() as f64, y / few.len() as f64)
     };
-    finite
-        .chunks(finite.len().div_ceil(SMOOTH_POINTS).max(1))
-        .map(mean)
-        .collect()
+    let size = finite.len().div_ceil(SMOOTH_POINTS).max(1);
+    finite.chunks(size).map(mean).collect()
 }
 
 #[cfg(test)]

@@ -13,8 +13,10 @@ mod validation;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use perception::train::{ComputePrecision, Trainer};
+use perception::train::{ComputePrecision, Prefetch, SaveEvery, Task, Trainer};
 use perception::weights::Weights;
+use tch::Tensor;
+use tch::nn::VarStore;
 
 pub use accuracy::Accuracy;
 pub use config::TrainConfig;
@@ -23,19 +25,19 @@ pub(crate) use validation::Validator;
 
 use self::curve::DetectorCurve;
 use crate::Error;
-use crate::loss::{LabelTensors, alignment_loss, detection_loss};
+use crate::loss::{LabelTensors, Loss, alignment_loss, detection_loss};
 use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleKind, SceneSet, batches};
 use fusion::method::{Exchange, Method};
 use fusion::model::{CooperativeModel, ModelError};
 
-/// Steps between two readings of the loss: reading waits for the device.
-const READ_EVERY: u64 = 10;
 /// Trains a method and writes checkpoint, curve (CSV and PNG), weights and model card into `config.run.out`.
 ///
 /// # Errors
 /// [`Error`]; the last checkpoint stays.
 pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary, Error> {
-    Training::prepare(config, observer)?.run(observer)
+    let (mut training, mut trainer) = Training::prepare(config, observer)?;
+    trainer.run(&mut training, SaveEvery::Steps(config.validate_every))?;
+    training.finish(&trainer)
 }
 
 /// The views that a method is trained on; `is_frozen`: its encoder is frozen, `is_ego_only`: ego-only training.
@@ -52,37 +54,36 @@ fn sample_kind(method: Method, is_frozen: bool, is_ego_only: bool) -> Result<Sam
 
 /// The initial model of a training.
 fn first_model(config: &TrainConfig) -> Result<CooperativeModel, Error> {
-    let TrainConfig {
-        method,
-        run,
-        fusion,
-        ..
-    } = config;
-    Ok(match (&config.init, fusion) {
+    let (detector, method, device) = (&config.detector, config.method, config.run.device);
+    Ok(match (&config.init, &config.fusion) {
         (Some(path), fusion) => {
             let weights = Weights::load(path).map_err(ModelError::from)?;
-            CooperativeModel::from_weights(&weights, Some(*method), fusion.as_ref(), run.device)?
+            CooperativeModel::from_weights(&weights, Some(method), fusion.as_ref(), device)?
         }
-        (None, Some(fusion)) => {
-            CooperativeModel::with_fusion(&config.detector, *method, fusion, run.device)?
-        }
-        (None, None) => CooperativeModel::new(&config.detector, *method, run.device)?,
+        (None, Some(fusion)) => CooperativeModel::with_fusion(detector, method, fusion, device)?,
+        (None, None) => CooperativeModel::new(detector, method, device)?,
     })
 }
 
 struct Training<'a> {
     config: &'a TrainConfig,
+    observer: &'a mut dyn Observer,
     model: CooperativeModel,
-    trainer: Trainer,
     scenes: Arc<SceneSet>,
-    builder: SampleBuilder,
+    loader: Prefetch<Result<Batch, Error>>,
     validator: Option<Validator>,
     curve: DetectorCurve,
+    /// Terms of the loss of the step in progress.
+    terms: Option<Loss>,
+    window: Window,
     accuracy: Option<Accuracy>,
 }
 
 impl<'a> Training<'a> {
-    fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, Error> {
+    fn prepare(
+        config: &'a TrainConfig,
+        observer: &'a mut dyn Observer,
+    ) -> Result<(Self, Trainer), Error> {
         let kind = sample_kind(
             config.method,
             config.frozen_encoder.is_some(),
@@ -98,190 +99,144 @@ impl<'a> Training<'a> {
         };
         samples.poses.validate()?;
         model.set_precision(run.precision);
-        let scenes = Arc::new(SceneSet::open(
-            &config.data,
-            &config.open,
-            &config.protocol,
-        )?);
+        let open = |folders| SceneSet::open(folders, &config.open, &config.protocol);
+        let scenes = Arc::new(open(&config.data)?);
         let assigner = Arc::new(model.assigner()?);
-        let mut builder = SampleBuilder::new(
-            Arc::clone(&scenes),
-            samples.clone(),
-            model.config().clone(),
-            assigner,
-        );
-        let mut validator = match config.validation.as_slice() {
-            [] => None,
-            folders => {
-                let scenes = SceneSet::open(folders, &config.open, &config.protocol)?;
-                Some(Validator::open(
-                    scenes,
-                    &samples,
-                    &model,
-                    config.validation_frames,
-                )?)
-            }
-        };
+        let detector = model.config().clone();
+        let mut builder =
+            SampleBuilder::new(Arc::clone(&scenes), samples.clone(), detector, assigner);
+        let mut validator = None;
+        if !config.validation.is_empty() {
+            let (scenes, frames) = (open(&config.validation)?, config.validation_frames);
+            validator = Some(Validator::open(scenes, &samples, &model, frames)?);
+        }
         if let Some(frozen) = &frozen {
             builder = builder.with_maps(frozen.maps(&scenes, observer)?);
             if let Some(validator) = &mut validator {
                 validator.use_maps(frozen.maps(validator.scenes(), observer)?);
             }
         }
-        let trainer = Trainer::begin(
-            run,
-            &model.variables,
-            Some(config.method.name()),
-            Instant::now(),
-        )?;
+        let method = Some(config.method.name());
+        let trainer = Trainer::begin(run, &model.variables, method, Instant::now())?;
         let curve = DetectorCurve::open(&trainer)?;
-        Ok(Self {
+        observer.opened(&scenes.data());
+        let pillar_grid = *model.network().pillar_grid();
+        let training = Self {
             config,
-            model,
-            trainer,
+            observer,
             scenes,
-            builder,
+            loader: batches(&builder, pillar_grid, run, trainer.steps()),
+            model,
             validator,
             curve,
+            terms: None,
+            window: Window::new(),
             accuracy: None,
-        })
-    }
-
-    fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, Error> {
-        observer.opened(&self.scenes.data());
-        let pillar_grid = *self.model.network().pillar_grid();
-        let mut loader = batches(
-            &self.builder,
-            pillar_grid,
-            &self.config.run,
-            self.trainer.steps(),
-        );
-        let mut window = Window::new();
-        while self.share_done() < 1.0 {
-            let asked = Instant::now();
-            let batch = loader.next_batch()??;
-            window.waited += asked.elapsed();
-            window.add(self.step(&batch)?);
-            self.trainer.check_interruption(&self.model.variables)?;
-            if self.trainer.steps().is_multiple_of(READ_EVERY) {
-                let report = self.report(&mut window);
-                self.curve.step(&report)?;
-                observer.stepped(&report);
-            }
-            if self
-                .trainer
-                .steps()
-                .is_multiple_of(self.config.validate_every)
-            {
-                self.look_back(observer)?;
-            }
-        }
-        if !self
-            .trainer
-            .steps()
-            .is_multiple_of(self.config.validate_every)
-        {
-            self.look_back(observer)?;
-        }
-        self.finish()
-    }
-
-    /// One step; its losses, or `None` when the gradient was not finite.
-    fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, Error> {
-        let device = self.config.run.device;
-        let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
-        let output = batch.output(&self.model, true)?;
-        let loss = detection_loss(
-            &output.head.scores,
-            &output.head.offsets,
-            &labels,
-            &self.config.loss,
-        )?;
-        let share_done = self.share_done();
-        let total = match self.config.loss.alignment_weight {
-            weight if weight > 0.0 => {
-                loss.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight
-            }
-            _ => loss.total(),
         };
-        Ok(match self.trainer.step(&total, share_done)? {
-            true => Some([
-                loss.score.f_double_value(&[])?,
-                loss.boxes.f_double_value(&[])?,
-            ]),
-            false => None,
-        })
-    }
-
-    fn epoch(&self) -> f64 {
-        (self.trainer.steps() * self.config.run.batch as u64) as f64
-            / self.scenes.ticks().len() as f64
-    }
-
-    fn share_done(&self) -> f64 {
-        self.trainer.share_done(self.epoch())
-    }
-
-    fn report(&self, window: &mut Window) -> StepReport {
-        let [score_loss, box_loss] = window.mean_losses();
-        let seconds = window.since.elapsed().as_secs_f64().max(1e-9);
-        let report = StepReport {
-            step: self.trainer.steps(),
-            epoch: self.epoch(),
-            progress: self.share_done().min(1.0),
-            seconds: self.trainer.seconds(),
-            learning_rate: self.trainer.learning_rate(self.share_done()),
-            score_loss,
-            box_loss,
-            samples_per_second: (window.steps * self.config.run.batch) as f64 / seconds,
-            waiting: window.waited.as_secs_f64() / seconds,
-        };
-        *window = Window::new();
-        report
-    }
-
-    /// Validation and checkpoint.
-    fn look_back(&mut self, observer: &mut dyn Observer) -> Result<(), Error> {
-        if let Some(validator) = &mut self.validator {
-            self.model.set_precision(ComputePrecision::F32);
-            let accuracy = validator.measure(&self.model);
-            self.model.set_precision(self.config.run.precision);
-            let (accuracy, step) = (accuracy?, self.trainer.steps());
-            self.curve
-                .validation(step, self.trainer.seconds(), &accuracy)?;
-            self.draw_curve()?;
-            observer.validated(step, &accuracy);
-            self.accuracy = Some(accuracy);
-        }
-        Ok(self.trainer.checkpoint(&self.model.variables)?)
+        Ok((training, trainer))
     }
 
     fn draw_curve(&self) -> Result<(), Error> {
-        let TrainConfig { method, run, .. } = self.config;
+        let (method, run) = (self.config.method, &self.config.run);
         self.curve.draw(&format!(
             "{method}, {} samples a step, seed {}",
             run.batch, run.seed
         ))
     }
 
-    fn finish(self) -> Result<Summary, Error> {
+    fn finish(self, trainer: &Trainer) -> Result<Summary, Error> {
         self.draw_curve()?;
-        let Self {
-            config,
-            model,
-            scenes,
-            accuracy,
-            ..
-        } = &self;
-        let trained = self
-            .trainer
-            .save_weights(&model.variables, model.about(), scenes.data())?;
+        let (config, model, scenes) = (self.config, &self.model, &self.scenes);
         let summary = Summary {
-            trained,
-            accuracy: *accuracy,
+            trained: trainer.save_weights(&model.variables, model.about(), scenes.data())?,
+            accuracy: self.accuracy,
         };
         card::card(config, model, scenes, &summary).write(&config.run.out)?;
         Ok(summary)
+    }
+}
+
+impl Task for Training<'_> {
+    type Error = Error;
+    /// Reading the loss waits for the device.
+    const REPORT_EVERY: u64 = 10;
+
+    fn variables(&self) -> &VarStore {
+        &self.model.variables
+    }
+
+    fn epoch(&self, steps: u64) -> f64 {
+        (steps * self.config.run.batch as u64) as f64 / self.scenes.ticks().len() as f64
+    }
+
+    fn loss(&mut self, _: &Trainer) -> Result<Tensor, Error> {
+        let asked = Instant::now();
+        let batch = self.loader.next_batch()??;
+        self.window.waited += asked.elapsed();
+        let config = &self.config.loss;
+        let device = self.config.run.device;
+        let labels = LabelTensors::gather(&batch.labels, config.unassigned, device);
+        let output = batch.output(&self.model, true)?;
+        let head = &output.head;
+        let terms = detection_loss(&head.scores, &head.offsets, &labels, config)?;
+        let total = match config.alignment_weight {
+            weight if weight > 0.0 => {
+                terms.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight
+            }
+            _ => terms.total(),
+        };
+        self.terms = Some(terms);
+        Ok(total)
+    }
+
+    fn stepped(&mut self, _: &Trainer, is_taken: bool) -> Result<(), Error> {
+        self.window.steps += 1;
+        if let (Some(terms), true) = (self.terms.take(), is_taken) {
+            self.window.losses[0] += terms.score.f_double_value(&[])?;
+            self.window.losses[1] += terms.boxes.f_double_value(&[])?;
+            self.window.finite += 1;
+        }
+        Ok(())
+    }
+
+    fn is_report_due(&self, trainer: &Trainer) -> bool {
+        trainer.steps().is_multiple_of(Self::REPORT_EVERY)
+    }
+
+    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+        let window = std::mem::replace(&mut self.window, Window::new());
+        let [score_loss, box_loss] = window.losses.map(|sum| sum / window.finite as f64);
+        let seconds = window.since.elapsed().as_secs_f64().max(1e-9);
+        let share_done = self.share_done(trainer);
+        let report = StepReport {
+            step: trainer.steps(),
+            epoch: self.epoch(trainer.steps()),
+            progress: share_done.min(1.0),
+            seconds: trainer.seconds(),
+            learning_rate: trainer.learning_rate(share_done),
+            score_loss,
+            box_loss,
+            samples_per_second: (window.steps * self.config.run.batch) as f64 / seconds,
+            waiting: window.waited.as_secs_f64() / seconds,
+        };
+        self.curve.step(&report)?;
+        self.observer.stepped(&report);
+        Ok(())
+    }
+
+    fn validate(&mut self, trainer: &Trainer) -> Result<(), Error> {
+        let Some(validator) = &mut self.validator else {
+            return Ok(());
+        };
+        self.model.set_precision(ComputePrecision::F32);
+        let accuracy = validator.measure(&self.model);
+        self.model.set_precision(self.config.run.precision);
+        let (accuracy, step) = (accuracy?, trainer.steps());
+        self.curve.validation(step, trainer.seconds(), &accuracy)?;
+        self.draw_curve()?;
+        self.observer.validated(step, &accuracy);
+        self.accuracy = Some(accuracy);
+        Ok(())
     }
 }
 
@@ -291,6 +246,7 @@ struct Window {
     waited: Duration,
     steps: usize,
     losses: [f64; 2],
+    /// Number of steps with finite gradients, whose losses count.
     finite: usize,
 }
 
@@ -303,21 +259,6 @@ impl Window {
             losses: [0.0; 2],
             finite: 0,
         }
-    }
-
-    fn add(&mut self, losses: Option<[f64; 2]>) {
-        self.steps += 1;
-        if let Some(losses) = losses {
-            self.finite += 1;
-            self.losses
-                .iter_mut()
-                .zip(losses)
-                .for_each(|(sum, loss)| *sum += loss);
-        }
-    }
-
-    fn mean_losses(&self) -> [f64; 2] {
-        self.losses.map(|sum| sum / self.finite as f64)
     }
 }
 

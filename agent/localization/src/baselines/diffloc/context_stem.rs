@@ -1,6 +1,6 @@
 //! Stem: residual context blocks at the resolution of the range image, then one token per patch.
 
-use perception::layers::convolution::Norm;
+use perception::layers::convolution::{Norm, channels_last};
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
@@ -19,12 +19,9 @@ struct Convolution {
 
 impl Convolution {
     fn new(path: &nn::Path<'_>, [inputs, outputs]: [i64; 2], kernel: i64, dilation: i64) -> Self {
+        let shape = [outputs, inputs, kernel, kernel];
         Self {
-            weight: path.var(
-                "weight",
-                &[outputs, inputs, kernel, kernel],
-                nn::init::DEFAULT_KAIMING_UNIFORM,
-            ),
+            weight: path.var("weight", &shape, nn::init::DEFAULT_KAIMING_UNIFORM),
             bias: path.var("bias", &[outputs], Init::Const(0.0)),
             padding: dilation * (kernel / 2),
             dilation,
@@ -32,20 +29,11 @@ impl Convolution {
     }
 
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let (weight, bias) = (
-            self.weight.f_to_kind(x.kind())?,
-            self.bias.f_to_kind(x.kind())?,
-        );
-        let [padding, dilation] = [self.padding, self.dilation];
-        x.f_conv2d(
-            &weight,
-            Some(bias),
-            [1, 1],
-            [padding, padding],
-            [dilation, dilation],
-            1,
-        )?
-        .f_leaky_relu()
+        let weight = self.weight.f_to_kind(x.kind())?;
+        let bias = Some(self.bias.f_to_kind(x.kind())?);
+        let (padding, dilation) = ([self.padding; 2], [self.dilation; 2]);
+        let y = x.f_conv2d(&weight, bias, [1, 1], padding, dilation, 1)?;
+        y.f_leaky_relu()
     }
 }
 
@@ -62,10 +50,8 @@ impl ContextBlock {
         let normed = |name: &str, dilation| {
             let below = path / name;
             let norm = Norm::with_defaults(&(&below / "norm"), outputs);
-            (
-                Convolution::new(&below, [outputs, outputs], 3, dilation),
-                norm,
-            )
+            let convolution = Convolution::new(&below, [outputs, outputs], 3, dilation);
+            (convolution, norm)
         };
         Self {
             shortcut: Convolution::new(&(path / "shortcut"), [inputs, outputs], 1, 1),
@@ -106,22 +92,15 @@ impl ContextStem {
 
     /// `[B, CHANNELS, rows, columns]` to tokens `[B, T, width]`, row by row.
     pub(super) fn forward(&self, images: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        let mut x = channels_last(images)?;
-        for block in &self.blocks {
-            x = block.forward(&x, train)?;
-        }
+        // In half precision convolutions are faster where channels lie next to each other in memory.
+        let images = match images.kind() {
+            Kind::Float => images.shallow_clone(),
+            _ => channels_last(images),
+        };
+        let mut blocks = self.blocks.iter();
+        let x = blocks.try_fold(images, |x, block| block.forward(&x, train))?;
         let pooled = x.f_avg_pool2d(self.patch, self.patch, [0, 0], false, true, None)?;
-        super::transformer::dense(&self.project, &pooled.f_flatten(2, 3)?.f_transpose(1, 2)?)
-    }
-}
-
-/// Channels next to each other in memory, where convolutions in half precision are faster.
-fn channels_last(x: &Tensor) -> Result<Tensor, TchError> {
-    match x.kind() {
-        Kind::Float => Ok(x.shallow_clone()),
-        _ => x
-            .f_permute([0, 2, 3, 1])?
-            .f_contiguous()?
-            .f_permute([0, 3, 1, 2]),
+        let tokens = pooled.f_flatten(2, 3)?.f_transpose(1, 2)?;
+        self.project.forward(&tokens)
     }
 }

@@ -1,12 +1,13 @@
 //! Denoiser: predicts the velocity of noisy poses of the sweeps of a window from their features.
 
 use tch::nn;
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
 
 use super::config::DiffLocConfig;
-use super::layer_norm::LayerNorm;
-use super::transformer::{TransformerLayer, dense};
+use super::transformer::{NORM_EPS, TransformerLayer};
+use crate::baselines::layers::LayerNorm;
 use crate::pgc::dense::Dense;
+use perception::tensor_values::tensor;
 
 /// Numbers of a pose: position in units of the training positions' deviation, cosine and sine of the heading.
 pub(super) const POSE: i64 = 5;
@@ -51,34 +52,26 @@ impl PoseDenoiser {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, TchError> {
-        let DiffLocConfig {
-            denoiser_width: width,
-            heads,
-            denoiser_layers,
-            ..
-        } = *config;
+        let width = config.denoiser_width;
         let inputs = POSE * (2 * HARMONICS + 1) + STEP_CHANNELS + config.width + 1;
         let layer = |number: usize| {
-            TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, 0.0)
+            let path = path / "layers" / number;
+            TransformerLayer::new(&path, width, config.heads, EXPANSION, 0.0)
         };
         let half = STEP_CHANNELS / 2;
-        let harmonics: Vec<f32> = (0..HARMONICS)
-            .map(|power| (1_u32 << power) as f32)
-            .collect();
-        let of_step: Vec<f32> = (0..half)
-            .map(|k| LONGEST.powf(-(k as f64) / half as f64) as f32)
-            .collect();
-        let table = |values: &[f32]| Tensor::f_from_slice(values)?.f_to_device(path.device());
+        let harmonics = (0..HARMONICS).map(|power| (1_u32 << power) as f32);
+        let of_step = (0..half).map(|k| LONGEST.powf(-(k as f64) / half as f64) as f32);
+        let table = |values: &[f32]| tensor(values, &[-1], path.device());
         Ok(Self {
             inward: Dense::new(&(path / "inward"), inputs, width, 0.7),
-            layers: (0..denoiser_layers).map(layer).collect(),
-            norm: LayerNorm::new(&(path / "norm"), width),
+            layers: (0..config.denoiser_layers).map(layer).collect(),
+            norm: LayerNorm::new(&(path / "norm"), width, NORM_EPS),
             outward: [
                 Dense::new(&(path / "outward" / 0), width, LAST, 1.0),
                 Dense::new(&(path / "outward" / 1), LAST, POSE, 0.1),
             ],
-            frequencies: table(&harmonics)?,
-            step_frequencies: table(&of_step)?,
+            frequencies: table(&harmonics.collect::<Vec<_>>())?,
+            step_frequencies: table(&of_step.collect::<Vec<_>>())?,
         })
     }
 
@@ -96,41 +89,33 @@ impl PoseDenoiser {
     ) -> Result<Tensor, TchError> {
         let (count, frames, _) = poses.size3()?;
         let on = (Kind::Float, poses.device());
+        // 0 between sweeps that see each other, [`UNSEEN`] elsewhere.
+        let single = Tensor::f_eye(frames, on)?.f_neg()?.f_add_scalar(1.0)?;
+        let single = single
+            .f_mul_scalar(UNSEEN)?
+            .f_view([1, 1, frames, frames])?;
         let (mask, age) = match windows {
-            Windows::Single => (
-                single_mask(frames, on.1)?.f_view([1, 1, frames, frames])?,
-                Tensor::f_ones([1, 1, 1], on)?,
-            ),
+            Windows::Single => (single, Tensor::f_ones([1, 1, 1], on)?),
             Windows::Joint(joint) => {
                 let alone = joint.f_neg()?.f_add_scalar(1.0)?;
-                let mask = single_mask(frames, on.1)?.f_view([1, 1, frames, frames])?
-                    * alone.f_view([-1, 1, 1, 1])?;
                 // The newest sweep is marked by 1, as one that is alone.
                 let place = Tensor::f_linspace(0.0, 1.0, frames, on)?.f_view([1, -1, 1])?;
-                let alone = alone.f_view([-1, 1, 1])?;
-                (mask, place.f_maximum(&alone)?)
+                let age = place.f_maximum(&alone.f_view([-1, 1, 1])?)?;
+                (single * alone.f_view([-1, 1, 1, 1])?, age)
             }
         };
-        let steps = self
-            .embed_steps(steps)?
-            .f_view([-1, 1, STEP_CHANNELS])?
-            .f_expand([count, frames, -1], false)?;
-        let age = age.f_expand([count, frames, 1], false)?;
-        let inputs = Tensor::f_cat(
-            &[
-                self.embed_poses(poses)?,
-                steps,
-                features.shallow_clone(),
-                age,
-            ],
-            2,
-        )?;
-        let mut x = dense(&self.inward, &inputs)?;
-        for layer in &self.layers {
-            x = layer.forward(&x, Some(&mask), false)?;
-        }
-        let hidden = dense(&self.outward[0], &self.norm.forward(&x)?)?.f_gelu("none")?;
-        dense(&self.outward[1], &hidden)
+        let steps = self.embed_steps(steps)?.f_view([-1, 1, STEP_CHANNELS])?;
+        let inputs = [
+            self.embed_poses(poses)?,
+            steps.f_expand([count, frames, -1], false)?,
+            features.shallow_clone(),
+            age.f_expand([count, frames, 1], false)?,
+        ];
+        let x = self.inward.forward(&Tensor::f_cat(&inputs, 2)?)?;
+        let mut layers = self.layers.iter();
+        let x = layers.try_fold(x, |x, layer| layer.forward(&x, Some(&mask), false))?;
+        let hidden = self.outward[0].forward(&self.norm.forward(&x)?)?;
+        self.outward[1].forward(&hidden.f_gelu("none")?)
     }
 
     /// A pose with sine and cosine of its multiples.
@@ -139,27 +124,13 @@ impl PoseDenoiser {
             .f_unsqueeze(3)?
             .f_mul(&self.frequencies)?
             .f_flatten(2, 3)?;
-        Tensor::f_cat(
-            &[poses.shallow_clone(), angles.f_sin()?, angles.f_cos()?],
-            2,
-        )
+        Tensor::f_cat(&[poses, &angles.f_sin()?, &angles.f_cos()?], 2)
     }
 
     /// Sine and cosine of the step `[W]` at falling frequencies.
     fn embed_steps(&self, steps: &Tensor) -> Result<Tensor, TchError> {
-        let angles = steps
-            .f_to_kind(Kind::Float)?
-            .f_unsqueeze(1)?
-            .f_mul(&self.step_frequencies)?;
+        let steps = steps.f_to_kind(Kind::Float)?.f_unsqueeze(1)?;
+        let angles = steps.f_mul(&self.step_frequencies)?;
         Tensor::f_cat(&[angles.f_sin()?, angles.f_cos()?], 1)
     }
-}
-
-/// `[F, F]`: 0 on the diagonal, [`UNSEEN`] elsewhere.
-fn single_mask(frames: i64, device: Device) -> Result<Tensor, TchError> {
-    let on = (Kind::Float, device);
-    Tensor::f_eye(frames, on)?
-        .f_neg()?
-        .f_add_scalar(1.0)?
-        .f_mul_scalar(UNSEEN)
 }

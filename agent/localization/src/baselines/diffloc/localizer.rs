@@ -1,124 +1,73 @@
 //! Localization by DiffLoc: from a sweep to a pose.
 
-use std::path::Path;
-
-use protocol::NoPoseReason;
-use tch::nn::VarStore;
-use tch::{Device, Tensor, no_grad};
+use protocol::PointCloud;
+use support::stage_times::StageTimes;
+use tch::{Device, TchError, nn, no_grad};
 
 use super::config::DiffLocConfig;
 use super::denoiser::Windows;
 use super::network::DiffLoc;
 use super::range_image::CHANNELS;
-use crate::baselines::regressed_pose::{localization, no_pose, upright};
+use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
+use crate::pgc::LocalizerError;
 use crate::pgc::localization::{ENCODE, REGRESS, VOXELISE};
 use crate::pgc::pose_solver::MIN_CELLS;
-use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
-use perception::tensor_values::values;
-use perception::weights::Weights;
+use perception::tensor_values::{tensor, values};
 
-/// A DiffLoc network of one scene, for single sweeps.
+/// A DiffLoc network of one scene, for single sweeps, output of `agent train diffloc`.
 ///
 /// The denoised pose is used unchanged, with full confidence.
-#[derive(Debug)]
-pub struct DiffLocLocalizer {
-    network: DiffLoc,
-    device: Device,
-    sha256: String,
-}
+pub type DiffLocLocalizer = PoseRegressor<DiffLoc>;
 
-impl DiffLocLocalizer {
-    /// Kind of the weights, as in their file.
-    pub const KIND: &'static str = "DiffLoc";
+impl RegressPose for DiffLoc {
+    const KIND: &'static str = "DiffLoc";
+    type Config = DiffLocConfig;
 
-    /// Reads the output of `agent train diffloc`.
-    ///
-    /// # Errors
-    /// [`LocalizerError`] when the file is missing, truncated or of another kind, or its tensors are not those of its
-    /// configuration.
-    pub fn load(path: &Path, device: Device) -> Result<Self, LocalizerError> {
-        let weights = Weights::load(path)?;
-        weights.check_kind(Self::KIND)?;
-        let config: DiffLocConfig = weights.config()?;
-        let mut variables = VarStore::new(device);
-        let network = DiffLoc::new(&variables.root(), &config)?;
-        weights.copy_into(&variables)?;
-        variables.freeze();
-        Ok(Self {
-            network,
-            device,
-            sha256: weights.sha256().to_owned(),
-        })
+    fn build(path: &nn::Path<'_>, config: &DiffLocConfig) -> Result<Self, LocalizerError> {
+        Self::new(path, config)
     }
 
-    /// SHA-256 of the weights.
-    pub fn sha256(&self) -> &str {
-        &self.sha256
+    fn scale(config: &DiffLocConfig) -> [[f64; 3]; 2] {
+        [config.origin_m, config.scale_m]
     }
 
-    /// Configuration: sizes and scene.
-    pub fn config(&self) -> &DiffLocConfig {
-        self.network.config()
-    }
-}
-
-impl Localize for DiffLocLocalizer {
-    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
-        let cloud = sweep.cloud;
-        let mut times = stopwatch();
-        let config = self.network.config();
-        let ranges = config.image.image(&cloud.xyzi);
+    fn regress(
+        &self,
+        cloud: &PointCloud,
+        device: Device,
+        times: &mut StageTimes,
+    ) -> Result<Option<[f32; 5]>, TchError> {
+        let config = self.config().image;
+        let image = config.image(&cloud.xyzi);
         times.lap(VOXELISE);
-        if ranges[..config.image.pixels()]
-            .iter()
-            .filter(|&&range| range > 0.0)
-            .count()
-            < MIN_CELLS
-        {
-            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+        let ranges = image[..config.pixels()].iter();
+        if ranges.filter(|&&range| range > 0.0).count() < MIN_CELLS {
+            return Ok(None);
         }
-        let shape = [
-            1,
-            CHANNELS as i64,
-            config.image.rows as i64,
-            config.image.columns as i64,
-        ];
-        let image = Tensor::f_from_slice(&ranges)?
-            .f_view(shape)?
-            .f_to_device(self.device)?;
-        let features = no_grad(|| self.network.encoder().forward(&image, false))?.features;
+        let [rows, columns] = [config.rows, config.columns].map(|size| size as i64);
+        let image = tensor(&image, &[1, CHANNELS as i64, rows, columns], device)?;
+        let features = no_grad(|| self.encoder().forward(&image, false))?.features;
         times.lap(ENCODE);
-        let poses = self
-            .network
-            .poses(&features.f_unsqueeze(1)?, Windows::Single)?;
-        let answer = values(&poses)?;
+        let found = values(&self.poses(&features.f_unsqueeze(1)?, Windows::Single)?)?;
         times.lap(REGRESS);
-        let pose = upright(&scaled(&answer, config.scale_m), config.origin_m);
-        Ok(localization(pose, times))
+        Ok(found.first_chunk().copied())
     }
-}
-
-/// A normalised pose with its position in metres.
-fn scaled(answer: &[f32], scale_m: [f64; 3]) -> Vec<f32> {
-    let scales = scale_m.iter().map(|&scale| scale as f32).chain([1.0; 2]);
-    answer
-        .iter()
-        .zip(scales)
-        .map(|(value, scale)| value * scale)
-        .collect()
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-    use std::path::PathBuf;
+    use std::path::{Path, PathBuf};
 
     use super::*;
     use crate::baselines::diffloc::RangeImageConfig;
     use crate::baselines::load_baseline;
+    use crate::pgc::LocalizerInput;
     use crate::pgc::pose_solver::PoseSolver;
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
-    use protocol::{PointCloud, PoseEstimate};
+    use protocol::{NoPoseReason, PoseEstimate};
+    use tch::Tensor;
+    use tch::nn::VarStore;
 
     fn config() -> DiffLocConfig {
         DiffLocConfig {

@@ -15,7 +15,6 @@
 mod config;
 mod context_stem;
 mod denoiser;
-mod layer_norm;
 mod localizer;
 mod network;
 mod noise_schedule;

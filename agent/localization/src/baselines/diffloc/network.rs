@@ -10,6 +10,7 @@ use super::denoiser::{POSE, PoseDenoiser, Windows};
 use super::noise_schedule::NoiseSchedule;
 use super::sweep_encoder::SweepEncoder;
 use crate::pgc::LocalizerError;
+use perception::tensor_values::tensor;
 
 /// Steps from noise to poses.
 const DENOISING_STEPS: usize = 10;
@@ -69,18 +70,13 @@ impl DiffLoc {
         let (count, frames, _) = features.size3()?;
         let device = features.device();
         let mut random = ChaCha8Rng::seed_from_u64(START_SEED);
-        let noise: Vec<f32> = (0..POSE)
-            .map(|_| StandardNormal.sample(&mut random))
-            .collect();
-        let start = Tensor::f_from_slice(&noise)?
-            .f_to_device(device)?
-            .f_expand([count, frames, POSE], false)?;
-        no_grad(|| {
-            self.schedule
-                .denoise(&start, DENOISING_STEPS, |noisy, step| {
-                    let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
-                    self.denoiser.forward(noisy, &steps, features, windows)
-                })
-        })
+        let noise = (0..POSE).map(|_| StandardNormal.sample(&mut random));
+        let start = tensor::<f32>(&noise.collect::<Vec<_>>(), &[POSE], device)?;
+        let start = start.f_expand([count, frames, POSE], false)?;
+        let velocity = |noisy: &Tensor, step| {
+            let steps = Tensor::f_full([count], step, (Kind::Int64, device))?;
+            self.denoiser.forward(noisy, &steps, features, windows)
+        };
+        no_grad(|| self.schedule.denoise(&start, DENOISING_STEPS, velocity))
     }
 }

@@ -1,5 +1,6 @@
 //! Noise schedule: how much of a pose remains at each step of the diffusion, and the way back (DDIM, Song et al. 2021).
 
+use perception::tensor_values::tensor;
 use tch::{Device, TchError, Tensor};
 
 /// Steps of the diffusion.
@@ -26,15 +27,14 @@ impl NoiseSchedule {
     pub fn new(device: Device) -> Result<Self, TchError> {
         let beta =
             |step: usize| BETAS[0] + (BETAS[1] - BETAS[0]) * step as f64 / (STEPS - 1) as f64;
-        let kept: Vec<f64> = (0..STEPS)
-            .scan(1.0, |product, step| {
-                *product *= 1.0 - beta(step);
-                Some(*product)
-            })
-            .collect();
+        let kept = (0..STEPS).scan(1.0, |product, step| {
+            *product *= 1.0 - beta(step);
+            Some(*product)
+        });
+        let kept: Vec<f64> = kept.collect();
         let table = |factor: fn(f64) -> f64| {
             let values: Vec<f32> = kept.iter().map(|&kept| factor(kept) as f32).collect();
-            Tensor::f_from_slice(&values)?.f_to_device(device)
+            tensor(&values, &[-1], device)
         };
         let factors = [table(f64::sqrt)?, table(|kept| (1.0 - kept).sqrt())?];
         Ok(Self { kept, factors })
@@ -57,9 +57,8 @@ impl NoiseSchedule {
     ) -> Result<Tensor, TchError> {
         let factor = |table: &Tensor| table.f_index_select(0, steps)?.f_view([-1, 1, 1]);
         let [signal, deviation] = &self.factors;
-        poses
-            .f_mul(&factor(signal)?)?
-            .f_add(&noise.f_mul(&factor(deviation)?)?)
+        let noise = noise.f_mul(&factor(deviation)?)?;
+        poses.f_mul(&factor(signal)?)?.f_add(&noise)
     }
 
     /// Poses `[W, F, D]` that `noisy` poses come from if their velocity at steps `[W]` is this (Salimans and Ho 2022).
@@ -88,21 +87,20 @@ impl NoiseSchedule {
         mut predict: impl FnMut(&Tensor, i64) -> Result<Tensor, TchError>,
     ) -> Result<Tensor, TchError> {
         let last = (self.kept.len() - 1) as f64;
-        let mut steps: Vec<usize> = (0..count.max(1))
-            .map(|number| {
-                (last * (1.0 - number as f64 / (count.max(2) - 1) as f64)).round() as usize
-            })
-            .collect();
+        let share = |number: usize| number as f64 / (count.max(2) - 1) as f64;
+        let steps = (0..count.max(1)).map(|number| (last * (1.0 - share(number))).round() as usize);
+        let mut steps: Vec<usize> = steps.collect();
         steps.dedup();
         let mut noisy = noise.shallow_clone();
         let mut poses = noise.shallow_clone();
         for (place, &step) in steps.iter().enumerate() {
             let kept = self.kept[step];
             let predicted = predict(&noisy, step as i64)?;
+            let noise = predicted * (1.0 - kept).sqrt();
             poses = noisy
                 .f_mul_scalar(kept.sqrt())?
-                .f_sub(&(predicted * (1.0 - kept).sqrt()))?;
-            poses = poses.f_clamp(-LIMIT, LIMIT)?;
+                .f_sub(&noise)?
+                .f_clamp(-LIMIT, LIMIT)?;
             if let Some(&next) = steps.get(place + 1) {
                 // The noise that leads from these poses to where they came from.
                 let noise = noisy.f_sub(&(&poses * kept.sqrt()))? / (1.0 - kept).sqrt();

@@ -6,8 +6,8 @@ use tch::{Kind, TchError, Tensor};
 
 use super::config::DiffLocConfig;
 use super::context_stem::ContextStem;
-use super::layer_norm::LayerNorm;
-use super::transformer::{TransformerLayer, dense};
+use super::transformer::{NORM_EPS, TransformerLayer};
+use crate::baselines::layers::LayerNorm;
 use crate::pgc::dense::Dense;
 
 /// Channels of the perceptrons, relative to those of a token.
@@ -36,29 +36,21 @@ pub struct EncodedSweeps {
 impl SweepEncoder {
     /// Builds the layers below `path`.
     pub fn new(path: &nn::Path<'_>, config: &DiffLocConfig) -> Self {
-        let DiffLocConfig {
-            width,
-            heads,
-            layers,
-            drop_path,
-            ..
-        } = *config;
+        let (width, last) = (config.width, (config.layers.max(2) - 1) as f64);
         let layer = |number: usize| {
-            let drop = drop_path * number as f64 / (layers.max(2) - 1) as f64;
-            TransformerLayer::new(&(path / "layers" / number), width, heads, EXPANSION, drop)
+            let (path, drop) = (
+                path / "layers" / number,
+                config.drop_path * number as f64 / last,
+            );
+            TransformerLayer::new(&path, width, config.heads, EXPANSION, drop)
         };
+        let (mean, stdev) = (0.0, 0.02);
+        let places = Init::Randn { mean, stdev };
         Self {
             stem: ContextStem::new(&(path / "stem"), config),
-            places: path.var(
-                "places",
-                &[config.tokens(), width],
-                Init::Randn {
-                    mean: 0.0,
-                    stdev: 0.02,
-                },
-            ),
-            layers: (0..layers).map(layer).collect(),
-            norm: LayerNorm::new(&(path / "norm"), width),
+            places: path.var("places", &[config.tokens(), width], places),
+            layers: (0..config.layers).map(layer).collect(),
+            norm: LayerNorm::new(&(path / "norm"), width, NORM_EPS),
             mask: Dense::new(&(path / "mask"), width, 1, 0.1),
             feature_norm: Norm::with_defaults(&(path / "feature_norm"), width),
         }
@@ -69,15 +61,12 @@ impl SweepEncoder {
     /// # Errors
     /// Those of the tensor library.
     pub fn forward(&self, images: &Tensor, train: bool) -> Result<EncodedSweeps, TchError> {
-        let mut x = self
-            .stem
-            .forward(images, train)?
-            .f_add(&self.places.f_to_kind(images.kind())?)?;
-        for layer in &self.layers {
-            x = layer.forward(&x, None, train)?;
-        }
+        let places = self.places.f_to_kind(images.kind())?;
+        let x = self.stem.forward(images, train)?.f_add(&places)?;
+        let mut layers = self.layers.iter();
+        let x = layers.try_fold(x, |x, layer| layer.forward(&x, None, train))?;
         let x = self.norm.forward(&x)?.f_to_kind(Kind::Float)?;
-        let logits = dense(&self.mask, &x)?;
+        let logits = self.mask.forward(&x)?;
         let weighted = x.f_add(&x.f_mul(&logits.f_sigmoid()?)?)?;
         let features = weighted.f_mean_dim(1_i64, false, Kind::Float)?;
         Ok(EncodedSweeps {

@@ -3,8 +3,11 @@
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
 
-use super::layer_norm::LayerNorm;
+use crate::baselines::layers::LayerNorm;
 use crate::pgc::dense::Dense;
+
+/// Added to variances.
+pub(super) const NORM_EPS: f64 = 1e-6;
 
 /// Gain of layers at whose end no rectifier follows, relative to He's.
 const LINEAR_GAIN: f64 = 0.7;
@@ -36,10 +39,10 @@ impl TransformerLayer {
     ) -> Self {
         let hidden = expansion * width;
         Self {
-            before_attention: LayerNorm::new(&(path / "norm1"), width),
+            before_attention: LayerNorm::new(&(path / "norm1"), width, NORM_EPS),
             qkv: Dense::new(&(path / "qkv"), width, 3 * width, LINEAR_GAIN),
             outward: Dense::new(&(path / "outward"), width, width, BRANCH_GAIN),
-            before_perceptron: LayerNorm::new(&(path / "norm2"), width),
+            before_perceptron: LayerNorm::new(&(path / "norm2"), width, NORM_EPS),
             up: Dense::new(&(path / "up"), width, hidden, LINEAR_GAIN),
             down: Dense::new(&(path / "down"), hidden, width, BRANCH_GAIN),
             heads,
@@ -57,21 +60,21 @@ impl TransformerLayer {
     ) -> Result<Tensor, TchError> {
         let attended = self.attend(&self.before_attention.forward(x)?, mask)?;
         let x = x.f_add(&self.keep_some(attended, train)?)?;
-        let hidden = dense(&self.up, &self.before_perceptron.forward(&x)?)?.f_gelu("none")?;
-        let answer = dense(&self.down, &hidden)?;
+        let hidden = self.up.forward(&self.before_perceptron.forward(&x)?)?;
+        let answer = self.down.forward(&hidden.f_gelu("none")?)?;
         x.f_add(&self.keep_some(answer, train)?)
     }
 
     fn attend(&self, x: &Tensor, mask: Option<&Tensor>) -> Result<Tensor, TchError> {
         let (batch, tokens, width) = x.size3()?;
-        let parts =
-            dense(&self.qkv, x)?.f_view([batch, tokens, 3, self.heads, width / self.heads])?;
-        let parts = parts.f_permute([2, 0, 3, 1, 4])?;
-        let [query, key, value] = [
-            parts.f_select(0, 0)?,
-            parts.f_select(0, 1)?,
-            parts.f_select(0, 2)?,
-        ];
+        let size = [batch, tokens, 3, self.heads, width / self.heads];
+        let parts = self
+            .qkv
+            .forward(x)?
+            .f_view(size)?
+            .f_permute([2, 0, 3, 1, 4])?;
+        let part = |number| parts.f_select(0, number);
+        let [query, key, value] = [part(0)?, part(1)?, part(2)?];
         let found = match mask {
             None => {
                 let none = None::<Tensor>;
@@ -83,15 +86,13 @@ impl TransformerLayer {
                 let scale = 1.0 / ((width / self.heads) as f64).sqrt();
                 let logits = query
                     .f_matmul(&key.f_transpose(2, 3)?)?
-                    .f_mul_scalar(scale)?
-                    .f_add(mask)?;
-                logits.f_softmax(3, Kind::Float)?.f_matmul(&value)?
+                    .f_mul_scalar(scale)?;
+                let shares = logits.f_add(mask)?.f_softmax(3, Kind::Float)?;
+                shares.f_matmul(&value)?
             }
         };
-        dense(
-            &self.outward,
-            &found.f_transpose(1, 2)?.f_reshape([batch, tokens, width])?,
-        )
+        let found = found.f_transpose(1, 2)?.f_reshape([batch, tokens, width])?;
+        self.outward.forward(&found)
     }
 
     /// Stochastic depth: zeroes the branch of some samples and scales the others.
@@ -107,12 +108,4 @@ impl TransformerLayer {
             .f_div_scalar(keep)?;
         branch.f_mul(&kept)
     }
-}
-
-/// A dense layer on the last dimension of `[B, T, inputs]`.
-pub(super) fn dense(layer: &Dense, x: &Tensor) -> Result<Tensor, TchError> {
-    let (batch, tokens, inputs) = x.size3()?;
-    layer
-        .forward(&x.f_reshape([batch * tokens, inputs])?)?
-        .f_view([batch, tokens, -1])
 }

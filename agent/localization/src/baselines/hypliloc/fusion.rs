@@ -28,13 +28,7 @@ impl Fusion {
     /// one pooled token of each.
     pub(super) fn forward(&self, points: &Tensor, image: &Tensor) -> Result<Tensor, TchError> {
         let pooled = |tokens: &Tensor| tokens.f_mean_dim(1_i64, true, Kind::Float);
-        let tokens = [
-            points.shallow_clone(),
-            image.shallow_clone(),
-            pooled(points)?,
-            pooled(image)?,
-        ];
-        let tokens = Tensor::f_cat(&tokens, 1)?;
+        let tokens = Tensor::f_cat(&[points, image, &pooled(points)?, &pooled(image)?], 1)?;
         let weight = |number| self.weights.f_select(0, number);
         let euclidean = self.euclidean.forward(&tokens)?.f_mul(&weight(0)?)?;
         euclidean.f_add(&self.poincare.forward(&tokens)?.f_mul(&weight(1)?)?)
@@ -43,8 +37,7 @@ impl Fusion {
 
 /// Tokens of length 1.
 pub(super) fn normalise(tokens: &Tensor) -> Result<Tensor, TchError> {
-    let squares = tokens
-        .f_square()?
-        .f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
+    let squares = tokens.f_square()?;
+    let squares = squares.f_sum_dim_intlist(-1_i64, true, Kind::Float)?;
     tokens.f_div(&squares.f_add_scalar(1e-12)?.f_sqrt()?)
 }

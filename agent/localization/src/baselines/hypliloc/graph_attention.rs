@@ -3,9 +3,8 @@
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor, no_grad};
 
-use super::dense_norm::{TokenNorm, of_tokens};
+use super::dense_norm::TokenLayer;
 use super::poincare::{expmap0, logmap0};
-use crate::pgc::dense::Dense;
 
 /// Heads of the attention.
 const HEADS: i64 = 8;
@@ -22,16 +21,19 @@ pub(super) enum Space {
 /// One layer: linear map, attention, layer norm, ReLU.
 #[derive(Debug)]
 pub(super) struct GraphAttention {
-    dense: Dense,
     metric: Option<Tensor>,
-    norm: TokenNorm,
+    layer: TokenLayer,
     space: Space,
 }
 
 impl GraphAttention {
     /// Attention by the scalar product, between points.
     pub(super) fn plain(path: &nn::Path<'_>, channels: i64) -> Self {
-        Self::new(path, channels, None, Space::Euclidean)
+        Self {
+            metric: None,
+            layer: TokenLayer::new(path, channels),
+            space: Space::Euclidean,
+        }
     }
 
     /// Attention by a learnt metric, which all heads share; it begins as the identity.
@@ -39,19 +41,10 @@ impl GraphAttention {
         let edge = channels / HEADS;
         let mut metric = path.var("metric", &[edge, edge], Init::Const(0.0));
         no_grad(|| metric.copy_(&Tensor::eye(edge, (metric.kind(), metric.device()))));
-        Self::new(path, channels, Some(metric), space)
-    }
-
-    fn new(path: &nn::Path<'_>, channels: i64, metric: Option<Tensor>, space: Space) -> Self {
-        let (dense, norm) = (
-            Dense::new(path, channels, channels, 1.0),
-            TokenNorm::new(&(path / "norm"), channels),
-        );
         Self {
-            dense,
-            metric,
-            norm,
+            metric: Some(metric),
             space,
+            ..Self::plain(path, channels)
         }
     }
 
@@ -60,29 +53,24 @@ impl GraphAttention {
     /// Weighted means of points of a ball lie in it, since it is convex.
     pub(super) fn forward(&self, tokens: &Tensor) -> Result<Tensor, TchError> {
         let (sweeps, count, channels) = tokens.size3()?;
-        let values = of_tokens(&self.dense, tokens)?
-            .f_view([sweeps, count, HEADS, channels / HEADS])?
-            .f_transpose(1, 2)?;
-        let values = match self.space {
-            Space::Euclidean => values,
-            Space::Poincare => expmap0(&values)?,
-        };
+        self.layer.around(tokens, |values| {
+            let values = values.f_view([sweeps, count, HEADS, channels / HEADS])?;
+            let values = values.f_transpose(1, 2)?;
+            let mean = match self.space {
+                Space::Euclidean => self.attend(&values)?,
+                Space::Poincare => logmap0(&self.attend(&expmap0(&values)?)?)?,
+            };
+            mean.f_transpose(1, 2)?.f_reshape([sweeps, count, channels])
+        })
+    }
+
+    /// Means of values `[S, HEADS, T, C / HEADS]`, weighted by their similarities.
+    fn attend(&self, values: &Tensor) -> Result<Tensor, TchError> {
         let query = match &self.metric {
             Some(metric) => values.f_matmul(metric)?,
             None => values.shallow_clone(),
         };
         let mask = None::<Tensor>;
-        let mean = Tensor::f_scaled_dot_product_attention(
-            &query, &values, &values, mask, 0.0, false, 1.0, false,
-        )?;
-        let mean = match self.space {
-            Space::Euclidean => mean,
-            Space::Poincare => logmap0(&mean)?,
-        };
-        self.norm.forward(
-            &mean
-                .f_transpose(1, 2)?
-                .f_reshape([sweeps, count, channels])?,
-        )
+        Tensor::f_scaled_dot_product_attention(&query, values, values, mask, 0.0, false, 1.0, false)
     }
 }

@@ -26,86 +26,23 @@ pub(super) const COARSE: Neighbourhood = Neighbourhood {
     neighbours: 32,
 };
 
-/// Indices of the neighbours of each centre.
-#[derive(Debug)]
-pub struct Groups {
-    /// `[S, 256, 24]` rows of the points.
-    pub(super) fine: Tensor,
-    /// `[S, 64, 32]` rows of the centres of the first set abstraction.
-    pub(super) coarse: Tensor,
-}
-
-impl Groups {
-    /// The nearest neighbours within the radius among points `[S, N, 3]`, metres; where there are too few, the centre
-    /// again. 16-bit integers, on the device of the points.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
-    pub fn find(points_m: &Tensor) -> Result<Self, TchError> {
-        let centres = points_m.f_narrow(1, 0, FINE.centres)?;
-        Ok(Self {
-            fine: neighbours(points_m, FINE)?,
-            coarse: neighbours(&centres, COARSE)?,
-        })
-    }
-
-    /// Those of several batches of sweeps, in their order.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
-    pub fn concatenate(batches: &[Self]) -> Result<Self, TchError> {
-        let all = |part: fn(&Self) -> &Tensor| {
-            Tensor::f_cat(&batches.iter().map(part).collect::<Vec<_>>(), 0)
-        };
-        Ok(Self {
-            fine: all(|batch| &batch.fine)?,
-            coarse: all(|batch| &batch.coarse)?,
-        })
-    }
-
-    /// Those of the sweeps `rows` `[B]`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
-    pub fn select(&self, rows: &Tensor) -> Result<Self, TchError> {
-        Ok(Self {
-            fine: self.fine.f_index_select(0, rows)?,
-            coarse: self.coarse.f_index_select(0, rows)?,
-        })
-    }
-
-    /// Replaces neighbours by their centre where `is_dropped` `[S, N]`.
-    ///
-    /// # Errors
-    /// Those of the tensor library.
-    pub fn without(&self, is_dropped: &Tensor) -> Result<Self, TchError> {
-        let fine = self.fine.f_to_kind(Kind::Int64)?;
-        let sweeps = fine.size()[0];
-        let dropped = is_dropped
-            .f_gather(1, &fine.f_view([sweeps, -1])?, false)?
-            .f_view_as(&fine)?;
-        let own = centre_rows(&fine)?;
-        Ok(Self {
-            fine: fine.f_where_self(&dropped.f_logical_not()?, &own)?,
-            coarse: self.coarse.shallow_clone(),
-        })
-    }
-}
-
-/// `[S, centres, neighbours]` rows of `points_m`.
-fn neighbours(
-    points_m: &Tensor,
-    Neighbourhood {
-        centres,
-        radius_m,
-        neighbours,
-    }: Neighbourhood,
-) -> Result<Tensor, TchError> {
-    let distances = Tensor::f_cdist(&points_m.f_narrow(1, 0, centres)?, points_m, 2.0, None)?;
-    let (distances, rows) = distances.f_topk(neighbours, 2, false, true)?;
-    let own = centre_rows(&rows)?;
-    rows.f_where_self(&distances.f_le(radius_m)?, &own)?
+/// `[S, centres, neighbours]`: rows of the nearest neighbours of each centre within the radius among points `[S, N, 3]`,
+/// metres; where there are too few, the centre again. 16-bit integers, on the device of the points.
+pub(super) fn neighbours(points_m: &Tensor, around: Neighbourhood) -> Result<Tensor, TchError> {
+    let centres_m = points_m.f_narrow(1, 0, around.centres)?;
+    let distances = Tensor::f_cdist(&centres_m, points_m, 2.0, None)?;
+    let (distances, rows) = distances.f_topk(around.neighbours, 2, false, true)?;
+    let is_near = distances.f_le(around.radius_m)?;
+    rows.f_where_self(&is_near, &centre_rows(&rows)?)?
         .f_to_kind(Kind::Int16)
+}
+
+/// Neighbours `[S, centres, neighbours]`, replaced by their centre where they are dropped, `[S, N]`.
+pub(super) fn without(groups: &Tensor, is_dropped: &Tensor) -> Result<Tensor, TchError> {
+    let rows = groups.f_to_kind(Kind::Int64)?;
+    let flat = rows.f_view([rows.size()[0], -1])?;
+    let is_kept = is_dropped.f_gather(1, &flat, false)?.f_logical_not()?;
+    rows.f_where_self(&is_kept.f_view_as(&rows)?, &centre_rows(&rows)?)
 }
 
 /// `[1, centres, 1]` the row of each centre itself.
@@ -129,14 +66,15 @@ mod tests {
     #[test]
     fn neighbours_lie_within_the_radius_and_the_centre_fills_up() {
         tch::set_num_threads(1);
-        let groups = Groups::find(&grid()).unwrap();
+        let fine = neighbours(&grid(), FINE).unwrap();
+        let coarse = neighbours(&grid().narrow(1, 0, FINE.centres), COARSE).unwrap();
         assert_eq!(
-            (groups.fine.size(), groups.coarse.size()),
+            (fine.size(), coarse.size()),
             (vec![1, 256, 24], vec![1, 64, 32])
         );
         // The corner has six points within 8 m: itself, two at 4 m, one at 5.7 m and two at 8 m.
         let mut corner: Vec<i64> =
-            Vec::try_from(&groups.fine.select(1, 0).view([-1]).to_kind(Kind::Int64)).unwrap();
+            Vec::try_from(&fine.select(1, 0).view([-1]).to_kind(Kind::Int64)).unwrap();
         corner.sort_unstable();
         corner.dedup();
         assert_eq!(corner, [0, 1, 2, 32, 33, 64]);
@@ -147,8 +85,7 @@ mod tests {
         tch::set_num_threads(1);
         let dropped = Tensor::zeros([1, 1024], (Kind::Bool, Device::Cpu));
         let _ = dropped.narrow(1, 1, 1).fill_(1);
-        let groups = Groups::find(&grid()).unwrap().without(&dropped).unwrap();
-        let fine = groups.fine.to_kind(Kind::Int64);
+        let fine = without(&neighbours(&grid(), FINE).unwrap(), &dropped).unwrap();
         let holders = fine.eq(1).any_dim(2, false).nonzero();
         let holders: Vec<i64> = Vec::try_from(&holders.narrow(1, 1, 1).reshape([-1])).unwrap();
         assert_eq!(holders, [1], "only a centre remains its own neighbour");

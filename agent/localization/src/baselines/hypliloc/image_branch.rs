@@ -26,9 +26,9 @@ impl ImageBranch {
         let mut blocks = Vec::new();
         let mut inputs = STAGES[0];
         for (stage, filters) in STAGES.into_iter().enumerate() {
-            let stride = if stage == 0 { 1 } else { 2 };
+            let (path, stride) = (path / "stages" / stage, if stage == 0 { 1 } else { 2 });
             blocks.extend(ResidualBlock::chain(
-                &(path / "stages" / stage),
+                &path,
                 [inputs, filters],
                 BLOCKS,
                 stride,
@@ -36,13 +36,8 @@ impl ImageBranch {
             inputs = filters;
         }
         let layer = |name: &str, io, kernel, stride| {
-            ConvLayer::normed(
-                &(path / name / "conv"),
-                &(path / name / "norm"),
-                io,
-                kernel,
-                stride,
-            )
+            let (conv, norm) = (path / name / "conv", path / name / "norm");
+            ConvLayer::normed(&conv, &norm, io, kernel, stride)
         };
         Self {
             stem: layer("stem", [CHANNELS, STAGES[0]], 7, 2),
@@ -58,13 +53,9 @@ impl ImageBranch {
         kind: Kind,
         train: bool,
     ) -> Result<Tensor, TchError> {
-        let x = self
-            .stem
-            .forward(&channels(ranges_m)?.f_to_kind(kind)?, train);
-        let x = self
-            .blocks
-            .iter()
-            .fold(x, |x, block| block.forward(&x, train));
+        let channels = channels(ranges_m)?.f_to_kind(kind)?;
+        let x = self.stem.forward(&channels, train);
+        let x = ResidualBlock::through(&self.blocks, x, train);
         self.outward.forward(&x, train).f_to_kind(Kind::Float)
     }
 }

@@ -1,106 +1,69 @@
 //! Localization by HypLiLoc: from a sweep to a pose.
 
-use std::path::Path;
-
-use protocol::NoPoseReason;
-use tch::nn::VarStore;
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use protocol::PointCloud;
+use support::stage_times::StageTimes;
+use tch::{Device, Kind, TchError, Tensor, nn, no_grad};
 
 use super::config::HypLiLocConfig;
 use super::network::HypLiLoc;
 use super::sweep_input::{InputBatch, SweepInput};
-use crate::baselines::regressed_pose::{localization, no_pose, upright};
+use crate::baselines::regressed_pose::{PoseRegressor, RegressPose};
+use crate::pgc::LocalizerError;
 use crate::pgc::localization::{REGRESS, VOXELISE};
-use crate::pgc::{Localization, Localize, LocalizerError, LocalizerInput, stopwatch};
 use perception::tensor_values::values;
-use perception::weights::Weights;
 
 /// Shortest heading that is a direction.
 const LEAST_HEADING: f32 = 1e-3;
 
-/// A trained network of one scene. Every pose has full confidence: the network predicts no error.
-#[derive(Debug)]
-pub struct HypLiLocLocalizer {
-    network: HypLiLoc,
-    config: HypLiLocConfig,
-    device: Device,
-}
+/// A trained network of one scene, output of `agent train hypliloc`.
+pub type HypLiLocLocalizer = PoseRegressor<HypLiLoc>;
 
-impl HypLiLocLocalizer {
-    /// Kind of the weights, as in their file.
-    pub const KIND: &'static str = "HypLiLoc";
+impl RegressPose for HypLiLoc {
+    const KIND: &'static str = "HypLiLoc";
+    type Config = HypLiLocConfig;
 
-    /// Reads the output of `agent train hypliloc`.
-    ///
-    /// # Errors
-    /// [`LocalizerError`] when the file is missing, truncated or of another kind, or its tensors are not those of the
-    /// network.
-    pub fn load(path: &Path, device: Device) -> Result<Self, LocalizerError> {
-        let weights = Weights::load(path)?;
-        weights.check_kind(Self::KIND)?;
-        let config: HypLiLocConfig = weights.config()?;
+    fn build(path: &nn::Path<'_>, config: &HypLiLocConfig) -> Result<Self, LocalizerError> {
         config.validate()?;
-        let mut variables = VarStore::new(device);
-        let network = HypLiLoc::new(&variables.root());
-        weights.copy_into(&variables)?;
-        variables.freeze();
-        Ok(Self {
-            network,
-            config,
-            device,
-        })
+        Ok(Self::new(path))
     }
 
-    /// Configuration: scene, origin and scale of its positions.
-    pub fn config(&self) -> &HypLiLocConfig {
-        &self.config
+    fn scale(config: &HypLiLocConfig) -> [[f64; 3]; 2] {
+        [config.origin_m, config.scale_m]
     }
 
-    /// Position relative to the origin, metres, cosine and sine of the heading.
-    fn regress(&self, input: SweepInput) -> Result<Vec<f32>, TchError> {
-        let batch = InputBatch::new(&[input], self.device)?;
-        let poses = self.network.forward(&batch, Kind::Float, false)?.fusion;
-        let answer = Tensor::f_cat(&[poses.position, poses.heading], 1)?;
-        values(&answer)
-    }
-}
-
-impl Localize for HypLiLocLocalizer {
-    fn localize(&mut self, sweep: LocalizerInput<'_>) -> Result<Localization, LocalizerError> {
-        let cloud = sweep.cloud;
-        let mut times = stopwatch();
+    /// The heading has length 1, or is NaN if it has no direction.
+    fn regress(
+        &self,
+        cloud: &PointCloud,
+        device: Device,
+        times: &mut StageTimes,
+    ) -> Result<Option<[f32; 5]>, TchError> {
         let points_m: Vec<[f32; 3]> = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]).collect();
         let input = SweepInput::new(&points_m);
         times.lap(VOXELISE);
         let Some(input) = input else {
-            return Ok(no_pose(NoPoseReason::TooFewPoints, times));
+            return Ok(None);
         };
-        let mut answer = no_grad(|| self.regress(input))?;
+        let answer = no_grad(|| {
+            let batch = InputBatch::new(&[input], device)?;
+            let poses = self.forward(&batch, Kind::Float, false)?.fusion;
+            values(&Tensor::f_cat(&[poses.position, poses.heading], 1)?)
+        })?;
         times.lap(REGRESS);
-        answer
-            .iter_mut()
-            .zip(self.config.scale_m)
-            .for_each(|(axis, scale)| *axis *= scale as f32);
-        let has_heading = of_length_one(&mut answer);
-        let pose = has_heading.then(|| upright(&answer, self.config.origin_m));
-        Ok(localization(pose.flatten(), times))
+        Ok(answer.first_chunk().map(|&[x, y, z, cosine, sine]| {
+            let length = match cosine.hypot(sine) {
+                length if length >= LEAST_HEADING => length,
+                _ => f32::NAN,
+            };
+            [x, y, z, cosine / length, sine / length]
+        }))
     }
-}
-
-/// Scales the heading after the position to length 1; false if it has no direction.
-fn of_length_one(answer: &mut [f32]) -> bool {
-    let [.., cosine, sine] = answer else {
-        return false;
-    };
-    let length = cosine.hypot(*sine);
-    (*cosine, *sine) = (*cosine / length, *sine / length);
-    length >= LEAST_HEADING
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-    use std::path::PathBuf;
+    use std::path::{Path, PathBuf};
 
     use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 
@@ -108,7 +71,9 @@ mod tests {
     use crate::baselines::load_baseline;
     use crate::baselines::sgloc::SgLocLocalizer;
     use crate::pgc::pose_solver::PoseSolver;
-    use protocol::{PointCloud, PoseEstimate};
+    use crate::pgc::{Localize, LocalizerInput};
+    use protocol::{NoPoseReason, PoseEstimate};
+    use tch::nn::VarStore;
 
     fn config() -> HypLiLocConfig {
         HypLiLocConfig {

@@ -26,11 +26,9 @@ mod point_branch;
 mod pose_head;
 mod range_image;
 mod sampling;
-mod set_abstraction;
 mod sweep_input;
 
 pub use config::HypLiLocConfig;
-pub use groups::Groups;
 pub use localizer::HypLiLocLocalizer;
 pub use network::{BranchPoses, HypLiLoc, WIDTH};
 pub use pose_head::NormalisedPoses;

@@ -3,7 +3,7 @@
 use perception::layers::residual::ResidualBlock;
 use tch::{Kind, TchError, Tensor, nn};
 
-use super::dense_norm::LayerNormed;
+use super::dense_norm::TokenLayer;
 use super::fusion::{Fusion, normalise};
 use super::graph_attention::{GraphAttention, Space};
 use super::image_branch::ImageBranch;
@@ -34,7 +34,7 @@ pub struct HypLiLoc {
     image: ImageBranch,
     first: Fusion,
     /// Block of the tokens of points.
-    point_block: (LayerNormed, GraphAttention, LayerNormed),
+    point_block: (TokenLayer, GraphAttention, TokenLayer),
     /// Block of the tokens of the image.
     image_block: Vec<ResidualBlock>,
     second: Fusion,
@@ -50,9 +50,9 @@ impl HypLiLoc {
             image: ImageBranch::new(&(path / "image")),
             first: Fusion::new(&(path / "first_fusion")),
             point_block: (
-                LayerNormed::new(&(&block / 0), WIDTH),
+                TokenLayer::new(&(&block / 0), WIDTH),
                 GraphAttention::with_metric(&(&block / 1), WIDTH, Space::Euclidean),
-                LayerNormed::new(&(&block / 2), WIDTH),
+                TokenLayer::new(&(&block / 2), WIDTH),
             ),
             image_block: ResidualBlock::chain(&(path / "image_block"), [WIDTH, WIDTH], 1, 1),
             second: Fusion::new(&(path / "second_fusion")),
@@ -71,27 +71,21 @@ impl HypLiLoc {
         kind: Kind,
         train: bool,
     ) -> Result<BranchPoses, TchError> {
-        let points = self
-            .points
-            .forward(&batch.points_m, &batch.groups, kind, train)?;
+        let points = self.points.forward(batch, kind, train)?;
         let map = self.image.forward(&batch.ranges_m, kind, train)?;
-        let (sweeps, channels, rows, columns) = map.size4()?;
         let tokens_of = |map: &Tensor| map.f_flatten(2, 3)?.f_transpose(1, 2);
         let image = tokens_of(&map)?;
+        let (count, cells) = (points.size()[1], image.size()[1]);
 
         let fused = self
             .first
             .forward(&normalise(&points)?, &normalise(&image)?)?;
-        let (count, cells) = (points.size()[1], rows * columns);
         let (inward, attention, outward) = &self.point_block;
-        let fused_points = outward
-            .forward(&attention.forward(&inward.forward(&fused.f_narrow(1, 0, count)?)?)?)?;
+        let fused_points = inward.forward(&fused.f_narrow(1, 0, count)?)?;
+        let fused_points = outward.forward(&attention.forward(&fused_points)?)?;
         let fused_map = fused.f_narrow(1, count, cells)?.f_transpose(1, 2)?;
-        let fused_map = fused_map.f_reshape([sweeps, channels, rows, columns])?;
-        let fused_map = self
-            .image_block
-            .iter()
-            .fold(fused_map, |map, block| block.forward(&map, train));
+        let fused_map = fused_map.f_reshape(map.size().as_slice())?;
+        let fused_map = ResidualBlock::through(&self.image_block, fused_map, train);
         let fused = self
             .second
             .forward(&fused_points, &tokens_of(&fused_map)?)?;

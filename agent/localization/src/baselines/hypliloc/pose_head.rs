@@ -27,17 +27,15 @@ impl PoseHead {
     /// Builds the layers below `path`.
     pub(super) fn new(path: &nn::Path<'_>) -> Self {
         let chain = |name: &str, outputs| {
-            let layer =
-                |number: usize, from, to, gain| Dense::new(&(path / name / number), from, to, gain);
+            let path = path / name;
             [
-                layer(0, WIDTH, 128, 1.0),
-                layer(1, 128, 64, 1.0),
-                layer(2, 64, outputs, 0.1),
+                Dense::new(&(&path / 0), WIDTH, 128, 1.0),
+                Dense::new(&(&path / 1), 128, 64, 1.0),
+                Dense::new(&(&path / 2), 64, outputs, 0.1),
             ]
         };
-        let norm = Norm::with_defaults(&(path / "norm"), WIDTH);
         Self {
-            norm,
+            norm: Norm::with_defaults(&(path / "norm"), WIDTH),
             position: chain("position", 3),
             heading: chain("heading", 2),
         }
@@ -45,19 +43,15 @@ impl PoseHead {
 
     /// `[S, WIDTH]`: batch norm of the mean of tokens `[S, T, WIDTH]`, which is nearly the same for all sweeps.
     pub(super) fn features(&self, tokens: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        Ok(self
-            .norm
-            .forward(&tokens.f_mean_dim(1_i64, false, Kind::Float)?, train))
+        let mean = tokens.f_mean_dim(1_i64, false, Kind::Float)?;
+        Ok(self.norm.forward(&mean, train))
     }
 
     /// Poses from features `[S, WIDTH]`.
     pub(super) fn forward(&self, features: &Tensor) -> Result<NormalisedPoses, TchError> {
         let through = |[first, second, third]: &[Dense; 3]| {
-            third.forward(
-                &second
-                    .forward(&first.forward(features)?.f_relu()?)?
-                    .f_relu()?,
-            )
+            let hidden = first.forward(features)?.f_relu()?;
+            third.forward(&second.forward(&hidden)?.f_relu()?)
         };
         Ok(NormalisedPoses {
             position: through(&self.position)?,

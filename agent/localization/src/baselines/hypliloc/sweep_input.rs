@@ -2,9 +2,10 @@
 
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::groups::Groups;
+use super::groups::{COARSE, FINE, neighbours, without};
 use super::range_image::{COLUMNS, ROWS, range_image};
 use super::sampling::{farthest_points, thin};
+use perception::tensor_values::tensor;
 
 /// Points of a sweep.
 pub const POINTS: i64 = 1024;
@@ -41,8 +42,10 @@ pub struct InputBatch {
     pub points_m: Tensor,
     /// `[S, ROWS, COLUMNS]`, metres.
     pub ranges_m: Tensor,
-    /// Neighbours among the points.
-    pub groups: Groups,
+    /// `[S, 256, 24]`: rows of the points near each centre of the first set abstraction.
+    pub fine: Tensor,
+    /// `[S, 64, 32]`: rows of these centres near each centre of the second one.
+    pub coarse: Tensor,
 }
 
 impl InputBatch {
@@ -51,27 +54,19 @@ impl InputBatch {
     /// # Errors
     /// Those of the tensor library.
     pub fn new(sweeps: &[SweepInput], device: Device) -> Result<Self, TchError> {
-        let points: Vec<f32> = sweeps
+        let points = sweeps
             .iter()
-            .flat_map(|sweep| sweep.points_m.as_flattened())
-            .copied()
-            .collect();
-        let ranges: Vec<f32> = sweeps
-            .iter()
-            .flat_map(|sweep| &sweep.ranges_m)
-            .copied()
-            .collect();
-        let points_m = Tensor::f_from_slice(&points)?
-            .f_view([-1, POINTS, 3])?
-            .f_to_device(device)?;
-        let ranges_m = Tensor::f_from_slice(&ranges)?
-            .f_view([-1, ROWS, COLUMNS])?
-            .f_to_kind(Kind::Half)?;
-        let groups = Groups::find(&points_m)?;
+            .flat_map(|sweep| sweep.points_m.as_flattened());
+        let points: Vec<f32> = points.copied().collect();
+        let ranges = sweeps.iter().flat_map(|sweep| &sweep.ranges_m);
+        let ranges: Vec<f32> = ranges.copied().collect();
+        let points_m = tensor(&points, &[-1, POINTS, 3], device)?;
+        let ranges_m = tensor(&ranges, &[-1, ROWS, COLUMNS], Device::Cpu)?;
         Ok(Self {
+            fine: neighbours(&points_m, FINE)?,
+            coarse: neighbours(&points_m.f_narrow(1, 0, FINE.centres)?, COARSE)?,
             points_m,
-            ranges_m: ranges_m.f_to_device(device)?,
-            groups,
+            ranges_m: ranges_m.f_to_kind(Kind::Half)?.f_to_device(device)?,
         })
     }
 
@@ -79,18 +74,15 @@ impl InputBatch {
     ///
     /// # Errors
     /// Those of the tensor library.
-    pub fn concatenate(batches: Vec<Self>) -> Result<Self, TchError> {
-        let (mut points, mut ranges, mut groups) = (Vec::new(), Vec::new(), Vec::new());
-        for batch in batches {
-            points.push(batch.points_m);
-            ranges.push(batch.ranges_m);
-            groups.push(batch.groups);
-        }
-        let (points_m, ranges_m) = (Tensor::f_cat(&points, 0)?, Tensor::f_cat(&ranges, 0)?);
+    pub fn concatenate(batches: &[Self]) -> Result<Self, TchError> {
+        let all = |part: fn(&Self) -> &Tensor| {
+            Tensor::f_cat(&batches.iter().map(part).collect::<Vec<_>>(), 0)
+        };
         Ok(Self {
-            points_m,
-            ranges_m,
-            groups: Groups::concatenate(&groups)?,
+            points_m: all(|batch| &batch.points_m)?,
+            ranges_m: all(|batch| &batch.ranges_m)?,
+            fine: all(|batch| &batch.fine)?,
+            coarse: all(|batch| &batch.coarse)?,
         })
     }
 
@@ -102,8 +94,17 @@ impl InputBatch {
         Ok(Self {
             points_m: self.points_m.f_index_select(0, rows)?,
             ranges_m: self.ranges_m.f_index_select(0, rows)?,
-            groups: self.groups.select(rows)?,
+            fine: self.fine.f_index_select(0, rows)?,
+            coarse: self.coarse.f_index_select(0, rows)?,
         })
+    }
+
+    /// Neighbours of the first set abstraction, replaced by their centre where points are dropped, `[S, POINTS]`.
+    ///
+    /// # Errors
+    /// Those of the tensor library.
+    pub fn fine_without(&self, is_dropped: &Tensor) -> Result<Tensor, TchError> {
+        without(&self.fine, is_dropped)
     }
 
     /// Number of sweeps.

@@ -1,8 +1,9 @@
 //! Head: attention between scales, residual layers with batch normalisation, and a shift of each cell's own position.
 
-use tch::nn::{self, BatchNormConfig, ModuleT};
+use tch::nn::{self, BatchNormConfig};
 use tch::{Kind, TchError, Tensor};
 
+use crate::baselines::layers::DenseNorm;
 use crate::pgc::SceneEncoderConfig;
 use crate::pgc::dense::Dense;
 
@@ -22,29 +23,9 @@ pub(super) struct SgLocHead {
     scales: Vec<i64>,
     /// One logit from each scale.
     squeeze: Vec<Dense>,
-    inward: Layer,
-    blocks: Vec<[Layer; 2]>,
+    inward: DenseNorm,
+    blocks: Vec<[DenseNorm; 2]>,
     outward: Dense,
-}
-
-/// A dense layer with batch normalisation.
-#[derive(Debug)]
-struct Layer {
-    dense: Dense,
-    norm: nn::BatchNorm,
-}
-
-impl Layer {
-    fn new(path: &nn::Path<'_>, inputs: i64) -> Self {
-        Self {
-            dense: Dense::new(path, inputs, WIDTH, 1.0),
-            norm: nn::batch_norm1d(path / "norm", WIDTH, BatchNormConfig::default()),
-        }
-    }
-
-    fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        Ok(self.norm.forward_t(&self.dense.forward(x)?, train))
-    }
 }
 
 impl SgLocHead {
@@ -53,20 +34,18 @@ impl SgLocHead {
         let coarse = encoder.coarse_channels();
         let fine = encoder.local_channels() - coarse;
         let surroundings = encoder.context_m.iter().map(|_| coarse);
-        let scales: Vec<i64> = [fine, coarse]
-            .into_iter()
-            .chain(surroundings)
-            .filter(|&channels| channels > 0)
-            .collect();
+        let scales = [fine, coarse].into_iter().chain(surroundings);
+        let scales: Vec<i64> = scales.filter(|&channels| channels > 0).collect();
         let squeeze = |(number, &channels): (usize, &i64)| {
             Dense::new(&(path / "squeeze" / number), channels, 1, 0.1)
         };
-        let block = |number: usize| {
-            [0, 1].map(|layer| Layer::new(&(path / "blocks" / number / layer), WIDTH))
+        let layer = |path: &nn::Path<'_>, inputs| {
+            DenseNorm::new(path, [inputs, WIDTH], BatchNormConfig::default())
         };
+        let block = |number: usize| [0, 1].map(|of| layer(&(path / "blocks" / number / of), WIDTH));
         Self {
             squeeze: scales.iter().enumerate().map(squeeze).collect(),
-            inward: Layer::new(&(path / "inward"), encoder.cell_channels() + 3),
+            inward: layer(&(path / "inward"), encoder.cell_channels() + 3),
             scales,
             blocks: (0..BLOCKS).map(block).collect(),
             outward: Dense::new(&(path / "outward"), WIDTH, 3, 0.1),
@@ -84,10 +63,8 @@ impl SgLocHead {
     ) -> Result<Tensor, TchError> {
         let mut parts = self.weigh(cells)?;
         parts.push((sensor_m / POSITION_SCALE_M).f_to_kind(cells.kind())?);
-        let mut x = self
-            .inward
-            .forward(&Tensor::f_cat(&parts, 1)?, train)?
-            .f_relu()?;
+        let parts = Tensor::f_cat(&parts, 1)?;
+        let mut x = self.inward.forward(&parts, train)?.f_relu()?;
         for [first, second] in &self.blocks {
             let inner = first.forward(&x, train)?.f_relu()?;
             x = (x + second.forward(&inner, train)?).f_relu()?;

@@ -2,13 +2,12 @@
 
 use std::path::Path;
 
-use perception::tensor_values::values;
+use perception::tensor_values::{tensor, values};
 use perception::weights::Weights;
 use protocol::NoPoseReason;
-use tch::nn::VarStore;
-use tch::{Device, Kind, Tensor, no_grad};
+use tch::{Device, Kind, nn, no_grad};
 
-use super::{SgLoc, SgLocConfig};
+use super::SgLoc;
 use crate::baselines::regressed_pose::no_pose;
 use crate::pgc::error::LocalizerError;
 use crate::pgc::localization::{ENCODE, REGRESS, SOLVE, VOXELISE};
@@ -43,15 +42,9 @@ impl SgLocLocalizer {
     /// [`LocalizerError`] when the file is missing, truncated or of another kind, or its tensors are not those of its
     /// configuration.
     pub fn load(path: &Path, device: Device, solver: PoseSolver) -> Result<Self, LocalizerError> {
-        let weights = Weights::load(path)?;
-        weights.check_kind(Self::KIND)?;
-        let config: SgLocConfig = weights.config()?;
-        let mut variables = VarStore::new(device);
-        let network = SgLoc::new(&variables.root(), &config)?;
-        weights.copy_into(&variables)?;
-        variables.freeze();
+        let build = |path: &nn::Path<'_>, config| SgLoc::new(path, &config);
         Ok(Self {
-            network,
+            network: Weights::load(path)?.network(Self::KIND, device, build)?,
             solver,
             device,
         })
@@ -65,20 +58,13 @@ impl SgLocLocalizer {
     ) -> Result<SceneCoordinates, LocalizerError> {
         let chosen = choose_evenly(sweep.cells(), CELLS);
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
-        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
-        let sensor_m: Vec<[f32; 3]> = chosen
-            .iter()
-            .map(|&cell| sweep.cells()[cell].centroid_m)
-            .collect();
-        let places = Tensor::f_from_slice(sensor_m.as_flattened())?
-            .f_view([-1, 3])?
-            .f_to_device(self.device)?;
+        let rows = tensor(&rows, &[-1], self.device)?;
+        let sensor_m = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m);
+        let sensor_m: Vec<[f32; 3]> = sensor_m.collect();
+        let places = tensor(sensor_m.as_flattened(), &[-1, 3], self.device)?;
         let world = no_grad(|| {
             let cells = features.cells.f_index_select(0, &rows)?;
-            let coordinates = self
-                .network
-                .coordinates(&cells, &places, Kind::Float, false)?;
-            values(&coordinates)
+            values(&(self.network).coordinates(&cells, &places, Kind::Float, false)?)
         })?;
         Ok(SceneCoordinates {
             epsilon_m: vec![0.0; sensor_m.len()],
@@ -121,8 +107,11 @@ mod tests {
     use protocol::PoseEstimate;
 
     use super::*;
+    use crate::baselines::sgloc::SgLocConfig;
     use crate::pgc::{Localizer, SceneEncoderConfig};
     use protocol::PointCloud;
+    use tch::Tensor;
+    use tch::nn::VarStore;
 
     fn config() -> SgLocConfig {
         let encoder = SceneEncoderConfig {

@@ -56,25 +56,17 @@ impl BevFormat {
                 height: pillars[1].div_ceil(stride as usize),
             }
         };
-        let levels = config
-            .num_filters
-            .iter()
-            .zip(&config.layer_strides)
-            .map(level)
-            .collect();
-        let reach_m = |axis: usize| {
-            config.lidar_range_m[axis]
-                .abs()
-                .max(config.lidar_range_m[axis + 3].abs())
-        };
+        let levels = config.num_filters.iter().zip(&config.layer_strides);
+        let levels = levels.map(level).collect();
+        let range_m = config.lidar_range_m.map(f64::abs);
+        let reach_m = |axis: usize| range_m[axis].max(range_m[axis + 3]);
         Self {
             crop: Crop::for_detector(config),
             low_m: [0, 1].map(|axis| config.lidar_range_m[axis] as f32),
             range_m: reach_m(0).hypot(reach_m(1)),
-            y_sign: if config.y_axis == YAxis::Right {
-                -1.0
-            } else {
-                1.0
+            y_sign: match config.y_axis == YAxis::Right {
+                true => -1.0,
+                false => 1.0,
             },
             levels,
         }
@@ -98,9 +90,8 @@ impl BevFormat {
 
     /// Channels, height and width of each level.
     pub(super) fn shapes(&self) -> impl Iterator<Item = [i64; 3]> + '_ {
-        self.levels
-            .iter()
-            .map(|level| [level.channels, level.height as i64, level.width as i64])
+        let shape = |level: &LevelGrid| [level.channels, level.height as i64, level.width as i64];
+        self.levels.iter().map(shape)
     }
 
     /// Height and width of the surroundings of a cell, cells of the coarsest level; odd, so that the cell is in the
@@ -145,26 +136,20 @@ impl BevCells {
         };
         let mut columns = vec![Column::default(); finest.width * finest.height];
         for &[x, y, z, _] in &cloud.xyzi {
-            let [column, row] =
-                finest.cell([x - format.low_m[0], y * format.y_sign - format.low_m[1]]);
+            let [low_x, low_y] = format.low_m;
+            let [column, row] = finest.cell([x - low_x, y * format.y_sign - low_y]);
             columns[row * finest.width + column].add([x, y, z]);
         }
-        let occupied = columns
-            .iter()
-            .enumerate()
-            .filter(|(_, column)| column.points > 0);
-        let (numbers, cells): (Vec<usize>, Vec<Cell>) = occupied
-            .map(|(number, column)| (number, column.cell()))
-            .unzip();
+        let occupied = (columns.iter().enumerate()).filter(|(_, column)| column.points > 0);
+        let cells = occupied.map(|(number, column)| (number, column.cell()));
+        let (numbers, cells): (Vec<usize>, Vec<Cell>) = cells.unzip();
         let place = |grid: &LevelGrid| {
             // Strides are whole numbers: the cells of a level are whole blocks of those of the finest.
             let steps =
                 [0, 1].map(|axis| (grid.cell_m[axis] / finest.cell_m[axis]).round() as usize);
             let number = |&number: &usize| {
-                let (column, row) = (
-                    number % finest.width / steps[0],
-                    number / finest.width / steps[1],
-                );
+                let column = number % finest.width / steps[0];
+                let row = number / finest.width / steps[1];
                 (row * grid.width + column) as i64
             };
             numbers.iter().map(number).collect()

@@ -78,28 +78,22 @@ impl CellEncoder {
         let sha256 = Self::sha256_of(&weights);
         if BackboneEncoder::is_in(&weights) {
             let encoder = Box::new(BackboneEncoder::of_detector(&weights, device)?);
-            let format = SweepFormat::Bev(encoder.format().clone());
-            return Ok((
-                Self {
-                    network: Network::Backbone(encoder),
-                    format,
-                    device,
-                },
-                sha256,
-            ));
+            let encoder = Self {
+                format: SweepFormat::Bev(encoder.format().clone()),
+                network: Network::Backbone(encoder),
+                device,
+            };
+            return Ok((encoder, sha256));
         }
-        Ok((
-            Self::sparse(SceneEncoder::from_weights(&weights, device)?, device),
-            sha256,
-        ))
+        let encoder = SceneEncoder::from_weights(&weights, device)?;
+        Ok((Self::sparse(encoder, device), sha256))
     }
 
     /// SHA-256 that a head names the encoder of a file by, see [`Self::load`].
     pub fn sha256_of(weights: &Weights) -> String {
-        if BackboneEncoder::is_in(weights) {
-            encoder_sha256(weights)
-        } else {
-            weights.sha256().to_owned()
+        match BackboneEncoder::is_in(weights) {
+            true => encoder_sha256(weights),
+            false => weights.sha256().to_owned(),
         }
     }
 
@@ -131,20 +125,14 @@ impl CellEncoder {
         match &self.network {
             Network::Sparse(encoder) => {
                 let batch = self.batch(encoder, sweeps)?;
-                let rows = (0..sweeps.len())
-                    .map(|sweep| batch.cell_rows(sweep))
-                    .collect();
                 Ok(EncodedCells {
                     features: encoder.encode(&batch, kind)?,
-                    rows,
+                    rows: batch.cell_rows.clone(),
                 })
             }
             Network::Backbone(encoder) => {
-                let cells: Vec<&BevCells> = sweeps
-                    .iter()
-                    .map(|sweep| sweep.bev())
-                    .collect::<Result<_, _>>()?;
-                encoder.encode(&cells)
+                let cells: Result<Vec<_>, _> = sweeps.iter().map(|sweep| sweep.bev()).collect();
+                encoder.encode(&cells?)
             }
         }
     }
@@ -202,11 +190,8 @@ impl CellEncoder {
         encoder: &SceneEncoder,
         sweeps: &[&PreparedSweep],
     ) -> Result<VoxelBatch, LocalizerError> {
-        let voxels: Vec<&SweepVoxels> = sweeps
-            .iter()
-            .map(|sweep| sweep.voxels())
-            .collect::<Result<_, _>>()?;
-        Ok(VoxelBatch::new(&voxels, encoder.config(), self.device)?)
+        let voxels: Result<Vec<_>, _> = sweeps.iter().map(|sweep| sweep.voxels()).collect();
+        Ok(VoxelBatch::new(&voxels?, encoder.config(), self.device)?)
     }
 }
 
@@ -215,10 +200,10 @@ impl SweepFormat {
     /// out.
     pub fn prepare(&self, points: &[[f32; 4]]) -> PreparedSweep {
         match self {
-            Self::Voxels(config) => PreparedSweep::Voxels(SweepVoxels::new(
-                points.iter().map(|&[x, y, z, _]| [x, y, z]),
-                config,
-            )),
+            Self::Voxels(config) => {
+                let points = points.iter().map(|&[x, y, z, _]| [x, y, z]);
+                PreparedSweep::Voxels(SweepVoxels::new(points, config))
+            }
             Self::Bev(format) => PreparedSweep::Bev(BevCells::new(points, format)),
         }
     }
@@ -268,9 +253,10 @@ impl PreparedSweep {
     fn voxels(&self) -> Result<&SweepVoxels, LocalizerError> {
         match self {
             Self::Voxels(voxels) => Ok(voxels),
-            Self::Bev(_) => Err(LocalizerError::Config(
-                "BEV cells of a detector, must be voxels".into(),
-            )),
+            Self::Bev(_) => {
+                let problem = "BEV cells of a detector, must be voxels";
+                Err(LocalizerError::Config(problem.into()))
+            }
         }
     }
 

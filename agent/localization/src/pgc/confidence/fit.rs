@@ -59,10 +59,9 @@ pub enum FitError {
 /// # Errors
 /// [`FitError::GoodLoss`] unless it is at least 0 and below 1.
 pub fn check_good_loss(good_loss: f64) -> Result<(), FitError> {
-    if (0.0..1.0).contains(&good_loss) {
-        Ok(())
-    } else {
-        Err(FitError::GoodLoss(good_loss))
+    match (0.0..1.0).contains(&good_loss) {
+        true => Ok(()),
+        false => Err(FitError::GoodLoss(good_loss)),
     }
 }
 
@@ -73,21 +72,15 @@ impl ConfidenceModel {
     /// [`FitError`] when there are too few sweeps, or `good_loss` is not at least 0 and below 1.
     pub fn fit(sweeps: &[Labelled], good_loss: f64) -> Result<(Self, FitReport), FitError> {
         check_good_loss(good_loss)?;
-        let sweeps: Vec<_> = sweeps
-            .iter()
-            .filter(|sweep| sweep.error_m.is_finite())
-            .collect();
+        let sweeps = sweeps.iter().filter(|sweep| sweep.error_m.is_finite());
+        let sweeps: Vec<_> = sweeps.collect();
         if sweeps.len() < MIN_SWEEPS {
             return Err(FitError::TooFew(sweeps.len()));
         }
-        let rows: Vec<[f64; FEATURES]> = sweeps
-            .iter()
-            .map(|sweep| features(&sweep.evidence))
-            .collect();
-        let targets: Vec<f64> = sweeps
-            .iter()
-            .map(|sweep| sweep.error_m.max(SMALLEST_ERROR_M).ln())
-            .collect();
+        let log_error = |error_m: f64| error_m.max(SMALLEST_ERROR_M).ln();
+        let (rows, targets): (Vec<[f64; FEATURES]>, Vec<f64>) = (sweeps.iter())
+            .map(|sweep| (features(&sweep.evidence), log_error(sweep.error_m)))
+            .unzip();
         let (bias, weights) = non_negative_regression(&rows, &targets);
         let mut model = Self {
             bias,
@@ -126,11 +119,8 @@ pub fn observed(error_m: f64) -> f64 {
 /// The highest threshold below which at most a share `good_loss` of the good poses lies; 1, which rejects every pose,
 /// without good ones.
 fn threshold(sigmas: &[(f64, bool)], good_loss: f64) -> f64 {
-    let mut good: Vec<f64> = sigmas
-        .iter()
-        .filter(|(_, is_good)| *is_good)
-        .map(|(sigma, _)| *sigma)
-        .collect();
+    let good = sigmas.iter().filter(|(_, is_good)| *is_good);
+    let mut good: Vec<f64> = good.map(|(sigma, _)| *sigma).collect();
     good.sort_by(f64::total_cmp);
     let lost = (good_loss * good.len() as f64).floor() as usize;
     good.get(lost).copied().unwrap_or(1.0)

@@ -90,13 +90,9 @@ pub struct IcpTarget {
 impl IcpTarget {
     /// Target without a point.
     pub fn new(config: &IcpConfig) -> Self {
-        let levels = config
-            .levels
-            .iter()
-            .map(|level| Surfels::new(level.voxel_m))
-            .collect();
+        let levels = config.levels.iter();
         Self {
-            levels,
+            levels: levels.map(|level| Surfels::new(level.voxel_m)).collect(),
             origin_m: None,
             range_m: config.range_m,
         }
@@ -157,9 +153,7 @@ fn within(
     xyzi: &[[f32; 4]],
     [nearest_m, farthest_m]: [f64; 2],
 ) -> impl Iterator<Item = Vector3<f64>> {
-    let points = xyzi
-        .iter()
-        .map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
+    let points = (xyzi.iter()).map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
     points.filter(move |point: &Vector3<f64>| (nearest_m..=farthest_m).contains(&point.norm()))
 }
 
@@ -277,10 +271,8 @@ pub fn register(
 fn moved(motion: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
     let turn = Vector3::new(step[0], step[1], step[2]) / LEVER_M;
     let shift = Vector3::new(step[3], step[4], step[5]);
-    Isometry3::from_parts(
-        Translation3::from(motion.translation.vector + shift),
-        UnitQuaternion::from_scaled_axis(turn) * motion.rotation,
-    )
+    let rotation = UnitQuaternion::from_scaled_axis(turn) * motion.rotation;
+    Isometry3::from_parts((motion.translation.vector + shift).into(), rotation)
 }
 
 /// Sums of one Gauss-Newton step: rotation about the sensor times [`LEVER_M`], then translation, all in metres.
@@ -323,15 +315,8 @@ impl NormalEquations {
                 sums.squares += distance * distance;
             }
             let weight = 1.0 / ((1.0 + scaled) * (1.0 + scaled));
-            let turn = arm.cross(&plane.normal) / LEVER_M;
-            let row = Vector6::new(
-                turn.x,
-                turn.y,
-                turn.z,
-                plane.normal.x,
-                plane.normal.y,
-                plane.normal.z,
-            );
+            let (normal, turn) = (plane.normal, arm.cross(&plane.normal) / LEVER_M);
+            let row = Vector6::new(turn.x, turn.y, turn.z, normal.x, normal.y, normal.z);
             sums.weight += weight;
             sums.hessian += row * row.transpose() * weight;
             sums.gradient += row * (distance * weight);
@@ -368,9 +353,8 @@ impl NormalEquations {
                 required: config.min_overlap,
             });
         }
-        let constraint = SymmetricEigen::new(self.hessian / self.weight)
-            .eigenvalues
-            .min();
+        let eigen = SymmetricEigen::new(self.hessian / self.weight);
+        let constraint = eigen.eigenvalues.min();
         if constraint < config.min_constraint {
             return Err(NoIcpFit::Unconstrained {
                 constraint,

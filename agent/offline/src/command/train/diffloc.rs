@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use agent_offline::training::{DiffLocAccuracy, DiffLocReport, DiffLocTrainConfig, train_diffloc};
+use agent_offline::training::{DiffLocTrainConfig, train_diffloc};
 use localization::baselines::diffloc::DiffLocConfig;
 use perception::train::{AdamWConfig, ModelCard, RunConfig, TrainingBar, TrainingOptions};
 
-use super::options::{SceneSweeps, SensorTurns, bad, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, SensorTurns, bad, check_folders, run_config, with_bar};
 
 /// Decoupled weight decay: sweeps are few beside the parameters.
 const WEIGHT_DECAY: f64 = 0.05;
@@ -40,31 +40,24 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let bar = TrainingBar::of(config.run.length);
-    let summary = train_diffloc(&config, &mut |report| show(&bar, report))?;
-    bar.finish();
-    print_left_out(&bar, &summary.trained.data);
+    let (summary, _) = with_bar(&bar, |observe| train_diffloc(&config, observe))?;
     let title = format!("DiffLoc of {}", config.network.scene_name);
-    let mut card = ModelCard::new(
-        &title,
-        "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.",
-    );
+    let about = "Pose regression by denoising diffusion, trained from random weights on the sweeps of one scene.";
+    let mut card = ModelCard::new(&title, about);
     let data = format!("{} sweeps", summary.sweeps);
     card.trained(&config.run, &summary.trained, &data, "sweeps");
     let (turn_deg, shift_m) = (args.turns.turn_deg, args.shift_m);
     let turns = format!("turns up to {turn_deg} degrees, shifts up to {shift_m} m");
     card.row("augmentation", turns);
-    card.row(
-        "mask of static objects",
-        "supervised: pixels in annotated boxes are not static",
-    );
+    let mask = "supervised: pixels in annotated boxes are not static";
+    card.row("mask of static objects", mask);
+    let mut more = serde_json::json!({});
     if let Some(accuracy) = summary.validation {
-        card.row("validation", text(&accuracy));
+        card.row("validation", accuracy);
+        more = serde_json::json!({"validation": accuracy});
     }
     card.configuration(&summary.network);
     card.write(&config.run.out)?;
-    let more = summary.validation.map_or(serde_json::json!({}), |DiffLocAccuracy { p50_m, success_3m }| {
-        serde_json::json!({"validation": {"p50_m": p50_m, "success_3m": success_3m}})
-    });
     args.options.print(&summary.trained, &more)?;
     Ok(())
 }
@@ -73,9 +66,8 @@ impl Args {
     fn config(&self) -> anyhow::Result<DiffLocTrainConfig> {
         let shift_m = self.shift_m;
         if !(0.0..=10.0).contains(&shift_m) {
-            return Err(bad(&format!(
-                "--shift-m is {shift_m}, must be 0 to 10 metres"
-            )));
+            let reason = format!("--shift-m is {shift_m}, must be 0 to 10 metres");
+            return Err(bad(&reason));
         }
         check_folders(self.sweeps.dataset.iter().chain(&self.validation))?;
         let run = run_config(&self.options, self.batch, self.lr)?;
@@ -96,38 +88,4 @@ impl Args {
             run: RunConfig { optimizer, ..run },
         })
     }
-}
-
-fn show(bar: &TrainingBar, report: &DiffLocReport) {
-    match report {
-        DiffLocReport::Imaging(done, total) => bar.encoded(*done, *total),
-        DiffLocReport::Stepped {
-            step,
-            share_done,
-            seconds,
-            pose_l1,
-            place_loss,
-            accuracy,
-        } => {
-            bar.report(
-                *share_done,
-                *seconds,
-                &format!(
-                    "step {step} poses {pose_l1:.3} places {place_loss:.2}, batch {}",
-                    text(accuracy)
-                ),
-            );
-        }
-        DiffLocReport::Validated(seconds, accuracy) => {
-            bar.print_line(&format!("{seconds:.0} s: validation {}", text(accuracy)));
-        }
-    }
-}
-
-fn text(accuracy: &DiffLocAccuracy) -> String {
-    format!(
-        "median {:.2} m, {:.1} % under 3 m",
-        accuracy.p50_m,
-        100.0 * accuracy.success_3m
-    )
 }

@@ -2,13 +2,11 @@
 
 use std::path::PathBuf;
 
-use agent_offline::training::{
-    EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder,
-};
+use agent_offline::training::{EncoderAccuracy, EncoderSummary, EncoderTrainConfig, train_encoder};
 use localization::pgc::SceneEncoderConfig;
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, print_left_out, run_config};
+use super::options::{bad, check_folders, run_config, with_bar};
 
 /// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
 ///
@@ -44,40 +42,10 @@ fn parse_network(name: &str) -> Result<SceneEncoderConfig, String> {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let bar = TrainingBar::of(config.run.length);
-    let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;
-    bar.finish();
+    let (summary, _) = with_bar(&bar, |observe| train_encoder(&config, observe))?;
     card(&config, &summary).write(&config.run.out)?;
-    args.options.print(
-        &summary.trained,
-        &serde_json::json!({"accuracy": summary.accuracy}),
-    )?;
-    Ok(())
-}
-
-fn tell(bar: &TrainingBar, report: &EncoderReport) {
-    match report {
-        EncoderReport::Read(data) => print_left_out(bar, data),
-        EncoderReport::Stepped {
-            step,
-            share_done,
-            seconds,
-            loss,
-            accuracy,
-        } => {
-            let EncoderAccuracy { top1, offset_m } = accuracy;
-            let text = format!(
-                "step {step} loss {loss:.3} top-1 {:.1} % offset {offset_m:.2} m",
-                100.0 * top1
-            );
-            bar.report(*share_done, *seconds, &text);
-        }
-        EncoderReport::Validated(step, EncoderAccuracy { top1, offset_m }) => {
-            bar.print_line(&format!(
-                "step {step}: validation top-1 {:.1} % offset {offset_m:.2} m",
-                100.0 * top1
-            ));
-        }
-    }
+    let more = serde_json::json!({"accuracy": summary.accuracy});
+    Ok(args.options.print(&summary.trained, &more)?)
 }
 
 impl Args {
@@ -97,28 +65,21 @@ impl Args {
 }
 
 fn card(config: &EncoderTrainConfig, summary: &EncoderSummary) -> ModelCard {
-    let mut card = ModelCard::new(
-        &format!("Scene encoder `{}`", config.encoder.name),
-        &format!(
-            "Sparse 3-D convolutions over voxels of {} m; trained on correspondences between overlapping sweeps.",
-            config.encoder.voxel_m
-        ),
+    let title = format!("Scene encoder `{}`", config.encoder.name);
+    let about = format!(
+        "Sparse 3-D convolutions over voxels of {} m; trained on correspondences between overlapping sweeps.",
+        config.encoder.voxel_m
     );
-    let data = format!(
-        "{} sweeps of {} scenes",
-        summary.sweeps,
-        config.scenes.len()
-    );
+    let mut card = ModelCard::new(&title, &about);
+    let (sweeps, scenes) = (summary.sweeps, config.scenes.len());
+    let data = format!("{sweeps} sweeps of {scenes} scenes");
     card.trained(&config.run, &summary.trained, &data, "pairs");
-    if let Some(accuracy) = summary.accuracy {
-        card.row(
-            "validation",
-            format_args!(
-                "{:.1} % of cells find their match among those of two pairs, offset error {:.2} m (L1)",
-                100.0 * accuracy.top1,
-                accuracy.offset_m
-            ),
+    if let Some(EncoderAccuracy { top1, offset_m }) = summary.accuracy {
+        let text = format!(
+            "{:.1} % of cells find their match among those of two pairs, offset error {offset_m:.2} m (L1)",
+            100.0 * top1
         );
+        card.row("validation", text);
     }
     card.configuration(&config.encoder);
     card

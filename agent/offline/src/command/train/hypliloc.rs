@@ -1,9 +1,9 @@
 //! `agent train hypliloc`: arguments, progress and model card.
 
-use agent_offline::training::{HypLiLocReport, HypLiLocTrainConfig, train_hypliloc};
+use agent_offline::training::{HypLiLocTrainConfig, train_hypliloc};
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{SceneSweeps, SensorTurns, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, SensorTurns, check_folders, run_config, with_bar};
 
 /// Train a small HypLiLoc on one scene; writes checkpoint, weights.safetensors and model-card.md.
 ///
@@ -33,42 +33,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         run: run_config(&args.options, args.batch, args.lr)?,
     };
     let bar = TrainingBar::of(config.run.length);
-    let mut latest = None;
-    let trained = train_hypliloc(&config, &mut |report| match *report {
-        HypLiLocReport::Sampling(done, total) => bar.encoded(done, total),
-        HypLiLocReport::Stepped {
-            step,
-            share_done,
-            seconds,
-            error_m,
-            error_deg,
-            place_losses: [points, image, fusion],
-        } => {
-            latest = Some((error_m, error_deg));
-            let places = format!("places {points:.2} {image:.2} {fusion:.2}");
-            let text = format!("step {step} error {error_m:.2} m {error_deg:.1} deg, {places}");
-            bar.report(share_done, seconds, &text);
-        }
-    })?;
-    bar.finish();
-    print_left_out(&bar, &trained.data);
+    let (trained, means) = with_bar(&bar, |observe| train_hypliloc(&config, observe))?;
     let title = format!("HypLiLoc, small, of {}", config.scene_name);
-    let mut card = ModelCard::new(
-        &title,
-        "Trained from random weights on the sweeps of one scene.",
-    );
+    let about = "Trained from random weights on the sweeps of one scene.";
+    let mut card = ModelCard::new(&title, about);
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
-    card.row(
-        "augmentation",
-        format_args!("turns up to {} degrees", args.turns.turn_deg),
-    );
-    if let Some((error_m, error_deg)) = latest {
-        card.row(
-            "mean error of the last steps, training sweeps",
-            format!("{error_m:.2} m, {error_deg:.1} deg"),
-        );
+    let turns = format!("turns up to {} degrees", args.turns.turn_deg);
+    card.row("augmentation", turns);
+    if let [error_m, error_deg, ..] = means[..] {
+        let name = "mean error of the last steps, training sweeps";
+        card.row(name, format_args!("{error_m:.2} m, {error_deg:.1} deg"));
     }
     card.write(&config.run.out)?;
-    args.options.print(&trained, &serde_json::json!({}))?;
-    Ok(())
+    Ok(args.options.print(&trained, &serde_json::json!({}))?)
 }

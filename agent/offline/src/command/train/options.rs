@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
+use agent_offline::Error;
 use anyhow::Context;
-use perception::train::{DataListing, RunConfig, TrainingBar, TrainingOptions};
+use perception::train::{Observe, Progress, RunConfig, TrainingBar, TrainingOptions};
 
 use support::cli::BadInput;
 
@@ -67,7 +68,18 @@ pub(crate) fn check_folders<'a>(
     Ok(())
 }
 
-/// Prints the part of the data that cannot be used.
-pub(crate) fn print_left_out(bar: &TrainingBar, data: &DataListing) {
-    data.left_out().iter().for_each(|text| bar.print_line(text));
+/// Trains with a bar; the result, and the means of the last report.
+pub(crate) fn with_bar<T>(
+    bar: &TrainingBar,
+    train: impl FnOnce(&mut Observe<'_>) -> Result<T, Error>,
+) -> anyhow::Result<(T, Vec<f64>)> {
+    let mut latest = Vec::new();
+    let trained = train(&mut |progress| {
+        if let Progress::Stepped(report) = progress {
+            latest.clone_from(&report.means);
+        }
+        bar.show_progress(progress);
+    });
+    bar.finish();
+    Ok((trained?, latest))
 }

@@ -4,12 +4,11 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use agent_offline::training::{
-    LeaveOut, RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation,
-    train_scene,
+    LeaveOut, RedundancyConfig, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
 };
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{SceneSweeps, bad, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, bad, check_folders, run_config, with_bar};
 
 /// Train the head of one scene on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors
 /// and model-card.md.
@@ -72,42 +71,14 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let bar = TrainingBar::including_encoding(config.run.length);
-    let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
-    bar.finish();
+    let (summary, _) = with_bar(&bar, |observe| train_scene(&config, observe))?;
     card(&config, &summary).write(&config.run.out)?;
-    let SceneSummary {
-        preparing_seconds,
-        accuracy,
-        cells_shown,
-        ..
-    } = summary;
-    let more = serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
-    args.options.print(&summary.trained, &more)?;
-    Ok(())
-}
-
-fn tell(bar: &TrainingBar, report: &SceneReport) {
-    match report {
-        SceneReport::Encoding(done, total) => bar.encoded(*done, *total),
-        SceneReport::Encoded(data) => print_left_out(bar, data),
-        SceneReport::Classified(share) => {
-            bar.print_line(&format!("{:.1} % of the training sweeps are assigned to their cluster", 100.0 * share));
-        }
-        SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m, refined_m } => {
-            let text = format!(
-                "step {step} epoch {epoch:.2} error {error_m:.2} m, predicted {epsilon_m:.2} m, refined {refined_m:.2} m"
-            );
-            bar.report(*share_done, *seconds, &text);
-        }
-        SceneReport::Validated(seconds, accuracy) => bar.print_line(&format!(
-            "{seconds:.0} s: cells {:.2} m, poses {:.3} m {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %",
-            accuracy.cell_p50_m,
-            accuracy.pose_p50_m,
-            accuracy.pose_p50_deg,
-            100.0 * accuracy.success_3m,
-            100.0 * accuracy.success_1m
-        )),
-    }
+    let more = serde_json::json!({
+        "preparing_seconds": summary.preparing_seconds,
+        "accuracy": summary.accuracy,
+        "cells_shown": summary.cells_shown,
+    });
+    Ok(args.options.print(&summary.trained, &more)?)
 }
 
 impl Args {
@@ -147,32 +118,22 @@ impl Args {
 
 fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> ModelCard {
     let title = format!("Scene head of {}", summary.scene_name);
-    let mut card = ModelCard::new(
-        &title,
-        "World coordinates of cells on the features of a frozen encoder.",
-    );
-    card.trained(
-        &config.run,
-        &summary.trained,
-        &format!("{} sweeps", summary.sweeps),
-        "cells",
-    );
-    card.row(
-        "of which reading and encoding",
-        format_args!("{:.0} s", summary.preparing_seconds),
-    );
+    let about = "World coordinates of cells on the features of a frozen encoder.";
+    let mut card = ModelCard::new(&title, about);
+    let data = format!("{} sweeps", summary.sweeps);
+    card.trained(&config.run, &summary.trained, &data, "cells");
+    let preparing = format!("{:.0} s", summary.preparing_seconds);
+    card.row("of which reading and encoding", preparing);
     if let Some(accuracy) = summary.accuracy {
-        card.row(
-            "validation",
-            format_args!(
-                "poses: median {:.3} m and {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %; cells: median {:.2} m (L1)",
-                accuracy.pose_p50_m,
-                accuracy.pose_p50_deg,
-                100.0 * accuracy.success_3m,
-                100.0 * accuracy.success_1m,
-                accuracy.cell_p50_m
-            ),
+        let text = format!(
+            "poses: median {:.3} m and {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %; cells: median {:.2} m (L1)",
+            accuracy.pose_p50_m,
+            accuracy.pose_p50_deg,
+            100.0 * accuracy.success_3m,
+            100.0 * accuracy.success_1m,
+            accuracy.cell_p50_m
         );
+        card.row("validation", text);
     }
     card
 }

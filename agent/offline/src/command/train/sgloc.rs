@@ -2,10 +2,10 @@
 
 use std::path::PathBuf;
 
-use agent_offline::training::{SgLocReport, SgLocTrainConfig, train_sgloc};
+use agent_offline::training::{SgLocTrainConfig, train_sgloc};
 use perception::train::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{SceneSweeps, check_folders, print_left_out, run_config};
+use super::options::{SceneSweeps, check_folders, run_config, with_bar};
 
 /// Train SGLoc's head on one scene, on a frozen encoder; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
@@ -34,35 +34,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         run: run_config(&args.options, args.batch, args.lr)?,
     };
     let bar = TrainingBar::of(config.run.length);
-    let mut latest_m = None;
-    let trained = train_sgloc(&config, &mut |report| match *report {
-        SgLocReport::Encoding(done, total) => bar.encoded(done, total),
-        SgLocReport::Stepped {
-            step,
-            share_done,
-            seconds,
-            error_m,
-        } => {
-            latest_m = Some(error_m);
-            let text = format!("step {step} error {error_m:.2} m");
-            bar.report(share_done, seconds, &text);
-        }
-    })?;
-    bar.finish();
-    print_left_out(&bar, &trained.data);
+    let (trained, means) = with_bar(&bar, |observe| train_sgloc(&config, observe))?;
     let title = format!("SGLoc, small, of {}", config.scene_name);
-    let mut card = ModelCard::new(
-        &title,
-        "Head on the features of a frozen encoder, trained on the sweeps of one scene.",
-    );
+    let about = "Head on the features of a frozen encoder, trained on the sweeps of one scene.";
+    let mut card = ModelCard::new(&title, about);
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
-    if let Some(error_m) = latest_m {
-        card.row(
-            "mean L1 error of the last steps, training cells",
-            format!("{error_m:.2} m"),
-        );
+    if let [error_m] = means[..] {
+        let name = "mean L1 error of the last steps, training cells";
+        card.row(name, format_args!("{error_m:.2} m"));
     }
     card.write(&config.run.out)?;
-    args.options.print(&trained, &serde_json::json!({}))?;
-    Ok(())
+    Ok(args.options.print(&trained, &serde_json::json!({}))?)
 }

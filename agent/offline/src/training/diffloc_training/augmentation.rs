@@ -4,7 +4,8 @@ use std::f64::consts::TAU;
 
 use tch::{Kind, TchError, Tensor};
 
-use super::images::{Normalisation, SweepBatch};
+use super::images::SweepBatch;
+use crate::training::pose_scale::PoseScale;
 use localization::baselines::diffloc::{CHANNELS, RangeImageConfig, UNITS};
 
 /// Deviation of the relative error of a range.
@@ -30,46 +31,29 @@ pub(super) struct Augmentation {
     pub(super) shift_m: f64,
 }
 
-/// Augmented sweeps.
-pub(super) struct Augmented {
-    /// `[N, STORED_CHANNELS, rows, columns]`, single precision.
-    pub(super) images: Tensor,
-    /// `[N, 5]`, of the changed sensor.
-    pub(super) poses: Tensor,
-}
-
 impl Augmentation {
     /// Changes windows of `frames` sweeps each; the sensor of a window is turned and moved alike in all of its sweeps.
     pub(super) fn apply(
         &self,
         windows: &SweepBatch,
         frames: i64,
-        normalisation: &Normalisation,
-    ) -> Result<Augmented, TchError> {
+        scale: &PoseScale,
+    ) -> Result<SweepBatch, TchError> {
         let images = windows.images.f_to_kind(Kind::Float)?;
-        let count = images.size()[0] / frames;
-        let on = (Kind::Float, images.device());
-        let mut changed = Augmented {
-            images,
-            poses: windows.poses.shallow_clone(),
-        };
+        let (count, device) = (images.size()[0] / frames, images.device());
+        let of_sweeps = |of: &Tensor| of.f_repeat_interleave_self_int(frames, 0, count * frames);
+        let poses = windows.poses.shallow_clone();
+        let mut changed = SweepBatch { images, poses };
         if self.shift_m > 0.0 {
-            let shift_m = (Tensor::f_rand([count, 2], on)? * 2.0 - 1.0) * self.shift_m;
-            changed = self.shifted(
-                &changed,
-                &shift_m.f_repeat_interleave_self_int(frames, 0, count * frames)?,
-                normalisation,
-            )?;
+            let share = Tensor::f_rand([count, 2], (Kind::Float, device))? * 2.0 - 1.0;
+            changed = self.shifted(&changed, &of_sweeps(&(share * self.shift_m))?, scale)?;
         }
         if self.turn_columns > 0 {
             let most = self.turn_columns;
-            let turn = Tensor::f_randint_low(-most, most + 1, [count], (Kind::Int64, on.1))?;
-            changed = self.turned(
-                &changed,
-                &turn.f_repeat_interleave_self_int(frames, 0, count * frames)?,
-            )?;
+            let turn = Tensor::f_randint_low(-most, most + 1, [count], (Kind::Int64, device))?;
+            changed = self.turned(&changed, &of_sweeps(&turn)?)?;
         }
-        Ok(Augmented {
+        Ok(SweepBatch {
             images: spoilt(&changed.images)?,
             poses: changed.poses,
         })
@@ -79,17 +63,13 @@ impl Augmentation {
     /// new sensor sees its point, the closest counts.
     fn shifted(
         &self,
-        sweeps: &Augmented,
+        sweeps: &SweepBatch,
         shift_m: &Tensor,
-        normalisation: &Normalisation,
-    ) -> Result<Augmented, TchError> {
-        let RangeImageConfig {
-            rows,
-            columns,
-            elevations_deg,
-        } = self.image;
-        let [low, high] = elevations_deg.map(|degrees| f64::from(degrees).to_radians());
-        let [rows, columns] = [rows, columns].map(|size| size as i64);
+        scale: &PoseScale,
+    ) -> Result<SweepBatch, TchError> {
+        let elevations_deg = self.image.elevations_deg.map(f64::from);
+        let [low, high] = elevations_deg.map(f64::to_radians);
+        let [rows, columns] = [self.image.rows, self.image.columns].map(|size| size as i64);
         let pixels = rows * columns;
         let flat = sweeps.images.f_flatten(2, 3)?;
         let count = flat.size()[0];
@@ -112,16 +92,14 @@ impl Augmentation {
             .f_logical_and(&range.f_gt(LEAST_RANGE_M)?)?;
         // Points that are not seen go to a pixel behind the last.
         let target = (row * columns as f64 + column).f_to_kind(Kind::Int64)?;
-        let target = target.f_where_self(
-            &is_seen,
-            &Tensor::f_full([1], pixels, (Kind::Int64, flat.device()))?,
-        )?;
+        let whole = (Kind::Int64, flat.device());
+        let target = target.f_where_self(&is_seen, &Tensor::f_full([1], pixels, whole)?)?;
         // The pixel that a point comes from, below its range: the least is the closest.
-        let source = Tensor::f_arange(pixels, (Kind::Int64, flat.device()))?;
+        let source = Tensor::f_arange(pixels, whole)?;
         let depth = (&range / DEPTH_UNIT_M).f_to_kind(Kind::Int64)?;
         let code = depth.f_mul_scalar(pixels)?.f_add(&source)?;
         let empty = i64::MAX / 2;
-        let least = Tensor::f_full([count, pixels + 1], empty, (Kind::Int64, flat.device()))?
+        let least = Tensor::f_full([count, pixels + 1], empty, whole)?
             .f_internal_scatter_reduce(1, &target, &code, "amin", true)?
             .f_narrow(1, 0, pixels)?;
         let is_filled = least.f_lt(empty)?.f_to_kind(Kind::Float)?.f_unsqueeze(1)?;
@@ -134,82 +112,67 @@ impl Augmentation {
             .f_gather(2, &origin.f_expand(all.size(), false)?, false)?
             .f_mul(&is_filled)?;
         // Along the heading, in the world.
-        let (cos, sin) = (
-            sweeps.poses.f_narrow(1, 3, 1)?,
-            sweeps.poses.f_narrow(1, 4, 1)?,
-        );
+        let poses = &sweeps.poses;
+        let (cos, sin) = (poses.f_narrow(1, 3, 1)?, poses.f_narrow(1, 4, 1)?);
         let (ahead, left) = (shift_m.f_narrow(1, 0, 1)?, shift_m.f_narrow(1, 1, 1)?);
-        let east = (&ahead * &cos - &left * &sin) / normalisation.scale_m[0];
-        let north = (&ahead * &sin + &left * &cos) / normalisation.scale_m[1];
+        let east = (&ahead * &cos - &left * &sin) / scale.scale_m[0];
+        let north = (&ahead * &sin + &left * &cos) / scale.scale_m[1];
         let rest = east.f_zeros_like()?.f_expand([count, 3], false)?;
-        let poses = sweeps
-            .poses
-            .f_add(&Tensor::f_cat(&[east, north, rest], 1)?)?;
-        Ok(Augmented {
+        let poses = poses.f_add(&Tensor::f_cat(&[east, north, rest], 1)?)?;
+        Ok(SweepBatch {
             images: images.f_view(sweeps.images.size().as_slice())?,
             poses,
         })
     }
 
     /// The sweeps of sensors whose points lie `columns` `[N]` further counter-clockwise.
-    fn turned(&self, sweeps: &Augmented, columns: &Tensor) -> Result<Augmented, TchError> {
+    fn turned(&self, sweeps: &SweepBatch, columns: &Tensor) -> Result<SweepBatch, TchError> {
         let images = &sweeps.images;
         let width = images.size()[3];
         let source = Tensor::f_arange(width, (Kind::Int64, images.device()))?;
         let source = source.f_sub(&columns.f_unsqueeze(1)?)?.f_remainder(width)?;
-        let source = source
-            .f_view([-1, 1, 1, width])?
-            .f_expand(images.size(), false)?;
-        let images = images.f_gather(3, &source, false)?;
+        let source = source.f_view([-1, 1, 1, width])?;
+        let images = images.f_gather(3, &source.f_expand(images.size(), false)?, false)?;
         let angle = columns.f_to_kind(Kind::Float)? * (TAU / width as f64);
         let (cos, sin) = (angle.f_cos()?, angle.f_sin()?);
-        let turn = |x: &Tensor, y: &Tensor, cos: &Tensor, sin: &Tensor| {
-            Ok::<_, TchError>([
-                x.f_mul(cos)?.f_sub(&y.f_mul(sin)?)?,
-                x.f_mul(sin)?.f_add(&y.f_mul(cos)?)?,
-            ])
-        };
-        let of_image = |values: &Tensor| values.f_view([-1, 1, 1, 1]);
-        let [x, y] = turn(
-            &images.f_narrow(1, 1, 1)?,
-            &images.f_narrow(1, 2, 1)?,
-            &of_image(&cos)?,
-            &of_image(&sin)?,
-        )?;
+        let of_image = [&cos, &sin].map(|values| values.view([-1, 1, 1, 1]));
+        let [x, y] = rotated(&images, 1, &of_image)?;
         let rest = images.f_narrow(1, 3, images.size()[1] - 3)?;
         let images = Tensor::f_cat(&[images.f_narrow(1, 0, 1)?, x, y, rest], 1)?;
         // The sensor itself has turned the other way.
-        let poses = &sweeps.poses;
-        let of_pose = |values: &Tensor| values.f_view([-1, 1]);
-        let [cosine, sine] = turn(
-            &poses.f_narrow(1, 3, 1)?,
-            &poses.f_narrow(1, 4, 1)?,
-            &of_pose(&cos)?,
-            &of_pose(&sin)?.f_neg()?,
-        )?;
-        Ok(Augmented {
-            images,
-            poses: Tensor::f_cat(&[poses.f_narrow(1, 0, 3)?, cosine, sine], 1)?,
-        })
+        let of_pose = [cos.view([-1, 1]), sin.view([-1, 1]).f_neg()?];
+        let [cosine, sine] = rotated(&sweeps.poses, 3, &of_pose)?;
+        let position = sweeps.poses.f_narrow(1, 0, 3)?;
+        let poses = Tensor::f_cat(&[position, cosine, sine], 1)?;
+        Ok(SweepBatch { images, poses })
     }
+}
+
+/// Channels `first` and the next one, turned about the vertical by an angle of this cosine and sine.
+fn rotated(values: &Tensor, first: i64, [cos, sin]: &[Tensor; 2]) -> Result<[Tensor; 2], TchError> {
+    let (x, y) = (
+        values.f_narrow(1, first, 1)?,
+        values.f_narrow(1, first + 1, 1)?,
+    );
+    Ok([
+        x.f_mul(cos)?.f_sub(&y.f_mul(sin)?)?,
+        x.f_mul(sin)?.f_add(&y.f_mul(cos)?)?,
+    ])
 }
 
 /// Images with noise in their ranges, without some pixels and without a sector.
 fn spoilt(images: &Tensor) -> Result<Tensor, TchError> {
     let (count, channels, rows, columns) = images.size4()?;
     let on = (Kind::Float, images.device());
-    let kept = Tensor::f_rand([count, 1, rows, columns], on)?
-        .f_ge_tensor(&(Tensor::f_rand([count, 1, 1, 1], on)? * LOST))?;
+    let of_sweeps = || Tensor::f_rand([count, 1, 1, 1], on);
+    let kept =
+        Tensor::f_rand([count, 1, rows, columns], on)?.f_ge_tensor(&(of_sweeps()? * LOST))?;
     let place = Tensor::f_arange(columns, on)?.f_view([1, 1, 1, -1])?;
-    let first = Tensor::f_rand([count, 1, 1, 1], on)? * columns as f64;
-    let width = Tensor::f_rand([count, 1, 1, 1], on)? * (SECTOR * columns as f64);
-    let is_hidden = Tensor::f_rand([count, 1, 1, 1], on)?
-        .f_lt(HIDDEN)?
-        .f_to_kind(Kind::Float)?;
-    let visible = place
-        .f_sub(&first)?
-        .f_remainder(columns as f64)?
-        .f_ge_tensor(&(width * is_hidden))?;
+    let first = of_sweeps()? * columns as f64;
+    let width = of_sweeps()? * (SECTOR * columns as f64);
+    let is_hidden = of_sweeps()?.f_lt(HIDDEN)?.f_to_kind(Kind::Float)?;
+    let from_first = place.f_sub(&first)?.f_remainder(columns as f64)?;
+    let visible = from_first.f_ge_tensor(&(width * is_hidden))?;
     let kept = kept.f_logical_and(&visible)?.f_to_kind(Kind::Float)?;
     let factor = (Tensor::f_randn([count, 1, rows, columns], on)? * RANGE_NOISE + 1.0) * &kept;
     let places = images.f_narrow(1, 0, 4)?.f_mul(&factor)?;
@@ -219,22 +182,17 @@ fn spoilt(images: &Tensor) -> Result<Tensor, TchError> {
 
 /// Share of the seen pixels of each token that show static objects is a half or more: `[N, T]` of 0 or 1.
 pub(super) fn static_tokens(images: &Tensor, patch: [i64; 2]) -> Result<Tensor, TchError> {
-    let pooled = |channel: i64| {
-        images
-            .f_narrow(1, channel, 1)?
-            .f_avg_pool2d(patch, patch, [0, 0], false, true, None)?
-            .f_flatten(1, 3)
+    let pooled = |values: &Tensor| {
+        let means = values.f_avg_pool2d(patch, patch, [0, 0], false, true, None)?;
+        means.f_flatten(1, 3)
     };
     let seen = images
         .f_narrow(1, 0, 1)?
         .f_gt(0.0)?
         .f_to_kind(Kind::Float)?;
-    let seen = seen
-        .f_avg_pool2d(patch, patch, [0, 0], false, true, None)?
-        .f_flatten(1, 3)?;
-    pooled(CHANNELS as i64)?
-        .f_le_tensor(&(seen * 0.5))?
-        .f_to_kind(Kind::Float)
+    let is_static =
+        pooled(&images.f_narrow(1, CHANNELS as i64, 1)?)?.f_le_tensor(&(pooled(&seen)? * 0.5))?;
+    is_static.f_to_kind(Kind::Float)
 }
 
 #[cfg(test)]
@@ -253,7 +211,7 @@ mod tests {
         turn_columns: 0,
         shift_m: 0.0,
     };
-    const METRES: Normalisation = Normalisation {
+    const METRES: PoseScale = PoseScale {
         origin_m: [0.0; 3],
         scale_m: [2.0, 4.0, 1.0],
     };
@@ -273,19 +231,19 @@ mod tests {
     }
 
     /// The sweep of a cloud from a normalised pose; nothing is movable.
-    fn sweep(cloud: &[[f32; 4]], pose: [f32; 5]) -> Augmented {
+    fn sweep(cloud: &[[f32; 4]], pose: [f32; 5]) -> SweepBatch {
         tch::set_num_threads(1);
         let mut values = IMAGE.image(cloud);
         values.extend(vec![0.0; IMAGE.pixels()]);
         let images =
             Tensor::from_slice(&values).view([1, -1, IMAGE.rows as i64, IMAGE.columns as i64]);
-        Augmented {
+        SweepBatch {
             images,
             poses: Tensor::from_slice(&pose).view([1, 5]),
         }
     }
 
-    fn assert_equal(found: &Augmented, expected: &Augmented) {
+    fn assert_equal(found: &SweepBatch, expected: &SweepBatch) {
         assert!(found.images.allclose(&expected.images, 1e-4, 1e-4, false));
         assert!(
             found.poses.allclose(&expected.poses, 1e-5, 1e-5, false),

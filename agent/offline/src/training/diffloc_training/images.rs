@@ -9,16 +9,15 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::Error;
 use crate::training::SweepList;
-use crate::training::sweep_store::heading_rad;
+use crate::training::pose_scale::PoseScale;
 use localization::baselines::diffloc::{CHANNELS, RangeImageConfig, UNITS};
+use perception::tensor_values::tensor;
 use perception::train::{Prefetch, RunConfig};
 
 /// Channels of a stored image: those of the network, and 1 where a movable object is seen.
 pub(super) const STORED_CHANNELS: i64 = CHANNELS as i64 + 1;
 /// Width that is added to a box on each side, metres: a vehicle moves while the sensor turns.
 const BOX_MARGIN_M: f32 = 0.2;
-/// Smallest deviation of positions along an axis, metres: scenes may be flat.
-const LEAST_SCALE_M: f64 = 1.0;
 /// Largest distance between two sweeps of a window, in sweeps of their drive.
 const LONGEST_SKIP: i64 = 3;
 
@@ -30,14 +29,7 @@ pub(super) struct SweepImages {
     pub(super) poses: Tensor,
     /// `[S]`: number of the first sweep of the same drive.
     first_of_drive: Tensor,
-    pub(super) normalisation: Normalisation,
-}
-
-/// Origin and unit of positions.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Normalisation {
-    pub(super) origin_m: [f64; 3],
-    pub(super) scale_m: [f64; 3],
+    pub(super) scale: PoseScale,
 }
 
 /// Some sweeps as they are stored.
@@ -63,51 +55,38 @@ impl SweepImages {
     pub(super) fn read(
         list: &Arc<SweepList>,
         config: RangeImageConfig,
-        normalisation: Option<Normalisation>,
+        scale: Option<PoseScale>,
         run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, Error> {
         let total = list.len();
         let source = Arc::clone(list);
         let mut loader = Prefetch::start(run.loader_threads, 0, move |number| {
-            let number = number as usize;
-            (number < source.len())
-                .then(|| prepare(&source, number, config))
-                .flatten()
+            prepare(&source, number as usize, config)
         });
-        let size = [
-            total as i64,
-            STORED_CHANNELS,
-            config.rows as i64,
-            config.columns as i64,
-        ];
+        let [rows, columns] = [config.rows, config.columns].map(|size| size as i64);
+        let size = [total as i64, STORED_CHANNELS, rows, columns];
         let images = Tensor::f_empty(size, (Kind::Half, run.device))?;
         let (mut poses, mut drives) = (Vec::new(), Vec::new());
         for done in 1..=total {
-            if let Some(Prepared {
-                values,
-                world_from_sensor,
-                drive,
-            }) = loader.next_batch()?
-            {
-                let image = Tensor::f_from_slice(&values)?
-                    .f_to_kind(Kind::Half)?
-                    .f_view(&size[1..])?;
+            if let Some(sweep) = loader.next_batch()? {
+                let image = Tensor::f_from_slice(&sweep.values)?.f_to_kind(Kind::Half)?;
+                let image = image.f_view(&size[1..])?;
                 no_grad(|| images.f_get(poses.len() as i64)?.f_copy_(&image))?;
-                poses.push(world_from_sensor);
-                drives.push(drive);
+                poses.push(sweep.world_from_sensor);
+                drives.push(sweep.drive);
             }
             progress(done, total);
         }
         if poses.is_empty() {
             return Err(Error::NoSweeps(Vec::new(), String::new()));
         }
-        let normalisation = normalisation.unwrap_or_else(|| Normalisation::of(&poses));
+        let scale = scale.unwrap_or_else(|| PoseScale::of(&poses));
         Ok(Self {
             images: images.f_narrow(0, 0, poses.len() as i64)?,
-            poses: normalisation.normalise(&poses, run.device)?,
+            poses: scale.normalise(&poses, run.device)?,
             first_of_drive: first_of_drive(&drives, run.device)?,
-            normalisation,
+            scale,
         })
     }
 
@@ -116,12 +95,9 @@ impl SweepImages {
         self.images.size()[0]
     }
 
-    /// Some images `[N, STORED_CHANNELS, rows, columns]` and poses `[N, 5]`, one after another.
-    pub(super) fn narrow(&self, first: i64, count: i64) -> Result<SweepBatch, TchError> {
-        Ok(SweepBatch {
-            images: self.images.f_narrow(0, first, count)?,
-            poses: self.poses.f_narrow(0, first, count)?,
-        })
+    /// Some images `[N, STORED_CHANNELS, rows, columns]`, one after another.
+    pub(super) fn narrow(&self, first: i64, count: i64) -> Result<Tensor, TchError> {
+        self.images.f_narrow(0, first, count)
     }
 
     /// `count` random windows of `frames` sweeps of a drive, oldest first, equally far apart; where a drive has just
@@ -131,49 +107,13 @@ impl SweepImages {
         let last = Tensor::f_randint(self.len(), [count, 1], on)?;
         let skip = Tensor::f_randint_low(1, LONGEST_SKIP + 1, [count, 1], on)?;
         let back = Tensor::f_arange_start_step(frames - 1, -1, -1, on)?;
-        let first = self
-            .first_of_drive
-            .f_index_select(0, &last.f_view([-1])?)?
-            .f_view([-1, 1])?;
-        let rows = last
-            .f_sub(&skip.f_mul(&back)?)?
-            .f_maximum(&first)?
-            .f_view([-1])?;
+        let of_drive = self.first_of_drive.f_index_select(0, &last.f_view([-1])?)?;
+        let rows = last.f_sub(&skip.f_mul(&back)?)?;
+        let rows = rows.f_maximum(&of_drive.f_view([-1, 1])?)?.f_view([-1])?;
         Ok(SweepBatch {
             images: self.images.f_index_select(0, &rows)?,
             poses: self.poses.f_index_select(0, &rows)?,
         })
-    }
-}
-
-impl Normalisation {
-    fn of(poses: &[Isometry3<f64>]) -> Self {
-        let count = poses.len() as f64;
-        let mean =
-            |value: &dyn Fn(&Isometry3<f64>) -> f64| poses.iter().map(value).sum::<f64>() / count;
-        let origin_m: [f64; 3] =
-            std::array::from_fn(|axis| mean(&|pose| pose.translation.vector[axis]));
-        let scale_m = std::array::from_fn(|axis| {
-            mean(&|pose| (pose.translation.vector[axis] - origin_m[axis]).powi(2))
-                .sqrt()
-                .max(LEAST_SCALE_M)
-        });
-        Self { origin_m, scale_m }
-    }
-
-    fn normalise(&self, poses: &[Isometry3<f64>], device: Device) -> Result<Tensor, TchError> {
-        let rows: Vec<f32> = poses.iter().flat_map(|pose| self.row(pose)).collect();
-        Tensor::f_from_slice(&rows)?
-            .f_view([-1, 5])?
-            .f_to_device(device)
-    }
-
-    fn row(&self, pose: &Isometry3<f64>) -> [f32; 5] {
-        let position = pose.translation.vector - Vector3::from(self.origin_m);
-        let [x, y, z]: [f32; 3] =
-            std::array::from_fn(|axis| (position[axis] / self.scale_m[axis]) as f32);
-        let (sin, cos) = heading_rad(pose).sin_cos();
-        [x, y, z, cos as f32, sin as f32]
     }
 }
 
@@ -196,11 +136,9 @@ fn movable_pixels(
     image: &[f32],
     pixels: usize,
 ) -> Vec<f32> {
-    let boxes: Vec<SensorBox> = frame
-        .objects
-        .iter()
-        .map(|object| SensorBox::new(object, world_from_sensor))
-        .collect();
+    let boxes = frame.objects.iter();
+    let boxes = boxes.map(|object| SensorBox::new(object, world_from_sensor));
+    let boxes: Vec<SensorBox> = boxes.collect();
     let axis = |channel: usize, pixel: usize| image[channel * pixels + pixel] * UNITS[channel];
     let is_movable = |pixel: usize| {
         let point = Point3::new(axis(1, pixel), axis(2, pixel), axis(3, pixel));
@@ -221,19 +159,13 @@ struct SensorBox {
 
 impl SensorBox {
     fn new(object: &Object, world_from_sensor: &Isometry3<f64>) -> Self {
-        let object_from_sensor = object
-            .world_from_object
-            .isometry()
-            .inv_mul(world_from_sensor);
+        let world_from_object = object.world_from_object.isometry();
+        let object_from_sensor = world_from_object.inv_mul(world_from_sensor);
         let [length, width, height] = object.size_m.map(|size| size as f32 / 2.0);
         let half_m = [length + BOX_MARGIN_M, width + BOX_MARGIN_M, height];
+        let center = object_from_sensor.inverse().translation.vector.cast();
         Self {
-            center: object_from_sensor
-                .inverse()
-                .translation
-                .vector
-                .cast()
-                .into(),
+            center: center.into(),
             object_from_sensor: object_from_sensor.cast(),
             half_m,
             radius_m: Vector3::from(half_m).norm(),
@@ -258,7 +190,7 @@ fn first_of_drive(drives: &[usize], device: Device) -> Result<Tensor, TchError> 
         first
     };
     let rows: Vec<i64> = (0..drives.len()).map(of).collect();
-    Tensor::f_from_slice(&rows)?.f_to_device(device)
+    tensor(&rows, &[-1], device)
 }
 
 /// Largest number of columns that a turn by `turn_rad` moves an image.
@@ -307,19 +239,19 @@ mod tests {
         assert_eq!(first, [0, 0, 0, 3, 3]);
         let place = |number: usize| Isometry3::translation(number as f64, 0.0, 0.0);
         let poses: Vec<_> = (0..5).map(place).collect();
-        let normalisation = Normalisation::of(&poses);
+        let scale = PoseScale::of(&poses);
         assert_eq!(
-            normalisation,
-            Normalisation {
+            scale,
+            PoseScale {
                 origin_m: [2.0, 0.0, 0.0],
                 scale_m: [2.0_f64.sqrt(), 1.0, 1.0]
             }
         );
         let images = SweepImages {
             images: Tensor::zeros([5, 1, 1, 1], (Kind::Half, Device::Cpu)),
-            poses: normalisation.normalise(&poses, Device::Cpu).unwrap(),
+            poses: scale.normalise(&poses, Device::Cpu).unwrap(),
             first_of_drive: Tensor::from_slice(&first),
-            normalisation,
+            scale,
         };
         let windows = images.draw(200, 3).unwrap().poses.narrow(1, 0, 1) * 2.0_f64.sqrt() + 2.0;
         let rows: Vec<f32> = Vec::try_from(windows.round().view([-1])).unwrap();

@@ -2,7 +2,8 @@
 
 use tch::{Kind, Reduction, TchError, Tensor};
 
-use super::augmentation::{Augmented, static_tokens};
+use super::augmentation::static_tokens;
+use super::images::SweepBatch;
 use crate::training::place_classes::PlaceClasses;
 use localization::baselines::diffloc::{CHANNELS, DiffLoc, Windows};
 
@@ -31,27 +32,27 @@ pub(super) struct Losses {
 pub(super) fn losses(
     network: &DiffLoc,
     places: &PlaceClasses<1>,
-    batch: &Augmented,
+    batch: &SweepBatch,
     frames: i64,
     kind: Kind,
 ) -> Result<Losses, TchError> {
-    let images = batch
-        .images
-        .f_narrow(1, 0, CHANNELS as i64)?
-        .f_to_kind(kind)?;
-    let encoded = network.encoder().forward(&images, true)?;
+    let images = batch.images.f_narrow(1, 0, CHANNELS as i64)?;
+    let encoded = network.encoder().forward(&images.f_to_kind(kind)?, true)?;
     let statics = static_tokens(&batch.images, network.config().patch)?;
-    let mask = encoded
-        .static_logits
-        .f_binary_cross_entropy_with_logits::<Tensor>(&statics, None, None, Reduction::Mean)?;
+    let logits = &encoded.static_logits;
+    let mask = logits.f_binary_cross_entropy_with_logits::<Tensor>(
+        &statics,
+        None,
+        None,
+        Reduction::Mean,
+    )?;
     let place = places
         .losses([&encoded.features], &batch.poses)?
         .f_select(0, 0)?;
-    let features = encoded
-        .features
-        .f_view([-1, frames, network.config().width])?;
-    let [pose, differences] =
-        pose_losses(network, &features, &batch.poses.f_view([-1, frames, 5])?)?;
+    let width = network.config().width;
+    let features = encoded.features.f_view([-1, frames, width])?;
+    let poses = batch.poses.f_view([-1, frames, 5])?;
+    let [pose, differences] = pose_losses(network, &features, &poses)?;
     let total = &pose + differences + mask * MASK_WEIGHT + &place * PLACE_WEIGHT;
     Ok(Losses {
         total,
@@ -73,25 +74,22 @@ fn pose_losses(
     let on = (Kind::Float, poses.device());
     let schedule = network.schedule();
     // The larger of two: where noise hides the pose, it has to come from the features.
-    let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?
-        .f_amax(0_i64, false)?;
+    let steps = Tensor::f_randint(schedule.steps(), [2, count], (Kind::Int64, on.1))?;
+    let steps = steps.f_amax(0_i64, false)?;
     let noise = Tensor::f_randn(poses.size(), on)?;
     let joint = Tensor::f_rand([count], on)?
         .f_ge(SINGLE)?
         .f_to_kind(Kind::Float)?;
     let noisy = schedule.add_noise(&poses, &noise, &steps)?;
-    let velocity = network
-        .denoiser()
-        .forward(&noisy, &steps, &features, Windows::Joint(&joint))?;
+    let (denoiser, windows) = (network.denoiser(), Windows::Joint(&joint));
+    let velocity = denoiser.forward(&noisy, &steps, &features, windows)?;
     let error = schedule.poses(&noisy, &velocity, &steps)?.f_sub(&poses)?;
     let mean = error.f_abs()?.f_mean(Kind::Float)?;
     if frames < 2 {
         let none = mean.f_zeros_like()?;
         return Ok([mean, none]);
     }
-    let differences = error
-        .f_diff::<Tensor>(1, 1, None, None)?
-        .f_abs()?
-        .f_mean_dim([1_i64, 2].as_slice(), false, Kind::Float)?;
+    let differences = error.f_diff::<Tensor>(1, 1, None, None)?.f_abs()?;
+    let differences = differences.f_mean_dim([1_i64, 2].as_slice(), false, Kind::Float)?;
     Ok([mean, differences.f_mul(&joint)?.f_mean(Kind::Float)?])
 }

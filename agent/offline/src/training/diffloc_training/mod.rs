@@ -13,19 +13,18 @@ use tch::nn::VarStore;
 use tch::{Cuda, Device, Kind, Tensor};
 
 use super::place_classes::PlaceClasses;
+use super::pose_scale::PoseScale;
 use super::sweep_store::SweepList;
 use crate::Error;
 use localization::baselines::diffloc::{DiffLoc, DiffLocConfig, DiffLocLocalizer};
-use perception::train::{RunConfig, Trained, Trainer};
+use perception::train::{Curve, Observe, Progress, RunConfig, SaveEvery, Task, Trained, Trainer};
 
 pub use accuracy::DiffLocAccuracy;
 use accuracy::{accuracy, validate};
 use augmentation::Augmentation;
-use images::{Normalisation, SweepImages};
+use images::SweepImages;
 use loss::losses;
 
-/// Steps between two reports; between them nothing waits for the device but the optimizer.
-const REPORT_EVERY: u64 = 50;
 /// Steps between two checkpoints and validations.
 const CHECKPOINT_EVERY: u64 = 1000;
 /// Columns of the training curve.
@@ -49,30 +48,6 @@ pub struct DiffLocTrainConfig {
     pub run: RunConfig,
 }
 
-/// Progress of a training of DiffLoc.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum DiffLocReport {
-    /// Range images are being computed: number done and number of all.
-    Imaging(usize, usize),
-    /// Some steps are done.
-    Stepped {
-        /// Number of steps done.
-        step: u64,
-        /// Share of the training that is done, 0..1.
-        share_done: f64,
-        /// Seconds spent.
-        seconds: f64,
-        /// Mean L1 of the normalised poses, at all steps of the diffusion, since the last report.
-        pose_l1: f64,
-        /// Mean cross entropy of places since the last report.
-        place_loss: f64,
-        /// Accuracy on the last batch.
-        accuracy: DiffLocAccuracy,
-    },
-    /// Sweeps that are not trained on were localized, after so many seconds.
-    Validated(f64, DiffLocAccuracy),
-}
-
 /// Result of a training of DiffLoc.
 #[derive(Debug, Clone)]
 pub struct DiffLocSummary {
@@ -86,13 +61,14 @@ pub struct DiffLocSummary {
     pub validation: Option<DiffLocAccuracy>,
 }
 
-/// Trains DiffLoc; writes checkpoint, curve and weights into `config.run.out`.
+/// Trains DiffLoc; writes checkpoint, curve and weights into `config.run.out`. Reported are the L1 error of the normalised
+/// poses at all steps of the diffusion, the cross entropy of places, and the accuracy on the last batch.
 ///
 /// # Errors
 /// [`Error`].
 pub fn train_diffloc(
     config: &DiffLocTrainConfig,
-    observe: &mut dyn FnMut(&DiffLocReport),
+    observe: &mut Observe<'_>,
 ) -> Result<DiffLocSummary, Error> {
     let started = Instant::now();
     let run = &config.run;
@@ -100,24 +76,20 @@ pub fn train_diffloc(
     if run.device != Device::Cpu {
         Cuda::cudnn_set_benchmark(true);
     }
-    let list = Arc::new(SweepList::open(&config.scenes)?);
-    let mut imaging = |done, total| observe(&DiffLocReport::Imaging(done, total));
-    let images = SweepImages::read(&list, config.network.image, None, run, &mut imaging)?;
-    let Normalisation { origin_m, scale_m } = images.normalisation;
+    let image = config.network.image;
+    let mut read = |folders: &[PathBuf], scale| {
+        let list = Arc::new(SweepList::open(folders)?);
+        let mut imaging = |done, total| observe(&Progress::Encoding(done, total));
+        let images = SweepImages::read(&list, image, scale, run, &mut imaging)?;
+        Ok::<_, Error>((images, list.data()))
+    };
+    let (images, data) = read(&config.scenes, None)?;
     let validation = match config.validation.as_slice() {
         [] => None,
-        folders => {
-            let list = Arc::new(SweepList::open(folders)?);
-            let normalisation = Some(images.normalisation);
-            Some(SweepImages::read(
-                &list,
-                config.network.image,
-                normalisation,
-                run,
-                &mut imaging,
-            )?)
-        }
+        folders => Some(read(folders, Some(images.scale))?.0),
     };
+    observe(&Progress::Read(data.clone()));
+    let PoseScale { origin_m, scale_m } = images.scale;
     let network_config = DiffLocConfig {
         origin_m,
         scale_m,
@@ -125,153 +97,112 @@ pub fn train_diffloc(
     };
     let variables = VarStore::new(run.device);
     let network = DiffLoc::new(&variables.root(), &network_config)?;
-    let places = [variables.root() / "places"];
-    let places = PlaceClasses::new(
-        places,
-        network_config.width,
-        &images.poses,
-        scale_m,
-        run.seed,
-    )?;
-    let trainer = Trainer::begin(run, &variables, None, started)?;
+    let (places, width) = ([variables.root() / "places"], network_config.width);
+    let places = PlaceClasses::new(places, width, &images.poses, scale_m, run.seed)?;
+    let mut trainer = Trainer::begin(run, &variables, None, started)?;
     let mut training = Training {
         config,
+        observe,
         network,
         places,
+        curve: trainer.curve(CURVE)?,
         variables,
         images,
         validation,
-        trainer,
-        last: None,
+        means: Vec::new(),
+        latest: None,
+        validated: None,
     };
-    training.run(observe)?;
+    trainer.run(&mut training, SaveEvery::Steps(CHECKPOINT_EVERY))?;
+    let (variables, kind) = (&training.variables, DiffLocLocalizer::KIND);
     Ok(DiffLocSummary {
-        trained: training.trainer.save_network(
-            &training.variables,
-            DiffLocLocalizer::KIND,
-            &network_config,
-            list.data(),
-        )?,
+        trained: trainer.save_network(variables, kind, &network_config, data)?,
         sweeps: training.images.len() as usize,
         network: network_config,
-        validation: training.last,
+        validation: training.validated,
     })
 }
 
 /// A training in progress.
 struct Training<'a> {
     config: &'a DiffLocTrainConfig,
+    observe: &'a mut Observe<'a>,
     network: DiffLoc,
     places: PlaceClasses<1>,
     variables: VarStore,
     images: SweepImages,
     validation: Option<SweepImages>,
-    trainer: Trainer,
+    curve: Curve,
+    /// `[2]` of each step since the last report: L1 of the poses, cross entropy of places.
+    means: Vec<Tensor>,
+    /// Features `[N, width]` and poses `[N, 5]` of the last step's sweeps.
+    latest: Option<[Tensor; 2]>,
     /// The last validation.
-    last: Option<DiffLocAccuracy>,
+    validated: Option<DiffLocAccuracy>,
 }
 
-impl Training<'_> {
-    fn run(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), Error> {
-        let mut curve = self.trainer.curve(CURVE)?;
-        let mut means = Vec::new();
-        while self.share_done() < 1.0 {
-            let losses = self.step()?;
-            self.trainer.check_interruption(&self.variables)?;
-            means.push(losses.means);
-            let step = self.trainer.steps();
-            if self.trainer.is_report_due(REPORT_EVERY) || self.share_done() >= 1.0 {
-                let mean = Tensor::f_stack(&means, 0)?.f_mean_dim(0_i64, false, Kind::Double)?;
-                let (pose_l1, place_loss) =
-                    (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
-                means.clear();
-                let seconds = self.trainer.seconds();
-                let accuracy = accuracy(
-                    &self.network,
-                    &losses.features,
-                    &losses.poses,
-                    &self.images.normalisation,
-                )?;
-                let share_done = self.share_done().min(1.0);
-                observe(&DiffLocReport::Stepped {
-                    step,
-                    share_done,
-                    seconds,
-                    pose_l1,
-                    place_loss,
-                    accuracy,
-                });
-                if step.is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0 {
-                    self.trainer.checkpoint(&self.variables)?;
-                    self.validate(observe)?;
-                }
-                let of = |accuracy: DiffLocAccuracy| [accuracy.p50_m, accuracy.success_3m];
-                let validated = self.last.map_or([f64::NAN; 2], of);
-                curve.numbers(
-                    &[
-                        &[step as f64, seconds, pose_l1, place_loss],
-                        &of(accuracy)[..],
-                        &validated,
-                    ]
-                    .concat(),
-                )?;
-            }
-        }
-        Ok(())
+impl Task for Training<'_> {
+    type Error = Error;
+    /// Between reports nothing waits for the device but the optimizer.
+    const REPORT_EVERY: u64 = 50;
+
+    fn variables(&self) -> &VarStore {
+        &self.variables
     }
 
-    fn share_done(&self) -> f64 {
-        let sweeps = self.trainer.steps() * self.config.run.batch as u64;
-        self.trainer
-            .share_done(sweeps as f64 / self.images.len() as f64)
+    fn epoch(&self, steps: u64) -> f64 {
+        (steps * self.config.run.batch as u64) as f64 / self.images.len() as f64
     }
 
     /// Order, augmentation and noise follow from seed and step, so a resumed training is the uninterrupted one.
-    fn step(&mut self) -> Result<StepLosses, Error> {
-        let Self {
-            config,
-            network,
-            places,
-            images,
-            ..
-        } = self;
-        let run = &config.run;
-        tch::manual_seed(run.seed.wrapping_shl(32).wrapping_add(self.trainer.steps()) as i64);
-        let frames = config.network.frames;
+    fn loss(&mut self, trainer: &Trainer) -> Result<Tensor, Error> {
+        let (run, images) = (&self.config.run, &self.images);
+        let network = &self.config.network;
+        tch::manual_seed(run.seed.wrapping_shl(32).wrapping_add(trainer.steps()) as i64);
+        let frames = network.frames;
         let windows = images.draw((run.batch as i64 / frames).max(1), frames)?;
         let augmentation = Augmentation {
-            image: config.network.image,
-            turn_columns: images::columns_of(config.turn_rad as f32, config.network.image),
-            shift_m: config.shift_m,
+            image: network.image,
+            turn_columns: images::columns_of(self.config.turn_rad as f32, network.image),
+            shift_m: self.config.shift_m,
         };
-        let batch = augmentation.apply(&windows, frames, &images.normalisation)?;
-        let losses = losses(network, places, &batch, frames, run.precision.kind())?;
-        let share_done = self.share_done();
-        self.trainer.step(&losses.total, share_done)?;
-        let means = Tensor::f_stack(&[losses.pose, losses.place], 0)?;
-        Ok(StepLosses {
-            means,
-            features: losses.features.f_flatten(0, 1)?,
-            poses: batch.poses,
-        })
+        let batch = augmentation.apply(&windows, frames, &images.scale)?;
+        let (network, kind) = (&self.network, run.precision.kind());
+        let losses = losses(network, &self.places, &batch, frames, kind)?;
+        self.means
+            .push(Tensor::f_stack(&[losses.pose, losses.place], 0)?);
+        self.latest = Some([losses.features.f_flatten(0, 1)?, batch.poses]);
+        Ok(losses.total)
     }
 
-    fn validate(&mut self, observe: &mut dyn FnMut(&DiffLocReport)) -> Result<(), Error> {
-        if let Some(images) = &self.validation {
-            let accuracy = validate(&self.network, images, self.config.run.precision.kind())?;
-            observe(&DiffLocReport::Validated(self.trainer.seconds(), accuracy));
-            self.last = Some(accuracy);
+    fn is_report_due(&self, trainer: &Trainer) -> bool {
+        trainer.is_report_due(Self::REPORT_EVERY) || self.share_done(trainer) >= 1.0
+    }
+
+    /// Also validates before a checkpoint, so that the row of the curve has the result.
+    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+        let Some([features, poses]) = self.latest.take() else {
+            return Ok(());
+        };
+        let mean = Tensor::f_stack(&self.means, 0)?.f_mean_dim(0_i64, false, Kind::Double)?;
+        let (pose_l1, place_loss) = (mean.f_double_value(&[0])?, mean.f_double_value(&[1])?);
+        self.means.clear();
+        let (network, seconds) = (&self.network, trainer.seconds());
+        let found = accuracy(network, &features, &poses, &self.images.scale)?;
+        let share_done = self.share_done(trainer);
+        let means = vec![pose_l1, place_loss, found.p50_m, found.success_3m];
+        let text = format!("poses {pose_l1:.3} places {place_loss:.2}, batch {found}");
+        let mut row = [vec![trainer.steps() as f64, seconds], means.clone()].concat();
+        (self.observe)(&trainer.step_report(share_done, means, &text));
+        let is_saved_next = trainer.steps().is_multiple_of(CHECKPOINT_EVERY) || share_done >= 1.0;
+        if let (true, Some(images)) = (is_saved_next, &self.validation) {
+            let found = validate(network, images, self.config.run.precision.kind())?;
+            let text = format!("{:.0} s: validation {found}", trainer.seconds());
+            (self.observe)(&Progress::Validated(text));
+            self.validated = Some(found);
         }
-        Ok(())
+        let validated = self.validated;
+        row.extend(validated.map_or([f64::NAN; 2], |found| [found.p50_m, found.success_3m]));
+        Ok(self.curve.numbers(&row)?)
     }
-}
-
-/// A step's loss and sweeps, on the device.
-struct StepLosses {
-    /// `[2]`: L1 of the poses, cross entropy of places.
-    means: Tensor,
-    /// `[N, width]`.
-    features: Tensor,
-    /// `[N, 5]`.
-    poses: Tensor,
 }

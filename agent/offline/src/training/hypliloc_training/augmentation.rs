@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use tch::{Kind, TchError, Tensor};
 
-use super::examples::Truth;
+use super::examples::Examples;
 use localization::baselines::hypliloc::{COLUMNS, InputBatch, roll_columns};
 
 /// Standard deviation of points and ranges, metres.
@@ -14,10 +14,8 @@ const MAX_DROPPED: f64 = 0.3;
 
 /// Turns each sweep about the vertical by a random whole number of columns of the image, at most `turn_rad` to either
 /// side, which its heading follows; moves points and ranges a little, and leaves some out.
-pub(super) fn augment(
-    (batch, truth): (InputBatch, Truth),
-    turn_rad: f64,
-) -> Result<(InputBatch, Truth), TchError> {
+pub(super) fn augment(examples: &Examples, turn_rad: f64) -> Result<Examples, TchError> {
+    let batch = &examples.inputs;
     let (sweeps, device) = (batch.len(), batch.points_m.device());
     let most = (turn_rad / TAU * COLUMNS as f64).round() as i64;
     let columns = Tensor::f_randint_low(-most, most + 1, [sweeps], (Kind::Int64, device))?;
@@ -31,24 +29,22 @@ pub(super) fn augment(
         let share = Tensor::f_rand(&shape, (Kind::Float, device))? * MAX_DROPPED;
         like.f_rand_like()?.f_lt_tensor(&share)
     };
-    let groups = batch.groups.without(&dropped(&points_m.f_select(2, 0)?)?)?;
-    let is_seen = ranges_m
-        .f_gt(0.0)?
-        .f_logical_and(&dropped(&ranges_m)?.f_logical_not()?)?;
+    let fine = batch.fine_without(&dropped(&points_m.f_select(2, 0)?)?)?;
+    let is_kept = dropped(&ranges_m)?.f_logical_not()?;
+    let is_seen = ranges_m.f_gt(0.0)?.f_logical_and(&is_kept)?;
     let ranges_m = (&ranges_m + ranges_m.f_randn_like()? * JITTER_M) * is_seen;
     // A sensor that is turned to the right sees all points turned to the left.
-    let heading = turned(&truth.heading, &-turn)?;
-    Ok((
-        InputBatch {
+    let heading = turned(&examples.poses.f_narrow(1, 3, 2)?, &-turn)?;
+    let position = examples.poses.f_narrow(1, 0, 3)?;
+    Ok(Examples {
+        inputs: InputBatch {
             points_m,
             ranges_m,
-            groups,
+            fine,
+            coarse: batch.coarse.shallow_clone(),
         },
-        Truth {
-            position: truth.position,
-            heading,
-        },
-    ))
+        poses: Tensor::f_cat(&[position, heading], 1)?,
+    })
 }
 
 /// Rotates vectors `[.., 2 or 3]` about the vertical by angles `[..]`, radians.
@@ -92,16 +88,18 @@ mod tests {
         tch::set_num_threads(1);
         tch::manual_seed(5);
         let input = SweepInput::new(&wall()).unwrap();
-        let heading = Tensor::from_slice(&[0.0f32, 1.0]).view([1, 2]);
         for _ in 0..8 {
             let batch = InputBatch::new(std::slice::from_ref(&input), Device::Cpu).unwrap();
-            let truth = Truth {
-                position: Tensor::from_slice(&[1f32, 2.0, 3.0]).view([1, 3]),
-                heading: heading.copy(),
+            let examples = Examples {
+                inputs: batch,
+                poses: Tensor::from_slice(&[1f32, 2.0, 3.0, 0.0, 1.0]).view([1, 5]),
             };
-            let (batch, truth) = augment((batch, truth), TAU / 2.0).unwrap();
+            let Examples {
+                inputs: batch,
+                poses,
+            } = augment(&examples, TAU / 2.0).unwrap();
             let pair = |of: &Tensor| azimuth_deg(of.double_value(&[0]), of.double_value(&[1]));
-            let heading_deg = pair(&truth.heading.view([2]));
+            let heading_deg = pair(&poses.view([5]).narrow(0, 3, 2));
             // The wall's middle: 40 degrees to the left of a vehicle that heads north.
             let off = |azimuth_deg: f64| {
                 (azimuth_deg + heading_deg - 130.0 + 540.0).rem_euclid(360.0) - 180.0
@@ -122,7 +120,7 @@ mod tests {
             let sum = |of: Tensor| of.sum(Kind::Float).double_value(&[]);
             let image_deg = azimuth_deg(sum(turn.cos()), sum(turn.sin()));
             assert!(off(image_deg).abs() < 1.5, "{image_deg} {heading_deg}");
-            let kept: Vec<f32> = Vec::try_from(&truth.position.view([3])).unwrap();
+            let kept: Vec<f32> = Vec::try_from(&poses.view([5]).narrow(0, 0, 3)).unwrap();
             assert_eq!(kept, [1.0, 2.0, 3.0]);
         }
     }

@@ -3,7 +3,6 @@
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-use super::examples::Truth;
 use localization::baselines::hypliloc::{BranchPoses, NormalisedPoses};
 
 /// Logarithms of the variances of position and heading at the start.
@@ -27,12 +26,13 @@ impl Criteria {
         Self { log_variances }
     }
 
-    /// Sum of the losses of the three branches.
-    pub(super) fn loss(&self, poses: &BranchPoses, truth: &Truth) -> Result<Tensor, TchError> {
+    /// Sum of the losses of the three branches; `truth` `[S, 5]`.
+    pub(super) fn loss(&self, poses: &BranchPoses, truth: &Tensor) -> Result<Tensor, TchError> {
+        let [true_position, true_heading] = [truth.f_narrow(1, 0, 3)?, truth.f_narrow(1, 3, 2)?];
         let mut errors = Vec::with_capacity(6);
         for NormalisedPoses { position, heading } in [&poses.points, &poses.image, &poses.fusion] {
-            errors.push((position - &truth.position).f_abs()?.f_mean(Kind::Float)?);
-            errors.push((heading - &truth.heading).f_abs()?.f_mean(Kind::Float)?);
+            errors.push((position - &true_position).f_abs()?.f_mean(Kind::Float)?);
+            errors.push((heading - &true_heading).f_abs()?.f_mean(Kind::Float)?);
         }
         let errors = Tensor::f_stack(&errors, 0)?.f_view([3, 2])?;
         let log_variances = &self.log_variances * RATE;
@@ -43,18 +43,17 @@ impl Criteria {
 /// `[2]` mean distance, metres, and mean heading error, radians; no gradient.
 pub(super) fn mean_errors(
     found: &NormalisedPoses,
-    truth: &Truth,
-    scale_m: &Tensor,
+    truth: &Tensor,
+    unit_m: &Tensor,
 ) -> Result<Tensor, TchError> {
-    let off = (found.position.detach() - &truth.position) * scale_m;
+    let off = (found.position.detach() - truth.f_narrow(1, 0, 3)?) * unit_m;
     let distance = off
         .f_square()?
         .f_sum_dim_intlist(1_i64, false, Kind::Float)?
         .f_sqrt()?;
-    let parts =
-        |heading: &Tensor| Ok::<_, TchError>((heading.f_select(1, 0)?, heading.f_select(1, 1)?));
-    let ((cosine, sine), (true_cosine, true_sine)) =
-        (parts(&found.heading.detach())?, parts(&truth.heading)?);
+    let heading = found.heading.f_detach()?;
+    let (cosine, sine) = (heading.f_select(1, 0)?, heading.f_select(1, 1)?);
+    let (true_cosine, true_sine) = (truth.f_select(1, 3)?, truth.f_select(1, 4)?);
     let across = &sine * &true_cosine - &cosine * &true_sine;
     let along = cosine * true_cosine + sine * true_sine;
     let angle = across.f_atan2(&along)?.f_abs()?;
@@ -81,10 +80,7 @@ mod tests {
             position: rows([0.3, 0.0, 0.0]),
             heading: rows([0.0, 0.2]),
         };
-        let truth = Truth {
-            position: rows([0.0, 0.2, 0.0]),
-            heading: rows([1.0, 0.0]),
-        };
+        let truth = rows([0.0, 0.2, 0.0, 1.0, 0.0]);
         let errors = mean_errors(&found, &truth, &Tensor::from_slice(&[10f32, 20.0, 1.0])).unwrap();
         let wanted = Tensor::from_slice(&[5.0, std::f32::consts::FRAC_PI_2]);
         assert!(errors.allclose(&wanted, 1e-5, 1e-5, false), "{errors:?}");
@@ -98,10 +94,7 @@ mod tests {
             position: rows([off; 3]),
             heading: rows([1.0 - off, 0.0]),
         };
-        let truth = Truth {
-            position: rows([0.0; 3]),
-            heading: rows([1.0, 0.0]),
-        };
+        let truth = rows([0.0, 0.0, 0.0, 1.0, 0.0]);
         let loss = |offs: [f32; 3]| {
             let [points, image, fusion] = offs.map(pose);
             let poses = BranchPoses {

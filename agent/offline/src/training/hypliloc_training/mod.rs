@@ -14,7 +14,7 @@ use super::place_classes::PlaceClasses;
 use crate::Error;
 use localization::baselines::HypLiLocLocalizer;
 use localization::baselines::hypliloc::{HypLiLoc, HypLiLocConfig, WIDTH};
-use perception::train::{RunConfig, Trained, Trainer};
+use perception::train::{Observe, Progress, RunConfig, SaveEvery, Task, Trained, Trainer};
 
 use augmentation::augment;
 use criterion::{Criteria, mean_errors};
@@ -22,8 +22,6 @@ use examples::Examples;
 
 /// Weight of the classification of places by each branch.
 const PLACE_WEIGHT: f64 = 0.5;
-/// Steps between two reports.
-const REPORT_EVERY: u64 = 20;
 /// Steps between two checkpoints.
 const CHECKPOINT_EVERY: u64 = 2000;
 
@@ -40,101 +38,106 @@ pub struct HypLiLocTrainConfig {
     pub run: RunConfig,
 }
 
-/// Progress of a training of HypLiLoc.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum HypLiLocReport {
-    /// Inputs are being computed: number of sweeps done and of all.
-    Sampling(usize, usize),
-    /// Some steps are done.
-    Stepped {
-        /// Number of steps done.
-        step: u64,
-        /// Share of the training that is done, 0..1.
-        share_done: f64,
-        /// Seconds spent.
-        seconds: f64,
-        /// Mean position error of the fusion since the last report, metres.
-        error_m: f64,
-        /// Mean heading error of the fusion since the last report, degrees.
-        error_deg: f64,
-        /// Mean cross entropy of places by points, image and fusion since the last report.
-        place_losses: [f64; 3],
-    },
-}
-
-/// Trains a network; writes checkpoint and weights into `config.run.out`.
+/// Trains a network; writes checkpoint and weights into `config.run.out`. Reported are the errors of the fusion's position
+/// (metres) and heading (degrees), and the cross entropies of places by points, image and fusion.
 ///
 /// # Errors
 /// [`Error`].
 pub fn train_hypliloc(
     config: &HypLiLocTrainConfig,
-    observe: &mut dyn FnMut(&HypLiLocReport),
+    observe: &mut Observe<'_>,
 ) -> Result<Trained, Error> {
     let run = &config.run;
     run.start()?;
-    let examples = Examples::read(&config.scenes, run, &mut |done, all| {
-        observe(&HypLiLocReport::Sampling(done, all))
-    })?;
+    let mut sampling = |done, all| observe(&Progress::Encoding(done, all));
+    let (examples, scale, data) = Examples::read(&config.scenes, run, &mut sampling)?;
+    observe(&Progress::Read(data.clone()));
     let variables = VarStore::new(run.device);
     let network = HypLiLoc::new(&variables.root());
     let criteria = Criteria::new(&(variables.root() / "criteria"));
     let places = ["points", "image", "fusion"].map(|branch| variables.root() / "places" / branch);
-    let places = PlaceClasses::new(
-        places,
-        WIDTH,
-        &examples.poses()?,
-        examples.deviation_m,
-        run.seed,
-    )?;
+    let places = PlaceClasses::new(places, WIDTH, &examples.poses, scale.scale_m, run.seed)?;
     let mut trainer = Trainer::begin(run, &variables, None, Instant::now())?;
     // The tensor library draws all random numbers of a step, on the device.
     tch::manual_seed(run.seed.wrapping_add(trainer.steps()) as i64);
     Cuda::cudnn_set_benchmark(run.device.is_cuda());
-    let share_done = |trainer: &Trainer| {
-        trainer.share_done((trainer.steps() * run.batch as u64) as f64 / examples.len() as f64)
+    let mut training = Training {
+        config,
+        observe,
+        examples,
+        unit_m: scale.unit_m(run.device)?,
+        variables,
+        network,
+        criteria,
+        places,
+        reported: trainer.steps(),
+        sums: Tensor::f_zeros([5], (Kind::Float, run.device))?,
     };
-    let mut reported = trainer.steps();
-    let mut sums = Tensor::f_zeros([5], (Kind::Float, run.device))?;
-    while share_done(&trainer) < 1.0 {
-        let (batch, truth) = augment(examples.draw(run.batch as i64)?, config.turn_rad)?;
-        let poses = network.forward(&batch, run.precision.kind(), true)?;
-        let place_losses = places.losses(poses.features.each_ref(), &truth.poses()?)?;
-        let loss = criteria.loss(&poses, &truth)? + place_losses.f_sum(Kind::Float)? * PLACE_WEIGHT;
-        trainer.step(&loss, share_done(&trainer))?;
-        trainer.check_interruption(&variables)?;
-        let errors = mean_errors(&poses.fusion, &truth, &examples.scale_m)?;
-        sums += Tensor::f_cat(&[errors, place_losses.f_detach()?], 0)?;
-        let step = trainer.steps();
-        if trainer.is_report_due(REPORT_EVERY) {
-            let steps = (step - reported) as f64;
-            reported = step;
-            let mean: Vec<f64> = Vec::try_from(&(&sums / steps).f_to_kind(Kind::Double)?)?;
-            let _ = sums.f_zero_()?;
-            observe(&HypLiLocReport::Stepped {
-                step,
-                share_done: share_done(&trainer).min(1.0),
-                seconds: trainer.seconds(),
-                error_m: mean[0],
-                error_deg: mean[1].to_degrees(),
-                place_losses: [mean[2], mean[3], mean[4]],
-            });
-        }
-        if step.is_multiple_of(CHECKPOINT_EVERY) {
-            trainer.checkpoint(&variables)?;
-        }
-    }
-    trainer.checkpoint(&variables)?;
+    trainer.run(&mut training, SaveEvery::Steps(CHECKPOINT_EVERY))?;
     let network_config = HypLiLocConfig {
         scene_name: config.scene_name.clone(),
-        origin_m: examples.origin_m,
-        scale_m: examples.deviation_m,
+        origin_m: scale.origin_m,
+        scale_m: scale.scale_m,
     };
-    Ok(trainer.save_network(
-        &variables,
-        HypLiLocLocalizer::KIND,
-        &network_config,
-        examples.data,
-    )?)
+    let (variables, kind) = (&training.variables, HypLiLocLocalizer::KIND);
+    Ok(trainer.save_network(variables, kind, &network_config, data)?)
+}
+
+struct Training<'a> {
+    config: &'a HypLiLocTrainConfig,
+    observe: &'a mut Observe<'a>,
+    examples: Examples,
+    /// `[3]`: unit of positions.
+    unit_m: Tensor,
+    variables: VarStore,
+    network: HypLiLoc,
+    criteria: Criteria,
+    places: PlaceClasses<3>,
+    /// Step of the last report.
+    reported: u64,
+    /// `[5]` on the device, since then: errors of position and heading, losses of places.
+    sums: Tensor,
+}
+
+impl Task for Training<'_> {
+    type Error = Error;
+    const REPORT_EVERY: u64 = 20;
+
+    fn variables(&self) -> &VarStore {
+        &self.variables
+    }
+
+    fn epoch(&self, steps: u64) -> f64 {
+        (steps * self.config.run.batch as u64) as f64 / self.examples.inputs.len() as f64
+    }
+
+    fn loss(&mut self, _: &Trainer) -> Result<Tensor, Error> {
+        let run = &self.config.run;
+        let drawn = self.examples.draw(run.batch as i64)?;
+        let Examples { inputs, poses } = augment(&drawn, self.config.turn_rad)?;
+        let found = self.network.forward(&inputs, run.precision.kind(), true)?;
+        let place_losses = self.places.losses(found.features.each_ref(), &poses)?;
+        let places = place_losses.f_sum(Kind::Float)? * PLACE_WEIGHT;
+        let loss = self.criteria.loss(&found, &poses)? + places;
+        let errors = mean_errors(&found.fusion, &poses, &self.unit_m)?;
+        self.sums += Tensor::f_cat(&[errors, place_losses.f_detach()?], 0)?;
+        Ok(loss)
+    }
+
+    fn report(&mut self, trainer: &Trainer) -> Result<(), Error> {
+        let steps = (trainer.steps() - self.reported) as f64;
+        self.reported = trainer.steps();
+        let mean = (&self.sums / steps).f_to_kind(Kind::Double)?;
+        let _ = self.sums.f_zero_()?;
+        let mut means: Vec<f64> = Vec::try_from(&mean)?;
+        means[1] = means[1].to_degrees();
+        let [error_m, error_deg, points, image, fusion] = [0, 1, 2, 3, 4].map(|of| means[of]);
+        let places = format!("places {points:.2} {image:.2} {fusion:.2}");
+        let text = format!("error {error_m:.2} m {error_deg:.1} deg, {places}");
+        let report = trainer.step_report(self.share_done(trainer), means, &text);
+        (self.observe)(&report);
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -176,8 +179,8 @@ mod tests {
         };
         generate(&drive, &|_| ()).unwrap();
         let mut sampled = 0;
-        let mut observe = |report: &HypLiLocReport| {
-            if let HypLiLocReport::Sampling(done, _) = report {
+        let mut observe = |progress: &Progress| {
+            if let Progress::Encoding(done, _) = progress {
                 sampled = *done;
             }
         };

@@ -1,5 +1,6 @@
 //! Order and weights of the cells of a training.
 
+use perception::tensor_values::tensor;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -61,16 +62,14 @@ impl CellOrder {
 
     /// Rows `[batch]` of the next step.
     pub(super) fn next_batch(&mut self, share_done: f64) -> Result<Tensor, TchError> {
-        let wants_all = self
-            .redundancy
-            .as_ref()
-            .is_some_and(|redundancy| redundancy.is_time_for_all(share_done));
+        let redundancy = self.redundancy.as_ref();
+        let wants_all = redundancy.is_some_and(|of| of.is_time_for_all(share_done));
         if wants_all || self.place + self.batch > self.order.len() {
             self.next_pass(share_done)?;
         }
         let end = self.place + self.batch;
-        let rows = Tensor::f_from_slice(&self.order[self.place..end])?
-            .f_to_device(self.sweep_of_cell.device())?;
+        let device = self.sweep_of_cell.device();
+        let rows = tensor(&self.order[self.place..end], &[-1], device)?;
         self.place = end;
         // One more at the end of a pass, whatever part of a batch is left over then.
         let (shown, batches) = (end / self.batch, self.order.len() / self.batch);
@@ -85,19 +84,12 @@ impl CellOrder {
         sweeps: &Tensor,
         errors: &Tensor,
     ) -> Result<(), TchError> {
-        if self
-            .redundancy
-            .as_ref()
-            .is_some_and(|redundancy| redundancy.watches(share_done))
-        {
+        let redundancy = self.redundancy.as_ref();
+        if redundancy.is_some_and(|of| of.watches(share_done)) {
             let errors: Vec<f32> = Vec::try_from(&errors.f_detach()?)?;
             let sweeps: Vec<i64> = Vec::try_from(sweeps)?;
-            self.watched.extend(
-                sweeps
-                    .iter()
-                    .zip(errors)
-                    .map(|(&sweep, error)| (sweep as usize, error)),
-            );
+            let sweeps = sweeps.iter().map(|&sweep| sweep as usize);
+            self.watched.extend(sweeps.zip(errors));
         }
         Ok(())
     }
@@ -112,15 +104,11 @@ impl CellOrder {
             }
             changed |= redundancy.advance(share_done);
             if changed {
-                self.sweep_weights =
-                    Tensor::f_from_slice(redundancy.weights())?.f_to_device(device)?;
+                self.sweep_weights = tensor(redundancy.weights(), &[-1], device)?;
             }
         }
         if changed {
-            let used = self
-                .sweep_weights
-                .f_index_select(0, &self.sweep_of_cell)?
-                .f_gt(0.0)?;
+            let used = self.weights(&self.sweep_of_cell)?.f_gt(0.0)?;
             self.order = Vec::try_from(&used.f_nonzero()?.f_squeeze_dim(1)?)?;
         }
         if self.order.len() < self.batch {

@@ -1,10 +1,10 @@
-//! Configuration and reports of a training of a head.
+//! Configuration and result of a training of a head.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::training::{RedundancyConfig, SceneAccuracy, SweepAugmentation};
-use perception::train::{DataListing, RunConfig, Trained};
+use perception::train::{RunConfig, Trained};
 
 /// Configuration of a training of a head.
 #[derive(Debug, Clone)]
@@ -39,36 +39,6 @@ pub struct SceneTrainConfig {
     pub run: RunConfig,
     /// Time between two validations and checkpoints.
     pub validate_every: Duration,
-}
-
-/// Progress of a training of a head.
-#[derive(Debug, Clone, PartialEq)]
-pub enum SceneReport {
-    /// Sweeps are being encoded: number done and number of all.
-    Encoding(usize, usize),
-    /// All training and validation sweeps are encoded.
-    Encoded(DataListing),
-    /// The classifier is trained: share of training sweeps that it classifies correctly.
-    Classified(f64),
-    /// Some steps are done.
-    Stepped {
-        /// Number of steps done.
-        step: u64,
-        /// Number of passes over the data.
-        epoch: f64,
-        /// Share of the training that is done, 0..1.
-        share_done: f64,
-        /// Seconds since the start.
-        seconds: f64,
-        /// Mean L1 error of a cell since the last report, metres.
-        error_m: f64,
-        /// Mean predicted error, metres.
-        epsilon_m: f64,
-        /// Mean L1 error of the refiner's predictions, metres.
-        refined_m: f64,
-    },
-    /// A validation is done, after so many seconds.
-    Validated(f64, SceneAccuracy),
 }
 
 /// Result of a training of a head.

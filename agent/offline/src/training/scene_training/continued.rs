@@ -31,14 +31,7 @@ impl StoredHead {
         let weights = Weights::load(path)?;
         weights.check_kind(SceneHead::KIND)?;
         let config: SceneHeadConfig = weights.config()?;
-        if config.encoder_sha256 != encoder_sha256 {
-            return Err(LocalizerError::OtherEncoder {
-                head: path.display().to_string(),
-                expected: config.encoder_sha256,
-                encoder: encoder.display().to_string(),
-                found: encoder_sha256.to_owned(),
-            });
-        }
+        config.check_encoder(path, encoder, encoder_sha256)?;
         Ok(Self { weights, config })
     }
 
@@ -55,25 +48,16 @@ pub(super) fn classes_of_sweeps(
     cache: &FeatureCache,
 ) -> Result<Vec<usize>, Error> {
     let (classes, errors_m) = no_grad(|| classify(head, cache))?;
-    let positions: Vec<[f64; 3]> = cache
-        .world_from_sensor
-        .iter()
-        .map(|pose| pose.translation.vector.into())
-        .collect();
+    let positions = cache.positions_m();
     let mut sums = vec![[0.0; 4]; head.config().classes as usize];
-    for ((&class, _), position) in classes
-        .iter()
-        .zip(&errors_m)
-        .zip(&positions)
-        .filter(|((_, error_m), _)| **error_m < TRUSTED_M)
-    {
-        (0..3).for_each(|axis| sums[class as usize][axis] += position[axis]);
-        sums[class as usize][3] += 1.0;
+    for ((&class, &error_m), position) in classes.iter().zip(&errors_m).zip(&positions) {
+        if error_m < TRUSTED_M {
+            (0..3).for_each(|axis| sums[class as usize][axis] += position[axis]);
+            sums[class as usize][3] += 1.0;
+        }
     }
-    let middles: Vec<(usize, [f64; 3])> = sums
-        .iter()
-        .enumerate()
-        .filter(|(_, sum)| sum[3] > 0.0)
+    let trusted = sums.iter().enumerate().filter(|(_, sum)| sum[3] > 0.0);
+    let middles: Vec<(usize, [f64; 3])> = trusted
         .map(|(class, sum)| (class, std::array::from_fn(|axis| sum[axis] / sum[3])))
         .collect();
     if middles.is_empty() {
@@ -100,35 +84,28 @@ fn classify(head: &SceneHead, cache: &FeatureCache) -> Result<(Vec<i64>, Vec<f64
         if count == 0 {
             return Ok(f64::INFINITY);
         }
-        let rows = Tensor::f_linspace(
-            rows.start as f64,
-            (rows.end - 1) as f64,
-            count,
-            (Kind::Double, cache.cells.device()),
-        )?
-        .f_to_kind(Kind::Int64)?;
+        let on = (Kind::Double, cache.cells.device());
+        let (first, last) = (rows.start as f64, (rows.end - 1) as f64);
+        let rows = Tensor::f_linspace(first, last, count, on)?.f_to_kind(Kind::Int64)?;
         let cells = head.normalise(&cache.cells.f_index_select(0, &rows)?)?;
         let of_cells = logits
             .f_narrow(0, sweep as i64, 1)?
             .f_expand([count, -1], false)?;
         let found = head.regress(&cells, &of_cells, Kind::Float)?.coordinates_m;
         let error = (found - cache.targets_m.f_index_select(0, &rows)?).f_abs()?;
-        error
-            .f_sum_dim_intlist(1_i64, false, Kind::Float)?
-            .f_median()?
-            .f_double_value(&[])
+        let error = error.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+        error.f_median()?.f_double_value(&[])
     });
     Ok((classes, errors.collect::<Result<_, TchError>>()?))
 }
 
 fn nearest(middles: &[(usize, [f64; 3])], position: &[f64; 3]) -> usize {
-    let square_m2 = |middle: &[f64; 3]| {
-        (0..3)
-            .map(|axis| (middle[axis] - position[axis]).powi(2))
-            .sum::<f64>()
+    let square_m2 = |(_, middle): &(usize, [f64; 3])| {
+        let squares = (0..3).map(|axis| (middle[axis] - position[axis]).powi(2));
+        squares.sum::<f64>()
     };
     let nearest = middles
         .iter()
-        .min_by(|(_, one), (_, other)| square_m2(one).total_cmp(&square_m2(other)));
+        .min_by(|one, other| square_m2(one).total_cmp(&square_m2(other)));
     nearest.map_or(0, |(class, _)| *class)
 }

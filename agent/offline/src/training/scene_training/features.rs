@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use super::config::{SceneReport, SceneTrainConfig};
+use super::config::SceneTrainConfig;
 use crate::Error;
 use crate::training::{FeatureCache, SweepAugmentation, SweepList};
 use localization::pgc::{CellEncoder, SweepFormat};
-use perception::train::DataListing;
+use perception::train::{DataListing, Observe, Progress};
 
 /// Sweeps of a scene.
 pub(crate) struct SceneSweeps {
@@ -31,14 +31,14 @@ impl Features {
     pub(super) fn compute(
         config: &SceneTrainConfig,
         sweeps: &SceneSweeps,
-        observe: &mut dyn FnMut(&SceneReport),
+        observe: &mut Observe<'_>,
     ) -> Result<Self, Error> {
         let (encoder, encoder_sha256) = CellEncoder::load(&config.encoder, config.run.device)?;
         let mut encode = |list: &Arc<SweepList>, augmentation| {
-            let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
+            let mut progress = |done, total| observe(&Progress::Encoding(done, total));
             let cache =
                 FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
-            observe(&SceneReport::Encoded(list.data()));
+            observe(&Progress::Read(list.data()));
             Ok::<_, Error>(cache)
         };
         let training = encode(&sweeps.training, config.augmentation)?;
@@ -46,19 +46,13 @@ impl Features {
             copies: 1,
             ..config.augmentation
         };
-        let validation = sweeps
-            .validation
-            .as_ref()
-            .map(|list| encode(list, unchanged))
-            .transpose()?;
-        let data = sweeps.training.data();
-        let format = encoder.format().clone();
+        let validation = sweeps.validation.as_ref();
         Ok(Self {
             training,
-            validation,
-            format,
+            validation: validation.map(|list| encode(list, unchanged)).transpose()?,
+            format: encoder.format().clone(),
             encoder_sha256,
-            data,
+            data: sweeps.training.data(),
         })
     }
 }
