@@ -24,7 +24,6 @@ pub struct CommandLine {
 }
 
 /// Runs the subcommand on the command line.
-#[must_use]
 pub fn main() -> ExitCode {
     let command_line: CommandLine = parse_beside(&RUNNER);
     bus::log_to_stderr();

@@ -55,7 +55,6 @@ struct Clock {
 impl CaptureClocks {
     /// Clocks without a sweep. Where arrivals are exact, as in simulation time, one sweep of a vehicle makes an
     /// estimate; where they are measured, three do.
-    #[must_use]
     pub fn new(has_exact_arrivals: bool) -> Self {
         Self {
             fewest: if has_exact_arrivals { 1 } else { 3 },
@@ -114,7 +113,6 @@ impl CaptureClocks {
     }
 
     /// A neighbour's capture time on the ego's clock, nanoseconds; `None` while its clock is too unsteady.
-    #[must_use]
     pub fn corrected(&self, cav: &CavId, capture_nanos: u64) -> Option<u64> {
         match self.neighbours.get(cav) {
             Some(clock) if clock.is_unsteady => None,
@@ -176,10 +174,10 @@ impl Clock {
         let mut sorted: Vec<i64> = self.samples.iter().map(|(_, ahead)| *ahead).collect();
         sorted.sort_unstable();
         let quartile = |quarter: usize| sorted.get(quarter * sorted.len() / 4).copied();
-        let ends = [sorted.first(), sorted.last()];
-        let ([Some(low), Some(median), Some(high)], [Some(&least), Some(&most)]) =
-            ([1, 2, 3].map(quartile), ends)
-        else {
+        let [Some(low), Some(median), Some(high)] = [1, 2, 3].map(quartile) else {
+            return false;
+        };
+        let [Some(&least), Some(&most)] = [sorted.first(), sorted.last()] else {
             return false;
         };
         let [limit, unsteady] =
@@ -220,14 +218,12 @@ impl Clock {
 fn own_capture(own: &VecDeque<SweepTime>, arrived_nanos: u64) -> Option<i128> {
     let next = own.partition_point(|sweep| sweep.arrived_nanos <= arrived_nanos);
     let before = own.get(next.checked_sub(1)?)?;
-    let [capture, since] = [
-        before.capture_nanos.into(),
-        i128::from(arrived_nanos) - i128::from(before.arrived_nanos),
-    ];
+    let capture = i128::from(before.capture_nanos);
     let Some(after) = own.get(next) else {
         return Some(capture);
     };
-    let took = i128::from(after.arrived_nanos) - i128::from(before.arrived_nanos);
+    let [since, took] = [arrived_nanos, after.arrived_nanos]
+        .map(|nanos| i128::from(nanos) - i128::from(before.arrived_nanos));
     let passed = i128::from(after.capture_nanos) - capture;
     Some(capture + passed * since / took)
 }

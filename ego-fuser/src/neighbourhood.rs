@@ -31,17 +31,13 @@ struct Queue(VecDeque<CavId>);
 /// Topic on which an ego receives a vehicle: direct, or behind the link emulation if there is one. Its own agent is
 /// always received directly.
 pub(crate) fn topic_of(ego: &CavId, cav: &CavId, stream: Stream, over_link: bool) -> Topic {
-    if over_link && cav != ego {
-        Topic::Received {
+    match over_link && cav != ego {
+        true => Topic::Received {
             ego: ego.clone(),
             cav: cav.clone(),
             stream,
-        }
-    } else {
-        Topic::Stream {
-            cav: cav.clone(),
-            stream,
-        }
+        },
+        false => Topic::stream(cav, stream),
     }
 }
 
@@ -64,15 +60,14 @@ impl Neighbourhood {
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
         let membership = Membership::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
-        let (members, queue) = (BTreeMap::new(), Queue::default());
         Ok(Self {
             ego: ego.clone(),
             streams,
             over_link,
             allowed,
             membership,
-            members,
-            queue,
+            members: BTreeMap::new(),
+            queue: Queue::default(),
         })
     }
 
@@ -99,24 +94,23 @@ impl Neighbourhood {
 
     fn subscribe(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
         tracing::info!(%cav, "a neighbour has joined");
-        let topics = self
+        let subscribe = |&stream: &Stream| {
+            let topic = topic_of(&self.ego, &cav, stream, self.over_link);
+            bus.subscribe(topic, inbox)
+        };
+        let subscriptions = self
             .streams
             .iter()
-            .map(|&stream| topic_of(&self.ego, &cav, stream, self.over_link));
-        let subscriptions = topics
-            .map(|topic| bus.subscribe(topic, inbox))
+            .map(subscribe)
             .collect::<Result<_, _>>()?;
         self.members.insert(cav, subscriptions);
         Ok(())
     }
 
     fn is_wanted(&self, cav: &CavId) -> bool {
-        *cav != self.ego
-            && !self.members.contains_key(cav)
-            && self
-                .allowed
-                .as_ref()
-                .is_none_or(|allowed| allowed.contains(cav))
+        let allowed = self.allowed.as_ref();
+        let is_allowed = allowed.is_none_or(|allowed| allowed.contains(cav));
+        *cav != self.ego && !self.members.contains_key(cav) && is_allowed
     }
 }
 

@@ -19,7 +19,7 @@ const MAX_STEP: u8 = 2;
 /// Longest mean interval, nanoseconds.
 const MAX_INTERVAL_NANOS: u64 = 1_000_000_000;
 /// First and longest time without an overloaded frame after which the share is raised, nanoseconds.
-const PATIENCE_NANOS: [u64; 2] = [5_000_000_000, 80_000_000_000];
+const CALM_NANOS: [u64; 2] = [5_000_000_000, 80_000_000_000];
 
 /// Controller of an ego's pace.
 #[derive(Debug)]
@@ -32,7 +32,7 @@ pub(crate) struct PaceControl {
     /// Time of the last overloaded frame or change, nanoseconds.
     quiet_since_nanos: u64,
     raised_at_nanos: Option<u64>,
-    patience_nanos: u64,
+    calm_nanos: u64,
 }
 
 /// A frame since the last change.
@@ -45,7 +45,6 @@ struct Judged {
 
 impl PaceControl {
     /// Controller that begins with every sweep.
-    #[must_use]
     pub(crate) fn new() -> Self {
         Self {
             period_nanos: None,
@@ -54,7 +53,7 @@ impl PaceControl {
             judged: VecDeque::new(),
             quiet_since_nanos: 0,
             raised_at_nanos: None,
-            patience_nanos: PATIENCE_NANOS[0],
+            calm_nanos: CALM_NANOS[0],
         }
     }
 
@@ -71,14 +70,11 @@ impl PaceControl {
         let gap_nanos = capture_nanos - last_nanos;
         let period_nanos = self.period_nanos.unwrap_or(gap_nanos).min(gap_nanos);
         self.period_nanos = Some(period_nanos);
-        let is_left_out = self
-            .pace
-            .interval_of(capture_nanos)
-            .zip(self.pace.interval_of(last_nanos))
-            .map_or(
-                gap_nanos > period_nanos.saturating_add(period_nanos / 2),
-                |(interval, last)| interval > last + 1,
-            );
+        let intervals = [capture_nanos, last_nanos].map(|nanos| self.pace.interval_of(nanos));
+        let is_left_out = match intervals {
+            [Some(interval), Some(last)] => interval > last + 1,
+            _ => gap_nanos > period_nanos.saturating_add(period_nanos / 2),
+        };
         // Between two sweeps that are left out, frames wait for each other.
         let is_every_sweep = self.pace == Pace::EVERY_SWEEP;
         let longest_nanos = period_nanos / if is_every_sweep { 2 } else { 1 };
@@ -112,26 +108,22 @@ impl PaceControl {
     /// Another share, tenths, if it is time for one.
     fn next_share(&mut self, period_nanos: u64, now_nanos: u64) -> Option<u8> {
         let share = self.pace.computed * (TENTHS / self.pace.of);
-        let count = self
-            .judged
-            .iter()
-            .filter(|frame| frame.is_overloaded)
-            .count();
+        let overloaded = self.judged.iter().filter(|frame| frame.is_overloaded);
+        let count = overloaded.count();
         let lowest = period_nanos.saturating_mul(u64::from(TENTHS)) / MAX_INTERVAL_NANOS;
         let lowest = u8::try_from(lowest.max(1)).unwrap_or(TENTHS);
         if count >= TOO_MANY && share > lowest {
             let raised_at_nanos = self.raised_at_nanos.take();
-            let has_failed =
-                raised_at_nanos.is_some_and(|at| now_nanos < at.saturating_add(PATIENCE_NANOS[0]));
-            self.patience_nanos = if has_failed {
-                (2 * self.patience_nanos).min(PATIENCE_NANOS[1])
-            } else {
-                PATIENCE_NANOS[0]
+            let [shortest, longest] = CALM_NANOS;
+            let has_failed = |at: u64| now_nanos < at.saturating_add(shortest);
+            self.calm_nanos = match raised_at_nanos.is_some_and(has_failed) {
+                true => (2 * self.calm_nanos).min(longest),
+                false => shortest,
             };
             let least = share.saturating_sub(MAX_STEP).max(lowest);
             return Some(self.achieved_share(period_nanos).clamp(least, share - 1));
         }
-        let is_quiet = now_nanos >= self.quiet_since_nanos.saturating_add(self.patience_nanos);
+        let is_quiet = now_nanos >= self.quiet_since_nanos.saturating_add(self.calm_nanos);
         (share < TENTHS && is_quiet).then(|| {
             self.raised_at_nanos = Some(now_nanos);
             share + 1

@@ -23,7 +23,6 @@ pub struct PairingConfig {
 impl PairingConfig {
     /// Messages of at most that age, half a frame of 10 Hz of lead, and at least eight messages: at 10 Hz all that may
     /// still be fused.
-    #[must_use]
     pub fn with_max_age_nanos(max_age_nanos: u64) -> Self {
         Self {
             max_age_nanos,
@@ -73,7 +72,6 @@ struct Waiting<T> {
 
 impl<T> Pairing<T> {
     /// No messages yet.
-    #[must_use]
     pub fn new(config: PairingConfig) -> Self {
         Self {
             config,
@@ -96,31 +94,23 @@ impl<T> Pairing<T> {
         if queue.iter().any(|held| held.capture_nanos == capture_nanos) {
             return dropped(capture_nanos, DropReason::Duplicate);
         }
-        if queue
-            .iter()
-            .any(|held| held.is_used && held.capture_nanos > capture_nanos)
-        {
+        let is_later = |held: &Waiting<T>| held.is_used && held.capture_nanos > capture_nanos;
+        if queue.iter().any(is_later) {
             return dropped(capture_nanos, DropReason::Superseded);
         }
         // Messages may be reordered by the channel.
         let place = queue.partition_point(|held| held.capture_nanos < capture_nanos);
-        queue.insert(
-            place,
-            Waiting {
-                capture_nanos,
-                is_used: false,
-                message,
-            },
-        );
+        let waiting = Waiting {
+            capture_nanos,
+            is_used: false,
+            message,
+        };
+        queue.insert(place, waiting);
         if queue.len() <= self.config.depth.max(1) {
             return None;
         }
-        let oldest = queue.pop_front()?;
-        if oldest.is_used {
-            None
-        } else {
-            dropped(oldest.capture_nanos, DropReason::Superseded)
-        }
+        let oldest = queue.pop_front().filter(|oldest| !oldest.is_used)?;
+        dropped(oldest.capture_nanos, DropReason::Superseded)
     }
 
     /// The messages that belong to the ego's frame, by CAV, and those that will never be used.
@@ -141,17 +131,14 @@ impl<T> Pairing<T> {
                 .filter(|&newest| queue[newest].capture_nanos >= earliest);
             // All before the newest that is due have missed their frame; without one young enough, so have all.
             for held in queue.drain(..newest.unwrap_or(due)) {
-                let is_old = held.capture_nanos < earliest;
-                let reason = if is_old {
-                    DropReason::Stale
-                } else {
-                    DropReason::Superseded
-                };
                 if !held.is_used {
                     dropped.push(Dropped {
                         cav: cav.clone(),
                         capture_nanos: held.capture_nanos,
-                        reason,
+                        reason: match held.capture_nanos < earliest {
+                            true => DropReason::Stale,
+                            false => DropReason::Superseded,
+                        },
                     });
                 }
             }
@@ -173,7 +160,6 @@ impl<T> Pairing<T> {
 
     /// True if a CAV's message for the ego's frame waits, or a later one: then this frame's own is lost, and waiting for
     /// it is useless.
-    #[must_use]
     pub fn has_reached(&self, cav: &CavId, ego_capture_nanos: u64) -> bool {
         let lead_nanos = self.config.max_lead_nanos;
         self.capture_times(cav)
@@ -182,15 +168,11 @@ impl<T> Pairing<T> {
 
     /// The capture times of messages of a CAV that wait, oldest first.
     pub fn capture_times(&self, cav: &CavId) -> impl Iterator<Item = u64> + '_ {
-        self.waiting
-            .get(cav)
-            .into_iter()
-            .flatten()
-            .map(|held| held.capture_nanos)
+        let queue = self.waiting.get(cav).into_iter().flatten();
+        queue.map(|held| held.capture_nanos)
     }
 
     /// All CAVs with waiting messages.
-    #[must_use]
     pub fn cavs(&self) -> Vec<CavId> {
         self.waiting.keys().cloned().collect()
     }
@@ -202,23 +184,20 @@ impl<T> Pairing<T> {
             return 0;
         };
         let latest = now_nanos.saturating_add(ahead_nanos);
-        let unused = queue
-            .iter()
-            .filter(|held| held.capture_nanos > latest && !held.is_used)
-            .count();
+        let is_unused = |held: &&Waiting<T>| held.capture_nanos > latest && !held.is_used;
+        let unused = queue.iter().filter(is_unused).count();
         queue.retain(|held| held.capture_nanos <= if held.is_used { now_nanos } else { latest });
         unused
     }
 
     /// Removes a CAV that has left; returns the number of its messages that were never used.
     pub fn forget(&mut self, cav: &CavId) -> usize {
-        self.waiting
-            .remove(cav)
-            .map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
+        let unused = self.unused(cav);
+        self.waiting.remove(cav);
+        unused
     }
 
     /// Messages of a CAV that wait and were never used, at the end of a run: in flight in the message accounting.
-    #[must_use]
     pub fn unused(&self, cav: &CavId) -> usize {
         let queue = self.waiting.get(cav).into_iter().flatten();
         queue.filter(|held| !held.is_used).count()

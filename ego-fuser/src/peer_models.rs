@@ -77,32 +77,16 @@ impl PeerModels {
 
     fn difference(&self, descriptor: &Descriptor) -> Option<OtherModel> {
         // Its streams and numeric type are not part of the network.
-        let Descriptor {
-            model_hash,
-            grid,
-            channels,
-            dtype: _,
-            streams: _,
-            sweeps: _,
-        } = descriptor;
-        if *grid != self.grid {
-            Some(OtherModel::Grid {
-                found: *grid,
-                own: self.grid,
-            })
-        } else if *channels != self.channels {
-            Some(OtherModel::Channels {
-                found: *channels,
-                own: self.channels,
-            })
-        } else if *model_hash != self.model_hash {
-            Some(OtherModel::Hash {
-                found: *model_hash,
-                own: self.model_hash,
-            })
-        } else {
-            None
+        let (found, own) = (descriptor.grid, self.grid);
+        if found != own {
+            return Some(OtherModel::Grid { found, own });
         }
+        let (found, own) = (descriptor.channels, self.channels);
+        if found != own {
+            return Some(OtherModel::Channels { found, own });
+        }
+        let (found, own) = (descriptor.model_hash, self.model_hash);
+        (found != own).then_some(OtherModel::Hash { found, own })
     }
 }
 

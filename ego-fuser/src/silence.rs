@@ -13,7 +13,6 @@ pub struct Silence(BTreeMap<CavId, u32>);
 
 impl Silence {
     /// True if frames wait for the neighbour.
-    #[must_use]
     pub fn is_awaited(&self, cav: &CavId) -> bool {
         self.0.get(cav).is_none_or(|frames| *frames < SILENT_AFTER)
     }

@@ -19,7 +19,6 @@ pub struct View {
 
 impl View {
     /// Age relative to another view, nanoseconds.
-    #[must_use]
     pub fn age_nanos(&self, newer: &Self) -> i64 {
         newer.capture_nanos as i64 - self.capture_nanos as i64
     }
@@ -38,7 +37,6 @@ pub enum Content {
 
 impl Content {
     /// Exchange that transmits this content.
-    #[must_use]
     pub fn exchange(&self) -> Exchange {
         match self {
             Self::Features(_) => Exchange::Features,

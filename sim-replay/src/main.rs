@@ -8,5 +8,5 @@ mod command_line;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    command_line::run(support::command_line::parse())
+    command_line::run(terminal::command_line::parse())
 }

@@ -92,19 +92,17 @@ impl Axis {
     #[must_use]
     pub fn logarithmic(label: &str, range: [f64; 2]) -> Self {
         Self {
-            label: label.into(),
-            range,
             is_logarithmic: true,
+            ..Self::linear(label, range)
         }
     }
 
     /// The range, or a substitute that can be drawn if it is empty or infinite.
     pub(super) fn drawn_range(&self) -> [f64; 2] {
         let [low, high] = self.range;
-        let lowest = if self.is_logarithmic {
-            f64::MIN_POSITIVE
-        } else {
-            f64::MIN
+        let lowest = match self.is_logarithmic {
+            true => f64::MIN_POSITIVE,
+            false => f64::MIN,
         };
         let can_be_drawn = low >= lowest && low < high && (high - low).is_finite();
         if can_be_drawn { self.range } else { [0.1, 1.0] }
@@ -112,12 +110,9 @@ impl Axis {
 
     /// Position of a value: 0 at the lower end, 1 at the upper.
     fn share(&self, value: f64) -> f64 {
-        let scale = |value: f64| {
-            if self.is_logarithmic {
-                value.ln()
-            } else {
-                value
-            }
+        let scale = |value: f64| match self.is_logarithmic {
+            true => value.ln(),
+            false => value,
         };
         let [low, high] = self.drawn_range().map(scale);
         (scale(value) - low) / (high - low)
@@ -134,10 +129,8 @@ impl Series {
         x: &'a Axis,
         y: &'a Axis,
     ) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
-        self.points
-            .iter()
-            .copied()
-            .filter(|point| x.contains(point.0) && y.contains(point.1))
+        let points = self.points.iter().copied();
+        points.filter(|point| x.contains(point.0) && y.contains(point.1))
     }
 
     fn dot_radius(&self) -> Option<u32> {
@@ -218,28 +211,22 @@ impl Chart {
 
     /// The quarter of the chart with the fewest points.
     fn emptiest_corner(&self) -> SeriesLabelPosition {
-        let points = || {
-            self.series
-                .iter()
-                .flat_map(|series| series.points_on(&self.x, &self.y))
+        use SeriesLabelPosition::{LowerLeft, LowerRight, UpperLeft, UpperRight};
+        let points = { self.series.iter() }.flat_map(|series| series.points_on(&self.x, &self.y));
+        let corner_of = |(x, y)| match (self.x.share(x) > 0.5, self.y.share(y) > 0.5) {
+            (false, true) => 0,
+            (true, true) => 1,
+            (false, false) => 2,
+            (true, false) => 3,
         };
-        let count = |is_right: bool, is_upper: bool| {
-            points()
-                .filter(|at| {
-                    (self.x.share(at.0) > 0.5) == is_right && (self.y.share(at.1) > 0.5) == is_upper
-                })
-                .count()
-        };
-        let corners = [
-            (count(false, true), SeriesLabelPosition::UpperLeft),
-            (count(true, true), SeriesLabelPosition::UpperRight),
-            (count(false, false), SeriesLabelPosition::LowerLeft),
-            (count(true, false), SeriesLabelPosition::LowerRight),
-        ];
-        corners
+        let mut counts = [0_usize; 4];
+        points.for_each(|point| counts[corner_of(point)] += 1);
+        let corners = [UpperLeft, UpperRight, LowerLeft, LowerRight];
+        let fewest = corners
             .into_iter()
-            .min_by_key(|corner| corner.0)
-            .map_or(SeriesLabelPosition::UpperLeft, |corner| corner.1)
+            .zip(counts)
+            .min_by_key(|(_, count)| *count);
+        fewest.map_or(UpperLeft, |(corner, _)| corner)
     }
 }
 

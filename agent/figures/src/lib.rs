@@ -72,10 +72,8 @@ pub fn save_png(charts: &[Chart], path: &Path) -> Result<(), FigureError> {
 pub fn svg(charts: &[Chart]) -> Result<String, FigureError> {
     load_font()?;
     let mut text = String::new();
-    draw(
-        charts,
-        &SVGBackend::with_string(&mut text, size(charts)).into_drawing_area(),
-    )?;
+    let backend = SVGBackend::with_string(&mut text, size(charts));
+    draw(charts, &backend.into_drawing_area())?;
     Ok(text)
 }
 
@@ -89,10 +87,9 @@ fn draw<DB: DrawingBackend>(
 ) -> Result<(), FigureError> {
     area.fill(&PAPER)?;
     let parts = area.split_evenly((1, charts.len().max(1)));
-    charts
-        .iter()
-        .zip(&parts)
-        .try_for_each(|(chart, part)| chart.draw(part))?;
+    for (chart, part) in charts.iter().zip(&parts) {
+        chart.draw(part)?;
+    }
     Ok(area.present()?)
 }
 

@@ -55,15 +55,10 @@ impl Ranged for Scale {
 /// Powers of ten of a range, its ends included; `None` where there are fewer than two.
 fn decades(range: &Range<f64>) -> Option<Vec<f64>> {
     // Logarithms of powers of ten are not exact.
-    let (first, last) = (
-        (range.start.log10() - 1e-9).ceil(),
-        (range.end.log10() + 1e-9).floor(),
-    );
-    (last > first).then(|| {
-        (first as i32..=last as i32)
-            .map(|power| 10f64.powi(power))
-            .collect()
-    })
+    let first = (range.start.log10() - 1e-9).ceil() as i32;
+    let last = (range.end.log10() + 1e-9).floor() as i32;
+    let powers = (first..=last).map(|power| 10f64.powi(power));
+    (last > first).then(|| powers.collect())
 }
 
 impl ValueFormatter<f64> for Scale {

@@ -7,7 +7,7 @@ mod command_line;
 
 use std::process::ExitCode;
 
-use support::command_line::parse_behind;
+use terminal::command_line::parse_behind;
 
 fn main() -> ExitCode {
     command_line::run(parse_behind::<_, agent::command_line::CommandLine>())

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use deploy::command_line::CommandLine as Front;
 use support::cli::exit_code;
-use support::command_line::parse_behind;
+use terminal::command_line::parse_behind;
 
 /// Runs and experiments that compute networks.
 #[derive(Debug, Parser)]

@@ -1,7 +1,6 @@
 //! `v2vloc keys`.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use crate::operate::keys::{KeyError, KeyPlan, make};
 use protocol::{CavId, Principal, Role};
@@ -38,47 +37,29 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Writes the keys and lists the files.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut principals: Vec<Principal> = self
-            .agents
-            .iter()
-            .map(|cav| Principal::new(Role::Agent, cav))
-            .collect();
-        principals.extend(
-            self.egos
-                .iter()
-                .flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))),
-        );
+        use Role::{Agent, Ego, Link, Recorder, Replay, Ros2, Scorer, Viewer};
+        let agents = self.agents.iter().map(|cav| Principal::new(Agent, cav));
+        let of_ego = |cav| [Ego, Link].map(|role| Principal::new(role, cav));
+        let egos = self.egos.iter().flat_map(of_ego);
         // Vehicles that are added later join a fleet whose other processes have certificates already.
-        let others = [
-            Role::Replay,
-            Role::Scorer,
-            Role::Recorder,
-            Role::Viewer,
-            Role::Ros2,
-        ]
-        .map(Principal::of_role);
+        let others = [Replay, Scorer, Recorder, Viewer, Ros2].map(Principal::of_role);
         let has_own = |principal: &Principal| self.out.join(principal.to_string()).exists();
-        principals.extend(
-            others
-                .into_iter()
-                .filter(|principal| self.force || !has_own(principal)),
-        );
+        let others = others
+            .into_iter()
+            .filter(|other| self.force || !has_own(other));
+        let principals = agents.chain(egos).chain(others).collect();
         let mut plan = KeyPlan::new(&self.out, principals, self.days);
         plan.hosts.extend(self.hosts);
-        plan.lifetime = Duration::from_secs(u64::from(self.days) * 24 * 3600);
         plan.replace = self.force;
         let written = make(&plan).map_err(|error| match error {
-            KeyError::There(_) | KeyError::Unusable { .. } => {
-                anyhow::Error::from(BadInput::of(error))
-            }
             KeyError::Io { .. } => anyhow::Error::from(error),
+            KeyError::There(_) | KeyError::Unusable { .. } => BadInput::of(error).into(),
         })?;
         if self.json {
             output::line(serde_json::to_string_pretty(&json!({ "files": written }))?)?;
         } else {
-            written
-                .iter()
-                .try_for_each(|path| output::line(path.display()))?;
+            let mut paths = written.iter();
+            paths.try_for_each(|path| output::line(path.display()))?;
         }
         Ok(Outcome::Done)
     }

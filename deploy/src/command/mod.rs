@@ -10,10 +10,12 @@ mod view;
 use std::path::Path;
 
 use anyhow::Context;
-use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, malloc_settings, process_id};
+use bus::{Bus, BusOptions, Endpoint, Identity, malloc_settings, process_id};
 use protocol::{CavId, Role, RunId};
 use support::cli::Outcome;
 use support::sibling_program::Sibling;
+
+use crate::operate::security::credentials;
 
 /// Subcommands that compute networks; listed first.
 pub(crate) const RUNNER: Sibling = Sibling {
@@ -71,11 +73,8 @@ pub(crate) enum Command {
 impl Command {
     /// Runs the subcommand.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let settings = [
-            malloc_settings::KEPT_MEMORY.as_slice(),
-            &[malloc_settings::ROUTER_THREADS],
-        ]
-        .concat();
+        use malloc_settings::{KEPT_MEMORY, ROUTER_THREADS};
+        let settings = [KEPT_MEMORY.as_slice(), &[ROUTER_THREADS]].concat();
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
             Self::Report(arguments) => arguments.run(),
@@ -88,19 +87,30 @@ impl Command {
     }
 }
 
-/// A connection to the router of a run as a viewer; `keys` where the run has security.
-fn viewer_bus(run: &RunId, router: &Endpoint, keys: Option<&Path>) -> anyhow::Result<Bus> {
-    let cav = CavId::new("viewer")?;
+/// Identity in a run and options of a client of its router, for the only process of a role; `keys` where the run has
+/// security.
+fn client(
+    run: &RunId,
+    role: Role,
+    router: &Endpoint,
+    keys: Option<&Path>,
+) -> anyhow::Result<(Identity, BusOptions)> {
+    let cav = CavId::new(role.as_str())?;
     let identity = Identity {
         run: run.clone(),
-        process: process_id(Role::Viewer, &cav),
+        process: process_id(role, &cav),
         cav,
     };
     let mut options = BusOptions::client(router.clone());
     if let Some(folder) = keys {
-        let credentials = Credentials::read(folder)?;
-        credentials.check_name(identity.process.as_str())?;
+        let credentials = credentials(folder, identity.process.as_str())?;
         options = options.with_credentials(credentials);
     }
+    Ok((identity, options))
+}
+
+/// A connection to the router of a run as a viewer.
+fn viewer_bus(run: &RunId, router: &Endpoint, keys: Option<&Path>) -> anyhow::Result<Bus> {
+    let (identity, options) = client(run, Role::Viewer, router, keys)?;
     Ok(Bus::join(&options, identity)?)
 }

@@ -68,19 +68,14 @@ impl Arguments {
 
     fn compare(&self, several: &[PathBuf]) -> anyhow::Result<Outcome> {
         let folder = |run: &PathBuf| RunStatus::folder(Some(run.clone()), &self.runs);
-        let folders = several
-            .iter()
-            .map(folder)
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(BadInput::of)?;
+        let folders = several.iter().map(folder).collect::<Result<Vec<_>, _>>();
+        let folders = folders.map_err(BadInput::of)?;
         if self.json {
-            let reports = folders
-                .iter()
-                .map(|folder| RunReport::read(folder))
-                .collect::<Result<Vec<_>, _>>();
-            output::line(serde_json::to_string_pretty(
-                &reports.map_err(BadInput::of)?,
-            )?)?;
+            let reports = folders.iter().map(|folder| RunReport::read(folder));
+            let reports = reports
+                .collect::<Result<Vec<_>, _>>()
+                .map_err(BadInput::of)?;
+            output::line(serde_json::to_string_pretty(&reports)?)?;
         } else {
             output::text(Comparison::read(&folders).map_err(BadInput::of)?)?;
         }

@@ -2,17 +2,17 @@
 
 use std::path::PathBuf;
 
-use crate::ros::{
-    AgentTopic, ClockMode, MotionReport, MotionSource, NodeOptions, NodeReport, RosSession, run,
-};
-use anyhow::Context;
+use crate::ros::{AgentTopic, ClockMode, MotionSource, NodeOptions, NodeReport, RosSession, run};
+use anyhow::{Context, bail, ensure};
 use bus::shutdown::Stop;
-use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, STOP_LIMIT, open_unless, process_id};
+use bus::{Bus, BusOptions, Endpoint, STOP_LIMIT, open_unless};
 use dataset::IntensityScale;
 use protocol::{CavId, Role, RunId};
 use ros2::{Distribution, MotionType, Mount, RosName};
 use support::cli::{BadInput, Outcome};
 use support::output;
+
+use super::client;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -120,7 +120,9 @@ impl Arguments {
         let stop = Stop::new();
         stop.on_signals()?;
         stop.enforce(STOP_LIMIT);
-        let bus = self.join(&stop)?;
+        let keys = self.keys.as_deref();
+        let (identity, options) = client(&self.run, Role::Ros2, &self.connect, keys)?;
+        let bus = Bus::join_unless(&stop, &options, identity)?;
         let router = self.network.ros_router.as_ref().unwrap_or(&self.connect);
         let network = BusOptions::client(router.clone());
         let session = open_unless(&stop, &network).context("the ROS 2 network")?;
@@ -146,41 +148,18 @@ impl Arguments {
     fn check(&self) -> anyhow::Result<()> {
         self.sensors.check()?;
         let published = self.content.initialpose.as_ref();
-        if let Some(source) = self
-            .sensors
-            .starting_pose
-            .iter()
-            .find(|source| Some(&source.cav) == published)
+        let mut starting_poses = self.sensors.starting_pose.iter();
+        if let Some(AgentTopic { topic, cav }) =
+            starting_poses.find(|source| Some(&source.cav) == published)
         {
-            return Err(BadInput::new(format!(
-                "--starting-pose {}={}: its first fix goes out by --initialpose, and would come back",
-                source.topic, source.cav
-            ))
-            .into());
+            bail!(BadInput::new(format!(
+                "--starting-pose {topic}={cav}: its first fix goes out by --initialpose, and would come back"
+            )));
         }
-        if self.network.ros_router.is_none() && self.keys.is_some() {
-            return Err(BadInput::new(
-                "--ros-router: nodes of ROS 2 have no certificates; name a router for them",
-            )
-            .into());
-        }
+        let message = "--ros-router: nodes of ROS 2 have no certificates; name a router for them";
+        let has_router = self.network.ros_router.is_some() || self.keys.is_none();
+        ensure!(has_router, BadInput::new(message));
         Ok(())
-    }
-
-    fn join(&self, stop: &Stop) -> anyhow::Result<Bus> {
-        let cav = CavId::new("ros2")?;
-        let identity = Identity {
-            run: self.run.clone(),
-            process: process_id(Role::Ros2, &cav),
-            cav,
-        };
-        let mut options = BusOptions::client(self.connect.clone());
-        if let Some(folder) = &self.keys {
-            let credentials = Credentials::read(folder)?;
-            credentials.check_name(identity.process.as_str())?;
-            options = options.with_credentials(credentials);
-        }
-        Ok(Bus::join_unless(stop, &options, identity)?)
     }
 
     fn distribution(&self) -> Distribution {
@@ -193,7 +172,7 @@ impl Arguments {
     fn options(&self) -> NodeOptions {
         let (content, sensors) = (&self.content, &self.sensors);
         NodeOptions {
-            with_points: !content.no_points,
+            no_points: content.no_points,
             clock: match content.clock {
                 Some(true) => ClockMode::On,
                 Some(false) => ClockMode::Off,
@@ -221,50 +200,40 @@ impl Sensors {
             ("--imu", "IMU", &self.imu),
             ("--starting-pose", "starting pose", &self.starting_pose),
         ] {
-            for (index, source) in sources.iter().enumerate() {
-                if let Some(other) = sources
-                    .iter()
-                    .take(index)
-                    .find(|other| other.cav == source.cav)
+            for (index, AgentTopic { topic, cav }) in sources.iter().enumerate() {
+                let mut others = sources.iter().take(index);
+                if let Some(AgentTopic { topic: first, .. }) =
+                    others.find(|other| other.cav == *cav)
                 {
-                    let (first, second, cav) = (&other.topic, &source.topic, &source.cav);
                     let message =
-                        format!("{option}: {first} and {second} are both the {what} of {cav}");
-                    return Err(BadInput::new(message).into());
+                        format!("{option}: {first} and {topic} are both the {what} of {cav}");
+                    bail!(BadInput::new(message));
                 }
             }
         }
         let has_lidar = |cav: &CavId| self.lidar.iter().any(|lidar| lidar.cav == *cav);
-        match speeds
-            .iter()
-            .chain(&self.imu)
-            .chain(&self.starting_pose)
-            .find(|source| !has_lidar(&source.cav))
-        {
-            Some(AgentTopic { topic, cav }) => {
-                let message = format!(
-                    "{topic}={cav}: an agent's motion and starting pose go with its sweeps; name its --lidar too"
-                );
-                Err(BadInput::new(message).into())
-            }
-            None => Ok(()),
+        let mut others = speeds.iter().chain(&self.imu).chain(&self.starting_pose);
+        if let Some(AgentTopic { topic, cav }) = others.find(|source| !has_lidar(&source.cav)) {
+            bail!(BadInput::new(format!(
+                "{topic}={cav}: an agent's motion and starting pose go with its sweeps; name its --lidar too"
+            )));
         }
+        Ok(())
     }
 
     fn motions(&self) -> Vec<MotionSource> {
-        let topics = [
+        let mut motions = Vec::new();
+        for (motion_type, sources) in [
             (MotionType::Odometry, &self.odometry),
             (MotionType::TwistStamped, &self.twist),
             (MotionType::Imu, &self.imu),
-        ];
-        let of_type = |(motion_type, sources): (MotionType, &Vec<AgentTopic>)| {
-            let source = |source: &AgentTopic| MotionSource {
+        ] {
+            motions.extend(sources.iter().cloned().map(|source| MotionSource {
                 motion_type,
-                source: source.clone(),
-            };
-            sources.iter().map(source).collect::<Vec<_>>()
-        };
-        topics.into_iter().flat_map(of_type).collect()
+                source,
+            }));
+        }
+        motions
     }
 }
 
@@ -274,15 +243,10 @@ impl Network {
         else {
             return Ok(self.domain_id.unwrap_or(0));
         };
-        let number = text
-            .to_str()
-            .and_then(|text| text.parse().ok())
-            .filter(|number| *number <= 232);
-        number.ok_or_else(|| {
-            BadInput::new(format!(
-                "ROS_DOMAIN_ID is {text:?}, not a number from 0 to 232"
-            ))
-            .into()
+        let number = text.to_str().and_then(|text| text.parse().ok());
+        number.filter(|number| *number <= 232).ok_or_else(|| {
+            let message = format!("ROS_DOMAIN_ID is {text:?}, not a number from 0 to 232");
+            BadInput::new(message).into()
         })
     }
 }
@@ -302,26 +266,14 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
             lidar.sweeps, lidar.superseded, lidar.repeated
         ))?;
     }
-    if lidar.sweeps_without_motion > 0 {
+    print_counts(&[(lidar.sweeps_without_motion, "of these without a motion")])?;
+    for (topic, motion) in &report.motion {
         output::line(format_args!(
-            "{} of these without a motion",
-            lidar.sweeps_without_motion
+            "{} messages of {topic} read, {} could not be read, {} measurements out of order",
+            motion.read, motion.unreadable, motion.out_of_order
         ))?;
     }
-    for (
-        topic,
-        MotionReport {
-            read,
-            unreadable,
-            out_of_order,
-        },
-    ) in &report.motion
-    {
-        output::line(format_args!(
-            "{read} messages of {topic} read, {unreadable} could not be read, {out_of_order} measurements out of order"
-        ))?;
-    }
-    for (count, what) in [
+    print_counts(&[
         (
             lidar.without_points,
             "sweeps have no point in range and were left out",
@@ -339,22 +291,15 @@ fn print(report: &NodeReport, as_json: bool) -> anyhow::Result<()> {
             report.unplaced_poses,
             "poses gave no place of an odometry frame in the map",
         ),
-    ] {
-        if count > 0 {
-            output::line(format_args!("{count} {what}"))?;
-        }
-    }
-    if lidar.unreadable > 0 {
-        output::line(format_args!(
-            "{} messages of LiDARs could not be read",
-            lidar.unreadable
-        ))?;
-    }
-    if report.left_out > 0 {
-        output::line(format_args!(
-            "{} messages of the run were left out",
-            report.left_out
-        ))?;
+        (lidar.unreadable, "messages of LiDARs could not be read"),
+        (report.left_out, "messages of the run were left out"),
+    ])
+}
+
+/// Prints a line for each of the counts that is not 0.
+fn print_counts(counts: &[(u64, &str)]) -> anyhow::Result<()> {
+    for (count, what) in counts.iter().filter(|(count, _)| *count > 0) {
+        output::line(format_args!("{count} {what}"))?;
     }
     Ok(())
 }

@@ -6,15 +6,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{
-    AccessControl, BusOptions, Credentials, Endpoint, ROUTER, RejectionLog, STOP_LIMIT,
-    SharedMemory, open,
-};
+use bus::{BusOptions, Endpoint, RejectionLog, STOP_LIMIT, SharedMemory, open};
 use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::Wait;
 
 use crate::operate::router_panic;
+use crate::operate::security::guarded;
 use support::cli::Outcome;
 
 /// Interval between reports of refused requests.
@@ -52,11 +50,10 @@ pub(crate) struct Arguments {
 
 fn seconds(text: &str) -> Result<f64, String> {
     let seconds: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if (0.1..=3600.0).contains(&seconds) {
-        Ok(seconds)
-    } else {
-        Err("0.1 to 3600 s".to_owned())
-    }
+    let is_allowed = (0.1..=3600.0).contains(&seconds);
+    is_allowed
+        .then_some(seconds)
+        .ok_or_else(|| "0.1 to 3600 s".to_owned())
 }
 
 impl Arguments {
@@ -77,10 +74,8 @@ impl Arguments {
         stop.enforce(STOP_LIMIT);
         router_panic::watch(&stop);
         let session = open(&options)?;
-        output::note(format_args!(
-            "routing at {} (Ctrl-C ends it)",
-            options.endpoint()
-        ));
+        let endpoint = options.endpoint();
+        output::note(format_args!("routing at {endpoint} (Ctrl-C ends it)"));
         let (mut refusals, mut reported) = (RejectionLog::of(options.endpoint()), BTreeMap::new());
         loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
@@ -88,14 +83,9 @@ impl Arguments {
                 refusals.update(&session);
                 for (refusal, count) in refusals.counts() {
                     let before = reported.insert(refusal.clone(), count).unwrap_or(0);
+                    let (peer, reason, what) = (refusal.peer, refusal.reason, refusal.message);
                     if count > before {
-                        tracing::warn!(
-                            peer = refusal.peer,
-                            reason = refusal.reason,
-                            what = refusal.message,
-                            count,
-                            "refused"
-                        );
+                        tracing::warn!(peer, reason, what, count, "refused");
                     }
                 }
             }
@@ -122,15 +112,7 @@ impl Arguments {
         let Some(folder) = &self.keys else {
             return Ok(options);
         };
-        let credentials = Credentials::read(folder)?;
-        credentials.check_name(ROUTER)?;
         let runs = self.run.clone().map_or(RunScope::Any, RunScope::One);
-        let guard = AccessControl {
-            members: credentials.members()?,
-            runs,
-        };
-        Ok(options
-            .with_credentials(credentials)
-            .with_access_control(guard))
+        Ok(guarded(options, folder, runs)?)
     }
 }

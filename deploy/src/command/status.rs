@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::operate::remote_status::RemoteStatus;
-use crate::operate::status::{RunStatus, StatusError};
+use crate::operate::status::RunStatus;
 use anyhow::ensure;
 use bus::Endpoint;
 use protocol::RunId;
@@ -45,13 +45,12 @@ impl Arguments {
             let bus = viewer_bus(name, router, self.keys.as_deref())?;
             let status = RemoteStatus::observe(&bus, OBSERVED)?;
             self.print(&status, &status.table())?;
-            return well(&status.run, &status.troubles());
+            return check(&status.run, &status.troubles());
         }
-        let bad_input = |error: StatusError| BadInput::of(error);
-        let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(bad_input)?;
-        let status = RunStatus::read(&folder).map_err(bad_input)?;
+        let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)?;
+        let status = RunStatus::read(&folder).map_err(BadInput::of)?;
         self.print(&status, &status.table())?;
-        well(&status.run, &status.troubles())
+        check(&status.run, &status.troubles())
     }
 
     fn print(&self, status: &impl serde::Serialize, table: &str) -> anyhow::Result<()> {
@@ -64,11 +63,9 @@ impl Arguments {
     }
 }
 
-fn well(run: &str, troubles: &[String]) -> anyhow::Result<Outcome> {
-    ensure!(
-        troubles.is_empty(),
-        "run {run} is not well: {}",
-        troubles.join("; ")
-    );
+/// An error for a run with problems.
+fn check(run: &str, troubles: &[String]) -> anyhow::Result<Outcome> {
+    let (is_well, troubles) = (troubles.is_empty(), troubles.join("; "));
+    ensure!(is_well, "run {run} is not well: {troubles}");
     Ok(Outcome::Done)
 }

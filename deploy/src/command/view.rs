@@ -1,7 +1,7 @@
 //! `v2vloc view`.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::operate::status::{Phase, RunStatus};
@@ -44,50 +44,41 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Serves the page until Ctrl-C.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        match self.shown()? {
-            Shown::Recorded(path) => show_recorded(&path, self.page)?,
-            Shown::Live(name, router, protocol) => {
-                // On the machine of the run, the run has priority.
-                let _ = rustix::process::nice(VIEWER_NICENESS);
-                let bus = viewer_bus(&name, &router, self.keys.as_deref())?;
-                let run = Arc::new(LiveRun::start(bus, protocol)?);
-                until_stopped(self.page, |address| serve_live(address, run))?;
-            }
-        }
-        Ok(Outcome::Done)
-    }
-}
-
-/// The run that is shown.
-enum Shown {
-    /// A run folder or a recording.
-    Recorded(PathBuf),
-    /// A run that goes on, its router, and its evaluation protocol if that is known.
-    Live(RunId, Endpoint, Option<EvaluationProtocol>),
-}
-
-impl Arguments {
-    fn shown(&self) -> anyhow::Result<Shown> {
         if let (Some(name), Some(router)) = (&self.name, &self.connect) {
-            return Ok(Shown::Live(name.clone(), router.clone(), None));
+            return self.show_live(name, router, None);
         }
         if let Some(file) = self.run.as_ref().filter(|path| path.is_file()) {
-            return Ok(Shown::Recorded(file.clone()));
+            return self.show_recording(file);
         }
         let folder = RunStatus::folder(self.run.clone(), &self.runs).map_err(BadInput::of)?;
         match RunStatus::read(&folder) {
-            Ok(RunStatus {
-                phase: Phase::Running,
-                run,
-                endpoint,
-                protocol,
-                ..
-            }) => {
+            Ok(status) if status.phase == Phase::Running => {
+                let (run, endpoint) = (&status.run, &status.endpoint);
                 output::note(format_args!("run {run} goes on at {endpoint}"));
-                Ok(Shown::Live(run.parse()?, endpoint.parse()?, protocol))
+                self.show_live(&run.parse()?, &endpoint.parse()?, status.protocol)
             }
             // Without a status it may still hold a recording.
-            _ => Ok(Shown::Recorded(folder)),
+            _ => self.show_recording(&folder),
         }
+    }
+
+    fn show_recording(&self, path: &Path) -> anyhow::Result<Outcome> {
+        show_recorded(path, self.page)?;
+        Ok(Outcome::Done)
+    }
+
+    /// Shows a run that goes on, judged by its evaluation protocol if that is known.
+    fn show_live(
+        &self,
+        name: &RunId,
+        router: &Endpoint,
+        protocol: Option<EvaluationProtocol>,
+    ) -> anyhow::Result<Outcome> {
+        // On the machine of the run, the run has priority.
+        let _ = rustix::process::nice(VIEWER_NICENESS);
+        let bus = viewer_bus(name, router, self.keys.as_deref())?;
+        let run = Arc::new(LiveRun::start(bus, protocol)?);
+        until_stopped(self.page, |address| serve_live(address, run))?;
+        Ok(Outcome::Done)
     }
 }

@@ -22,9 +22,8 @@ impl Failures {
         let ProcessEvent { name, what } = event;
         let text = match what {
             ProcessEventKind::Logged { line } if name == RECORDER => {
-                serde_json::from_str::<RecordReport>(line)
-                    .ok()?
-                    .loss_in_words()?
+                let report: RecordReport = serde_json::from_str(line).ok()?;
+                report.loss_in_words()?
             }
             ProcessEventKind::Logged { line } => {
                 self.last_line.insert(name.clone(), line.clone());
@@ -56,8 +55,8 @@ impl Failures {
 
     /// Description of each failure, after the name of its process.
     pub(crate) fn in_words(&self) -> Vec<String> {
-        self.failed
-            .iter()
+        let failed = self.failed.iter();
+        failed
             .map(|(name, text)| format!("{name}: {text}"))
             .collect()
     }

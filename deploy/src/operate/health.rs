@@ -31,7 +31,8 @@ pub enum State {
     /// Running, but without a report for a while.
     Silent,
     /// Crashed, about to be restarted.
-    Fallen,
+    #[serde(rename = "fallen")]
+    Crashed,
     /// Ended as expected.
     Ended,
     /// Crashed and not restarted.
@@ -54,10 +55,8 @@ pub struct ProcessStatus {
     /// Description of its last crash.
     pub last_fall: Option<String>,
     /// Description of its failure, for a process that has failed in its task.
-    #[serde(default)]
     pub failure: Option<String>,
     /// Problems that it reports while it runs.
-    #[serde(default)]
     pub problems: Vec<String>,
     /// Time since its last report, seconds.
     pub silent_s: Option<f64>,
@@ -80,6 +79,20 @@ struct Noted {
     restarts: u32,
     last_fall: Option<String>,
     failure: Option<String>,
+}
+
+impl Noted {
+    fn new(now: Instant) -> Self {
+        Self {
+            state: State::Starting,
+            pid: None,
+            started: now,
+            last_report: None,
+            restarts: 0,
+            last_fall: None,
+            failure: None,
+        }
+    }
 }
 
 /// Monitors the processes of a run.
@@ -109,29 +122,14 @@ impl Health {
         let noted = self
             .processes
             .entry(event.name.clone())
-            .or_insert_with(|| Noted {
-                state: State::Starting,
-                pid: None,
-                started: now,
-                last_report: None,
-                restarts: 0,
-                last_fall: None,
-                failure: None,
-            });
+            .or_insert_with(|| Noted::new(now));
         match &event.what {
             ProcessEventKind::Started { pid } => {
-                *noted = Noted {
-                    state: State::Starting,
-                    pid: Some(*pid),
-                    started: now,
-                    last_report: None,
-                    restarts: noted.restarts,
-                    last_fall: noted.last_fall.take(),
-                    failure: noted.failure.take(),
-                };
+                (noted.state, noted.pid) = (State::Starting, Some(*pid));
+                (noted.started, noted.last_report) = (now, None);
             }
             ProcessEventKind::Crashed { how, restart, .. } => {
-                (noted.state, noted.pid, noted.restarts) = (State::Fallen, None, *restart);
+                (noted.state, noted.pid, noted.restarts) = (State::Crashed, None, *restart);
                 noted.last_fall = Some(how.clone());
             }
             ProcessEventKind::Logged { .. } => {}
@@ -160,20 +158,16 @@ impl Health {
         self.looked = now;
         // The reports of this program come over the same bus. Without any report at all, the network is down, and no
         // process counts as hung.
-        let network_is_up = last_reports.is_empty()
-            || last_reports
-                .values()
-                .any(|at| now.saturating_duration_since(*at) <= SILENT);
+        let mut ages = { last_reports.values() }.map(|at| now.saturating_duration_since(*at));
+        let network_is_up = last_reports.is_empty() || ages.any(|age| age <= SILENT);
         let mut hanging = Vec::new();
         for (name, noted) in &mut self.processes {
             if noted.pid.is_none() {
                 continue;
             }
             // The last reports of the previous process instance may arrive after its end.
-            let last = last_reports
-                .get(name)
-                .copied()
-                .filter(|at| *at > noted.started + SILENT / 3);
+            let last = last_reports.get(name).copied();
+            let last = last.filter(|at| *at > noted.started + SILENT / 3);
             noted.last_report = noted.last_report.max(last);
             if was_stopped {
                 // Reports of that time were not received.
@@ -191,13 +185,17 @@ impl Health {
                 Some(_) => State::Ready,
             };
             if since > timeout && network_is_up {
-                hanging.push((
-                    name.clone(),
-                    format!("has not reported for {:.1} s", since.as_secs_f64()),
-                ));
+                let why = format!("has not reported for {:.1} s", since.as_secs_f64());
+                hanging.push((name.clone(), why));
             }
         }
         hanging
+    }
+
+    /// Processes that crashed at least once.
+    pub(crate) fn crashed(&self) -> Vec<String> {
+        let crashed = { self.processes.iter() }.filter(|(_, noted)| noted.last_fall.is_some());
+        crashed.map(|(name, _)| name.clone()).collect()
     }
 
     /// Status of every process; `progress` has what they reported.
@@ -205,26 +203,18 @@ impl Health {
         let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
         let status = |(name, noted): (&String, &Noted)| {
             let usage = noted.pid.and_then(Usage::of).unwrap_or_default();
+            let runs = noted.pid.is_some();
+            let problems = progress.problems.get(name).filter(|_| runs);
             ProcessStatus {
                 name: name.clone(),
                 state: noted.state,
                 pid: noted.pid,
-                up_s: if noted.pid.is_some() {
-                    seconds(noted.started)
-                } else {
-                    0.0
-                },
+                up_s: if runs { seconds(noted.started) } else { 0.0 },
                 restarts: noted.restarts,
                 last_fall: noted.last_fall.clone(),
                 failure: noted.failure.clone(),
-                problems: { progress.problems.get(name) }
-                    .filter(|_| noted.pid.is_some())
-                    .cloned()
-                    .unwrap_or_default(),
-                silent_s: noted
-                    .last_report
-                    .filter(|_| noted.pid.is_some())
-                    .map(seconds),
+                problems: problems.cloned().unwrap_or_default(),
+                silent_s: noted.last_report.filter(|_| runs).map(seconds),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,
                 descriptors: usage.descriptors,
@@ -237,29 +227,27 @@ impl Health {
 /// Resources of a process, from `/proc`.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Usage {
-    /// Number of threads.
+    /// Resident memory, MiB.
     pub resident_mib: Option<f64>,
-    /// Number of open descriptors.
+    /// Number of threads.
     pub threads: Option<u64>,
-    /// Open descriptors.
+    /// Number of open descriptors.
     pub descriptors: Option<u64>,
 }
 
 impl Usage {
     /// Of the process `pid`; empty when it has ended.
-    #[must_use]
     pub fn of(pid: u32) -> Option<Self> {
         let text = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
         let field = |name: &str| {
             let line = text.lines().find_map(|line| line.strip_prefix(name))?;
             line.split_whitespace().next()?.parse::<u64>().ok()
         };
+        let descriptors = fs::read_dir(format!("/proc/{pid}/fd")).ok();
         Some(Self {
             resident_mib: field("VmRSS:").map(|kib| kib as f64 / 1024.0),
             threads: field("Threads:"),
-            descriptors: fs::read_dir(format!("/proc/{pid}/fd"))
-                .ok()
-                .map(|entries| entries.count() as u64),
+            descriptors: descriptors.map(|entries| entries.count() as u64),
         })
     }
 }
@@ -337,7 +325,7 @@ mod tests {
         let status = health.statuses(&Progress::default(), began).remove(0);
         assert_eq!(
             (status.state, status.restarts, status.last_fall.as_deref()),
-            (State::Fallen, 1, Some("hung"))
+            (State::Crashed, 1, Some("hung"))
         );
     }
 

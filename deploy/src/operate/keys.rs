@@ -49,7 +49,6 @@ pub struct KeyPlan {
 
 impl KeyPlan {
     /// Certificates for `principals` of a fleet on this machine, valid for `days` days.
-    #[must_use]
     pub fn new(folder: &Path, principals: Vec<Principal>, days: u32) -> Self {
         let hosts = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
         Self {
@@ -91,37 +90,25 @@ pub enum KeyError {
 /// # Errors
 /// [`KeyError`]; files that were written before it stay.
 pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
-    let mut desk = KeyStore {
+    let mut store = KeyStore {
         plan,
         written: Vec::new(),
     };
-    let folders = plan
-        .principals
-        .iter()
-        .map(ToString::to_string)
-        .chain([ROUTER.to_owned()]);
-    let folders: Vec<(String, PathBuf)> = folders
-        .map(|name| (name.clone(), plan.folder.join(name)))
-        .collect();
-    let router_is_there = plan.folder.join(ROUTER).join(CERTIFICATE_FILE).exists();
-    let is_wanted = |name: &str| name != ROUTER || !router_is_there || plan.replace;
-    if !plan.replace {
-        let taken = folders
-            .iter()
-            .map(|(name, folder)| (name, folder.join(CERTIFICATE_FILE)));
-        if let Some((_, taken)) = taken
-            .filter(|(name, _)| *name != ROUTER)
-            .find(|(_, file)| file.exists())
-        {
-            return Err(KeyError::There(taken));
-        }
+    let names = plan.principals.iter().map(ToString::to_string);
+    let is_there = |name: &str| plan.folder.join(name).join(CERTIFICATE_FILE).exists();
+    if !plan.replace
+        && let Some(taken) = names.clone().find(|name| is_there(name))
+    {
+        let taken = plan.folder.join(taken).join(CERTIFICATE_FILE);
+        return Err(KeyError::There(taken));
     }
-    let authority = desk.authority()?;
-    for (name, folder) in folders.iter().filter(|(name, _)| is_wanted(name)) {
-        desk.certify(&authority, name, folder)?;
+    let authority = store.authority()?;
+    let router = (plan.replace || !is_there(ROUTER)).then(|| ROUTER.to_owned());
+    for name in names.chain(router) {
+        store.certify(&authority, &name)?;
     }
-    desk.enlist()?;
-    Ok(desk.written)
+    store.enlist()?;
+    Ok(store.written)
 }
 
 /// The authority: its certificate as text, and its signer.
@@ -141,21 +128,18 @@ impl KeyStore<'_> {
         let folder = &self.plan.folder;
         make_folder(folder)?;
         let (key_path, pem_path) = (folder.join(AUTHORITY_KEY), folder.join(AUTHORITY_FILE));
-        let unusable = |cause| KeyError::Unusable {
-            what: key_path.display().to_string(),
-            cause,
-        };
+        let unusable = unusable(key_path.display().to_string());
         // An existing one stays valid for as long as the certificates that it signs.
         let params = authority_params(self.plan.lifetime.max(DAY * 3650))?;
         if key_path.exists() {
-            let key = KeyPair::from_pem(&read(&key_path)?).map_err(unusable)?;
+            let key = KeyPair::from_pem(&read(&key_path)?).map_err(&unusable)?;
             return Ok(Authority {
                 pem: read(&pem_path)?,
                 issuer: Issuer::new(params, key),
             });
         }
-        let key = KeyPair::generate().map_err(unusable)?;
-        let pem = params.self_signed(&key).map_err(unusable)?.pem();
+        let key = KeyPair::generate().map_err(&unusable)?;
+        let pem = params.self_signed(&key).map_err(&unusable)?.pem();
         self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
         self.write(pem_path, &pem, 0o644)?;
         Ok(Authority {
@@ -164,36 +148,24 @@ impl KeyStore<'_> {
         })
     }
 
-    fn certify(
-        &mut self,
-        authority: &Authority,
-        name: &str,
-        folder: &Path,
-    ) -> Result<(), KeyError> {
-        let unusable = |cause| KeyError::Unusable {
-            what: format!("a certificate for {name}"),
-            cause,
-        };
+    fn certify(&mut self, authority: &Authority, name: &str) -> Result<(), KeyError> {
+        let folder = &self.plan.folder.join(name);
+        let unusable = unusable(format!("a certificate for {name}"));
         let mut params = params(name, self.plan.lifetime)?;
         params.use_authority_key_identifier_extension = true;
         params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         // Any process can be the router of its run (--listen); only the one of that name is addressed by host name.
         params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
         if name == ROUTER {
-            params
-                .extended_key_usages
-                .push(ExtendedKeyUsagePurpose::ServerAuth);
-            params.subject_alt_names = self
-                .plan
-                .hosts
-                .iter()
-                .map(|host| alternative(host))
-                .collect::<Result<_, _>>()?;
+            let usages = &mut params.extended_key_usages;
+            usages.push(ExtendedKeyUsagePurpose::ServerAuth);
+            let hosts = self.plan.hosts.iter().map(|host| alternative(host));
+            params.subject_alt_names = hosts.collect::<Result<_, _>>()?;
         }
-        let key = KeyPair::generate().map_err(unusable)?;
+        let key = KeyPair::generate().map_err(&unusable)?;
         let certificate = params
             .signed_by(&key, &authority.issuer)
-            .map_err(unusable)?;
+            .map_err(&unusable)?;
         make_folder(folder)?;
         self.write(folder.join(AUTHORITY_FILE), &authority.pem, 0o644)?;
         self.write(folder.join(KEY_FILE), &key.serialize_pem(), 0o600)?;
@@ -204,65 +176,60 @@ impl KeyStore<'_> {
     /// Writes the router's list of every process in the folder, including earlier ones.
     fn enlist(&mut self) -> Result<(), KeyError> {
         let folder = &self.plan.folder;
-        let io = |cause| KeyError::Io {
-            path: folder.clone(),
-            cause,
-        };
+        let io = at(folder);
         let mut members = Vec::new();
-        for entry in fs::read_dir(folder).map_err(io)? {
-            let entry = entry.map_err(io)?;
+        for entry in fs::read_dir(folder).map_err(&io)? {
+            let entry = entry.map_err(&io)?;
             let name = entry.file_name().to_string_lossy().into_owned();
             if entry.path().join(CERTIFICATE_FILE).exists() && name.parse::<Principal>().is_ok() {
                 members.push(name + "\n");
             }
         }
         members.sort();
-        self.write(
-            folder.join(ROUTER).join(MEMBERS_FILE),
-            &members.concat(),
-            0o644,
-        )
+        let path = folder.join(ROUTER).join(MEMBERS_FILE);
+        self.write(path, &members.concat(), 0o644)
     }
 
     /// Atomic write: leaves neither half a file nor a moment in which others can read a key.
     fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyError> {
-        let io = |cause| KeyError::Io {
-            path: path.clone(),
-            cause,
-        };
         let begun = path.with_extension("new");
         let _ = fs::remove_file(&begun);
-        let mut file = OpenOptions::new()
-            .write(true)
-            .create_new(true)
-            .mode(mode)
-            .open(&begun)
-            .map_err(io)?;
-        file.write_all(text.as_bytes())
-            .and_then(|()| file.sync_all())
-            .map_err(io)?;
-        fs::rename(&begun, &path).map_err(io)?;
+        let mut options = OpenOptions::new();
+        options.write(true).create_new(true).mode(mode);
+        let written = options.open(&begun).and_then(|mut file| {
+            file.write_all(text.as_bytes())?;
+            file.sync_all()?;
+            fs::rename(&begun, &path)
+        });
+        written.map_err(at(&path))?;
         self.written.push(path);
         Ok(())
     }
 }
 
-fn make_folder(path: &Path) -> Result<(), KeyError> {
-    let made = fs::DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(path);
-    made.map_err(|cause| KeyError::Io {
-        path: path.to_path_buf(),
+fn at(path: &Path) -> impl Fn(io::Error) -> KeyError {
+    let path = path.to_owned();
+    move |cause| KeyError::Io {
+        path: path.clone(),
         cause,
-    })
+    }
+}
+
+fn unusable(what: String) -> impl Fn(rcgen::Error) -> KeyError {
+    move |cause| KeyError::Unusable {
+        what: what.clone(),
+        cause,
+    }
+}
+
+fn make_folder(path: &Path) -> Result<(), KeyError> {
+    let mut builder = fs::DirBuilder::new();
+    let made = builder.recursive(true).mode(0o700).create(path);
+    made.map_err(at(path))
 }
 
 fn read(path: &Path) -> Result<String, KeyError> {
-    bounded_file::read_text(path, MAX_TEXT_BYTES).map_err(|cause| KeyError::Io {
-        path: path.to_path_buf(),
-        cause,
-    })
+    bounded_file::read_text(path, MAX_TEXT_BYTES).map_err(at(path))
 }
 
 fn authority_params(lifetime: Duration) -> Result<CertificateParams, KeyError> {
@@ -273,16 +240,11 @@ fn authority_params(lifetime: Duration) -> Result<CertificateParams, KeyError> {
 }
 
 fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError> {
-    let unusable = |cause| KeyError::Unusable {
-        what: name.to_owned(),
-        cause,
-    };
-    let mut params = CertificateParams::new(Vec::new()).map_err(unusable)?;
+    let mut params = CertificateParams::new(Vec::new()).map_err(unusable(name.to_owned()))?;
     params.distinguished_name = DistinguishedName::new();
     params.distinguished_name.push(DnType::CommonName, name);
-    let now = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default();
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    let now = now.unwrap_or_default();
     let epoch = date_time_ymd(1970, 1, 1);
     params.not_before = epoch + now.saturating_sub(LEEWAY);
     params.not_after = epoch + now + lifetime;
@@ -294,11 +256,8 @@ fn alternative(host: &str) -> Result<SanType, KeyError> {
     if let Ok(address) = host.parse::<IpAddr>() {
         return Ok(SanType::IpAddress(address));
     }
-    let unusable = |cause| KeyError::Unusable {
-        what: format!("host {host:?}"),
-        cause,
-    };
-    host.try_into().map(SanType::DnsName).map_err(unusable)
+    let name = host.try_into().map(SanType::DnsName);
+    name.map_err(unusable(format!("host {host:?}")))
 }
 
 #[cfg(test)]

@@ -4,13 +4,13 @@ use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
 use bus::shutdown::{self, Overdue};
-use bus::{BusError, BusOptions, Endpoint, SharedMemory, open, present, process_id};
-use protocol::{KeyExpr, Principal, ProcessId, Role, RunId};
+use bus::{BusError, BusOptions, Endpoint, ROUTER, SharedMemory, open, present, process_id};
+use protocol::{KeyExpr, Principal, ProcessId, Role, RunId, RunScope};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
 
-use crate::operate::security::RunKeys;
+use crate::operate::security::{self, RunKeys};
 use crate::operate::supervise::ProcessSpec;
 use crate::score::scorer_cav;
 
@@ -65,22 +65,26 @@ impl RouterEndpoint {
     /// # Errors
     /// [`BusError`] when the port is in use, no router answers, the endpoint is invalid or the keys do not fit.
     pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
-        let options = match &network.connect {
-            Some(router) => {
-                let options = BusOptions::client(Endpoint::new(router)?);
-                keys.map_or(Ok(options.clone()), |keys| {
-                    keys.for_client(options, Principal::of_role(Role::Scorer).name().as_str())
-                })
+        let mut options = match &network.connect {
+            Some(router) => BusOptions::client(Endpoint::new(router)?),
+            None => BusOptions::router(with_port(&network.listen, keys.is_some())?),
+        };
+        if network.connect.is_none() {
+            options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
+            if network.shared_memory_mib > 0 {
+                options.shared_memory = SharedMemory::Attached;
             }
-            None => {
-                let mut options = BusOptions::router(with_port(&network.listen, keys.is_some())?);
-                options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
-                if network.shared_memory_mib > 0 {
-                    options.shared_memory = SharedMemory::Attached;
-                }
-                keys.map_or(Ok(options.clone()), |keys| keys.for_router(options, run))
-            }
-        }?;
+        }
+        if let Some(keys) = keys {
+            options = if network.connect.is_none() {
+                let runs = RunScope::One(run.clone());
+                security::guarded(options, &keys.of_process(ROUTER), runs)?
+            } else {
+                let name = Principal::of_role(Role::Scorer).to_string();
+                let credentials = security::credentials(&keys.of_process(&name), &name)?;
+                options.with_credentials(credentials)
+            };
+        }
         let session = open(&options)?;
         Ok(Self {
             session,
@@ -106,12 +110,8 @@ impl RouterEndpoint {
         let is_ours = |process: &ProcessId| {
             *process == scorer || specs.iter().any(|spec| spec.name == process.as_str())
         };
-        Ok(
-            present(&self.session, KeyExpr::everyone_alive(run).as_str())?
-                .into_iter()
-                .filter(is_ours)
-                .collect(),
-        )
+        let present = present(&self.session, KeyExpr::everyone_alive(run).as_str())?;
+        Ok(present.into_iter().filter(is_ours).collect())
     }
 
     /// Closes the session.
@@ -141,15 +141,13 @@ fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
     };
     let host = place.split_once('/').map_or(place, |(_, host)| host);
     // If another program takes the port in between, the router reports the error.
-    let bound = if secured {
-        UdpSocket::bind(format!("{host}:0")).and_then(|socket| socket.local_addr())
-    } else {
-        TcpListener::bind(format!("{host}:0")).and_then(|listener| listener.local_addr())
+    let any = format!("{host}:0");
+    let bound = match secured {
+        true => UdpSocket::bind(any).and_then(|socket| socket.local_addr()),
+        false => TcpListener::bind(any).and_then(|listener| listener.local_addr()),
     };
-    Endpoint::new(&format!(
-        "{place}:{}",
-        bound.as_ref().map_or(0, SocketAddr::port)
-    ))
+    let port = bound.as_ref().map_or(0, SocketAddr::port);
+    Endpoint::new(&format!("{place}:{port}"))
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
 use support::{output, progress};
+use terminal::text_table::number;
 
 use crate::score::Progress;
 
@@ -20,13 +21,10 @@ pub struct Display {
 
 impl Display {
     /// A display for `ticks` ticks, or for a run without end.
-    #[must_use]
     pub fn new(ticks: Option<usize>) -> Self {
         let bar = std::io::stderr().is_terminal().then(|| {
-            ticks.map_or_else(
-                || progress::spinner("frames"),
-                |ticks| progress::bar(ticks, "frames"),
-            )
+            let spinner = || progress::spinner("frames");
+            ticks.map_or_else(spinner, |ticks| progress::bar(ticks, "frames"))
         });
         Self {
             bar,
@@ -47,10 +45,9 @@ impl Display {
             {
                 self.last_line = Instant::now();
                 self.shown_frames = progress.frames;
+                let (frames, ticks) = (progress.frames, progress.ticks);
                 output::note(format_args!(
-                    "answered {}/{}  {}",
-                    progress.frames,
-                    progress.ticks,
+                    "answered {frames}/{ticks}  {}",
                     summary(progress)
                 ));
             }
@@ -76,14 +73,10 @@ impl Display {
 
 /// Rate, latency, neighbours, bytes, drops.
 fn summary(progress: &Progress) -> String {
-    let rate = progress
-        .rate_hz()
-        .map_or("-".into(), |rate| format!("{rate:.1}"));
-    let latency = progress
-        .latency_ms
-        .map_or("-".into(), |latency| format!("{latency:.0}"));
     format!(
-        "{rate} Hz  latency {latency} ms  {} fused  {}  {} dropped",
+        "{} Hz  latency {} ms  {} fused  {}  {} dropped",
+        number(progress.rate_hz(), 1),
+        number(progress.latency_ms, 0),
         progress.fused,
         bytes(progress.wire_bytes as f64),
         progress.dropped
@@ -91,20 +84,15 @@ fn summary(progress: &Progress) -> String {
 }
 
 /// A number of bytes as text, with a unit.
-#[must_use]
 pub fn bytes(count: f64) -> String {
     const UNITS: [&str; 4] = ["B", "kB", "MB", "GB"];
-    let mut value = count;
-    let mut unit = 0;
+    let (mut value, mut unit) = (count, 0);
     while value >= 1000.0 && unit + 1 < UNITS.len() {
         value /= 1000.0;
         unit += 1;
     }
-    if unit == 0 {
-        format!("{value:.0} B")
-    } else {
-        format!("{value:.1} {}", UNITS[unit])
-    }
+    let digits = usize::from(unit > 0);
+    format!("{value:.digits$} {}", UNITS[unit])
 }
 
 #[cfg(test)]

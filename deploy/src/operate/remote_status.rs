@@ -7,7 +7,9 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, present};
 use protocol::{CavId, Detections, KeyExpr, Limits, Stats, Stream, Topic, wire};
 use serde::Serialize;
-use support::text_table::{Side, TextTable, number};
+use terminal::text_table::{Side, TextTable, number};
+
+use crate::operate::status::name_of;
 
 /// Queued messages of a topic.
 const PLACES: usize = 64;
@@ -81,25 +83,22 @@ impl RemoteStatus {
             KeyExpr::stream(run, Stream::Detections),
             KeyExpr::truth(run),
         ];
-        let tap = bus.tap(&selectors, PLACES)?;
+        let subscriber = bus.tap(&selectors, PLACES)?;
         let mut seen = Seen::default();
         let end = Instant::now() + time;
-        while let Pop::Item(topic, message) = tap.take(Some(end)) {
+        while let Pop::Item(topic, message) = subscriber.take(Some(end)) {
             seen.add(&topic, &message.pieces());
         }
         // This observer reports, too.
         let own = &bus.identity().process;
         seen.reports.remove(own.as_str());
-        let alive = present(bus.session(), KeyExpr::everyone_alive(run).as_str())?
-            .iter()
-            .filter(|process| *process != own)
-            .map(ToString::to_string)
-            .collect();
+        let alive = present(bus.session(), KeyExpr::everyone_alive(run).as_str())?;
+        let others = alive.iter().filter(|process| *process != own);
+        let alive = others.map(ToString::to_string).collect();
         Ok(seen.status(run.to_string(), time, &alive))
     }
 
     /// Problems as text.
-    #[must_use]
     pub fn troubles(&self) -> Vec<String> {
         if self.processes.is_empty() {
             return vec!["no process of it is connected to this router".to_owned()];
@@ -115,58 +114,42 @@ impl RemoteStatus {
     }
 
     /// The status as text for a terminal.
-    #[must_use]
     pub fn table(&self) -> String {
-        let left = ["process", "state"].map(|name| (name, Side::Left));
-        let right = ["cores", "MiB", "sent", "dropped"].map(|name| (name, Side::Right));
-        let last = [("problem", Side::Left)];
-        let mut table = TextTable::new(left.into_iter().chain(right).chain(last));
-        for RemoteProcess {
-            name,
-            state,
-            cores,
-            resident_mib,
-            sent,
-            dropped,
-            problems,
-        } in &self.processes
-        {
-            let count =
-                |count: &Option<u64>| count.map_or("-".to_owned(), |count| count.to_string());
-            let state = match state {
-                RemoteState::Alive => "alive",
-                RemoteState::Silent => "silent",
-                RemoteState::Gone => "gone",
-            };
+        let columns = [
+            ("process", Side::Left),
+            ("state", Side::Left),
+            ("cores", Side::Right),
+            ("MiB", Side::Right),
+            ("sent", Side::Right),
+            ("dropped", Side::Right),
+            ("problem", Side::Left),
+        ];
+        let mut table = TextTable::new(columns);
+        for process in &self.processes {
+            let count = |count: Option<u64>| number(count.map(|count| count as f64), 0);
             table.row([
-                name.clone(),
-                state.to_owned(),
-                number(*cores, 2),
-                number(*resident_mib, 0),
-                count(sent),
-                count(dropped),
-                problems.join("; "),
+                process.name.clone(),
+                name_of(&process.state),
+                number(process.cores, 2),
+                number(process.resident_mib, 0),
+                count(process.sent),
+                count(process.dropped),
+                process.problems.join("; "),
             ]);
         }
         let results: String = self.egos.iter().map(result_line).collect();
-        format!(
-            "{}, observed for {:.1} s\n{results}{table}",
-            self.run, self.observed_s
-        )
+        let (run, observed_s) = (&self.run, self.observed_s);
+        format!("{run}, observed for {observed_s:.1} s\n{results}{table}")
     }
 }
 
-fn result_line(
-    RemoteEgo {
-        ego,
-        rate_hz,
-        latency_ms,
-        fused,
-    }: &RemoteEgo,
-) -> String {
+fn result_line(ego: &RemoteEgo) -> String {
     format!(
-        "ego {ego}: {rate_hz:.1} results a second, latency {} ms, {fused} fused\n",
-        number(*latency_ms, 0)
+        "ego {}: {:.1} results a second, latency {} ms, {} fused\n",
+        ego.ego,
+        ego.rate_hz,
+        number(ego.latency_ms, 0),
+        ego.fused
     )
 }
 
@@ -186,29 +169,23 @@ impl Seen {
     fn add(&mut self, topic: &Topic, pieces: &[&[u8]]) {
         match topic {
             Topic::Stats(process) => {
-                let Ok((header, stats)) =
-                    wire::decode::<Stats>(pieces.iter().copied(), &Limits::DEFAULT)
-                else {
-                    return;
-                };
+                let decoded = wire::decode::<Stats>(pieces.iter().copied(), &Limits::DEFAULT);
+                let Ok((header, stats)) = decoded else { return };
                 let report = (header.stamp.publish_nanos, stats);
                 self.reports
                     .entry(process.to_string())
                     .and_modify(|[_, last]| *last = report.clone())
                     .or_insert_with(|| [report.clone(), report]);
             }
-            Topic::Stream {
-                cav,
-                stream: Stream::Detections,
-            } => {
+            Topic::Stream { cav, stream } if *stream == Stream::Detections => {
                 let decoded = wire::decode::<Detections>(pieces.iter().copied(), &Limits::DEFAULT);
                 let Ok((header, result)) = decoded else {
                     return;
                 };
                 let count = self.results.get(cav).map_or(0, |(count, _)| *count) + 1;
-                let began_nanos = self.ticks.get(&header.stamp.capture_nanos);
-                let latency_ms = began_nanos
-                    .map(|began| (header.stamp.publish_nanos as f64 - *began as f64) / 1e6);
+                let (stamp, began) = (&header.stamp, self.ticks.get(&header.stamp.capture_nanos));
+                let latency_ms =
+                    began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
                 let ego = RemoteEgo {
                     ego: cav.clone(),
                     rate_hz: 0.0,

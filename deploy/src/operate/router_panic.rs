@@ -35,7 +35,6 @@ pub fn watch(stop: &Stop) {
 }
 
 /// The first panic of a thread of the router, if there was one.
-#[must_use]
 pub fn first() -> Option<&'static str> {
     FIRST.get().map(String::as_str)
 }

@@ -1,16 +1,16 @@
 //! `runs/<name>/`: files of a run.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
+use std::{fs, io};
 
 use protocol::RunId;
 use serde::Serialize;
 use support::atomic_file;
 use support::csv_file::CsvText;
 
-use crate::score::{FrameRecord, StageStamps, StreamedResult};
+use crate::score::FrameRecord;
 
 /// Reason why a run folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -24,8 +24,14 @@ pub enum RunFolderError {
         /// File or folder.
         path: PathBuf,
         /// Error of the operating system.
-        source: std::io::Error,
+        source: io::Error,
     },
+}
+
+impl RunFolderError {
+    fn write(path: PathBuf, source: io::Error) -> Self {
+        Self::Write { path, source }
+    }
 }
 
 /// The recording of a run.
@@ -49,49 +55,42 @@ impl RunFolder {
     pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
         let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
         let path = runs.join(name.as_str());
-        fs::create_dir_all(&runs).map_err(|source| RunFolderError::Write {
-            path: runs.clone(),
-            source,
-        })?;
+        let created = fs::create_dir_all(&runs);
+        created.map_err(|source| RunFolderError::write(runs, source))?;
         // One call that fails if the folder exists, so that two runs never share a folder.
         match fs::create_dir(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
                 return Err(RunFolderError::Taken(path));
             }
-            other => other.map_err(|source| RunFolderError::Write {
-                path: path.clone(),
-                source,
-            })?,
+            Err(error) => return Err(RunFolderError::write(path, error)),
         }
         let log = path.join("log");
-        fs::create_dir(&log).map_err(|source| RunFolderError::Write { path: log, source })?;
+        fs::create_dir(&log).map_err(|source| RunFolderError::write(log, source))?;
         Ok(Self { path })
     }
 
     /// Removes it with all its files: for a run that was refused before it began, so that its name is free again.
     pub fn remove(self) {
         if let Err(error) = fs::remove_dir_all(&self.path) {
+            let folder = self.path.display();
             tracing::warn!(
-                "cannot remove {}, the folder of a run that did not begin: {error}",
-                self.path.display()
+                "cannot remove {folder}, the folder of a run that did not begin: {error}"
             );
         }
     }
 
     /// Path of the folder.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// Folder of the processes' logs.
-    #[must_use]
     pub fn log_dir(&self) -> PathBuf {
         self.path.join("log")
     }
 
     /// Path of a file in the folder.
-    #[must_use]
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }
@@ -102,7 +101,7 @@ impl RunFolder {
     /// [`RunFolderError::Write`].
     pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
         let path = self.file(name);
-        atomic_file::write(&path, text).map_err(|source| RunFolderError::Write { path, source })
+        atomic_file::write(&path, text).map_err(|source| RunFolderError::write(path, source))
     }
 
     /// Writes the configuration of a process to `config/<process>.yaml`; returns its path.
@@ -116,12 +115,9 @@ impl RunFolder {
     ) -> Result<PathBuf, RunFolderError> {
         let name = format!("config/{process}.yaml");
         let path = self.file(&name);
-        let unwritable = |source| RunFolderError::Write {
-            path: path.clone(),
-            source,
-        };
+        let unwritable = |source| RunFolderError::write(path.clone(), source);
         let text = serde_saphyr::to_string(config)
-            .map_err(|error| unwritable(std::io::Error::other(error.to_string())))?;
+            .map_err(|error| unwritable(io::Error::other(error.to_string())))?;
         fs::create_dir_all(self.file("config")).map_err(unwritable)?;
         self.write(&name, &text)?;
         Ok(path)
@@ -132,14 +128,12 @@ impl RunFolder {
     /// # Errors
     /// [`RunFolderError::Write`].
     pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunFolderError> {
-        let text = serde_json::to_string_pretty(value).map_err(|error| RunFolderError::Write {
-            path: self.file(name),
-            source: error.into(),
-        })?;
+        let text = serde_json::to_string_pretty(value)
+            .map_err(|error| RunFolderError::write(self.file(name), error.into()))?;
         self.write(name, &(text + "\n"))
     }
 
-    /// Writes `frames.csv`; `swept` holds the arrival time of each sweep at the ego's agent, by capture time, Unix
+    /// Writes `frames.csv`; `arrivals` holds the arrival time of each sweep at the ego's agent, by capture time, Unix
     /// nanoseconds.
     ///
     /// # Errors
@@ -147,9 +141,9 @@ impl RunFolder {
     pub fn write_frames(
         &self,
         records: &[FrameRecord],
-        swept: &BTreeMap<u64, u64>,
+        arrivals: &BTreeMap<u64, u64>,
     ) -> Result<(), RunFolderError> {
-        self.write("frames.csv", &frames_csv(records, swept, None))
+        self.write("frames.csv", &frames_csv(records, arrivals, None))
     }
 }
 
@@ -157,123 +151,81 @@ impl RunFolder {
 /// first column.
 pub fn frames_csv(
     records: &[FrameRecord],
-    swept: &BTreeMap<u64, u64>,
+    arrivals: &BTreeMap<u64, u64>,
     scenarios: Option<&[String]>,
 ) -> String {
-    let header = "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
-         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms,answered,tick_unix_nanos,\
-         streamed_tick,streamed_age_ms,streamed_detected,streamed_found";
-    let mut text = CsvText::new(
-        &scenarios.map_or_else(|| header.to_owned(), |_| format!("scenario,{header}")),
-    );
+    let scenario = scenarios.map(|_| "scenario");
+    let names = COLUMNS.iter().map(|(name, _)| *name);
+    let mut text = CsvText::headless();
+    text.row(scenario.into_iter().chain(names));
     for (place, record) in records.iter().enumerate() {
-        let scenario = scenarios
-            .and_then(|scenarios| scenarios.get(place))
-            .cloned();
-        text.row(scenario.into_iter().chain(frame_fields(record, swept)));
+        let scenario = scenarios.and_then(|all| all.get(place)).cloned();
+        let arrival = arrivals.get(&record.capture_nanos);
+        let swept_ms = arrival.and_then(|arrival| record.stamps.since_began_ms(*arrival));
+        let fields = COLUMNS.iter().map(|(_, field)| field(record, swept_ms));
+        text.row(scenario.into_iter().chain(fields));
     }
     text.finish()
 }
 
-fn frame_fields(record: &FrameRecord, swept: &BTreeMap<u64, u64>) -> Vec<String> {
-    // Destructured in full, so that a new column stops the build here.
-    let FrameRecord {
-        tick,
-        agent_frame,
-        capture_nanos,
-        latency_ms,
-        stamps,
-        detected,
-        truth,
-        found,
-        fused,
-        skipped,
-        oldest_ms,
-        stale,
-        payload_bytes,
-        wire_bytes,
-        ego_error_m,
-        ego_error_deg,
-        streamed,
-    } = record;
-    let StageStamps {
-        began_nanos,
-        posed_ms,
-        published_ms,
-        arrived_ms,
-        decided_ms,
-        fused_ms,
-        detected_ms,
-    } = stamps;
-    let swept_ms = swept
-        .get(capture_nanos)
-        .and_then(|swept| stamps.since_began_ms(*swept));
-    let number =
-        |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
-    let optional = |number: Option<u64>| number.map_or(String::new(), |number| number.to_string());
-    let mut fields = vec![
-        tick.to_string(),
-        optional(*agent_frame),
-        capture_nanos.to_string(),
-        number(latency_ms),
-    ];
-    fields.extend([detected, truth, found, fused, skipped].map(ToString::to_string));
-    fields.extend([
-        number(oldest_ms),
-        stale.to_string(),
-        payload_bytes.to_string(),
-        wire_bytes.to_string(),
-    ]);
-    fields.extend([ego_error_m, ego_error_deg].map(number));
-    fields.extend(
-        [
-            &swept_ms,
-            posed_ms,
-            published_ms,
-            arrived_ms,
-            decided_ms,
-            fused_ms,
-            detected_ms,
-        ]
-        .map(number),
-    );
-    fields.extend([
-        u8::from(record.is_answered()).to_string(),
-        optional(*began_nanos),
-    ]);
-    fields.extend(streamed_fields(streamed.as_ref()));
-    fields
+/// Name of a column, and its value for a tick whose sweep arrived so many milliseconds after the tick.
+type Column = (&'static str, fn(&FrameRecord, Option<f64>) -> String);
+
+const COLUMNS: [Column; 28] = [
+    ("tick", |of, _| of.tick.to_string()),
+    ("agent_frame", |of, _| integer(of.agent_frame)),
+    ("capture_nanos", |of, _| of.capture_nanos.to_string()),
+    ("latency_ms", |of, _| number(of.latency_ms)),
+    ("detected", |of, _| of.detected.to_string()),
+    ("truth", |of, _| of.truth.to_string()),
+    ("found", |of, _| of.found.to_string()),
+    ("fused", |of, _| of.fused.to_string()),
+    ("skipped", |of, _| of.skipped.to_string()),
+    ("oldest_ms", |of, _| number(of.oldest_ms)),
+    ("stale", |of, _| of.stale.to_string()),
+    ("payload_bytes", |of, _| of.payload_bytes.to_string()),
+    ("wire_bytes", |of, _| of.wire_bytes.to_string()),
+    ("ego_error_m", |of, _| number(of.ego_error_m)),
+    ("ego_error_deg", |of, _| number(of.ego_error_deg)),
+    ("swept_ms", |_, swept_ms| number(swept_ms)),
+    ("posed_ms", |of, _| number(of.stamps.posed_ms)),
+    ("published_ms", |of, _| number(of.stamps.published_ms)),
+    ("arrived_ms", |of, _| number(of.stamps.arrived_ms)),
+    ("decided_ms", |of, _| number(of.stamps.decided_ms)),
+    ("fused_ms", |of, _| number(of.stamps.fused_ms)),
+    ("detected_ms", |of, _| number(of.stamps.detected_ms)),
+    ("answered", |of, _| u8::from(of.is_answered()).to_string()),
+    ("tick_unix_nanos", |of, _| integer(of.stamps.began_nanos)),
+    ("streamed_tick", |of, _| {
+        integer(of.streamed.map(|of| of.tick))
+    }),
+    ("streamed_age_ms", |of, _| {
+        number(of.streamed.map(|of| of.age_ms))
+    }),
+    ("streamed_detected", |of, _| {
+        integer(of.streamed.map(|of| of.detected))
+    }),
+    ("streamed_found", |of, _| {
+        integer(of.streamed.map(|of| of.found))
+    }),
+];
+
+fn number(value: Option<f64>) -> String {
+    value.map_or(String::new(), |value| format!("{value:.4}"))
 }
 
-fn streamed_fields(streamed: Option<&StreamedResult>) -> [String; 4] {
-    streamed.map_or_else(
-        Default::default,
-        |StreamedResult {
-             tick,
-             age_ms,
-             detected,
-             found,
-         }| {
-            [
-                tick.to_string(),
-                format!("{age_ms:.4}"),
-                detected.to_string(),
-                found.to_string(),
-            ]
-        },
-    )
+fn integer(value: Option<impl ToString>) -> String {
+    value.map_or(String::new(), |value| value.to_string())
 }
 
 /// Name for an unnamed run: `prefix` and the time, UTC, for example `up-20260131-235959`.
 ///
 /// # Panics
 /// Never with a `prefix` of an identifier's characters, at most 16.
-#[must_use]
 pub fn name_of_now(prefix: &str) -> RunId {
-    let since_epoch = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or(Duration::ZERO);
-    let name = format!("{prefix}-{}", time_stamp(since_epoch.as_secs()));
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH);
+    let seconds = since_epoch.unwrap_or_default().as_secs();
+    let name = format!("{prefix}-{}", time_stamp(seconds));
     RunId::new(&name).expect("a prefix and digits make an identifier")
 }
 
@@ -308,6 +260,7 @@ fn time_stamp(unix_secs: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::score::{StageStamps, StreamedResult};
 
     #[test]
     fn two_runs_never_share_a_folder() {

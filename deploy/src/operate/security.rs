@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
 use bus::{AccessControl, BusError, BusOptions, Credentials, ROUTER, Rejection, RejectionLog};
-use protocol::{Principal, RunId, RunScope};
+use protocol::{Principal, RunScope};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -46,61 +46,44 @@ impl RunKeys {
         run_folder: &Path,
     ) -> Result<Self, KeyError> {
         if let Some(folder) = &security.keys {
-            return Ok(Self {
-                folder: folder.clone(),
-                is_own: false,
-            });
+            let (folder, is_own) = (folder.clone(), false);
+            return Ok(Self { folder, is_own });
         }
-        let own = Self {
-            folder: run_folder.join("keys"),
-            is_own: true,
-        };
+        let (folder, is_own) = (run_folder.join("keys"), true);
+        let own = Self { folder, is_own };
         keys::make(&KeyPlan::new(&own.folder, principals, DAYS_OF_A_RUN))?;
         Ok(own)
     }
 
     /// The folder of one process.
-    #[must_use]
     pub fn of_process(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
+}
 
-    /// A router with these keys that admits every process with a certificate, into `run` only.
-    ///
-    /// # Errors
-    /// [`BusError::Keys`] names the problem.
-    pub(crate) fn for_router(
-        &self,
-        options: BusOptions,
-        run: &RunId,
-    ) -> Result<BusOptions, BusError> {
-        let credentials = self.read(ROUTER)?;
-        let guard = AccessControl {
-            members: credentials.members()?,
-            runs: RunScope::One(run.clone()),
-        };
-        Ok(options
-            .with_credentials(credentials)
-            .with_access_control(guard))
-    }
+/// A router with the keys in a folder, which admits every process with a certificate, into `runs` only.
+///
+/// # Errors
+/// [`BusError::Keys`] names the problem.
+pub(crate) fn guarded(
+    options: BusOptions,
+    folder: &Path,
+    runs: RunScope,
+) -> Result<BusOptions, BusError> {
+    let credentials = credentials(folder, ROUTER)?;
+    let members = credentials.members()?;
+    let options = options.with_credentials(credentials);
+    Ok(options.with_access_control(AccessControl { members, runs }))
+}
 
-    /// A client with the keys of the process of that name.
-    ///
-    /// # Errors
-    /// [`BusError::Keys`] names the problem.
-    pub(crate) fn for_client(
-        &self,
-        options: BusOptions,
-        name: &str,
-    ) -> Result<BusOptions, BusError> {
-        Ok(options.with_credentials(self.read(name)?))
-    }
-
-    fn read(&self, name: &str) -> Result<Credentials, BusError> {
-        let credentials = Credentials::read(&self.of_process(name))?;
-        credentials.check_name(name)?;
-        Ok(credentials)
-    }
+/// Credentials in a folder, of the process of that name.
+///
+/// # Errors
+/// [`BusError::Keys`] names the problem.
+pub(crate) fn credentials(folder: &Path, name: &str) -> Result<Credentials, BusError> {
+    let credentials = Credentials::read(folder)?;
+    credentials.check_name(name)?;
+    Ok(credentials)
 }
 
 impl Drop for RunKeys {
@@ -108,10 +91,8 @@ impl Drop for RunKeys {
         if self.is_own
             && let Err(error) = fs::remove_dir_all(&self.folder)
         {
-            tracing::warn!(
-                "{} holds keys that are no longer needed: {error}",
-                self.folder.display()
-            );
+            let folder = self.folder.display();
+            tracing::warn!("{folder} holds keys that are no longer needed: {error}");
         }
     }
 }
@@ -160,20 +141,14 @@ impl RefusalWatch {
     /// All refusals, which are also logged.
     pub fn finish(mut self) -> BTreeMap<Rejection, u64> {
         self.stop.request();
-        let counts = self
-            .thread
-            .take()
-            .and_then(|thread| thread.join().ok())
-            .map_or_else(BTreeMap::new, |all| all.counts());
-        for (
-            Rejection {
+        let read = self.thread.take().and_then(|thread| thread.join().ok());
+        let counts = read.map_or_else(BTreeMap::new, |all| all.counts());
+        for (refused, count) in &counts {
+            let Rejection {
                 peer,
                 reason,
                 message,
-            },
-            count,
-        ) in &counts
-        {
+            } = refused;
             tracing::warn!(%peer, %reason, what = %message, count, "refused by the router");
         }
         counts

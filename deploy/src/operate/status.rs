@@ -9,7 +9,8 @@ use protocol::NeighbourState;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
-use support::text_table::{Side, TextTable};
+use support::file_error::{AtFile, FileError};
+use terminal::text_table::{Side, TextTable, number};
 
 use crate::operate::health::{ProcessStatus, State, Usage};
 use crate::score::Progress;
@@ -37,15 +38,12 @@ pub struct RunStatus {
     /// Time since its start, seconds.
     pub seconds: f64,
     /// Evaluation protocol of the run.
-    #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
     /// Number of results of the ego so far: the answered ticks.
     pub frames: u64,
     /// Number of ticks that the replay has published so far.
-    #[serde(default)]
     pub ticks: u64,
     /// Results per second so far.
-    #[serde(default)]
     pub rate_hz: Option<f64>,
     /// Time since the last result, seconds.
     pub last_result_s: Option<f64>,
@@ -54,7 +52,6 @@ pub struct RunStatus {
     /// Number of neighbours in the last result.
     pub fused: usize,
     /// Neighbours whose messages the ego received for the last result, and its judgement of each.
-    #[serde(default)]
     pub neighbours: Vec<NeighbourState>,
     /// Number of messages dropped so far, by all processes.
     pub dropped: u64,
@@ -79,22 +76,9 @@ pub enum Phase {
 /// Reason why there is no status.
 #[derive(Debug, thiserror::Error)]
 pub enum StatusError {
-    /// The file cannot be read.
-    #[error("{}: {source}; is it the folder of a run that `v2vloc up` has started?", path.display())]
-    Read {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
-    /// The file is no status.
-    #[error("{}: {problem}", path.display())]
-    Syntax {
-        /// Path of the file.
-        path: PathBuf,
-        /// Description of the error.
-        problem: String,
-    },
+    /// The file cannot be read, or is no status.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// No run has this name or path.
     #[error("there is no run {}, neither here nor in {}", name.display(), runs.display())]
     NotThere {
@@ -115,25 +99,16 @@ impl RunStatus {
     /// [`StatusError`] names the file.
     pub fn read(folder: &Path) -> Result<Self, StatusError> {
         let path = folder.join(FILE);
-        let text =
-            bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|source| StatusError::Read {
-                path: path.clone(),
-                source,
-            })?;
-        let status: Self = serde_json::from_str(&text).map_err(|error| StatusError::Syntax {
-            path: path.clone(),
-            problem: error.to_string(),
+        let text = bounded_file::read_text(&path, MAX_TEXT_BYTES).map_err(|error| {
+            let hint = "is it the folder of a run that `v2vloc up` has started?";
+            FileError::new(&path, format_args!("{error}; {hint}"))
         })?;
-        let is_lost = status.phase != Phase::Over
-            && (Usage::of(status.pid).is_none() || status.age() > STALE);
-        Ok(if is_lost {
-            Self {
-                phase: Phase::Lost,
-                ..status
-            }
-        } else {
-            status
-        })
+        let mut status: Self = serde_json::from_str(&text).at(&path)?;
+        if status.phase != Phase::Over && (Usage::of(status.pid).is_none() || status.age() > STALE)
+        {
+            status.phase = Phase::Lost;
+        }
+        Ok(status)
     }
 
     /// Folder of a run that is named by its path or by its name in `runs`; not named: the newest.
@@ -157,24 +132,20 @@ impl RunStatus {
     /// # Errors
     /// [`StatusError::NoRun`] when no run has one.
     pub fn newest(runs: &Path) -> Result<PathBuf, StatusError> {
-        let folders = fs::read_dir(runs)
-            .into_iter()
-            .flatten()
-            .flatten()
-            .map(|entry| entry.path());
-        let written = |folder: &PathBuf| {
-            fs::metadata(folder.join(FILE))
-                .and_then(|file| file.modified())
-                .ok()
+        let entries = fs::read_dir(runs).into_iter().flatten().flatten();
+        let written = |folder: PathBuf| {
+            let file = fs::metadata(folder.join(FILE)).ok()?;
+            Some((file.modified().ok()?, folder))
         };
-        let newest = folders
-            .filter(|folder| written(folder).is_some())
-            .max_by_key(written);
-        newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))
+        let folders = entries.filter_map(|entry| written(entry.path()));
+        let newest = folders.max_by_key(|(written, _)| *written);
+        newest.map_or_else(
+            || Err(StatusError::NoRun(runs.to_owned())),
+            |(_, folder)| Ok(folder),
+        )
     }
 
     /// Problems as text: of processes during the run; of failed or crashed ones when it is over.
-    #[must_use]
     pub fn troubles(&self) -> Vec<String> {
         let is_well = |process: &&ProcessStatus| match self.phase {
             Phase::Running => {
@@ -183,18 +154,11 @@ impl RunStatus {
             Phase::Ending | Phase::Over => process.state != State::Down,
             Phase::Lost => true,
         };
-        let sick = self
-            .processes
-            .iter()
-            .filter(|process| !is_well(process) || process.failure.is_some());
+        let is_unwell = |process: &&ProcessStatus| !is_well(process) || process.failure.is_some();
+        let sick = self.processes.iter().filter(is_unwell);
         let describe = |process: &ProcessStatus| {
-            let why = why(process);
-            let state = name_of(&process.state);
-            format!(
-                "{} is {state}{}",
-                process.name,
-                why.map_or(String::new(), |why| format!(": {why}"))
-            )
+            let why = why(process).map_or(String::new(), |why| format!(": {why}"));
+            format!("{} is {}{why}", process.name, name_of(&process.state))
         };
         let lost = (self.phase == Phase::Lost).then(|| "the supervisor has ended".to_owned());
         lost.into_iter().chain(sick.map(describe)).collect()
@@ -212,7 +176,6 @@ impl RunStatus {
     }
 
     /// The status as text for a terminal.
-    #[must_use]
     pub fn table(&self) -> String {
         let mut text = format!(
             "{} {} for {:.0} s at {}: answered {}/{}, {} Hz, latency {} ms, {} fused, {} dropped\n",
@@ -222,8 +185,8 @@ impl RunStatus {
             self.endpoint,
             self.frames,
             self.ticks,
-            optional(self.rate_hz, 1),
-            optional(self.latency_ms, 0),
+            number(self.rate_hz, 1),
+            number(self.latency_ms, 0),
             self.fused,
             self.dropped
         );
@@ -235,26 +198,28 @@ impl RunStatus {
     }
 
     fn processes_table(&self) -> TextTable {
-        let left = ["process", "state"].map(|name| (name, Side::Left));
-        let right =
-            ["pid", "up s", "restarts", "silent s", "MiB", "fds"].map(|name| (name, Side::Right));
-        let mut table = TextTable::new(
-            left.into_iter()
-                .chain(right)
-                .chain([("problem, last crash or failure", Side::Left)]),
-        );
+        let columns = [
+            ("process", Side::Left),
+            ("state", Side::Left),
+            ("pid", Side::Right),
+            ("up s", Side::Right),
+            ("restarts", Side::Right),
+            ("silent s", Side::Right),
+            ("MiB", Side::Right),
+            ("fds", Side::Right),
+            ("problem, last crash or failure", Side::Left),
+        ];
+        let mut table = TextTable::new(columns);
         for process in &self.processes {
             table.row([
                 process.name.clone(),
                 name_of(&process.state),
-                process.pid.map_or("-".into(), |pid| pid.to_string()),
+                number(process.pid.map(f64::from), 0),
                 format!("{:.0}", process.up_s),
                 process.restarts.to_string(),
-                optional(process.silent_s, 1),
-                optional(process.resident_mib, 0),
-                process
-                    .descriptors
-                    .map_or("-".into(), |count| count.to_string()),
+                number(process.silent_s, 1),
+                number(process.resident_mib, 0),
+                number(process.descriptors.map(|count| count as f64), 0),
                 why(process).unwrap_or_default(),
             ]);
         }
@@ -262,22 +227,21 @@ impl RunStatus {
     }
 
     fn neighbours_table(&self) -> TextTable {
-        let numbers = ["clock ms", "capture ms", "trust"].map(|name| (name, Side::Right));
-        let mut table = TextTable::new(
-            [("neighbour", Side::Left)]
-                .into_iter()
-                .chain(numbers)
-                .chain([("left out because", Side::Left)]),
-        );
+        let columns = [
+            ("neighbour", Side::Left),
+            ("clock ms", Side::Right),
+            ("capture ms", Side::Right),
+            ("trust", Side::Right),
+            ("left out because", Side::Left),
+        ];
+        let mut table = TextTable::new(columns);
         for neighbour in &self.neighbours {
             table.row([
                 neighbour.cav.to_string(),
-                optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
-                optional(neighbour.capture_offset_s.map(|seconds| seconds * 1e3), 1),
-                optional(neighbour.trust, 2),
-                neighbour
-                    .misbehaviour
-                    .map_or(String::new(), |misbehaviour| misbehaviour.to_string()),
+                number(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
+                number(neighbour.capture_offset_s.map(|seconds| seconds * 1e3), 1),
+                number(neighbour.trust, 2),
+                { neighbour.misbehaviour }.map_or(String::new(), |reason| reason.to_string()),
             ]);
         }
         table
@@ -291,12 +255,8 @@ fn why(process: &ProcessStatus) -> Option<String> {
     failure.or_else(|| process.last_fall.clone())
 }
 
-fn optional(value: Option<f64>, digits: usize) -> String {
-    value.map_or("-".into(), |value| format!("{value:.digits$}"))
-}
-
 /// Name of a value as in the file.
-fn name_of(value: &impl Serialize) -> String {
+pub(super) fn name_of(value: &impl Serialize) -> String {
     serde_json::to_value(value)
         .ok()
         .and_then(|value| value.as_str().map(str::to_owned))
@@ -317,26 +277,21 @@ pub(crate) struct StatusWriter {
 }
 
 impl StatusWriter {
-    /// For the run in `folder`, with its router at `endpoint`.
-    #[must_use]
-    pub(crate) fn new(folder: &Path, run: &str, endpoint: &str) -> Self {
+    /// For the run in `folder`, with its router at `endpoint`, judged by `protocol`.
+    pub(crate) fn new(
+        folder: &Path,
+        run: &str,
+        endpoint: &str,
+        protocol: Option<EvaluationProtocol>,
+    ) -> Self {
         Self {
             path: folder.join(FILE),
             run: run.to_owned(),
             endpoint: endpoint.to_owned(),
-            protocol: None,
+            protocol,
             began: Instant::now(),
             written: None,
             has_warned: false,
-        }
-    }
-
-    /// The same, with the protocol of the run.
-    #[must_use]
-    pub(crate) fn with_protocol(self, protocol: EvaluationProtocol) -> Self {
-        Self {
-            protocol: Some(protocol),
-            ..self
         }
     }
 
@@ -348,11 +303,8 @@ impl StatusWriter {
         processes: impl FnOnce(Instant) -> Vec<ProcessStatus>,
     ) {
         let now = Instant::now();
-        if phase == Phase::Running
-            && self
-                .written
-                .is_some_and(|written| now.duration_since(written) < PERIOD)
-        {
+        let is_recent = |written| now.duration_since(written) < PERIOD;
+        if phase == Phase::Running && self.written.is_some_and(is_recent) {
             return;
         }
         self.written = Some(now);
@@ -367,8 +319,7 @@ impl StatusWriter {
             frames: progress.frames,
             ticks: progress.ticks,
             rate_hz: progress.rate_hz(),
-            last_result_s: progress
-                .span
+            last_result_s: { progress.span }
                 .map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
             latency_ms: progress.latency_ms,
             fused: progress.fused,
@@ -376,17 +327,13 @@ impl StatusWriter {
             dropped: progress.dropped,
             processes: processes(now),
         };
-        match atomic_file::write_volatile(
-            &self.path,
-            serde_json::to_string_pretty(&status).unwrap_or_default(),
-        ) {
+        let json = serde_json::to_string_pretty(&status).unwrap_or_default();
+        match atomic_file::write_volatile(&self.path, json) {
             Ok(()) => self.has_warned = false,
             Err(error) if !self.has_warned => {
                 self.has_warned = true;
-                tracing::warn!(
-                    "{}: {error}; `v2vloc status` will show an old state",
-                    self.path.display()
-                );
+                let path = self.path.display();
+                tracing::warn!("{path}: {error}; `v2vloc status` will show an old state");
             }
             Err(_) => {}
         }
@@ -436,7 +383,7 @@ mod tests {
                 .to_string()
                 .contains("status.json")
         );
-        let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447");
+        let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447", None);
         let attacker = NeighbourState {
             cav: protocol::CavId::new("4279").unwrap(),
             trust: Some(0.03),
@@ -481,10 +428,7 @@ mod tests {
         let found = RunStatus::read(&run).unwrap();
         assert!(found.phase == Phase::Lost && !found.is_well());
         fs::write(run.join(FILE), "{").unwrap();
-        assert!(matches!(
-            RunStatus::read(&run),
-            Err(StatusError::Syntax { .. })
-        ));
+        assert!(matches!(RunStatus::read(&run), Err(StatusError::File(_))));
     }
 
     #[test]
@@ -496,10 +440,10 @@ mod tests {
             (State::Starting, false),
             (State::Failing, false),
             (State::Silent, false),
-            (State::Fallen, false),
+            (State::Crashed, false),
             (State::Down, false),
         ] {
-            let mut writer = StatusWriter::new(folder.path(), "test", "tcp/127.0.0.1:7447");
+            let mut writer = StatusWriter::new(folder.path(), "test", "tcp/127.0.0.1:7447", None);
             writer.write(Phase::Running, &Progress::default(), |_| {
                 vec![process(state)]
             });
@@ -513,7 +457,8 @@ mod tests {
 
     #[test]
     fn a_disk_that_refuses_ends_nothing() {
-        let mut writer = StatusWriter::new(Path::new("/nowhere"), "test", "tcp/127.0.0.1:7447");
+        let mut writer =
+            StatusWriter::new(Path::new("/nowhere"), "test", "tcp/127.0.0.1:7447", None);
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
         assert!(writer.has_warned);
     }

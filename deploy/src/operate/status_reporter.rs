@@ -48,7 +48,6 @@ pub struct StatusReporter {
 
 impl StatusReporter {
     /// For a run with these timeouts and its router at `endpoint`, judged by `protocol`.
-    #[must_use]
     pub fn new(
         timeouts: &Timeouts,
         run: &RunId,
@@ -61,8 +60,12 @@ impl StatusReporter {
         Self {
             health: Health::new(hang, start),
             failures: Failures::default(),
-            status: StatusWriter::new(folder.path(), run.as_str(), endpoint.as_str())
-                .with_protocol(protocol),
+            status: StatusWriter::new(
+                folder.path(),
+                run.as_str(),
+                endpoint.as_str(),
+                Some(protocol),
+            ),
         }
     }
 
@@ -80,19 +83,12 @@ impl StatusReporter {
     }
 
     /// Processes that crashed at least once.
-    pub fn fallen(&self) -> Vec<String> {
-        let statuses = self
-            .health
-            .statuses(&Progress::default(), Instant::now())
-            .into_iter();
-        statuses
-            .filter(|process| process.last_fall.is_some())
-            .map(|process| process.name)
-            .collect()
+    pub fn crashed(&self) -> Vec<String> {
+        self.health.crashed()
     }
 
     /// Writes the status of the run.
-    pub fn tell(&mut self, phase: Phase, progress: &Progress) {
+    pub fn write_status(&mut self, phase: Phase, progress: &Progress) {
         let health = &self.health;
         self.status
             .write(phase, progress, |now| health.statuses(progress, now));
@@ -103,7 +99,7 @@ impl StatusReporter {
     pub fn follow(
         &mut self,
         supervisor: &Supervisor,
-        happened: &Receiver<ProcessEvent>,
+        events: &Receiver<ProcessEvent>,
         scorer: &ScorerNode,
         stop: &Stop,
         display: &mut Display,
@@ -121,8 +117,8 @@ impl StatusReporter {
             for (name, why) in self.health.look(&progress.last_reports, Instant::now()) {
                 supervisor.replace(&name, &why);
             }
-            self.tell(Phase::Running, &progress);
-            let event = match happened.recv_timeout(BEAT) {
+            self.write_status(Phase::Running, &progress);
+            let event = match events.recv_timeout(BEAT) {
                 Ok(event) => event,
                 Err(RecvTimeoutError::Timeout) => continue,
                 // Not before the supervisor has ended, which outlives this.

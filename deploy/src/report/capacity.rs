@@ -52,13 +52,11 @@ pub struct Capacity {
 
 impl Capacity {
     /// True if all frames are expected to be answered.
-    #[must_use]
     pub fn keeps_up(&self) -> bool {
         self.expected_share >= KEEPS_UP
     }
 
     /// Expected and answered frames of a run, if they differ by more than 15 %.
-    #[must_use]
     pub(super) fn deviation(&self, pace: &Pace) -> Option<String> {
         let expected = self.expected_share * pace.ticks as f64;
         let deviation = pace.answered as f64 / expected - 1.0;
@@ -74,7 +72,6 @@ impl Capacity {
 
     /// Replay rate at which the machine is expected to keep up, relative to the current one: a multiple of 0.05 below
     /// the expected share.
-    #[must_use]
     pub fn relative_rate(&self) -> f64 {
         ((self.expected_share * 20.0 * 0.95).floor() / 20.0).max(0.05)
     }
@@ -82,24 +79,18 @@ impl Capacity {
 
 impl fmt::Display for Capacity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self {
-            machine: Machine {
-                cores,
-                instructions,
-            },
-            method,
-            vehicles,
-            needed_ms,
-            available_ms,
-            ..
-        } = self;
         let plural = |count: usize| if count == 1 { "" } else { "s" };
+        let (cores, vehicles) = (self.machine.cores, self.vehicles);
         write!(
             f,
-            "{cores} core{}, {instructions}; {method} with {vehicles} vehicle{} needs about {needed_ms:.0} ms of CPU per \
-             frame of {available_ms:.0} available: expect about {} of 10 frames answered",
-            plural(*cores),
-            plural(*vehicles),
+            "{cores} core{}, {}; {} with {vehicles} vehicle{} needs about {:.0} ms of CPU per frame of {:.0} available: \
+             expect about {} of 10 frames answered",
+            plural(cores),
+            self.machine.instructions,
+            self.method,
+            plural(vehicles),
+            self.needed_ms,
+            self.available_ms,
             (10.0 * self.expected_share).round()
         )
     }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::score::NeighbourRecord;
 
 /// Offsets of a vehicle's clocks from the ego's.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct OtherClock {
     /// Offset of its system clock, less the shortest transit time, seconds; `None` where it is the ego's.
     pub system_s: Option<f64>,
@@ -21,18 +21,12 @@ pub struct OtherClock {
 /// Neighbours with another clock than the ego.
 pub(super) fn others(neighbours: &BTreeMap<CavId, NeighbourRecord>) -> BTreeMap<CavId, OtherClock> {
     let other = |(cav, record): (&CavId, &NeighbourRecord)| {
-        let system_s = record
-            .clock_offset_s
-            .filter(|offset_s| !is_same_clock(*offset_s, NETWORK_TRANSIT_S));
-        let capture_s = record.capture_offset_s;
-        let is_other = system_s.is_some() || capture_s.is_some();
-        is_other.then(|| {
-            let clock = OtherClock {
-                system_s,
-                capture_s,
-            };
-            (cav.clone(), clock)
-        })
+        let is_other = |offset_s: &f64| !is_same_clock(*offset_s, NETWORK_TRANSIT_S);
+        let clock = OtherClock {
+            system_s: record.clock_offset_s.filter(is_other),
+            capture_s: record.capture_offset_s,
+        };
+        (clock != OtherClock::default()).then(|| (cav.clone(), clock))
     };
     neighbours.iter().filter_map(other).collect()
 }

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::Path;
 
-use support::text_table::{Side, TextTable, number};
+use terminal::text_table::{Side, TextTable, number};
 
 use super::{ReportError, RunReport, read_json};
 use crate::operate::progress::bytes;
@@ -46,11 +46,8 @@ const ROWS: [Row; 16] = [
         number(report.pace.interval_ms.p95, 0)
     }),
     ("CPU per frame, all processes, ms", |report, _| {
-        let of_all: Option<f64> = report
-            .processes
-            .iter()
-            .map(|process| process.cpu_ms_per_frame)
-            .sum();
+        let times = report.processes.iter().map(|of| of.cpu_ms_per_frame);
+        let of_all: Option<f64> = times.sum();
         number(of_all.filter(|_| !report.processes.is_empty()), 0)
     }),
     ("bytes of a neighbour per frame", |_, metrics| {
@@ -65,43 +62,29 @@ impl Comparison {
     /// [`ReportError`] names the file.
     pub fn read(folders: &[impl AsRef<Path>]) -> Result<Self, ReportError> {
         let read = |folder: &Path| {
-            Ok((
-                RunReport::read(folder)?,
-                read_json(folder.join(metrics::FILE))?,
-            ))
+            let metrics = read_json(folder.join(metrics::FILE));
+            Ok((RunReport::read(folder)?, metrics?))
         };
-        folders
-            .iter()
-            .map(|folder| read(folder.as_ref()))
-            .collect::<Result<_, _>>()
-            .map(Self)
+        let runs = folders.iter().map(|folder| read(folder.as_ref()));
+        runs.collect::<Result<_, _>>().map(Self)
     }
 }
 
 impl fmt::Display for Comparison {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let runs = self
-            .0
-            .iter()
-            .map(|(report, _)| (report.run.as_str(), Side::Right));
+        let runs = { self.0.iter() }.map(|(report, _)| (report.run.as_str(), Side::Right));
         let mut table = TextTable::new([("run", Side::Left)].into_iter().chain(runs));
         for (name, value) in ROWS {
-            let values = self
-                .0
-                .iter()
-                .map(|(report, metrics)| value(report, metrics));
+            let values = { self.0.iter() }.map(|(report, metrics)| value(report, metrics));
             table.row([name.to_owned()].into_iter().chain(values));
         }
         write!(f, "{table}")?;
-        if self
-            .0
-            .windows(2)
-            .any(|pair| pair[0].1.answered != pair[1].1.answered)
-        {
-            writeln!(
-                f,
-                "\nRuns answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5."
-            )?;
+        let mut answered = self.0.iter().map(|(_, metrics)| metrics.answered);
+        let first = answered.next();
+        if answered.any(|answered| Some(answered) != first) {
+            let hint =
+                "Runs answered different numbers of ticks: compare \"AP@0.5 all\" and sAP@0.5.";
+            writeln!(f, "\n{hint}")?;
         }
         Ok(())
     }

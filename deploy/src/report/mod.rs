@@ -15,6 +15,7 @@ use protocol::{CavId, RunId};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
+use support::file_error::{AtFile, FileError};
 use support::statistics::{quantile, sorted};
 
 pub use capacity::{Capacity, Machine};
@@ -56,7 +57,6 @@ pub struct RunReport {
     /// Published bytes by stream.
     pub streams: Vec<StreamBytes>,
     /// Vehicles whose clocks differ from the ego's.
-    #[serde(default)]
     pub other_clocks: BTreeMap<CavId, OtherClock>,
 }
 
@@ -86,30 +86,16 @@ impl Spread {
 /// Reason why a run has no report.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
-    /// The file cannot be read.
-    #[error("{}: {source}; is it the folder of a run that has ended?", path.display())]
-    Read {
-        /// Path of the file.
-        path: PathBuf,
-        /// Error of the operating system.
-        source: std::io::Error,
-    },
+    /// The file cannot be read, or has another form.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// The run ended before its first tick.
     #[error("{}: nothing was played in this run: it ended before its first tick", .0.display())]
     NothingPlayed(PathBuf),
-    /// The file has another form.
-    #[error("{}: {problem}", path.display())]
-    Syntax {
-        /// Path of the file.
-        path: PathBuf,
-        /// Description of the error.
-        problem: String,
-    },
 }
 
 impl RunReport {
     /// Report from the ticks of a run, its metrics, and the last reports of its processes (none in simulation time).
-    #[must_use]
     pub fn new(
         run: &RunId,
         metrics: &Metrics,
@@ -117,10 +103,7 @@ impl RunReport {
         processes: &[ProcessStats],
         capacity: Option<Capacity>,
     ) -> Self {
-        let latencies: Vec<f64> = records
-            .iter()
-            .filter_map(|record| record.latency_ms)
-            .collect();
+        let latencies = records.iter().filter_map(|record| record.latency_ms);
         let pace = Pace::of(metrics, records, processes);
         Self {
             run: run.to_string(),
@@ -128,7 +111,7 @@ impl RunReport {
             pose_source: metrics.pose_source.clone(),
             clock: metrics.clock.clone(),
             capacity,
-            latency_ms: Spread::of(&latencies),
+            latency_ms: Spread::of(&latencies.collect::<Vec<_>>()),
             stages: resources::stages(processes),
             processes: resources::processes(processes, &pace),
             streams: resources::streams(processes),
@@ -151,15 +134,12 @@ impl RunReport {
 }
 
 /// Reads a file of a run.
-fn read_json<T: DeserializeOwned>(path: PathBuf) -> Result<T, ReportError> {
-    let text = bounded_file::read_text(&path, MAX_BYTES).map_err(|source| ReportError::Read {
-        path: path.clone(),
-        source,
+fn read_json<T: DeserializeOwned>(path: PathBuf) -> Result<T, FileError> {
+    let text = bounded_file::read_text(&path, MAX_BYTES).map_err(|error| {
+        let hint = "is it the folder of a run that has ended?";
+        FileError::new(&path, format_args!("{error}; {hint}"))
     })?;
-    serde_json::from_str(&text).map_err(|error| ReportError::Syntax {
-        path,
-        problem: error.to_string(),
-    })
+    serde_json::from_str(&text).at(&path)
 }
 
 #[cfg(test)]

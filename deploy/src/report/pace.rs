@@ -46,35 +46,24 @@ impl Pace {
     ) -> Self {
         let mut published_s: Vec<f64> = records.iter().filter_map(published_s).collect();
         published_s.sort_by(f64::total_cmp);
-        let intervals_ms: Vec<f64> = published_s
-            .windows(2)
-            .map(|pair| (pair[1] - pair[0]) * 1e3)
-            .collect();
-        let ticks_s = || records.iter().map(began_s);
-        let first_s = ticks_s().reduce(f64::min);
-        let last_s = ticks_s()
-            .chain(published_s.iter().copied())
-            .reduce(f64::max);
-        let span_s = published_s
-            .first()
-            .zip(published_s.last())
-            .map(|(first, last)| last - first);
+        let intervals_ms = published_s.windows(2).map(|pair| (pair[1] - pair[0]) * 1e3);
+        let intervals_ms: Vec<f64> = intervals_ms.collect();
+        let first_s = records.iter().map(began_s).reduce(f64::min);
+        let began_s = records.iter().map(began_s);
+        let last_s = began_s.chain(published_s.iter().copied()).reduce(f64::max);
+        let ends = published_s.first().zip(published_s.last());
+        let span_s = ends.map_or(0.0, |(first, last)| last - first);
         Self {
             ticks: metrics.ticks,
             answered: metrics.answered,
             agents: agents(processes, metrics.ticks),
             interval_ms: Spread::of(&intervals_ms),
-            rate_hz: span_s
-                .filter(|span| *span > 0.0)
-                .map(|span| intervals_ms.len() as f64 / span),
-            seconds: first_s
-                .zip(last_s)
-                .map_or(0.0, |(first, last)| last - first),
+            rate_hz: (span_s > 0.0).then(|| intervals_ms.len() as f64 / span_s),
+            seconds: { first_s.zip(last_s) }.map_or(0.0, |(first, last)| last - first),
         }
     }
 
     /// Share of answered ticks, 0..=1; `None` without ticks.
-    #[must_use]
     pub fn answered_share(&self) -> Option<f64> {
         (self.ticks > 0).then(|| self.answered as f64 / self.ticks as f64)
     }
@@ -109,17 +98,13 @@ fn agents(processes: &[ProcessStats], ticks: u64) -> BTreeMap<String, AgentPace>
 
 /// Vehicle of an agent's process.
 fn vehicle_of(process: &ProcessId) -> Option<&str> {
-    process
-        .as_str()
-        .strip_prefix(Role::Agent.as_str())?
-        .strip_prefix('-')
+    let rest = process.as_str().strip_prefix(Role::Agent.as_str())?;
+    rest.strip_prefix('-')
 }
 
 /// Number of sweeps that an agent has computed.
 pub(super) fn sweeps(stats: &ProcessStats) -> u64 {
-    stats
-        .stages
-        .iter()
-        .find(|stage| stage.stage == WHOLE_SWEEP)
-        .map_or(0, |stage| stage.count)
+    let mut stages = stats.stages.iter();
+    let whole = stages.find(|stage| stage.stage == WHOLE_SWEEP);
+    whole.map_or(0, |stage| stage.count)
 }

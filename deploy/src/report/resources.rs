@@ -11,7 +11,7 @@ use crate::score::ProcessStats;
 
 /// Durations of one stage in the processes of one kind. Of several processes those of the slowest, for which the ego
 /// waits.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct StageTimes {
     /// Kind of process: its role.
     pub kind: String,
@@ -30,7 +30,7 @@ pub struct StageTimes {
 }
 
 /// CPU time and memory of a process, over all its instances.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ProcessResources {
     /// Name of the process. `scorer` is `v2vloc` itself, with the router of the run.
     pub process: String,
@@ -66,17 +66,10 @@ pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
     for stats in processes {
         let (order, kind) = kind_of(stats.process.as_str());
         for stage in &stats.stages {
-            let times = all
-                .entry((order, kind.clone(), stage.stage.clone()))
-                .or_insert_with(|| StageTimes {
-                    kind: kind.clone(),
-                    processes: 0,
-                    stage: stage.stage.clone(),
-                    count: 0,
-                    p50_ms: 0.0,
-                    p95_ms: 0.0,
-                    max_ms: 0.0,
-                });
+            let key = (order, kind.clone(), stage.stage.clone());
+            let times = all.entry(key).or_default();
+            times.kind.clone_from(&kind);
+            times.stage.clone_from(&stage.stage);
             times.processes += 1;
             times.count += stage.count;
             times.p50_ms = times.p50_ms.max(stage.p50_ms);
@@ -89,13 +82,8 @@ pub(super) fn stages(processes: &[ProcessStats]) -> Vec<StageTimes> {
 
 /// Kind of a process, and its place in the data flow.
 fn kind_of(process: &str) -> (usize, String) {
-    const ORDER: [Role; 5] = [
-        Role::Replay,
-        Role::Agent,
-        Role::Link,
-        Role::Ego,
-        Role::Scorer,
-    ];
+    use Role::{Agent, Ego, Link, Replay, Scorer};
+    const ORDER: [Role; 5] = [Replay, Agent, Link, Ego, Scorer];
     let is_of = |role: Role| process.split('-').next() == Some(role.as_str());
     match ORDER.into_iter().position(is_of) {
         Some(place) => (place, ORDER[place].to_string()),
@@ -109,9 +97,8 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessR
     for stats in processes {
         let name = stats.process.to_string();
         let (order, kind) = kind_of(&name);
-        let (sum, frames) = all
-            .entry((order, name.clone()))
-            .or_insert_with(|| (nothing_of(name), 0));
+        let (sum, frames) = all.entry((order, name.clone())).or_default();
+        sum.process = name;
         sum.instances += 1;
         sum.cpu_s += stats.usage.cpu_s;
         sum.playing_cpu_s += (stats.usage.cpu_s - stats.cpu_before_s).max(0.0);
@@ -130,18 +117,6 @@ pub(super) fn processes(processes: &[ProcessStats], pace: &Pace) -> Vec<ProcessR
     all.into_values().map(finished).collect()
 }
 
-fn nothing_of(process: String) -> ProcessResources {
-    ProcessResources {
-        process,
-        instances: 0,
-        cpu_s: 0.0,
-        playing_cpu_s: 0.0,
-        cores: None,
-        cpu_ms_per_frame: None,
-        peak_resident_bytes: 0,
-    }
-}
-
 /// Published bytes by stream, the largest first.
 pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
     let mut sums = BTreeMap::<String, (u64, u64)>::new();
@@ -152,10 +127,8 @@ pub(super) fn streams(processes: &[ProcessStats]) -> Vec<StreamBytes> {
             other => other.to_string(),
         };
         let (messages, bytes) = sums.entry(stream).or_default();
-        (*messages, *bytes) = (
-            *messages + traffic.messages,
-            bytes.saturating_add(traffic.bytes),
-        );
+        *messages += traffic.messages;
+        *bytes = bytes.saturating_add(traffic.bytes);
     }
     let of = |(stream, (messages, bytes))| StreamBytes {
         stream,

@@ -240,7 +240,7 @@ fn a_report_reads_back_and_is_a_table_for_people() {
     std::fs::write(folder.path().join(FILE), "{").unwrap();
     assert!(matches!(
         RunReport::read(folder.path()),
-        Err(ReportError::Syntax { .. })
+        Err(ReportError::File(_))
     ));
 }
 

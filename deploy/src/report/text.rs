@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use support::text_table::{Side, TextTable, number};
+use terminal::text_table::{TextTable, number};
 
 use super::{Pace, RunReport, Spread};
 use crate::operate::progress::bytes;
@@ -20,22 +20,18 @@ impl fmt::Display for RunReport {
         if let Some(deviation) = capacity.and_then(|capacity| capacity.deviation(&self.pace)) {
             writeln!(f, "forecast  {deviation}")?;
         }
-        writeln!(
-            f,
-            "latency   capture to detection: {}",
-            milliseconds(&self.latency_ms)
-        )?;
+        let latency = milliseconds(&self.latency_ms);
+        writeln!(f, "latency   capture to detection: {latency}")?;
         for (cav, clock) in &self.other_clocks {
             writeln!(f, "clock     {cav}: {clock}")?;
         }
-        for (rows, table) in [
+        let tables = [
             (self.stages.len(), self.stage_table()),
             (self.processes.len(), self.process_table()),
             (self.streams.len(), self.stream_table()),
-        ] {
-            if rows > 0 {
-                write!(f, "\n{table}")?;
-            }
+        ];
+        for (_, table) in tables.iter().filter(|(rows, _)| *rows > 0) {
+            write!(f, "\n{table}")?;
         }
         Ok(())
     }
@@ -44,53 +40,38 @@ impl fmt::Display for RunReport {
 impl fmt::Display for Pace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
-            ticks,
-            answered,
-            agents,
-            interval_ms,
-            rate_hz,
-            ..
+            ticks, answered, ..
         } = self;
         let share = self.answered_share().map_or("-".into(), percent);
-        let rate = rate_hz.map_or(String::new(), |rate| {
-            format!(", {rate:.1} detections a second")
-        });
+        let rate = { self.rate_hz }.map(|rate| format!(", {rate:.1} detections a second"));
+        let (rate, interval) = (rate.unwrap_or_default(), milliseconds(&self.interval_ms));
         writeln!(
             f,
-            "pace      answered {answered}/{ticks} ({share}){rate}; between detections {}",
-            milliseconds(interval_ms)
+            "pace      answered {answered}/{ticks} ({share}){rate}; between detections {interval}"
         )?;
-        if !agents.is_empty() {
-            let of = |(cav, pace): (&String, &super::AgentPace)| {
-                format!("{cav} {}/{ticks} ({})", pace.computed, percent(pace.share))
-            };
-            writeln!(
-                f,
-                "computed  {}",
-                agents.iter().map(of).collect::<Vec<_>>().join(", ")
-            )?;
+        let of = |(cav, pace): (&String, &super::AgentPace)| {
+            format!("{cav} {}/{ticks} ({})", pace.computed, percent(pace.share))
+        };
+        let agents: Vec<String> = self.agents.iter().map(of).collect();
+        match agents.as_slice() {
+            [] => Ok(()),
+            agents => writeln!(f, "computed  {}", agents.join(", ")),
         }
-        Ok(())
     }
 }
 
 impl RunReport {
     fn stage_table(&self) -> TextTable {
-        let numbers =
-            ["frames", "median ms", "95th percentile", "longest"].map(|name| (name, Side::Right));
-        let names = ["process", "stage"].map(|name| (name, Side::Left));
-        let mut table = TextTable::new(names.into_iter().chain(numbers));
+        let numbers = ["frames", "median ms", "95th percentile", "longest"];
+        let mut table = TextTable::of(&["process", "stage"], &numbers);
         for stage in &self.stages {
             let kind = match stage.processes {
                 1 => stage.kind.clone(),
                 several => format!("{}, slowest of {several}", stage.kind),
             };
             let times = [stage.p50_ms, stage.p95_ms, stage.max_ms].map(|ms| format!("{ms:.1}"));
-            table.row(
-                [kind, stage.stage.clone(), stage.count.to_string()]
-                    .into_iter()
-                    .chain(times),
-            );
+            let stage = [kind, stage.stage.clone(), stage.count.to_string()];
+            table.row(stage.into_iter().chain(times));
         }
         table
     }
@@ -103,8 +84,7 @@ impl RunReport {
             "CPU ms per frame",
             "peak MiB",
         ];
-        let numbers = numbers.map(|name| (name, Side::Right));
-        let mut table = TextTable::new([("process", Side::Left)].into_iter().chain(numbers));
+        let mut table = TextTable::of(&["process"], &numbers);
         for process in &self.processes {
             let name = match (process.process.as_str(), process.instances) {
                 ("scorer", _) => "v2vloc (router, scorer)".to_owned(),
@@ -124,8 +104,7 @@ impl RunReport {
     }
 
     fn stream_table(&self) -> TextTable {
-        let numbers = ["messages", "bytes", "per message"].map(|name| (name, Side::Right));
-        let mut table = TextTable::new([("stream", Side::Left)].into_iter().chain(numbers));
+        let mut table = TextTable::of(&["stream"], &["messages", "bytes", "per message"]);
         for stream in &self.streams {
             let mean = stream.bytes as f64 / stream.messages.max(1) as f64;
             table.row([
@@ -143,12 +122,10 @@ impl RunReport {
 fn milliseconds(spread: &Spread) -> String {
     match spread.p50 {
         None => "-".into(),
-        Some(_) => format!(
-            "median {} ms, 95th percentile {}, longest {}",
-            number(spread.p50, 0),
-            number(spread.p95, 0),
-            number(spread.max, 0)
-        ),
+        Some(_) => {
+            let [p50, p95, max] = [spread.p50, spread.p95, spread.max].map(|ms| number(ms, 0));
+            format!("median {p50} ms, 95th percentile {p95}, longest {max}")
+        }
     }
 }
 

@@ -2,8 +2,9 @@
 
 use std::str::FromStr;
 
-use protocol::CavId;
-use ros2::RosName;
+use protocol::text::excerpt;
+use protocol::{CavId, IdError};
+use ros2::{NameError, RosName};
 
 /// A topic and the vehicle whose sensor publishes it, written `/points=1000`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -14,29 +15,19 @@ pub struct AgentTopic {
     pub cav: CavId,
 }
 
-/// Error of a text that is no [`AgentTopic`].
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum AgentTopicError {
-    /// There is no `=`.
-    #[error("{0:?} is not TOPIC=AGENT, for example /velodyne_points=1000")]
-    NoSeparator(String),
-    /// The topic is no topic.
-    #[error(transparent)]
-    Topic(#[from] ros2::NameError),
-    /// The vehicle is no vehicle.
-    #[error(transparent)]
-    Cav(#[from] protocol::IdError),
-}
-
 impl FromStr for AgentTopic {
-    type Err = AgentTopicError;
+    type Err = String;
 
-    fn from_str(text: &str) -> Result<Self, AgentTopicError> {
-        let none = || AgentTopicError::NoSeparator(text.chars().take(100).collect());
-        let (topic, cav) = text.split_once('=').ok_or_else(none)?;
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (topic, cav) = text.split_once('=').ok_or_else(|| {
+            let shown = excerpt(text, 100);
+            format!("{shown:?} is not TOPIC=AGENT, for example /velodyne_points=1000")
+        })?;
         Ok(Self {
-            topic: topic.parse()?,
-            cav: cav.parse()?,
+            topic: topic
+                .parse()
+                .map_err(|error: NameError| error.to_string())?,
+            cav: cav.parse().map_err(|error: IdError| error.to_string())?,
         })
     }
 }

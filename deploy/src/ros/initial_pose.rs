@@ -37,30 +37,25 @@ impl InitialPose {
         message: &Message,
         is_wanted: impl FnOnce() -> bool,
     ) -> Option<Vec<u8>> {
-        let Message::Pose(estimate) = message else {
-            return None;
-        };
-        if self.is_published || *cav != self.cav {
-            return None;
-        }
-        let PoseEstimate::Pose {
+        let Message::Pose(PoseEstimate::Pose {
             world_from_cav,
             covariance,
             ..
-        } = estimate
+        }) = message
         else {
             return None;
         };
-        if !is_wanted() {
+        if self.is_published || *cav != self.cav || !is_wanted() {
             return None;
         }
         self.is_published = true;
         let lidar_from_base = self.mount.base_from_lidar.isometry().inverse();
         let world_from_base = (world_from_cav.isometry() * lidar_from_base).into();
+        let covariance = covariance.as_ref().unwrap_or(&DRAWN);
         Some(ros2::pose(
             capture_nanos,
             &world_from_base,
-            Some(covariance.as_ref().unwrap_or(&DRAWN)),
+            Some(covariance),
         ))
     }
 

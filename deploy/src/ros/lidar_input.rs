@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use bus::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use bus::shutdown::Stop;
@@ -12,6 +13,7 @@ use protocol::{CavId, Lidar, Limits, Stream, Topic};
 use ros2::{Qos, RosName, RosType, Sweep, SweepLimits, read_point_cloud};
 use serde::Serialize;
 use zenoh::bytes::ZBytes;
+use zenoh::sample::Sample;
 
 use super::agent_topic::AgentTopic;
 use super::motion_input::{MotionInput, MotionReport};
@@ -57,7 +59,6 @@ pub struct LidarReport {
 
 impl LidarReport {
     /// True if no message is missing.
-    #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unreadable + self.without_stamp + self.without_points == 0
     }
@@ -81,7 +82,7 @@ struct Input {
 pub(super) struct LidarInputs {
     inputs: BTreeMap<CavId, Input>,
     queue: Arc<BoundedQueue<CavId, ZBytes>>,
-    superseded: Arc<std::sync::atomic::AtomicU64>,
+    superseded: Arc<AtomicU64>,
     report: LidarReport,
 }
 
@@ -95,35 +96,29 @@ impl LidarInputs {
     ) -> Result<Self, BusError> {
         // One place: an agent computes the newest sweep.
         let queue = Arc::new(BoundedQueue::new(1, options.lidars.len()));
-        let superseded = Arc::<std::sync::atomic::AtomicU64>::default();
+        let superseded = Arc::<AtomicU64>::default();
         stop.on_request({
             let queue = Arc::clone(&queue);
             move || queue.close()
         });
-        let open = |AgentTopic { topic, cav }: &AgentTopic| {
-            let lidar = Topic::Stream {
-                cav: cav.clone(),
-                stream: Stream::Lidar,
-            };
+        let mut inputs = BTreeMap::new();
+        for AgentTopic { topic, cav } in &options.lidars {
             // A robot's agent stays when this node ends, and is served by its next instance.
+            let lidar = Topic::stream(cav, Stream::Lidar);
             let publisher = bus.publisher(lidar, PublisherOptions::SENSOR.live())?;
-            let starting_pose = options
-                .starting_poses
-                .iter()
-                .find(|source| source.cav == *cav);
-            let (queue, superseded, lane) =
-                (Arc::clone(&queue), Arc::clone(&superseded), cav.clone());
-            let subscription = session.subscribe(
-                topic,
-                RosType::PointCloud2,
-                Qos::SENSOR_DATA,
-                move |sample| match queue.push(lane.clone(), sample.payload().clone()) {
+            let mut starting_poses = options.starting_poses.iter();
+            let starting_pose = starting_poses.find(|source| source.cav == *cav);
+            let (queue, superseded) = (Arc::clone(&queue), Arc::clone(&superseded));
+            let lane = cav.clone();
+            let receive =
+                move |sample: Sample| match queue.push(lane.clone(), sample.payload().clone()) {
                     PushOutcome::Queued | PushOutcome::Closed(_) => {}
                     PushOutcome::Replaced(_) | PushOutcome::NoLane(_) => {
-                        superseded.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                        superseded.fetch_add(1, Ordering::Relaxed);
                     }
-                },
-            )?;
+                };
+            let ros_type = RosType::PointCloud2;
+            let subscription = session.subscribe(topic, ros_type, Qos::SENSOR_DATA, receive)?;
             let input = Input {
                 cav: cav.clone(),
                 topic: topic.clone(),
@@ -135,16 +130,11 @@ impl LidarInputs {
                 frames: frames.clone(),
                 stamps: StampCheck::default(),
                 intensities: LiveIntensities::new(options.intensity_scale),
-                log: RefusalLog::of(topic.clone(), RosType::PointCloud2),
+                log: RefusalLog::of(topic.clone(), ros_type),
                 _subscription: subscription,
             };
-            Ok((cav.clone(), input))
-        };
-        let inputs = options
-            .lidars
-            .iter()
-            .map(open)
-            .collect::<Result<_, BusError>>()?;
+            inputs.insert(cav.clone(), input);
+        }
         Ok(Self {
             inputs,
             queue,
@@ -163,20 +153,13 @@ impl LidarInputs {
         let mut motions = BTreeMap::new();
         for input in self.inputs.into_values() {
             input.publisher.finish();
-            input
-                .starting_pose
-                .into_iter()
-                .for_each(StartingPose::finish);
+            if let Some(starting_pose) = input.starting_pose {
+                starting_pose.finish();
+            }
             motions.extend(input.motion.map(MotionInput::finish).unwrap_or_default());
         }
-        let superseded = self.superseded.load(std::sync::atomic::Ordering::Relaxed);
-        (
-            LidarReport {
-                superseded,
-                ..self.report
-            },
-            motions,
-        )
+        self.report.superseded = self.superseded.load(Ordering::Relaxed);
+        (self.report, motions)
     }
 }
 
@@ -228,9 +211,8 @@ impl Input {
         self.frames.note_lidar(&self.cav, &sweep.frame_id);
         // Before the sweep: the agent waits for nothing then.
         if let Some(starting_pose) = &self.starting_pose {
-            starting_pose.publish(sweep.capture_nanos, || {
-                self.frames.base_from_lidar(&self.cav, sweep.capture_nanos)
-            });
+            let base_from_lidar = || self.frames.base_from_lidar(&self.cav, sweep.capture_nanos);
+            starting_pose.publish(sweep.capture_nanos, base_from_lidar);
         }
         if let Some(motion) = &mut self.motion
             && !motion.publish(previous_nanos, sweep.capture_nanos)
@@ -240,11 +222,7 @@ impl Input {
         if let Some(finding) = self.intensities.scale(&mut sweep.points, sweep.intensity) {
             tracing::warn!("{}: {finding}", self.topic);
         }
-        self.publisher.submit(
-            sweep.capture_nanos,
-            Lidar {
-                points: sweep.points,
-            },
-        );
+        let points = sweep.points;
+        self.publisher.submit(sweep.capture_nanos, Lidar { points });
     }
 }

@@ -23,7 +23,7 @@ mod sweeps;
 mod time_series;
 mod transform_tree;
 
-pub use agent_topic::{AgentTopic, AgentTopicError};
+pub use agent_topic::AgentTopic;
 pub use lidar_input::LidarReport;
 pub use motion_input::{MotionReport, MotionSource};
 pub use node::{NodeReport, run};

@@ -1,12 +1,13 @@
 //! Odometry and gyroscopes of a ROS 2 network as the motion of the run's agents: one message for each sweep of a LiDAR.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use protocol::{CavId, EgoMotion, Stream, Topic};
 use ros2::{MotionType, Qos, RosName, TimedMotion};
 use serde::Serialize;
+use support::sync::lock;
 
 use super::agent_topic::AgentTopic;
 use super::refusal_log::RefusalLog;
@@ -57,27 +58,20 @@ impl MotionInput {
         (cav, frames): (&CavId, &RobotFrames),
         sources: &[MotionSource],
     ) -> Result<Option<Self>, BusError> {
-        let own: Vec<&MotionSource> = sources
-            .iter()
-            .filter(|source| source.source.cav == *cav)
-            .collect();
-        if own.is_empty() {
+        let own = sources.iter().filter(|source| source.source.cav == *cav);
+        if own.clone().next().is_none() {
             return Ok(None);
         }
         // A gyroscope measures turns better than wheels.
         let has_imu = own
-            .iter()
+            .clone()
             .any(|source| source.motion_type == MotionType::Imu);
         let measurements = Arc::<Mutex<Measurements>>::default();
-        let subscribe = |source: &&MotionSource| {
-            let MotionSource {
-                motion_type,
-                source: AgentTopic { topic, .. },
-            } = (*source).clone();
+        let subscribe = |source: &MotionSource| {
+            let (motion_type, topic) = (source.motion_type, source.source.topic.clone());
             let (measurements, ros_type) = (Arc::clone(&measurements), motion_type.ros_type());
-            lock(&measurements)
-                .reports
-                .insert(topic.clone(), MotionReport::default());
+            let report = MotionReport::default();
+            lock(&measurements).reports.insert(topic.clone(), report);
             let takes_yaw_rate = motion_type == MotionType::Imu || !has_imu;
             let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
             let (cav, frames) = (cav.clone(), frames.clone());
@@ -88,18 +82,13 @@ impl MotionInput {
                 }
                 let read = motion_type.read(&bytes);
                 if let Err(error) = &read {
-                    log.lock()
-                        .unwrap_or_else(PoisonError::into_inner)
-                        .warn(error);
+                    lock(&log).warn(error);
                 }
                 lock(&measurements).add(&topic, read.ok(), takes_yaw_rate);
             })
         };
-        let subscriptions = own.iter().map(subscribe).collect::<Result<_, _>>()?;
-        let imu = Topic::Stream {
-            cav: cav.clone(),
-            stream: Stream::Imu,
-        };
+        let subscriptions = own.map(subscribe).collect::<Result<_, _>>()?;
+        let imu = Topic::stream(cav, Stream::Imu);
         let publisher = bus.publisher(imu, PublisherOptions::POSE.live())?;
         Ok(Some(Self {
             measurements,
@@ -123,10 +112,8 @@ impl MotionInput {
     pub(super) fn finish(self) -> BTreeMap<String, MotionReport> {
         let reports = std::mem::take(&mut lock(&self.measurements).reports);
         self.publisher.finish();
-        reports
-            .into_iter()
-            .map(|(topic, report)| (topic.to_string(), report))
-            .collect()
+        let reports = reports.into_iter();
+        { reports.map(|(topic, report)| (topic.to_string(), report)) }.collect()
     }
 }
 
@@ -134,7 +121,7 @@ impl Measurements {
     fn add(&mut self, topic: &RosName, read: Option<TimedMotion>, takes_yaw_rate: bool) {
         let report = self.reports.entry(topic.clone()).or_default();
         let Some(TimedMotion {
-            capture_nanos,
+            capture_nanos: nanos,
             motion,
         }) = read
         else {
@@ -143,23 +130,18 @@ impl Measurements {
         };
         report.read += 1;
         if let Some(speed_mps) = motion.speed_mps {
-            report.out_of_order += self.speed_mps.add(capture_nanos, speed_mps);
+            report.out_of_order += self.speed_mps.add(nanos, speed_mps);
         }
         if let Some(yaw_rate_rad_s) = motion.yaw_rate_rad_s.filter(|_| takes_yaw_rate) {
-            report.out_of_order += self.yaw_rate_rad_s.add(capture_nanos, yaw_rate_rad_s);
+            report.out_of_order += self.yaw_rate_rad_s.add(nanos, yaw_rate_rad_s);
         }
     }
 
     fn motion(&self, previous_nanos: Option<u64>, capture_nanos: u64) -> EgoMotion {
+        let previous_nanos = previous_nanos.unwrap_or(capture_nanos);
         EgoMotion {
             speed_mps: self.speed_mps.at(capture_nanos),
-            yaw_rate_rad_s: self
-                .yaw_rate_rad_s
-                .mean(previous_nanos.unwrap_or(capture_nanos), capture_nanos),
+            yaw_rate_rad_s: self.yaw_rate_rad_s.mean(previous_nanos, capture_nanos),
         }
     }
-}
-
-fn lock(measurements: &Mutex<Measurements>) -> MutexGuard<'_, Measurements> {
-    measurements.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use bus::bounded_queue::{BoundedQueue, Pop};
 use bus::shutdown::Stop;
-use bus::{Bus, BusError, LivelinessEvent, RawMessage};
+use bus::{Bus, BusError, LivelinessEvent, PassiveSubscriber, RawMessage};
 use protocol::{CavId, KeyExpr, Kind, Limits, Message, Role, Stream, Topic, wire};
 use ros2::{FrameNames, RosTopic, Translator, VehicleTopic};
 use serde::Serialize;
@@ -31,6 +31,10 @@ const EVENTS: usize = 256;
 /// Period at which vehicles that have joined or left are looked at.
 const POLL_PERIOD: Duration = Duration::from_millis(50);
 
+/// Topics of a vehicle while its agent is there, and while its ego-fuser is.
+const OF_AGENT: [VehicleTopic; 2] = [VehicleTopic::Pose, VehicleTopic::Odometry];
+const OF_EGO: [VehicleTopic; 2] = [VehicleTopic::Detections, VehicleTopic::Markers];
+
 /// Summary of a node: messages published and received.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct NodeReport {
@@ -48,7 +52,6 @@ pub struct NodeReport {
 
 impl NodeReport {
     /// True if every message of a sensor could be read.
-    #[must_use]
     pub fn is_complete(&self) -> bool {
         self.lidar.is_complete() && self.motion.values().all(|motion| motion.unreadable == 0)
     }
@@ -68,8 +71,8 @@ pub fn run(
     let run = &bus.identity().run;
     let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
     selectors.push(KeyExpr::stats(run));
-    let tap = bus.tap(&selectors, PLACES)?;
-    stop.on_request(tap.closer());
+    let subscriber = bus.tap(&selectors, PLACES)?;
+    stop.on_request(subscriber.closer());
     let members = Arc::new(BoundedQueue::new(EVENTS, 1));
     let watched = [Role::Agent, Role::Ego].map(|role| {
         let members = Arc::clone(&members);
@@ -86,12 +89,12 @@ pub fn run(
     let presence = bus.announce(Role::Ros2)?;
     let report = std::thread::scope(|scope| {
         let reading = inputs.map(|inputs| scope.spawn(move || inputs.run()));
-        let followed = follow(scope, (bus, session, options), &frames, (&tap, &members));
+        let node = Node::new(scope, (bus, session, options), frames.clone());
+        let followed = node.and_then(|node| node.follow(&subscriber, &members));
         // After an error the threads of the LiDARs have to end too.
         stop.request();
-        let (lidar, motion) = reading
-            .map(|reading| reading.join().unwrap_or_default())
-            .unwrap_or_default();
+        let read = reading.map(|reading| reading.join().unwrap_or_default());
+        let (lidar, motion) = read.unwrap_or_default();
         followed.map(|report| NodeReport {
             lidar,
             motion,
@@ -101,26 +104,6 @@ pub fn run(
     })?;
     presence.withdraw()?;
     Ok(report)
-}
-
-/// Publishes what the run publishes until `tap` is closed.
-fn follow<'scope, 'env>(
-    scope: &'scope Scope<'scope, 'env>,
-    (bus, session, options): (&'env Bus, &'env RosSession, &'env NodeOptions),
-    frames: &RobotFrames,
-    (tap, members): (&bus::PassiveSubscriber, &BoundedQueue<(), LivelinessEvent>),
-) -> Result<NodeReport, BusError> {
-    let mut node = Node::new(scope, (bus, session, options), frames.clone())?;
-    let followed = node.follow(tap, members);
-    std::mem::take(&mut node.sweeps)
-        .into_values()
-        .for_each(Forwarding::end);
-    let left_out = node.left_out + tap.overwritten() + tap.undelivered();
-    followed.map(|()| NodeReport {
-        published: node.published,
-        left_out,
-        ..NodeReport::default()
-    })
 }
 
 /// Sweeps of one vehicle, forwarded on a thread of their own.
@@ -158,10 +141,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
         frames: RobotFrames,
     ) -> Result<Self, BusError> {
         let mount = options.mount.unwrap_or_default();
-        let initial_pose = options
-            .initial_pose_of
-            .clone()
-            .map(|cav| InitialPose::of(cav, mount));
+        let initial_pose = options.initial_pose_of.clone();
+        let initial_pose = initial_pose.map(|cav| InitialPose::of(cav, mount));
         let names = FrameNames::within(session.node().namespace.as_ref());
         let translator = Translator::new(&bus.identity().run)
             .with_frames(names.clone(), options.robots().collect());
@@ -194,10 +175,25 @@ impl<'scope, 'env> Node<'scope, 'env> {
         Ok(node)
     }
 
-    /// Publishes what the run publishes until the queue is closed.
+    /// Publishes what the run publishes until `subscriber` is closed.
     fn follow(
+        mut self,
+        subscriber: &PassiveSubscriber,
+        members: &BoundedQueue<(), LivelinessEvent>,
+    ) -> Result<NodeReport, BusError> {
+        let ended = self.publish_all(subscriber, members);
+        self.sweeps.into_values().for_each(Forwarding::end);
+        let left_out = self.left_out + subscriber.overwritten() + subscriber.undelivered();
+        ended.map(|()| NodeReport {
+            published: self.published,
+            left_out,
+            ..NodeReport::default()
+        })
+    }
+
+    fn publish_all(
         &mut self,
-        tap: &bus::PassiveSubscriber,
+        subscriber: &PassiveSubscriber,
         members: &BoundedQueue<(), LivelinessEvent>,
     ) -> Result<(), BusError> {
         loop {
@@ -205,7 +201,7 @@ impl<'scope, 'env> Node<'scope, 'env> {
                 self.note(event)?;
             }
             self.place_robots()?;
-            match tap.take(Some(Instant::now() + POLL_PERIOD)) {
+            match subscriber.take(Some(Instant::now() + POLL_PERIOD)) {
                 Pop::Item(topic, raw) => self.take(&topic, &raw)?,
                 Pop::TimedOut => {}
                 Pop::Closed => return Ok(()),
@@ -216,46 +212,39 @@ impl<'scope, 'env> Node<'scope, 'env> {
     /// A process of a vehicle has joined or left: its topics appear, or disappear.
     fn note(&mut self, event: LivelinessEvent) -> Result<(), BusError> {
         match event {
-            LivelinessEvent::Joined {
-                role: Role::Agent,
-                cav,
-            } => {
-                self.agents.insert(cav.clone());
-                [VehicleTopic::Pose, VehicleTopic::Odometry]
-                    .into_iter()
-                    .try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic)))?;
-                if self.options.with_points {
-                    self.forward_sweeps(&cav)?;
+            LivelinessEvent::Joined { role, cav } => match role {
+                Role::Agent => {
+                    self.agents.insert(cav.clone());
+                    self.declare_all(&cav, OF_AGENT)?;
+                    if !self.options.no_points {
+                        self.forward_sweeps(&cav)?;
+                    }
                 }
-                Ok(())
-            }
-            LivelinessEvent::Joined { cav, .. } => {
-                [VehicleTopic::Detections, VehicleTopic::Markers]
-                    .into_iter()
-                    .try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic)))
-            }
-            LivelinessEvent::Left {
-                role: Role::Agent,
-                cav,
-            } => {
-                self.agents.remove(&cav);
-                self.withdraw(&cav, &[VehicleTopic::Pose, VehicleTopic::Odometry]);
-                if let Some(forwarding) = self.sweeps.remove(&cav) {
-                    forwarding.end();
+                _ => self.declare_all(&cav, OF_EGO)?,
+            },
+            LivelinessEvent::Left { role, cav } => match role {
+                Role::Agent => {
+                    self.agents.remove(&cav);
+                    self.withdraw(&cav, OF_AGENT);
+                    if let Some(forwarding) = self.sweeps.remove(&cav) {
+                        forwarding.end();
+                    }
                 }
-                Ok(())
-            }
-            LivelinessEvent::Left { cav, .. } => {
-                self.withdraw(&cav, &[VehicleTopic::Detections, VehicleTopic::Markers]);
-                Ok(())
-            }
+                _ => self.withdraw(&cav, OF_EGO),
+            },
         }
+        Ok(())
     }
 
-    fn withdraw(&mut self, cav: &CavId, topics: &[VehicleTopic]) {
+    fn declare_all(&mut self, cav: &CavId, topics: [VehicleTopic; 2]) -> Result<(), BusError> {
+        let mut topics = topics.into_iter();
+        topics.try_for_each(|topic| self.declare(RosTopic::Vehicle(cav.clone(), topic)))
+    }
+
+    fn withdraw(&mut self, cav: &CavId, topics: [VehicleTopic; 2]) {
         for topic in topics {
-            self.publishers
-                .remove(&RosTopic::Vehicle(cav.clone(), *topic));
+            let topic = RosTopic::Vehicle(cav.clone(), topic);
+            self.publishers.remove(&topic);
         }
     }
 
@@ -273,14 +262,11 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let mount = self.options.mount.unwrap_or_default();
         let mut in_robots = self.frames.lidars_in_robots(&self.names);
         let is_robot = |cav: &CavId| self.options.robots().any(|robot| robot == *cav);
-        let frames: Vec<_> = self
-            .agents
-            .iter()
-            .filter_map(|cav| match is_robot(cav) {
-                true => in_robots.remove(cav),
-                false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
-            })
-            .collect();
+        let place = |cav: &CavId| match is_robot(cav) {
+            true => in_robots.remove(cav),
+            false => Some(ros2::body_in_lidar(&self.names, cav, &mount)),
+        };
+        let frames: Vec<_> = self.agents.iter().filter_map(place).collect();
         // The stamp of a fixed transform has no meaning.
         let cdr = ros2::transforms(0, &frames);
         if self.fixed == cdr || self.fixed.is_empty() && frames.is_empty() {
@@ -297,9 +283,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
         {
             return Ok(());
         }
-        let mut publisher = self
-            .session
-            .publisher(&RosTopic::Vehicle(cav.clone(), VehicleTopic::Points))?;
+        let points = RosTopic::Vehicle(cav.clone(), VehicleTopic::Points);
+        let mut publisher = self.session.publisher(&points)?;
         let ending = Arc::<AtomicBool>::default();
         let (bus, vehicle, ended) = (self.bus, cav.clone(), Arc::clone(&ending));
         let names = self.names.clone();
@@ -308,8 +293,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
                 tracing::error!("sweeps of {vehicle} are no longer published: {error}");
             }
         });
-        self.sweeps
-            .insert(cav.clone(), Forwarding { ending, thread });
+        let forwarding = Forwarding { ending, thread };
+        self.sweeps.insert(cav.clone(), forwarding);
         Ok(())
     }
 
@@ -325,8 +310,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
         };
         let capture_nanos = header.stamp.capture_nanos;
         if let Topic::Stream { cav, stream } = topic {
-            self.tell_time(cav, *stream, capture_nanos)?;
-            self.tell_initial_pose(cav, capture_nanos, &message)?;
+            self.publish_time(cav, *stream, capture_nanos)?;
+            self.publish_initial_pose(cav, capture_nanos, &message)?;
             if let Message::Pose(estimate) = &message {
                 let pose = estimate.world_from_cav().map(protocol::Pose::isometry);
                 self.frames.note_pose(cav, capture_nanos, pose);
@@ -339,23 +324,20 @@ impl<'scope, 'env> Node<'scope, 'env> {
     }
 
     /// The clock before the message: nothing has a stamp in the future.
-    fn tell_time(
+    fn publish_time(
         &mut self,
         cav: &CavId,
         stream: Stream,
         capture_nanos: u64,
     ) -> Result<(), BusError> {
-        match self
-            .clock
-            .advance(cav, stream, capture_nanos)
-            .filter(|_| self.publishes_clock)
-        {
+        let time_nanos = self.clock.advance(cav, stream, capture_nanos);
+        match time_nanos.filter(|_| self.publishes_clock) {
             Some(nanos) => self.publish(RosTopic::Clock, ros2::clock(nanos)),
             None => Ok(()),
         }
     }
 
-    fn tell_initial_pose(
+    fn publish_initial_pose(
         &mut self,
         cav: &CavId,
         capture_nanos: u64,
@@ -364,12 +346,8 @@ impl<'scope, 'env> Node<'scope, 'env> {
         let Some(initial) = &mut self.initial_pose else {
             return Ok(());
         };
-        let publishers = &self.publishers;
-        let is_wanted = || {
-            publishers
-                .get(&InitialPose::TOPIC)
-                .is_some_and(RosPublisher::is_wanted)
-        };
+        let publisher = self.publishers.get(&InitialPose::TOPIC);
+        let is_wanted = || publisher.is_some_and(RosPublisher::is_wanted);
         match initial.of_message(cav, capture_nanos, message, is_wanted) {
             Some(cdr) => self.publish(InitialPose::TOPIC, cdr),
             None => Ok(()),
@@ -386,13 +364,10 @@ impl<'scope, 'env> Node<'scope, 'env> {
 
     fn publish(&mut self, topic: RosTopic, cdr: Vec<u8>) -> Result<(), BusError> {
         self.declare(topic.clone())?;
-        let name = topic
-            .name(self.session.node().namespace.as_ref())
-            .to_string();
-        *self.published.entry(name).or_default() += 1;
-        self.publishers
-            .get_mut(&topic)
-            .map_or(Ok(()), |publisher| publisher.publish(cdr))
+        let name = topic.name(self.session.node().namespace.as_ref());
+        *self.published.entry(name.to_string()).or_default() += 1;
+        let publisher = self.publishers.get_mut(&topic);
+        publisher.map_or(Ok(()), |publisher| publisher.publish(cdr))
     }
 }
 

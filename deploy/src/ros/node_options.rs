@@ -8,10 +8,10 @@ use super::agent_topic::AgentTopic;
 use super::motion_input::MotionSource;
 
 /// Options of the node.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct NodeOptions {
-    /// True to offer the sweeps of the run's vehicles.
-    pub with_points: bool,
+    /// True if the sweeps of the run's vehicles are not offered.
+    pub no_points: bool,
     /// Publication of `/clock`.
     pub clock: ClockMode,
     /// Place of the LiDARs on their vehicles; absent: at the origin of the body, and of robots as tf has it.
@@ -29,11 +29,12 @@ pub struct NodeOptions {
 }
 
 /// Publication of `/clock`, of which a ROS 2 network has one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ClockMode {
     /// Published.
     On,
     /// Published if no other node publishes it.
+    #[default]
     Unoccupied,
     /// Not published.
     Off,
@@ -42,25 +43,8 @@ pub enum ClockMode {
 impl NodeOptions {
     /// Vehicles with an odometry: their frames are in a tree of their own.
     pub(super) fn robots(&self) -> impl Iterator<Item = CavId> {
-        let odometry = self
-            .motions
-            .iter()
-            .filter(|motion| motion.motion_type == MotionType::Odometry);
+        let is_odometry = |motion: &&MotionSource| motion.motion_type == MotionType::Odometry;
+        let odometry = self.motions.iter().filter(is_odometry);
         odometry.map(|motion| motion.source.cav.clone())
-    }
-}
-
-impl Default for NodeOptions {
-    fn default() -> Self {
-        Self {
-            with_points: true,
-            clock: ClockMode::Unoccupied,
-            mount: None,
-            lidars: Vec::new(),
-            motions: Vec::new(),
-            starting_poses: Vec::new(),
-            intensity_scale: IntensityScale::AUTO,
-            initial_pose_of: None,
-        }
     }
 }

@@ -26,26 +26,20 @@ impl Namesakes {
     pub(super) fn watch(session: &RosSession) -> Result<Self, BusError> {
         let (own, domain_id) = (session.node().name_in_network(), session.node().domain_id);
         let selector = session.node().namesakes();
-        let subscriber = session
-            .zenoh()
-            .liveliness()
-            .declare_subscriber(&selector)
-            .history(true)
-            .callback(move |sample| {
-                let token = sample.key_expr().as_str();
-                if sample.kind() == SampleKind::Put
-                    && let Some(other) = NodeName::of_token(token)
-                    && other.zid != own.zid
-                {
-                    warn(&own, &other, domain_id);
-                }
-            });
-        let subscriber = subscriber
-            .wait()
-            .map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))?;
-        Ok(Self {
-            _subscriber: subscriber,
-        })
+        let liveliness = session.zenoh().liveliness();
+        let builder = liveliness.declare_subscriber(&selector).history(true);
+        let subscriber = builder.callback(move |sample| {
+            let token = sample.key_expr().as_str();
+            if sample.kind() == SampleKind::Put
+                && let Some(other) = NodeName::of_token(token)
+                && other.zid != own.zid
+            {
+                warn(&own, &other, domain_id);
+            }
+        });
+        let refused = |cause| BusError::zenoh(format!("watching {selector}"), &cause);
+        let _subscriber = subscriber.wait().map_err(refused)?;
+        Ok(Self { _subscriber })
     }
 }
 
@@ -69,8 +63,7 @@ pub(super) fn publishes_clock(session: &RosSession, mode: ClockMode) -> Result<b
     let others = publishers(session, &RosTopic::Clock.name(None))?;
     let is_published = others.is_empty() || mode == ClockMode::On;
     if !others.is_empty() {
-        let names: Vec<&str> = others.iter().map(String::as_str).collect();
-        let names = names.join(", ");
+        let names = Vec::from_iter(others).join(", ");
         if is_published {
             tracing::warn!("/clock is published by {names} too: nodes get the time of two clocks");
         } else {

@@ -42,9 +42,7 @@ impl RosPublisher {
         qos: Qos,
         (gid, token): (Gid, LivelinessToken),
     ) -> Result<Self, BusError> {
-        let refused = |cause: zenoh::Error| {
-            BusError::zenoh(format!("declaring a publisher on {key}"), &cause)
-        };
+        let refused = |cause| BusError::zenoh(format!("declaring a publisher on {key}"), &cause);
         // As in rmw_zenoh: a slow receiver loses messages, nobody waits for it.
         let builder = session
             .declare_publisher(key.to_owned())
@@ -52,11 +50,8 @@ impl RosPublisher {
         let kind = if qos.is_latched {
             let cache = CacheConfig::default().max_samples(qos.depth as usize);
             let sequence = MissDetectionConfig::default().sporadic_heartbeat(HEARTBEAT);
-            let builder = builder
-                .cache(cache)
-                .sample_miss_detection(sequence)
-                .publisher_detection();
-            Kind::Latched(builder.wait().map_err(refused)?)
+            let builder = builder.cache(cache).sample_miss_detection(sequence);
+            Kind::Latched(builder.publisher_detection().wait().map_err(refused)?)
         } else {
             let publisher = builder.wait().map_err(refused)?;
             let has_subscribers = bus::has_subscribers(&publisher).map_err(refused)?;

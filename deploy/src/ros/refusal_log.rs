@@ -32,20 +32,14 @@ impl RefusalLog {
     /// Logs why a message is left out.
     pub(super) fn warn(&mut self, reason: &dyn Display) {
         if self.is_due(&reason.to_string(), Instant::now()) {
-            tracing::warn!(
-                "{}: {} left out: {reason}",
-                self.topic,
-                self.ros_type.name()
-            );
+            let (topic, name) = (&self.topic, self.ros_type.name());
+            tracing::warn!("{topic}: {name} left out: {reason}");
         }
     }
 
     /// True if no reason of this kind was logged in the period. Reasons that differ in numbers alone are of one kind.
     fn is_due(&mut self, reason: &str, now: Instant) -> bool {
-        let mut kind: String = reason
-            .chars()
-            .filter(|letter| !letter.is_ascii_digit())
-            .collect();
+        let mut kind = reason.replace(|letter: char| letter.is_ascii_digit(), "");
         if self.logged.len() >= MOST_KINDS && !self.logged.contains_key(&kind) {
             kind = String::new();
         }

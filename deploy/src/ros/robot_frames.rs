@@ -4,13 +4,15 @@
 //! where that frame is in the map, and nothing of the robot's own.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use bus::BusError;
 use nalgebra::Isometry3;
 use protocol::CavId;
 use ros2::names::MAP_FRAME;
 use ros2::{FrameInParent, FrameNames, Mount, PoseType, Qos, RosTopic, RosType, Transform};
+
+use support::sync::lock;
 
 use super::session::{RosSession, RosSubscription};
 use super::transform_tree::{NoTransform, Origin, TransformTree};
@@ -78,22 +80,21 @@ impl RobotFrames {
             (RosTopic::Tf, Qos::TF, Origin::Moving),
             (RosTopic::TfStatic, Qos::TF_STATIC, Origin::Fixed),
         ];
-        let is_needed = !self.lock().robots.is_empty();
+        let is_needed = !lock(&self.state).robots.is_empty();
         let topics = topics.into_iter().filter(|_| is_needed);
-        topics
-            .map(|(topic, qos, origin)| {
-                let frames = self.clone();
-                session.subscribe(&topic.name(None), RosType::TfMessage, qos, move |sample| {
-                    frames.note_transforms(&sample.payload().to_bytes(), origin);
-                })
+        let subscribe = |(topic, qos, origin): (RosTopic, Qos, Origin)| {
+            let frames = self.clone();
+            session.subscribe(&topic.name(None), RosType::TfMessage, qos, move |sample| {
+                frames.note_transforms(&sample.payload().to_bytes(), origin);
             })
-            .collect()
+        };
+        topics.map(subscribe).collect()
     }
 
     fn note_transforms(&self, bytes: &[u8], origin: Origin) {
         match PoseType::TfMessage.read(bytes) {
             Ok(transforms) => {
-                let mut state = self.lock();
+                let mut state = lock(&self.state);
                 for transform in &transforms {
                     state.tree.add(transform, origin);
                 }
@@ -107,13 +108,13 @@ impl RobotFrames {
         // An unreadable message is named by the reader of its motion.
         let read = PoseType::Odometry.read(bytes).unwrap_or_default();
         for transform in read {
-            self.lock().note_odometry(cav, &transform);
+            lock(&self.state).note_odometry(cav, &transform);
         }
     }
 
     /// The frame of a robot's LiDAR.
     pub(super) fn note_lidar(&self, cav: &CavId, frame: &str) {
-        if let Some(robot) = self.lock().robots.get_mut(cav)
+        if let Some(robot) = lock(&self.state).robots.get_mut(cav)
             && robot.lidar.as_deref() != Some(frame)
         {
             robot.lidar = Some(frame.to_owned());
@@ -122,7 +123,7 @@ impl RobotFrames {
 
     /// `world_from_lidar` of a sweep of a vehicle; `None`: the sweep has no pose.
     pub(super) fn note_pose(&self, cav: &CavId, nanos: u64, pose: Option<Isometry3<f64>>) {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         let Some(robot) = state.robots.get_mut(cav) else {
             return;
         };
@@ -136,7 +137,7 @@ impl RobotFrames {
     /// Transforms from `map` to odometry frames that have become known, with their stamps, nanoseconds. A sweep without a
     /// pose repeats the one before: the robot goes on by its odometry.
     pub(super) fn odometry_in_map(&self) -> Vec<(u64, FrameInParent)> {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         let State {
             tree,
             robots,
@@ -164,15 +165,11 @@ impl RobotFrames {
 
     /// Frames of the vehicles' LiDARs under `names` in the robots' own frames, of those robots whose frames are known.
     pub(super) fn lidars_in_robots(&self, names: &FrameNames) -> BTreeMap<CavId, FrameInParent> {
-        let state = self.lock();
+        let state = lock(&self.state);
         let placed = state.robots.iter().filter_map(|(cav, robot)| {
             let (parent, parent_from_lidar) = robot.lidar_place(self.mount.as_ref())?;
-            let frame = (
-                parent.to_owned(),
-                names.lidar(cav),
-                parent_from_lidar.into(),
-            );
-            Some((cav.clone(), frame))
+            let (parent, lidar) = (parent.to_owned(), names.lidar(cav));
+            Some((cav.clone(), (parent, lidar, parent_from_lidar.into())))
         });
         placed.collect()
     }
@@ -182,7 +179,7 @@ impl RobotFrames {
         if let Some(mount) = &self.mount {
             return mount.base_from_lidar.isometry();
         }
-        let state = self.lock();
+        let state = lock(&self.state);
         let frames = state.robots.get(cav).and_then(|robot| {
             let [_, base] = robot.odom_and_base.as_ref()?;
             Some((base, robot.lidar.as_ref()?))
@@ -194,11 +191,7 @@ impl RobotFrames {
 
     /// Poses so far for which there were no transforms.
     pub(super) fn unplaced(&self) -> u64 {
-        self.lock().unplaced
-    }
-
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state).unplaced
     }
 }
 
@@ -216,15 +209,11 @@ impl State {
             return;
         };
         if is_taken {
-            return robot.log(
-                cav,
-                &format_args!(
-                    "frame {odom:?} of its odometry is that of another robot, or the map"
-                ),
-            );
+            let reason =
+                format!("frame {odom:?} of its odometry is that of another robot, or the map");
+            return robot.log(cav, &reason);
         }
-        let frames = [odom, base].map(String::clone);
-        robot.odom_and_base = Some(frames);
+        robot.odom_and_base = Some([odom, base].map(String::clone));
     }
 }
 

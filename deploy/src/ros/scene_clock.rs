@@ -20,15 +20,13 @@ impl SceneClock {
         stream: Stream,
         capture_nanos: u64,
     ) -> Option<u64> {
-        let is_sensor = stream == Stream::Imu;
-        let previous = if is_sensor {
-            self.sensors.insert(cav.clone(), capture_nanos)
-        } else {
-            None
+        let previous = match stream {
+            Stream::Imu => self.sensors.insert(cav.clone(), capture_nanos),
+            _ => None,
         };
         if previous.is_some_and(|previous| capture_nanos < previous) {
             self.sensors.retain(|_, nanos| *nanos <= capture_nanos);
-            return self.now_nanos.insert(capture_nanos).to_owned().into();
+            return Some(*self.now_nanos.insert(capture_nanos));
         }
         let is_later = self.now_nanos.is_none_or(|now| capture_nanos > now);
         is_later.then(|| *self.now_nanos.insert(capture_nanos))

@@ -60,7 +60,6 @@ impl RosSession {
     }
 
     /// The node.
-    #[must_use]
     pub fn node(&self) -> &Node {
         &self.node
     }
@@ -95,15 +94,14 @@ impl RosSession {
             .declare_subscriber(&keys)
             .allowed_origin(Locality::Remote)
             .callback(receive);
-        let subscriber: zenoh::Result<Box<dyn Any + Send + Sync>> = if qos.is_latched {
+        let refused = |cause| BusError::zenoh(format!("subscribing to {keys}"), &cause);
+        let subscriber: Box<dyn Any + Send + Sync> = if qos.is_latched {
             let history = HistoryConfig::default().detect_late_publishers();
             let builder = builder.history(history).subscriber_detection();
-            builder.wait().map(|subscriber| Box::new(subscriber) as _)
+            Box::new(builder.wait().map_err(refused)?)
         } else {
-            builder.wait().map(|subscriber| Box::new(subscriber) as _)
+            Box::new(builder.wait().map_err(refused)?)
         };
-        let subscriber = subscriber
-            .map_err(|cause| BusError::zenoh(format!("subscribing to {keys}"), &cause))?;
         let token = self.endpoint_token(EndpointKind::Subscription, topic.clone(), ros_type, qos);
         Ok(RosSubscription {
             _subscriber: subscriber,

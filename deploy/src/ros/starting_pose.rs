@@ -1,11 +1,13 @@
 //! Starting pose: a pose that a person states on the ROS 2 network, `/initialpose` of RViz, as a message to the agent.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use bus::{Bus, BusError, Publisher, PublisherOptions};
 use nalgebra::Isometry3;
 use protocol::{Gnss, GnssSource, Stream, Topic};
 use ros2::{Qos, RosType, StatedPose};
+use support::sync::lock;
+use zenoh::sample::Sample;
 
 use super::agent_topic::AgentTopic;
 use super::refusal_log::RefusalLog;
@@ -29,23 +31,12 @@ impl StartingPose {
         let ros_type = RosType::PoseWithCovarianceStamped;
         let log = Mutex::new(RefusalLog::of(topic.clone(), ros_type));
         let newest = Arc::clone(&stated);
-        let subscription =
-            session.subscribe(
-                topic,
-                ros_type,
-                Qos::DEFAULT,
-                move |sample| match StatedPose::read(&sample.payload().to_bytes()) {
-                    Ok(pose) => *newest.lock().unwrap_or_else(PoisonError::into_inner) = Some(pose),
-                    Err(error) => log
-                        .lock()
-                        .unwrap_or_else(PoisonError::into_inner)
-                        .warn(&error),
-                },
-            )?;
-        let gnss = Topic::Stream {
-            cav: cav.clone(),
-            stream: Stream::Gnss,
+        let receive = move |sample: Sample| match StatedPose::read(&sample.payload().to_bytes()) {
+            Ok(pose) => *lock(&newest) = Some(pose),
+            Err(error) => lock(&log).warn(&error),
         };
+        let subscription = session.subscribe(topic, ros_type, Qos::DEFAULT, receive)?;
+        let gnss = Topic::stream(cav, Stream::Gnss);
         Ok(Self {
             stated,
             publisher: bus.publisher(gnss, PublisherOptions::POSE.live())?,
@@ -59,11 +50,7 @@ impl StartingPose {
         capture_nanos: u64,
         base_from_lidar: impl FnOnce() -> Isometry3<f64>,
     ) {
-        let stated = self
-            .stated
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .take();
+        let stated = lock(&self.stated).take();
         if let Some(stated) = stated {
             let world_from_lidar = stated.world_from_base.isometry() * base_from_lidar();
             let pose = Gnss {

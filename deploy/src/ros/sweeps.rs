@@ -24,10 +24,7 @@ pub(super) fn forward(
     (publisher, names): (&mut RosPublisher, FrameNames),
     ending: &Arc<AtomicBool>,
 ) -> Result<(), BusError> {
-    let topic = Topic::Stream {
-        cav: cav.clone(),
-        stream: Stream::Lidar,
-    };
+    let topic = Topic::stream(cav, Stream::Lidar);
     let key = KeyExpr::one(&bus.key(topic.clone()));
     let mut translator = Translator::new(&bus.identity().run).with_frames(names, BTreeSet::new());
     let is_ending = || ending.load(Ordering::Relaxed);
@@ -36,9 +33,9 @@ pub(super) fn forward(
             thread::sleep(POLL_PERIOD);
             continue;
         }
-        let tap = bus.tap(std::slice::from_ref(&key), 1)?;
+        let subscriber = bus.tap(std::slice::from_ref(&key), 1)?;
         while publisher.is_wanted() && !is_ending() {
-            let Pop::Item(_, raw) = tap.take(Some(Instant::now() + POLL_PERIOD)) else {
+            let Pop::Item(_, raw) = subscriber.take(Some(Instant::now() + POLL_PERIOD)) else {
                 continue;
             };
             for message in translated(&mut translator, &topic, &raw) {

@@ -90,12 +90,9 @@ impl TimeSeries<f64> {
                 Some(first + (last - first) * seconds(nanos - from) / seconds(to - from))
             }
             _ => {
-                let near = [before, after]
-                    .into_iter()
-                    .flatten()
-                    .filter(|(time, _)| time.abs_diff(nanos) <= MAX_GAP_NANOS);
-                near.min_by_key(|(time, _)| time.abs_diff(nanos))
-                    .map(|(_, value)| value)
+                let both = [before, after].into_iter().flatten();
+                let nearest = both.min_by_key(|(time, _)| time.abs_diff(nanos))?;
+                (nearest.0.abs_diff(nanos) <= MAX_GAP_NANOS).then_some(nearest.1)
             }
         }
     }
@@ -107,11 +104,8 @@ impl TimeSeries<f64> {
         let Some(first) = self.at(from).filter(|_| from < to) else {
             return Some(last);
         };
-        let between = self
-            .0
-            .iter()
-            .copied()
-            .filter(|(time, _)| (from + 1..to).contains(time));
+        let is_between = |(time, _): &(u64, f64)| (from + 1..to).contains(time);
+        let between = self.0.iter().copied().filter(is_between);
         let (mut sum, mut previous) = (0.0, (from, first));
         for next in between.chain([(to, last)]) {
             sum += 0.5 * (previous.1 + next.1) * seconds(next.0 - previous.0);

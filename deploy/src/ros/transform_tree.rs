@@ -74,19 +74,16 @@ impl TransformTree {
         {
             return false;
         }
-        let frame = self
-            .0
-            .entry(child.clone())
-            .or_insert_with(|| Frame::below(parent, origin));
+        let frame = self.0.entry(child.clone());
+        let frame = frame.or_insert_with(|| Frame::below(parent, origin));
         if frame.origin > origin {
             return true;
         }
         if frame.origin != origin || frame.parent != *parent {
             *frame = Frame::below(parent, origin);
         }
-        frame
-            .parent_from_frame
-            .add(*nanos, parent_from_child.isometry());
+        let pose = parent_from_child.isometry();
+        frame.parent_from_frame.add(*nanos, pose);
         true
     }
 

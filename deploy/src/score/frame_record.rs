@@ -6,7 +6,7 @@ use serde::Serialize;
 use super::StageStamps;
 
 /// One line of `frames.csv`: a tick of the scene, with or without a result of the ego.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct FrameRecord {
     /// Tick of the scene, counted from 0.
     pub tick: u64,
@@ -60,41 +60,8 @@ pub struct StreamedResult {
 
 impl FrameRecord {
     /// True if the ego has published a result of the tick.
-    #[must_use]
     pub fn is_answered(&self) -> bool {
         self.agent_frame.is_some()
-    }
-
-    /// A tick without a result.
-    pub(super) fn unanswered(
-        tick: u64,
-        capture_nanos: u64,
-        began_nanos: u64,
-        truth: usize,
-        streamed: Option<StreamedResult>,
-    ) -> Self {
-        Self {
-            tick,
-            agent_frame: None,
-            capture_nanos,
-            latency_ms: None,
-            stamps: StageStamps {
-                began_nanos: Some(began_nanos),
-                ..StageStamps::default()
-            },
-            detected: 0,
-            truth,
-            found: 0,
-            fused: 0,
-            skipped: 0,
-            oldest_ms: None,
-            stale: 0,
-            payload_bytes: 0,
-            wire_bytes: 0,
-            ego_error_m: None,
-            ego_error_deg: None,
-            streamed,
-        }
     }
 }
 

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use dataset::average_precision::{Ordering, Scorer};
 use dataset::ground_truth::{GroundTruth, GroundTruthRule};
+use protocol::message::SkippedNeighbour;
 use protocol::{CavId, Detections, DropReason, Pose, PoseError, PoseEstimate, Stamp, Truth};
 
 use super::frame_record::{FrameRecord, JudgedFrame, StreamedResult};
@@ -41,7 +42,6 @@ pub struct FrameScores {
 impl FrameScores {
     /// Empty scores for the detections of `ego`, with the ground-truth `rule`; a feature map of the model has
     /// `nominal_values` values.
-    #[must_use]
     pub fn new(ego: CavId, rule: GroundTruthRule, nominal_values: u64) -> Self {
         Self {
             ego,
@@ -67,7 +67,6 @@ impl FrameScores {
     }
 
     /// The ground truth of a tick as it is scored; `None` where the ego takes no part.
-    #[must_use]
     pub fn truth_line(&self, stamp: &Stamp, truth: &Truth) -> Option<TruthLine> {
         let ego = truth.agents.iter().find(|agent| agent.cav == self.ego)?;
         Some(TruthLine {
@@ -103,67 +102,56 @@ impl FrameScores {
     }
 
     /// Ticks scored so far, in order, those without a result of the ego included.
-    #[must_use]
     pub fn records(&self) -> &[FrameRecord] {
         &self.records
     }
 
     /// Number of ticks so far, and of those with a result of the ego.
-    #[must_use]
     pub fn ticks(&self) -> (u64, u64) {
         self.live.ticks()
     }
 
     /// Number of ticks without a result of the ego.
-    #[must_use]
     pub fn missed(&self) -> u64 {
         let (ticks, answered) = self.live.ticks();
         ticks - answered
     }
 
     /// Frame for the picture so far: the one with the most neighbours, then true boxes.
-    #[must_use]
     pub fn showpiece(&self) -> Option<&JudgedFrame> {
         self.best.as_ref()
     }
 
     /// Average precision over the answered ticks, ordered by score over all frames, and ordered by frame.
-    #[must_use]
     pub fn average_precision(&self) -> (ByIou, ByIou) {
-        (
-            by_iou(&self.scorer, Ordering::Global),
-            by_iou(&self.scorer, Ordering::Frame),
-        )
+        let [global, frame] =
+            [Ordering::Global, Ordering::Frame].map(|by| by_iou(&self.scorer, by));
+        (global, frame)
     }
 
     /// Average precision over the answered ticks by distance and by class, ordered by score over all frames.
-    #[must_use]
     pub fn average_precision_by_part(&self) -> [BTreeMap<String, PartPrecision>; 2] {
         by_part(&self.scorer)
     }
 
     /// Precision over recall at the three IoU thresholds as a table, a row per detection by falling score; precision is
     /// made non-increasing in recall, as for [`Self::average_precision`].
-    #[must_use]
     pub fn precision_recall_csv(&self) -> String {
         precision_recall_csv(&self.scorer)
     }
 
     /// Average precision over all ticks, ordered by score; one without a result is a frame without detections.
-    #[must_use]
     pub fn unanswered_empty(&self) -> ByIou {
         self.live.unanswered_empty()
     }
 
     /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score; `None` if
     /// results have no time of publication.
-    #[must_use]
     pub fn streaming(&self) -> Option<ByIou> {
         self.live.streaming()
     }
 
     /// Id of the ego.
-    #[must_use]
     pub fn ego(&self) -> &CavId {
         &self.ego
     }
@@ -174,46 +162,34 @@ impl FrameScores {
     }
 
     /// Latencies of all frames.
-    #[must_use]
     pub fn latencies(&self) -> Latencies {
-        let sample: Vec<f64> = self
-            .records
-            .iter()
-            .filter_map(|record| record.latency_ms)
-            .collect();
+        let sample = self.records.iter().filter_map(|record| record.latency_ms);
         Latencies {
-            capture_to_detection: Percentiles::of(&sample),
+            capture_to_detection: Percentiles::of(&sample.collect::<Vec<_>>()),
         }
     }
 
     /// Ages of all fused data.
-    #[must_use]
     pub fn ages(&self) -> Percentiles {
         Percentiles::of(&self.ages_ms)
     }
 
     /// From the first to the last frame on the scene's clock, seconds; scenarios that follow one another add up.
-    #[must_use]
     pub fn seconds(&self) -> f64 {
-        let steps = self
-            .records
-            .windows(2)
-            .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let times = self.records.iter().map(|record| record.capture_nanos);
+        let pairs = times.clone().zip(times.skip(1));
+        let steps = pairs.map(|(from, to)| to.saturating_sub(from));
         // The clock jumps at the start of another scenario, ahead or back.
-        steps
-            .filter(|nanos| *nanos < SCENARIO_GAP_NANOS)
-            .map(|nanos| nanos as f64 * 1e-9)
-            .sum()
+        let steps = steps.filter(|nanos| *nanos < SCENARIO_GAP_NANOS);
+        steps.map(|nanos| nanos as f64 * 1e-9).sum()
     }
 
     /// Bytes of all fused messages.
-    #[must_use]
     pub fn communication(&self) -> Communication {
         Communication::of(&self.bytes, self.nominal_values)
     }
 
     /// Every neighbour from which messages were received.
-    #[must_use]
     pub fn neighbours(&self) -> &BTreeMap<CavId, NeighbourRecord> {
         &self.neighbours
     }
@@ -228,11 +204,9 @@ impl FrameScores {
         let Some((began_nanos, truth)) = tick.truth else {
             return;
         };
-        let world_from_lidar: Vec<(CavId, Pose)> = truth
-            .agents
-            .iter()
-            .map(|agent| (agent.cav.clone(), agent.world_from_lidar))
-            .collect();
+        let agents = truth.agents.iter();
+        let world_from_lidar: Vec<(CavId, Pose)> =
+            { agents.map(|agent| (agent.cav.clone(), agent.world_from_lidar)) }.collect();
         self.judge_poses(&tick.poses, &world_from_lidar);
         let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
         if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
@@ -247,13 +221,8 @@ impl FrameScores {
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
-        self.judge_answered(
-            at,
-            (stamps, Some(done_nanos)),
-            result,
-            &objects,
-            world_from_lidar,
-        );
+        let timed = (stamps, Some(done_nanos));
+        self.judge_answered(at, timed, result, &objects, world_from_lidar);
     }
 
     /// Scores a frame whose truth is known already, at once; `result` is `None` if the ego has none, `poses` are the
@@ -279,13 +248,8 @@ impl FrameScores {
         };
         let published_nanos =
             latency_ms.map(|latency_ms| capture_nanos.saturating_add((latency_ms * 1e6) as u64));
-        self.judge_answered(
-            at,
-            (stamps, published_nanos),
-            result,
-            objects,
-            world_from_lidar,
-        );
+        let timed = (stamps, published_nanos);
+        self.judge_answered(at, timed, result, objects, world_from_lidar);
     }
 
     /// Scores a tick, of a number, capture time and time of publication, without a result.
@@ -296,13 +260,17 @@ impl FrameScores {
         world_from_lidar: &[(CavId, Pose)],
     ) {
         let streamed = self.judge_live((tick, began_nanos), world_from_lidar, objects, None);
-        self.records.push(FrameRecord::unanswered(
+        self.records.push(FrameRecord {
             tick,
             capture_nanos,
-            began_nanos,
-            objects.objects.len(),
+            stamps: StageStamps {
+                began_nanos: Some(began_nanos),
+                ..StageStamps::default()
+            },
+            truth: objects.objects.len(),
             streamed,
-        ));
+            ..FrameRecord::default()
+        });
     }
 
     /// Scores a tick with or without a result; returns the result that was the newest at its publication.
@@ -313,16 +281,13 @@ impl FrameScores {
         truth: &GroundTruth,
         answer: Option<Answer<'_>>,
     ) -> Option<StreamedResult> {
-        let world_from_ego = true_pose(world_from_lidar, &self.ego).copied();
-        self.live.add(
-            &TickTruth {
-                tick,
-                began_nanos,
-                world_from_ego,
-                truth,
-            },
-            answer,
-        )
+        let truth = TickTruth {
+            tick,
+            began_nanos,
+            world_from_ego: true_pose(world_from_lidar, &self.ego).copied(),
+            truth,
+        };
+        self.live.add(&truth, answer)
     }
 
     fn judge_answered(
@@ -337,47 +302,32 @@ impl FrameScores {
             published_nanos,
             detections: &result.detections,
         };
-        let streamed = self.judge_live(
-            (tick, began_nanos),
-            &world_from_lidar,
-            objects,
-            Some(answer),
-        );
+        let at = (tick, began_nanos);
+        let streamed = self.judge_live(at, &world_from_lidar, objects, Some(answer));
         let verdicts = self.scorer.add(&result.detections, objects);
-        let FrameCounts { detected, found } = FrameCounts::of(&self.scorer, &verdicts);
-        let bytes: Vec<(u64, u64)> = result
-            .fused
-            .iter()
-            .map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes))
-            .collect();
-        let ages_ms = result
-            .fused
-            .iter()
-            .map(|neighbour| neighbour.age_nanos as f64 * 1e-6);
-        let ego_error = result
-            .pose
-            .world_from_cav()
-            .zip(true_pose(&world_from_lidar, &self.ego));
-        let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
+        let counts = FrameCounts::of(&self.scorer, &verdicts);
+        let fused = result.fused.iter();
+        let bytes = fused.clone().map(|of| (of.payload_bytes, of.wire_bytes));
+        let ages_ms = fused.map(|of| of.age_nanos as f64 * 1e-6);
+        let found = result.pose.world_from_cav();
+        let ego_error = { found.zip(true_pose(&world_from_lidar, &self.ego)) }
+            .map(|(found, truth)| PoseError::between(found, truth));
+        let stale = |left_out: &&SkippedNeighbour| left_out.reason == Some(DropReason::Stale);
         self.records.push(FrameRecord {
             tick,
             agent_frame: Some(result.agent_frame),
             capture_nanos,
             latency_ms: stamps.detected_ms,
             stamps,
-            detected,
+            detected: counts.detected,
             truth: objects.objects.len(),
-            found,
+            found: counts.found,
             fused: result.fused.len(),
             skipped: result.skipped.len(),
             oldest_ms: ages_ms.clone().max_by(f64::total_cmp),
-            stale: result
-                .skipped
-                .iter()
-                .filter(|left_out| left_out.reason == Some(DropReason::Stale))
-                .count(),
-            payload_bytes: bytes.iter().map(|(payload, _)| payload).sum(),
-            wire_bytes: bytes.iter().map(|(_, wire)| wire).sum(),
+            stale: result.skipped.iter().filter(stale).count(),
+            payload_bytes: bytes.clone().map(|(payload, _)| payload).sum(),
+            wire_bytes: bytes.clone().map(|(_, wire)| wire).sum(),
             ego_error_m: ego_error.map(|error| error.distance_m),
             ego_error_deg: ego_error.map(|error| error.angle_deg),
             streamed,
@@ -408,11 +358,9 @@ impl FrameScores {
         objects: &GroundTruth,
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
-        let better = self.best.as_ref().is_none_or(|best| {
-            (result.fused.len(), objects.objects.len())
-                > (best.result.fused.len(), best.truth.len())
-        });
-        if better {
+        let best = self.best.as_ref();
+        let best = best.map(|best| (best.result.fused.len(), best.truth.len()));
+        if best.is_none_or(|best| (result.fused.len(), objects.objects.len()) > best) {
             self.best = Some(JudgedFrame {
                 tick,
                 result,
@@ -424,10 +372,8 @@ impl FrameScores {
 }
 
 fn true_pose<'a>(truth: &'a [(CavId, Pose)], cav: &CavId) -> Option<&'a Pose> {
-    truth
-        .iter()
-        .find(|(known, _)| known == cav)
-        .map(|(_, pose)| pose)
+    let (_, pose) = truth.iter().find(|(known, _)| known == cav)?;
+    Some(pose)
 }
 
 #[cfg(test)]

@@ -64,29 +64,20 @@ impl LivePrecision {
     ) -> Option<StreamedResult> {
         self.ticks += 1;
         self.answered += u64::from(answer.is_some());
-        self.all_ticks.add(
-            answer.as_ref().map_or(&[], |answer| answer.detections),
-            truth.truth,
-        );
+        let detections = answer.as_ref().map_or(&[][..], |answer| answer.detections);
+        self.all_ticks.add(detections, truth.truth);
         let streamed = self.stream(truth);
         match answer {
             Some(Answer {
                 published_nanos: Some(nanos),
                 detections,
             }) => {
-                let TickTruth {
-                    tick,
-                    began_nanos,
-                    world_from_ego,
-                    ..
-                } = *truth;
-                let detections = detections.to_vec();
                 self.published.push_back(Published {
                     nanos,
-                    tick,
-                    began_nanos,
-                    world_from_ego,
-                    detections,
+                    tick: truth.tick,
+                    began_nanos: truth.began_nanos,
+                    world_from_ego: truth.world_from_ego,
+                    detections: detections.to_vec(),
                 });
                 if self.published.len() > MOST_KEPT {
                     self.published.pop_front();
@@ -137,39 +128,25 @@ impl LivePrecision {
     /// The detections of the newest sweep that were published by a tick, moved to the ego's pose at that tick. Older
     /// ones are dropped.
     fn newest(&mut self, truth: &TickTruth<'_>) -> Option<(StreamedResult, Vec<Detection>)> {
-        let index = self
-            .published
-            .iter()
-            .rposition(|published| published.nanos <= truth.began_nanos)?;
+        let mut published = self.published.iter();
+        let index = published.rposition(|published| published.nanos <= truth.began_nanos)?;
         self.published.drain(..index);
-        let Published {
-            tick,
-            began_nanos,
-            world_from_ego,
-            detections,
-            ..
-        } = self.published.front()?;
-        let now_from_then = match (truth.world_from_ego, world_from_ego) {
-            (Some(now), Some(then)) => now.from_world(then).isometry(),
+        let newest = self.published.front()?;
+        let now_from_then = match (truth.world_from_ego, newest.world_from_ego) {
+            (Some(now), Some(then)) => now.from_world(&then).isometry(),
             _ => Pose::IDENTITY.isometry(),
         };
-        let moved = detections.iter().map(|found| {
-            let box3d = found.box3d.transformed(&now_from_then);
-            Detection {
-                box3d,
-                ..found.clone()
-            }
+        let moved = newest.detections.iter().map(|found| Detection {
+            box3d: found.box3d.transformed(&now_from_then),
+            ..found.clone()
         });
-        let age_ms = (truth.began_nanos.saturating_sub(*began_nanos)) as f64 * 1e-6;
-        Some((
-            StreamedResult {
-                tick: *tick,
-                age_ms,
-                detected: 0,
-                found: 0,
-            },
-            moved.collect(),
-        ))
+        let result = StreamedResult {
+            tick: newest.tick,
+            age_ms: truth.began_nanos.saturating_sub(newest.began_nanos) as f64 * 1e-6,
+            detected: 0,
+            found: 0,
+        };
+        Some((result, moved.collect()))
     }
 }
 

@@ -27,10 +27,8 @@ pub struct Metrics {
     /// Number of frames that the ego reported.
     pub frames: u64,
     /// Number of ticks of the scene; without a network all are answered.
-    #[serde(default)]
     pub ticks: u64,
     /// Number of ticks with detections; the others are unanswered.
-    #[serde(default)]
     pub answered: u64,
     /// From the first to the last detections, seconds of wall time.
     pub seconds: f64,
@@ -46,21 +44,16 @@ pub struct Metrics {
     /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
     pub ap_frame_order: ByIou,
     /// `ap_global` under the name that says over which ticks it is.
-    #[serde(default)]
     pub ap_answered: ByIou,
     /// The same over all ticks; an unanswered one is a frame without detections.
-    #[serde(default)]
     pub ap_unanswered_empty: ByIou,
     /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score: at each tick the
     /// last detections published until then are moved by the ego's true motion since their capture and compared with
     /// the truth at that tick. Latency and missing results both lower it. `null` if results have no time of publication.
-    #[serde(default)]
     pub ap_streaming: Option<ByIou>,
     /// `ap_answered` by the distance of the objects from the ego's LiDAR, metres in the plane: bins that have objects.
-    #[serde(default)]
     pub ap_by_distance: BTreeMap<String, PartPrecision>,
     /// `ap_answered` by the class of the objects: classes that have objects.
-    #[serde(default)]
     pub ap_by_class: BTreeMap<String, PartPrecision>,
     /// Errors of the poses that fusion used.
     pub pose: PoseErrors,
@@ -68,27 +61,21 @@ pub struct Metrics {
     pub latency_ms: Latencies,
     /// Age of neighbours' data: capture time of the ego's sweep less that of the neighbour's, per neighbour and frame
     /// that was fused, milliseconds.
-    #[serde(default)]
     pub age_ms: Percentiles,
     /// Transmitted data.
     pub comm: Communication,
     /// Contribution of the neighbours.
-    #[serde(default)]
     pub contribution: Contribution,
     /// Every neighbour from which the ego received messages.
-    #[serde(default)]
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
     /// Totals of the ledger.
     pub messages: Messages,
     /// The evaluation protocol, with the ground-truth range as it was applied.
-    #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
     /// Data of the scene that could not be used, and frames that could not be computed. On the wall clock frames that
     /// failed are unanswered, and `messages` counts theirs as dropped.
-    #[serde(default)]
     pub left_out: LeftOut,
     /// Command, programs, and the digests of everything that the result was made from.
-    #[serde(default)]
     pub provenance: Option<Provenance>,
 }
 
@@ -96,17 +83,17 @@ impl Metrics {
     /// Metrics from the scores of a run of `seconds`; `sent_bytes` is the size of all messages that neighbours sent, if
     /// known.
     pub fn of(
-        board: &FrameScores,
+        scores: &FrameScores,
         clock: &str,
         [method, pose_source]: [&str; 2],
         seconds: f64,
         ledger: &Ledger,
         sent_bytes: Option<u64>,
     ) -> Self {
-        let fused = board.records().iter().map(|record| record.fused).sum();
-        let (ap_global, ap_frame_order) = board.average_precision();
-        let [ap_by_distance, ap_by_class] = board.average_precision_by_part();
-        let (ticks, answered) = board.ticks();
+        let fused = scores.records().iter().map(|record| record.fused).sum();
+        let (ap_global, ap_frame_order) = scores.average_precision();
+        let [ap_by_distance, ap_by_class] = scores.average_precision_by_part();
+        let (ticks, answered) = scores.ticks();
         Self {
             frames: answered,
             ticks,
@@ -118,20 +105,18 @@ impl Metrics {
             ap_global,
             ap_frame_order,
             ap_answered: ap_global,
-            ap_unanswered_empty: board.unanswered_empty(),
-            ap_streaming: board.streaming(),
+            ap_unanswered_empty: scores.unanswered_empty(),
+            ap_streaming: scores.streaming(),
             ap_by_distance,
             ap_by_class,
-            pose: board.pose_errors(),
-            latency_ms: board.latencies(),
-            age_ms: board.ages(),
-            comm: board.communication(),
-            contribution: Contribution::of(answered, fused, board.ego(), ledger, sent_bytes),
-            neighbours: board.neighbours().clone(),
+            pose: scores.pose_errors(),
+            latency_ms: scores.latencies(),
+            age_ms: scores.ages(),
+            comm: scores.communication(),
+            contribution: Contribution::of(answered, fused, scores.ego(), ledger, sent_bytes),
+            neighbours: scores.neighbours().clone(),
             messages: Messages::of(&ledger.total()),
-            protocol: None,
-            left_out: LeftOut::default(),
-            provenance: None,
+            ..Self::default()
         }
     }
 }
@@ -226,7 +211,6 @@ pub struct Messages {
 
 impl Percentiles {
     /// Quantiles of `sample`.
-    #[must_use]
     pub fn of(sample: &[f64]) -> Self {
         let sorted = sorted(sample);
         Self {
@@ -239,26 +223,17 @@ impl Percentiles {
 
 impl Messages {
     /// Totals of a ledger.
-    #[must_use]
     pub fn of(total: &Counts) -> Self {
-        let Counts {
-            sent,
-            received,
-            in_flight,
-            dropped,
-            adapted: _,
-        } = total.clone();
         Self {
-            sent,
-            received,
-            in_flight,
-            dropped,
+            sent: total.sent,
+            received: total.received,
+            in_flight: total.in_flight,
+            dropped: total.dropped.clone(),
         }
     }
 
     /// True if most of the messages that were sent neither arrived nor were lost: then the link carries next to
     /// nothing.
-    #[must_use]
     pub fn are_stuck(&self) -> bool {
         self.in_flight >= FEW && self.in_flight > self.sent / 2
     }
@@ -266,19 +241,11 @@ impl Messages {
 
 impl PoseErrors {
     /// Summarises the errors of all poses; `no_pose` is the number of frames of vehicles without a pose.
-    #[must_use]
     pub fn of(errors: &[PoseError], no_pose: u64) -> Self {
-        let distances = sorted(
-            &errors
-                .iter()
-                .map(|error| error.distance_m)
-                .collect::<Vec<_>>(),
-        );
+        let distances: Vec<f64> = errors.iter().map(|error| error.distance_m).collect();
+        let distances = sorted(&distances);
         let tried = errors.len() as u64 + no_pose;
-        let near = distances
-            .iter()
-            .filter(|distance| **distance < SUCCESS_M)
-            .count();
+        let near = distances.partition_point(|distance| *distance < SUCCESS_M);
         Self {
             mean_m: mean(distances.iter().copied()),
             p50_m: quantile(&distances, 0.50),
@@ -292,7 +259,6 @@ impl PoseErrors {
 
 impl Communication {
     /// Summarises `(payload, wire)` bytes of every neighbour and frame; `nominal_values` is the size of a feature map.
-    #[must_use]
     pub fn of(bytes: &[(u64, u64)], nominal_values: u64) -> Self {
         let payload = mean(bytes.iter().map(|(payload, _)| *payload as f64));
         Self {

@@ -25,7 +25,6 @@ pub struct NeighbourRecord {
     /// simulation time.
     pub clock_offset_s: Option<f64>,
     /// Offset of its capture times from the ego's that the ego corrected last, seconds; `None` if they agreed.
-    #[serde(default)]
     pub capture_offset_s: Option<f64>,
     /// Misbehaviour reason at the end, if it was excluded.
     pub misbehaviour: Option<MisbehaviourReason>,
@@ -56,10 +55,8 @@ pub(super) fn add(neighbours: &mut BTreeMap<CavId, NeighbourRecord>, result: &De
             record.misbehaviour = neighbour.misbehaviour;
             // One that cannot be fused gets no new trust score.
             record.trust = neighbour.trust.or(record.trust);
-            record.least_trust = [record.least_trust, neighbour.trust]
-                .into_iter()
-                .flatten()
-                .reduce(f64::min);
+            let trusts = [record.least_trust, neighbour.trust].into_iter().flatten();
+            record.least_trust = trusts.reduce(f64::min);
             record.clock_offset_s = neighbour.clock_offset_s.or(record.clock_offset_s);
             record.capture_offset_s = neighbour.capture_offset_s.or(record.capture_offset_s);
         });

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::mem;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -17,6 +17,7 @@ use protocol::{
     CavId, Detections, DetectionsReport, KeyExpr, Ledger, Limits, NeighbourState, PoseEstimate,
     ProcessId, ProcessUsage, Role, RunId, StageSummary, Stats, Stream, Topic, TopicTraffic, Truth,
 };
+use support::sync::lock;
 use zenoh::Session;
 
 use super::FrameScores;
@@ -60,7 +61,6 @@ pub struct Progress {
 
 impl Progress {
     /// Results per second.
-    #[must_use]
     pub fn rate_hz(&self) -> Option<f64> {
         let (first, last) = self.span?;
         let seconds = last.duration_since(first).as_secs_f64();
@@ -94,7 +94,7 @@ type ScoreStats = BTreeMap<(ProcessId, u64), ProcessStats>;
 /// Results of the scorer at the end.
 pub struct Scored {
     /// Detections against the truth.
-    pub board: FrameScores,
+    pub scores: FrameScores,
     /// Last report of every process instance.
     pub stats: Vec<ProcessStats>,
     /// Progress of the run.
@@ -121,13 +121,10 @@ pub enum ScorerError {
 
 /// A running scorer.
 pub struct ScorerNode {
-    bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
     thread: JoinHandle<(FrameScores, ScoreStats, [u64; 2])>,
-    offline: OfflineIntervals,
-    _subscriptions: Vec<Subscription>,
-    _presence: LivelinessToken,
+    connection: Connection,
 }
 
 impl ScorerNode {
@@ -141,37 +138,26 @@ impl ScorerNode {
         run: &RunId,
         agents: &[CavId],
         ego: &CavId,
-        board: FrameScores,
+        scores: FrameScores,
         files: [PathBuf; 2],
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
         let process = process_id(Role::Scorer, &cav);
-        let bus = Bus::over(
-            session,
-            Identity {
-                run: run.clone(),
-                process,
-                cav,
-            },
-        )?;
-        let inbox = bus.inbox(PLACES, 4 * agents.len() + 64);
-        let detections = Topic::Stream {
-            cav: ego.clone(),
-            stream: Stream::Detections,
+        let identity = Identity {
+            run: run.clone(),
+            process,
+            cav,
         };
+        let bus = Bus::over(session, identity)?;
+        let inbox = bus.inbox(PLACES, 4 * agents.len() + 64);
+        let detections = Topic::stream(ego, Stream::Detections);
         let mut subscriptions = vec![
             bus.subscribe(Topic::Truth, &inbox)?,
             bus.subscribe(detections, &inbox)?,
             bus.subscribe_all(&KeyExpr::stats(run), &inbox)?,
         ];
         for cav in agents {
-            subscriptions.push(bus.subscribe(
-                Topic::Stream {
-                    cav: cav.clone(),
-                    stream: Stream::Pose,
-                },
-                &inbox,
-            )?);
+            subscriptions.push(bus.subscribe(Topic::stream(cav, Stream::Pose), &inbox)?);
         }
         let presence = bus.announce(Role::Scorer)?;
         let offline = OfflineIntervals::watch(&bus)?;
@@ -184,7 +170,7 @@ impl ScorerNode {
         let worker = Worker {
             inbox: Arc::clone(&inbox),
             bus_stats: bus.stats().clone(),
-            board,
+            scores,
             stats: BTreeMap::new(),
             reported_foreign: BTreeSet::new(),
             progress: Arc::clone(&progress),
@@ -198,13 +184,15 @@ impl ScorerNode {
             .spawn(move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
         Ok(Self {
-            bus,
             inbox,
             progress,
             thread,
-            offline,
-            _subscriptions: subscriptions,
-            _presence: presence,
+            connection: Connection {
+                bus,
+                offline,
+                subscriptions,
+                presence,
+            },
         })
     }
 
@@ -217,23 +205,18 @@ impl ScorerNode {
         address: SocketAddr,
         others: Vec<MetricsPeer>,
     ) -> Result<(), ScorerError> {
-        self.bus.serve_metrics(address, others)?;
+        self.connection.bus.serve_metrics(address, others)?;
         Ok(())
     }
 
     /// Progress so far.
-    #[must_use]
     pub fn progress(&self) -> Progress {
-        self.progress
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone()
+        lock(&self.progress).clone()
     }
 
     /// Processes that were offline so far.
-    #[must_use]
     pub fn absent(&self) -> BTreeSet<String> {
-        self.offline.so_far()
+        self.connection.offline.so_far()
     }
 
     /// Ends the scorer after every received message has been scored.
@@ -267,46 +250,29 @@ impl ScorerNode {
 
     fn scored(self) -> (Scored, Connection) {
         self.inbox.close();
-        let (board, stats, unwritten) = self
-            .thread
-            .join()
-            .expect("the scorer's thread has no reason to panic");
-        let own_stats = self.bus.stats();
-        let process = self.bus.identity().process.clone();
-        let cpu_before_s = stats
-            .values()
-            .find(|stats| stats.process == process)
-            .map_or(0.0, |own| own.cpu_before_s);
+        let joined = self.thread.join();
+        let (scores, stats, unwritten) =
+            joined.expect("the scorer's thread has no reason to panic");
+        let own_stats = self.connection.bus.stats();
+        let process = &self.connection.bus.identity().process;
+        let (own, others): (Vec<_>, Vec<_>) =
+            { stats.into_values() }.partition(|stats| stats.process == *process);
+        // The scorer receives its own reports like those of others; its current counters are newer.
         let own = ProcessStats {
-            process,
+            process: process.clone(),
             ledger: own_stats.ledger(),
             stages: own_stats.stages(),
             usage: process_usage(),
-            cpu_before_s,
+            cpu_before_s: own.first().map_or(0.0, |own| own.cpu_before_s),
             traffic: own_stats.traffic(),
         };
-        let progress = self
-            .progress
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        // The scorer receives its own reports like those of others; its current counters are newer.
-        let others = stats
-            .into_values()
-            .filter(|stats| stats.process != own.process);
         let scored = Scored {
-            board,
-            stats: others.chain([own.clone()]).collect(),
-            progress,
+            scores,
+            stats: others.into_iter().chain([own]).collect(),
+            progress: lock(&self.progress).clone(),
             unwritten,
         };
-        let connection = Connection {
-            bus: self.bus,
-            offline: self.offline,
-            subscriptions: self._subscriptions,
-            presence: self._presence,
-        };
-        (scored, connection)
+        (scored, self.connection)
     }
 }
 
@@ -322,7 +288,6 @@ struct Connection {
 ///
 /// # Panics
 /// Never: the name is an identifier.
-#[must_use]
 pub fn scorer_cav() -> CavId {
     CavId::new(SCORER).expect("six lower-case letters")
 }
@@ -331,7 +296,7 @@ pub fn scorer_cav() -> CavId {
 struct Worker {
     inbox: Arc<Inbox>,
     bus_stats: bus::MessageStats,
-    board: FrameScores,
+    scores: FrameScores,
     stats: ScoreStats,
     /// Processes whose reports on messages of others are named already.
     reported_foreign: BTreeSet<ProcessId>,
@@ -356,25 +321,16 @@ impl Worker {
             }
         }
         self.write_results(true);
-        self.board.close();
-        (
-            self.board,
-            self.stats,
-            [self.detections.finish(), self.truth_lines.finish()],
-        )
+        self.scores.close();
+        let unwritten = [self.detections.finish(), self.truth_lines.finish()];
+        (self.scores, self.stats, unwritten)
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
         let used = match topic {
             Topic::Truth => self.truth(arrival),
-            Topic::Stream {
-                stream: Stream::Detections,
-                ..
-            } => self.result(arrival),
-            Topic::Stream {
-                stream: Stream::Pose,
-                ..
-            } => self.pose(arrival),
+            Topic::Stream { stream, .. } if *stream == Stream::Detections => self.result(arrival),
+            Topic::Stream { stream, .. } if *stream == Stream::Pose => self.pose(arrival),
             Topic::Stats(sender) => return self.stats(sender, arrival),
             _ => None,
         };
@@ -387,16 +343,16 @@ impl Worker {
     fn truth(&mut self, arrival: &Arrival) -> Option<()> {
         let truth: Truth = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        self.published
-            .insert(stamp.capture_nanos, stamp.publish_nanos);
+        let (capture_nanos, publish_nanos) = (stamp.capture_nanos, stamp.publish_nanos);
+        self.published.insert(capture_nanos, publish_nanos);
         while self.published.len() > PLACES {
             self.published.pop_first();
         }
-        self.numbered.tick(stamp.capture_nanos, truth.tick);
-        if let Some(line) = self.board.truth_line(stamp, &truth) {
+        self.numbered.tick(capture_nanos, truth.tick);
+        if let Some(line) = self.scores.truth_line(stamp, &truth) {
             self.truth_lines.add(line.to_json());
         }
-        self.board.truth(stamp, truth);
+        self.scores.truth(stamp, truth);
         self.write_results(false);
         self.bus_stats.tick();
         self.note(|progress| progress.ticks += 1);
@@ -406,20 +362,15 @@ impl Worker {
     fn result(&mut self, arrival: &Arrival) -> Option<()> {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        self.numbered
-            .result(DetectionsReport::new(stamp, None, result.clone()));
+        let report = DetectionsReport::new(stamp, None, result.clone());
+        self.numbered.result(report);
         self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
         let neighbours = result.neighbours.clone();
-        let (fused, bytes) = (
-            result.fused.len(),
-            result
-                .fused
-                .iter()
-                .map(|neighbour| neighbour.wire_bytes)
-                .sum::<u64>(),
-        );
+        let fused = result.fused.len();
+        let wire_bytes = result.fused.iter().map(|neighbour| neighbour.wire_bytes);
+        let bytes: u64 = wire_bytes.sum();
         let latency = latency_ms.map(|ms| Duration::from_secs_f64(ms.max(0.0) / 1e3));
         self.bus_stats.answered(latency, fused);
         let at = arrival.at;
@@ -431,7 +382,7 @@ impl Worker {
             progress.neighbours = neighbours;
             progress.wire_bytes += bytes;
         });
-        self.board.result(stamp, result);
+        self.scores.result(stamp, result);
         Some(())
     }
 
@@ -444,7 +395,7 @@ impl Worker {
 
     fn pose(&mut self, arrival: &Arrival) -> Option<()> {
         let estimate: PoseEstimate = self.inbox.decode(arrival, &Limits::DEFAULT)?;
-        self.board.pose(&arrival.header.stamp, estimate);
+        self.scores.pose(&arrival.header.stamp, estimate);
         Some(())
     }
 
@@ -475,12 +426,10 @@ impl Worker {
         }
         let (name, at) = (process.to_string(), arrival.at);
         // Until the first tick: the loading of models belongs to no frame.
+        let known = self.stats.get(&instance);
         let cpu_before_s = match self.published.is_empty() {
             true => usage.cpu_s,
-            false => self
-                .stats
-                .get(&instance)
-                .map_or(0.0, |known| known.cpu_before_s),
+            false => known.map_or(0.0, |known| known.cpu_before_s),
         };
         let stats = ProcessStats {
             process,
@@ -491,11 +440,8 @@ impl Worker {
             traffic,
         };
         self.stats.insert(instance, stats);
-        let dropped = self
-            .stats
-            .values()
-            .map(|stats| stats.ledger.total().dropped_total())
-            .sum();
+        let ledgers = self.stats.values().map(|stats| &stats.ledger);
+        let dropped = ledgers.map(|ledger| ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;
             progress.problems.insert(name.clone(), problems);
@@ -504,6 +450,6 @@ impl Worker {
     }
 
     fn note(&self, change: impl FnOnce(&mut Progress)) {
-        change(&mut self.progress.lock().unwrap_or_else(PoisonError::into_inner));
+        change(&mut lock(&self.progress));
     }
 }

@@ -34,10 +34,8 @@ impl NumberedResults {
     pub(super) fn next(&mut self, is_over: bool) -> Option<DetectionsReport> {
         let capture_nanos = self.waiting.front()?.capture_nanos;
         let tick = self.ticks.get(&capture_nanos).copied();
-        let is_past = self
-            .ticks
-            .last_key_value()
-            .is_some_and(|(newest, _)| *newest > capture_nanos);
+        let newest = self.ticks.last_key_value();
+        let is_past = newest.is_some_and(|(newest, _)| *newest > capture_nanos);
         if tick.is_none() && !is_past && !is_over && self.waiting.len() <= PLACES {
             return None;
         }

@@ -5,10 +5,11 @@
 //! and in the report; all others have to balance.
 
 use std::collections::BTreeSet;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use bus::{Bus, BusError, LivelinessEvent, LivelinessSubscription, process_id};
 use protocol::{Account, Role, Stream, Topic};
+use support::sync::lock;
 
 const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 
@@ -36,7 +37,7 @@ impl OfflineIntervals {
         let watch = |role| {
             let state = Arc::clone(&state);
             bus.watch(role, move |event| {
-                let mut state = state.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut state = lock(&state);
                 match event {
                     LivelinessEvent::Left { role, cav } => {
                         state.gone.insert(process_id(role, &cav).to_string());
@@ -59,19 +60,14 @@ impl OfflineIntervals {
     /// Processes that were offline so far. One that does not return counts too, except the replay, which leaves when
     /// the scene is over.
     pub(crate) fn so_far(&self) -> BTreeSet<String> {
-        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = lock(&self.state);
         let replay = Role::Replay.to_string();
-        state
-            .returned
-            .iter()
-            .chain(state.gone.iter().filter(|name| **name != replay))
-            .cloned()
-            .collect()
+        let gone = state.gone.iter().filter(|name| **name != replay);
+        state.returned.iter().chain(gone).cloned().collect()
     }
 }
 
 /// True if a process that the account concerns was offline: sender, receiver or the link between them.
-#[must_use]
 pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     let replay = Role::Replay.to_string();
     let agent = |cav| process_id(Role::Agent, cav).to_string();
@@ -80,15 +76,11 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
             stream: Stream::Lidar | Stream::Gnss | Stream::Imu | Stream::Radar | Stream::Camera(_),
             ..
         }
-        | Topic::Truth => {
-            vec![replay]
-        }
+        | Topic::Truth => vec![replay],
         Topic::Stream {
             cav,
             stream: Stream::Detections | Stream::DetectionsJson | Stream::Pace,
-        } => {
-            vec![process_id(Role::Ego, cav).to_string()]
-        }
+        } => vec![process_id(Role::Ego, cav).to_string()],
         Topic::Stream { cav, .. } => vec![agent(cav)],
         Topic::Received { ego, cav, .. } => {
             vec![agent(cav), process_id(Role::Link, ego).to_string()]
@@ -98,11 +90,8 @@ pub fn concerns(offline: &BTreeSet<String>, account: &Account) -> bool {
     if let Some(to) = &account.to {
         concerned.push(to.to_string());
         // An ego receives messages of neighbours through its link.
-        concerned.extend(
-            to.as_str()
-                .strip_prefix("ego-")
-                .map(|ego| format!("link-{ego}")),
-        );
+        let ego = to.as_str().strip_prefix("ego-");
+        concerned.extend(ego.map(|ego| format!("link-{ego}")));
     }
     concerned.iter().any(|name| offline.contains(name))
 }

@@ -39,10 +39,7 @@ impl OpenTicks {
     /// the oldest tick is removed and returned with its capture time.
     pub(super) fn add(&mut self, stamp: &Stamp, part: Part) -> Option<(u64, Tick)> {
         let capture_nanos = stamp.capture_nanos;
-        if self
-            .closed_until
-            .is_some_and(|closed| capture_nanos <= closed)
-        {
+        if { self.closed_until }.is_some_and(|closed| capture_nanos <= closed) {
             return None;
         }
         let is_full = self.open.len() >= MOST_OPEN && !self.open.contains_key(&capture_nanos);

@@ -20,12 +20,8 @@ pub(super) struct ResultLines<W: Write = File> {
 
 impl ResultLines {
     pub(super) fn create(path: &Path) -> io::Result<Self> {
-        let name = path
-            .file_name()
-            .unwrap_or_default()
-            .to_string_lossy()
-            .into_owned();
-        File::create(path).map(|file| Self::over(name, file))
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        File::create(path).map(|file| Self::over(name.into_owned(), file))
     }
 }
 

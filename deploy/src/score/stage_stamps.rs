@@ -32,27 +32,18 @@ impl StageStamps {
         stages: &[StageTiming],
     ) -> Self {
         let since = |nanos: u64| ms_between(began_nanos, nanos);
-        let took = |name: &str| {
-            stages
-                .iter()
-                .find(|timing| timing.stage == name)
-                .map(|timing| timing.nanos as f64 / 1e6)
-        };
-        let fusing: f64 = stages
-            .iter()
-            .filter(|timing| !["transport", "wait", "send"].contains(&timing.stage.as_str()))
-            .map(|timing| timing.nanos as f64 / 1e6)
-            .sum();
+        let ms = |timing: &StageTiming| timing.nanos as f64 / 1e6;
+        let took = |name: &str| stages.iter().find(|timing| timing.stage == name).map(ms);
+        let is_fusing =
+            |timing: &&StageTiming| !["transport", "wait", "send"].contains(&timing.stage.as_str());
+        let fusing: f64 = stages.iter().filter(is_fusing).map(ms).sum();
+        let before = |end: Option<f64>, stage| Some(end? - took(stage)?);
         let detected = since(detected_nanos);
         // The ego's stages follow each other without a gap: counted back from the end.
-        let fused = took("send").map(|send| detected - send);
+        let fused = before(Some(detected), "send");
         let decided = fused.map(|fused| fused - fusing);
-        let arrived = decided
-            .zip(took("wait"))
-            .map(|(decided, wait)| decided - wait);
-        let published = arrived
-            .zip(took("transport"))
-            .map(|(arrived, transport)| arrived - transport);
+        let arrived = before(decided, "wait");
+        let published = before(arrived, "transport");
         Self {
             began_nanos: Some(began_nanos),
             posed_ms: posed_nanos.map(since),

@@ -8,9 +8,6 @@ use protocol::{CavId, Truth};
 pub(crate) fn ground_truth(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> GroundTruth {
     let frames: Vec<Frame> = truth.agents.iter().map(Frame::of_truth).collect();
     let ego_index = frames.iter().position(|frame| frame.cav == *ego);
-    GroundTruth::of_tick(
-        &frames.iter().collect::<Vec<_>>(),
-        ego_index.unwrap_or(frames.len()),
-        rule,
-    )
+    let frames: Vec<&Frame> = frames.iter().collect();
+    GroundTruth::of_tick(&frames, ego_index.unwrap_or(frames.len()), rule)
 }

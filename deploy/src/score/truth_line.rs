@@ -24,7 +24,6 @@ pub struct TruthLine {
 
 impl TruthLine {
     /// The line, without its end.
-    #[must_use]
     pub fn to_json(&self) -> String {
         // Numbers, names and lists have a spelling in JSON.
         serde_json::to_string(self).unwrap_or_default()

@@ -4,13 +4,15 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use dataset::average_precision::Verdict;
 use dataset::evaluation_protocol::EvaluationProtocol;
+use nalgebra::Vector3;
+use protocol::message::AgentTruth;
 use protocol::{
     Box3d, Boxes, CavId, Descriptor, Detection, Detections, Header, Ledger, Lidar, Limits, Payload,
     Pose, PoseEstimate, StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
 };
 
 use super::judgement::{DetectionArea, Judge, Judgement};
-use super::pace_counter::{PaceCounter, ShownPace};
+use super::pace_counter::PaceCounter;
 use super::scene_frame::{
     Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate,
 };
@@ -115,10 +117,8 @@ impl FrameAssembler {
         {
             return None;
         }
-        if let Topic::Stream {
-            cav,
-            stream: Stream::Descriptor,
-        } = seen.topic
+        if let Topic::Stream { cav, stream } = seen.topic
+            && *stream == Stream::Descriptor
         {
             if let Some(Descriptor { grid, .. }) = decode(seen) {
                 self.areas.insert(cav.clone(), DetectionArea::from(&grid));
@@ -153,56 +153,40 @@ impl FrameAssembler {
         let later = self.open.split_off(&capture_nanos);
         // Older ones will have no result any more.
         let closed = std::mem::replace(&mut self.open, later);
-        let ticks = closed
-            .values()
-            .chain([&frame])
-            .filter(|frame| frame.truth.is_some());
-        ticks.for_each(|frame| {
-            self.pace
-                .tick(frame.result.as_ref().map(|(published, _)| *published))
-        });
+        for frame in closed.values().chain([&frame]) {
+            if frame.truth.is_some() {
+                let result = frame.result.as_ref();
+                self.pace.tick(result.map(|(published, _)| *published));
+            }
+        }
         self.shown_until = Some(capture_nanos);
-        let area = frame
-            .result
-            .as_ref()
-            .and_then(|(_, result)| self.areas.get(&result.ego))
-            .copied();
+        let result = frame.result();
+        let area = result.and_then(|result| self.areas.get(&result.ego).copied());
         let judgement = frame.judged(area.as_ref(), &mut self.judge);
-        let shown = frame.frame(capture_nanos, &self.ledgers, &judgement);
-        let (pace, ap_50) = (self.pace.pace(), self.judge.average_precision());
         Some(SceneFrame {
-            pace,
+            pace: self.pace.pace(),
             area,
-            ap_50,
+            ap_50: self.judge.average_precision(),
             protocol: self.judge.protocol().to_owned(),
             egos: self.egos.iter().cloned().collect(),
-            ..shown
+            ..frame.frame(capture_nanos, &self.ledgers, &judgement)
         })
     }
 
     fn keep_ledger(&mut self, seen: &ReceivedMessage<'_>) {
-        let Some(Stats {
-            process,
-            ledger,
-            stages,
-            ..
-        }) = decode(seen)
-        else {
+        let Some(stats) = decode::<Stats>(seen) else {
             return;
         };
-        let process = process.to_string();
+        let process = stats.process.to_string();
         if self.ledgers.len() < MOST_LEDGERS || self.ledgers.contains_key(&process) {
-            self.ledgers.insert(process, (ledger, stages));
+            self.ledgers.insert(process, (stats.ledger, stats.stages));
         }
     }
 
     /// Another replay of the same run begins at its own first tick, which the frames shown so far do not hide.
     fn begin_again_with(&mut self, epoch: u64) {
-        if self
-            .replay_epoch
-            .replace(epoch)
-            .is_some_and(|known| known != epoch)
-        {
+        let known = self.replay_epoch.replace(epoch);
+        if known.is_some_and(|known| known != epoch) {
             self.open.clear();
             self.shown_until = None;
         }
@@ -211,58 +195,52 @@ impl FrameAssembler {
     /// Adds a message to its scene frame; returns true if that is complete now.
     fn fill(&mut self, at: u64, seen: &ReceivedMessage<'_>) -> bool {
         let published = seen.header.stamp.publish_nanos;
-        match seen.topic {
+        let (cav, stream) = match seen.topic {
             Topic::Truth => {
                 if let Some(truth) = decode(seen) {
                     self.frame(at).truth = Some((published, truth));
                 }
+                return false;
             }
-            Topic::Stream {
-                cav,
-                stream: Stream::Detections,
-            } => {
-                self.egos.insert(cav.clone());
-                if self.ego.is_none() {
-                    self.ego = Some(cav.clone());
-                }
-                if let Some(result) = decode(seen).filter(|_| self.ego.as_ref() == Some(cav)) {
-                    self.frame(at).result = Some((published, result));
-                    return true;
-                }
-            }
-            Topic::Stream {
-                cav,
-                stream: Stream::Lidar | Stream::Preview,
-            } => {
-                if let Some(payload) = seen.payload {
-                    self.frame(at).sweeps.insert(cav.clone(), payload.to_vec());
-                }
-            }
-            Topic::Stream { cav, stream } => {
-                match stream {
-                    Stream::Pose => {
-                        if let Some(estimate) = decode(seen) {
-                            self.frame(at)
-                                .poses
-                                .insert(cav.clone(), (published, estimate));
-                        }
-                    }
-                    Stream::Boxes => {
-                        if let Some(boxes) = decode(seen) {
-                            self.frame(at).own_boxes.insert(cav.clone(), boxes);
-                        }
-                    }
-                    _ => {}
-                }
-                self.arrived(at, cav, *stream, 0, seen);
-            }
+            Topic::Stream { cav, stream } => (cav, *stream),
             Topic::Received { ego, cav, stream } => {
                 if self.ego.as_ref().is_none_or(|shown| shown == ego) {
                     self.arrived(at, cav, *stream, 2, seen);
                 }
+                return false;
             }
-            Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => {}
+            Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => {
+                return false;
+            }
+        };
+        match stream {
+            Stream::Detections => {
+                self.egos.insert(cav.clone());
+                let is_shown = self.ego.get_or_insert_with(|| cav.clone()) == cav;
+                if let Some(result) = decode(seen).filter(|_| is_shown) {
+                    self.frame(at).result = Some((published, result));
+                    return true;
+                }
+            }
+            Stream::Lidar | Stream::Preview => {
+                if let Some(payload) = seen.payload {
+                    self.frame(at).sweeps.insert(cav.clone(), payload.to_vec());
+                }
+            }
+            Stream::Pose => {
+                if let Some(estimate) = decode(seen) {
+                    let poses = &mut self.frame(at).poses;
+                    poses.insert(cav.clone(), (published, estimate));
+                }
+            }
+            Stream::Boxes => {
+                if let Some(boxes) = decode(seen) {
+                    self.frame(at).own_boxes.insert(cav.clone(), boxes);
+                }
+            }
+            _ => {}
         }
+        self.arrived(at, cav, stream, 0, seen);
         false
     }
 
@@ -282,14 +260,12 @@ impl FrameAssembler {
         let latency_ms = (seen.arrived_nanos as f64 - seen.header.stamp.publish_nanos as f64) / 1e6;
         let arrivals = &mut self.frame(at).arrivals;
         if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
-            arrivals.insert(
-                cav.clone(),
-                Arrival {
-                    rank,
-                    stream,
-                    latency_ms,
-                },
-            );
+            let arrival = Arrival {
+                rank,
+                stream,
+                latency_ms,
+            };
+            arrivals.insert(cav.clone(), arrival);
         }
     }
 
@@ -308,9 +284,13 @@ fn is_hit(verdict: Verdict) -> Option<bool> {
 }
 
 fn decode<M: Payload>(seen: &ReceivedMessage<'_>) -> Option<M> {
-    wire::decode([seen.payload?], &Limits::DEFAULT)
-        .map(|(_, message)| message)
-        .ok()
+    decoded(seen.payload?)
+}
+
+/// Content of an encoded message; `None` if it is damaged.
+pub(super) fn decoded<M: Payload>(bytes: &[u8]) -> Option<M> {
+    let (_, message) = wire::decode([bytes], &Limits::DEFAULT).ok()?;
+    Some(message)
 }
 
 impl OpenFrame {
@@ -328,102 +308,78 @@ impl OpenFrame {
         ledgers: &BTreeMap<String, (Ledger, Vec<StageSummary>)>,
         judgement: &Judgement,
     ) -> SceneFrame {
-        let result = self.result.as_ref().map(|(_, result)| result);
+        let result = self.result();
         let (vehicles, points) = self.vehicles();
         let began = self.truth.as_ref().map(|(began, _)| *began);
         let since_began_ms = |nanos: u64| began.map(|began| (nanos as f64 - began as f64) / 1e6);
-        let posed = result
-            .and_then(|result| self.poses.get(&result.ego))
-            .map(|(posed, _)| *posed);
+        let done = self.result.as_ref().map(|(done, _)| *done);
+        let posed = result.and_then(|result| self.poses.get(&result.ego));
+        let process = |(process, (_, stages)): (&String, &(Ledger, Vec<StageSummary>))| Process {
+            process: process.clone(),
+            stages: stages.clone(),
+        };
         SceneFrame {
             capture_s: capture_nanos as f64 / 1e9,
             tick: self.truth.as_ref().map(|(_, truth)| truth.tick),
             ego: result.map(|result| result.ego.clone()),
             method: result.map(|result| result.method.clone()),
-            latency_ms: self
-                .result
-                .as_ref()
-                .and_then(|(done, _)| since_began_ms(*done)),
-            swept_ms: None,
-            posed_ms: posed.and_then(since_began_ms),
+            latency_ms: done.and_then(since_began_ms),
+            posed_ms: posed.and_then(|(posed, _)| since_began_ms(*posed)),
             vehicles,
             truth: self.true_boxes(judgement),
             detections: self.detections(judgement),
             single: self.single(),
             links: self.links(),
             stages: result.map_or(Vec::new(), |result| result.stages.clone()),
-            pace: ShownPace::default(),
-            egos: Vec::new(),
-            area: None,
-            ap_50: None,
-            protocol: String::new(),
-            processes: ledgers
-                .iter()
-                .map(|(process, (_, stages))| Process {
-                    process: process.clone(),
-                    stages: stages.clone(),
-                })
-                .collect(),
+            processes: ledgers.iter().map(process).collect(),
             messages: messages(ledgers.values().map(|(ledger, _)| ledger)),
             points,
+            ..SceneFrame::default()
         }
+    }
+
+    fn result(&self) -> Option<&Detections> {
+        self.result.as_ref().map(|(_, result)| result)
+    }
+
+    fn true_agents(&self) -> impl Iterator<Item = &AgentTruth> {
+        self.truth.iter().flat_map(|(_, truth)| &truth.agents)
+    }
+
+    /// True pose of a vehicle's LiDAR.
+    fn true_pose(&self, cav: &CavId) -> Option<&Pose> {
+        let agent = self.true_agents().find(|agent| agent.cav == *cav);
+        agent.map(|agent| &agent.world_from_lidar)
     }
 
     /// Every vehicle, the ego first, and their points.
     fn vehicles(&self) -> (Vec<Vehicle>, Vec<u8>) {
-        let ego = self.result.as_ref().map(|(_, result)| &result.ego);
-        let in_truth = self
-            .truth
-            .iter()
-            .flat_map(|(_, truth)| truth.agents.iter().map(|agent| &agent.cav));
+        let ego = self.result().map(|result| &result.ego);
+        let in_truth = self.true_agents().map(|agent| &agent.cav);
+        let with_messages = self.poses.keys().chain(self.sweeps.keys());
         let mut cavs: Vec<&CavId> = Vec::new();
-        for cav in ego
-            .into_iter()
-            .chain(in_truth)
-            .chain(self.poses.keys())
-            .chain(self.sweeps.keys())
-        {
+        for cav in ego.into_iter().chain(in_truth).chain(with_messages) {
             if !cavs.contains(&cav) {
                 cavs.push(cav);
             }
         }
         let mut points = Vec::new();
-        let vehicles = cavs
-            .into_iter()
-            .map(|cav| self.vehicle(cav, &mut points))
-            .collect();
-        (vehicles, points)
+        let vehicles = { cavs.into_iter() }.map(|cav| self.vehicle(cav, &mut points));
+        (vehicles.collect(), points)
     }
 
     fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> Vehicle {
-        let agents = self.truth.iter().flat_map(|(_, truth)| &truth.agents);
-        let truth = agents
-            .into_iter()
-            .find(|agent| agent.cav == *cav)
-            .map(|agent| &agent.world_from_lidar);
-        let estimate = self
-            .poses
-            .get(cav)
+        let truth = self.true_pose(cav);
+        let own_result = self.result().filter(|result| result.ego == *cav);
+        let estimate = { self.poses.get(cav) }
             .map(|(_, estimate)| estimate)
-            .or_else(|| {
-                self.result
-                    .as_ref()
-                    .map(|(_, result)| result)
-                    .filter(|result| result.ego == *cav)
-                    .map(|result| &result.pose)
-            });
+            .or(own_result.map(|result| &result.pose));
         let pose = estimate.and_then(PoseEstimate::world_from_cav);
         let sweep = self.sweep(cav);
         points.extend(&sweep);
-        let distance = |found: &Pose, truth: &Pose| {
-            found
-                .translation_m
-                .iter()
-                .zip(truth.translation_m)
-                .map(|(a, b)| (a - b).powi(2))
-                .sum::<f64>()
-                .sqrt()
-        };
+        let position = |pose: &Pose| Vector3::from(pose.translation_m);
+        let distance_m =
+            |(found, truth): (&Pose, &Pose)| (position(found) - position(truth)).norm();
         Vehicle {
             cav: cav.clone(),
             pose: pose.map(Planar::of),
@@ -436,56 +392,46 @@ impl OpenFrame {
                 _ => None,
             },
             truth: truth.map(Planar::of),
-            error_m: pose.zip(truth).map(|(found, truth)| distance(found, truth)),
+            error_m: pose.zip(truth).map(distance_m),
             world_from_lidar: pose.or(truth).copied(),
             points: sweep.len() / POINT_BYTES,
         }
     }
 
     fn sweep(&self, cav: &CavId) -> Vec<u8> {
-        let payload = self.sweeps.get(cav).map(Vec::as_slice);
-        let decoded =
-            payload.and_then(|payload| wire::decode::<Lidar>([payload], &Limits::DEFAULT).ok());
-        decoded.map_or(Vec::new(), |(_, Lidar { points })| decimate(&points))
+        let sweep = { self.sweeps.get(cav) }.and_then(|payload| decoded::<Lidar>(payload));
+        sweep.map_or(Vec::new(), |Lidar { points }| decimate(&points))
     }
 
     fn true_boxes(&self, judgement: &Judgement) -> Vec<ShownBox> {
         let mut objects: BTreeMap<i64, &TrueObject> = BTreeMap::new();
-        for object in self
-            .truth
-            .iter()
-            .flat_map(|(_, truth)| truth.agents.iter().flat_map(|agent| &agent.objects))
-        {
+        for object in self.true_agents().flat_map(|agent| &agent.objects) {
             objects.entry(object.id).or_insert(object);
         }
         let shown = |object: &TrueObject| ShownBox {
             id: Some(object.id),
             is_counted: judgement.found.contains_key(&object.id),
             found_score: judgement.found.get(&object.id).copied().flatten(),
-            is_hit: None,
             speed_mps: object.speed_mps,
-            box3d: Box3d {
+            class: Some(object.class.clone()),
+            ..ShownBox::of(Box3d {
                 center_m: object.world_from_object.translation_m,
                 size_m: object.size_m,
                 heading_rad: object.world_from_object.yaw_rad(),
-            },
-            score: None,
-            source: None,
-            class: Some(object.class.clone()),
+            })
         };
         objects.into_values().map(shown).collect()
     }
 
     /// The ego's detections, placed by its estimated pose.
     fn detections(&self, judgement: &Judgement) -> Vec<ShownBox> {
-        let Some((_, result)) = &self.result else {
+        let Some(result) = self.result() else {
             return Vec::new();
         };
         let mut shown = self.placed(&result.ego, &result.pose, &result.detections, None);
-        shown
-            .iter_mut()
-            .zip(&judgement.verdicts)
-            .for_each(|(shown, verdict)| shown.is_hit = is_hit(*verdict));
+        for (shown, verdict) in shown.iter_mut().zip(&judgement.verdicts) {
+            shown.is_hit = is_hit(*verdict);
+        }
         shown
     }
 
@@ -505,85 +451,57 @@ impl OpenFrame {
         found: &[Detection],
         source: Option<&CavId>,
     ) -> Vec<ShownBox> {
-        let truth = self
-            .truth
-            .iter()
-            .flat_map(|(_, truth)| &truth.agents)
-            .find(|agent| agent.cav == *cav);
-        let pose = pose
-            .world_from_cav()
-            .or(truth.map(|agent| &agent.world_from_lidar));
+        let pose = pose.world_from_cav().or(self.true_pose(cav));
         let Some(world_from_cav) = pose.map(Pose::isometry) else {
             return Vec::new();
         };
         let shown = |detection: &Detection| ShownBox {
-            box3d: detection.box3d.transformed(&world_from_cav),
             score: Some(detection.score),
             source: source.or(detection.source.as_ref()).cloned(),
-            class: None,
-            id: None,
-            is_counted: false,
-            found_score: None,
-            is_hit: None,
-            speed_mps: None,
+            ..ShownBox::of(detection.box3d.transformed(&world_from_cav))
         };
         found.iter().map(shown).collect()
     }
 
     fn links(&self) -> Vec<Link> {
-        let Some((_, result)) = &self.result else {
+        let Some(result) = self.result() else {
             return Vec::new();
         };
-        let mut links: BTreeMap<String, Link> = BTreeMap::new();
-        let to = result.ego.to_string();
-        for (cav, arrival) in self.arrivals.iter().filter(|(cav, _)| **cav != result.ego) {
-            let (latency_ms, stream) = (Some(arrival.latency_ms), Some(arrival.stream.to_string()));
-            let link = Link {
-                from: cav.to_string(),
-                to: to.clone(),
-                latency_ms,
-                stream,
-                ..Link::default()
-            };
-            links.insert(link.from.clone(), link);
-        }
-        let mut link = |cav: &CavId| {
-            let new = || Link {
-                from: cav.to_string(),
-                to: to.clone(),
-                ..Link::default()
-            };
-            links.remove(cav.as_str()).unwrap_or_else(new)
+        let new = |from: &CavId| Link {
+            from: from.to_string(),
+            to: result.ego.to_string(),
+            ..Link::default()
         };
-        let fused: Vec<Link> = result
-            .fused
-            .iter()
-            .map(|neighbour| Link {
-                wire_bytes: Some(neighbour.wire_bytes),
-                age_ms: Some(neighbour.age_nanos as f64 / 1e6),
+        let mut links: BTreeMap<&CavId, Link> = BTreeMap::new();
+        for (cav, arrival) in self.arrivals.iter().filter(|(cav, _)| **cav != result.ego) {
+            let link = Link {
+                latency_ms: Some(arrival.latency_ms),
+                stream: Some(arrival.stream.to_string()),
+                ..new(cav)
+            };
+            links.insert(cav, link);
+        }
+        let mut all = Vec::new();
+        for fused in &result.fused {
+            all.push(Link {
+                wire_bytes: Some(fused.wire_bytes),
+                age_ms: Some(fused.age_nanos as f64 / 1e6),
                 is_fused: true,
-                ..link(&neighbour.cav)
-            })
-            .collect();
-        let skipped: Vec<Link> = result
-            .skipped
-            .iter()
-            .map(|neighbour| Link {
-                skipped: neighbour.reason,
-                ..link(&neighbour.cav)
-            })
-            .collect();
-        let mut all: Vec<Link> = fused
-            .into_iter()
-            .chain(skipped)
-            .chain(links.into_values())
-            .collect();
+                ..links.remove(&fused.cav).unwrap_or_else(|| new(&fused.cav))
+            });
+        }
+        for skipped in &result.skipped {
+            all.push(Link {
+                skipped: skipped.reason,
+                ..links
+                    .remove(&skipped.cav)
+                    .unwrap_or_else(|| new(&skipped.cav))
+            });
+        }
+        all.extend(links.into_values());
         for link in &mut all {
-            let Some(known) = result
-                .neighbours
-                .iter()
-                .find(|state| state.cav.as_str() == link.from)
-            else {
+            let mut neighbours = result.neighbours.iter();
+            let Some(known) = neighbours.find(|known| known.cav.as_str() == link.from) else {
                 continue;
             };
             (link.trust, link.misbehaviour) = (known.trust, known.misbehaviour);

@@ -36,19 +36,11 @@ impl HeatMap {
     /// The map as sent to the page: a JSON document after its length (32 bits, little-endian), then one byte per cell,
     /// row by row.
     pub(super) fn to_bytes(&self) -> Vec<u8> {
-        let Self {
-            capture_s,
-            grid,
-            channels,
-            levels,
-        } = self;
-        let json = json!({"capture_s": capture_s, "channels": channels, "grid": grid}).to_string();
-        [
-            (json.len() as u32).to_le_bytes().as_slice(),
-            json.as_bytes(),
-            levels,
-        ]
-        .concat()
+        let head =
+            json!({"capture_s": self.capture_s, "channels": self.channels, "grid": self.grid});
+        let head = head.to_string();
+        let length = (head.len() as u32).to_le_bytes();
+        [&length, head.as_bytes(), &self.levels].concat()
     }
 }
 
@@ -57,9 +49,9 @@ fn activations(features: &BevFeatures) -> Vec<f32> {
     let cells = features.grid.cells().max(1);
     let mut sums = vec![0.0_f32; cells];
     for plane in features.values.chunks_exact(cells) {
-        sums.iter_mut()
-            .zip(plane)
-            .for_each(|(sum, value)| *sum += value.abs());
+        for (sum, value) in sums.iter_mut().zip(plane) {
+            *sum += value.abs();
+        }
     }
     let channels = features.channels.max(1) as f32;
     sums.iter_mut().for_each(|sum| *sum /= channels);
@@ -68,18 +60,13 @@ fn activations(features: &BevFeatures) -> Vec<f32> {
 
 /// Activations between those of empty ground and the brightest as 0..=255.
 fn levels(activations: &[f32]) -> Vec<u8> {
-    let mut sorted: Vec<f32> = activations
-        .iter()
-        .copied()
-        .filter(|value| value.is_finite())
-        .collect();
+    let mut sorted = activations.to_vec();
+    sorted.retain(|value| value.is_finite());
     sorted.sort_by(f32::total_cmp);
-    let at = |share: f64| {
-        sorted
-            .get((share * sorted.len().saturating_sub(1) as f64).round() as usize)
-            .copied()
-    };
-    let (empty, brightest) = (at(EMPTY).unwrap_or(0.0), at(BRIGHTEST).unwrap_or(0.0));
+    let [empty, brightest] = [EMPTY, BRIGHTEST].map(|share| {
+        let rank = (share * sorted.len().saturating_sub(1) as f64).round();
+        sorted.get(rank as usize).copied().unwrap_or(0.0)
+    });
     let range = (brightest - empty).max(f32::MIN_POSITIVE);
     activations
         .iter()

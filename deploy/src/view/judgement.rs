@@ -50,10 +50,8 @@ impl Judgement {
         };
         let matches = shown().filter(|(_, verdict)| matches!(verdict, Verdict::Match(_)));
         let wrong = shown().filter(|(_, verdict)| **verdict == Verdict::FalsePositive);
-        let missed = self
-            .found
-            .values()
-            .filter(|score| score.is_none_or(|score| score < least_score));
+        let is_missed = |score: &&Option<f32>| score.is_none_or(|score| score < least_score);
+        let missed = self.found.values().filter(is_missed);
         [matches.count(), wrong.count(), missed.count()]
     }
 }
@@ -113,11 +111,8 @@ impl Judge {
         // The scorer has one threshold.
         let verdicts = self.scorer.add(&result.detections, &objects);
         let verdicts = verdicts.into_iter().next().unwrap_or_default();
-        let mut found: BTreeMap<i64, Option<f32>> = objects
-            .objects
-            .iter()
-            .map(|object| (object.id, None))
-            .collect();
+        let unfound = objects.objects.iter().map(|object| (object.id, None));
+        let mut found: BTreeMap<i64, Option<f32>> = unfound.collect();
         for (detection, verdict) in result.detections.iter().zip(&verdicts) {
             if let Verdict::Match(index) = verdict
                 && let Some(object) = objects.objects.get(*index)
@@ -131,11 +126,9 @@ impl Judge {
     /// Average precision of the frames so far; `None` without an object.
     pub(super) fn average_precision(&self) -> Option<f64> {
         let tally = self.scorer.tallies().first()?;
-        let order =
-            { self.protocol.as_ref() }.map_or(ApOrder::Global, |protocol| protocol.ap_order);
-        let ordering = match order {
-            ApOrder::Global => Ordering::Global,
-            ApOrder::Frame => Ordering::Frame,
+        let ordering = match self.protocol.as_ref().map(|protocol| protocol.ap_order) {
+            None | Some(ApOrder::Global) => Ordering::Global,
+            Some(ApOrder::Frame) => Ordering::Frame,
         };
         (tally.objects > 0).then(|| tally.curve(ordering).average_precision)
     }

@@ -54,10 +54,7 @@ impl LinkSeries {
                 } if to == ego => (cav, *stream, false, true),
                 _ => continue,
             };
-            if !matches!(
-                stream,
-                Stream::Pose | Stream::Bev | Stream::Boxes | Stream::Points
-            ) {
+            if ![Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points].contains(&stream) {
                 continue;
             }
             let link = series.links.entry(cav.clone()).or_default();
@@ -67,10 +64,8 @@ impl LinkSeries {
             }
             if is_arrived {
                 let transit_ms = (entry.arrived_nanos as f64 - stamp.publish_nanos as f64) / 1e6;
-                let longest = link
-                    .transit_ms
-                    .entry(stamp.capture_nanos)
-                    .or_insert(transit_ms);
+                let longest = link.transit_ms.entry(stamp.capture_nanos);
+                let longest = longest.or_insert(transit_ms);
                 *longest = longest.max(transit_ms);
                 link.published.push((stamp.publish_nanos, bytes));
                 link.arrived.push((entry.arrived_nanos, bytes));
@@ -113,10 +108,7 @@ fn accumulate(messages: &mut [(u64, u64)]) {
 /// Sum of the bytes until a time, which counts.
 fn until(accumulated: &[(u64, u64)], nanos: u64) -> u64 {
     let count = accumulated.partition_point(|(at, _)| *at <= nanos);
-    count
-        .checked_sub(1)
-        .and_then(|last| accumulated.get(last))
-        .map_or(0, |(_, sum)| *sum)
+    accumulated[..count].last().map_or(0, |(_, sum)| *sum)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -12,15 +12,16 @@ use bytes::Bytes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use futures_util::{Stream as Pieces, stream};
 use protocol::{
-    Camera, CavId, ImageFormat, Key, KeyExpr, Kind, Limits, ProcessId, RunId, Stats, Stream, Topic,
-    Verb, wire,
+    Camera, CavId, ImageFormat, Key, KeyExpr, Kind, ProcessId, RunId, Stats, Stream, Topic, Verb,
+    wire,
 };
 use serde::Serialize;
+use support::sync::lock;
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 use zenoh::Wait;
 
-use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::frame_assembler::{FrameAssembler, ReceivedMessage, decoded};
 use super::on_demand::OnDemand;
 
 /// Largest number of waiting messages of one key.
@@ -50,18 +51,23 @@ type NewestImages = OnDemand<(CavId, u8), (ImageFormat, Bytes)>;
 type NewestMaps = OnDemand<CavId, Bytes>;
 /// Newest scene frame, after its length, of each ego that a page shows; of no name: the first with results. Empty: none
 /// so far.
-type NewestFrames = Mutex<BTreeMap<Option<CavId>, Arc<watch::Sender<Bytes>>>>;
+type NewestFrames = BTreeMap<Option<CavId>, watch::Sender<Bytes>>;
 
 /// Newest scene frame of a run, for any number of pages. The run is subscribed to only while a page is open, so that a
 /// closed page costs nothing. Points are those of previews, which are sent only while they have a subscriber.
 pub struct LiveRun {
-    newest: Arc<NewestFrames>,
     run: RunId,
-    activity: Arc<Mutex<RunActivity>>,
-    images: Arc<NewestImages>,
-    maps: Arc<NewestMaps>,
-    ending: Arc<AtomicBool>,
+    shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
+}
+
+/// What the thread writes and pages read.
+struct Shared {
+    newest: Mutex<NewestFrames>,
+    activity: Mutex<RunActivity>,
+    images: NewestImages,
+    maps: NewestMaps,
+    ending: AtomicBool,
 }
 
 /// Status of a live run: time since its last message, end, connection.
@@ -100,23 +106,19 @@ impl LiveRun {
     /// [`BusError`] when the system gives no thread.
     pub fn start(bus: Bus, protocol: Option<EvaluationProtocol>) -> Result<Self, BusError> {
         let run = bus.identity().run.clone();
-        let newest = Arc::<NewestFrames>::default();
-        let ending = Arc::<AtomicBool>::default();
-        let activity = Arc::default();
-        let (images, maps) = (
-            Arc::new(OnDemand::new(MOST_IMAGES)),
-            Arc::new(OnDemand::new(MOST_MAPS)),
-        );
+        let shared = Arc::new(Shared {
+            newest: Mutex::default(),
+            activity: Mutex::default(),
+            images: OnDemand::new(MOST_IMAGES),
+            maps: OnDemand::new(MOST_MAPS),
+            ending: AtomicBool::new(false),
+        });
         let listener = Listener {
             bus,
             run: run.clone(),
-            newest: Arc::clone(&newest),
-            ending: Arc::clone(&ending),
+            shared: Arc::clone(&shared),
             assembly: FrameAssembler::new(protocol, BTreeMap::new()),
             others: BTreeMap::new(),
-            activity: Arc::clone(&activity),
-            images: Arc::clone(&images),
-            maps: Arc::clone(&maps),
         };
         let thread = thread::Builder::new()
             .name("view".into())
@@ -126,25 +128,20 @@ impl LiveRun {
                 cause,
             })?;
         Ok(Self {
-            newest,
             run,
-            activity,
-            images,
-            maps,
-            ending,
+            shared,
             thread: Some(thread),
         })
     }
 
     /// Name of the run.
-    #[must_use]
     pub fn name(&self) -> &str {
         self.run.as_str()
     }
 
     /// State of the run.
     pub(super) fn status(&self) -> RunStatus {
-        let activity = lock(&self.activity);
+        let activity = lock(&self.shared.activity);
         RunStatus {
             silent_s: activity.last_message.map(|at| at.elapsed().as_secs_f64()),
             unanswered_s: activity.answered.map(|at| at.elapsed().as_secs_f64()),
@@ -153,27 +150,25 @@ impl LiveRun {
                 .collect(),
             is_over: activity.is_over,
             has_router: activity.has_router,
-            images_left_out: self.images.left_out(),
+            images_left_out: self.shared.images.left_out(),
         }
     }
 
     /// Newest images of the cameras.
     pub(super) fn images(&self) -> &NewestImages {
-        &self.images
+        &self.shared.images
     }
 
     /// Newest feature maps of the vehicles.
     pub(super) fn maps(&self) -> &NewestMaps {
-        &self.maps
+        &self.shared.maps
     }
 
     /// Number of open pages.
     #[cfg(test)]
     pub(crate) fn watchers(&self) -> usize {
-        lock(&self.newest)
-            .values()
-            .map(|newest| newest.receiver_count())
-            .sum()
+        let newest = lock(&self.shared.newest);
+        newest.values().map(watch::Sender::receiver_count).sum()
     }
 
     /// Scene frames of an ego (`None`: the first with results) for one page, each after its length (32 bits,
@@ -185,44 +180,38 @@ impl LiveRun {
         ego: Option<CavId>,
     ) -> impl Pieces<Item = Bytes> + Send + use<> {
         let newest = self.subscribe(ego);
-        stream::unfold(
-            (newest, limit, Duration::ZERO),
-            |(mut newest, left, pause)| async move {
-                if left == Some(0) {
-                    return None;
+        let begun = (newest, limit, Duration::ZERO);
+        stream::unfold(begun, |(mut newest, left, pause)| async move {
+            if left == Some(0) {
+                return None;
+            }
+            sleep(pause).await;
+            match timeout(HEARTBEAT, newest.changed()).await {
+                Err(_) => {
+                    let nothing_new = Bytes::from_static(&NOTHING_NEW);
+                    Some((nothing_new, (newest, left, Duration::ZERO)))
                 }
-                sleep(pause).await;
-                match timeout(HEARTBEAT, newest.changed()).await {
-                    Err(_) => Some((
-                        Bytes::from_static(&NOTHING_NEW),
-                        (newest, left, Duration::ZERO),
-                    )),
-                    Ok(Err(_)) => None,
-                    Ok(Ok(())) => {
-                        let moment = newest.borrow_and_update().clone();
-                        Some((moment, (newest, left.map(|left| left - 1), SHORTEST_PERIOD)))
-                    }
+                Ok(Err(_)) => None,
+                Ok(Ok(())) => {
+                    let frame = newest.borrow_and_update().clone();
+                    Some((frame, (newest, left.map(|left| left - 1), SHORTEST_PERIOD)))
                 }
-            },
-        )
+            }
+        })
     }
 
     /// Beyond [`MOST_EGOS`], those of the first ego with results.
     fn subscribe(&self, ego: Option<CavId>) -> watch::Receiver<Bytes> {
-        let mut newest = lock(&self.newest);
+        let mut newest = lock(&self.shared.newest);
         let has_room = newest.len() <= MOST_EGOS || newest.contains_key(&ego);
         let ego = ego.filter(|_| has_room);
         newest.entry(ego).or_default().subscribe()
     }
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl Drop for LiveRun {
     fn drop(&mut self) {
-        self.ending.store(true, Ordering::Relaxed);
+        self.shared.ending.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
         {
@@ -235,15 +224,11 @@ impl Drop for LiveRun {
 struct Listener {
     bus: Bus,
     run: RunId,
-    newest: Arc<NewestFrames>,
-    ending: Arc<AtomicBool>,
+    shared: Arc<Shared>,
     /// Scene frames of the first ego with results.
     assembly: FrameAssembler,
     /// Scene frames of the egos that pages name.
     others: BTreeMap<CavId, FrameAssembler>,
-    activity: Arc<Mutex<RunActivity>>,
-    images: Arc<NewestImages>,
-    maps: Arc<NewestMaps>,
 }
 
 /// Subscriptions while a page is open.
@@ -265,8 +250,8 @@ impl Subscriptions {
             KeyExpr::received_by_anyone(run, Stream::Pose),
             KeyExpr::truth(run),
             KeyExpr::stats(run),
+            KeyExpr::control(run),
         ]);
-        selectors.push(KeyExpr::control(run));
         let previews = bus.tap(&[KeyExpr::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
         Ok(Self {
             previews,
@@ -277,19 +262,17 @@ impl Subscriptions {
 
 impl Listener {
     fn run(mut self) {
-        let mut ears: Option<Subscriptions> = None;
-        let mut cameras: Option<PassiveSubscriber> = None;
-        let mut maps = None;
-        while !self.ending.load(Ordering::Relaxed) {
+        let (mut subscriptions, mut cameras, mut maps) = (None, None, None);
+        while !self.shared.ending.load(Ordering::Relaxed) {
             self.watch_router();
             if !self.is_watched() {
-                (ears, cameras, maps) = (None, None, None);
+                (subscriptions, cameras, maps) = (None, None, None);
                 thread::sleep(CHECK_PERIOD);
                 continue;
             }
-            let Some(Subscriptions { previews, rest }) = &ears else {
+            let Some(Subscriptions { previews, rest }) = &subscriptions else {
                 match Subscriptions::open(&self.bus, &self.run) {
-                    Ok(opened) => ears = Some(opened),
+                    Ok(opened) => subscriptions = Some(opened),
                     Err(error) => {
                         tracing::error!("nothing is shown: {error}");
                         thread::sleep(HEARTBEAT);
@@ -307,104 +290,82 @@ impl Listener {
                 self.take(&message);
             }
         }
-        drop(ears);
+        drop(subscriptions);
         if let Err(overdue) = self.bus.leave(Duration::from_millis(500)) {
             tracing::warn!("{overdue}");
         }
     }
 
     fn watch_router(&self) {
-        let has_router = self
-            .bus
-            .session()
-            .info()
-            .routers_zid()
-            .wait()
-            .next()
-            .is_some();
-        lock(&self.activity).has_router = has_router;
+        let mut routers = self.bus.session().info().routers_zid().wait();
+        lock(&self.shared.activity).has_router = routers.next().is_some();
     }
 
     /// Receives images only while a page shows them: they are the largest stream after sweeps.
     fn follow_cameras(&self, cameras: &mut Option<PassiveSubscriber>) {
-        if self.images.wanted().is_empty() {
+        if self.shared.images.wanted().is_empty() {
             *cameras = None;
             return;
         }
         if cameras.is_none() {
-            match self.bus.tap(&[KeyExpr::cameras(&self.run)], PREVIEW_PLACES) {
-                Ok(opened) => *cameras = Some(opened),
-                Err(error) => tracing::error!("no images are shown: {error}"),
-            }
+            *cameras = self.open(&[KeyExpr::cameras(&self.run)], "images");
         }
         let Some(cameras) = cameras else { return };
         while let Pop::Item(_, message) = cameras.take(Some(Instant::now())) {
-            let Topic::Stream {
-                cav,
-                stream: Stream::Camera(number),
-            } = &message.key.topic
-            else {
-                continue;
-            };
-            let Ok((_, Camera { metadata, image })) =
-                wire::decode::<Camera>([message.bytes().as_ref()], &Limits::DEFAULT)
-            else {
-                continue;
-            };
-            self.images
-                .keep((cav.clone(), *number), (metadata.format, image.into()));
+            if let Topic::Stream { cav, stream } = &message.key.topic
+                && let Stream::Camera(number) = stream
+                && let Some(Camera { metadata, image }) = decoded(&message.bytes())
+            {
+                let image = (metadata.format, image.into());
+                self.shared.images.keep((cav.clone(), *number), image);
+            }
         }
     }
 
     /// Receives the feature maps of the vehicles of which a page shows one.
     fn follow_maps(&self, maps: &mut Option<(BTreeSet<CavId>, PassiveSubscriber)>) {
-        let wanted = self.maps.wanted();
-        if maps
-            .as_ref()
-            .is_some_and(|(subscribed, _)| *subscribed != wanted)
-        {
-            *maps = None;
-        }
+        let wanted = self.shared.maps.wanted();
+        maps.take_if(|(subscribed, _)| *subscribed != wanted);
         if wanted.is_empty() {
             return;
         }
         if maps.is_none() {
-            let selectors: Vec<KeyExpr> = wanted
-                .iter()
-                .map(|cav| KeyExpr::one(&Key::stream(&self.run, cav, Stream::Bev)))
-                .collect();
-            match self.bus.tap(&selectors, PREVIEW_PLACES) {
-                Ok(opened) => *maps = Some((wanted, opened)),
-                Err(error) => tracing::error!("no feature maps are shown: {error}"),
-            }
+            let one = |cav| KeyExpr::one(&Key::stream(&self.run, cav, Stream::Bev));
+            let selectors: Vec<KeyExpr> = wanted.iter().map(one).collect();
+            let opened = self.open(&selectors, "feature maps");
+            *maps = opened.map(|opened| (wanted, opened));
         }
         let Some((_, maps)) = maps else { return };
         while let Pop::Item(_, message) = maps.take(Some(Instant::now())) {
-            if let Topic::Stream {
-                cav,
-                stream: Stream::Bev,
-            } = &message.key.topic
+            if let Topic::Stream { cav, stream } = &message.key.topic
+                && *stream == Stream::Bev
             {
-                self.maps
-                    .keep(cav.clone(), Bytes::copy_from_slice(&message.bytes()));
+                let map = Bytes::copy_from_slice(&message.bytes());
+                self.shared.maps.keep(cav.clone(), map);
             }
         }
     }
 
+    fn open(&self, selectors: &[KeyExpr], what: &str) -> Option<PassiveSubscriber> {
+        let opened = self.bus.tap(selectors, PREVIEW_PLACES);
+        opened
+            .inspect_err(|error| tracing::error!("no {what} are shown: {error}"))
+            .ok()
+    }
+
     fn is_watched(&self) -> bool {
-        lock(&self.newest)
-            .values()
-            .any(|newest| newest.receiver_count() > 0)
+        let newest = lock(&self.shared.newest);
+        newest.values().any(|newest| newest.receiver_count() > 0)
     }
 
     /// Reports of processes are no activity: a viewer reports too, for as long as its page is open.
     fn note(&self, topic: &Topic, bytes: &[u8]) {
-        let mut activity = lock(&self.activity);
+        let mut activity = lock(&self.shared.activity);
         if let Topic::Stats(name) = topic {
-            let report = wire::decode::<Stats>([bytes], &Limits::DEFAULT);
+            let report = decoded::<Stats>(bytes);
             let known = &mut activity.problems;
             let has_room = known.len() < MAX_REPORTERS || known.contains_key(name);
-            if let Ok((_, report)) = report
+            if let Some(report) = report
                 && has_room
                 && report.process == *name
             {
@@ -415,14 +376,10 @@ impl Listener {
         let now = Instant::now();
         activity.last_message = Some(now);
         activity.answered.get_or_insert(now);
-        if let Topic::Stream {
-            stream: Stream::Detections,
-            ..
-        } = topic
-        {
-            activity.answered = Some(now);
-        }
         match topic {
+            Topic::Stream { stream, .. } if *stream == Stream::Detections => {
+                activity.answered = Some(now);
+            }
             Topic::Control(Verb::End) => activity.is_over = true,
             Topic::Truth => activity.is_over = false,
             _ => {}
@@ -439,14 +396,13 @@ impl Listener {
         if header.kind == Kind::Control {
             return;
         }
-        let (arrived_nanos, payload) = (message.arrived_nanos, Some(bytes.as_ref()));
         let seen = ReceivedMessage {
             topic,
             header: &header,
-            arrived_nanos,
-            payload,
+            arrived_nanos: message.arrived_nanos,
+            payload: Some(bytes.as_ref()),
         };
-        let mut newest = lock(&self.newest);
+        let mut newest = lock(&self.shared.newest);
         newest.retain(|ego, frames| ego.is_none() || frames.receiver_count() > 0);
         self.others
             .retain(|ego, _| newest.contains_key(&Some(ego.clone())));

@@ -1,8 +1,10 @@
 //! Store of the newest values of a live run that a page asks for one by one: images, feature maps.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
+
+use support::sync::lock;
 
 /// Time after the last request until which values are received.
 const WANTED: Duration = Duration::from_secs(3);
@@ -42,7 +44,7 @@ impl<K: Ord + Clone, V: Clone> OnDemand<K, V> {
 
     /// The newest value of a key; from now on values are wanted.
     pub(super) fn get(&self, key: &K) -> Option<V> {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         if state.asked.len() < self.most || state.asked.contains_key(key) {
             state.asked.insert(key.clone(), Instant::now());
         }
@@ -51,7 +53,7 @@ impl<K: Ord + Clone, V: Clone> OnDemand<K, V> {
 
     /// Keys that pages have asked for lately; when there are none, the values that are kept are forgotten.
     pub(super) fn wanted(&self) -> BTreeSet<K> {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         state.asked.retain(|_, asked| asked.elapsed() < WANTED);
         if state.asked.is_empty() {
             state.newest.clear();
@@ -62,21 +64,17 @@ impl<K: Ord + Clone, V: Clone> OnDemand<K, V> {
 
     /// Number of keys whose values are not kept, beyond the largest number.
     pub(super) fn left_out(&self) -> usize {
-        self.lock().left_out.len()
+        lock(&self.state).left_out.len()
     }
 
     /// Keeps a value.
     pub(super) fn keep(&self, key: K, value: V) {
-        let mut state = self.lock();
+        let mut state = lock(&self.state);
         if state.newest.len() < self.most || state.newest.contains_key(&key) {
             state.newest.insert(key, value);
         } else if state.left_out.len() < MOST_LEFT_OUT {
             state.left_out.insert(key);
         }
-    }
-
-    fn lock(&self) -> MutexGuard<'_, State<K, V>> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

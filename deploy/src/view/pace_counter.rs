@@ -21,8 +21,7 @@ pub struct ShownPace {
 /// Counts ticks and detections.
 #[derive(Debug, Clone, Default)]
 pub(super) struct PaceCounter {
-    ticks: u64,
-    answered: u64,
+    counts: ShownPace,
     /// Times of publication of the last detections, nanoseconds.
     published: VecDeque<u64>,
 }
@@ -30,9 +29,9 @@ pub(super) struct PaceCounter {
 impl PaceCounter {
     /// Counts a tick; `published_nanos` is the time of publication of its detections, `None` without detections.
     pub(super) fn tick(&mut self, published_nanos: Option<u64>) {
-        self.ticks += 1;
+        self.counts.ticks += 1;
         let Some(nanos) = published_nanos else { return };
-        self.answered += 1;
+        self.counts.answered += 1;
         self.published.push_back(nanos);
         if self.published.len() > RECENT {
             self.published.pop_front();
@@ -40,15 +39,13 @@ impl PaceCounter {
     }
 
     pub(super) fn pace(&self) -> ShownPace {
-        let span = self.published.front().zip(self.published.back());
-        let seconds = span.map_or(0.0, |(first, last)| {
-            last.saturating_sub(*first) as f64 * 1e-9
-        });
+        let ends = self.published.front().zip(self.published.back());
+        let nanos = ends.map_or(0, |(first, last)| last.saturating_sub(*first));
+        let seconds = nanos as f64 * 1e-9;
         let rate_hz = (seconds > 0.0).then(|| (self.published.len() - 1) as f64 / seconds);
         ShownPace {
-            ticks: self.ticks,
-            answered: self.answered,
             rate_hz,
+            ..self.counts
         }
     }
 }

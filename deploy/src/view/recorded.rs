@@ -6,13 +6,12 @@ use std::path::{Path, PathBuf};
 use bytes::Bytes;
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::{
-    Camera, CavId, Descriptor, Detections, ImageFormat, Limits, Payload, PoseEstimate, Stream,
-    Topic, Truth, wire,
+    Camera, CavId, Descriptor, Detections, ImageFormat, Payload, PoseEstimate, Stream, Topic, Truth,
 };
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
 
-use super::frame_assembler::{FrameAssembler, ReceivedMessage};
+use super::frame_assembler::{FrameAssembler, ReceivedMessage, decoded};
 use super::heat_map::HeatMap;
 use super::judgement::{DetectionArea, Judge};
 use super::link_series::{LinkSeries, LinkTraffic};
@@ -54,7 +53,7 @@ pub struct RecordedRun {
     /// One for each ego, in the order of their first results; one for a run without results.
     timelines: Vec<Timeline>,
     /// Arrival time of each sweep at the ego's agent, if the run recorded it.
-    swept: BTreeMap<u64, u64>,
+    arrivals: BTreeMap<u64, u64>,
     /// Entries with the reports of all processes.
     stats: Vec<usize>,
     areas: BTreeMap<CavId, DetectionArea>,
@@ -120,84 +119,62 @@ impl RecordedRun {
         if recording.entries().is_empty() {
             return Err(ViewError::OtherVersion(file));
         }
-        let name = recording
-            .entries()
-            .first()
-            .map_or(String::new(), |entry| entry.key.run.to_string());
+        let first = recording.entries().first();
+        let name = first.map_or(String::new(), |entry| entry.key.run.to_string());
         let mut moments = BTreeMap::<u64, Vec<usize>>::new();
         let (mut stats, mut areas) = (Vec::new(), BTreeMap::new());
         for (index, entry) in recording.entries().iter().enumerate() {
             match &entry.key.topic {
                 Topic::Stats(_) => stats.push(index),
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Descriptor,
-                } => {
-                    let bytes = recording.read(entry)?;
-                    if let Ok((_, descriptor)) =
-                        wire::decode::<Descriptor>([bytes.as_slice()], &Limits::DEFAULT)
-                    {
+                Topic::Stream { cav, stream } if *stream == Stream::Descriptor => {
+                    if let Some(descriptor) = decoded::<Descriptor>(&recording.read(entry)?) {
                         areas.insert(cav.clone(), DetectionArea::from(&descriptor.grid));
                     }
                 }
-                Topic::Received {
-                    stream: Stream::Descriptor,
-                    ..
-                } => {}
+                Topic::Received { stream, .. } if *stream == Stream::Descriptor => {}
                 Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => {
-                    moments
-                        .entry(entry.header.stamp.capture_nanos)
-                        .or_default()
-                        .push(index);
+                    let capture_nanos = entry.header.stamp.capture_nanos;
+                    moments.entry(capture_nanos).or_default().push(index);
                 }
                 Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => {}
             }
         }
-        let swept = support::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
+        let arrivals =
+            support::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
         let mut run = Self {
             recording,
             name,
             moments: Vec::new(),
             timelines: Vec::new(),
-            swept,
+            arrivals,
             stats,
             areas,
             protocol: { file.parent() }.and_then(protocol_of),
         };
-        run.moments = moments
-            .into_iter()
-            .filter_map(|(at, entries)| run.moment(at, entries))
-            .collect();
+        let moment = |(at, entries)| run.moment(at, entries);
+        run.moments = moments.into_iter().filter_map(moment).collect();
         if run.moments.is_empty() {
             return Err(ViewError::Empty(file));
         }
         let egos = run.egos();
-        let shown = if egos.is_empty() {
-            vec![None]
-        } else {
-            egos.into_iter().map(Some).collect()
-        };
-        run.timelines = shown
-            .into_iter()
+        let no_ego = egos.is_empty().then_some(None);
+        run.timelines = { egos.into_iter().map(Some).chain(no_ego) }
             .map(|ego| run.timeline_of(ego))
             .collect::<Result<_, _>>()?;
         Ok(run)
     }
 
     /// Name of the run.
-    #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
     /// Number of scene frames.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.moments.len()
     }
 
     /// Always false: an empty recording cannot be opened.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.moments.is_empty()
     }
@@ -221,49 +198,30 @@ impl RecordedRun {
         };
         let mut assembly = FrameAssembler::new(self.protocol.clone(), self.areas.clone())
             .for_ego(timeline.ego.clone());
-        let until = moment
-            .entries
-            .iter()
-            .map(|entry| self.entry(*entry).arrived_nanos)
-            .max()
-            .unwrap_or(0);
+        let arrivals = self.entries_of(moment).map(|entry| entry.arrived_nanos);
+        let until = arrivals.max().unwrap_or(0);
         // Results come last, and complete the scene frame.
-        let (results, others): (Vec<usize>, Vec<usize>) = moment
-            .entries
-            .iter()
-            .partition(|entry| is_result(&self.entry(**entry).key.topic));
-        for number in self
-            .reports_until(until)
-            .into_iter()
-            .chain(others)
-            .chain(results)
-        {
+        let is_of_result = |entry: &&usize| is_result(&self.entry(**entry).key.topic);
+        let (results, others): (Vec<usize>, Vec<usize>) =
+            moment.entries.iter().partition(is_of_result);
+        let reports = self.reports_until(until).into_iter();
+        for number in reports.chain(others).chain(results) {
             let entry = self.entry(number);
-            let payload = if is_wanted(&entry.key.topic) {
-                Some(self.recording.read(entry)?)
-            } else {
-                None
-            };
-            let Entry {
-                key,
-                header,
-                arrived_nanos,
-                ..
-            } = entry;
-            let (topic, payload) = (&key.topic, payload.as_deref());
+            let payload = is_wanted(&entry.key.topic)
+                .then(|| self.recording.read(entry))
+                .transpose()?;
             let shown = assembly.add(&ReceivedMessage {
-                topic,
-                header,
-                arrived_nanos: *arrived_nanos,
-                payload,
+                topic: &entry.key.topic,
+                header: &entry.header,
+                arrived_nanos: entry.arrived_nanos,
+                payload: payload.as_deref(),
             });
-            if shown.is_some() {
-                return Ok(shown.map(|frame| self.complete(frame, index, timeline)));
+            if let Some(frame) = shown {
+                return Ok(Some(self.complete(frame, index, timeline)));
             }
         }
-        Ok(assembly
-            .show(moment.capture_nanos)
-            .map(|frame| self.complete(frame, index, timeline)))
+        let frame = assembly.show(moment.capture_nanos);
+        Ok(frame.map(|frame| self.complete(frame, index, timeline)))
     }
 
     /// The image of a camera at a scene frame; `None` if there is none.
@@ -276,11 +234,9 @@ impl RecordedRun {
         cav: &CavId,
         number: u8,
     ) -> Result<Option<(ImageFormat, Bytes)>, RecordingError> {
-        let Some(bytes) = self.message(index, cav, Stream::Camera(number))? else {
-            return Ok(None);
-        };
-        let decoded = wire::decode::<Camera>([bytes.as_slice()], &Limits::DEFAULT).ok();
-        Ok(decoded.map(|(_, Camera { metadata, image })| (metadata.format, image.into())))
+        let bytes = self.message(index, cav, Stream::Camera(number))?;
+        let camera = bytes.and_then(|bytes| decoded::<Camera>(&bytes));
+        Ok(camera.map(|Camera { metadata, image }| (metadata.format, image.into())))
     }
 
     /// The heat map of a vehicle's feature map at a scene frame; `None` if it published none.
@@ -292,9 +248,8 @@ impl RecordedRun {
         index: usize,
         cav: &CavId,
     ) -> Result<Option<HeatMap>, RecordingError> {
-        Ok(self
-            .message(index, cav, Stream::Bev)?
-            .and_then(|bytes| HeatMap::of(&bytes)))
+        let bytes = self.message(index, cav, Stream::Bev)?;
+        Ok(bytes.and_then(|bytes| HeatMap::of(&bytes)))
     }
 
     fn message(
@@ -303,60 +258,42 @@ impl RecordedRun {
         cav: &CavId,
         stream: Stream,
     ) -> Result<Option<Vec<u8>>, RecordingError> {
-        let topic = Topic::Stream {
-            cav: cav.clone(),
-            stream,
-        };
-        let entries = self
-            .moments
-            .get(index)
-            .into_iter()
-            .flat_map(|moment| &moment.entries);
-        let entry = entries
-            .map(|entry| self.entry(*entry))
-            .find(|entry| entry.key.topic == topic);
+        let topic = Topic::stream(cav, stream);
+        let moment = self.moments.get(index).into_iter();
+        let mut entries = moment.flat_map(|moment| self.entries_of(moment));
+        let entry = entries.find(|entry| entry.key.topic == topic);
         entry.map(|entry| self.recording.read(entry)).transpose()
     }
 
     /// Numbers of the cameras of any vehicle.
     pub(super) fn cameras(&self) -> BTreeSet<u8> {
-        let numbers = self
-            .recording
-            .entries()
-            .iter()
-            .filter_map(|entry| match entry.key.topic {
-                Topic::Stream {
-                    stream: Stream::Camera(number),
-                    ..
-                } => Some(number),
-                _ => None,
-            });
-        numbers.collect()
+        let mut numbers = BTreeSet::new();
+        for entry in self.recording.entries() {
+            if let Topic::Stream { stream, .. } = entry.key.topic
+                && let Stream::Camera(number) = stream
+            {
+                numbers.insert(number);
+            }
+        }
+        numbers
     }
 
     fn shown(&self, ego: Option<&CavId>) -> Option<&Timeline> {
-        let asked = self
-            .timelines
-            .iter()
-            .find(|timeline| ego.is_some() && timeline.ego.as_ref() == ego);
+        let mut timelines = self.timelines.iter();
+        let asked = timelines.find(|timeline| ego.is_some() && timeline.ego.as_ref() == ego);
         asked.or(self.timelines.first())
     }
 
     /// All egos, in the order of their first results.
     pub(super) fn egos(&self) -> Vec<CavId> {
         let mut egos = Vec::new();
-        for entry in self
-            .moments
-            .iter()
-            .flat_map(|moment| &moment.entries)
-            .map(|entry| self.entry(*entry))
-        {
-            match &entry.key.topic {
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Detections,
-                } if !egos.contains(cav) => egos.push(cav.clone()),
-                _ => {}
+        let moments = self.moments.iter();
+        for entry in moments.flat_map(|moment| self.entries_of(moment)) {
+            if let Topic::Stream { cav, .. } = &entry.key.topic
+                && is_result(&entry.key.topic)
+                && !egos.contains(cav)
+            {
+                egos.push(cav.clone());
             }
         }
         egos
@@ -364,16 +301,11 @@ impl RecordedRun {
 
     /// `None` if there is neither truth nor result.
     fn moment(&self, capture_nanos: u64, entries: Vec<usize>) -> Option<Moment> {
-        let topics = || entries.iter().map(|index| &self.entry(*index).key.topic);
-        if !topics().any(|topic| *topic == Topic::Truth || is_result(topic)) {
-            return None;
-        }
-        let truth = entries
-            .iter()
-            .map(|index| self.entry(*index))
-            .find(|entry| entry.key.topic == Topic::Truth);
+        let all = || entries.iter().map(|index| self.entry(*index));
+        let truth = all().find(|entry| entry.key.topic == Topic::Truth);
         let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
-        Some(Moment {
+        let is_shown = truth.is_some() || all().any(|entry| is_result(&entry.key.topic));
+        is_shown.then_some(Moment {
             capture_nanos,
             began_nanos,
             entries,
@@ -381,21 +313,16 @@ impl RecordedRun {
     }
 
     fn timeline_of(&self, ego: Option<CavId>) -> Result<Timeline, RecordingError> {
-        let links = ego
-            .as_ref()
-            .map(|ego| LinkSeries::new(self.recording.entries(), ego))
-            .unwrap_or_default();
+        let links_to = |ego| LinkSeries::new(self.recording.entries(), ego);
+        let links = ego.as_ref().map(links_to).unwrap_or_default();
         let (mut pace, mut judge) = (PaceCounter::default(), Judge::new(self.protocol.clone()));
         let mut summaries = Vec::with_capacity(self.moments.len());
         for moment in &self.moments {
             let mut summary = self.summary(moment, ego.as_ref(), &mut judge)?;
             summary.links = links.at(moment.capture_nanos, moment.began_nanos);
             if let Some(began) = moment.began_nanos {
-                pace.tick(
-                    summary
-                        .latency_ms
-                        .map(|latency_ms| began.saturating_add((latency_ms * 1e6) as u64)),
-                );
+                let done = |latency_ms| began.saturating_add((latency_ms * 1e6) as u64);
+                pace.tick(summary.latency_ms.map(done));
             }
             summaries.push(summary);
         }
@@ -408,30 +335,24 @@ impl RecordedRun {
 
     /// Adds what is known of a whole recording.
     fn complete(&self, frame: SceneFrame, index: usize, timeline: &Timeline) -> SceneFrame {
-        let moment = self.moments.get(index);
-        let swept = moment.and_then(|moment| {
-            self.swept
-                .get(&moment.capture_nanos)
-                .copied()
-                .zip(moment.began_nanos)
+        let times = self.moments.get(index).and_then(|moment| {
+            let arrived = *self.arrivals.get(&moment.capture_nanos)?;
+            Some((moment.began_nanos?, arrived))
         });
-        let swept_ms = swept.map(|(swept, began)| (swept as f64 - began as f64) / 1e6);
-        let ap_50 = timeline
-            .summaries
-            .get(index)
-            .and_then(|summary| summary.ap_50);
-        let egos = self
-            .timelines
-            .iter()
-            .filter_map(|timeline| timeline.ego.clone())
-            .collect();
+        let swept_ms = times.map(|(began, arrived)| (arrived as f64 - began as f64) / 1e6);
+        let summary = timeline.summaries.get(index);
+        let egos = { self.timelines.iter() }.filter_map(|timeline| timeline.ego.clone());
         SceneFrame {
             swept_ms,
             pace: timeline.pace.pace(),
-            ap_50,
-            egos,
+            ap_50: summary.and_then(|summary| summary.ap_50),
+            egos: egos.collect(),
             ..frame
         }
+    }
+
+    fn entries_of<'a>(&'a self, moment: &'a Moment) -> impl Iterator<Item = &'a Entry> {
+        moment.entries.iter().map(|index| self.entry(*index))
     }
 
     fn entry(&self, index: usize) -> &Entry {
@@ -441,13 +362,11 @@ impl RecordedRun {
     /// Last report of every process until `nanos`.
     fn reports_until(&self, nanos: u64) -> Vec<usize> {
         let mut last = BTreeMap::new();
-        for index in self
-            .stats
-            .iter()
-            .copied()
-            .filter(|index| self.entry(*index).arrived_nanos <= nanos)
-        {
-            last.insert(&self.entry(index).key.topic, index);
+        for &index in &self.stats {
+            let entry = self.entry(index);
+            if entry.arrived_nanos <= nanos {
+                last.insert(&entry.key.topic, index);
+            }
         }
         last.into_values().collect()
     }
@@ -458,27 +377,16 @@ impl RecordedRun {
         ego: Option<&CavId>,
         judge: &mut Judge,
     ) -> Result<MomentSummary, RecordingError> {
-        let capture_s = moment.capture_nanos as f64 / 1e9;
         let mut summary = MomentSummary {
-            capture_s,
+            capture_s: moment.capture_nanos as f64 / 1e9,
             ..MomentSummary::default()
         };
         let (mut truth, mut result) = (None, None);
-        for entry in moment.entries.iter().map(|index| self.entry(*index)) {
-            let published = entry.header.stamp.publish_nanos;
+        for entry in self.entries_of(moment) {
             match &entry.key.topic {
-                Topic::Truth => {
-                    truth = self
-                        .decoded::<Truth>(entry)?
-                        .map(|truth| (published, truth))
-                }
-                Topic::Stream {
-                    cav,
-                    stream: Stream::Detections,
-                } if Some(cav) == ego => {
-                    result = self
-                        .decoded::<Detections>(entry)?
-                        .map(|result| (published, result));
+                Topic::Truth => truth = self.published::<Truth>(entry)?,
+                topic @ Topic::Stream { cav, .. } if is_result(topic) && Some(cav) == ego => {
+                    result = self.published::<Detections>(entry)?;
                 }
                 _ => {}
             }
@@ -498,12 +406,10 @@ impl RecordedRun {
         Ok(summary)
     }
 
-    /// The content of a message; `None` if it is damaged.
-    fn decoded<M: Payload>(&self, entry: &Entry) -> Result<Option<M>, RecordingError> {
-        let bytes = self.recording.read(entry)?;
-        Ok(wire::decode([bytes.as_slice()], &Limits::DEFAULT)
-            .ok()
-            .map(|(_, message)| message))
+    /// Time of publication and content of a message; `None` if it is damaged.
+    fn published<M: Payload>(&self, entry: &Entry) -> Result<Option<(u64, M)>, RecordingError> {
+        let message = decoded(&self.recording.read(entry)?);
+        Ok(message.map(|message| (entry.header.stamp.publish_nanos, message)))
     }
 }
 
@@ -513,23 +419,14 @@ fn ego_error_m(pose: &PoseEstimate, truth: &Truth, result: &Detections) -> Optio
 }
 
 fn is_result(topic: &Topic) -> bool {
-    matches!(
-        topic,
-        Topic::Stream {
-            stream: Stream::Detections,
-            ..
-        }
-    )
+    matches!(topic, Topic::Stream { stream, .. } if *stream == Stream::Detections)
 }
 
 /// True if a message's content is shown, and not only its arrival.
 fn is_wanted(topic: &Topic) -> bool {
-    const SHOWN: [Stream; 4] = [
-        Stream::Lidar,
-        Stream::Pose,
-        Stream::Boxes,
-        Stream::Detections,
-    ];
-    matches!(topic, Topic::Truth | Topic::Stats(_))
-        || matches!(topic, Topic::Stream { stream, .. } if SHOWN.contains(stream))
+    use Stream::{Boxes, Detections, Lidar, Pose};
+    match topic {
+        Topic::Stream { stream, .. } => [Lidar, Pose, Boxes, Detections].contains(stream),
+        _ => matches!(topic, Topic::Truth | Topic::Stats(_)),
+    }
 }

@@ -186,18 +186,11 @@ impl SceneFrame {
         self.vehicles.iter().map(move |vehicle| {
             let (points, behind) = rest.split_at((vehicle.points * POINT_BYTES).min(rest.len()));
             rest = behind;
-            let metres = |bytes: &[u8]| f32::from(i16::from_le_bytes([bytes[0], bytes[1]])) / 100.0;
-            let point = |bytes: &[u8]| {
-                [
-                    metres(&bytes[..2]),
-                    metres(&bytes[2..4]),
-                    metres(&bytes[4..]),
-                ]
-            };
-            (
-                vehicle,
-                points.chunks_exact(POINT_BYTES).map(point).collect(),
-            )
+            let points = points.chunks_exact(POINT_BYTES).map(|point| {
+                let at = |axis: usize| i16::from_le_bytes([point[2 * axis], point[2 * axis + 1]]);
+                [0, 1, 2].map(|axis| f32::from(at(axis)) / 100.0)
+            });
+            (vehicle, points.collect())
         })
     }
 
@@ -205,13 +198,29 @@ impl SceneFrame {
     ///
     /// # Panics
     /// Never: every field has a spelling in JSON.
-    #[must_use]
     pub fn to_bytes(&self) -> Vec<u8> {
         let json = serde_json::to_vec(self).expect("plain structs, texts and numbers");
         let mut bytes = (json.len() as u32).to_le_bytes().to_vec();
         bytes.extend(json);
         bytes.extend(&self.points);
         bytes
+    }
+}
+
+impl ShownBox {
+    /// A box of which nothing else is known.
+    pub(super) fn of(box3d: Box3d) -> Self {
+        Self {
+            box3d,
+            score: None,
+            source: None,
+            class: None,
+            id: None,
+            speed_mps: None,
+            is_counted: false,
+            found_score: None,
+            is_hit: None,
+        }
     }
 }
 
@@ -227,17 +236,10 @@ impl Planar {
 
 fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S::Ok, S::Error> {
     let rows = |pose: &Pose| {
-        let rotation = pose.isometry().rotation.to_rotation_matrix();
-        let row = |index: usize| {
-            [
-                rotation[(index, 0)],
-                rotation[(index, 1)],
-                rotation[(index, 2)],
-                pose.translation_m[index],
-            ]
-        };
-        let ([a, b, c, d], [e, f, g, h]) = (row(0), row(1));
-        [a, b, c, d, e, f, g, h]
+        let matrix = pose.isometry().to_homogeneous();
+        [0, 1]
+            .map(|row| [0, 1, 2, 3].map(|column| matrix[(row, column)]))
+            .concat()
     };
     pose.as_ref().map(rows).serialize(serializer)
 }
@@ -245,11 +247,7 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
 /// The points of a sweep as sent to the page, evenly decimated if there are many.
 pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
     let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
-    let decimate = points.decimate(MAX_POINTS);
-    decimate
-        .xyzi
-        .iter()
-        .flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres))
-        .flatten()
-        .collect()
+    let decimated = points.decimate(MAX_POINTS);
+    let coordinates = { decimated.xyzi.iter() }.flat_map(|[x, y, z, _]| [*x, *y, *z]);
+    coordinates.flat_map(centimetres).collect()
 }

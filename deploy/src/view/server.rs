@@ -50,11 +50,10 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
         "/status" => document(&json!(run.status())),
         path => match (camera(path), mapped(path)) {
             (Some(camera), _) => image(run.images().get(&camera)),
-            (None, Some(cav)) => heat_map(
-                run.maps()
-                    .get(&cav)
-                    .and_then(|message| HeatMap::of(&message)),
-            ),
+            (None, Some(cav)) => {
+                let message = run.maps().get(&cav);
+                heat_map(message.and_then(|message| HeatMap::of(&message)))
+            }
             (None, None) => asset(request),
         },
     })
@@ -70,14 +69,10 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
         if request.path == "/run" {
             let timeline = run.timeline(ego.as_ref());
             let (egos, cameras) = (run.egos(), run.cameras());
-            let run = run.name();
-            return document(
-                &json!({"mode": "recorded", "run": run, "egos": egos, "timeline": timeline, "cameras": cameras}),
-            );
+            return document(&json!({"mode": "recorded", "run": run.name(), "egos": egos,
+                "timeline": timeline, "cameras": cameras}));
         }
-        let index = number_of("at", &request.query)
-            .and_then(|index| usize::try_from(index).ok())
-            .unwrap_or(0);
+        let index = number_of("at", &request.query).unwrap_or(0) as usize;
         if let Some((cav, number)) = camera(&request.path) {
             return run.image(index, &cav, number).map_or_else(not_found, image);
         }
@@ -88,10 +83,7 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
             return asset(request);
         };
         match index.parse().map(|index| run.frame(index, ego.as_ref())) {
-            Ok(Ok(Some(frame))) => Answer::Page {
-                content_type: BINARY,
-                body: frame.to_bytes().into(),
-            },
+            Ok(Ok(Some(frame))) => page(BINARY, frame.to_bytes()),
             Ok(Ok(None)) => {
                 Answer::NotFound(format!("there are {} moments, counted from 0", run.len()))
             }
@@ -114,11 +106,7 @@ fn mapped(path: &str) -> Option<CavId> {
 
 /// A heat map; nothing where there is none.
 fn heat_map(found: Option<HeatMap>) -> Answer {
-    let body = found.map_or(Bytes::new(), |map| map.to_bytes().into());
-    Answer::Page {
-        content_type: BINARY,
-        body,
-    }
+    page(BINARY, found.map_or(Vec::new(), |map| map.to_bytes()))
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "the error of a result")]
@@ -128,18 +116,16 @@ fn not_found(error: RecordingError) -> Answer {
 
 fn image(found: Option<(ImageFormat, Bytes)>) -> Answer {
     match found {
-        Some((ImageFormat::Png, body)) => Answer::Page {
-            content_type: "image/png",
-            body,
-        },
-        Some((ImageFormat::Jpeg, body)) => Answer::Page {
-            content_type: "image/jpeg",
-            body,
-        },
-        None => Answer::Page {
-            content_type: "image/svg+xml",
-            body: Bytes::from_static(NO_IMAGE.as_bytes()),
-        },
+        Some((ImageFormat::Png, image)) => page("image/png", image),
+        Some((ImageFormat::Jpeg, image)) => page("image/jpeg", image),
+        None => page("image/svg+xml", NO_IMAGE),
+    }
+}
+
+fn page(content_type: &'static str, body: impl Into<Bytes>) -> Answer {
+    Answer::Page {
+        content_type,
+        body: body.into(),
     }
 }
 
@@ -151,17 +137,11 @@ fn asset(request: &Request) -> Answer {
         (_, Some((_, script))) => ("text/javascript; charset=utf-8", script),
         (other, None) => return Answer::NotFound(format!("there is no {other}")),
     };
-    Answer::Page {
-        content_type,
-        body: Bytes::from_static(text.as_bytes()),
-    }
+    page(content_type, text)
 }
 
 fn document(value: &serde_json::Value) -> Answer {
-    Answer::Page {
-        content_type: "application/json",
-        body: value.to_string().into(),
-    }
+    page("application/json", value.to_string())
 }
 
 /// Number that a query has for `name`.

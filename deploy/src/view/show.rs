@@ -20,10 +20,8 @@ use super::server::serve_recorded;
 /// When the recording cannot be read, or the address cannot be listened at.
 pub fn show_recorded(recording: &Path, listen: SocketAddr) -> anyhow::Result<()> {
     let run = RecordedRun::open(recording).map_err(|error| match error {
-        ViewError::NotRecorded(_) | ViewError::OtherVersion(_) | ViewError::Empty(_) => {
-            anyhow::Error::from(BadInput::of(error))
-        }
         ViewError::Recording(_) => anyhow::Error::from(error),
+        _ => BadInput::of(error).into(),
     })?;
     output::note(format_args!("{} moments of run {}", run.len(), run.name()));
     until_stopped(listen, |address| serve_recorded(address, Arc::new(run)))
@@ -46,15 +44,11 @@ pub fn until_stopped(
         server.address()
     ));
     while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
-    warn_dropped(&server);
-    Ok(())
-}
-
-fn warn_dropped(server: &WebServer) {
     let dropped = server.readers().dropped();
     if dropped > 0 {
         output::note(format_args!(
             "{dropped} readers did not read and were dropped"
         ));
     }
+    Ok(())
 }

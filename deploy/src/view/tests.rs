@@ -352,7 +352,7 @@ fn a_recorded_run_is_shown_in_any_order() {
 }
 
 #[test]
-fn a_recording_with_nothing_to_show_says_why() {
+fn a_recording_with_nothing_to_show_is_refused_with_the_reason() {
     let all = messages(0, 0, Stream::Lidar);
     let of_another_version: Vec<_> = { all.iter().cloned() }
         .map(|(topic, mut payload)| {

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use clap::Parser;
 use ego_fuser::command_line::CommandLine as Front;
 use support::cli::exit_code;
-use support::command_line::parse_behind;
+use terminal::command_line::parse_behind;
 
 /// Training and evaluation of collaborative detection.
 #[derive(Debug, Parser)]

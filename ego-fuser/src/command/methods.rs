@@ -2,6 +2,7 @@
 
 use anyhow::Result;
 use fusion::Method;
+use serde_json::json;
 use support::output;
 
 /// Lists the collaboration methods.
@@ -16,10 +17,8 @@ impl Arguments {
     /// Prints the registry to standard output.
     pub(crate) fn run(self) -> Result<()> {
         if self.json {
-            let rows: Vec<_> = Method::ALL
-                .iter()
-                .map(|method| serde_json::json!({"method": method, "exchange": method.exchange(), "summary": method.summary()}))
-                .collect();
+            let row = |method: &Method| json!({"method": method, "exchange": method.exchange(), "summary": method.summary()});
+            let rows: Vec<_> = Method::ALL.iter().map(row).collect();
             output::line(serde_json::to_string_pretty(&rows)?)?;
         } else {
             for method in Method::ALL {

@@ -135,8 +135,7 @@ impl EgoLoop {
         let Some(newest) = self.own_nanos else {
             return Ok(capture_nanos);
         };
-        let oldest = self.frames.front();
-        let oldest = oldest.map_or(newest, |frame| frame.view.capture_nanos);
+        let oldest = { self.frames.front() }.map_or(newest, |frame| frame.view.capture_nanos);
         if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
             Err(DropReason::Future)
         } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {
@@ -149,10 +148,8 @@ impl EgoLoop {
     /// Sets the clock by the ego's own sweeps. Where the scene restarts, all state is reset.
     fn keep_time(&mut self, ego: &mut Ego, capture_nanos: u64) {
         let max_age_nanos = self.options.pairing.max_age_nanos;
-        if self
-            .own_nanos
-            .is_some_and(|own| capture_nanos.saturating_add(max_age_nanos) < own)
-        {
+        let latest_nanos = capture_nanos.saturating_add(max_age_nanos);
+        if self.own_nanos.is_some_and(|own| latest_nanos < own) {
             tracing::info!(capture_nanos, "the scene has restarted");
             for cav in self.pairing.cavs() {
                 let gone = self.pairing.turn_back(&cav, capture_nanos, MAX_AHEAD_NANOS);

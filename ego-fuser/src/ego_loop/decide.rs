@@ -117,8 +117,7 @@ impl EgoLoop {
             }
             Err(error) => {
                 self.report.failed += 1;
-                let first = &mut self.report.failure;
-                first.get_or_insert_with(|| error.to_string());
+                { &mut self.report.failure }.get_or_insert_with(|| error.to_string());
                 let reason = match error.is_of_frame() {
                     true => DropReason::NotFinite,
                     false => DropReason::Shape,
@@ -176,15 +175,12 @@ impl EgoLoop {
             }
             self.silence.missed(cav);
             let lost = dropped.iter().rev().find(|lost| lost.cav == *cav);
-            let reason = if self.models.is_other(cav) {
-                Some(DropReason::Shape)
-            } else {
-                lost.map(|lost| lost.reason)
+            let reason = match self.models.is_other(cav) {
+                true => Some(DropReason::Shape),
+                false => lost.map(|lost| lost.reason),
             };
-            choice.skipped.push(SkippedNeighbour {
-                cav: cav.clone(),
-                reason,
-            });
+            let cav = cav.clone();
+            choice.skipped.push(SkippedNeighbour { cav, reason });
         }
         choice
     }

@@ -52,7 +52,6 @@ pub struct LoopOptions {
 
 impl LoopOptions {
     /// Options in simulation time, with these limits.
-    #[must_use]
     pub fn stepped(settings: &EgoSettings) -> Self {
         Self {
             deadline_nanos: settings.deadline_ms.saturating_mul(1_000_000),
@@ -115,7 +114,6 @@ pub struct EgoLoop {
 
 impl EgoLoop {
     /// Loop of the vehicle `cav`, whose frames `ego` fuses, before its first input.
-    #[must_use]
     pub fn new(cav: &CavId, ego: &Ego, options: LoopOptions) -> Self {
         let stream = stream_of(ego.method().own_content());
         Self {
@@ -170,38 +168,32 @@ impl EgoLoop {
     }
 
     /// Time by which the loop has to be woken, 0 if at once; `None`: nothing waits.
-    #[must_use]
     pub fn wakes_nanos(&self) -> Option<u64> {
         let front = self.frames.front().map(|frame| self.due_nanos(frame));
         front.into_iter().chain(self.ends_nanos).min()
     }
 
     /// True after the own agent's end, when everything is decided.
-    #[must_use]
     pub fn is_finished(&self) -> bool {
         self.is_finished
     }
 
     /// Stream of the vehicles' perception that the method fuses.
-    #[must_use]
     pub fn stream(&self) -> Stream {
         self.stream
     }
 
     /// Problems of the ego: missing messages and streams, each with the time of its beginning, nanoseconds.
-    #[must_use]
     pub fn problems(&self, now_nanos: u64) -> Vec<(String, u64)> {
         self.waits.problems(now_nanos)
     }
 
     /// Summary so far.
-    #[must_use]
     pub fn report(&self) -> &LoopReport {
         &self.report
     }
 
     /// Messages of a neighbour that wait and were never used.
-    #[must_use]
     pub fn unused(&self, cav: &CavId) -> usize {
         self.pairing.unused(cav)
     }

@@ -78,58 +78,43 @@ impl Evidence {
         };
         let sender = Point2::from(ego_from_cav.translation.vector);
         let is_near = |at: &Point2<f64>| {
-            let distances = [at.coords.norm(), (at - sender).norm()];
-            distances
-                .iter()
-                .all(|distance| (OWN_BODY_M..NEAR_M).contains(distance))
+            let mut distances = [at.coords.norm(), (at - sender).norm()].into_iter();
+            distances.all(|distance| (OWN_BODY_M..NEAR_M).contains(&distance))
         };
-        let theirs_here: Vec<Point2<f64>> = theirs
-            .vehicles
-            .iter()
-            .map(|at| ego_from_cav * Point2::from(*at))
-            .collect();
-        let is_same = |one: &Point2<f64>, other: &Point2<f64>| (one - other).norm() < radius_m;
-        for at in theirs_here
-            .iter()
-            .filter(|at| at.coords.norm() >= OWN_BODY_M)
-        {
-            let is_mine = own
-                .vehicles
-                .iter()
-                .any(|other| is_same(at, &Point2::from(*other)));
-            let is_empty = own
-                .sure_at([at.x, at.y], radius_m)
-                .is_some_and(|sure| sure < EMPTY);
+        let points = |seen: &Observation| -> Vec<Point2<f64>> {
+            { seen.vehicles.iter() }
+                .map(|at| Point2::from(*at))
+                .collect()
+        };
+        let mine = points(own);
+        let theirs_here = { points(theirs).into_iter() }.map(|at| ego_from_cav * at);
+        let theirs_here: Vec<Point2<f64>> = theirs_here.collect();
+        let is_among = |at: &Point2<f64>, others: &[Point2<f64>]| {
+            others.iter().any(|other| (at - other).norm() < radius_m)
+        };
+        for at in { theirs_here.iter() }.filter(|at| at.coords.norm() >= OWN_BODY_M) {
+            let is_mine = is_among(at, &mine);
+            let sure = own.sure_at([at.x, at.y], radius_m);
+            let is_empty = sure.is_some_and(|sure| sure < EMPTY);
             match (is_near(at), is_mine) {
                 (true, true) => evidence.matched += 1,
                 (true, false) => evidence.contradicted += u32::from(is_empty),
                 (false, is_mine) => evidence.strange += u32::from(!is_mine && is_empty),
             }
         }
-        let is_missed =
-            |at: &Point2<f64>| is_near(at) && !theirs_here.iter().any(|other| is_same(at, other));
-        evidence.missed = own
-            .vehicles
-            .iter()
-            .filter(|at| is_missed(&Point2::from(**at)))
-            .count() as u32;
+        let is_missed = |at: &&Point2<f64>| is_near(at) && !is_among(at, &theirs_here);
+        evidence.missed = mine.iter().filter(is_missed).count() as u32;
         evidence
     }
 
     /// Log likelihood ratio of an honest neighbour and the most likely type of attacker, and that type; `None` without
     /// anything to compare.
     pub(super) fn judgement(&self) -> Option<(f64, MisbehaviourReason)> {
-        let elsewhere = self
-            .against_elsewhere()
-            .map(|odds| (odds, MisbehaviourReason::PositionMismatch));
-        let invention = self
-            .against_invention()
-            .map(|odds| (odds, MisbehaviourReason::GhostObjects));
-        let candidates = [elsewhere, invention, self.against_other_attacks()];
-        candidates
-            .into_iter()
-            .flatten()
-            .min_by(|(one, _), (other, _)| one.total_cmp(other))
+        use MisbehaviourReason::{GhostObjects, PositionMismatch};
+        let elsewhere = { self.against_elsewhere() }.map(|odds| (odds, PositionMismatch));
+        let invention = { self.against_invention() }.map(|odds| (odds, GhostObjects));
+        let candidates = [elsewhere, invention, self.against_other_attacks()].into_iter();
+        { candidates.flatten() }.min_by(|(one, _), (other, _)| one.total_cmp(other))
     }
 
     /// The log likelihood ratio without the type.
@@ -150,10 +135,9 @@ impl Evidence {
             return None;
         }
         let matched = [0.0, 1.5, 2.2, 2.8][self.matched.min(3) as usize];
-        let unmatched = if self.matched == 0 {
-            -0.5 * f64::from(self.contradicted.min(3))
-        } else {
-            0.0
+        let unmatched = match self.matched {
+            0 => -0.5 * f64::from(self.contradicted.min(3)),
+            _ => 0.0,
         };
         let missed = -0.3 * f64::from(self.missed.saturating_sub(1).min(4));
         Some(matched + seen.iter().sum::<f64>().clamp(-4.0, 2.0) + unmatched + missed)
@@ -173,12 +157,8 @@ impl Evidence {
             (false, true) | (true, false) => 3,
             (true, true) => 2,
         };
-        let is_too_much = self.strange >= enough;
-        let odds = odds[(self.contradicted as usize).min(odds.len() - 1)].min(if is_too_much {
-            -3.6
-        } else {
-            0.0
-        });
+        let most = if self.strange >= enough { -3.6 } else { 0.0 };
+        let odds = odds[(self.contradicted as usize).min(odds.len() - 1)].min(most);
         (odds < 0.0).then_some(odds)
     }
 
@@ -204,21 +184,11 @@ impl Evidence {
             (sure, _) if sure >= 0.25 => 1.2,
             (sure, _) if sure >= 0.15 => 0.3,
             (_, distance_m) if distance_m > 50.0 => 0.0,
-            (_, distance_m) if distance_m > NEAR_M => {
-                if blind {
-                    -0.7
-                } else {
-                    -0.3
-                }
-            }
+            (_, distance_m) if distance_m > NEAR_M && blind => -0.7,
+            (_, distance_m) if distance_m > NEAR_M => -0.3,
             (_, distance_m) if self.boxes_only && distance_m > 25.0 => -1.2,
-            _ => {
-                if blind {
-                    -3.0
-                } else {
-                    -1.5
-                }
-            }
+            _ if blind => -3.0,
+            _ => -1.5,
         }
     }
 }

@@ -89,23 +89,19 @@ pub struct Assessment {
 
 impl Assessment {
     /// True if it is left out.
-    #[must_use]
     pub fn is_out(&self) -> bool {
         self.misbehaviour.is_some()
     }
 }
 
 /// Report of the assessed neighbours, without clock data; `assessments` are the `beliefs` of an `EgoOutput`.
-#[must_use]
 pub fn neighbour_states(
     assessments: &[(usize, Assessment)],
     views: &[View],
 ) -> Vec<NeighbourState> {
     let of = |(index, view): (usize, &View)| {
-        let assessment = assessments
-            .iter()
-            .find(|(known, _)| *known == index)
-            .map(|(_, assessment)| assessment);
+        let assessment = assessments.iter().find(|(known, _)| *known == index);
+        let assessment = assessment.map(|(_, assessment)| assessment);
         NeighbourState {
             trust: assessment.map(|assessment| assessment.trust),
             misbehaviour: assessment.and_then(|assessment| assessment.misbehaviour),
@@ -143,30 +139,24 @@ impl MisbehaviourDetector {
         neighbours: &[(&View, Pose)],
         detector: &mut Detector,
     ) -> Result<Vec<Assessment>, DetectorError> {
-        self.forget_absent(
-            own.capture_nanos,
-            neighbours.iter().map(|(view, _)| &view.cav),
-        );
+        let present = neighbours.iter().map(|(view, _)| &view.cav);
+        self.forget_absent(own.capture_nanos, present);
         let mine = Observation::in_message(&own.content, detector, &self.empty)?;
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
-            all.push(Observation::in_message(
-                &view.content,
-                detector,
-                &self.empty,
-            )?);
+            let seen = Observation::in_message(&view.content, detector, &self.empty)?;
+            all.push(seen);
         }
         // A message that serves a second frame is no new evidence.
         let is_new = |view: &View| {
-            self.last_of(&view.cav)
-                .is_none_or(|(nanos, ..)| *nanos != view.capture_nanos)
+            let last = self.last_of(&view.cav);
+            last.is_none_or(|(nanos, ..)| *nanos != view.capture_nanos)
         };
-        let evidence = neighbours.iter().zip(&all);
-        let mut evidence: Vec<Option<Evidence>> = evidence
-            .map(|((view, ego_from_cav), seen)| {
-                is_new(view).then(|| self.evidence(own, &mine, view, ego_from_cav, seen))
-            })
-            .collect();
+        let mut evidence = Vec::with_capacity(neighbours.len());
+        for ((view, ego_from_cav), seen) in neighbours.iter().zip(&all) {
+            let evidence_of = || self.evidence(own, &mine, view, ego_from_cav, seen);
+            evidence.push(is_new(view).then(evidence_of));
+        }
         flag_duplicates(&mut evidence, &all);
         let mut assessments = Vec::with_capacity(neighbours.len());
         for ((view, _), evidence) in neighbours.iter().zip(evidence) {
@@ -199,19 +189,14 @@ impl MisbehaviourDetector {
     ) -> Evidence {
         let [x, y, _] = ego_from_cav.translation_m;
         let relative = Isometry2::new([x, y].into(), ego_from_cav.yaw_rad());
-        let mut evidence =
-            Evidence::between(mine, seen, &relative, view.age_nanos(own) as f64 * 1e-9);
-        let earlier = self
-            .peers
-            .iter()
-            .filter(|(cav, _)| **cav != view.cav)
-            .filter_map(|(_, peer)| peer.last.as_ref());
-        let others = earlier
-            .map(|(_, _, fingerprint)| fingerprint)
-            .chain([&mine.fingerprint]);
-        evidence.like_another = others
-            .map(|fingerprint| alike(&seen.fingerprint, fingerprint))
-            .fold(0.0, f64::max);
+        let age_s = view.age_nanos(own) as f64 * 1e-9;
+        let mut evidence = Evidence::between(mine, seen, &relative, age_s);
+        let others = self.peers.iter().filter(|(cav, _)| **cav != view.cav);
+        let earlier = others.filter_map(|(_, peer)| peer.last.as_ref());
+        let fingerprints = earlier.map(|(_, _, fingerprint)| fingerprint);
+        let likeness = { fingerprints.chain([&mine.fingerprint]) }
+            .map(|fingerprint| alike(&seen.fingerprint, fingerprint));
+        evidence.like_another = likeness.fold(0.0, f64::max);
         if let (Some((capture_nanos, before, fingerprint)), Some(now)) =
             (self.last_of(&view.cav), view.pose.world_from_cav())
         {
@@ -267,12 +252,8 @@ impl MisbehaviourDetector {
             }
         }
         let was_out = reputation.is_out;
-        reputation.is_out = reputation.log_odds
-            < if was_out {
-                take_back_above
-            } else {
-                leave_out_below
-            };
+        let threshold = [leave_out_below, take_back_above][usize::from(was_out)];
+        reputation.is_out = reputation.log_odds < threshold;
         let reason = reputation.reason;
         match (was_out, reputation.is_out) {
             (false, true) => {
@@ -293,21 +274,16 @@ impl MisbehaviourDetector {
 /// Of two neighbours with the same message, the one with the weaker evidence otherwise is the copier; both where
 /// neither has any in its favour.
 fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
-    let fits: Vec<f64> = evidence
+    let log_odds = |evidence: &Option<Evidence>| evidence.as_ref()?.log_odds();
+    let fits = evidence
         .iter()
-        .map(|evidence| {
-            evidence
-                .as_ref()
-                .and_then(Evidence::log_odds)
-                .unwrap_or(0.0)
-        })
-        .collect();
+        .map(|evidence| log_odds(evidence).unwrap_or(0.0));
+    let fits: Vec<f64> = fits.collect();
     for (index, evidence) in evidence.iter_mut().enumerate() {
         let Some(evidence) = evidence else { continue };
         for other in (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index]) {
-            evidence.like_another = evidence
-                .like_another
-                .max(alike(&all[index].fingerprint, &all[other].fingerprint));
+            let likeness = alike(&all[index].fingerprint, &all[other].fingerprint);
+            evidence.like_another = evidence.like_another.max(likeness);
         }
     }
 }

@@ -46,51 +46,35 @@ impl Observation {
         empty: &[f32],
     ) -> Result<Self, DetectorError> {
         match content {
-            Content::Features(map) => Self::in_map(
-                &detector.received(map)?,
-                map.sent.as_deref(),
-                detector,
-                empty,
-            ),
+            Content::Features(map) => {
+                let received = detector.received(map)?;
+                Self::in_map(&received, map.sent.as_deref(), detector, empty)
+            }
             Content::Boxes(found) => {
-                let at = |[x, y, _]: [f64; 3]| [x, y];
                 let evident = found.iter().filter(|found| found.score > EVIDENT);
-                Ok(Self::of_boxes(
-                    evident
-                        .map(|found| (at(found.box3d.center_m), found.score))
-                        .collect(),
-                ))
+                let boxes = evident.map(|found| {
+                    let [x, y, _] = found.box3d.center_m;
+                    ([x, y], found.score)
+                });
+                Ok(Self::of_boxes(boxes.collect()))
             }
             Content::Points(points) => {
                 let encoded = detector.encode(points)?.features;
-                let seen = Self::in_map(
-                    &detector.through_compressor(&encoded)?,
-                    None,
-                    detector,
-                    empty,
-                )?;
-                Ok(Self {
-                    is_blind: seen.vehicles.is_empty(),
-                    ..seen
-                })
+                let map = detector.through_compressor(&encoded)?;
+                let mut seen = Self::in_map(&map, None, detector, empty)?;
+                seen.is_blind = seen.vehicles.is_empty();
+                Ok(seen)
             }
         }
     }
 
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
-        let vehicles: Vec<_> = all
-            .iter()
-            .filter(|(_, score)| *score >= SURE)
-            .map(|(at_m, _)| *at_m)
-            .collect();
-        let fingerprint = all
-            .iter()
-            .flat_map(|([x, y], score)| [*x as f32, *y as f32, *score])
-            .collect();
+        let sure = all.iter().filter(|(_, score)| *score >= SURE);
+        let values = |([x, y], score): &([f64; 2], f32)| [*x as f32, *y as f32, *score];
         Self {
-            vehicles,
+            vehicles: sure.map(|(at_m, _)| *at_m).collect(),
+            fingerprint: all.iter().flat_map(values).collect(),
             sure: Sure::Boxes(all),
-            fingerprint,
             is_blind: false,
         }
     }
@@ -115,23 +99,17 @@ impl Observation {
             boxes: &boxes,
             output_from_agent: Isometry3::identity(),
         };
-        let found = postprocess(&[own], &limits)
-            .into_iter()
-            .filter_map(|found| {
-                let [x, y, _] = found.detection(None).box3d.center_m;
-                cell_of(&grid, x, y)
-                    .is_none_or(was_sent)
-                    .then_some(([x, y], found.score))
-            });
-        let found: Vec<_> = found.collect();
+        let mut found = Vec::new();
+        for candidate in postprocess(&[own], &limits) {
+            let [x, y, _] = candidate.detection(None).box3d.center_m;
+            if cell_of(&grid, x, y).is_none_or(was_sent) {
+                found.push(([x, y], candidate.score));
+            }
+        }
         let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
-        let fingerprint = values
-            .iter()
-            .zip(empty)
-            .step_by((empty.len() / FINGERPRINT_VALUES).max(1));
-        let fingerprint = fingerprint
-            .map(|(value, nothing)| value - nothing)
-            .collect();
+        let step = (empty.len() / FINGERPRINT_VALUES).max(1);
+        let compared = values.iter().zip(empty).step_by(step);
+        let fingerprint = compared.map(|(value, nothing)| value - nothing).collect();
         if detector.config().y_axis == YAxis::Right {
             // The cells of a mirrored network lie elsewhere; its boxes do not.
             return Ok(Self {
@@ -140,11 +118,11 @@ impl Observation {
             });
         }
         let mut cells = heads.confidence;
-        cells
-            .iter_mut()
-            .enumerate()
-            .filter(|(cell, _)| !was_sent(*cell))
-            .for_each(|(_, sure)| *sure = 0.0);
+        for (cell, sure) in cells.iter_mut().enumerate() {
+            if !was_sent(cell) {
+                *sure = 0.0;
+            }
+        }
         let vehicles = found.into_iter().map(|(at_m, _)| at_m).collect();
         Ok(Self {
             vehicles,
@@ -162,14 +140,14 @@ impl Observation {
     /// Confidence of the detector in a vehicle within `radius_m` of a position, 0..1; `None` outside its range.
     pub(super) fn sure_at(&self, at_m: [f64; 2], radius_m: f64) -> Option<f32> {
         match &self.sure {
-            Sure::Cells(grid, cells) => around(grid, at_m, radius_m)
-                .map(|cell| cells[cell])
-                .reduce(f32::max),
+            Sure::Cells(grid, cells) => {
+                let near = around(grid, at_m, radius_m);
+                near.map(|cell| cells[cell]).reduce(f32::max)
+            }
             Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
             Sure::Boxes(all) => {
-                let near = all
-                    .iter()
-                    .filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
+                let distance_m = |[x, y]: &[f64; 2]| (x - at_m[0]).hypot(y - at_m[1]);
+                let near = all.iter().filter(|(at, _)| distance_m(at) <= radius_m);
                 Some(near.map(|(_, score)| *score).fold(0.0, f32::max))
             }
         }
@@ -203,10 +181,8 @@ pub(super) fn cosine_similarity(one: &[f32], other: &[f32]) -> f64 {
         return 0.0;
     }
     let dot = |a: &[f32], b: &[f32]| {
-        a.iter()
-            .zip(b)
-            .map(|(a, b)| f64::from(*a) * f64::from(*b))
-            .sum::<f64>()
+        let products = a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b));
+        products.sum::<f64>()
     };
     dot(one, other) / (dot(one, one) * dot(other, other)).sqrt().max(1e-12)
 }

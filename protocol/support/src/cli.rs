@@ -1,7 +1,7 @@
 //! Exit of a program: printed errors, and the exit codes 0 to 3 and 130.
 
 use std::error::Error;
-use std::fmt::{self, Debug, Display};
+use std::fmt::{Debug, Display};
 use std::io;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -28,14 +28,9 @@ impl BadInput {
 
 /// Context of an error of writing: the place that cannot be written. No input causes it: exit code 1, also below
 /// [`BadInput`].
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{} cannot be written", .0.display())]
 pub struct NotWritten(pub PathBuf);
-
-impl Display for NotWritten {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} cannot be written", self.0.display())
-    }
-}
 
 /// Cause of an end on request (Ctrl-C): exit code 130. The error above it states what is kept; it is printed as a note.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -67,10 +62,9 @@ impl Outcome {
 
     /// [`Self::DataLost`] if data were lost.
     pub fn of(lost_data: bool) -> Self {
-        if lost_data {
-            Self::DataLost
-        } else {
-            Self::Done
+        match lost_data {
+            true => Self::DataLost,
+            false => Self::Done,
         }
     }
 }
@@ -91,13 +85,13 @@ pub fn exit_code(
         }
         Err(error) => {
             output::error(chain_of(&error));
-            let is_bad =
-                |cause: &(dyn Error + 'static)| cause.is::<BadInput>() || is_bad_input(cause);
-            if error.chain().any(is_bad) && !is_of_writing(&error) {
-                ExitCode::from(2)
+            let mut causes = error.chain();
+            let is_bad = causes.any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
+            ExitCode::from(if is_bad && !is_of_writing(&error) {
+                2
             } else {
-                ExitCode::FAILURE
-            }
+                1
+            })
         }
     }
 }
@@ -106,14 +100,12 @@ pub fn exit_code(
 fn is_of_writing(error: &anyhow::Error) -> bool {
     let is_within = |cause: &(dyn Error + 'static)| match cause.downcast_ref() {
         Some(BadInput(inner)) => is_of_writing(inner),
-        None => is_no_space(cause),
+        None => {
+            let of_system = cause.downcast_ref::<io::Error>();
+            cause.is::<NoSpace>() || of_system.is_some_and(|error| NoSpace::of(error).is_some())
+        }
     };
     error.is::<NotWritten>() || error.chain().any(is_within)
-}
-
-fn is_no_space(cause: &(dyn Error + 'static)) -> bool {
-    let of_system = cause.downcast_ref::<io::Error>();
-    cause.is::<NoSpace>() || of_system.is_some_and(|error| NoSpace::of(error).is_some())
 }
 
 /// The chain of causes on one line, without causes that the message above them quotes already.

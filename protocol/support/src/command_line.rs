@@ -1,11 +1,8 @@
-//! Command line: parsing with the options of all programs, shell completions and manual pages.
+//! Command line: parsing with the options of all programs.
 
-use std::env;
-use std::path::Path;
-use std::{io, process};
+use std::{env, io, process};
 
-use clap::{Arg, ArgAction, ArgMatches, Command, CommandFactory, Parser};
-use clap_complete::Shell;
+use clap::{ArgAction, ArgMatches, Args, Command, FromArgMatches, Parser};
 
 use crate::list_values::with_lists_joined;
 use crate::output::{self, Verbosity};
@@ -13,49 +10,26 @@ use crate::sibling_program::Sibling;
 
 /// Variable that asks for a completion script (`bash`, `zsh`, `fish`, ...) on standard output, or for manual pages in a
 /// folder (`man:FOLDER`), instead of running.
-const GENERATE: &str = "V2VLOC_GENERATE";
+pub const GENERATE: &str = "V2VLOC_GENERATE";
 
 /// Place of the last option in the help, before `--help`.
 const LAST: usize = 998;
 
-/// Parses the command line of this process; sets the verbosity of its messages. Ends the process on wrong usage, as
-/// [`Parser::parse`].
-pub fn parse<P: Parser>() -> P {
-    end_if_generated(P::command);
-    parse_arguments(P::command())
-}
-
 /// Parses the command line of a program with the subcommands that `sibling`, a program beside it, carries out: where one
-/// of these is given, the process becomes that program.
+/// of these is given, the process becomes that program, which also writes the completions and manual pages of both.
 pub fn parse_beside<P: Parser>(sibling: &Sibling) -> P {
     if env::var_os(GENERATE).is_some() {
-        let error = sibling.exec_generator();
-        output::note(format_args!(
-            "without the options of {}: {error}",
-            sibling.program
-        ));
+        end_if_failed(Some(sibling.exec_generator()));
     }
-    end_if_generated(|| sibling.extend(P::command()));
     end_if_failed(sibling.exec_help(env::args_os()));
     let matches = matches(sibling.extend(P::command()));
     end_if_failed(sibling.exec_subcommand(&matches));
     P::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
 }
 
-/// Parses the command line of a sibling of the program `Front`; completions and manual pages are those of `Front` with
-/// the subcommands of both.
-pub fn parse_behind<P: Parser, Front: CommandFactory>() -> P {
-    end_if_generated(|| {
-        let own = P::command();
-        let shown = own
-            .get_subcommands()
-            .filter(|command| !command.is_hide_set());
-        Front::command().subcommands(shown.cloned())
-    });
-    parse_arguments(P::command())
-}
-
-fn parse_arguments<P: Parser>(command: Command) -> P {
+/// Parses the command line of this process by `command`; sets the verbosity of its messages. Ends the process on wrong
+/// usage.
+pub fn parse_arguments<P: Parser>(command: Command) -> P {
     P::from_arg_matches(&matches(command)).unwrap_or_else(|error| error.exit())
 }
 
@@ -64,23 +38,9 @@ fn matches(command: Command) -> ArgMatches {
     let command = with_negative_numbers(with_verbosity(command));
     let words = with_lists_joined(&command, env::args_os());
     let matches = command.get_matches_from(words);
-    output::set_verbosity(verbosity(
-        matches.get_count("verbose"),
-        matches.get_flag("quiet"),
-    ));
+    let options = VerbosityOptions::from_arg_matches(&matches);
+    output::set_verbosity(options.map_or(Verbosity::Usual, |options| options.verbosity()));
     matches
-}
-
-fn end_if_generated(command: impl FnOnce() -> Command) {
-    let Some(wanted) = env::var_os(GENERATE) else {
-        return;
-    };
-    let wanted = wanted.to_string_lossy();
-    let generated = generate(with_verbosity(command()), &wanted);
-    if let Err(error) = &generated {
-        output::error(format_args!("{GENERATE}={wanted}: {error}"));
-    }
-    process::exit(if generated.is_ok() { 0 } else { 2 });
 }
 
 fn end_if_failed(error: Option<io::Error>) {
@@ -104,57 +64,36 @@ fn with_negative_numbers(command: Command) -> Command {
         .mut_subcommands(with_negative_numbers)
 }
 
-/// The options of the verbosity on standard error.
-fn with_verbosity(command: Command) -> Command {
-    let verbose = Arg::new("verbose")
-        .short('v')
-        .long("verbose")
-        .action(ArgAction::Count)
-        .global(true);
-    let quiet = Arg::new("quiet")
-        .short('q')
-        .long("quiet")
-        .action(ArgAction::SetTrue)
-        .global(true);
-    command
-        .arg(
-            verbose
-                .help("Log more, -vv even more; RUST_LOG sets single parts")
-                .conflicts_with("quiet")
-                .display_order(LAST - 1),
-        )
-        .arg(
-            quiet
-                .help("Errors only on standard error: no progress, notes and warnings")
-                .display_order(LAST),
-        )
+/// The command with the options of the verbosity on standard error.
+pub fn with_verbosity(command: Command) -> Command {
+    VerbosityOptions::augment_args(command)
 }
 
-fn verbosity(verbose: u8, quiet: bool) -> Verbosity {
-    match (quiet, verbose) {
-        (true, _) => Verbosity::Quiet,
-        (false, 0) => Verbosity::Usual,
-        (false, 1) => Verbosity::Debug,
-        (false, _) => Verbosity::Trace,
-    }
+#[derive(clap::Args)]
+#[group(skip)]
+struct VerbosityOptions {
+    /// Log more, -vv even more; RUST_LOG sets single parts
+    #[arg(short, long, action = ArgAction::Count, global = true, conflicts_with = "quiet", display_order = LAST - 1)]
+    verbose: u8,
+    /// Errors only on standard error: no progress, notes and warnings
+    #[arg(short, long, global = true, display_order = LAST)]
+    quiet: bool,
 }
 
-fn generate(mut command: Command, wanted: &str) -> io::Result<()> {
-    if let Some(folder) = wanted.strip_prefix("man:") {
-        return clap_mangen::generate_to(command, Path::new(folder));
+impl VerbosityOptions {
+    fn verbosity(&self) -> Verbosity {
+        match (self.quiet, self.verbose) {
+            (true, _) => Verbosity::Quiet,
+            (false, 0) => Verbosity::Usual,
+            (false, 1) => Verbosity::Debug,
+            (false, _) => Verbosity::Trace,
+        }
     }
-    let shell: Shell = wanted
-        .parse()
-        .map_err(|error: String| io::Error::new(io::ErrorKind::InvalidInput, error))?;
-    let name = command.get_name().to_owned();
-    let mut script = Vec::new();
-    clap_complete::generate(shell, &mut command, name, &mut script);
-    output::text(String::from_utf8_lossy(&script))
 }
 
 #[cfg(test)]
 mod tests {
-    use clap::FromArgMatches;
+    use clap::CommandFactory;
 
     use super::*;
 
@@ -184,32 +123,11 @@ mod tests {
             ("program act --quiet", Verbosity::Quiet),
         ] {
             let matches = of(line).unwrap();
-            assert_eq!(
-                verbosity(matches.get_count("verbose"), matches.get_flag("quiet")),
-                expected,
-                "{line}"
-            );
+            let options = VerbosityOptions::from_arg_matches(&matches).unwrap();
+            assert_eq!(options.verbosity(), expected, "{line}");
             let Sub::Act { fast } = Cli::from_arg_matches(&matches).unwrap().command;
             assert_eq!(fast, line.contains("--fast"));
         }
         assert!(of("program act -v -q").is_err());
-    }
-
-    #[test]
-    fn manual_pages_are_written_and_an_unknown_shell_is_named() {
-        let folder = tempfile::tempdir().unwrap();
-        generate(Cli::command(), &format!("man:{}", folder.path().display())).unwrap();
-        let mut pages: Vec<_> = folder
-            .path()
-            .read_dir()
-            .unwrap()
-            .map(|page| page.unwrap().file_name())
-            .collect();
-        pages.sort();
-        assert!(
-            pages.contains(&"program.1".into()) && pages.contains(&"program-act.1".into()),
-            "{pages:?}"
-        );
-        assert!(generate(Cli::command(), "tcsh").is_err());
     }
 }

@@ -5,10 +5,12 @@ use std::fs::{File, Metadata};
 use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::Mutex;
 
 use protocol::text::hex;
 use sha2::{Digest, Sha256};
+
+use crate::sync::lock;
 
 /// The file of this process, also where another one has taken its place since.
 const THIS_PROGRAM: &str = "/proc/self/exe";
@@ -76,22 +78,16 @@ impl FileDigests {
     fn read(&self, path: &Path) -> io::Result<[u8; 32]> {
         let about = path.metadata()?;
         if !about.is_file() {
-            return Err(io::Error::new(
-                io::ErrorKind::InvalidInput,
-                "not a regular file",
-            ));
+            let reason = "not a regular file";
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
         }
         let version = Version::of(&about);
-        if let Some(digest) = self.known().get(&version) {
+        if let Some(digest) = lock(&self.known).get(&version) {
             return Ok(*digest);
         }
         let digest = digest(File::open(path)?)?;
-        self.known().insert(version, digest);
+        lock(&self.known).insert(version, digest);
         Ok(digest)
-    }
-
-    fn known(&self) -> MutexGuard<'_, HashMap<Version, [u8; 32]>> {
-        self.known.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

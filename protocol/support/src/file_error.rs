@@ -1,13 +1,12 @@
 //! File error: the path of a file and what is wrong with it.
 
 use std::any::Any;
-use std::error::Error;
 use std::fmt::{self, Display};
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 /// A file that cannot be read, written or used.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub struct FileError {
     /// Path of the file.
     pub path: PathBuf,
@@ -16,6 +15,7 @@ pub struct FileError {
     /// Entry that is wrong, the value found and the values allowed; or the error of the system.
     pub problem: String,
     /// Set where the disk is full, which no input causes.
+    #[source]
     pub no_space: Option<NoSpace>,
 }
 
@@ -59,13 +59,6 @@ impl Display for FileError {
             write!(f, ":{line}")?;
         }
         write!(f, ": {}", self.problem)
-    }
-}
-
-impl Error for FileError {
-    fn source(&self) -> Option<&(dyn Error + 'static)> {
-        let no_space = self.no_space.as_ref()?;
-        Some(no_space)
     }
 }
 

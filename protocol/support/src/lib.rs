@@ -1,11 +1,11 @@
 //! Program support: common functions of all programs that no crate of the field offers.
 //!
-//! - [`command_line`]: parsing, verbosity, completions; [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files
-//!   that come with the programs.
-//! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
+//! - [`command_line`]: parsing, verbosity; [`cli`]: errors and exit codes; [`output`], [`progress`]: standard output and error;
+//!   [`sibling_program`]: subcommands that another program executes; [`shared_files`]: files that come with the programs.
 //! - [`bounded_file`], [`atomic_file`], [`csv_file`], [`file_digests`]: reads with a limit on their size, atomic writes,
 //!   CSV, SHA-256 of whole files; errors name the file ([`file_error`]).
-//! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
+//! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds;
+//!   [`sync`]: locks.
 //! - [`provenance`]: the command, programs and digests that a result was made from.
 //! - [`rounding`]: floats to integers; [`sampling`]: parts of lists.
 //! - [`sweep_log`]: arrival of each sweep at an agent, for whoever times a run; [`record_log`]: records of a process.
@@ -52,4 +52,4 @@ pub mod sibling_program;
 pub mod stage_times;
 pub mod statistics;
 pub mod sweep_log;
-pub mod text_table;
+pub mod sync;

@@ -18,9 +18,8 @@ pub(crate) fn with_lists_joined(
         };
         if let Some(option) = text.strip_prefix("--") {
             let (name, value) = option.split_once('=').unwrap_or((option, ""));
-            is_list = of
-                .get_arguments()
-                .any(|arg| arg.get_long() == Some(name) && has_commas(arg));
+            let has_name = |arg: &&Arg| arg.get_long() == Some(name);
+            is_list = of.get_arguments().filter(has_name).any(has_commas);
             let is_value = is_list && !value.is_empty();
             is_list &= value.is_empty() || value.trim_end().ends_with(',');
             joined.push(match is_value {
@@ -36,10 +35,8 @@ pub(crate) fn with_lists_joined(
         }
         let text = without_blanks(text);
         is_list = text.ends_with(',');
-        match joined
-            .last_mut()
-            .filter(|last| last.as_encoded_bytes().ends_with(b","))
-        {
+        let last = joined.last_mut();
+        match last.filter(|last| last.as_encoded_bytes().ends_with(b",")) {
             Some(last) => last.push(text),
             None => joined.push(text.into()),
         }

@@ -5,7 +5,9 @@
 
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Write};
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::Mutex;
+
+use crate::sync::lock;
 
 /// Verbosity of a program on standard error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -20,25 +22,16 @@ pub enum Verbosity {
     Trace,
 }
 
-static VERBOSITY: AtomicU8 = AtomicU8::new(Verbosity::Usual as u8);
+static VERBOSITY: Mutex<Verbosity> = Mutex::new(Verbosity::Usual);
 
 /// Sets the verbosity of this process.
 pub fn set_verbosity(verbosity: Verbosity) {
-    VERBOSITY.store(verbosity as u8, Ordering::Relaxed);
+    *lock(&VERBOSITY) = verbosity;
 }
 
 /// The verbosity of this process.
 pub fn verbosity() -> Verbosity {
-    let set = VERBOSITY.load(Ordering::Relaxed);
-    let all = [
-        Verbosity::Quiet,
-        Verbosity::Usual,
-        Verbosity::Debug,
-        Verbosity::Trace,
-    ];
-    all.into_iter()
-        .find(|verbosity| *verbosity as u8 == set)
-        .unwrap_or(Verbosity::Usual)
+    *lock(&VERBOSITY)
 }
 
 /// Prints a line to standard output.
@@ -73,10 +66,10 @@ pub fn error(line: impl Display) {
 fn print(mut to: impl Write, text: impl Display) -> io::Result<()> {
     match write!(to, "{text}").and_then(|()| to.flush()) {
         Err(error) if error.kind() == ErrorKind::BrokenPipe => Ok(()),
-        Err(error) => Err(io::Error::new(
-            error.kind(),
-            format!("cannot write to standard output: {error}"),
-        )),
+        Err(error) => {
+            let message = format!("cannot write to standard output: {error}");
+            Err(io::Error::new(error.kind(), message))
+        }
         Ok(()) => Ok(()),
     }
 }

@@ -65,11 +65,9 @@ impl Provenance {
     /// The same with the command line of this process.
     #[must_use]
     pub fn with_command(self) -> Self {
-        let command = env::args_os().map(|argument| argument.to_string_lossy().into_owned());
-        Self {
-            command: command.collect(),
-            ..self
-        }
+        let words = env::args_os().map(|word| word.to_string_lossy().into_owned());
+        let command = words.collect();
+        Self { command, ..self }
     }
 
     /// Digest of the settings, written as text, and of all that they were applied to; the command does not count.
@@ -79,9 +77,9 @@ impl Provenance {
         for part in [&self.program_sha256, &self.data_sha256] {
             hash.update(part);
         }
-        self.files_sha256
-            .values()
-            .for_each(|sha256| hash.update(sha256));
+        for sha256 in self.files_sha256.values() {
+            hash.update(sha256);
+        }
         hash.update(settings);
         hex(&hash.finalize())
     }

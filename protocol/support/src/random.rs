@@ -87,10 +87,9 @@ impl RngCore for SplitMix64 {
 
     fn fill_bytes(&mut self, bytes: &mut [u8]) {
         for chunk in bytes.chunks_mut(8) {
-            chunk
-                .iter_mut()
-                .zip(self.next_u64().to_le_bytes())
-                .for_each(|(byte, random)| *byte = random);
+            for (byte, random) in chunk.iter_mut().zip(self.next_u64().to_le_bytes()) {
+                *byte = random;
+            }
         }
     }
 }

@@ -49,18 +49,18 @@ impl Sibling {
         &self,
         mut arguments: impl Iterator<Item = OsString>,
     ) -> Option<io::Error> {
-        let [_, help] = [arguments.next()?, arguments.next()?];
+        let help = arguments.nth(1)?;
         let rest: Vec<OsString> = arguments.collect();
-        let name = rest
-            .first()?
-            .to_str()
-            .filter(|name| help == "help" && self.has(name))?;
+        let name = rest.first()?.to_str()?;
+        if help != "help" || !self.has(name) {
+            return None;
+        }
         Some(self.exec(name, [&help].into_iter().chain(&rest)))
     }
 
     /// Replaces this process by the program, which writes completions and manual pages of both. Returns only on failure.
     pub(crate) fn exec_generator(&self) -> io::Error {
-        process::Command::new(self.path()).exec()
+        self.exec("the generator of completions", std::iter::empty())
     }
 
     /// Replaces this process by the program if the command line names one of the subcommands. Returns only otherwise
@@ -83,24 +83,17 @@ impl Sibling {
             Verbosity::Trace => &["-vv"],
         };
         let path = self.path();
-        let error = process::Command::new(&path)
-            .args(verbosity)
-            .args(arguments)
-            .exec();
-        io::Error::new(
-            error.kind(),
-            format!("{name} is part of the program {}: {error}", path.display()),
-        )
+        let mut command = process::Command::new(&path);
+        let error = command.args(verbosity).args(arguments).exec();
+        let message = format!("{name} is part of the program {}: {error}", path.display());
+        io::Error::new(error.kind(), message)
     }
 
     /// The program of the same folder, or else the one in `PATH`.
     fn path(&self) -> PathBuf {
-        let beside = env::current_exe()
-            .ok()
-            .map(|own| own.with_file_name(self.program));
-        beside
-            .filter(|path| path.exists())
-            .unwrap_or_else(|| self.program.into())
+        let beside = env::current_exe().map(|own| own.with_file_name(self.program));
+        let beside = beside.ok().filter(|path| path.exists());
+        beside.unwrap_or_else(|| self.program.into())
     }
 }
 

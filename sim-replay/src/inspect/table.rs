@@ -7,7 +7,7 @@ use protocol::Handedness;
 
 use super::{AgentReport, Report, ScenarioReport, Summary, TickReport};
 use dataset::Layout;
-use support::text_table::{Side, TextTable};
+use terminal::text_table::{Side, TextTable};
 
 /// Problems that are printed; further ones are counted.
 const MAX_PROBLEMS: usize = 50;

@@ -156,7 +156,7 @@ fn completions_and_manual_pages_know_the_options_of_a_sibling() {
 }
 
 #[test]
-fn a_program_without_its_sibling_says_so() {
+fn a_program_without_its_sibling_names_it() {
     let folder = tempfile::tempdir().unwrap();
     for (program, sibling, words, _) in FORWARDING {
         let lonely = folder.path().join(program);
@@ -181,7 +181,7 @@ fn a_program_without_its_sibling_says_so() {
         );
         let (code, stderr) = run(&[], Some("bash"));
         assert!(
-            code == Some(0) && stderr.contains(&format!("without the options of {sibling}")),
+            code == Some(1) && stderr.contains(&format!("is part of the program {sibling}")),
             "{stderr}"
         );
     }

@@ -10,7 +10,7 @@ use fusion::{Exchange, Method};
 use localization::pgc::wrong_place::wrong_place_hint;
 use localization::pose_source::PoseSourceConfig;
 use support::output;
-use support::text_table::{Side, TextTable, number};
+use terminal::text_table::{Side, TextTable, number};
 
 use crate::run::loss;
 use crate::run::run_fleet::RunResult;

@@ -288,9 +288,9 @@ fn watch(
     );
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
-    let crashed = watch.fallen();
+    let crashed = watch.crashed();
     offline.extend(crashed.iter().cloned());
-    watch.tell(Phase::Ending, &scorer.progress());
+    watch.write_status(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
     drain(&supervisor, scorer, limits.drain, &mut display);
@@ -302,7 +302,7 @@ fn watch(
     while let Ok(event) = happened.try_recv() {
         watch.note(&event);
     }
-    watch.tell(Phase::Over, &scorer.progress());
+    watch.write_status(Phase::Over, &scorer.progress());
     offline.extend(killed.iter().cloned());
     let failures = watch.failures();
     Ok(Watched {
@@ -381,7 +381,7 @@ fn write(
     capacity: Option<Capacity>,
 ) -> RunResult {
     let Scored {
-        board,
+        scores: board,
         stats,
         progress,
         unwritten: lines,

@@ -23,11 +23,8 @@ pub(super) async fn follow(
             let room = MAX_LINE.saturating_sub(line.len());
             line.extend_from_slice(&part[..part.len().min(room)]);
             if part.ends_with(b"\n") {
-                on_line(
-                    String::from_utf8_lossy(&std::mem::take(&mut line))
-                        .trim_end()
-                        .to_owned(),
-                );
+                on_line(String::from_utf8_lossy(&line).trim_end().to_owned());
+                line.clear();
             }
         }
     }

@@ -164,39 +164,34 @@ impl Supervisor {
             .enable_all()
             .build()
             .map_err(SuperviseError::Runtime)?;
-        let watched = specs
-            .into_iter()
-            .zip(logs)
-            .map(|(spec, log)| {
-                let (name, (stop, stop_request)) = (spec.name.clone(), watch::channel(None));
-                let (replace, replace_request) = mpsc::channel(1);
-                let watcher = Watcher {
-                    spec,
-                    log,
-                    restarts,
-                    events: events.clone(),
-                    stop: stop_request,
-                    replace: replace_request,
-                    crashes: 0,
-                    restarted: 0,
-                };
-                Watched {
-                    name,
-                    stop,
-                    replace,
-                    task: runtime.spawn(watcher.run()),
-                }
-            })
-            .collect();
+        let mut watched = Vec::new();
+        for (spec, log) in specs.into_iter().zip(logs) {
+            let (name, (stop, stop_request)) = (spec.name.clone(), watch::channel(None));
+            let (replace, replace_request) = mpsc::channel(1);
+            let watcher = Watcher {
+                spec,
+                log,
+                restarts,
+                events: events.clone(),
+                stop: stop_request,
+                replace: replace_request,
+                crashes: 0,
+                restarted: 0,
+            };
+            watched.push(Watched {
+                name,
+                stop,
+                replace,
+                task: runtime.spawn(watcher.run()),
+            });
+        }
         Ok(Self { runtime, watched })
     }
 
     /// True if every process has ended for good.
-    #[must_use]
     pub fn all_ended(&self) -> bool {
-        self.watched
-            .iter()
-            .all(|watched| watched.task.is_finished())
+        let mut watched = self.watched.iter();
+        watched.all(|watched| watched.task.is_finished())
     }
 
     /// Kills a hung process; then the rules of a crash apply. `why` describes the problem.
@@ -210,12 +205,8 @@ impl Supervisor {
     /// Ends the processes that `which` selects by name: SIGTERM, then SIGKILL at `deadline`. Returns when they have
     /// ended.
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
-        let (chosen, others) = self
-            .watched
-            .drain(..)
-            .partition(|watched| which(&watched.name));
-        self.watched = others;
-        let chosen: Vec<Watched> = chosen;
+        let is_chosen = |watched: &mut Watched| which(&watched.name);
+        let chosen: Vec<Watched> = self.watched.extract_if(.., is_chosen).collect();
         for watched in &chosen {
             watched.stop.send_replace(Some(deadline));
         }

@@ -51,11 +51,8 @@ impl Log {
     fn last_line(&self) -> Option<String> {
         let bytes = std::fs::read(&self.path).ok()?;
         let tail = String::from_utf8_lossy(&bytes[bytes.len().saturating_sub(4096)..]).into_owned();
-        tail.lines()
-            .rev()
-            .map(str::trim)
-            .find(|line| !line.is_empty())
-            .map(str::to_owned)
+        let mut lines = tail.lines().rev().map(str::trim);
+        lines.find(|line| !line.is_empty()).map(str::to_owned)
     }
 }
 
@@ -79,7 +76,7 @@ impl Watcher {
     pub(super) async fn run(mut self) -> bool {
         loop {
             let born = Instant::now();
-            let mut can_go_on = self.spec.life != RestartPolicy::Optional;
+            let mut may_restart = self.spec.life != RestartPolicy::Optional;
             let how = match self.spawn() {
                 Err(error) => format!("cannot be started: {error}"),
                 Ok(mut child) => {
@@ -106,7 +103,7 @@ impl Watcher {
                             Ok(status) if is_done(status) => "ended without a request".into(),
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&describe(status)),
                             Ok(status) => {
-                                can_go_on &= self.spec.life == RestartPolicy::Service || is_struck(status);
+                                may_restart &= self.spec.life == RestartPolicy::Service || is_struck(status);
                                 describe(status)
                             }
                             Err(error) => error.to_string(),
@@ -123,7 +120,7 @@ impl Watcher {
                 self.crashes = 0;
             }
             self.crashes += 1;
-            if !can_go_on || self.crashes > self.restarts {
+            if !may_restart || self.crashes > self.restarts {
                 return self.give_up(&how);
             }
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.crashes - 1).min(5)));
@@ -219,10 +216,10 @@ async fn stop_requested(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
 
 /// Sends SIGTERM to a process, then SIGKILL at the deadline. Returns its exit status; `None`: it had to be killed.
 async fn end(child: &mut Child, deadline: Instant) -> Option<ExitStatus> {
-    if let Some(pid) = child
+    let pid = child
         .id()
-        .and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?))
-    {
+        .and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?));
+    if let Some(pid) = pid {
         // It may have ended at this moment, which is as good.
         let _ = kill_process(pid, Signal::TERM);
         // A stopped process does not handle SIGTERM.

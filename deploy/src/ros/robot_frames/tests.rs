@@ -20,8 +20,8 @@ fn add(frames: &RobotFrames, nanos: u64, [parent, child]: [&str; 2], pose: Pose,
         parent_from_child: pose,
     };
     match by {
-        Origin::Odometry => frames.lock().note_odometry(&cav(), &transform),
-        by => assert!(frames.lock().tree.add(&transform, by)),
+        Origin::Odometry => lock(&frames.state).note_odometry(&cav(), &transform),
+        by => assert!(lock(&frames.state).tree.add(&transform, by)),
     }
 }
 
@@ -109,7 +109,7 @@ fn a_lidar_without_a_place_on_the_robot_gives_no_transform() {
     let frames = robot(None);
     frames.note_pose(&cav(), S, facing_y());
     assert_eq!((map_from_odom(&frames), frames.unplaced()), (vec![], 1));
-    let logged = frames.lock().robots[&cav()].logged.clone();
+    let logged = lock(&frames.state).robots[&cav()].logged.clone();
     assert!(logged.contains("\"velodyne\" has no parent"), "{logged}");
 }
 
@@ -141,9 +141,9 @@ fn two_robots_cannot_have_one_odometry_frame() {
         parent_from_child: Pose::IDENTITY,
     };
     for cav in [cav(), other.clone()] {
-        frames.lock().note_odometry(&cav, &transform);
+        lock(&frames.state).note_odometry(&cav, &transform);
     }
-    let state = frames.lock();
+    let state = lock(&frames.state);
     assert!(state.robots[&cav()].odom_and_base.is_some());
     assert!(state.robots[&other].logged.contains("another robot"));
 }

@@ -95,17 +95,17 @@ fn result(tick: u64, at_x: &[f64]) -> Detections {
     }
 }
 
-fn board() -> FrameScores {
+fn scores() -> FrameScores {
     FrameScores::new(cav("e"), RULE, 64 * 96 * 128)
 }
 
 #[test]
 fn a_frame_is_judged_against_everyones_truth() {
-    let mut board = board();
-    board.truth(&stamp("replay", 0, 1_000), truth(0));
-    board.result(&stamp("e", 0, 1_080), result(0, &[10.0, 30.0, -20.0]));
-    board.close();
-    let record = &board.records()[0];
+    let mut scores = scores();
+    scores.truth(&stamp("replay", 0, 1_000), truth(0));
+    scores.result(&stamp("e", 0, 1_080), result(0, &[10.0, 30.0, -20.0]));
+    scores.close();
+    let record = &scores.records()[0];
     assert_eq!(
         (record.truth, record.detected, record.found),
         (2, 3, 2),
@@ -116,20 +116,20 @@ fn a_frame_is_judged_against_everyones_truth() {
         (Some(80.0), 1000, 1300)
     );
     assert_eq!(record.ego_error_m, Some(1.0));
-    let (global, _) = board.average_precision();
+    let (global, _) = scores.average_precision();
     assert_eq!(
         global.at_50,
         Some(1.0),
         "the false box has the same score and comes last"
     );
-    assert_eq!(board.communication().payload_bytes_mean, Some(1000.0));
-    assert_eq!(board.showpiece().unwrap().truth.len(), 2);
+    assert_eq!(scores.communication().payload_bytes_mean, Some(1000.0));
+    assert_eq!(scores.showpiece().unwrap().truth.len(), 2);
 }
 
 #[test]
 fn order_of_arrival_changes_nothing() {
     let score = |backwards: bool| {
-        let mut board = board();
+        let mut scores = scores();
         let mut ticks: Vec<u64> = (0..10).collect();
         if backwards {
             ticks.reverse();
@@ -141,37 +141,37 @@ fn order_of_arrival_changes_nothing() {
                 &[-7.0, 30.0]
             };
             if backwards {
-                board.result(&stamp("e", tick, 50), result(tick, detected));
-                board.truth(&stamp("replay", tick, 0), truth(tick));
+                scores.result(&stamp("e", tick, 50), result(tick, detected));
+                scores.truth(&stamp("replay", tick, 0), truth(tick));
             } else {
-                board.truth(&stamp("replay", tick, 0), truth(tick));
-                board.result(&stamp("e", tick, 50), result(tick, detected));
+                scores.truth(&stamp("replay", tick, 0), truth(tick));
+                scores.result(&stamp("e", tick, 50), result(tick, detected));
             }
         }
-        board.close();
-        (board.average_precision(), board.records().to_vec())
+        scores.close();
+        (scores.average_precision(), scores.records().to_vec())
     };
     assert_eq!(score(false), score(true));
 }
 
 #[test]
 fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
-    let mut board = board();
+    let mut scores = scores();
     for tick in 0..3 {
-        board.truth(&stamp("replay", tick, 0), truth(tick));
+        scores.truth(&stamp("replay", tick, 0), truth(tick));
     }
-    board.result(&stamp("e", 1, 50), result(1, &[10.0]));
-    board.result(&stamp("e", 1, 90), result(1, &[]));
-    board.close();
-    assert_eq!((board.missed(), board.ticks()), (2, (3, 1)));
-    let answered: Vec<bool> = board
+    scores.result(&stamp("e", 1, 50), result(1, &[10.0]));
+    scores.result(&stamp("e", 1, 90), result(1, &[]));
+    scores.close();
+    assert_eq!((scores.missed(), scores.ticks()), (2, (3, 1)));
+    let answered: Vec<bool> = scores
         .records()
         .iter()
         .map(FrameRecord::is_answered)
         .collect();
     assert_eq!(answered, [false, true, false], "every tick has a record");
     assert_eq!(
-        (board.records()[1].latency_ms, board.records()[1].detected),
+        (scores.records()[1].latency_ms, scores.records()[1].detected),
         (Some(50.0), 1)
     );
 }
@@ -180,65 +180,65 @@ fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
 /// tick 0 is answered in full after 50 ms, tick 1 not at all, tick 2 in full after 250 ms, tick 3 with one car.
 #[test]
 fn the_three_precisions_differ_in_what_they_count() {
-    let mut board = board();
+    let mut scores = scores();
     let began_ms = |tick: u64| 1_000 + 100 * tick;
     for tick in 0..4 {
-        board.truth(&stamp("replay", tick, began_ms(tick)), truth(tick));
+        scores.truth(&stamp("replay", tick, began_ms(tick)), truth(tick));
     }
     for (tick, latency_ms, at_x) in [
         (0, 50, &[10.0, 30.0][..]),
         (2, 250, &[10.0, 30.0]),
         (3, 20, &[10.0]),
     ] {
-        board.result(
+        scores.result(
             &stamp("e", tick, began_ms(tick) + latency_ms),
             result(tick, at_x),
         );
     }
-    board.close();
+    scores.close();
     let is_near = |found: Option<f64>, expected: f64| (found.unwrap() - expected).abs() < 1e-9;
     // Five of the six boxes of the answered ticks, and five of the eight of all.
-    assert!(is_near(board.average_precision().0.at_50, 5.0 / 6.0));
-    assert!(is_near(board.unanswered_empty().at_50, 5.0 / 8.0));
+    assert!(is_near(scores.average_precision().0.at_50, 5.0 / 6.0));
+    assert!(is_near(scores.unanswered_empty().at_50, 5.0 / 8.0));
     // Nothing is published by tick 0; its result is the newest at the three that follow: 6 of 8 boxes.
-    assert!(is_near(board.streaming().unwrap().at_50, 6.0 / 8.0));
-    let streamed: Vec<Option<u64>> = board
+    assert!(is_near(scores.streaming().unwrap().at_50, 6.0 / 8.0));
+    let streamed: Vec<Option<u64>> = scores
         .records()
         .iter()
         .map(|record| Some(record.streamed?.tick))
         .collect();
     assert_eq!(streamed, [None, Some(0), Some(0), Some(0)]);
     assert_eq!(
-        board.records()[2]
+        scores.records()[2]
             .streamed
             .map(|streamed| (streamed.age_ms, streamed.found)),
         Some((200.0, 2))
     );
-    assert_eq!(board.ticks(), (4, 3));
+    assert_eq!(scores.ticks(), (4, 3));
 }
 
 #[test]
 fn poses_of_all_vehicles_are_judged() {
-    let mut board = board();
-    board.pose(
+    let mut scores = scores();
+    scores.pose(
         &stamp("n", 0, 0),
         PoseEstimate::new(Pose::from_xyz_yaw([20.0, 4.0, 0.0], 0.0), 0.5),
     );
     let reason = protocol::NoPoseReason::TooFewPoints;
-    board.pose(
+    scores.pose(
         &stamp("e", 0, 0),
         PoseEstimate::NoPose {
             reason,
             inlier_count: 2,
         },
     );
-    board.pose(
+    scores.pose(
         &stamp("unknown", 0, 0),
         PoseEstimate::new(Pose::IDENTITY, 0.5),
     );
-    board.truth(&stamp("replay", 0, 0), truth(0));
-    board.close();
-    let errors = board.pose_errors();
+    scores.truth(&stamp("replay", 0, 0), truth(0));
+    scores.close();
+    let errors = scores.pose_errors();
     assert_eq!(
         (errors.mean_m, errors.no_pose, errors.success_3m),
         (Some(4.0), 1, Some(0.0))
@@ -247,16 +247,16 @@ fn poses_of_all_vehicles_are_judged() {
 
 #[test]
 fn a_long_run_keeps_few_ticks_open() {
-    let mut board = board();
+    let mut scores = scores();
     for tick in 0..1_000 {
-        board.truth(&stamp("replay", tick, 0), truth(tick));
-        board.result(&stamp("e", tick, 50), result(tick, &[10.0]));
+        scores.truth(&stamp("replay", tick, 0), truth(tick));
+        scores.result(&stamp("e", tick, 50), result(tick, &[10.0]));
     }
-    assert!(board.open.len() <= MOST_OPEN && board.records().len() >= 1_000 - MOST_OPEN);
-    board.result(&stamp("e", 3, 50), result(3, &[]));
-    board.close();
+    assert!(scores.open.len() <= MOST_OPEN && scores.records().len() >= 1_000 - MOST_OPEN);
+    scores.result(&stamp("e", 3, 50), result(3, &[]));
+    scores.close();
     assert_eq!(
-        board.records().len(),
+        scores.records().len(),
         1_000,
         "a late second result of a judged tick adds none"
     );
@@ -264,7 +264,7 @@ fn a_long_run_keeps_few_ticks_open() {
 
 #[test]
 fn neighbours_are_followed_over_the_run() {
-    let mut board = FrameScores::new(cav("e"), RULE, 1);
+    let mut scores = FrameScores::new(cav("e"), RULE, 1);
     let misbehaving = Detections {
         fused: vec![],
         skipped: vec![SkippedNeighbour {
@@ -281,11 +281,11 @@ fn neighbours_are_followed_over_the_run() {
         ..result(1, &[])
     };
     for (tick, result) in [(0, result(0, &[])), (1, misbehaving)] {
-        board.truth(&stamp("replay", tick, 100 * tick), truth(tick));
-        board.result(&stamp("e", tick, 100 * tick + 50), result);
+        scores.truth(&stamp("replay", tick, 100 * tick), truth(tick));
+        scores.result(&stamp("e", tick, 100 * tick + 50), result);
     }
-    board.close();
-    let record = &board.neighbours()[&cav("n")];
+    scores.close();
+    let record = &scores.neighbours()[&cav("n")];
     assert_eq!(
         (
             record.fused,

@@ -1,6 +1,6 @@
 //! Contribution of the neighbours to the frames of a run.
 
-use protocol::{Account, CavId, Ledger, Role, Stream, Topic};
+use protocol::{Account, CavId, Counts, Ledger, ProcessId, Role, Stream, Topic};
 use serde::{Deserialize, Serialize};
 
 /// Use of the data that neighbours shared.
@@ -26,33 +26,20 @@ impl Contribution {
         ledger: &Ledger,
         sent_bytes: Option<u64>,
     ) -> Self {
-        let of_neighbours = || {
-            ledger
-                .iter()
-                .filter(|(account, _)| shares(&account.topic, ego))
-        };
+        let is_shared = |(account, _): &(&Account, &Counts)| shares(&account.topic, ego);
+        let shared = || ledger.iter().filter(is_shared);
         let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
-        let sent = of_neighbours()
-            .filter(|(account, _)| is_sent(account))
-            .map(|(_, counts)| counts.sent)
-            .sum();
+        let of_senders = shared().filter(|(account, _)| is_sent(account));
+        let sent = of_senders.map(|(_, counts)| counts.sent).sum();
         let ego_process = format!("{}-", Role::Ego);
-        let is_used = |account: &Account| {
-            account
-                .to
-                .as_ref()
-                .is_some_and(|to| to.as_str().starts_with(&ego_process))
-        };
-        let used = of_neighbours()
-            .filter(|(account, _)| is_used(account))
-            .map(|(_, counts)| counts.received)
-            .sum();
+        let is_ego = |to: &ProcessId| to.as_str().starts_with(&ego_process);
+        let of_egos = shared().filter(|(account, _)| account.to.as_ref().is_some_and(is_ego));
+        let used = of_egos.map(|(_, counts)| counts.received).sum();
         Self {
             fused_per_frame: (frames > 0).then(|| fused as f64 / frames as f64),
             sent,
             used,
-            sent_bytes_mean: sent_bytes
-                .filter(|_| sent > 0)
+            sent_bytes_mean: { sent_bytes.filter(|_| sent > 0) }
                 .map(|bytes| bytes as f64 / sent as f64),
         }
     }

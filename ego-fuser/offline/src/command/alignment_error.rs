@@ -7,7 +7,7 @@ use dataset::LeftOut;
 use ego_fuser_offline::alignment_error::{AlignmentError, AlignmentMeter, Offset};
 use perception::weights::Weights;
 use support::output;
-use support::text_table::{Side, TextTable};
+use terminal::text_table::{Side, TextTable};
 
 use super::{DataSets, print_left_out, rows_with_provenance};
 use support::cli::{BadInput, Outcome};

@@ -1,6 +1,6 @@
 //! Columns of a sweep's table that vary, as its report and the terminal show them, and what is seen in them.
 
-use support::text_table::{GAP, Side, TextTable};
+use terminal::text_table::{GAP, Side, TextTable};
 
 /// Columns that are shown first, and in whose highest value a reader is interested.
 const PRECISIONS: [&str; 3] = ["ap_global_30", "ap_global_50", "ap_global_70"];

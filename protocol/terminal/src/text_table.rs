@@ -36,6 +36,12 @@ impl TextTable {
         Self(table)
     }
 
+    /// A table with columns of texts, then of numbers.
+    pub fn of(texts: &[&str], numbers: &[&str]) -> Self {
+        let texts = texts.iter().map(|name| (*name, Side::Left));
+        Self::new(texts.chain(numbers.iter().map(|name| (*name, Side::Right))))
+    }
+
     /// Appends a row.
     pub fn row(&mut self, cells: impl IntoIterator<Item = String>) {
         self.0.add_row(cells);
