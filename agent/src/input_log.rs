@@ -31,11 +31,11 @@ pub enum Record<I, P> {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Start {
     /// Configuration of the process, as JSON.
-    config: String,
+    pub config: String,
     /// Hash of the detector's network; `None`: the process has no detector.
-    model_hash: Option<ModelHash>,
+    pub model_hash: Option<ModelHash>,
     /// Version of the program.
-    version: String,
+    pub version: String,
 }
 
 /// File in which the inputs of a loop are recorded, and the configuration of its process as JSON.

@@ -13,7 +13,8 @@ use protocol::{Box3d, DetectionsReport, PoseEstimate, corners_within};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use support::bounded_file;
-use support::text_table::{Side, TextTable, number};
+use support::file_error::{AtFile, FileError};
+use terminal::text_table::{Side, TextTable, number};
 use tracking::metrics::{
     MATCH_DISTANCE_M, Sequence, TrackPoint, TrackQuality, TrackedFrame, TruePoint,
 };
@@ -240,25 +241,18 @@ fn for_each_line<T: DeserializeOwned>(
     path: &Path,
     mut take: impl FnMut(T) -> Result<(), String>,
 ) -> Result<(), ReportError> {
-    let cannot_read = |source| ReportError::Read {
-        path: path.to_owned(),
-        source,
-    };
-    let mut reader = BufReader::new(bounded_file::open(path).map_err(cannot_read)?);
+    let mut reader = BufReader::new(bounded_file::open(path).at(path)?);
     let mut line = Vec::new();
     for index in 1.. {
         line.clear();
         let mut bounded = reader.by_ref().take(MAX_LINE_BYTES);
-        if bounded.read_until(b'\n', &mut line).map_err(cannot_read)? == 0 {
+        if bounded.read_until(b'\n', &mut line).at(path)? == 0 {
             break;
         }
         let parsed = serde_json::from_slice(&line).map_err(|error| error.to_string());
         parsed
             .and_then(&mut take)
-            .map_err(|problem| ReportError::Syntax {
-                path: path.to_owned(),
-                problem: format!("line {index}: {problem}"),
-            })?;
+            .map_err(|problem| FileError::new(path, format_args!("line {index}: {problem}")))?;
     }
     Ok(())
 }

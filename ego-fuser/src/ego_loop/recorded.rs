@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::{EgoLoop, Input, Message, Reception, Refusal};
 
 /// Kind of a log of an ego's inputs.
-pub const KIND: &str = "ego inputs";
+pub const KIND: &str = "ego inputs, 2";
 
 /// A record of an ego's inputs.
 pub type Record = input_log::Record<Input<WireMessage>, Published>;

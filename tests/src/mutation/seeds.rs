@@ -3,8 +3,9 @@
 use std::path::Path;
 use std::time::Duration;
 
+use agent::input_log::Start;
 use dataset::pcd::{Encoding, IntensityField, encode};
-use ego_fuser::ego_loop::recorded::{KIND, Record, WireMessage};
+use ego_fuser::ego_loop::recorded::{KIND, Published, Record, WireMessage};
 use ego_fuser::ego_loop::{Input, Reception};
 use protocol::{CavId, Key, Lidar, Message, Pose, PoseEstimate, RunId, Stamp, Stream, Topic, wire};
 use recording::{ExportTimes, RecordingOptions, RecordingWriter, export_ros2};
@@ -275,15 +276,15 @@ pub fn ego_inputs(scratch: &Path) -> Vec<u8> {
         Input::Left(cav.clone()),
         Input::Ended(cav.clone()),
     ]);
-    let start = Record::Start {
+    let start = Record::Start(Start {
         config: "{\"run\":\"test\"}".into(),
-        model_hash: descriptor.model_hash,
+        model_hash: Some(descriptor.model_hash),
         version: "0.1.0".into(),
-    };
-    let published = Record::Published {
+    });
+    let published = Record::Published(Published {
         stamp: stamp.clone(),
         stages: Vec::new(),
-    };
+    });
     let inputs = (0..)
         .zip(inputs)
         .map(|(now_nanos, input)| Record::Input { now_nanos, input });
