@@ -1,7 +1,10 @@
+use std::path::{Path, PathBuf};
+
 use localization::pose_source::RecordedPose;
 use perception::detector::Detector;
 use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
+use perception::weights::{CONFIG_KEY, Precision, save};
 use protocol::{EgoMotion, PointCloud, Pose, Stamp};
 use tch::{Device, nn::VarStore};
 
@@ -15,16 +18,24 @@ fn cav() -> CavId {
     CavId::new("4279").unwrap()
 }
 
-fn agent() -> Agent {
+/// Writes weights of a small detector with random parameters.
+fn write_weights(folder: &Path) -> PathBuf {
     tch::set_num_threads(1);
-    tch::manual_seed(11);
     let config = DetectorConfig {
         lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
         ..DetectorConfig::lean()
     };
     let network = VarStore::new(Device::Cpu);
-    let pillars = PointPillars::new(&network.root(), &config).unwrap();
-    let detector = Detector::from_network(pillars);
+    PointPillars::new(&network.root(), &config).unwrap();
+    let config = serde_json::to_string(&config).unwrap();
+    let path = folder.join("detector.safetensors");
+    let metadata = [(CONFIG_KEY.to_owned(), config)].into();
+    save(&path, &network, &metadata, Precision::Single).unwrap();
+    path
+}
+
+fn agent(weights: &Path) -> Agent {
+    let detector = Detector::load(weights, Device::Cpu).unwrap();
     Agent::new(cav(), Box::new(RecordedPose), detector)
 }
 
@@ -80,7 +91,9 @@ fn outputs(agent_loop: &mut AgentLoop, inputs: Vec<Input>) -> Vec<Output> {
 
 #[test]
 fn a_sweep_waits_for_its_pose_and_its_steps_are_published_one_by_one() {
-    let mut agent_loop = AgentLoop::new(agent(), LoopOptions::default());
+    let folder = tempfile::tempdir().unwrap();
+    let agent = agent(&write_weights(folder.path()));
+    let mut agent_loop = AgentLoop::new(agent, LoopOptions::default());
     // The agent does not know yet that its vehicle measures no motion.
     let motion = Input::Motion(10, EgoMotion::default());
     let first = published(&mut agent_loop, vec![motion, sweep(10)]);
@@ -131,8 +144,10 @@ fn the_same_inputs_give_the_same_bytes() {
         },
         ..LoopOptions::default()
     };
+    let folder = tempfile::tempdir().unwrap();
+    let weights = write_weights(folder.path());
     let run = || {
-        let mut agent_loop = AgentLoop::new(agent(), options.clone());
+        let mut agent_loop = AgentLoop::new(agent(&weights), options.clone());
         let encoder = MessageEncoder::new(&options);
         let inputs = vec![
             gnss(5, GnssSource::Stated),
