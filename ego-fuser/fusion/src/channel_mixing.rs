@@ -63,9 +63,11 @@ impl ChannelMixing {
             let (from, mut to) = (flat(&features.f_get(map)?)?, flat(&result.f_get(map)?)?);
             match matrix {
                 Some(matrix) => drop(matrix.f_mm_out(&to, &from)?.f_relu_()?),
-                None if to.stride() == from.stride() => to.f_copy_(&from)?,
-                // Exact, and faster than the library's copy into another memory order.
-                None => drop(self.identity()?.f_mm_out(&to, &from)?),
+                // The library transposes blocks if rows of the result are contiguous.
+                None if order == Order::Cells => {
+                    to.f_transpose(0, 1)?.f_copy_(&from.f_transpose(0, 1)?)?
+                }
+                None => to.f_copy_(&from)?,
             }
         }
         Ok(result)

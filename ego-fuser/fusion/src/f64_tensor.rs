@@ -19,6 +19,16 @@ pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     Vec::try_from(tensor.f_reshape(-1)?)
 }
 
+/// Indices of the highest numbers, a `share` of all and at least one, in ascending order.
+pub(crate) fn largest(numbers: &[f32], share: f64) -> Vec<usize> {
+    let wanted = ((numbers.len() as f64 * share).ceil() as usize).clamp(1, numbers.len());
+    let mut order: Vec<usize> = (0..numbers.len()).collect();
+    order.sort_by(|a, b| numbers[*b].total_cmp(&numbers[*a]));
+    order.truncate(wanted);
+    order.sort_unstable();
+    order
+}
+
 /// True if loops over plain floats may replace the tensor library's operations.
 pub(crate) fn are_numbers(tensor: &Tensor) -> bool {
     tensor.device() == Device::Cpu

@@ -2,6 +2,8 @@
 
 use tch::{Kind, TchError, Tensor};
 
+use crate::f64_tensor::largest;
+
 /// Edge of a tile, cells.
 pub(super) const EDGE: i64 = 8;
 /// Cells around a tile on which two 3x3 convolutions depend.
@@ -28,13 +30,9 @@ impl Tiles {
         let by_tile = likely.f_max_pool2d([window; 2], [EDGE; 2], [NEAR; 2], [1, 1], false)?;
         let by_tile: Vec<f32> = Vec::try_from(by_tile.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
         let all = Self::all([height, width]).first_cells;
-        let wanted = ((all.len() as f64 * share).ceil() as usize).clamp(1, all.len());
-        let mut order: Vec<usize> = (0..all.len()).collect();
-        order.sort_by(|a, b| by_tile[*b].total_cmp(&by_tile[*a]));
-        order.truncate(wanted);
-        order.sort_unstable();
+        let chosen = largest(&by_tile, share);
         Ok(Self {
-            first_cells: order.into_iter().map(|tile| all[tile]).collect(),
+            first_cells: chosen.into_iter().map(|tile| all[tile]).collect(),
             size: [height, width],
         })
     }

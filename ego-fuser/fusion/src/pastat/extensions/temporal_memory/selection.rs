@@ -2,6 +2,8 @@
 
 use tch::{Kind, TchError, Tensor};
 
+use crate::f64_tensor::largest;
+
 /// A cell and its eight neighbours.
 pub(super) const AROUND: i64 = 9;
 /// Margin around a patch, cells, whose likelihood counts as the patch's own: one cell gives the presence of a vehicle,
@@ -44,13 +46,8 @@ impl Selection {
         let by_patch =
             likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
         let by_patch: Vec<f32> = Vec::try_from(by_patch.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
-        let wanted = ((by_patch.len() as f64 * share).ceil() as usize).clamp(1, by_patch.len());
-        let mut patches: Vec<usize> = (0..by_patch.len()).collect();
-        patches.sort_by(|a, b| by_patch[*b].total_cmp(&by_patch[*a]));
-        patches.truncate(wanted);
-        patches.sort_unstable();
         Ok(Self::of(
-            &patches,
+            &largest(&by_patch, share),
             patch as usize,
             [height as usize, width as usize],
         ))
