@@ -24,7 +24,7 @@ struct Followed {
     /// Interval of the last computed sweep.
     last: Option<i128>,
     /// Time of the last message, nanoseconds.
-    heard_nanos: u64,
+    received_nanos: u64,
 }
 
 impl SweepSelection {
@@ -56,7 +56,7 @@ impl SweepSelection {
             Followed {
                 pace,
                 last,
-                heard_nanos: now_nanos,
+                received_nanos: now_nanos,
             },
         );
         true
@@ -71,7 +71,7 @@ impl SweepSelection {
     /// before the last one begins anew.
     pub(crate) fn admits(&mut self, capture_nanos: u64, now_nanos: u64) -> bool {
         self.paces.retain(|ego, followed| {
-            let is_heard = now_nanos.saturating_sub(followed.heard_nanos) <= MAX_SILENCE_NANOS;
+            let is_heard = now_nanos.saturating_sub(followed.received_nanos) <= MAX_SILENCE_NANOS;
             if !is_heard {
                 tracing::info!(%ego, "the ego is silent: its pace is forgotten");
             }

@@ -132,7 +132,7 @@ fn an_identity_is_not_used_again_and_a_weak_detection_begins_no_track() {
 }
 
 #[test]
-fn front_and_rear_are_told_apart_by_a_clear_motion() {
+fn front_and_rear_are_distinguished_by_a_clear_motion() {
     let frames = (0..30).map(|tick| {
         let mut seen = detection(f64::from(tick), 0.0, 0.9);
         // Every detection but each fourth has the front at the rear.
