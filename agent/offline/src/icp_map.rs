@@ -8,7 +8,7 @@ use crate::sweep_database::present_sweeps;
 use std::path::Path;
 use std::sync::Arc;
 
-use dataset::{self, LoadOptions};
+use dataset::{self, LeftOut, LoadOptions, Problem};
 use nalgebra::Isometry3;
 use protocol::{NoPoseReason, PoseEstimate};
 
@@ -57,35 +57,46 @@ fn no_pose(reason: NoPoseReason) -> PoseEstimate {
     }
 }
 
-/// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path.
+/// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path. Sweeps that
+/// cannot be read are left out and counted in `left_out`.
 ///
 /// # Errors
-/// [`Error`] names the file.
+/// [`Error`] names the drive that cannot be opened, or of which no sweep has a pose.
 pub fn read_map(
     folders: &[impl AsRef<Path>],
     spacing_m: f64,
     config: &IcpConfig,
+    left_out: &mut LeftOut,
 ) -> Result<IcpTarget, Error> {
     let mut map = IcpTarget::new(config);
     for folder in folders {
         let mut sweeps = 0;
-        for scenario in dataset::open(folder.as_ref())?.scenarios {
+        let drives = dataset::open(folder.as_ref())?;
+        left_out.add_files(&drives.problems);
+        for scenario in drives.scenarios {
             let mut last: Option<(usize, Isometry3<f64>)> = None;
             for (agent, tick) in present_sweeps(&scenario) {
                 let without_points = LoadOptions {
                     points: false,
                     ..LoadOptions::default()
                 };
-                let frame = scenario.load(agent, tick, &without_points)?;
-                let Some(pose) = frame.world_from_lidar else {
+                let mut load = |options: &LoadOptions| {
+                    let frame = scenario.load(agent, tick, options);
+                    frame
+                        .map_err(|error| left_out.add_unreadable(agent, Problem::from(&error)))
+                        .ok()
+                };
+                let Some(pose) = load(&without_points).and_then(|frame| frame.world_from_lidar)
+                else {
                     continue;
                 };
                 let pose = pose.isometry();
                 let way_m = last
                     .filter(|(of, _)| *of == agent)
                     .map(|(_, last)| (last.translation.vector - pose.translation.vector).norm());
-                if way_m.is_none_or(|way_m| way_m >= spacing_m) {
-                    let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+                if way_m.is_none_or(|way_m| way_m >= spacing_m)
+                    && let Some(frame) = load(&LoadOptions::default())
+                {
                     map.add(&frame.points.xyzi, &pose);
                     last = Some((agent, pose));
                     sweeps += 1;
@@ -94,8 +105,14 @@ pub fn read_map(
         }
         if sweeps == 0 {
             let folder = folder.as_ref().display();
+            let reasons = left_out.reasons();
             return Err(Error::Input(format!(
-                "{folder}: no sweep has a true pose to put it on the map with"
+                "{folder}: no sweep has a true pose to put it on the map with{}{reasons}",
+                if reasons.is_empty() {
+                    ""
+                } else {
+                    "; left out: "
+                }
             )));
         }
     }

@@ -10,6 +10,7 @@ use ego_fuser::ego_loop::Input;
 use ego_fuser::ego_loop::recorded::{KIND, Record};
 use link::{LinkConfig, Trace};
 use localization::pose_source::{ErrorTable, PoseTable};
+use localization::registration::icp::surfel_map::SurfelMap;
 use perception::weights::Weights;
 use protocol::{Limits, wire};
 use recording::Recording;
@@ -183,6 +184,12 @@ pub fn all(root: &Path) -> Vec<Reader> {
             text(seeds::ERRORS),
             file("errors", "a.csv"),
             |path, _| ErrorTable::read(path).is_ok(),
+        ),
+        on_disk(
+            "surfel map",
+            vec![seeds::surfel_map(root)],
+            file("surfels", "a.safetensors"),
+            |path, _| SurfelMap::load(path).is_ok_and(|map| map.target().planes() < 1 << 20),
         ),
         on_disk(
             "weights",

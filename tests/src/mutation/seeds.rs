@@ -7,6 +7,9 @@ use agent::input_log::Start;
 use dataset::pcd::{Encoding, IntensityField, encode};
 use ego_fuser::ego_loop::recorded::{KIND, Published, Record, WireMessage};
 use ego_fuser::ego_loop::{Input, Reception};
+use localization::registration::icp::IcpTarget;
+use localization::registration::icp::surfel_map::SurfelMap;
+use nalgebra::Isometry3;
 use protocol::{CavId, Key, Lidar, Message, Pose, PoseEstimate, RunId, Stamp, Stream, Topic, wire};
 use recording::{ExportTimes, RecordingOptions, RecordingWriter, export_ros2};
 use ros2::{Mount, Translator};
@@ -293,6 +296,31 @@ pub fn ego_inputs(scratch: &Path) -> Vec<u8> {
     for record in std::iter::once(start).chain(inputs).chain([published]) {
         writer.add(&record).expect("a writable folder");
     }
+    std::fs::read(&path).expect("it was written")
+}
+
+/// Surfel map of a level square of ten metres.
+///
+/// # Panics
+/// When a file cannot be written.
+#[must_use]
+pub fn surfel_map(scratch: &Path) -> Vec<u8> {
+    let square = (0..1600).map(|k| {
+        [
+            (k % 40) as f32 * 0.25 + 3.0,
+            (k / 40) as f32 * 0.25,
+            -2.0,
+            0.1,
+        ]
+    });
+    let mut target = IcpTarget::new(&SurfelMap::building());
+    target.add(
+        &square.collect::<Vec<_>>(),
+        &Isometry3::translation(100.0, 200.0, 2.0),
+    );
+    target.fit();
+    let path = scratch.join("seed-surfels.safetensors");
+    SurfelMap::write(&path, &target).expect("a writable folder");
     std::fs::read(&path).expect("it was written")
 }
 

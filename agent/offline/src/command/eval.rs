@@ -241,7 +241,7 @@ impl Args {
             return Err(BadInput::new(reason));
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.icp_map, spacing_m, &config).map_err(BadInput::of)?;
+        let map = read_map(&self.icp_map, spacing_m, &config, left_out).map_err(BadInput::of)?;
         let source = IcpMapPose::new(Arc::new(map), config);
         Ok(Subject::Source(Box::new(source)))
     }

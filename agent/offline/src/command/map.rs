@@ -7,6 +7,7 @@ use agent_offline::icp_map::read_map;
 use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
+use dataset::LeftOut;
 use localization::pgc::head_files::{ENCODER_FILE, SURFELS_FILE, released_encoder};
 use localization::registration::icp::surfel_map::SurfelMap;
 use perception::compute_device::ComputeDevice;
@@ -80,7 +81,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         check_folders(&args.drives)?;
         check_out(&args.out, false, args.force).map_err(BadInput::of)?;
         std::fs::create_dir_all(&args.out).at(&args.out)?;
-        return args.write_surfels();
+        return Ok(args.write_surfels()?.print());
     }
     malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS)
         .context("cannot execute this program again")?;
@@ -98,7 +99,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         false => anyhow::Error::from(error),
     })?;
     write(&config, &report)?;
-    args.write_surfels()?;
     let head = report.trained.weights.display();
     if args.json {
         output::line(serde_json::to_string_pretty(&report)?)?;
@@ -109,21 +109,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(left_out) = &report.left_out {
         output::note(format_args!("left out: {left_out}"));
     }
+    // What is left out here is left out of the report too.
+    args.write_surfels()?;
     Ok(Outcome::of(report.left_out.is_some()))
 }
 
 impl Args {
     /// Writes the planes of the place beside the head.
-    fn write_surfels(&self) -> anyhow::Result<Outcome> {
-        let target = read_map(&self.drives, self.surfel_spacing_m, &SurfelMap::building());
+    fn write_surfels(&self) -> anyhow::Result<LeftOut> {
+        let mut left_out = LeftOut::default();
+        let config = SurfelMap::building();
+        let target = read_map(&self.drives, self.surfel_spacing_m, &config, &mut left_out);
         let target = target.map_err(BadInput::of)?;
         let path = self.out.join(SURFELS_FILE);
         let sha256 = SurfelMap::write(&path, &target)?;
         let (planes, path) = (target.planes(), path.display());
-        output::line(format_args!(
-            "surfels    {planes} planes, {path}, SHA-256 {sha256}"
-        ))?;
-        Ok(Outcome::Done)
+        output::note(format_args!("{path}: {planes} planes, SHA-256 {sha256}"));
+        Ok(left_out)
     }
 
     fn config(&self) -> anyhow::Result<MapConfig> {

@@ -26,7 +26,7 @@ use crate::tensor_values::tensor;
 use crate::torch_error::first_line;
 
 pub use annotate::annotate;
-pub use save::{Precision, save};
+pub use save::{Precision, save, with_header};
 pub(crate) use save::{Stored, file_bytes};
 pub use support::file_error::FileError;
 

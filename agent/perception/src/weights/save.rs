@@ -63,7 +63,7 @@ pub fn save(
 
 /// The same file with a changed header, in the order of names: the library writes metadata in the order of a hash map,
 /// and equal weights should give equal files. `file` was read or written by the library: its length and header are valid.
-pub(super) fn with_header(
+pub fn with_header(
     file: &[u8],
     change: impl FnOnce(&mut BTreeMap<String, Value>),
 ) -> Result<Vec<u8>, serde_json::Error> {

@@ -130,7 +130,11 @@ impl Arguments {
         let scenarios = self.data.scenarios(&mut left_out)?;
         let mut rows = Vec::new();
         for (number, &boxes) in self.boxes.iter().enumerate() {
-            let mut methods = self.methods()?;
+            let mut of_maps = LeftOut::default();
+            let mut methods = self.methods(&mut of_maps)?;
+            if number == 0 {
+                left_out.merge(&of_maps);
+            }
             // What exchanges no boxes is compared once.
             methods.retain(|method| number == 0 || method.needs_boxes);
             let mut source = self.box_source(boxes, &methods)?;
@@ -156,7 +160,7 @@ impl Arguments {
         Ok(print_left_out(&left_out))
     }
 
-    fn methods(&self) -> Result<Vec<AlignmentSpec>> {
+    fn methods(&self, left_out: &mut LeftOut) -> Result<Vec<AlignmentSpec>> {
         use Method::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
         let all = [Gnss, Icp, IcpGnss, BoxIcpMethod, FreeAlignMethod];
         let named = if self.method.is_empty() {
@@ -164,30 +168,31 @@ impl Arguments {
         } else {
             &self.method
         };
-        let built_in = named.iter().map(|method| self.built_in(*method));
+        let built_in = named.iter().map(|method| self.built_in(*method, left_out));
         built_in
             .chain(self.pose_source.iter().map(from_source))
             .collect()
     }
 
-    fn built_in(&self, method: Method) -> Result<AlignmentSpec> {
+    fn built_in(&self, method: Method, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
         Ok(match method {
             Method::Gnss => Poses::spec("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose))),
             Method::Icp => CloudIcp::spec(IcpConfig::default(), false),
             Method::IcpGnss => CloudIcp::spec(IcpConfig::default(), true),
-            Method::IcpMap => self.icp_map()?,
+            Method::IcpMap => self.icp_map(left_out)?,
             Method::BoxIcp => BoxIcp::spec(),
             Method::FreeAlign => FreeAlign::spec(FreeAlignConfig::default()),
         })
     }
 
-    fn icp_map(&self) -> Result<AlignmentSpec> {
+    fn icp_map(&self, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
         if self.icp_map.is_empty() || self.map_spacing_m.is_nan() || self.map_spacing_m < 0.0 {
             let reason = "icp-map needs --icp-map DIR, and a spacing that is not negative";
             return Err(BadInput::new(reason).into());
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.icp_map, self.map_spacing_m, &config).map_err(BadInput::of)?;
+        let map =
+            read_map(&self.icp_map, self.map_spacing_m, &config, left_out).map_err(BadInput::of)?;
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
         let build = move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>);

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use nalgebra::Vector3;
-use perception::weights::{CONFIG_KEY, FileError, KIND_KEY};
+use perception::weights::{CONFIG_KEY, FileError, KIND_KEY, with_header};
 use protocol::text::hex;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, serialize};
 use serde::{Deserialize, Serialize};
@@ -146,7 +146,8 @@ fn encode(config: &Config, count: usize, columns: [&[u8]; 3]) -> Result<Vec<u8>,
         (KIND_KEY.to_owned(), KIND.to_owned()),
         (CONFIG_KEY.to_owned(), config),
     ]);
-    serialize(tensors, Some(metadata)).map_err(|error| error.to_string())
+    let bytes = serialize(tensors, Some(metadata)).map_err(|error| error.to_string())?;
+    with_header(&bytes, |_| ()).map_err(|error| error.to_string())
 }
 
 fn decode(bytes: &[u8]) -> Result<IcpTarget, String> {
@@ -272,7 +273,8 @@ mod tests {
         let mut target = IcpTarget::new(&SurfelMap::building());
         target.add(&yard(), &pose);
         target.fit();
-        SurfelMap::write(&path, &target).unwrap();
+        let sha256 = SurfelMap::write(&path, &target).unwrap();
+        assert_eq!(SurfelMap::write(&path, &target).unwrap(), sha256);
         (folder, path, pose)
     }
 
