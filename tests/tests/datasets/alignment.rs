@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use dataset::pcd;
-use dataset::{self, LoadOptions};
+use dataset::{self, LeftOut, LoadOptions};
 use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
 use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use ego_fuser_offline::evaluation::alignment::table::Tally;
@@ -147,7 +147,7 @@ fn approaches_meet_on_generated_scenes() {
     // A point cloud map of the scenes themselves: exact, so that any error is one of the registration.
     let config = IcpConfig::default();
     no_map_of_nothing(folder.path());
-    let map = Arc::new(read_map(&[&scenes], 1.0, &config).unwrap());
+    let map = Arc::new(read_map(&[&scenes], 1.0, &config, &mut LeftOut::default()).unwrap());
     assert!(map.planes() > 1000);
     let source = IcpMapPose::new(map, config.clone());
     let methods = [
@@ -200,7 +200,15 @@ fn approaches_meet_on_generated_scenes() {
 fn no_map_of_nothing(folder: &std::path::Path) {
     let empty = folder.join("nothing");
     std::fs::create_dir(&empty).unwrap();
-    assert!(read_map(&[&empty], 1.0, &IcpConfig::default()).is_err());
+    assert!(
+        read_map(
+            &[&empty],
+            1.0,
+            &IcpConfig::default(),
+            &mut LeftOut::default()
+        )
+        .is_err()
+    );
 }
 
 #[test]
