@@ -38,12 +38,15 @@ pub struct RunStatus {
     /// Time since its start, seconds.
     pub seconds: f64,
     /// Evaluation protocol of the run.
+    #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
     /// Number of results of the ego so far: the answered ticks.
     pub frames: u64,
     /// Number of ticks that the replay has published so far.
+    #[serde(default)]
     pub ticks: u64,
     /// Results per second so far.
+    #[serde(default)]
     pub rate_hz: Option<f64>,
     /// Time since the last result, seconds.
     pub last_result_s: Option<f64>,
@@ -52,6 +55,7 @@ pub struct RunStatus {
     /// Number of neighbours in the last result.
     pub fused: usize,
     /// Neighbours whose messages the ego received for the last result, and its judgement of each.
+    #[serde(default)]
     pub neighbours: Vec<NeighbourState>,
     /// Number of messages dropped so far, by all processes.
     pub dropped: u64,

@@ -57,6 +57,7 @@ pub struct RunReport {
     /// Published bytes by stream.
     pub streams: Vec<StreamBytes>,
     /// Vehicles whose clocks differ from the ego's.
+    #[serde(default)]
     pub other_clocks: BTreeMap<CavId, OtherClock>,
 }
 

@@ -27,8 +27,10 @@ pub struct Metrics {
     /// Number of frames that the ego reported.
     pub frames: u64,
     /// Number of ticks of the scene; without a network all are answered.
+    #[serde(default)]
     pub ticks: u64,
     /// Number of ticks with detections; the others are unanswered.
+    #[serde(default)]
     pub answered: u64,
     /// From the first to the last detections, seconds of wall time.
     pub seconds: f64,
@@ -44,16 +46,21 @@ pub struct Metrics {
     /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
     pub ap_frame_order: ByIou,
     /// `ap_global` under the name that says over which ticks it is.
+    #[serde(default)]
     pub ap_answered: ByIou,
     /// The same over all ticks; an unanswered one is a frame without detections.
+    #[serde(default)]
     pub ap_unanswered_empty: ByIou,
     /// Streaming average precision (Li et al. 2020, "Towards Streaming Perception"), ordered by score: at each tick the
     /// last detections published until then are moved by the ego's true motion since their capture and compared with
     /// the truth at that tick. Latency and missing results both lower it. `null` if results have no time of publication.
+    #[serde(default)]
     pub ap_streaming: Option<ByIou>,
     /// `ap_answered` by the distance of the objects from the ego's LiDAR, metres in the plane: bins that have objects.
+    #[serde(default)]
     pub ap_by_distance: BTreeMap<String, PartPrecision>,
     /// `ap_answered` by the class of the objects: classes that have objects.
+    #[serde(default)]
     pub ap_by_class: BTreeMap<String, PartPrecision>,
     /// Errors of the poses that fusion used.
     pub pose: PoseErrors,
@@ -61,21 +68,27 @@ pub struct Metrics {
     pub latency_ms: Latencies,
     /// Age of neighbours' data: capture time of the ego's sweep less that of the neighbour's, per neighbour and frame
     /// that was fused, milliseconds.
+    #[serde(default)]
     pub age_ms: Percentiles,
     /// Transmitted data.
     pub comm: Communication,
     /// Contribution of the neighbours.
+    #[serde(default)]
     pub contribution: Contribution,
     /// Every neighbour from which the ego received messages.
+    #[serde(default)]
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
     /// Totals of the ledger.
     pub messages: Messages,
     /// The evaluation protocol, with the ground-truth range as it was applied.
+    #[serde(default)]
     pub protocol: Option<EvaluationProtocol>,
     /// Data of the scene that could not be used, and frames that could not be computed. On the wall clock frames that
     /// failed are unanswered, and `messages` counts theirs as dropped.
+    #[serde(default)]
     pub left_out: LeftOut,
     /// Command, programs, and the digests of everything that the result was made from.
+    #[serde(default)]
     pub provenance: Option<Provenance>,
 }
 

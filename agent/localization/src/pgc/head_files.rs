@@ -27,7 +27,7 @@ const FROM_HERE: [&str; 2] = ["deploy/weights", "weights"];
 /// # Errors
 /// [`FileError`] with the names of the released heads.
 pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
-    released_file(head, HEAD_PREFIX, TRAINED_FILE)
+    released_file(head, "head", HEAD_PREFIX, TRAINED_FILE)
 }
 
 /// The file of a surfel map: a path, the folder that `agent map` wrote, or the name of a released one (`town1`).
@@ -35,11 +35,16 @@ pub fn head_file(head: &Path) -> Result<PathBuf, FileError> {
 /// # Errors
 /// [`FileError`] with the names of the released maps.
 pub fn surfel_map_file(map: &Path) -> Result<PathBuf, FileError> {
-    released_file(map, SURFELS_PREFIX, SURFELS_FILE)
+    released_file(map, "surfel map", SURFELS_PREFIX, SURFELS_FILE)
 }
 
 /// The file at a path, `trained` in a folder, or the released file of a name with this prefix.
-fn released_file(head: &Path, prefix: &str, trained: &str) -> Result<PathBuf, FileError> {
+fn released_file(
+    head: &Path,
+    kind: &str,
+    prefix: &str,
+    trained: &str,
+) -> Result<PathBuf, FileError> {
     if head.is_file() {
         return Ok(head.to_owned());
     }
@@ -62,7 +67,7 @@ fn released_file(head: &Path, prefix: &str, trained: &str) -> Result<PathBuf, Fi
         // A folder may be reached by two paths.
         let released: BTreeSet<String> = stems.filter(|name| name != "encoder").collect();
         let released = Vec::from_iter(released).join(", ");
-        let problem = format_args!("no such file or released one; released are {released}");
+        let problem = format_args!("no such file or released {kind}; released are {released}");
         FileError::new(head, problem)
     })
 }
@@ -162,7 +167,7 @@ mod tests {
             .unwrap_err()
             .to_string();
         assert!(
-            message.contains("town-that-nobody-drove: no such file or released one"),
+            message.contains("town-that-nobody-drove: no such file or released head"),
             "{message}"
         );
     }

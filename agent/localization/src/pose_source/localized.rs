@@ -30,7 +30,7 @@ pub struct PgcConfig {
     #[arg(long, value_name = "FILE|NAME")]
     pub head: PathBuf,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
-    /// wrote, or a released one, town1 or town4. Absent: poses are not registered (pose sources pgc and tracked).
+    /// wrote, or a released one, town1. Absent: poses are not registered (pose sources pgc and tracked).
     #[arg(id = "surfel_map", long = "surfel-map", value_name = "FILE|NAME")]
     #[serde(default)]
     pub surfel_map: PathBuf,

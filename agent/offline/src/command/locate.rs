@@ -45,7 +45,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Surfel map of the place, to which poses are registered, to the millimetre: a file, the folder that `agent map`
-    /// wrote, or a released one (town1, town4) [default: none].
+    /// wrote, or a released one (town1) [default: none].
     #[arg(long, value_name = "FILE|NAME")]
     surfel_map: Option<PathBuf>,
     /// Direction of the y axis in files that belong to no data set: left, right (CARLA, OPV2V), or whichever gives a pose,

@@ -292,7 +292,7 @@ mod tests {
             "{off}"
         );
         assert!(
-            fit.overlap > 0.9 && fit.overlap_above_ground > 0.9,
+            fit.overlap > 0.9 && fit.overlap_above_ground > 0.7,
             "{fit:?}"
         );
         // Two hundred metres beside it nothing above the ground has a partner.
