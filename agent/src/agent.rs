@@ -59,7 +59,7 @@ pub struct AgentOutput {
 pub(crate) struct EncodedSweep {
     /// Beginning of the first step.
     began: Instant,
-    /// What the detector computed of it; `None`: nothing yet.
+    /// Feature map and levels of the detector; `None` before they are computed.
     encoded: Option<Encoded>,
 }
 

@@ -20,7 +20,7 @@ pub enum Record<I, P> {
     Input {
         /// Time on the loop's clock, nanoseconds.
         now_nanos: u64,
-        /// What happened.
+        /// The input.
         input: I,
     },
     /// A message was published: what only its sending thread knows of it.

@@ -173,9 +173,9 @@ mod tests {
         streams! {
             /// Sound.
             Sonar = "sonar": Some(Kind::Radar), Replay, true, None;
-            /// What an agent hears, by ear.
+            /// Sound at each microphone of an agent.
             Echo(ear: u8) = "echo/{ear}": Some(Kind::Boxes), Agent, true, Some(1 << 10);
-            /// How loud an ego wants it.
+            /// Volume that an ego asks for.
             Volume = "volume": Some(Kind::Pace), Ego, false, Some(1 << 9);
         }
     }

@@ -57,17 +57,31 @@ fn no_pose(reason: NoPoseReason) -> PoseEstimate {
     }
 }
 
+/// Checks the distance between two sweeps on a map.
+///
+/// # Errors
+/// [`Error::Input`] when it is negative or not finite.
+pub fn check_spacing(spacing_m: f64) -> Result<(), Error> {
+    if spacing_m.is_finite() && spacing_m >= 0.0 {
+        return Ok(());
+    }
+    Err(Error::Input(format!(
+        "the distance between sweeps on the map is {spacing_m} m, must be 0 or more"
+    )))
+}
+
 /// Builds a point-cloud map of drives with true poses: of every agent a sweep per `spacing_m` metres of path. Sweeps that
 /// cannot be read are left out and counted in `left_out`.
 ///
 /// # Errors
-/// [`Error`] names the drive that cannot be opened, or of which no sweep has a pose.
+/// [`Error`] names the drive that cannot be opened, or of which no sweep has a pose; or the distance is not valid.
 pub fn read_map(
     folders: &[impl AsRef<Path>],
     spacing_m: f64,
     config: &IcpConfig,
     left_out: &mut LeftOut,
 ) -> Result<IcpTarget, Error> {
+    check_spacing(spacing_m)?;
     let mut map = IcpTarget::new(config);
     for folder in folders {
         let mut sweeps = 0;

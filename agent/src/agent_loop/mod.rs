@@ -1,6 +1,6 @@
 //! Agent loop: what a vehicle does with each input, at a time that is given. It has no network, clock or thread.
 //!
-//! A sweep waits for the pose and the motion of its capture time. Then it is computed in steps, and what a step gives is
+//! A sweep waits for the pose and the motion of its capture time. Then it is computed in steps. The result of a step is
 //! published before the next one: the pose, the perception, and the measurement for the poses of later sweeps.
 //!
 //! The live process and the replay of recorded inputs are adapters: they bring inputs in order of time and carry out the
@@ -170,7 +170,7 @@ impl AgentLoop {
     }
 
     /// Takes an input in at `now_nanos`, which does not decrease. Only [`Input::Wake`] computes, and one step at most:
-    /// what a step gives is published before the next one.
+    /// the result of a step is published before the next one.
     pub fn handle(&mut self, input: Input, now_nanos: u64) -> Vec<Output> {
         match input {
             Input::Sweep(sweep) => self.admit(sweep, now_nanos),

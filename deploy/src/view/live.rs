@@ -61,7 +61,7 @@ pub struct LiveRun {
     thread: Option<JoinHandle<()>>,
 }
 
-/// What the thread writes and pages read.
+/// State of a live run: the thread writes it, pages read it.
 struct Shared {
     newest: Mutex<NewestFrames>,
     activity: Mutex<RunActivity>,

@@ -8,7 +8,7 @@ use protocol::config::FieldError;
 
 use super::{PoseSource, PoseSourceError};
 
-/// What the poses of a source are made from.
+/// Input from which a source makes its poses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum PoseBasis {
     /// The measured pose of the sweep.
@@ -21,7 +21,7 @@ pub(crate) enum PoseBasis {
 
 /// Settings of a pose source. Its file implements this, and its row is in `table.rs`.
 pub(crate) trait PoseSettings {
-    /// What its poses are made from.
+    /// Input from which the poses are made.
     fn basis(&self) -> PoseBasis;
 
     /// Sets the source up with checked settings and reads its files.
@@ -47,7 +47,7 @@ pub(crate) trait PoseSettings {
             .collect()
     }
 
-    /// What the identifiers of its options have before the name of the field.
+    /// Prefix of the identifiers of its options, before the name of the field.
     fn option_prefix() -> &'static str
     where
         Self: Sized,

@@ -236,10 +236,6 @@ impl Args {
             return Ok(Subject::Localizer(localizer));
         }
         let spacing_m = self.map_spacing_m;
-        if !spacing_m.is_finite() || spacing_m < 0.0 {
-            let reason = format!("--map-spacing-m is {spacing_m}, must be 0 or more");
-            return Err(BadInput::new(reason));
-        }
         let config = IcpConfig::default();
         let map = read_map(&self.icp_map, spacing_m, &config, left_out).map_err(BadInput::of)?;
         let source = IcpMapPose::new(Arc::new(map), config);

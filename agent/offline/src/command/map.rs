@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use agent_offline::icp_map::read_map;
+use agent_offline::icp_map::{check_spacing, read_map};
 use agent_offline::mapping::{MapConfig, MapProgress, MapReport, make_map};
 use anyhow::Context;
 use bus::malloc_settings;
@@ -77,6 +77,7 @@ pub(crate) struct Args {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    check_spacing(args.surfel_spacing_m).map_err(BadInput::of)?;
     if args.surfels_only {
         check_folders(&args.drives)?;
         check_out(&args.out, false, args.force).map_err(BadInput::of)?;

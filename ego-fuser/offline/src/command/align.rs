@@ -186,8 +186,8 @@ impl Arguments {
     }
 
     fn icp_map(&self, left_out: &mut LeftOut) -> Result<AlignmentSpec> {
-        if self.icp_map.is_empty() || self.map_spacing_m.is_nan() || self.map_spacing_m < 0.0 {
-            let reason = "icp-map needs --icp-map DIR, and a spacing that is not negative";
+        if self.icp_map.is_empty() {
+            let reason = "icp-map needs --icp-map DIR";
             return Err(BadInput::new(reason).into());
         }
         let config = IcpConfig::default();
