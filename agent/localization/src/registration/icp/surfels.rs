@@ -23,6 +23,14 @@ pub(super) struct Surfel {
     pub normal: Vector3<f64>,
 }
 
+/// A plane as it is kept: a town has half a million of them. Single precision is 30 nm in a voxel of half a metre.
+#[derive(Debug, Clone, Copy)]
+struct KeptPlane {
+    /// Centre from the voxel's lowest corner, metres.
+    offset_m: Vector3<f32>,
+    normal: Vector3<f32>,
+}
+
 /// Sums over the points of a voxel.
 #[derive(Debug, Clone, Copy, Default)]
 struct Moments {
@@ -71,7 +79,9 @@ pub(super) struct Surfels {
     sites: Sites,
     moments: Vec<Moments>,
     /// By row of `sites`; made by [`Self::fit`].
-    planes: Vec<Option<Surfel>>,
+    planes: Vec<Option<KeptPlane>>,
+    /// Voxels with a plane.
+    count: usize,
 }
 
 impl Surfels {
@@ -81,6 +91,7 @@ impl Surfels {
             sites: Sites::default(),
             moments: Vec::new(),
             planes: Vec::new(),
+            count: 0,
         }
     }
 
@@ -114,10 +125,11 @@ impl Surfels {
             moments
         };
         let plane = |(coord, own): (&[i32; 3], &Moments)| {
-            Some(Surfel {
+            let plane = Surfel {
                 centre_m: own.mean(),
                 normal: around(coord).normal()?,
-            })
+            };
+            Some(self.kept(*coord, &plane))
         };
         self.planes = self
             .sites
@@ -126,20 +138,24 @@ impl Surfels {
             .zip(&self.moments)
             .map(plane)
             .collect();
+        self.count = self.planes.iter().flatten().count();
     }
 
     /// A grid of planes that were fitted before: no point can be added to it.
     pub(super) fn of_planes(
         voxel_m: f64,
-        planes: impl IntoIterator<Item = ([i32; 3], Surfel)>,
+        planes: impl ExactSizeIterator<Item = ([i32; 3], Surfel)>,
     ) -> Self {
         let mut surfels = Self::new(voxel_m);
+        surfels.planes.reserve_exact(planes.len());
         for (voxel, plane) in planes {
             // A voxel has one plane: the first.
             if surfels.sites.add(voxel) as usize == surfels.planes.len() {
-                surfels.planes.push(Some(plane));
+                let kept = surfels.kept(voxel, &plane);
+                surfels.planes.push(Some(kept));
             }
         }
+        surfels.count = surfels.planes.len();
         surfels
     }
 
@@ -148,7 +164,25 @@ impl Surfels {
         let voxels = self.sites.coords().iter().copied();
         voxels
             .zip(&self.planes)
-            .filter_map(|(voxel, plane)| Some((voxel, (*plane)?)))
+            .filter_map(|(voxel, kept)| Some((voxel, self.plane(voxel, kept.as_ref()?))))
+    }
+
+    fn kept(&self, voxel: [i32; 3], plane: &Surfel) -> KeptPlane {
+        KeptPlane {
+            offset_m: (plane.centre_m - self.corner_m(voxel)).cast(),
+            normal: plane.normal.cast(),
+        }
+    }
+
+    fn plane(&self, voxel: [i32; 3], kept: &KeptPlane) -> Surfel {
+        Surfel {
+            centre_m: self.corner_m(voxel) + kept.offset_m.cast::<f64>(),
+            normal: kept.normal.cast(),
+        }
+    }
+
+    fn corner_m(&self, voxel: [i32; 3]) -> Vector3<f64> {
+        Vector3::from(voxel.map(f64::from)) * self.voxel_m
     }
 
     /// Side of a voxel, metres.
@@ -158,7 +192,7 @@ impl Surfels {
 
     /// Number of voxels with a plane.
     pub(super) fn len(&self) -> usize {
-        self.planes.iter().flatten().count()
+        self.count
     }
 
     /// The plane whose centre is nearest to a point, among the eight voxels on the point's side: complete to half a
@@ -173,19 +207,17 @@ impl Surfels {
                 first[1] + (offset >> 1 & 1),
                 first[2] + (offset >> 2),
             ];
-            let Some(plane) = self
-                .sites
-                .row(voxel)
-                .and_then(|row| self.planes.get(row as usize)?.as_ref())
-            else {
+            let row = self.sites.row(voxel);
+            let Some(kept) = row.and_then(|row| self.planes.get(row as usize)?.as_ref()) else {
                 continue;
             };
+            let plane = self.plane(voxel, kept);
             let distance = (plane.centre_m - point_m).norm_squared();
             if distance < least {
                 (nearest, least) = (Some(plane), distance);
             }
         }
-        nearest.copied()
+        nearest
     }
 }
 
