@@ -34,6 +34,10 @@ pub(crate) const RUNNER: Sibling = Sibling {
             "Evaluate methods on recorded scenes without a network: AP, pose errors, bytes",
         ),
         (
+            "bench",
+            "Measure what a frame costs on this machine: every stage in milliseconds and in units, which compare machines",
+        ),
+        (
             "sweep",
             "Run a grid of experiments in simulation time: one CSV, charts, a report",
         ),

@@ -32,7 +32,7 @@ pub struct Capacity {
     pub vehicles: usize,
     /// Number of these whose agents run on this machine.
     pub local_vehicles: usize,
-    /// CPU time of an agent per frame, milliseconds.
+    /// CPU time of an agent per frame while the other cores compute too, milliseconds.
     pub agent_ms: f64,
     /// CPU time of the fusion per frame, milliseconds.
     pub fuse_ms: f64,
@@ -40,11 +40,18 @@ pub struct Capacity {
     pub messages_ms: f64,
     /// Time between two frames, milliseconds.
     pub period_ms: f64,
-    /// Speed of a core while the others compute too and other programs run, relative to one of an idle machine, 0..=1.
+    /// Time of one 3x3 convolution from 64 to 64 channels on 96 x 128, in 32 bits, on one thread that is held to AVX2,
+    /// milliseconds: the unit in which machines compare.
+    #[serde(default)]
+    pub unit_ms: f64,
+    /// Medians of the stages of an agent, then of the ego, milliseconds.
+    #[serde(default)]
+    pub stages: [Vec<(String, f64)>; 2],
+    /// Share of a core that other programs leave, 0..=1.
     pub shared_speed: f64,
     /// CPU time per frame of all processes on this machine, milliseconds.
     pub needed_ms: f64,
-    /// CPU time that the cores give per frame, milliseconds of a core that computes alone.
+    /// CPU time that the cores give per frame, milliseconds.
     pub available_ms: f64,
     /// Expected share of answered frames, 0..=1.
     pub expected_share: f64,

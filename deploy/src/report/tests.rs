@@ -207,6 +207,8 @@ fn a_report_reads_back_and_is_a_table_for_people() {
         fuse_ms: 100.0,
         messages_ms: 26.0,
         period_ms: 100.0,
+        unit_ms: 20.0,
+        stages: Default::default(),
         shared_speed: 1.0,
         needed_ms: 326.0,
         available_ms: 200.0,

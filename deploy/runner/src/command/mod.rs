@@ -1,5 +1,6 @@
 //! One file per subcommand: its arguments, and the call into the library.
 
+mod bench;
 mod capacity;
 mod demo;
 mod eval;
@@ -21,7 +22,9 @@ use support::output;
 /// Subcommands of `v2vloc` that compute networks.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
-    /// Estimate the pace of a run, in a process of its own.
+    /// Measure what a frame costs on this machine: every stage in milliseconds and in units, which compare machines.
+    Bench(bench::Arguments),
+    /// Measure what the pace of a run is estimated from, in a process of its own.
     #[command(hide = true)]
     Capacity(capacity::Arguments),
     /// Generate a scene if there is none, run a fleet on it and print the result.
@@ -47,6 +50,7 @@ impl Command {
         .concat();
         malloc_settings::ensure(&settings).context("this program again")?;
         match self {
+            Self::Bench(arguments) => arguments.run(),
             Self::Capacity(arguments) => arguments.run(),
             Self::Demo(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),

@@ -3,107 +3,153 @@
 
 use std::io;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use bus::process_cpu_s;
 use dataset::LoadOptions;
 use deploy::report::{Capacity, Machine};
-use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use ego_fuser_offline::evaluation::{EvaluateError, Evaluator};
 use fusion::{Exchange, Method};
 use perception::compute_device::ComputeDevice;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 
 use crate::fleet::{Fleet, RUNNER};
 use crate::run::RunError;
 use crate::run::loss::listed;
-use crate::run::machine::{CoreSpeed, this_machine};
+use crate::run::machine::{AVX2, this_machine};
 use crate::run::stepped::setup;
 
-/// Time for computing frames; loading the models comes on top.
-const BUDGET: Duration = Duration::from_millis(600);
-/// CPU time of replay, transport, encoding, router and scorer for each megabyte of sweeps and maps, relative to
-/// [`CoreSpeed::unit_ms`]: 58 ms for 5.0 MB where a unit takes 19.4 ms (EPYC 7003, AVX2). The report of a run shows the
+/// Time for computing frames before a run; loading the models comes on top.
+pub(crate) const BUDGET: Duration = Duration::from_millis(600);
+/// CPU time of replay, transport, encoding, router and scorer for each megabyte of sweeps and maps, in units
+/// ([`Capacity::unit_ms`]): 58 ms for 5.0 MB where a unit takes 19.4 ms (EPYC 7003, AVX2). The report of a run shows the
 /// parts.
 const UNITS_PER_MB: f64 = 0.6;
 
-/// [`estimate`] in a short-lived process of its own, so that models and their memory are not kept by the
-/// process that runs the fleet. `programs` is the folder of the programs.
+/// Compute times of a fleet's processes on this machine.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Measured {
+    /// CPU time of an agent per frame, milliseconds.
+    agent_ms: f64,
+    /// CPU time of the fusion per frame, milliseconds.
+    fuse_ms: f64,
+    /// Medians of the stages of an agent, then of the ego, milliseconds.
+    stages: [Vec<(String, f64)>; 2],
+    /// Share of a core that other programs leave, 0..=1.
+    left: f64,
+}
+
+/// Estimates the pace of a fleet from [`measure`] in short-lived processes of their own, so that models and their memory
+/// are not kept by the process that runs the fleet: as many at once as will share caches and memory in the run. `None`
+/// for a run without a pace of its own. `programs` is the folder of the programs.
 ///
 /// # Errors
-/// The error of that process, or of starting it.
-pub fn estimate_apart(fleet: &Fleet, programs: &Path) -> io::Result<Option<Capacity>> {
-    if !has_pace(fleet) {
+/// The error of such a process, or of starting it.
+pub fn estimate(fleet: &Fleet, programs: &Path, budget: Duration) -> io::Result<Option<Capacity>> {
+    let Some(period_ms) = period_ms(fleet) else {
         return Ok(None);
-    }
-    let mut command = Command::new(programs.join(RUNNER));
-    command
-        .arg("capacity")
+    };
+    let program = programs.join(RUNNER);
+    let unit = Command::new(&program)
+        .args(["capacity", "--unit"])
+        .envs(AVX2)
+        .output()?;
+    let machine = this_machine();
+    let beside = machine.cores.min(local_vehicles(fleet) + 1);
+    let children: Vec<Child> = (0..beside)
+        .map(|_| start(&program, fleet, budget))
+        .collect::<io::Result<_>>()?;
+    let measured = children
+        .into_iter()
+        .map(|child| answer(child.wait_with_output()?))
+        .collect::<io::Result<Vec<Measured>>>()?;
+    let vehicle_mb = vehicle_mb(fleet).map_err(io::Error::other)?;
+    let mut capacity = capacity_of(
+        machine,
+        &measured,
+        (fleet.agents.len(), local_vehicles(fleet)),
+        vehicle_mb,
+        (period_ms, answer(unit)?),
+    );
+    fleet
+        .scenario
+        .method
+        .name()
+        .clone_into(&mut capacity.method);
+    Ok(Some(capacity))
+}
+
+/// Starts a process that measures.
+fn start(program: &Path, fleet: &Fleet, budget: Duration) -> io::Result<Child> {
+    let mut child = Command::new(program)
+        .args(["capacity", "--budget-ms", &budget.as_millis().to_string()])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
-        .stderr(Stdio::piped());
-    let mut child = command.spawn()?;
+        .stderr(Stdio::piped())
+        .spawn()?;
     // A process that ends before it has read the scenario says why itself.
-    drop(
-        child
-            .stdin
-            .take()
-            .map(|stdin| serde_json::to_writer(stdin, &fleet.scenario)),
-    );
-    let output = child.wait_with_output()?;
+    let scenario = child.stdin.take();
+    drop(scenario.map(|stdin| serde_json::to_writer(stdin, &fleet.scenario)));
+    Ok(child)
+}
+
+/// What a process printed as JSON.
+fn answer<T: DeserializeOwned>(output: Output) -> io::Result<T> {
     if output.status.success() {
         return Ok(serde_json::from_slice(&output.stdout)?);
     }
     let reasons = String::from_utf8_lossy(&output.stderr);
-    Err(io::Error::other(
-        reasons.lines().last().unwrap_or_default().to_owned(),
-    ))
+    let last = reasons.lines().last().unwrap_or_default();
+    Err(io::Error::other(last.to_owned()))
 }
 
-/// Estimates the pace of a fleet. `None` for a run without a pace of its own: in lockstep, as fast as possible, or
-/// of a single tick; and for networks that do not compute on the CPU, which is what is measured.
+/// Measures a fleet's processes in this one.
 ///
 /// # Errors
 /// [`RunError`] when models or frames cannot be loaded or computed.
-pub fn estimate(fleet: &Fleet) -> Result<Option<Capacity>, RunError> {
-    let scene = &fleet.scenario.scene;
-    let recorded = &fleet.recorded;
+pub fn measure(fleet: &Fleet, budget: Duration) -> Result<Measured, RunError> {
+    fleet.scenario.models.threads.apply();
+    let mut evaluator = Evaluator::new(setup(fleet)?)?;
+    let (began, before_s) = (Instant::now(), process_cpu_s());
+    let estimated = evaluator.estimate(&fleet.recorded, fleet.agents.len(), budget)?;
+    let left = ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
+    let steps = estimated.steps;
+    Ok(Measured {
+        agent_ms: (steps.pose_ms + steps.map_ms) * left,
+        fuse_ms: steps.fuse_ms * left,
+        stages: estimated.stages.map(|stages| {
+            stages
+                .into_iter()
+                .map(|(stage, ms)| (stage, ms * left))
+                .collect()
+        }),
+        left,
+    })
+}
+
+fn local_vehicles(fleet: &Fleet) -> usize {
+    let (all, remote) = (fleet.agents.len(), fleet.scenario.remote_agents.len());
+    all.saturating_sub(remote)
+}
+
+/// Time between two frames of a run with a pace of its own that can be estimated: not in lockstep, as fast as possible,
+/// or of a single tick, and with networks on the CPU, which is what is measured.
+fn period_ms(
+    Fleet {
+        scenario, recorded, ..
+    }: &Fleet,
+) -> Option<f64> {
+    let scene = &scenario.scene;
+    let has_pace =
+        !scene.lockstep && scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu;
     let steps = recorded
         .ticks
         .windows(2)
         .map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
-    let Some(period_nanos) = steps.min().filter(|_| has_pace(fleet)) else {
-        return Ok(None);
-    };
-    let period_ms = period_nanos as f64 * 1e-6 / scene.rate;
-    fleet.scenario.models.threads.apply();
-    let vehicles = fleet.agents.len();
-    let mut evaluator = Evaluator::new(setup(fleet)?)?;
-    let (began, before_s) = (Instant::now(), process_cpu_s());
-    let elapsed = evaluator.estimate(recorded, vehicles, BUDGET)?;
-    // Share of a core that other programs leave.
-    let left = ((process_cpu_s() - before_s) / began.elapsed().as_secs_f64()).clamp(0.01, 1.0);
-    let [pose_ms, map_ms, fuse_ms] =
-        [elapsed.pose_ms, elapsed.map_ms, elapsed.fuse_ms].map(|ms| ms * left);
-    let times = ComputeTimes {
-        pose_ms,
-        map_ms,
-        fuse_ms,
-    };
-    let machine = this_machine();
-    let speed = CoreSpeed::measure(machine.cores.min(vehicles + 1));
-    let remote = fleet.scenario.remote_agents.len();
-    let method = fleet.scenario.method.name();
-    Ok(Some(capacity_of(
-        machine,
-        (method, vehicles, vehicles - remote.min(vehicles)),
-        (&times, vehicle_mb(fleet)?),
-        period_ms,
-        CoreSpeed {
-            shared: left * speed.shared,
-            ..speed
-        },
-    )))
+    let least = steps.min().filter(|_| has_pace)?;
+    Some(least as f64 * 1e-6 / scene.rate)
 }
 
 /// Megabytes of a vehicle's sweep and of its map.
@@ -122,17 +168,20 @@ fn vehicle_mb(fleet: &Fleet) -> Result<f64, RunError> {
     Ok((sweep_bytes + map_bytes) as f64 * 1e-6)
 }
 
-/// Capacity from measured times.
+/// Capacity from measured times: their means.
 fn capacity_of(
     machine: Machine,
-    (method, vehicles, local_vehicles): (&str, usize, usize),
-    (times, vehicle_mb): (&ComputeTimes, f64),
-    period_ms: f64,
-    speed: CoreSpeed,
+    measured: &[Measured],
+    (vehicles, local_vehicles): (usize, usize),
+    vehicle_mb: f64,
+    (period_ms, unit_ms): (f64, f64),
 ) -> Capacity {
-    let (agent_ms, fuse_ms) = (times.pose_ms + times.map_ms, times.fuse_ms);
-    let shared_speed = speed.shared;
-    let messages_ms = vehicles as f64 * vehicle_mb * UNITS_PER_MB * speed.unit_ms;
+    let mean = |value: fn(&Measured) -> f64| {
+        measured.iter().map(value).sum::<f64>() / measured.len().max(1) as f64
+    };
+    let (agent_ms, fuse_ms) = (mean(|one| one.agent_ms), mean(|one| one.fuse_ms));
+    let shared_speed = mean(|one| one.left);
+    let messages_ms = vehicles as f64 * vehicle_mb * UNITS_PER_MB * unit_ms;
     let needed_ms = local_vehicles as f64 * agent_ms + fuse_ms + messages_ms;
     let available_ms = machine.cores as f64 * shared_speed * period_ms;
     // Neither an agent nor the ego computes two frames at once.
@@ -140,27 +189,25 @@ fn capacity_of(
     let expected_share = (available_ms / needed_ms)
         .min(period_ms / longest_ms)
         .min(1.0);
-    let method = method.to_owned();
     Capacity {
         machine,
-        method,
+        method: String::new(),
         vehicles,
         local_vehicles,
         agent_ms,
         fuse_ms,
         messages_ms,
         period_ms,
+        unit_ms,
+        stages: measured
+            .first()
+            .map(|one| one.stages.clone())
+            .unwrap_or_default(),
         shared_speed,
         needed_ms,
         available_ms,
         expected_share,
     }
-}
-/// True if a run has a pace of its own, and one that can be estimated.
-fn has_pace(Fleet { scenario, .. }: &Fleet) -> bool {
-    !scenario.scene.lockstep
-        && scenario.scene.rate > 0.0
-        && scenario.models.device == ComputeDevice::Cpu
 }
 
 /// Changes that let a fleet answer more ticks, the mildest first, as text: `tracked poses, method max or clock: stepped`.
@@ -205,56 +252,47 @@ fn rounded(rate: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Capacity of a machine with 10 ms for the messages of a frame.
-    fn capacity(cores: usize, pose_ms: f64, fuse_ms: f64, shared: f64) -> Capacity {
-        let speed = CoreSpeed {
-            unit_ms: 10.0,
-            shared,
-        };
-        capacity_with(cores, [pose_ms, 40.0, fuse_ms], 0.5 / UNITS_PER_MB, speed)
+    /// Capacity of a machine with 10 ms for the messages of a frame of two vehicles.
+    fn capacity(cores: usize, agent_ms: f64, fuse_ms: f64, left: f64) -> Capacity {
+        capacity_with(cores, [agent_ms, fuse_ms, left], 0.5 / UNITS_PER_MB, 10.0)
     }
 
     fn capacity_with(
         cores: usize,
-        [pose_ms, map_ms, fuse_ms]: [f64; 3],
+        [agent_ms, fuse_ms, left]: [f64; 3],
         vehicle_mb: f64,
-        speed: CoreSpeed,
+        unit_ms: f64,
     ) -> Capacity {
+        let measured = Measured {
+            agent_ms,
+            fuse_ms,
+            stages: Default::default(),
+            left,
+        };
         let machine = Machine {
             cores,
             instructions: "AVX2".into(),
         };
-        let times = ComputeTimes {
-            pose_ms,
-            map_ms,
-            fuse_ms,
-        };
-        capacity_of(
-            machine,
-            ("pastat", 2, 2),
-            (&times, vehicle_mb),
-            100.0,
-            speed,
-        )
+        let all = [measured.clone(), measured];
+        let pace = (100.0, unit_ms);
+        Capacity {
+            method: "pastat".into(),
+            ..capacity_of(machine, &all, (2, 2), vehicle_mb, pace)
+        }
     }
 
-    /// Measured on two cores of an EPYC 7003, AVX2: alone an agent takes 37 ms and the ego 78; a run took 240 ms of CPU
-    /// per frame of 200 ms.
+    /// Measured on two cores of an EPYC 7003, AVX2, while both compute: an agent takes 42 ms and the ego 89; a run took
+    /// 240 ms of CPU per frame of 200 ms.
     #[test]
     fn a_run_that_needs_240_of_200_ms_answers_50_of_60_frames() {
-        let speed = CoreSpeed {
-            unit_ms: 19.4,
-            shared: 0.875,
-        };
-        let capacity = capacity_with(2, [3.0, 34.0, 78.0], 2.5, speed);
-        let at_full_speed_ms = capacity.needed_ms / capacity.shared_speed;
-        assert!((at_full_speed_ms - 240.0).abs() < 5.0, "{capacity:?}");
-        assert_eq!((60.0 * capacity.expected_share).round(), 50.0);
+        let capacity = capacity_with(2, [42.3, 89.1, 1.0], 2.5, 19.4);
+        assert!((capacity.needed_ms - 232.0).abs() < 1.0, "{capacity:?}");
+        assert_eq!((60.0 * capacity.expected_share).round(), 52.0);
     }
 
     #[test]
     fn a_machine_with_time_to_spare_keeps_up() {
-        let capacity = capacity(4, 20.0, 40.0, 1.0);
+        let capacity = capacity(4, 60.0, 40.0, 1.0);
         assert!(
             capacity.keeps_up() && (capacity.needed_ms, capacity.available_ms) == (170.0, 400.0),
             "{capacity:?}"
@@ -273,12 +311,12 @@ mod tests {
     #[test]
     fn all_cores_together_and_each_process_alone_limit_the_pace() {
         // 2 x 100 + 100 + 10 ms in 2 x 100 ms.
-        let together = capacity(2, 60.0, 100.0, 1.0);
+        let together = capacity(2, 100.0, 100.0, 1.0);
         assert!((together.expected_share - 200.0 / 310.0).abs() < 1e-9 && !together.keeps_up());
         assert!((together.relative_rate() - 0.6).abs() < 1e-9);
-        // Hyperthreads of one core.
-        assert!((capacity(2, 60.0, 100.0, 0.6).expected_share - 120.0 / 310.0).abs() < 1e-9);
+        // Other programs leave 60 % of the cores.
+        assert!((capacity(2, 100.0, 100.0, 0.6).expected_share - 120.0 / 310.0).abs() < 1e-9);
         // Many cores do not help an agent that needs 160 ms for a sweep.
-        assert!((capacity(16, 120.0, 50.0, 1.0).expected_share - 100.0 / 160.0).abs() < 1e-9);
+        assert!((capacity(16, 160.0, 50.0, 1.0).expected_share - 100.0 / 160.0).abs() < 1e-9);
     }
 }

@@ -5,7 +5,7 @@ pub mod capacity;
 pub mod demo;
 pub(crate) mod ledger_report;
 pub(crate) mod loss;
-pub(crate) mod machine;
+pub mod machine;
 mod picture;
 mod run_error;
 pub mod run_fleet;

@@ -27,7 +27,7 @@ use support::output;
 use support::provenance::Provenance;
 
 use crate::fleet::{Fleet, SessionContext};
-use crate::run::capacity::{estimate_apart, remedies};
+use crate::run::capacity::{BUDGET, estimate, remedies};
 use crate::run::ledger_report::LedgerReport;
 use crate::run::{RunError, loss};
 use crate::scenario::{Clock, Scenario};
@@ -115,7 +115,7 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
 
 /// Prints what this machine can carry. A run whose pace cannot be estimated goes on without.
 fn announce_capacity(fleet: &Fleet, programs: &Path) -> Option<Capacity> {
-    let capacity = estimate_apart(fleet, programs).unwrap_or_else(|error| {
+    let capacity = estimate(fleet, programs, BUDGET).unwrap_or_else(|error| {
         tracing::warn!("the pace of the run cannot be estimated: {error}");
         None
     })?;

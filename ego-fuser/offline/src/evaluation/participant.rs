@@ -6,7 +6,9 @@ use agent::agent::{Agent, AgentInput, Perception};
 use agent::attack::Attack;
 use dataset::frame::Frame;
 use perception::detector::DetectorError;
-use protocol::{CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, WireError};
+use protocol::{
+    CavId, CodecConfig, EncodedFeatures, PointCloud, PoseEstimate, StageTiming, WireError,
+};
 use tch::Tensor;
 
 use super::sent::Sent;
@@ -18,6 +20,8 @@ pub(super) struct Participant {
     /// Encoding of its maps.
     codec: CodecConfig,
     times: PoseTimes,
+    /// Stages of the last sweep's perception.
+    stages: Vec<StageTiming>,
 }
 
 /// Durations of the last sweep's pose.
@@ -36,6 +40,7 @@ impl Participant {
             attack,
             codec,
             times: PoseTimes::default(),
+            stages: Vec::new(),
         }
     }
 
@@ -72,6 +77,11 @@ impl Participant {
         self.times
     }
 
+    /// Stages of the last sweep's perception.
+    pub(super) fn stages(&self) -> &[StageTiming] {
+        &self.stages
+    }
+
     /// The published map, confidence and detections, from a map `[1, C, H, W]` of the encoder where there is one.
     pub(super) fn perceive(
         &mut self,
@@ -82,6 +92,7 @@ impl Participant {
             Some(map) => self.agent.perceive_map(map),
             None => self.agent.perceive(&frame.points),
         }?;
+        self.stages.clone_from(&perception.times);
         Ok(match &mut self.attack {
             Some(attack) => attack.perception(perception),
             None => perception,

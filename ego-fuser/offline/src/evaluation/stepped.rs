@@ -16,7 +16,7 @@ use dataset::ground_truth::GroundTruth;
 use dataset::{LoadOptions, Scenario};
 use protocol::{CavId, Detections, PoseEstimate, StageTiming};
 
-pub use compute::ComputeTimes;
+pub use compute::{ComputeTimes, EstimatedTimes};
 pub use remote::{RemoteError, RemotePool};
 
 use super::participant::Participant;

@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use dataset::{LoadOptions, Scenario};
 use ego_fuser::ego::View;
-use protocol::EgoMotion;
 use protocol::config::{FieldError, within};
+use protocol::{EgoMotion, StageTiming};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::nanos;
@@ -18,8 +18,11 @@ use super::super::{EvaluateError, Evaluator};
 const MEASURED_TICKS: usize = 5;
 /// Vehicles that they are measured with: the ego and a neighbour.
 const MEASURED_VEHICLES: usize = 2;
-/// Fewest ticks of an estimate: the first one does not count, as every network allocates its memory in it.
-const ESTIMATED_TICKS: usize = 2;
+/// Fewest ticks of an estimate: the first half does not count, as every network allocates its memory in the first one,
+/// and PASTAT has no earlier maps then.
+const ESTIMATED_TICKS: usize = 5;
+/// Most ticks of it.
+const MOST_ESTIMATED_TICKS: usize = 50;
 
 /// Compute time of each step, milliseconds: the same for all vehicles and ticks.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -92,6 +95,15 @@ impl ComputeTimes {
     }
 }
 
+/// Compute times of a fleet's processes on this machine, and of their stages.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct EstimatedTimes {
+    /// Of the steps.
+    pub steps: ComputeTimes,
+    /// Medians by stage of an agent, then of the ego, milliseconds.
+    pub stages: [Vec<(String, f64)>; 2],
+}
+
 /// Durations of stages, milliseconds.
 #[derive(Debug, Default)]
 struct Samples {
@@ -99,8 +111,24 @@ struct Samples {
     observe: Vec<f64>,
     map: Vec<f64>,
     fuse: Vec<f64>,
+    /// By stage of an agent, and of the ego, in the order of their first appearance.
+    stages: [Vec<(String, Vec<f64>)>; 2],
     /// Motion of a vehicle in the last sweep.
     motion: EgoMotion,
+}
+
+impl Samples {
+    fn add(&mut self, process: usize, timings: &[StageTiming]) {
+        for timing in timings {
+            let stages = &mut self.stages[process];
+            let known = stages.iter().position(|(stage, _)| *stage == timing.stage);
+            let place = known.unwrap_or_else(|| {
+                stages.push((timing.stage.clone(), Vec::new()));
+                stages.len() - 1
+            });
+            stages[place].1.push(timing.nanos as f64 * 1e-6);
+        }
+    }
 }
 
 impl Evaluator {
@@ -120,7 +148,7 @@ impl Evaluator {
     }
 
     /// Estimates the compute times of a fleet of `vehicles` on this machine from as many ticks as `budget` allows:
-    /// medians without the first tick. Only two vehicles are computed; the ego fuses the message of the neighbour as
+    /// medians of the later half of the ticks. Only two vehicles are computed; the ego fuses the message of the neighbour as
     /// often as there are neighbours.
     ///
     /// # Errors
@@ -130,27 +158,30 @@ impl Evaluator {
         scenario: &Scenario,
         vehicles: usize,
         budget: Duration,
-    ) -> Result<ComputeTimes, EvaluateError> {
+    ) -> Result<EstimatedTimes, EvaluateError> {
         let began = Instant::now();
-        let goes_on =
-            |ticks| ticks < ESTIMATED_TICKS || (ticks < MEASURED_TICKS && began.elapsed() < budget);
+        let goes_on = |ticks| {
+            ticks < ESTIMATED_TICKS || (ticks < MOST_ESTIMATED_TICKS && began.elapsed() < budget)
+        };
         // Few sweeps are timed, so each of them is measured.
         let source = self.setup.agents.pose.clone();
         self.setup.agents.pose = source.clone().measuring_every_sweep();
         let samples = self.samples(scenario, vehicles, &goes_on);
         self.setup.agents.pose = source;
         let samples = samples?;
-        let warm = |per_tick: usize, sample: &[f64]| {
-            let warm = sample.get(per_tick..).filter(|warm| !warm.is_empty());
-            median(warm.unwrap_or(sample)).unwrap_or(0.0)
-        };
-        let agents = vehicles.min(MEASURED_VEHICLES);
+        let warm = |sample: &[f64]| median(&sample[sample.len() / 2..]).unwrap_or(0.0);
         let interval = f64::from(self.setup.agents.pose.measuring_interval(&samples.motion));
-        Ok(ComputeTimes {
-            pose_ms: warm(agents, &samples.pose) + warm(agents, &samples.observe) / interval,
-            map_ms: warm(agents, &samples.map),
-            fuse_ms: warm(1, &samples.fuse),
-        })
+        let steps = ComputeTimes {
+            pose_ms: warm(&samples.pose) + warm(&samples.observe) / interval,
+            map_ms: warm(&samples.map),
+            fuse_ms: warm(&samples.fuse),
+        };
+        let medians = |stages: Vec<(String, Vec<f64>)>| {
+            let median = |(stage, sample): (String, Vec<f64>)| (stage, warm(&sample));
+            stages.into_iter().map(median).collect()
+        };
+        let stages = samples.stages.map(medians);
+        Ok(EstimatedTimes { steps, stages })
     }
 
     /// Durations while `goes_on` with the number of ticks so far.
@@ -183,6 +214,7 @@ impl Evaluator {
                 let times = participant.pose_times();
                 samples.pose.push(ms(times.estimate));
                 samples.observe.push(ms(times.observe));
+                samples.add(0, participant.stages());
                 samples
                     .map
                     .push(ms(all.saturating_sub(times.estimate + times.observe)));
@@ -202,13 +234,16 @@ impl Evaluator {
             sent.extend(copies);
             let began = Instant::now();
             // A frame that fails takes its time too; it is counted when it is evaluated.
-            if let [own, neighbours @ ..] = &sent[..]
-                && let Err(error) = self.ego.detect(own, neighbours)
-                && !error.is_of_frame()
-            {
-                return Err(error.into());
-            }
+            let [own, neighbours @ ..] = &sent[..] else {
+                continue;
+            };
+            let detected = self.ego.detect(own, neighbours);
             samples.fuse.push(ms(began.elapsed()));
+            match detected {
+                Ok(output) => samples.add(1, &output.stages),
+                Err(error) if error.is_of_frame() => {}
+                Err(error) => return Err(error.into()),
+            }
         }
         self.ego.forget();
         Ok(samples)
