@@ -251,3 +251,40 @@ fn a_script_runs_live_and_what_is_wrong_with_it_is_said_before_the_start() {
     assert!(message.contains("broken.pt"), "{message}");
     assert_ne!(output.status.code(), Some(0));
 }
+
+#[test]
+fn the_bench_states_every_stage_in_milliseconds_and_in_units() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 6, "", "");
+    let scenario = scenario.to_str().unwrap();
+    let printed = v2vloc(&["bench", scenario, "--seconds", "0", "--json"]);
+    assert!(printed.status.success(), "{printed:?}");
+    let all: Value = serde_json::from_slice(&printed.stdout).unwrap();
+    let of = |field: &str| all[0][field].as_f64().unwrap();
+    assert!(
+        of("unit_ms") > 0.1 && of("agent_ms") > 0.0 && of("fuse_ms") > 0.0,
+        "{all}"
+    );
+    let needed_ms = 2.0 * of("agent_ms") + of("fuse_ms") + of("messages_ms");
+    assert!((of("needed_ms") - needed_ms).abs() < 1e-9, "{all}");
+    let stages = |process: usize| -> Vec<&str> {
+        let stages = all[0]["stages"][process].as_array().unwrap();
+        stages
+            .iter()
+            .map(|stage| stage[0].as_str().unwrap())
+            .collect()
+    };
+    assert!(
+        stages(0).contains(&"backbone") && stages(1).contains(&"fuse"),
+        "{all}"
+    );
+    let text = v2vloc(&[
+        "bench",
+        scenario,
+        "--seconds",
+        "0",
+        "--set",
+        "scene.lockstep=true",
+    ]);
+    assert_eq!(text.status.code(), Some(2), "{text:?}");
+}
