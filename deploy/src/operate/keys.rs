@@ -23,6 +23,7 @@ use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
     Issuer, KeyPair, KeyUsagePurpose, SanType, date_time_ymd,
 };
+use support::atomic_file;
 use support::bounded_file::{self, MAX_TEXT_BYTES};
 
 /// File name of the authority's key.
@@ -130,22 +131,21 @@ impl KeyStore<'_> {
         let (key_path, pem_path) = (folder.join(AUTHORITY_KEY), folder.join(AUTHORITY_FILE));
         let unusable = unusable(key_path.display().to_string());
         // An existing one stays valid for as long as the certificates that it signs.
-        let params = authority_params(self.plan.lifetime.max(DAY * 3650))?;
-        if key_path.exists() {
+        let mut params = params(AUTHORITY_NAME, self.plan.lifetime.max(DAY * 3650))?;
+        params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+        params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+        let (pem, key) = if key_path.exists() {
             let key = KeyPair::from_pem(&read(&key_path)?).map_err(&unusable)?;
-            return Ok(Authority {
-                pem: read(&pem_path)?,
-                issuer: Issuer::new(params, key),
-            });
-        }
-        let key = KeyPair::generate().map_err(&unusable)?;
-        let pem = params.self_signed(&key).map_err(&unusable)?.pem();
-        self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
-        self.write(pem_path, &pem, 0o644)?;
-        Ok(Authority {
-            pem,
-            issuer: Issuer::new(params, key),
-        })
+            (read(&pem_path)?, key)
+        } else {
+            let key = KeyPair::generate().map_err(&unusable)?;
+            let pem = params.self_signed(&key).map_err(&unusable)?.pem();
+            self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
+            self.write(pem_path, &pem, 0o644)?;
+            (pem, key)
+        };
+        let issuer = Issuer::new(params, key);
+        Ok(Authority { pem, issuer })
     }
 
     fn certify(&mut self, authority: &Authority, name: &str) -> Result<(), KeyError> {
@@ -199,7 +199,8 @@ impl KeyStore<'_> {
         let written = options.open(&begun).and_then(|mut file| {
             file.write_all(text.as_bytes())?;
             file.sync_all()?;
-            fs::rename(&begun, &path)
+            fs::rename(&begun, &path)?;
+            atomic_file::sync_name(&path)
         });
         written.map_err(at(&path))?;
         self.written.push(path);
@@ -230,13 +231,6 @@ fn make_folder(path: &Path) -> Result<(), KeyError> {
 
 fn read(path: &Path) -> Result<String, KeyError> {
     bounded_file::read_text(path, MAX_TEXT_BYTES).map_err(at(path))
-}
-
-fn authority_params(lifetime: Duration) -> Result<CertificateParams, KeyError> {
-    let mut params = params(AUTHORITY_NAME, lifetime)?;
-    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
-    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
-    Ok(params)
 }
 
 fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError> {

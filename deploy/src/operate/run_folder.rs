@@ -9,6 +9,7 @@ use protocol::RunId;
 use serde::Serialize;
 use support::atomic_file;
 use support::csv_file::CsvText;
+use time::UtcDateTime;
 
 use crate::score::FrameRecord;
 
@@ -67,6 +68,8 @@ impl RunFolder {
         }
         let log = path.join("log");
         fs::create_dir(&log).map_err(|source| RunFolderError::write(log, source))?;
+        let kept = atomic_file::sync_name(&path);
+        kept.map_err(|source| RunFolderError::write(path.clone(), source))?;
         Ok(Self { path })
     }
 
@@ -173,48 +176,50 @@ type Column = (&'static str, fn(&FrameRecord, Option<f64>) -> String);
 
 const COLUMNS: [Column; 28] = [
     ("tick", |of, _| of.tick.to_string()),
-    ("agent_frame", |of, _| integer(of.agent_frame)),
+    ("agent_frame", |of, _| plain(of.agent_frame)),
     ("capture_nanos", |of, _| of.capture_nanos.to_string()),
-    ("latency_ms", |of, _| number(of.latency_ms)),
+    ("latency_ms", |of, _| fixed(of.latency_ms, 4)),
     ("detected", |of, _| of.detected.to_string()),
     ("truth", |of, _| of.truth.to_string()),
     ("found", |of, _| of.found.to_string()),
     ("fused", |of, _| of.fused.to_string()),
     ("skipped", |of, _| of.skipped.to_string()),
-    ("oldest_ms", |of, _| number(of.oldest_ms)),
+    ("oldest_ms", |of, _| fixed(of.oldest_ms, 4)),
     ("stale", |of, _| of.stale.to_string()),
     ("payload_bytes", |of, _| of.payload_bytes.to_string()),
     ("wire_bytes", |of, _| of.wire_bytes.to_string()),
-    ("ego_error_m", |of, _| number(of.ego_error_m)),
-    ("ego_error_deg", |of, _| number(of.ego_error_deg)),
-    ("swept_ms", |_, swept_ms| number(swept_ms)),
-    ("posed_ms", |of, _| number(of.stamps.posed_ms)),
-    ("published_ms", |of, _| number(of.stamps.published_ms)),
-    ("arrived_ms", |of, _| number(of.stamps.arrived_ms)),
-    ("decided_ms", |of, _| number(of.stamps.decided_ms)),
-    ("fused_ms", |of, _| number(of.stamps.fused_ms)),
-    ("detected_ms", |of, _| number(of.stamps.detected_ms)),
+    ("ego_error_m", |of, _| fixed(of.ego_error_m, 4)),
+    ("ego_error_deg", |of, _| fixed(of.ego_error_deg, 4)),
+    ("swept_ms", |_, swept_ms| fixed(swept_ms, 4)),
+    ("posed_ms", |of, _| fixed(of.stamps.posed_ms, 4)),
+    ("published_ms", |of, _| fixed(of.stamps.published_ms, 4)),
+    ("arrived_ms", |of, _| fixed(of.stamps.arrived_ms, 4)),
+    ("decided_ms", |of, _| fixed(of.stamps.decided_ms, 4)),
+    ("fused_ms", |of, _| fixed(of.stamps.fused_ms, 4)),
+    ("detected_ms", |of, _| fixed(of.stamps.detected_ms, 4)),
     ("answered", |of, _| u8::from(of.is_answered()).to_string()),
-    ("tick_unix_nanos", |of, _| integer(of.stamps.began_nanos)),
+    ("tick_unix_nanos", |of, _| plain(of.stamps.began_nanos)),
     ("streamed_tick", |of, _| {
-        integer(of.streamed.map(|of| of.tick))
+        plain(of.streamed.map(|of| of.tick))
     }),
     ("streamed_age_ms", |of, _| {
-        number(of.streamed.map(|of| of.age_ms))
+        fixed(of.streamed.map(|of| of.age_ms), 4)
     }),
     ("streamed_detected", |of, _| {
-        integer(of.streamed.map(|of| of.detected))
+        plain(of.streamed.map(|of| of.detected))
     }),
     ("streamed_found", |of, _| {
-        integer(of.streamed.map(|of| of.found))
+        plain(of.streamed.map(|of| of.found))
     }),
 ];
 
-fn number(value: Option<f64>) -> String {
-    value.map_or(String::new(), |value| format!("{value:.4}"))
+/// Field of a CSV file: a number with this many decimals, empty if it is unknown.
+pub fn fixed(value: Option<f64>, digits: usize) -> String {
+    value.map_or(String::new(), |value| format!("{value:.digits$}"))
 }
 
-fn integer(value: Option<impl ToString>) -> String {
+/// Field of a CSV file: a value as it prints, empty if it is unknown.
+pub fn plain(value: Option<impl ToString>) -> String {
     value.map_or(String::new(), |value| value.to_string())
 }
 
@@ -231,29 +236,11 @@ pub fn name_of_now(prefix: &str) -> RunId {
 
 /// Seconds of the Unix clock as `YYYYMMDD-HHMMSS`, UTC.
 fn time_stamp(unix_secs: u64) -> String {
-    let (days, second_of_day) = (unix_secs / 86_400, unix_secs % 86_400);
-    // Days since 0000-03-01, cut into 400-year cycles: with years that begin in March the leap day comes last, and the
-    // lengths of the months are a linear function (Howard Hinnant, "chrono-compatible low-level date algorithms").
-    let days = days + 719_468;
-    let (cycle, day_of_cycle) = (days / 146_097, days % 146_097);
-    let year_of_cycle = (day_of_cycle - day_of_cycle / 1_460 + day_of_cycle / 36_524
-        - day_of_cycle / 146_096)
-        / 365;
-    let day_of_year =
-        day_of_cycle - (365 * year_of_cycle + year_of_cycle / 4 - year_of_cycle / 100);
-    let march_month = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * march_month + 2) / 5 + 1;
-    let month = if march_month < 10 {
-        march_month + 3
-    } else {
-        march_month - 9
-    };
-    let year = 400 * cycle + year_of_cycle + u64::from(month <= 2);
-    let (hour, minute, second) = (
-        second_of_day / 3_600,
-        second_of_day / 60 % 60,
-        second_of_day % 60,
-    );
+    let time = UtcDateTime::from_unix_timestamp(unix_secs.cast_signed());
+    let time = time.unwrap_or(UtcDateTime::UNIX_EPOCH);
+    let (year, month, day) = time.to_calendar_date();
+    let (hour, minute, second) = time.as_hms();
+    let month = u8::from(month);
     format!("{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}")
 }
 

@@ -59,10 +59,7 @@ pub fn export_ros2(
     let timed = in_order(&wanted, nanos);
     if timed.is_empty() {
         let reason = "it holds no message that can be read and that ROS 2 has a type for; recordings of other versions of this program cannot be read";
-        return Err(RecordingError::NotOurs {
-            path: from.into(),
-            reason: reason.into(),
-        });
+        return Err(RecordingError::not_ours(from, reason));
     }
     let options = RecordingOptions {
         zstd_level,

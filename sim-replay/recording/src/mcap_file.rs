@@ -113,13 +113,11 @@ impl McapFile {
     }
 
     /// The file.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
     /// The parts of the file that could not be read, in its order.
-    #[must_use]
     pub fn damage(&self) -> &[Damage] {
         &self.damage
     }
@@ -269,14 +267,7 @@ impl Contents<'_> {
                 }
                 let chunk = unpack(body, &mut self.channels).map_err(in_words)?;
                 self.unpacked_bytes += chunk.bytes as u64;
-                self.add(
-                    Holder {
-                        begin,
-                        len: body.len(),
-                        is_chunk: true,
-                    },
-                    &chunk.messages,
-                );
+                self.add(begin, body.len(), true, &chunk.messages);
                 if chunk.orphans > 0 {
                     let orphans = chunk.orphans;
                     let what = format!("{orphans} messages of channels that are described nowhere");
@@ -307,18 +298,11 @@ impl Contents<'_> {
                 }
             }
         }
-        self.add(
-            Holder {
-                begin,
-                len: body.len(),
-                is_chunk: false,
-            },
-            &[message],
-        );
+        self.add(begin, body.len(), false, &[message]);
         Ok(Ok(()))
     }
 
-    fn add(&mut self, holder: Holder, messages: &[Message<'static>]) {
+    fn add(&mut self, begin: u64, len: usize, is_chunk: bool, messages: &[Message<'static>]) {
         for (index, message) in messages.iter().enumerate() {
             let place = Place {
                 holder: self.holders.len(),
@@ -328,7 +312,11 @@ impl Contents<'_> {
                 self.arrivals.push(message.log_time);
             }
         }
-        self.holders.push(holder);
+        self.holders.push(Holder {
+            begin,
+            len,
+            is_chunk,
+        });
     }
 
     /// Records a skipped part; one that continues the last one is merged with it.

@@ -74,19 +74,16 @@ impl Recording {
     }
 
     /// The file.
-    #[must_use]
     pub fn path(&self) -> &Path {
         self.file.path()
     }
 
     /// The messages, in the order in which they were recorded.
-    #[must_use]
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
     /// The parts of the file that could not be read, in its order.
-    #[must_use]
     pub fn damage(&self) -> &[Damage] {
         self.file.damage()
     }

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{self, Write};
+use std::path::Path;
 
 /// An output that appends bytes and can truncate them.
 pub trait Store: Write {
@@ -10,11 +11,23 @@ pub trait Store: Write {
     /// # Errors
     /// Errors of the operating system.
     fn cut(&mut self, len: u64) -> io::Result<()>;
+
+    /// Returns when the output of this name is on the disk.
+    ///
+    /// # Errors
+    /// Errors of the operating system.
+    fn sync(_path: &Path) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 impl Store for File {
     fn cut(&mut self, len: u64) -> io::Result<()> {
         self.set_len(len)
+    }
+
+    fn sync(path: &Path) -> io::Result<()> {
+        support::atomic_file::sync(path)
     }
 }
 

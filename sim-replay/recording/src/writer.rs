@@ -169,15 +169,13 @@ impl<S: Store> RecordingWriter<S> {
     fn add_ros(&mut self, nanos: u64, sequence: u32, message: &RosMessage) -> McapResult<()> {
         let channel_id = self.ros_channel(&message.topic)?;
         // Published at the time of its arrival: several senders share /tf, whose times have to be in order.
-        self.put(
-            &MessageHeader {
-                channel_id,
-                sequence,
-                log_time: nanos,
-                publish_time: nanos,
-            },
-            &message.cdr,
-        )
+        let head = MessageHeader {
+            channel_id,
+            sequence,
+            log_time: nanos,
+            publish_time: nanos,
+        };
+        self.put(&head, &message.cdr)
     }
 
     fn put(&mut self, head: &MessageHeader, data: &[u8]) -> McapResult<()> {
@@ -197,14 +195,7 @@ impl<S: Store> RecordingWriter<S> {
     ) -> Result<(), RecordingError> {
         self.check_open()?;
         let cdr = ros2::static_transforms(nanos, vehicles.iter(), mount);
-        let added = self.add_ros(
-            nanos,
-            0,
-            &RosMessage {
-                topic: RosTopic::TfStatic,
-                cdr,
-            },
-        );
+        let added = self.add_ros(nanos, 0, &RosMessage::new(RosTopic::TfStatic, cdr));
         self.checked(added)
     }
 
@@ -222,12 +213,11 @@ impl<S: Store> RecordingWriter<S> {
 
     /// Messages in whole chunks: those that can be read back. Translations are not counted again; a bag counts messages
     /// that have one.
-    #[must_use]
     pub fn whole_messages(&self) -> u64 {
         self.whole_messages
     }
 
-    /// Writes the index and ends the recording.
+    /// Writes the index and ends the recording, which then survives a power cut.
     ///
     /// # Errors
     /// As [`Self::write`].
@@ -236,7 +226,7 @@ impl<S: Store> RecordingWriter<S> {
         let finished = self.mcap.finish();
         self.checked(finished)?;
         self.ended = Some("it is complete".into());
-        Ok(())
+        S::sync(&self.path).map_err(|source| RecordingError::io(&self.path, source))
     }
 
     /// The channel of messages as transmitted, declared on first use.

@@ -86,7 +86,7 @@ fn tick_messages(tick: u64, points: usize) -> Vec<(Key, Vec<u8>)> {
         ));
     }
     messages.push((
-        Key::truth(&run),
+        protocol::Topic::Truth.in_run(&run),
         wire::encode(&stamp("replay", tick), truth(tick))
             .unwrap()
             .to_vec(),

@@ -11,8 +11,8 @@ use super::layout::{SceneLayout, remove_folder};
 use super::options::SynthOptions;
 use super::scenes::{Summary, generate, sources};
 use crate::map::RoadMapSource;
-use support::bounded_file;
 use support::file_error::{AtFile, FileError};
+use support::{atomic_file, bounded_file};
 
 /// Longer files were not written by this program, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
@@ -65,25 +65,14 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
     };
     let maps: Vec<String> = sources(options).iter().map(RoadMapSource::name).collect();
     for made in &scenarios {
-        let Generator {
-            subset,
-            seed,
-            map,
-            map_seed,
-            agents,
-            frames,
-            period_seconds,
-            weather,
-            layout,
-        } = made;
         let settings: [(&str, &dyn ToString, &dyn ToString); 7] = [
-            ("subset", subset, &options.subset.name()),
-            ("seed", seed, &options.seed),
-            ("frames", frames, &options.frames),
-            ("period_seconds", period_seconds, &options.period_s),
-            ("weather", weather, &options.weather.name()),
-            ("map_seed", map_seed, &options.map_seed),
-            ("layout", layout, &options.layout.name()),
+            ("subset", &made.subset, &options.subset.name()),
+            ("seed", &made.seed, &options.seed),
+            ("frames", &made.frames, &options.frames),
+            ("period_seconds", &made.period_seconds, &options.period_s),
+            ("weather", &made.weather, &options.weather.name()),
+            ("map_seed", &made.map_seed, &options.map_seed),
+            ("layout", &made.layout, &options.layout.name()),
         ];
         for (setting, found, wanted) in settings {
             let (found, wanted) = (found.to_string(), wanted.to_string());
@@ -91,12 +80,12 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
                 return differs(setting, found, wanted);
             }
         }
-        if !maps.contains(map) {
-            return differs("map", map.clone(), maps.join(" or "));
+        if !maps.contains(&made.map) {
+            return differs("map", made.map.clone(), maps.join(" or "));
         }
-        if !options.agents.contains(agents) {
+        if !options.agents.contains(&made.agents) {
             let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
-            return differs("agents", agents.to_string(), wanted);
+            return differs("agents", made.agents.to_string(), wanted);
         }
     }
     let (found, wanted) = (scenarios.len(), options.scenes);
@@ -122,7 +111,10 @@ pub fn generate_whole(
         ..options.clone()
     };
     let summary = generate(&aside, progress)?;
-    fs::rename(&unfinished, &options.out)
+    // A folder with its final name has all its files, also after a power cut.
+    atomic_file::sync(&unfinished)
+        .and_then(|()| fs::rename(&unfinished, &options.out))
+        .and_then(|()| atomic_file::sync_name(&options.out))
         .at(&options.out)
         .map_err(SynthError::Write)?;
     Ok(summary)
