@@ -6,17 +6,23 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{BusOptions, Endpoint, RejectionLog, STOP_LIMIT, SharedMemory, open};
+use bus::{BusOptions, Endpoint, RejectionLog, RouterProbe, STOP_LIMIT, SharedMemory, open};
 use protocol::{RunId, RunScope};
 use support::output;
-use zenoh::Wait;
+use zenoh::{Session, Wait};
 
+use crate::operate::network::from_here;
 use crate::operate::router_panic;
+use crate::operate::router_watch;
 use crate::operate::security::guarded;
 use support::cli::Outcome;
 
+/// Interval between looks at the router.
+const LOOK_ROUND: Duration = Duration::from_millis(200);
 /// Interval between reports of refused requests.
-const LOOK_ROUND: Duration = Duration::from_secs(5);
+const REPORT_ROUND: Duration = Duration::from_secs(5);
+/// Longest time for opening the session that watches the router.
+const PROBE_LIMIT: Duration = Duration::from_secs(2);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -62,7 +68,7 @@ impl Arguments {
         let options = self.options()?;
         if let Some(path) = &self.zenohd {
             let text = serde_json::to_string_pretty(&options.for_zenohd())? + "\n";
-            std::fs::write(path, text).with_context(|| path.display().to_string())?;
+            support::atomic_file::write(path, text).with_context(|| path.display().to_string())?;
             output::note(path.display());
             return Ok(Outcome::Done);
         }
@@ -76,10 +82,13 @@ impl Arguments {
         let session = open(&options)?;
         let endpoint = options.endpoint();
         output::note(format_args!("routing at {endpoint} (Ctrl-C ends it)"));
-        let (mut refusals, mut reported) = (RejectionLog::of(options.endpoint()), BTreeMap::new());
-        loop {
+        let mut refusals = RejectionLog::of(options.endpoint());
+        let (mut reported, mut report_at) = (BTreeMap::new(), Instant::now() + REPORT_ROUND);
+        let mut probe = self.probe(&session, &options);
+        let failure = loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
-            if options.guard.is_some() {
+            if options.guard.is_some() && (ended || Instant::now() > report_at) {
+                report_at = Instant::now() + REPORT_ROUND;
                 refusals.update(&session);
                 for (refusal, count) in refusals.counts() {
                     let before = reported.insert(refusal.clone(), count).unwrap_or(0);
@@ -89,17 +98,40 @@ impl Arguments {
                     }
                 }
             }
-            if ended {
-                break;
+            let silence = probe.as_mut().map(|probe| probe.silence(Instant::now()));
+            if let Some(panic) = router_panic::first() {
+                break Some(panic.to_owned());
+            } else if let Some(silence) = silence.filter(|silence| *silence > router_watch::LIMIT) {
+                break Some(router_watch::in_words(silence));
+            } else if ended {
+                break None;
             }
-        }
-        if let Some(panic) = router_panic::first() {
-            output::error(format_args!("the router failed and ends: {panic}"));
-            // Closing a session whose lock is poisoned would abort.
+        };
+        if let Some(failure) = failure {
+            output::error(format_args!("the router failed and ends: {failure}"));
+            // Closing a session whose lock is poisoned would abort, or never end.
             std::process::exit(1);
+        }
+        if let Some(probe) = probe {
+            probe.end(false);
         }
         session.close().wait().map_err(anyhow::Error::from_boxed)?;
         Ok(Outcome::Done)
+    }
+
+    /// A second session that has to receive what the router's own publishes; `None`, with a warning, if the router cannot
+    /// be reached at its address.
+    fn probe(&self, router: &Session, options: &BusOptions) -> Option<RouterProbe> {
+        let endpoint = from_here(options.endpoint());
+        let client = |endpoint| BusOptions {
+            connect_timeout: PROBE_LIMIT,
+            credentials: options.credentials.clone(),
+            ..BusOptions::client(endpoint)
+        };
+        let probe = endpoint.and_then(|at| RouterProbe::of_router(router, &client(at)));
+        probe
+            .inspect_err(|error| tracing::warn!("the router is not watched: {error}"))
+            .ok()
     }
 
     fn options(&self) -> anyhow::Result<BusOptions> {

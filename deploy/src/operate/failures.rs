@@ -85,6 +85,7 @@ mod tests {
             seconds: 0.93,
             overwritten: 0,
             undelivered: 0,
+            router_gone_s: 0.0,
             not_written,
             failure: failure.map(str::to_owned),
         };

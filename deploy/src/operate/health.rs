@@ -200,6 +200,18 @@ impl Health {
         crashed.map(|(name, _)| name.clone()).collect()
     }
 
+    /// Ends of processes that were unexpected, as text: `agent-4288 was ended by signal 9`.
+    pub(crate) fn ends(&self) -> Vec<String> {
+        let end = |(name, noted): (&String, &Noted)| {
+            let times = match noted.restarts {
+                0 | 1 => String::new(),
+                restarts => format!(", restarted {restarts} times"),
+            };
+            { noted.last_fall.as_ref() }.map(|how| format!("{name} {how}{times}"))
+        };
+        self.processes.iter().filter_map(end).collect()
+    }
+
     /// Status of every process; `progress` has what they reported.
     pub(crate) fn statuses(&self, progress: &Progress, now: Instant) -> Vec<ProcessStatus> {
         let seconds = |at: Instant| now.saturating_duration_since(at).as_secs_f64();
@@ -235,6 +247,8 @@ pub struct Usage {
     pub threads: Option<u64>,
     /// Number of open descriptors.
     pub descriptors: Option<u64>,
+    /// True if a signal has stopped it (Ctrl-Z).
+    pub is_stopped: bool,
 }
 
 impl Usage {
@@ -250,6 +264,7 @@ impl Usage {
             resident_mib: field("VmRSS:").map(|kib| kib as f64 / 1024.0),
             threads: field("Threads:"),
             descriptors: descriptors.map(|entries| entries.count() as u64),
+            is_stopped: text.contains("\nState:\tT"),
         })
     }
 }

@@ -7,6 +7,7 @@ pub mod network;
 pub mod progress;
 pub mod remote_status;
 pub mod router_panic;
+pub(crate) mod router_watch;
 pub mod run_folder;
 pub mod security;
 pub mod status;

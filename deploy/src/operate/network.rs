@@ -4,8 +4,10 @@ use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
 use bus::shutdown::{self, Overdue};
-use bus::{BusError, BusOptions, Endpoint, ROUTER, SharedMemory, open, present, process_id};
-use protocol::{KeyExpr, Principal, ProcessId, Role, RunId, RunScope};
+use bus::{
+    BusError, BusOptions, Endpoint, ROUTER, RouterProbe, SharedMemory, open, present, process_id,
+};
+use protocol::{Key, KeyExpr, Principal, ProcessId, Role, RunId, RunScope};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use zenoh::{Session, Wait};
@@ -80,9 +82,7 @@ impl RouterEndpoint {
                 let runs = RunScope::One(run.clone());
                 security::guarded(options, &keys.of_process(ROUTER), runs)?
             } else {
-                let name = Principal::of_role(Role::Scorer).to_string();
-                let credentials = security::credentials(&keys.of_process(&name), &name)?;
-                options.with_credentials(credentials)
+                as_scorer(options, keys)?
             };
         }
         let session = open(&options)?;
@@ -91,6 +91,21 @@ impl RouterEndpoint {
             endpoint: from_here(options.endpoint())?,
             is_guarded: options.guard.is_some(),
         })
+    }
+
+    /// A probe of the router: a second session that receives the reports of the scorer. `None`, with a warning, if it
+    /// cannot be opened.
+    pub fn probe(&self, run: &RunId, keys: Option<&RunKeys>) -> Option<RouterProbe> {
+        let options = BusOptions::client(self.endpoint.clone());
+        let reports = Key::stats(run, &process_id(Role::Scorer, &scorer_cav()));
+        let probe = match keys {
+            Some(keys) => as_scorer(options, keys),
+            None => Ok(options),
+        }
+        .and_then(|options| RouterProbe::of_key(&options, &KeyExpr::one(&reports)));
+        probe
+            .inspect_err(|error| tracing::warn!("the router is not watched: {error}"))
+            .ok()
     }
 
     /// Processes to start, and a scorer, that are present already on a shared router.
@@ -127,9 +142,16 @@ impl RouterEndpoint {
     }
 }
 
+/// The same with the keys of the scorer.
+fn as_scorer(options: BusOptions, keys: &RunKeys) -> Result<BusOptions, BusError> {
+    let name = Principal::of_role(Role::Scorer).to_string();
+    let credentials = security::credentials(&keys.of_process(&name), &name)?;
+    Ok(options.with_credentials(credentials))
+}
+
 /// Endpoint as processes of this host reach it: an unspecified listening address becomes the loopback, whose name
 /// certificates carry.
-fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
+pub(crate) fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
     let text = endpoint.as_str().replacen("/0.0.0.0:", "/127.0.0.1:", 1);
     Endpoint::new(&text.replacen("/[::]:", "/[::1]:", 1))
 }

@@ -4,7 +4,8 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::ProgressBar;
-use support::{output, progress};
+use support::output;
+use terminal::progress;
 use terminal::text_table::number;
 
 use crate::score::Progress;

@@ -7,9 +7,9 @@ use bus::bounded_queue::Pop;
 use bus::{Bus, BusError, present};
 use protocol::{CavId, Detections, KeyExpr, Limits, Stats, Stream, Topic, wire};
 use serde::Serialize;
-use terminal::text_table::{Side, TextTable, number};
+use terminal::text_table::number;
 
-use crate::operate::status::name_of;
+use crate::operate::status::{name_of, table_with_note};
 
 /// Queued messages of a topic.
 const PLACES: usize = 64;
@@ -115,16 +115,8 @@ impl RemoteStatus {
 
     /// The status as text for a terminal.
     pub fn table(&self) -> String {
-        let columns = [
-            ("process", Side::Left),
-            ("state", Side::Left),
-            ("cores", Side::Right),
-            ("MiB", Side::Right),
-            ("sent", Side::Right),
-            ("dropped", Side::Right),
-            ("problem", Side::Left),
-        ];
-        let mut table = TextTable::new(columns);
+        let numbers = ["cores", "MiB", "sent", "dropped"];
+        let mut table = table_with_note(&["process", "state"], &numbers, "problem");
         for process in &self.processes {
             let count = |count: Option<u64>| number(count.map(|count| count as f64), 0);
             table.row([

@@ -59,6 +59,12 @@ pub struct RunStatus {
     pub neighbours: Vec<NeighbourState>,
     /// Number of messages dropped so far, by all processes.
     pub dropped: u64,
+    /// Observed causes of lost messages so far: outages of the router, pauses of the run, ends of processes.
+    #[serde(default)]
+    pub causes: Vec<String>,
+    /// Time since which the router is gone, seconds.
+    #[serde(default)]
+    pub router_gone_s: Option<f64>,
     /// Status of each process.
     pub processes: Vec<ProcessStatus>,
 }
@@ -75,6 +81,8 @@ pub enum Phase {
     Over,
     /// The supervisor has ended without a final status.
     Lost,
+    /// A signal has stopped the supervisor (Ctrl-Z), and the router of the run with it.
+    Suspended,
 }
 
 /// Reason why there is no status.
@@ -108,9 +116,14 @@ impl RunStatus {
             FileError::new(&path, format_args!("{error}; {hint}"))
         })?;
         let mut status: Self = serde_json::from_str(&text).at(&path)?;
-        if status.phase != Phase::Over && (Usage::of(status.pid).is_none() || status.age() > STALE)
-        {
-            status.phase = Phase::Lost;
+        let supervisor = Usage::of(status.pid);
+        if status.phase != Phase::Over && (supervisor.is_none() || status.age() > STALE) {
+            let is_stopped = supervisor.is_some_and(|usage| usage.is_stopped);
+            status.phase = if is_stopped {
+                Phase::Suspended
+            } else {
+                Phase::Lost
+            };
         }
         Ok(status)
     }
@@ -156,7 +169,7 @@ impl RunStatus {
                 matches!(process.state, State::Ready | State::Ended) && process.problems.is_empty()
             }
             Phase::Ending | Phase::Over => process.state != State::Down,
-            Phase::Lost => true,
+            Phase::Lost | Phase::Suspended => true,
         };
         let is_unwell = |process: &&ProcessStatus| !is_well(process) || process.failure.is_some();
         let sick = self.processes.iter().filter(is_unwell);
@@ -164,8 +177,14 @@ impl RunStatus {
             let why = why(process).map_or(String::new(), |why| format!(": {why}"));
             format!("{} is {}{why}", process.name, name_of(&process.state))
         };
-        let lost = (self.phase == Phase::Lost).then(|| "the supervisor has ended".to_owned());
-        lost.into_iter().chain(sick.map(describe)).collect()
+        let age_s = self.age().as_secs_f64();
+        let run = match (self.phase, self.router_gone_s) {
+            (Phase::Lost, _) => Some("the supervisor has ended".to_owned()),
+            (Phase::Suspended, _) => Some(format!("the run is suspended for {age_s:.0} s")),
+            (Phase::Running, Some(seconds)) => Some(format!("router gone for {seconds:.1} s")),
+            _ => None,
+        };
+        run.into_iter().chain(sick.map(describe)).collect()
     }
 
     /// True if there is no problem.
@@ -194,6 +213,9 @@ impl RunStatus {
             self.fused,
             self.dropped
         );
+        if !self.causes.is_empty() {
+            text += &format!("observed: {}\n", self.causes.join(", "));
+        }
         text += &self.processes_table().to_string();
         if !self.neighbours.is_empty() {
             text += &self.neighbours_table().to_string();
@@ -202,18 +224,12 @@ impl RunStatus {
     }
 
     fn processes_table(&self) -> TextTable {
-        let columns = [
-            ("process", Side::Left),
-            ("state", Side::Left),
-            ("pid", Side::Right),
-            ("up s", Side::Right),
-            ("restarts", Side::Right),
-            ("silent s", Side::Right),
-            ("MiB", Side::Right),
-            ("fds", Side::Right),
-            ("problem, last crash or failure", Side::Left),
-        ];
-        let mut table = TextTable::new(columns);
+        let numbers = ["pid", "up s", "restarts", "silent s", "MiB", "fds"];
+        let mut table = table_with_note(
+            &["process", "state"],
+            &numbers,
+            "problem, last crash or failure",
+        );
         for process in &self.processes {
             table.row([
                 process.name.clone(),
@@ -231,14 +247,8 @@ impl RunStatus {
     }
 
     fn neighbours_table(&self) -> TextTable {
-        let columns = [
-            ("neighbour", Side::Left),
-            ("clock ms", Side::Right),
-            ("capture ms", Side::Right),
-            ("trust", Side::Right),
-            ("left out because", Side::Left),
-        ];
-        let mut table = TextTable::new(columns);
+        let numbers = ["clock ms", "capture ms", "trust"];
+        let mut table = table_with_note(&["neighbour"], &numbers, "left out because");
         for neighbour in &self.neighbours {
             table.row([
                 neighbour.cav.to_string(),
@@ -250,6 +260,13 @@ impl RunStatus {
         }
         table
     }
+}
+
+/// A table with columns of texts, then of numbers, then one of text.
+pub(super) fn table_with_note(texts: &[&str], numbers: &[&str], note: &str) -> TextTable {
+    let texts = texts.iter().map(|name| (*name, Side::Left));
+    let numbers = numbers.iter().map(|name| (*name, Side::Right));
+    TextTable::new(texts.chain(numbers).chain([(note, Side::Left)]))
 }
 
 /// Failure of a process, its problems, or its last crash.
@@ -304,6 +321,7 @@ impl StatusWriter {
         &mut self,
         phase: Phase,
         progress: &Progress,
+        (causes, router_gone_s): (Vec<String>, Option<f64>),
         processes: impl FnOnce(Instant) -> Vec<ProcessStatus>,
     ) {
         let now = Instant::now();
@@ -329,6 +347,8 @@ impl StatusWriter {
             fused: progress.fused,
             neighbours: progress.neighbours.clone(),
             dropped: progress.dropped,
+            causes,
+            router_gone_s,
             processes: processes(now),
         };
         let json = serde_json::to_string_pretty(&status).unwrap_or_default();
@@ -353,7 +373,13 @@ fn unix_ms() -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use std::process::Command;
+
     use super::*;
+
+    fn observed() -> (Vec<String>, Option<f64>) {
+        (vec!["router gone for 4.0 s".into()], None)
+    }
 
     fn process(state: State) -> ProcessStatus {
         ProcessStatus {
@@ -401,9 +427,13 @@ mod tests {
             neighbours: vec![attacker],
             ..Progress::default()
         };
-        writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
+        writer.write(Phase::Running, &progress, observed(), |_| {
+            vec![process(State::Ready)]
+        });
         // Not due yet.
-        writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
+        writer.write(Phase::Running, &Progress::default(), observed(), |_| {
+            Vec::new()
+        });
         let status = RunStatus::read(&RunStatus::newest(folder.path()).unwrap()).unwrap();
         assert_eq!(
             (status.phase, status.frames, status.processes.len()),
@@ -413,6 +443,10 @@ mod tests {
         let table = status.table();
         assert!(
             table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: answered 7/9, - Hz"),
+            "{table}"
+        );
+        assert!(
+            table.contains("\nobserved: router gone for 4.0 s\n"),
             "{table}"
         );
         assert!(
@@ -431,6 +465,32 @@ mod tests {
         fs::write(run.join(FILE), serde_json::to_string(&ended).unwrap()).unwrap();
         let found = RunStatus::read(&run).unwrap();
         assert!(found.phase == Phase::Lost && !found.is_well());
+        let gone = RunStatus {
+            router_gone_s: Some(2.5),
+            ..status.clone()
+        };
+        assert_eq!(gone.troubles(), ["router gone for 2.5 s"]);
+        let mut stopped = Command::new("sleep").arg("60").spawn().unwrap();
+        let suspended = RunStatus {
+            pid: stopped.id(),
+            written_unix_ms: unix_ms() - 20_000,
+            ..status.clone()
+        };
+        fs::write(run.join(FILE), serde_json::to_string(&suspended).unwrap()).unwrap();
+        assert_eq!(RunStatus::read(&run).unwrap().phase, Phase::Lost);
+        let pid = stopped.id().to_string();
+        let sent = Command::new("kill").args(["-STOP", &pid]).status();
+        assert!(sent.unwrap().success());
+        let deadline = Instant::now() + Duration::from_secs(10);
+        while RunStatus::read(&run).unwrap().phase != Phase::Suspended {
+            assert!(Instant::now() < deadline);
+        }
+        assert_eq!(
+            RunStatus::read(&run).unwrap().troubles()[0],
+            "the run is suspended for 20 s"
+        );
+        stopped.kill().unwrap();
+        stopped.wait().unwrap();
         fs::write(run.join(FILE), "{").unwrap();
         assert!(matches!(RunStatus::read(&run), Err(StatusError::File(_))));
     }
@@ -448,7 +508,7 @@ mod tests {
             (State::Down, false),
         ] {
             let mut writer = StatusWriter::new(folder.path(), "test", "tcp/127.0.0.1:7447", None);
-            writer.write(Phase::Running, &Progress::default(), |_| {
+            writer.write(Phase::Running, &Progress::default(), observed(), |_| {
                 vec![process(state)]
             });
             assert_eq!(
@@ -463,7 +523,9 @@ mod tests {
     fn a_disk_that_refuses_ends_nothing() {
         let mut writer =
             StatusWriter::new(Path::new("/nowhere"), "test", "tcp/127.0.0.1:7447", None);
-        writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
+        writer.write(Phase::Running, &Progress::default(), observed(), |_| {
+            Vec::new()
+        });
         assert!(writer.has_warned);
     }
 }

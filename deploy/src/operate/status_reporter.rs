@@ -3,8 +3,8 @@
 use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use bus::Endpoint;
 use bus::shutdown::Stop;
+use bus::{Endpoint, RouterProbe};
 use dataset::evaluation_protocol::EvaluationProtocol;
 use protocol::RunId;
 
@@ -13,11 +13,12 @@ use crate::operate::failures::Failures;
 use crate::operate::health::Health;
 use crate::operate::progress::Display;
 use crate::operate::router_panic;
+use crate::operate::router_watch::{Finding, RouterWatch};
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
 use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
 use crate::operate::timeouts::Timeouts;
-use crate::score::{Progress, ScorerNode};
+use crate::score::{Progress, SCORER, ScorerNode};
 
 /// Update interval of the display and of the checks.
 const BEAT: Duration = Duration::from_millis(100);
@@ -28,8 +29,11 @@ pub enum Ending {
     Over,
     /// The user ended the run.
     Asked,
-    /// The router inside this process panicked: no message passes any more.
-    RouterFailed,
+    /// The router inside this process passes no message any more.
+    RouterFailed {
+        /// Its panic, or the time of its silence.
+        how: String,
+    },
     /// A process crashed and is not restarted.
     Failed {
         /// Name of the process.
@@ -43,15 +47,17 @@ pub enum Ending {
 pub struct StatusReporter {
     health: Health,
     failures: Failures,
+    router: RouterWatch,
     status: StatusWriter,
 }
 
 impl StatusReporter {
-    /// For a run with these timeouts and its router at `endpoint`, judged by `protocol`.
+    /// For a run with these timeouts and its router at `endpoint`, in this process or not, that `probe` reaches; judged
+    /// by `protocol`.
     pub fn new(
         timeouts: &Timeouts,
         run: &RunId,
-        endpoint: &Endpoint,
+        (endpoint, is_here, probe): (&Endpoint, bool, Option<RouterProbe>),
         folder: &RunFolder,
         protocol: EvaluationProtocol,
     ) -> Self {
@@ -60,6 +66,7 @@ impl StatusReporter {
         Self {
             health: Health::new(hang, start),
             failures: Failures::default(),
+            router: RouterWatch::new(probe, is_here),
             status: StatusWriter::new(
                 folder.path(),
                 run.as_str(),
@@ -87,11 +94,27 @@ impl StatusReporter {
         self.health.crashed()
     }
 
+    /// Observed causes of lost messages, as text: outages of the router, pauses of the run, ends of processes.
+    pub fn causes(&self) -> Vec<String> {
+        let ends = self.health.ends();
+        self.router.causes().into_iter().chain(ends).collect()
+    }
+
+    /// True if messages of any process may have been lost while the router was gone or the run suspended.
+    pub fn had_outages(&self) -> bool {
+        self.router.had_outages()
+    }
+
+    /// Ends the watch of the router, which may have failed.
+    pub fn end(&mut self, router_failed: bool) {
+        self.router.end(router_failed);
+    }
+
     /// Writes the status of the run.
     pub fn write_status(&mut self, phase: Phase, progress: &Progress) {
-        let health = &self.health;
-        self.status
-            .write(phase, progress, |now| health.statuses(progress, now));
+        let (health, causes) = (&self.health, (self.causes(), self.router.gone_s()));
+        let processes = |now| health.statuses(progress, now);
+        self.status.write(phase, progress, causes, processes);
     }
 
     /// Displays events and replaces hung processes until the scene is over, the user ends the run, or a process stays
@@ -105,8 +128,9 @@ impl StatusReporter {
         display: &mut Display,
     ) -> Ending {
         loop {
-            if router_panic::first().is_some() {
-                return Ending::RouterFailed;
+            if let Some(panic) = router_panic::first() {
+                let how = panic.to_owned();
+                return Ending::RouterFailed { how };
             }
             if stop.requested() {
                 display.print_line("ending");
@@ -114,6 +138,12 @@ impl StatusReporter {
             }
             let progress = scorer.progress();
             display.update(&progress);
+            let others = { progress.last_reports.iter() }.filter(|(name, _)| *name != SCORER);
+            match self.router.look(scorer, others.map(|(_, at)| *at).max()) {
+                Some(Finding::Failed(how)) => return Ending::RouterFailed { how },
+                Some(Finding::Line(line)) => display.print_line(&line),
+                None => {}
+            }
             for (name, why) in self.health.look(&progress.last_reports, Instant::now()) {
                 supervisor.replace(&name, &why);
             }

@@ -8,6 +8,9 @@ use std::collections::BTreeMap;
 use protocol::{KeyExpr, Operation, Permission, Principal, RunScope, access};
 use serde_json::{Value, json};
 
+use super::credentials::ROUTER;
+use super::router_probe::PROBE_KEY;
+
 /// Principals that a router admits, and their runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AccessControl {
@@ -42,6 +45,17 @@ impl AccessControl {
                 .push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
             policies.push(json!({"id": name, "rules": names, "subjects": [name]}));
         }
+        // The process of the router receives its own probes over a second session.
+        rules.push(json!({
+            "id": PROBE_KEY,
+            "permission": "allow",
+            "flows": ["ingress", "egress"],
+            "messages": ["declare_subscriber", "put"],
+            "key_exprs": [PROBE_KEY],
+        }));
+        subjects
+            .push(json!({"id": ROUTER, "cert_common_names": [ROUTER], "link_protocols": ["quic"]}));
+        policies.push(json!({"id": ROUTER, "rules": [PROBE_KEY], "subjects": [ROUTER]}));
         json!({
             "enabled": true,
             "default_permission": "deny",

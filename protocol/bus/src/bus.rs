@@ -16,6 +16,7 @@ use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken
 use super::metrics::{MetricsPeer, MetricsServer};
 use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
+use super::router_contact::RouterContact;
 use super::shared_pool::SharedPool;
 use super::shutdown::{self, Overdue, Stop};
 use super::status_publisher::{StatusPublisher, StatusSender};
@@ -46,6 +47,7 @@ pub struct Bus {
     epoch: u64,
     stats: MessageStats,
     pool: SharedPool,
+    contact: RouterContact,
     status: StatusPublisher,
     status_thread: JoinHandle<()>,
     metrics: Option<MetricsServer>,
@@ -85,7 +87,7 @@ impl Bus {
     /// Joins the run over a session that is open already, without a pool of shared memory.
     ///
     /// # Errors
-    /// [`BusError::Thread`] when the system cannot start a thread.
+    /// [`BusError`] when the system cannot start a thread, or the session is closed.
     pub fn over(session: Session, identity: Identity) -> Result<Self, BusError> {
         let (epoch, stats, status) = (
             new_epoch(),
@@ -98,14 +100,16 @@ impl Bus {
             cav: identity.cav.clone(),
             epoch,
             stats: stats.clone(),
+            sequence: 0,
         })?;
-        let pool = SharedPool::none();
+        let (pool, contact) = (SharedPool::none(), RouterContact::watch(&session)?);
         Ok(Self {
             session,
             identity,
             epoch,
             stats,
             pool,
+            contact,
             status,
             status_thread,
             metrics: None,
@@ -158,6 +162,16 @@ impl Bus {
         &self.stats
     }
 
+    /// Time since which the process has had no connection to its router.
+    pub fn router_lost_since(&self) -> Option<Instant> {
+        self.contact.lost_since()
+    }
+
+    /// Time without a connection to the router so far.
+    pub fn router_lost(&self) -> Duration {
+        self.contact.lost()
+    }
+
     /// The zenoh session, for operations that this type does not offer.
     pub fn session(&self) -> &Session {
         &self.session
@@ -189,7 +203,7 @@ impl Bus {
 
     /// An inbox of `places` messages for each of at most `max_topics` topics.
     pub fn inbox(&self, places: usize, max_topics: usize) -> Arc<Inbox> {
-        Inbox::new(places, max_topics, &self.stats)
+        self.limited_inbox(places, max_topics, InboxLimits::NONE)
     }
 
     /// An inbox with `limits` on each sender.

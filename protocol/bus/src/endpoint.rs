@@ -16,19 +16,7 @@ const QUIC: &str = "quic/";
 #[serde(try_from = "String", into = "String")]
 pub struct Endpoint(String);
 
-impl TryFrom<String> for Endpoint {
-    type Error = BusError;
-
-    fn try_from(text: String) -> Result<Self, BusError> {
-        Self::new(&text)
-    }
-}
-
-impl From<Endpoint> for String {
-    fn from(endpoint: Endpoint) -> Self {
-        endpoint.0
-    }
-}
+protocol::written_as_text!(Endpoint);
 
 impl Endpoint {
     /// Parses `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts are in brackets.

@@ -136,6 +136,12 @@ impl BusError {
         )
     }
 
+    /// The error of a thread that cannot be spawned.
+    pub(crate) fn thread(what: impl Into<String>) -> impl FnOnce(std::io::Error) -> Self {
+        let what = what.into();
+        move |cause| Self::Thread { what, cause }
+    }
+
     /// An error of zenoh during an operation.
     pub fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
         Self::Zenoh {

@@ -136,32 +136,22 @@ impl MessageStats {
 
     /// Counts one more message submitted on `topic`.
     pub fn submitted(&self, topic: &Topic) {
-        self.note(topic, |state| {
-            state.ledger.sent(&Account::published(topic.clone()))
-        });
+        self.note_published(topic, |state, own| state.ledger.sent(&own));
     }
 
     /// Counts a submitted message as taken by the network.
     pub fn delivered(&self, topic: &Topic) {
-        self.note(topic, |state| state.pass(Account::published(topic.clone())));
+        self.note_published(topic, |state, own| state.pass(own, 1));
     }
 
     /// Counts a submitted message as suppressed.
     pub fn suppressed(&self, topic: &Topic, reason: DropReason) {
-        self.note(topic, |state| {
-            state
-                .ledger
-                .dropped(&Account::published(topic.clone()), reason)
-        });
+        self.note_published(topic, |state, own| state.ledger.dropped(&own, reason));
     }
 
     /// Counts a submitted feature map as written to keep within a limit.
     pub fn adapted(&self, topic: &Topic, reason: RateReason) {
-        self.note(topic, |state| {
-            state
-                .ledger
-                .adapted(&Account::published(topic.clone()), reason)
-        });
+        self.note_published(topic, |state, own| state.ledger.adapted(&own, reason));
     }
 
     /// Opens the account of a subscription to `topic`.
@@ -171,7 +161,7 @@ impl MessageStats {
 
     /// Counts a message as delivered by the network, valid or not.
     pub fn arrived(&self, topic: &Topic) {
-        self.note(topic, |state| state.pass(self.here(topic)));
+        self.note(topic, |state| state.pass(self.here(topic), 1));
     }
 
     /// Counts an arrived message as used.
@@ -188,13 +178,11 @@ impl MessageStats {
 
     /// Counts messages that the router has taken and not handed on to this process.
     pub(super) fn undelivered(&self, topic: &Topic, messages: u32) {
+        let (here, messages) = (self.here(topic), u64::from(messages));
+        let why = DropReason::Undelivered;
         self.note(topic, |state| {
-            state.pass_many(self.here(topic), u64::from(messages));
-            state.ledger.dropped_many(
-                &self.here(topic),
-                DropReason::Undelivered,
-                u64::from(messages),
-            );
+            state.ledger.dropped_many(&here, why, messages);
+            state.pass(here, messages);
         });
     }
 
@@ -467,6 +455,12 @@ impl MessageStats {
         }
     }
 
+    fn note_published(&self, topic: &Topic, change: impl FnOnce(&mut State, Account)) {
+        self.note(topic, |state| {
+            change(state, Account::published(topic.clone()))
+        });
+    }
+
     fn has_account(&self, state: &State, topic: &Topic) -> bool {
         [self.here(topic), Account::published(topic.clone())]
             .iter()
@@ -491,11 +485,7 @@ impl State {
         Some(self.peers.entry(cav.clone()).or_default())
     }
 
-    fn pass(&mut self, account: Account) {
-        self.pass_many(account, 1);
-    }
-
-    fn pass_many(&mut self, account: Account, messages: u64) {
+    fn pass(&mut self, account: Account, messages: u64) {
         *self.passed.entry(account).or_default() += messages;
     }
 }

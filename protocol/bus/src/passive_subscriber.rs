@@ -4,13 +4,15 @@
 //! overwrite messages without loss in the ledgers; it counts overwritten messages itself.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use protocol::{Control, Key, KeyExpr, Kind, Limits, Topic, wire};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
+
+use support::sync::lock;
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::delivery_gaps::DeliveryGaps;
@@ -141,9 +143,7 @@ impl Shared {
             let is_notice = header
                 .as_ref()
                 .is_ok_and(|header| header.kind == Kind::Control);
-            let mut gaps = self.gaps.lock().unwrap_or_else(PoisonError::into_inner);
-            let skipped = gaps.note(&key.topic, sample.source_info(), is_notice);
-            drop(gaps);
+            let skipped = lock(&self.gaps).note(&key.topic, sample.source_info(), is_notice);
             self.undelivered
                 .fetch_add(u64::from(skipped), Ordering::Relaxed);
             match header {

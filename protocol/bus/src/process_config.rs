@@ -10,7 +10,7 @@ use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 use protocol::config::{FieldError, document, options_of};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde_json::{Map, Value};
+use serde_json::{Value, json};
 use support::cli::BadInput;
 use support::file_error::FileError;
 
@@ -36,22 +36,15 @@ pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
 pub fn minimal<C: ProcessConfig>(
     value_of: impl Fn(&str) -> String,
 ) -> Result<C, serde_json::Error> {
-    let mut root = Map::new();
+    let mut root = json!({});
     for field in C::REQUIRED {
-        let (section, name) = field
-            .split_once('.')
-            .map_or((None, *field), |(section, name)| (Some(section), name));
-        let value = Value::String(value_of(name));
-        match section {
-            None => root.insert(name.into(), value),
-            Some(section) => root
-                .entry(section)
-                .or_insert_with(|| Value::Object(Map::new()))
-                .as_object_mut()
-                .and_then(|section| section.insert(name.into(), value)),
-        };
+        let (mut place, mut name) = (&mut root, *field);
+        for part in field.split('.') {
+            (place, name) = (&mut place[part], part);
+        }
+        *place = Value::String(value_of(name));
     }
-    serde_json::from_value(Value::Object(root))
+    serde_json::from_value(root)
 }
 
 /// Options of a process: those of its configuration, and `--config`.

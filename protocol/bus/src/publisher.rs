@@ -87,30 +87,24 @@ impl PublisherOptions {
 
     /// The same of a source that may stop and come back, as a sensor does and a replay does not: its receivers stay.
     #[must_use]
-    pub const fn live(self) -> Self {
-        Self {
-            announces_end: false,
-            ..self
-        }
+    pub const fn live(mut self) -> Self {
+        self.announces_end = false;
+        self
     }
 
     /// The same, but the producer waits for a place among `places` instead of replacing a message.
     #[must_use]
-    pub const fn waiting(self, places: usize) -> Self {
-        Self {
-            overflow: Overflow::Wait(places),
-            ..self
-        }
+    pub const fn waiting(mut self, places: usize) -> Self {
+        self.overflow = Overflow::Wait(places);
+        self
     }
 
     /// The same, and the router waits for every receiver: no message is dropped, and a receiver that takes nothing
     /// stops the publisher until its connection is closed. For paced runs.
     #[must_use]
-    pub const fn lossless(self, places: usize) -> Self {
-        Self {
-            priority: Priority::RealTime,
-            ..self.waiting(places)
-        }
+    pub const fn lossless(mut self, places: usize) -> Self {
+        self.priority = Priority::RealTime;
+        self.waiting(places)
     }
 }
 
@@ -149,13 +143,6 @@ impl Publisher {
         (stats, pool): (&MessageStats, &SharedPool),
         options: PublisherOptions,
     ) -> Result<Self, BusError> {
-        let PublisherOptions {
-            overflow,
-            priority,
-            express,
-            is_for_onlookers,
-            announces_end,
-        } = options;
         let topic = key.topic.clone();
         // JSON is read by programs outside this project, which do not expect probes.
         let is_json = topic.is_json();
@@ -164,7 +151,7 @@ impl Publisher {
         } else {
             Encoding::APPLICATION_OCTET_STREAM
         };
-        let congestion = if is_for_onlookers {
+        let congestion = if options.is_for_onlookers {
             CongestionControl::Drop
         } else {
             CongestionControl::Block
@@ -173,14 +160,15 @@ impl Publisher {
             .declare_publisher(key.to_string())
             .encoding(encoding)
             .congestion_control(congestion)
-            .priority(priority)
-            .express(express)
+            .priority(options.priority)
+            .express(options.express)
             .wait()
             .map_err(|cause| BusError::zenoh(format!("declaring a publisher on {key}"), &cause))?;
-        let places = match overflow {
+        let places = match options.overflow {
             Overflow::KeepLast(places) | Overflow::Wait(places) => places,
         };
-        let has_subscribers = is_for_onlookers
+        let has_subscribers = options
+            .is_for_onlookers
             .then(|| has_subscribers(&publisher))
             .transpose();
         let has_subscribers = has_subscribers
@@ -191,26 +179,24 @@ impl Publisher {
             cav: cav.clone(),
             epoch,
             sequence: 0,
-            has_notifications: !is_json && !is_for_onlookers,
-            announces_end,
+            has_notifications: !is_json && !options.is_for_onlookers,
+            announces_end: options.announces_end,
             queue: Arc::clone(&queue),
             stats: stats.clone(),
             pool: pool.clone(),
             handed_over: 0,
             publisher,
-            receipt: FlushBarrier::new(session, &key.run, priority),
-            is_one_at_a_time: matches!(overflow, Overflow::KeepLast(_)) && !is_for_onlookers,
+            receipt: FlushBarrier::new(session, &key.run, options.priority),
+            is_one_at_a_time: matches!(options.overflow, Overflow::KeepLast(_))
+                && !options.is_for_onlookers,
         };
         let thread = thread::Builder::new()
             .name(format!("send {topic}"))
             .spawn(move || sender.run())
-            .map_err(|cause| BusError::Thread {
-                what: format!("sending {key}"),
-                cause,
-            })?;
+            .map_err(BusError::thread(format!("sending {key}")))?;
         Ok(Self {
             topic,
-            overflow,
+            overflow: options.overflow,
             queue,
             stats: stats.clone(),
             has_subscribers,
@@ -242,19 +228,16 @@ impl Publisher {
         capture_nanos: u64,
         encode: impl FnOnce(&Stamp) -> Result<Encoded, WireError> + Send + 'static,
     ) {
-        self.push(Submission {
+        self.push(
             capture_nanos,
-            encode: Box::new(|stamp, pool| Ok(pool.payload(encode(stamp)?))),
-        });
+            |stamp, pool| Ok(pool.payload(encode(stamp)?)),
+        );
     }
 
     /// Forwards a message unchanged, under the stamp of its sender; nothing is copied.
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload().clone();
-        self.push(Submission {
-            capture_nanos: arrival.header.stamp.capture_nanos,
-            encode: Box::new(|_, _| Ok(bytes)),
-        });
+        self.push(arrival.header.stamp.capture_nanos, |_, _| Ok(bytes));
     }
 
     /// The same with another capture time, that of an erroneous clock.
@@ -274,23 +257,25 @@ impl Publisher {
         writer.append(header.to_bytes().to_vec().into());
         writer.append(rest.into());
         let bytes = writer.finish();
-        self.push(Submission {
-            capture_nanos,
-            encode: Box::new(|_, _| Ok(bytes)),
-        });
+        self.push(capture_nanos, |_, _| Ok(bytes));
     }
 
-    fn push(&self, submission: Submission) {
+    fn push<E>(&self, capture_nanos: u64, encode: E)
+    where
+        E: FnOnce(&Stamp, &SharedPool) -> Result<ZBytes, WireError> + Send + 'static,
+    {
         self.stats.submitted(&self.topic);
+        let encode = Box::new(encode);
+        let submission = Submission {
+            capture_nanos,
+            encode,
+        };
         let pushed = match self.overflow {
             Overflow::KeepLast(_) => self.queue.push((), submission),
             Overflow::Wait(_) => self.queue.push_waiting((), submission),
         };
-        match pushed {
-            PushOutcome::Queued => {}
-            PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {
-                self.stats.suppressed(&self.topic, DropReason::Superseded);
-            }
+        if !matches!(pushed, PushOutcome::Queued) {
+            self.stats.suppressed(&self.topic, DropReason::Superseded);
         }
     }
 
@@ -446,12 +431,7 @@ pub fn has_subscribers(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Resul
 
 /// Head and body concatenated, without copying the body.
 pub(super) fn payload(encoded: Encoded) -> ZBytes {
-    let mut writer = ZBytes::writer();
-    writer.append(encoded.head.into());
-    if !encoded.body.is_empty() {
-        writer.append(bytes::Bytes::from_owner(encoded.body).into());
-    }
-    writer.finish()
+    SharedPool::none().payload(encoded)
 }
 
 /// Current time on the Unix clock, nanoseconds.

@@ -83,19 +83,7 @@ impl FromStr for Route {
     }
 }
 
-impl TryFrom<String> for Route {
-    type Error = RouteError;
-
-    fn try_from(text: String) -> Result<Self, RouteError> {
-        text.parse()
-    }
-}
-
-impl From<Route> for String {
-    fn from(route: Route) -> Self {
-        route.to_string()
-    }
-}
+protocol::written_as_text!(Route);
 
 /// Some routes are not confirmed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -136,10 +124,7 @@ impl Barrier {
         thread::Builder::new()
             .name("readiness".into())
             .spawn(move || attending.0.listen(&attending.1))
-            .map_err(|cause| BusError::Thread {
-                what: "readiness".into(),
-                cause,
-            })?;
+            .map_err(BusError::thread("readiness"))?;
         Ok(RoutesReady {
             barrier,
             inbox,

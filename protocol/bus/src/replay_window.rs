@@ -27,7 +27,7 @@ pub(super) struct ReplayWindow {
 }
 
 /// Result of the check of a message.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Admission {
     /// Drop reason; `None` if the message is accepted.
     pub(super) dropped: Option<DropReason>,
@@ -88,10 +88,7 @@ impl ReplayWindow {
             quarantined_until: None,
         };
         self.topics.insert(topic.clone(), senders);
-        Admission {
-            dropped: None,
-            quarantine: None,
-        }
+        Admission::default()
     }
 }
 

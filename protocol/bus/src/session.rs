@@ -40,18 +40,12 @@ const LONGEST_SECURED: Duration = Duration::from_secs(30);
 const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
 
 /// Role of a process in the star topology.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
     /// The centre: routes for all others. One process of a run, usually the one that starts the others.
-    Router {
-        /// Listening endpoint, for example `tcp/127.0.0.1:7447`.
-        listen: Endpoint,
-    },
+    Router,
     /// All other processes.
-    Client {
-        /// The router's endpoint.
-        connect: Endpoint,
-    },
+    Client,
 }
 
 /// Use of shared memory for the large messages of one machine. Without it they take the socket.
@@ -79,8 +73,10 @@ impl SharedMemory {
 /// Options of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BusOptions {
-    /// Router or client, with its endpoint.
+    /// Router or client.
     pub role: Role,
+    /// Endpoint at which a router listens or to which a client connects, for example `tcp/127.0.0.1:7447`.
+    pub endpoint: Endpoint,
     /// Timeout of a client for reaching the router.
     pub connect_timeout: Duration,
     /// Shared memory for large messages between processes of one machine.
@@ -99,17 +95,18 @@ pub struct BusOptions {
 impl BusOptions {
     /// A router that listens at `listen`.
     pub fn router(listen: Endpoint) -> Self {
-        Self::with_role(Role::Router { listen }, LONGEST_DELIVERY)
+        Self::with_role(Role::Router, listen, LONGEST_DELIVERY)
     }
 
     /// A client of the router at `connect`.
     pub fn client(connect: Endpoint) -> Self {
-        Self::with_role(Role::Client { connect }, LONGEST_MESSAGE)
+        Self::with_role(Role::Client, connect, LONGEST_MESSAGE)
     }
 
-    fn with_role(role: Role, stall_limit: Duration) -> Self {
+    fn with_role(role: Role, endpoint: Endpoint, stall_limit: Duration) -> Self {
         Self {
             role,
+            endpoint,
             connect_timeout: Duration::from_secs(10),
             shared_memory: SharedMemory::Off,
             // Twice a full feature map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and
@@ -124,9 +121,7 @@ impl BusOptions {
     /// The same with keys: the endpoint becomes a QUIC endpoint.
     #[must_use]
     pub fn with_credentials(mut self, credentials: Credentials) -> Self {
-        let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) =
-            &mut self.role;
-        *endpoint = endpoint.secured();
+        self.endpoint = self.endpoint.secured();
         self.stall_limit = self.stall_limit.min(LONGEST_SECURED);
         self.credentials = Some(credentials);
         self
@@ -134,17 +129,14 @@ impl BusOptions {
 
     /// The same as a router with access control.
     #[must_use]
-    pub fn with_access_control(self, guard: AccessControl) -> Self {
-        Self {
-            guard: Some(guard),
-            ..self
-        }
+    pub fn with_access_control(mut self, guard: AccessControl) -> Self {
+        self.guard = Some(guard);
+        self
     }
 
     /// Endpoint at which this end listens or to which it connects.
     pub fn endpoint(&self) -> &Endpoint {
-        let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &self.role;
-        endpoint
+        &self.endpoint
     }
 
     /// The same as a configuration for a separate `zenohd`.
@@ -162,9 +154,10 @@ impl BusOptions {
 
     /// The keys of zenoh's configuration that differ from its defaults, or on which this crate relies.
     fn settings(&self) -> Vec<(&'static str, Value)> {
-        let (mode, listen, connect) = match &self.role {
-            Role::Router { listen } => ("router", vec![listen.for_zenoh()], vec![]),
-            Role::Client { connect } => ("client", vec![], vec![connect.for_zenoh()]),
+        let own = vec![self.endpoint.for_zenoh()];
+        let (mode, listen, connect) = match self.role {
+            Role::Router => ("router", own, vec![]),
+            Role::Client => ("client", vec![], own),
         };
         let millis = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
         let mut settings = vec![
@@ -235,7 +228,7 @@ impl BusOptions {
                 json!(false),
             ),
         ];
-        if matches!(self.role, Role::Router { .. }) {
+        if self.role == Role::Router {
             settings.push(("low_pass_filter", access_control::size_limits()));
             settings.extend(egress::settings());
         }
@@ -285,31 +278,25 @@ fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
 /// # Errors
 /// [`BusError`] states the endpoint and the remedy.
 pub fn open(options: &BusOptions) -> Result<Session, BusError> {
-    if options.credentials.is_none() && options.endpoint().is_secured() {
-        return Err(BusError::NoKeys(options.endpoint().clone()));
+    let endpoint = options.endpoint.clone();
+    if options.credentials.is_none() && endpoint.is_secured() {
+        return Err(BusError::NoKeys(endpoint));
     }
     let config = config(options)?;
     let began = Instant::now();
     // Before zenoh tries, which would print a warning of its own first; it fails too if another process is faster.
-    if let Role::Router { listen } = &options.role
-        && port_in_use(listen)
-    {
-        return Err(BusError::PortInUse {
-            endpoint: listen.clone(),
-        });
+    if options.role == Role::Router && port_in_use(&endpoint) {
+        return Err(BusError::PortInUse { endpoint });
     }
-    zenoh::open(config)
-        .wait()
-        .map_err(|cause| match &options.role {
-            Role::Router { listen } if port_in_use(listen) => BusError::PortInUse {
-                endpoint: listen.clone(),
-            },
-            Role::Router { listen } => BusError::zenoh(format!("listening at {listen}"), &cause),
-            Role::Client { connect } => BusError::Unreachable {
-                endpoint: connect.clone(),
-                waited_s: began.elapsed().as_secs_f64(),
-            },
-        })
+    let opened = zenoh::open(config).wait();
+    opened.map_err(|cause| match options.role {
+        Role::Router if port_in_use(&endpoint) => BusError::PortInUse { endpoint },
+        Role::Router => BusError::zenoh(format!("listening at {endpoint}"), &cause),
+        Role::Client => BusError::Unreachable {
+            endpoint,
+            waited_s: began.elapsed().as_secs_f64(),
+        },
+    })
 }
 
 /// [`open`], or the end at once when `stop` is requested while a client waits for its router.
@@ -328,12 +315,9 @@ pub fn open_unless(stop: &Stop, options: &BusOptions) -> Result<Session, BusErro
     thread::Builder::new()
         .name("open".into())
         .spawn(move || drop(result.send(Some(open(&wanted)))))
-        .map_err(|cause| BusError::Thread {
-            what: "opening a session".into(),
-            cause,
-        })?;
+        .map_err(BusError::thread("opening a session"))?;
     let stopped = BusError::Stopped {
-        endpoint: options.endpoint().clone(),
+        endpoint: options.endpoint.clone(),
         source: Interrupted,
     };
     first.recv().ok().flatten().unwrap_or(Err(stopped))

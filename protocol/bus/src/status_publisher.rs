@@ -4,13 +4,15 @@
 
 use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, Key, Payload, RunId, Stamp, Stats, Topic, wire};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
+
+use support::sync::lock;
 
 use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::process_usage::process_usage;
@@ -59,11 +61,7 @@ impl StatusPublisher {
 
     /// Marks the route of `topic` as confirmed.
     pub(super) fn confirm_route(&self, topic: &Topic) {
-        let mut confirmed = self
-            .0
-            .confirmed
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
+        let mut confirmed = lock(&self.0.confirmed);
         if confirmed.len() < MAX_CONFIRMED && !confirmed.contains(topic) {
             confirmed.insert(topic.clone());
         }
@@ -87,11 +85,7 @@ impl StatusPublisher {
 
     /// Heartbeats are published only while this thread works; `None`: always.
     pub(super) fn watch(&self, watchdog: Option<Arc<Watchdog>>) {
-        *self
-            .0
-            .watchdog
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner) = watchdog;
+        *lock(&self.0.watchdog) = watchdog;
     }
 
     /// Ends the thread after it has published the queued messages and the final ledger.
@@ -100,14 +94,9 @@ impl StatusPublisher {
     }
 
     fn push(&self, request: Request) {
-        match self.0.queue.push((), request) {
-            PushOutcome::Replaced(Request::Control { control, .. }) => {
-                tracing::error!("the network is stalled: {control:?} was not sent");
-            }
-            PushOutcome::Queued
-            | PushOutcome::Replaced(Request::Ready)
-            | PushOutcome::NoLane(_)
-            | PushOutcome::Closed(_) => {}
+        let outcome = self.0.queue.push((), request);
+        if let PushOutcome::Replaced(Request::Control { control, .. }) = outcome {
+            tracing::error!("the network is stalled: {control:?} was not sent");
         }
     }
 
@@ -116,10 +105,7 @@ impl StatusPublisher {
         thread::Builder::new()
             .name("status".into())
             .spawn(move || sender.run(&shared))
-            .map_err(|cause| BusError::Thread {
-                what: "status".into(),
-                cause,
-            })
+            .map_err(BusError::thread("status"))
     }
 }
 
@@ -130,15 +116,16 @@ pub(super) struct StatusSender {
     pub(super) cav: CavId,
     pub(super) epoch: u64,
     pub(super) stats: MessageStats,
+    pub(super) sequence: u64,
 }
 
 impl StatusSender {
-    fn run(self, shared: &Shared) {
-        let (mut sequence, mut beats) = (0, 0);
+    fn run(mut self, shared: &Shared) {
+        let mut beats = 0;
         let mut next = Instant::now() + PERIOD;
         loop {
             match shared.queue.take(Some(next)) {
-                Pop::Item((), Request::Ready) => self.ready(shared, &mut sequence),
+                Pop::Item((), Request::Ready) => self.ready(shared),
                 Pop::Item(
                     (),
                     Request::Control {
@@ -146,64 +133,44 @@ impl StatusSender {
                         capture_nanos,
                     },
                 ) => {
-                    self.control(control, capture_nanos, &mut sequence);
+                    self.control(control, capture_nanos);
                 }
                 Pop::TimedOut => {
                     next = Instant::now() + PERIOD;
-                    self.ready(shared, &mut sequence);
-                    let watchdog = shared
-                        .watchdog
-                        .lock()
-                        .unwrap_or_else(PoisonError::into_inner)
-                        .clone();
+                    self.ready(shared);
+                    let watchdog = lock(&shared.watchdog).clone();
                     if watchdog.is_none_or(|watchdog| watchdog.is_alive(&mut beats)) {
-                        self.stats(&mut sequence);
+                        self.stats();
                     }
                 }
-                Pop::Closed => return self.stats(&mut sequence),
+                Pop::Closed => return self.stats(),
             }
         }
     }
 
-    fn ready(&self, shared: &Shared, sequence: &mut u64) {
+    fn ready(&mut self, shared: &Shared) {
         // Cleared first: a probe that arrives from here on requests a new answer.
         shared.answer_due.store(false, Ordering::Release);
-        let subscribed: Vec<Topic> = shared
-            .confirmed
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .iter()
-            .cloned()
-            .collect();
+        let subscribed: Vec<Topic> = lock(&shared.confirmed).iter().cloned().collect();
         if !subscribed.is_empty() {
             let process = self.stats.process().clone();
-            let key = Key::ready(&self.run, &process);
-            self.put(
-                &key,
-                Priority::InteractiveHigh,
-                0,
-                Control::Ready {
-                    process,
-                    subscribed,
-                },
-                sequence,
-            );
+            let key = Topic::Ready(process.clone()).in_run(&self.run);
+            let ready = Control::Ready {
+                process,
+                subscribed,
+            };
+            self.put(&key, Priority::InteractiveHigh, 0, ready);
         }
     }
 
-    fn control(&self, control: Control, capture_nanos: u64, sequence: &mut u64) {
+    fn control(&mut self, control: Control, capture_nanos: u64) {
         if let Some(verb) = control.verb() {
-            self.put(
-                &Key::control(&self.run, verb),
-                Priority::InteractiveHigh,
-                capture_nanos,
-                control,
-                sequence,
-            );
+            let key = Topic::Control(verb).in_run(&self.run);
+            self.put(&key, Priority::InteractiveHigh, capture_nanos, control);
         }
     }
 
-    fn stats(&self, sequence: &mut u64) {
+    fn stats(&mut self) {
         let process = self.stats.process().clone();
         let key = Key::stats(&self.run, &process);
         let stats = Stats {
@@ -214,25 +181,18 @@ impl StatusSender {
             traffic: self.stats.traffic(),
             problems: self.stats.problems(),
         };
-        self.put(&key, Priority::Background, 0, stats, sequence);
+        self.put(&key, Priority::Background, 0, stats);
     }
 
-    fn put<M: Payload>(
-        &self,
-        key: &Key,
-        priority: Priority,
-        capture_nanos: u64,
-        message: M,
-        sequence: &mut u64,
-    ) {
+    fn put<M: Payload>(&mut self, key: &Key, priority: Priority, capture_nanos: u64, message: M) {
         let stamp = Stamp {
             cav: self.cav.clone(),
             epoch: self.epoch,
-            sequence: *sequence,
+            sequence: self.sequence,
             capture_nanos,
             publish_nanos: unix_nanos(),
         };
-        *sequence += 1;
+        self.sequence += 1;
         let encoded = match wire::encode(&stamp, message) {
             Ok(encoded) => encoded,
             Err(error) => return tracing::error!(%key, "status cannot be sent: {error}"),

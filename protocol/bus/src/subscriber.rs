@@ -1,7 +1,7 @@
 //! Subscriptions: filter messages on the network's thread, and queue them for the thread that processes them.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use protocol::{
@@ -9,6 +9,7 @@ use protocol::{
     wire,
 };
 use support::nanos;
+use support::sync::lock;
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::{Sample, SourceInfo};
@@ -118,10 +119,6 @@ pub struct Inbox {
 }
 
 impl Inbox {
-    pub(super) fn new(places: usize, max_topics: usize, stats: &MessageStats) -> Arc<Self> {
-        Self::within(InboxLimits::NONE, places, max_topics, stats)
-    }
-
     pub(super) fn within(
         limits: InboxLimits,
         places: usize,
@@ -353,12 +350,7 @@ impl IngressFilter {
         }
         let is_notice = payload.len() <= MAX_NOTICE_BYTES
             && header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header));
-        let mut gaps = self
-            .inbox
-            .gaps
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        let skipped = gaps.note(topic, source, is_notice);
+        let skipped = lock(&self.inbox.gaps).note(topic, source, is_notice);
         if skipped > 0 {
             self.inbox.stats.undelivered(topic, skipped);
         }
@@ -401,14 +393,7 @@ impl IngressFilter {
         let Admission {
             dropped,
             quarantine,
-        } = {
-            let mut replay_window = self
-                .inbox
-                .replay_window
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner);
-            replay_window.admit(topic, stamp.epoch, stamp.sequence, at)
-        };
+        } = lock(&self.inbox.replay_window).admit(topic, stamp.epoch, stamp.sequence, at);
         if let Some(is_twice) = quarantine {
             let text = format!("two senders use {topic}: both are rejected");
             let problem = is_twice.then(|| (text.clone(), at));
@@ -425,16 +410,7 @@ impl IngressFilter {
 
 /// The header of a message on `topic`, if it is allowed there.
 fn header_of(topic: &Topic, payload: &ZBytes) -> Result<Header, WireError> {
-    wire::decode_header(payload.slices()).and_then(|header| check(topic, header))
-}
-
-/// True if a message is a notification about its publisher, which is not counted.
-fn is_notice(topic: &Topic, header: &Header) -> bool {
-    header.kind == Kind::Control && has_notifications(topic)
-}
-
-/// Checks sender and kind of a message on `topic`.
-fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
+    let header = wire::decode_header(payload.slices())?;
     if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = topic {
         header.check_sender(cav)?;
     }
@@ -442,6 +418,11 @@ fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
         header.check_kind(expected)?;
     }
     Ok(header)
+}
+
+/// True if a message is a notification about its publisher, which is not counted.
+fn is_notice(topic: &Topic, header: &Header) -> bool {
+    header.kind == Kind::Control && has_notifications(topic)
 }
 
 #[cfg(test)]

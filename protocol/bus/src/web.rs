@@ -216,11 +216,7 @@ async fn answer(
     request: hyper::Request<Incoming>,
 ) -> Result<Response<Body>, Infallible> {
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
-        let mut refusal = respond(
-            StatusCode::METHOD_NOT_ALLOWED,
-            TEXT,
-            whole("GET and HEAD only".into()),
-        );
+        let mut refusal = refuse(StatusCode::METHOD_NOT_ALLOWED, "GET and HEAD only".into());
         refusal
             .headers_mut()
             .insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
@@ -230,7 +226,7 @@ async fn answer(
         && let Err(name) = host::check(local, request.uri(), request.headers())
     {
         let message = format!("this server is called localhost, not {name:?}");
-        return Ok(respond(StatusCode::FORBIDDEN, TEXT, whole(message.into())));
+        return Ok(refuse(StatusCode::FORBIDDEN, message));
     }
     let (path, query) = (
         request.uri().path().to_owned(),
@@ -248,15 +244,13 @@ async fn answer(
             let body = StreamBody::new(pieces.map(|piece| Ok(Frame::data(piece))));
             respond(StatusCode::OK, content_type, body.boxed_unsync())
         }
-        Ok(Answer::NotFound(message)) => {
-            respond(StatusCode::NOT_FOUND, TEXT, whole(message.into()))
-        }
-        Err(panicked) => respond(
-            StatusCode::INTERNAL_SERVER_ERROR,
-            TEXT,
-            whole(panicked.to_string().into()),
-        ),
+        Ok(Answer::NotFound(message)) => refuse(StatusCode::NOT_FOUND, message),
+        Err(panicked) => refuse(StatusCode::INTERNAL_SERVER_ERROR, panicked.to_string()),
     })
+}
+
+fn refuse(status: StatusCode, message: String) -> Response<Body> {
+    respond(status, TEXT, whole(message.into()))
 }
 
 fn whole(bytes: Bytes) -> Body {

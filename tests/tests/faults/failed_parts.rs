@@ -94,7 +94,7 @@ fn a_cut_recording_is_reported_by_report_status_and_exit_code() {
 }
 
 #[test]
-fn a_second_fleet_of_the_same_name_is_refused_and_the_first_goes_on() {
+fn a_second_fleet_of_the_same_name_is_refused_and_the_first_continues() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     let free = TcpListener::bind("127.0.0.1:0")

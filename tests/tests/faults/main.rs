@@ -6,6 +6,7 @@ mod poisoned_router;
 mod processes;
 mod receivers;
 mod shared_memory;
+mod silent_router;
 
 use peak_alloc::PeakAlloc;
 

@@ -96,8 +96,11 @@ fn a_run_whose_router_is_poisoned_ends_with_its_results() {
     up.wait_for_results("some results", |results| results.len() > 5);
     let began = Instant::now();
     poison(address.parse().unwrap());
-    up.wait_for_line("the router of the run failed");
-    assert_eq!(up.wait().code(), Some(1));
+    let line = up.wait_for_line("the router of the run failed");
+    assert!(began.elapsed() < Duration::from_secs(4), "{line}");
+    let line = up.wait_for_line("exit 3: ");
+    assert!(line.contains("the router of the run failed"), "{line}");
+    assert_eq!(up.wait().code(), Some(3));
     assert!(
         began.elapsed() < Duration::from_secs(20),
         "{:?}",

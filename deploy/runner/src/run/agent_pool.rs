@@ -95,7 +95,7 @@ impl CrewProcesses {
 
     /// Ends all processes; returns the names of those that had to be killed.
     pub(crate) fn end(self) -> Vec<String> {
-        let killed = self.supervisor.stop(self.grace).killed;
+        let killed = self.supervisor.stop(self.grace);
         for closed in [self.bus.leave(LEAVE_LIMIT), self.place.close()] {
             if let Err(overdue) = closed {
                 tracing::warn!("{overdue}");

@@ -66,19 +66,15 @@ pub fn estimate(fleet: &Fleet, programs: &Path, budget: Duration) -> io::Result<
         .map(|child| answer(child.wait_with_output()?))
         .collect::<io::Result<Vec<Measured>>>()?;
     let vehicle_mb = vehicle_mb(fleet).map_err(io::Error::other)?;
-    let mut capacity = capacity_of(
+    let capacity = capacity_of(
         machine,
         &measured,
         (fleet.agents.len(), local_vehicles(fleet)),
         vehicle_mb,
         (period_ms, answer(unit)?),
     );
-    fleet
-        .scenario
-        .method
-        .name()
-        .clone_into(&mut capacity.method);
-    Ok(Some(capacity))
+    let method = fleet.scenario.method.to_string();
+    Ok(Some(Capacity { method, ..capacity }))
 }
 
 /// Starts a process that measures.
@@ -136,11 +132,8 @@ fn local_vehicles(fleet: &Fleet) -> usize {
 
 /// Time between two frames of a run with a pace of its own that can be estimated: not in lockstep, as fast as possible,
 /// or of a single tick, and with networks on the CPU, which is what is measured.
-fn period_ms(
-    Fleet {
-        scenario, recorded, ..
-    }: &Fleet,
-) -> Option<f64> {
+fn period_ms(fleet: &Fleet) -> Option<f64> {
+    let (scenario, recorded) = (&fleet.scenario, &fleet.recorded);
     let scene = &scenario.scene;
     let has_pace =
         !scene.lockstep && scene.rate > 0.0 && scenario.models.device == ComputeDevice::Cpu;

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use dataset::{self, LoadOptions};
+use dataset::LoadOptions;
 use deploy::score::{FrameScores, JudgedFrame};
 use protocol::{CavId, Pose};
 
@@ -34,11 +34,7 @@ fn try_draw(
         Some(poses.find(|(known, _)| known == cav)?.1)
     };
     let world_from_ego: Pose = pose_of(&fleet.ego).ok_or("the truth names no pose of the ego")?;
-    let dataset = dataset::open(&fleet.scenario.scene.dir)?;
-    let name = fleet.scenario.scene.scenario.as_deref();
-    let mut scenarios = dataset.scenarios.iter();
-    let scenario = scenarios.find(|known| Some(known.name.as_str()) == name);
-    let scenario = scenario.ok_or("the scene is gone")?;
+    let scenario = &fleet.recorded;
     let options = LoadOptions {
         lidar_variant: fleet.scenario.scene.variant.clone(),
         ..LoadOptions::default()

@@ -1,10 +1,10 @@
 //! `ledger.json`: the ledger of every process, their sum, and the discrepancies.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use bus::Rejection;
 use deploy::score::ProcessStats;
-use protocol::{Counts, Ledger, Reconciliation, StageSummary};
+use protocol::{Counts, Ledger, Reconciliation};
 use serde::Serialize;
 
 /// Message accounting of a run.
@@ -25,8 +25,11 @@ pub(crate) struct LedgerReport {
     /// Requests that the router of the run refused: peer, message, reason.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub refused: Vec<RefusedReport>,
+    /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub causes: Vec<String>,
     /// Last report of each process; a restarted one has an entry per instance.
-    pub processes: Vec<ProcessReport>,
+    pub processes: Vec<ProcessStats>,
 }
 
 /// Requests of one peer that the router refused.
@@ -42,17 +45,6 @@ pub(crate) struct RefusedReport {
     pub count: u64,
 }
 
-/// Ledger of one process instance.
-#[derive(Debug, Clone, Serialize)]
-pub(crate) struct ProcessReport {
-    /// Name of the process.
-    pub process: String,
-    /// Its message counters.
-    pub ledger: Ledger,
-    /// Durations of its stages.
-    pub stages: Vec<StageSummary>,
-}
-
 impl LedgerReport {
     /// Report on `ledgers`, whose sum is `sum`; processes that were offline, and the number of messages exempt for
     /// that.
@@ -62,11 +54,6 @@ impl LedgerReport {
         balance: &Reconciliation,
         (away, exempted): (&BTreeSet<String>, u64),
     ) -> Self {
-        let process = |instance: &ProcessStats| ProcessReport {
-            process: instance.process.to_string(),
-            ledger: instance.ledger.clone(),
-            stages: instance.stages.clone(),
-        };
         Self {
             balances: balance.is_exact(),
             balance: balance.clone(),
@@ -75,21 +62,20 @@ impl LedgerReport {
             total: sum.total(),
             sum: sum.clone(),
             refused: Vec::new(),
-            processes: ledgers.iter().map(process).collect(),
+            causes: Vec::new(),
+            processes: ledgers.to_vec(),
         }
     }
+}
 
-    /// Adds the requests that the router of the run refused.
-    pub(crate) fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
-        let refused = refused.iter().map(|(of, count)| RefusedReport {
-            peer: of.peer.clone(),
-            message: of.message.clone(),
-            reason: of.reason.clone(),
-            count: *count,
-        });
+impl RefusedReport {
+    /// The requests that the router of the run refused.
+    pub(crate) fn of((refused, count): (&Rejection, &u64)) -> Self {
         Self {
-            refused: refused.collect(),
-            ..self
+            peer: refused.peer.clone(),
+            message: refused.message.clone(),
+            reason: refused.reason.clone(),
+            count: *count,
         }
     }
 }

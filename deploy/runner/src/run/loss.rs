@@ -6,8 +6,8 @@ use protocol::DropReason;
 
 use crate::run::run_fleet::RunResult;
 
-/// Drop reasons of messages that came too late for a busy process.
-const OVERLOAD: [DropReason; 2] = [DropReason::Superseded, DropReason::Stale];
+/// Drop reasons of messages that came too late for a busy process, or were not computed for that.
+const OVERLOAD: [DropReason; 3] = [DropReason::Superseded, DropReason::Stale, DropReason::Paced];
 
 /// Reasons for exit code 3 and what would help; `None` if nothing was lost beyond the drops of the link.
 pub(crate) fn sentence(result: &RunResult) -> Option<String> {
@@ -30,7 +30,8 @@ fn reasons(result: &RunResult) -> Vec<String> {
     let messages = &result.metrics.messages;
     let dropped = messages.dropped.iter();
     let lost = dropped.filter(|(reason, count)| reason.is_loss() && **count > 0);
-    let dropped = lost.map(|(reason, count)| format!("{count} {}", spoken(*reason)));
+    let dropped =
+        lost.map(|(reason, count)| format!("{count} {}", reason.as_str().replace('_', " ")));
     let dropped: Vec<String> = dropped.collect();
     if !dropped.is_empty() {
         reasons.push(format!("messages lost ({})", dropped.join(", ")));
@@ -59,19 +60,22 @@ fn help(result: &RunResult) -> Option<String> {
     let dropped = &result.metrics.messages.dropped;
     let count = |reason: &DropReason| dropped.get(reason).copied().unwrap_or(0);
     let log = |folder: &Path| format!("see {}", folder.join("log").display());
+    let mut causes = result.causes.clone();
+    causes.retain(|cause| !result.failures.contains(cause));
+    if result.interrupted && result.metrics.ticks > 0 {
+        causes.push("the run was ended before its time".into());
+    }
     if !result.unwritten.is_empty() {
         Some("free disk space".into())
     } else if result.interrupted {
-        (result.metrics.ticks > 0).then(|| "the run was ended before its time".into())
-    } else if !result.failures.is_empty() || !result.crashed.is_empty() {
-        let crashed = match &result.crashed[..] {
-            [] => String::new(),
-            names => format!("{} crashed, ", names.join(" and ")),
-        };
-        Some(format!("{crashed}{}", log(result.folder.path())))
+        (!causes.is_empty()).then(|| listed(&causes, "and"))
+    } else if !result.failures.is_empty() || !causes.is_empty() {
+        causes.push(log(result.folder.path()));
+        Some(causes.join(", "))
     } else if count(&DropReason::NoPose) > 0 && result.metrics.pose.success_3m == Some(0.0) {
         Some("no vehicle found itself: is the head of agents.pose that of this scene?".into())
-    } else if result.missed > 0 || OVERLOAD.iter().any(|reason| count(reason) > 0) {
+    } else if result.metrics.messages.are_stuck() || OVERLOAD.iter().any(|reason| count(reason) > 0)
+    {
         let remedies = result.remedies.as_ref();
         remedies.map(|remedies| format!("{remedies} would answer more"))
     } else if !result.metrics.left_out.is_nothing() {
@@ -79,10 +83,6 @@ fn help(result: &RunResult) -> Option<String> {
     } else {
         Some(log(result.folder.path()))
     }
-}
-
-fn spoken(reason: DropReason) -> String {
-    reason.as_str().replace('_', " ")
 }
 
 /// `a, b and c`.

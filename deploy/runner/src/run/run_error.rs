@@ -50,17 +50,6 @@ pub enum RunError {
     /// A run in simulation time cannot be computed.
     #[error(transparent)]
     Evaluate(Box<EvaluateError>),
-    /// The router of the run panicked.
-    #[error(
-        "the router of the run failed, and no message passed any more: {panic} (results until then: {})",
-        folder.display()
-    )]
-    Router {
-        /// Its panic.
-        panic: String,
-        /// Folder of the run.
-        folder: PathBuf,
-    },
     /// A process stays down.
     #[error("{process} {how} (log: {})", log.display())]
     Process {
@@ -91,7 +80,7 @@ impl RunError {
     /// True if the run was refused before any process started, so that its folder holds nothing of use.
     pub(crate) fn is_refusal(&self) -> bool {
         match self {
-            Self::Process { .. } | Self::Router { .. } | Self::Folder(_) => false,
+            Self::Process { .. } | Self::Folder(_) => false,
             Self::Evaluate(_) => self.is_bad_input(),
             _ => true,
         }

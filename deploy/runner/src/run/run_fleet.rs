@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{Endpoint, MetricsPeer, Rejection};
+use bus::{MetricsPeer, Rejection};
 use dataset::findings;
 use deploy::operate::network::{Network, RouterEndpoint};
 use deploy::operate::progress::Display;
@@ -21,14 +21,15 @@ use deploy::operate::supervise::{ProcessSpec, Supervisor};
 use deploy::operate::{RECORDER, REPLAY};
 use deploy::report::{self, Capacity, RunReport};
 use deploy::score::metrics::Metrics;
-use deploy::score::{FrameScores, Progress, Scored, ScorerNode, offline_intervals};
-use protocol::{Ledger, Reconciliation, RunId};
+use deploy::score::{FrameScores, Progress, Scored, ScorerNode, TRACKS, offline_intervals};
+use protocol::{Ledger, Reconciliation, Role, RunId};
+use support::atomic_file;
 use support::output;
 use support::provenance::Provenance;
 
 use crate::fleet::{Fleet, SessionContext};
 use crate::run::capacity::{BUDGET, estimate, remedies};
-use crate::run::ledger_report::LedgerReport;
+use crate::run::ledger_report::{LedgerReport, RefusedReport};
 use crate::run::{RunError, loss};
 use crate::scenario::{Clock, Scenario};
 
@@ -43,7 +44,10 @@ const DRAIN_SHARE: f64 = 0.5;
 const RECORDER_SHARE: Duration = Duration::from_millis(800);
 
 /// Files of results and of ground truth, a line each.
-const LINES: [&str; 2] = ["detections.jsonl", "truth.jsonl"];
+const LINES: [&str; 3] = ["detections.jsonl", "truth.jsonl", TRACKS];
+
+/// A run whose router, in this process, passes no message.
+const ROUTER_FAILED: &str = "the router of the run failed, and no message passed any more";
 
 /// Settings of a run beside its scenario.
 #[derive(Debug, Clone)]
@@ -75,8 +79,8 @@ pub struct RunResult {
     pub unwritten: Vec<String>,
     /// Processes that failed in their task, with the reason.
     pub failures: Vec<String>,
-    /// Processes that crashed at least once.
-    pub crashed: Vec<String>,
+    /// Observed causes of lost messages: outages of the router, pauses of the run, ends of processes.
+    pub causes: Vec<String>,
     /// Changes that would let the fleet answer more ticks; `None` in simulation time, where it answers all.
     pub remedies: Option<String>,
     /// Pace, stages and resources.
@@ -103,10 +107,21 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     }
     let fleet = Fleet::plan(scenario).map_err(RunError::Fleet)?;
     findings::note(&fleet.findings);
+    in_folder(&fleet, options, |run, folder| {
+        go(&fleet, options, run, folder)
+    })
+}
+
+/// Computes a run in a folder of its own, which is removed if the run is refused.
+pub(super) fn in_folder(
+    fleet: &Fleet,
+    options: &RunOptions,
+    go: impl FnOnce(&RunId, &RunFolder) -> Result<RunResult, RunError>,
+) -> Result<RunResult, RunError> {
     let named = fleet.scenario.run.clone();
     let run = named.unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
-    let result = go(&fleet, options, &run, &folder);
+    let result = go(&run, &folder);
     if result.as_ref().is_err_and(RunError::is_refusal) {
         folder.remove();
     }
@@ -158,9 +173,18 @@ fn go(
     let refused = RefusalWatch::over(&place)?;
     let (ego, agents) = (&fleet.ego, &fleet.agents);
     let board = FrameScores::new(ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
-    let files = LINES.map(|name| folder.file(name));
+    let [detections, truth, tracks] = LINES.map(|name| folder.file(name));
+    let tracks = fleet.scenario.ego.tracks.then_some(tracks);
     let session = place.session.clone();
-    let mut scorer = ScorerNode::start(session, run, agents, ego, board, files)?;
+    let mut scorer = ScorerNode::start(
+        session,
+        run,
+        agents,
+        ego,
+        board,
+        [detections, truth],
+        tracks,
+    )?;
     if let Some(address) = fleet.scenario.network.metrics {
         let peer = |spec: &ProcessSpec| {
             Some(MetricsPeer {
@@ -170,9 +194,8 @@ fn go(
         };
         scorer.serve_metrics(address, specs.iter().filter_map(peer).collect())?;
     }
-    let watched = watch(fleet, &context, specs, &place.endpoint, &scorer, &stop);
-    let has_router =
-        !{ watched.as_ref() }.is_ok_and(|watched| matches!(watched.ending, Ending::RouterFailed));
+    let watched = watch(fleet, &context, specs, &place, &scorer, &stop);
+    let has_router = !{ watched.as_ref() }.is_ok_and(|watched| watched.router_failed());
     let (scored, refused) = if has_router {
         // Before the scorer closes the session.
         let refused = refused.finish();
@@ -197,11 +220,7 @@ fn go(
         capacity,
     );
     match watched.ending {
-        Ending::Over | Ending::Asked => Ok(result),
-        Ending::RouterFailed => Err(RunError::Router {
-            panic: router_panic::first().unwrap_or_default().into(),
-            folder: result.folder.path().to_owned(),
-        }),
+        Ending::Over | Ending::Asked | Ending::RouterFailed { .. } => Ok(result),
         Ending::Failed { process, how } => {
             let log = result.folder.log_dir().join(format!("{process}.log"));
             Err(RunError::Process { process, how, log })
@@ -239,8 +258,14 @@ struct Watched {
     offline: BTreeSet<String>,
     /// Processes that failed in their task, with the reason.
     failures: Vec<String>,
-    /// Processes that crashed at least once.
-    crashed: Vec<String>,
+    /// Observed causes of lost messages.
+    causes: Vec<String>,
+}
+
+impl Watched {
+    fn router_failed(&self) -> bool {
+        matches!(self.ending, Ending::RouterFailed { .. })
+    }
 }
 
 /// Arrival time of each sweep at the ego's agent, by capture time. An agent on another host writes none.
@@ -261,11 +286,14 @@ fn watch(
     fleet: &Fleet,
     context: &SessionContext<'_>,
     specs: Vec<ProcessSpec>,
-    endpoint: &Endpoint,
+    place: &RouterEndpoint,
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, RunError> {
-    let SessionContext { run, folder, .. } = *context;
+    let SessionContext {
+        run, folder, keys, ..
+    } = *context;
+    let endpoint = &place.endpoint;
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
     if let Some(address) = fleet.scenario.network.metrics {
@@ -278,39 +306,57 @@ fn watch(
         specs.len(),
         folder.log_dir().display()
     ));
+    let everyone = specs.iter().map(|spec| spec.name.clone());
+    let everyone: Vec<String> = everyone.chain([Role::Scorer.to_string()]).collect();
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let mut watch = StatusReporter::new(
         &fleet.scenario.timeouts,
         run,
-        endpoint,
+        (
+            endpoint,
+            fleet.scenario.network.connect.is_none(),
+            place.probe(run, keys),
+        ),
         folder,
         fleet.applied_protocol(),
     );
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
     let mut offline = scorer.absent();
-    let crashed = watch.crashed();
-    offline.extend(crashed.iter().cloned());
+    offline.extend(watch.crashed());
+    if let Ending::RouterFailed { how } = &ending {
+        display.print_line(&format!("{ROUTER_FAILED}: {how}"));
+    }
+    if watch.had_outages() || matches!(ending, Ending::RouterFailed { .. }) {
+        offline.extend(everyone);
+    }
+    watch.end(matches!(ending, Ending::RouterFailed { .. }));
     watch.write_status(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
-    let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
+    let mut killed = supervisor.end(|name| name == REPLAY, limits.replay);
     drain(&supervisor, scorer, limits.drain, &mut display);
-    let agents = supervisor.end(|name| name.starts_with("agent"), limits.all);
-    killed.extend(agents.killed);
-    killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
-    killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
+    killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all));
+    killed.extend(supervisor.end(|name| name != RECORDER, limits.all));
+    killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE));
     display.finish();
     while let Ok(event) = happened.try_recv() {
         watch.note(&event);
     }
     watch.write_status(Phase::Over, &scorer.progress());
     offline.extend(killed.iter().cloned());
-    let failures = watch.failures();
+    let (mut failures, mut causes) = (watch.failures(), watch.causes());
+    if let Ending::RouterFailed { how } = &ending {
+        let failure = format!("{ROUTER_FAILED}: {how}");
+        failures.push(failure.clone());
+        causes.push(failure);
+        // They cannot take their leave without a router.
+        killed.clear();
+    }
     Ok(Watched {
         ending,
         killed,
         offline,
         failures,
-        crashed,
+        causes,
     })
 }
 
@@ -325,30 +371,16 @@ impl Limits {
     /// After Ctrl-C everything has to end within `stop_s`; a run that is over waits for its last results first.
     fn of(fleet: &Fleet, ending: &Ending) -> Self {
         let timeouts = &fleet.scenario.timeouts;
+        let (drain_s, stop_s) = (timeouts.drain_s, timeouts.stop_s);
+        let limits_s = match ending {
+            Ending::Over => [0.0, drain_s, drain_s + stop_s],
+            Ending::Asked => [stop_s * REPLAY_SHARE, stop_s * DRAIN_SHARE, stop_s],
+            Ending::RouterFailed { .. } => [0.0, 0.0, stop_s],
+            Ending::Failed { .. } => [stop_s, 0.0, stop_s],
+        };
         let now = Instant::now();
-        let after = |seconds: f64| now + Duration::from_secs_f64(seconds);
-        match ending {
-            Ending::Over => Self {
-                replay: now,
-                drain: after(timeouts.drain_s),
-                all: after(timeouts.drain_s + timeouts.stop_s),
-            },
-            Ending::Asked => Self {
-                replay: after(timeouts.stop_s * REPLAY_SHARE),
-                drain: after(timeouts.stop_s * DRAIN_SHARE),
-                all: after(timeouts.stop_s),
-            },
-            Ending::RouterFailed => Self {
-                replay: now,
-                drain: now,
-                all: after(timeouts.stop_s),
-            },
-            Ending::Failed { .. } => Self {
-                replay: after(timeouts.stop_s),
-                drain: now,
-                all: after(timeouts.stop_s),
-            },
-        }
+        let [replay, drain, all] = limits_s.map(|after_s| now + Duration::from_secs_f64(after_s));
+        Self { replay, drain, all }
     }
 }
 
@@ -391,6 +423,11 @@ fn write(
         let file = folder.file(name);
         unwritten.push(format!("{lines} lines are missing in {}", file.display()));
     }
+    for file in LINES.map(|name| folder.file(name)) {
+        if let Err(error) = atomic_file::sync(&file) {
+            unwritten.push(format!("{}: {error}", file.display()));
+        }
+    }
     let mut note = |written: Result<(), RunFolderError>| {
         if let Err(error) = written {
             unwritten.push(error.to_string());
@@ -420,11 +457,17 @@ fn write(
     };
     note(folder.write_json(deploy::score::metrics::FILE, &metrics));
     let remedies = remedies(fleet, capacity.as_ref());
-    let run_report = RunReport::new(run, &metrics, board.records(), &stats, capacity);
+    let run_report = RunReport {
+        causes: watched.causes.clone(),
+        ..RunReport::new(run, &metrics, board.records(), &stats, capacity)
+    };
     note(folder.write_json(report::FILE, &run_report));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
-    let report = LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
-        .with_refused(refused);
+    let report = LedgerReport {
+        refused: refused.iter().map(RefusedReport::of).collect(),
+        causes: watched.causes.clone(),
+        ..LedgerReport::new(&stats, &sum, &balance, (&watched.offline, exempted))
+    };
     note(folder.write_json("ledger.json", &report));
     let resolved = Scenario {
         run: Some(run.clone()),
@@ -443,7 +486,7 @@ fn write(
         killed: watched.killed.clone(),
         unwritten,
         failures: watched.failures.clone(),
-        crashed: watched.crashed.clone(),
+        causes: watched.causes.clone(),
         remedies: Some(remedies),
         report: run_report,
         picture,

@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::ops::ControlFlow;
 
 use dataset::findings;
-use deploy::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
+use deploy::operate::run_folder::{RunFolder, RunFolderError};
 use deploy::report::{self, RunReport};
 use deploy::score::FrameScores;
 use deploy::score::metrics::Metrics;
@@ -15,8 +15,8 @@ use ego_fuser_offline::evaluation::{
     AgentPool, EmulatedLink, EvaluateError, EvaluatedFrame, Evaluator, Setup,
 };
 use protocol::{CavId, RunId};
-use support::progress;
 use support::provenance::Provenance;
+use terminal::progress;
 
 use crate::evaluated_frame::{judge, metrics};
 use crate::fleet::Fleet;
@@ -24,7 +24,7 @@ use crate::frame_lines::FrameLines;
 use crate::run::RunError;
 use crate::run::agent_pool::CrewProcesses;
 use crate::run::ledger_report::LedgerReport;
-use crate::run::run_fleet::{RunOptions, RunResult};
+use crate::run::run_fleet::{RunOptions, RunResult, in_folder};
 use crate::scenario::{AgentOverrides, Scenario};
 
 /// Runs a scenario in simulation time to its end.
@@ -43,14 +43,9 @@ pub fn run_scenario(scenario: &Scenario, options: &RunOptions) -> Result<RunResu
     };
     stepped.compute = Some(compute);
     evaluator.set_compute(compute);
-    let named = fleet.scenario.run.clone();
-    let run = named.unwrap_or_else(|| name_of_now(options.prefix));
-    let folder = RunFolder::create(&options.runs, &run)?;
-    let result = go(&fleet, &mut evaluator, (&run, &folder), options);
-    if result.as_ref().is_err_and(RunError::is_refusal) {
-        folder.remove();
-    }
-    result
+    in_folder(&fleet, options, |run, folder| {
+        go(&fleet, &mut evaluator, (run, folder), options)
+    })
 }
 
 /// Runs a fleet under the given run name in the given folder.
@@ -184,7 +179,7 @@ fn write(
         killed: Vec::new(),
         unwritten: Vec::new(),
         failures: Vec::new(),
-        crashed: Vec::new(),
+        causes: Vec::new(),
         remedies: None,
         report,
         picture,

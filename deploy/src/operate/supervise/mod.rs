@@ -116,13 +116,6 @@ pub enum SuperviseError {
     Runtime(std::io::Error),
 }
 
-/// Result of ending a fleet.
-#[derive(Debug, Default, Clone, PartialEq, Eq)]
-pub struct StopReport {
-    /// Processes that did not end in time and were killed.
-    pub killed: Vec<String>,
-}
-
 /// Processes of a run. Dropping it kills those that still run.
 pub struct Supervisor {
     runtime: Runtime,
@@ -203,24 +196,24 @@ impl Supervisor {
     }
 
     /// Ends the processes that `which` selects by name: SIGTERM, then SIGKILL at `deadline`. Returns when they have
-    /// ended.
-    pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
+    /// ended, with the names of those that were killed.
+    pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> Vec<String> {
         let is_chosen = |watched: &mut Watched| which(&watched.name);
         let chosen: Vec<Watched> = self.watched.extract_if(.., is_chosen).collect();
         for watched in &chosen {
             watched.stop.send_replace(Some(deadline));
         }
-        let mut report = StopReport::default();
+        let mut killed = Vec::new();
         for watched in chosen {
             if self.runtime.block_on(watched.task).unwrap_or(true) {
-                report.killed.push(watched.name);
+                killed.push(watched.name);
             }
         }
-        report
+        killed
     }
 
-    /// Ends all processes within `grace`.
-    pub fn stop(mut self, grace: Duration) -> StopReport {
+    /// Ends all processes within `grace`; names those that were killed.
+    pub fn stop(mut self, grace: Duration) -> Vec<String> {
         self.end(|_| true, Instant::now() + grace)
     }
 }

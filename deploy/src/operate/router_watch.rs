@@ -1,0 +1,216 @@
+//! Router watch: the failure of a run's router, its outages, and times in which the run itself was suspended.
+
+use std::time::{Duration, Instant};
+
+use bus::RouterProbe;
+
+use crate::score::ScorerNode;
+
+/// Longest time without a message through the router.
+pub(crate) const LIMIT: Duration = Duration::from_secs(2);
+
+/// What the watch has found at one look.
+#[derive(Debug, PartialEq)]
+pub(crate) enum Finding {
+    /// A line for the terminal: the router is gone, or back, or the run was suspended.
+    Line(String),
+    /// The router in this process passes no message, with the reason.
+    Failed(String),
+}
+
+/// Reason for the failure of a router through which nothing came for this time.
+pub(crate) fn in_words(silence: Duration) -> String {
+    let seconds = silence.as_secs_f64();
+    format!("nothing came through it for {seconds:.1} s")
+}
+
+/// Times of one kind.
+#[derive(Debug, Default)]
+struct Times {
+    count: usize,
+    sum: Duration,
+}
+
+impl Times {
+    fn add(&mut self, time: Duration) {
+        self.count += 1;
+        self.sum += time;
+    }
+
+    /// `router gone for 4.0 s`, with the number of times where there were several.
+    fn sentence(&self, what: &str) -> Option<String> {
+        let times = match self.count {
+            0 => return None,
+            1 => String::new(),
+            count => format!(" in all ({count} times)"),
+        };
+        Some(format!("{what} for {:.1} s{times}", self.sum.as_secs_f64()))
+    }
+}
+
+/// Watch of the router of a run.
+#[derive(Default)]
+pub(crate) struct RouterWatch {
+    /// Absent where no second session could be opened.
+    probe: Option<RouterProbe>,
+    /// True if the router is in this process.
+    is_here: bool,
+    looked: Option<Instant>,
+    gone_since: Option<Instant>,
+    outages: Times,
+    pauses: Times,
+}
+
+impl RouterWatch {
+    /// A watch over the router that `probe` reaches.
+    pub(crate) fn new(probe: Option<RouterProbe>, is_here: bool) -> Self {
+        Self {
+            probe,
+            is_here,
+            ..Self::default()
+        }
+    }
+
+    /// Judges the router by its probe, by the connection of `scorer`, and by the last report of another process.
+    pub(crate) fn look(
+        &mut self,
+        scorer: &ScorerNode,
+        reported: Option<Instant>,
+    ) -> Option<Finding> {
+        let now = Instant::now();
+        let silence = { self.probe.as_mut() }.map_or(Duration::ZERO, |probe| probe.silence(now));
+        let reported = reported.map_or(silence, |at| now.saturating_duration_since(at));
+        self.judge(silence.min(reported), scorer.router_lost_since(), now)
+    }
+
+    /// Judges it by the time for which nothing has come through it, and since when there is no connection.
+    fn judge(
+        &mut self,
+        silence: Duration,
+        lost_since: Option<Instant>,
+        now: Instant,
+    ) -> Option<Finding> {
+        let looked = self.looked.replace(now).unwrap_or(now);
+        let pause = now.saturating_duration_since(looked);
+        if pause > LIMIT {
+            self.pauses.add(pause);
+            let seconds = pause.as_secs_f64();
+            return Some(Finding::Line(format!(
+                "the run was suspended for {seconds:.1} s"
+            )));
+        }
+        let is_silent = silence > LIMIT;
+        if is_silent && self.is_here {
+            return Some(Finding::Failed(in_words(silence)));
+        }
+        let since = lost_since.or_else(|| is_silent.then(|| now.checked_sub(silence))?);
+        match (self.gone_since, since) {
+            (None, Some(since)) => {
+                self.gone_since = Some(since);
+                Some(Finding::Line(
+                    "the router is gone: no message passes".into(),
+                ))
+            }
+            (Some(since), None) => {
+                let outage = now.saturating_duration_since(since);
+                self.gone_since = None;
+                self.outages.add(outage);
+                let seconds = outage.as_secs_f64();
+                Some(Finding::Line(format!(
+                    "the router is back after {seconds:.1} s"
+                )))
+            }
+            _ => None,
+        }
+    }
+
+    /// Time since which the router is gone.
+    pub(crate) fn gone_s(&self) -> Option<f64> {
+        self.gone_since.map(|since| since.elapsed().as_secs_f64())
+    }
+
+    /// Outages and pauses so far, as text.
+    pub(crate) fn causes(&self) -> Vec<String> {
+        let current = self
+            .gone_s()
+            .map(|seconds| format!("router gone for {seconds:.1} s"));
+        let over = [
+            self.outages.sentence("router gone"),
+            self.pauses.sentence("suspended"),
+        ];
+        over.into_iter().flatten().chain(current).collect()
+    }
+
+    /// True if messages of any process may have been lost without its knowledge.
+    pub(crate) fn had_outages(&self) -> bool {
+        self.gone_since.is_some() || self.outages.count + self.pauses.count > 0
+    }
+
+    /// Ends the probe.
+    pub(crate) fn end(&mut self, has_failed: bool) {
+        if let Some(probe) = self.probe.take() {
+            probe.end(has_failed || self.gone_since.is_some());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BEAT: Duration = Duration::from_millis(100);
+
+    fn line(found: Option<Finding>) -> String {
+        match found {
+            Some(Finding::Line(line)) => line,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_router_elsewhere_that_is_silent_or_lost_is_gone_until_it_is_back() {
+        let (mut watch, mut now) = (RouterWatch::new(None, false), Instant::now());
+        let mut look = |watch: &mut RouterWatch, silence: f64, lost: Option<f64>| {
+            now += BEAT;
+            let lost = lost.map(|seconds| now - Duration::from_secs_f64(seconds));
+            watch.judge(Duration::from_secs_f64(silence), lost, now)
+        };
+        assert_eq!(look(&mut watch, 1.9, None), None);
+        assert!(line(look(&mut watch, 2.1, None)).contains("the router is gone"));
+        assert_eq!(look(&mut watch, 2.2, Some(0.1)), None, "once");
+        assert_eq!(
+            line(look(&mut watch, 0.0, None)),
+            "the router is back after 2.3 s"
+        );
+        assert_eq!(watch.causes(), ["router gone for 2.3 s"]);
+        assert!(line(look(&mut watch, 0.1, Some(0.1))).contains("gone"));
+        assert!(watch.causes()[1].starts_with("router gone for 0."));
+        line(look(&mut watch, 0.2, None));
+        assert_eq!(watch.causes(), ["router gone for 2.5 s in all (2 times)"]);
+    }
+
+    #[test]
+    fn a_router_here_that_is_silent_has_failed() {
+        let mut watch = RouterWatch::new(None, true);
+        let now = Instant::now();
+        assert_eq!(watch.judge(LIMIT, None, now), None);
+        let found = watch.judge(LIMIT + BEAT, None, now + BEAT);
+        let reason = "nothing came through it for 2.1 s".to_owned();
+        assert_eq!(found, Some(Finding::Failed(reason)));
+    }
+
+    #[test]
+    fn a_pause_of_the_run_is_no_outage_of_the_router() {
+        let mut watch = RouterWatch::new(None, true);
+        let now = Instant::now();
+        watch.judge(BEAT, None, now);
+        let after = now + Duration::from_secs(20);
+        assert_eq!(
+            line(watch.judge(Duration::from_secs(20), None, after)),
+            "the run was suspended for 20.0 s"
+        );
+        assert_eq!(watch.judge(BEAT, None, after + BEAT), None);
+        assert_eq!(watch.causes(), ["suspended for 20.0 s"]);
+        assert!(watch.had_outages());
+    }
+}
