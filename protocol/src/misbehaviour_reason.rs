@@ -17,5 +17,7 @@ named! {
         ImplausibleMotion = "implausible_motion",
         /// There is no evidence against it, but none for it yet.
         Probation = "probation",
+        /// Its feature map has values that the network does not give.
+        ImplausibleValues = "implausible_values",
     }
 }

@@ -18,6 +18,13 @@ const DRIVES_MPS: f64 = 12.0;
 const OWN_BODY_M: f64 = 2.5;
 /// Both vehicles detect objects within this distance of both, unless they are occluded, metres.
 const NEAR_M: f64 = 35.0;
+/// A vehicle within this distance of the ego is in full view unless another one hides it, metres.
+const FULL_VIEW_M: f64 = 20.0;
+/// A vehicle hides what is behind it within this distance of the line of sight, metres.
+const HIDDEN_M: f64 = 1.5;
+/// Log odds of a single vehicle in full view where the ego detects none: two such frames leave a newcomer out,
+/// four one that has agreed for long.
+const FULL_VIEW: f64 = -1.2;
 /// A confidence of a vehicle below this means that the ego observes an empty place.
 const EMPTY: f32 = 0.06;
 /// Messages with a higher similarity are the same one. Two vehicles reach 0.92 at most.
@@ -37,6 +44,8 @@ pub(super) struct Evidence {
     pub(super) matched: u32,
     /// Vehicles of the neighbour near both where the ego detects none.
     pub(super) contradicted: u32,
+    /// Of these, the ones near the ego that no vehicle hides from it.
+    pub(super) in_full_view: u32,
     /// Vehicles of the neighbour further away where the ego detects none.
     pub(super) strange: u32,
     /// Vehicles of the ego near both where the neighbour detects none.
@@ -52,6 +61,8 @@ pub(super) struct Evidence {
     pub(super) like_before: Option<f64>,
     /// True if its pose is not reachable from the previous one.
     pub(super) jumped: bool,
+    /// True if its map has values that the network does not give.
+    pub(super) is_out_of_range: bool,
     /// True if its points contain no vehicle, and the ego's own do.
     pub(super) is_blind: bool,
     /// True if all this is derived from boxes, which do not distinguish empty places from uncertain ones.
@@ -98,7 +109,11 @@ impl Evidence {
             let is_empty = sure.is_some_and(|sure| sure < EMPTY);
             match (is_near(at), is_mine) {
                 (true, true) => evidence.matched += 1,
-                (true, false) => evidence.contradicted += u32::from(is_empty),
+                (true, false) if is_empty => {
+                    evidence.contradicted += 1;
+                    evidence.in_full_view += u32::from(is_in_full_view(at, &mine));
+                }
+                (true, false) => {}
                 (false, is_mine) => evidence.strange += u32::from(!is_mine && is_empty),
             }
         }
@@ -158,15 +173,26 @@ impl Evidence {
             (true, true) => 2,
         };
         let most = if self.strange >= enough { -3.6 } else { 0.0 };
-        let odds = odds[(self.contradicted as usize).min(odds.len() - 1)].min(most);
+        let plain = if self.in_full_view > 0 {
+            FULL_VIEW
+        } else {
+            0.0
+        };
+        let odds = odds[(self.contradicted as usize).min(odds.len() - 1)];
+        let odds = odds.min(most).min(plain);
         (odds < 0.0).then_some(odds)
     }
 
-    /// Evidence against a copier, against unrelated successive maps and against jumps.
+    /// Evidence against values of no network, against a copier, against unrelated successive maps and against jumps.
     fn against_other_attacks(&self) -> Option<(f64, MisbehaviourReason)> {
         let is_torn = !self.boxes_only && self.like_before.is_some_and(|like| like < SUCCESSIVE);
         let is_copied = self.like_another > COPY;
         let sure = [
+            (
+                self.is_out_of_range,
+                -8.0,
+                MisbehaviourReason::ImplausibleValues,
+            ),
             (is_copied, -8.0, MisbehaviourReason::Duplicated),
             (self.jumped, -4.0, MisbehaviourReason::ImplausibleMotion),
             (is_torn, -3.0, MisbehaviourReason::Inconsistent),
@@ -191,6 +217,17 @@ impl Evidence {
             _ => -1.5,
         }
     }
+}
+
+/// True if the ego would detect a vehicle there: it is near, and no detected one hides it.
+fn is_in_full_view(at: &Point2<f64>, detected: &[Point2<f64>]) -> bool {
+    let distance_m = at.coords.norm();
+    let hides = |other: &Point2<f64>| {
+        let along_m = other.coords.dot(&at.coords) / distance_m;
+        let beside_m = other.coords.perp(&at.coords).abs() / distance_m;
+        (OWN_BODY_M..distance_m).contains(&along_m) && beside_m < HIDDEN_M
+    };
+    distance_m < FULL_VIEW_M && !detected.iter().any(hides)
 }
 
 #[cfg(test)]
@@ -272,6 +309,29 @@ mod tests {
     }
 
     #[test]
+    fn a_single_invented_vehicle_in_full_view_counts_and_a_hidden_one_does_not() {
+        let own = seen(&boxes(&WORLD, WORLD[0]));
+        let with = |invented: [f64; 2]| {
+            let mut echo = WORLD.to_vec();
+            echo.push(invented);
+            let theirs = seen(&boxes(&echo, WORLD[1]));
+            Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0)
+        };
+        let phantom = with([12.0, -1.0]);
+        assert_eq!((phantom.contradicted, phantom.in_full_view), (1, 1));
+        assert_eq!(
+            phantom.judgement(),
+            Some((FULL_VIEW, MisbehaviourReason::GhostObjects))
+        );
+        // Behind the vehicle at (10, -6).
+        let hidden = with([15.0, -9.0]);
+        assert_eq!((hidden.contradicted, hidden.in_full_view), (1, 0));
+        assert!(hidden.log_odds() > phantom.log_odds());
+        let far = with([24.0, 5.5]);
+        assert_eq!(far.in_full_view, 0);
+    }
+
+    #[test]
     fn a_copy_a_jump_and_noise_are_detected() {
         let fine = Evidence {
             matched: 3,
@@ -292,7 +352,12 @@ mod tests {
             like_before: Some(0.7),
             ..Evidence::default()
         };
+        let constant = Evidence {
+            is_out_of_range: true,
+            ..fine.clone()
+        };
         for (evidence, reason) in [
+            (constant, MisbehaviourReason::ImplausibleValues),
             (copied, MisbehaviourReason::Duplicated),
             (jumped, MisbehaviourReason::ImplausibleMotion),
             (torn, MisbehaviourReason::Inconsistent),

@@ -1,7 +1,8 @@
 //! Misbehaviour detection: compares a neighbour's detections with the ego's in the jointly observed area.
 //!
 //! Every message is evaluated separately, by the ego's own head, before any of it is fused: vehicles that only one of
-//! the two detects, mutual detection at the reported positions, similarity to other senders' messages. Evidence is
+//! the two detects, mutual detection at the reported positions, similarity to other senders' messages, values that the
+//! network does not give. Evidence is
 //! averaged over frames, the newest counting half; a neighbour below a threshold is left out until its average has
 //! recovered. A neighbour without evidence keeps its trust. Maps are accepted until there is evidence against them, as
 //! fused features must agree with the ego's own in any case; boxes, which count as received, are accepted only with
@@ -9,6 +10,7 @@
 
 mod evidence;
 mod seen;
+mod value_range;
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -16,11 +18,11 @@ use nalgebra::Isometry2;
 use perception::detector::{Detector, DetectorError};
 use protocol::message::NeighbourState;
 use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
-use serde::{Deserialize, Serialize};
 
 use crate::view::View;
 use evidence::Evidence;
 use seen::{Observation, cosine_similarity};
+use value_range::ValueRange;
 
 /// Weight of a frame against all before it.
 const NEWEST: f64 = 0.5;
@@ -38,31 +40,18 @@ const MAX_JUMP_M: f64 = 20.0;
 /// Largest turn rate of a vehicle, radians per second, and largest heading error between successive poses, radians.
 const MAX_TURN: (f64, f64) = (2.0, 1.0);
 
-/// Thresholds for leaving out and readmitting a neighbour.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct MisbehaviourConfig {
-    /// Below this running mean of the evidence a neighbour is left out, log odds.
-    pub leave_out_below: f64,
-    /// Above this it is readmitted, log odds.
-    pub take_back_above: f64,
-}
-
-impl Default for MisbehaviourConfig {
-    fn default() -> Self {
-        Self {
-            leave_out_below: -0.7,
-            take_back_above: 0.7,
-        }
-    }
-}
+/// Below this running mean of the evidence a neighbour is left out, log odds.
+const LEAVE_OUT_BELOW: f64 = -0.7;
+/// Above this it is readmitted, log odds.
+const TAKE_BACK_ABOVE: f64 = 0.7;
 
 /// State of all neighbours.
 #[derive(Debug)]
 pub(crate) struct MisbehaviourDetector {
-    config: MisbehaviourConfig,
     /// The map of an empty world, `[C, H, W]`.
     empty: Vec<f32>,
+    /// Of the own maps so far, and of the empty one.
+    range: ValueRange,
     peers: BTreeMap<CavId, Reputation>,
 }
 
@@ -113,15 +102,13 @@ pub fn neighbour_states(
 
 impl MisbehaviourDetector {
     /// Starts with all neighbours trusted.
-    pub(crate) fn new(
-        config: MisbehaviourConfig,
-        detector: &mut Detector,
-    ) -> Result<Self, DetectorError> {
+    pub(crate) fn new(detector: &mut Detector) -> Result<Self, DetectorError> {
         let encoded = detector.encode(&PointCloud::default())?.features;
         let empty = detector.through_compressor(&encoded)?;
-        let empty = Vec::try_from(&empty.f_contiguous()?.f_view([-1])?)?;
+        let empty: Vec<f32> = Vec::try_from(&empty.f_contiguous()?.f_view([-1])?)?;
+        let [channels, ..] = detector.map_shape();
         Ok(Self {
-            config,
+            range: ValueRange::of(&empty, usize::try_from(channels).unwrap_or(0)),
             empty,
             peers: BTreeMap::new(),
         })
@@ -142,9 +129,16 @@ impl MisbehaviourDetector {
         let present = neighbours.iter().map(|(view, _)| &view.cav);
         self.forget_absent(own.capture_nanos, present);
         let mine = Observation::in_message(&own.content, detector, &self.empty)?;
+        self.range.widen(&mine.map);
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
-            let seen = Observation::in_message(&view.content, detector, &self.empty)?;
+            // A map from which the head makes values or boxes of no detector is evidence against its sender only.
+            let seen = match Observation::in_message(&view.content, detector, &self.empty) {
+                Err(DetectorError::Values { .. } | DetectorError::Box(_)) => {
+                    Observation::implausible()
+                }
+                seen => seen?,
+            };
             all.push(seen);
         }
         // A message that serves a second frame is no new evidence.
@@ -191,6 +185,7 @@ impl MisbehaviourDetector {
         let relative = Isometry2::new([x, y].into(), ego_from_cav.yaw_rad());
         let age_s = view.age_nanos(own) as f64 * 1e-9;
         let mut evidence = Evidence::between(mine, seen, &relative, age_s);
+        evidence.is_out_of_range = self.range.is_left_by(&seen.map);
         let others = self.peers.iter().filter(|(cav, _)| **cav != view.cav);
         let earlier = others.filter_map(|(_, peer)| peer.last.as_ref());
         let fingerprints = earlier.map(|(_, _, fingerprint)| fingerprint);
@@ -226,10 +221,6 @@ impl MisbehaviourDetector {
         judgement: Option<(f64, MisbehaviourReason)>,
         probation: bool,
     ) -> Assessment {
-        let MisbehaviourConfig {
-            leave_out_below,
-            take_back_above,
-        } = self.config;
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             // Beyond the limit of neighbours nothing is known.
             return Assessment {
@@ -252,7 +243,7 @@ impl MisbehaviourDetector {
             }
         }
         let was_out = reputation.is_out;
-        let threshold = [leave_out_below, take_back_above][usize::from(was_out)];
+        let threshold = [LEAVE_OUT_BELOW, TAKE_BACK_ABOVE][usize::from(was_out)];
         reputation.is_out = reputation.log_odds < threshold;
         let reason = reputation.reason;
         match (was_out, reputation.is_out) {
@@ -313,8 +304,8 @@ mod tests {
 
     fn trust() -> MisbehaviourDetector {
         MisbehaviourDetector {
-            config: MisbehaviourConfig::default(),
             empty: vec![],
+            range: ValueRange::default(),
             peers: BTreeMap::new(),
         }
     }

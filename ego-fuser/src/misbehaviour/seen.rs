@@ -1,7 +1,6 @@
 //! Observation: content of one vehicle's message, evaluated separately and in its own frame.
 
-use nalgebra::Isometry3;
-use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::boxes::postprocess::{PostprocessConfig, detections};
 use perception::detector::{Detector, DetectorError};
 use perception::model_config::YAxis;
 use protocol::BevGrid;
@@ -30,6 +29,8 @@ pub(super) struct Observation {
     pub(super) fingerprint: Vec<f32>,
     /// True for points that contain no vehicle.
     pub(super) is_blind: bool,
+    /// The map, `[C, H, W]`; empty where there are boxes only.
+    pub(super) map: Vec<f32>,
 }
 
 #[derive(Debug)]
@@ -68,6 +69,14 @@ impl Observation {
         }
     }
 
+    /// Of a map that no head can interpret.
+    pub(super) fn implausible() -> Self {
+        Self {
+            map: vec![f32::INFINITY],
+            ..Self::of_boxes(Vec::new())
+        }
+    }
+
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
         let sure = all.iter().filter(|(_, score)| *score >= SURE);
         let values = |([x, y], score): &([f64; 2], f32)| [*x as f32, *y as f32, *score];
@@ -76,6 +85,7 @@ impl Observation {
             fingerprint: all.iter().flat_map(values).collect(),
             sure: Sure::Boxes(all),
             is_blind: false,
+            map: Vec::new(),
         }
     }
 
@@ -95,15 +105,11 @@ impl Observation {
             ..PostprocessConfig::for_late_fusion(detector.config())
         };
         let boxes = detector.boxes(&heads, SURE)?;
-        let own = AgentBoxes {
-            boxes: &boxes,
-            output_from_agent: Isometry3::identity(),
-        };
         let mut found = Vec::new();
-        for candidate in postprocess(&[own], &limits) {
-            let [x, y, _] = candidate.detection(None).box3d.center_m;
+        for detection in detections(&boxes, &limits) {
+            let [x, y, _] = detection.box3d.center_m;
             if cell_of(&grid, x, y).is_none_or(was_sent) {
-                found.push(([x, y], candidate.score));
+                found.push(([x, y], detection.score));
             }
         }
         let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
@@ -114,6 +120,7 @@ impl Observation {
             // The cells of a mirrored network lie elsewhere; its boxes do not.
             return Ok(Self {
                 fingerprint,
+                map: values,
                 ..Self::of_boxes(found)
             });
         }
@@ -129,6 +136,7 @@ impl Observation {
             sure: Sure::Cells(grid, cells),
             fingerprint,
             is_blind: false,
+            map: values,
         })
     }
 
@@ -215,6 +223,7 @@ mod tests {
             vehicles: vec![],
             sure: Sure::Cells(grid, sure),
             fingerprint: vec![],
+            map: vec![],
             is_blind: false,
         };
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));

@@ -539,3 +539,20 @@ fn a_message_over_the_size_limit_is_refused_and_others_are_not_affected() {
         "not even the ego's own limits had to see it"
     );
 }
+
+#[test]
+fn a_router_with_keys_receives_its_own_probes() {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = keys_for(folder.path(), &["agent-1"]);
+    let router = GuardedRouter::open(&keys);
+    let client = BusOptions::client(router.endpoint.clone())
+        .with_credentials(Credentials::read(&keys.join(bus::ROUTER)).unwrap());
+    let mut probe = bus::RouterProbe::of_router(&router.session, &client).unwrap();
+    let began = Instant::now();
+    while began.elapsed() < Duration::from_secs(3) {
+        let silence = probe.silence(Instant::now());
+        assert!(silence < Duration::from_secs(2), "{silence:?}");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    probe.end(false);
+}
